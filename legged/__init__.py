@@ -1,0 +1,7 @@
+"""Legged robots learn to walk: legged_gym's task on batched MuJoCo, trained by rsl-rl."""
+
+from legged.config import ConfigError, TaskConfig
+from legged.envs import LeggedRobot
+from legged.registry import make_task, register, task_config
+
+__all__ = ["ConfigError", "LeggedRobot", "TaskConfig", "make_task", "register", "task_config"]

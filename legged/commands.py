@@ -1,0 +1,67 @@
+"""Velocity commands: sampling, holding, heading mode."""
+
+import torch
+from torch import Tensor
+
+from legged.config.schema import CommandsConfig
+from legged.math import masked_set_, uniform, wrap_to_pi, yaw_of
+
+MOVING = 0.1
+"""Norm of (vx, vy, yaw rate) above which a robot is asked to move."""
+HEADING_GAIN = 0.5
+"""Yaw rate per heading error in heading mode [1/s]."""
+
+
+class Commands:
+    """What each robot is asked to do: (vx, vy) [m/s] and yaw rate [rad/s] in the base frame, and a heading [rad]."""
+
+    def __init__(self, cfg: CommandsConfig, num_envs: int, dt: float, device: torch.device) -> None:
+        """All commands start at zero, due to be sampled at the first update; `dt` is the control step [s]."""
+        self.cfg, self.dt = cfg, dt
+        ranges = (cfg.ranges.lin_vel_x, cfg.ranges.lin_vel_y, cfg.ranges.ang_vel_yaw)
+        self.full_ranges = torch.tensor(ranges, device=device)
+        self.ranges = self.full_ranges.clone()
+        """(3, 2) lowest and highest vx, vy, yaw rate that are sampled now; a curriculum writes them in place."""
+        self.commands = torch.zeros(num_envs, 4, device=device)
+        """(N, 4) vx, vy [m/s], yaw rate [rad/s], heading [rad]."""
+        self.is_moving = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        """(N,) whether the robot is asked to move at all, turning on the spot included."""
+        self.time_left = torch.zeros(num_envs, device=device)
+        """(N,) time until the next sample [s]."""
+        self.held = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        """(N,) robots whose command was given by `hold` and is not sampled."""
+
+    def update(self, reset: Tensor, base_quat: Tensor) -> None:
+        """Sample where an episode begins or the time is up, then steer towards the headings."""
+        self.time_left.sub_(self.dt)
+        self._resample((reset | (self.time_left <= 0.5 * self.dt)) & ~self.held)
+        if self.cfg.heading_command:
+            low, high = self.cfg.ranges.ang_vel_yaw
+            error = wrap_to_pi(self.commands[:, 3] - yaw_of(base_quat))
+            self.commands[:, 2].copy_(
+                torch.where(self.held, self.commands[:, 2], torch.clamp(HEADING_GAIN * error, low, high))
+            )
+        torch.gt(self.commands[:, :3].norm(dim=1), MOVING, out=self.is_moving)
+
+    def _resample(self, mask: Tensor) -> None:
+        cfg, device, n = self.cfg, self.commands.device, len(self.commands)
+        low, high = self.ranges[:, 0], self.ranges[:, 1]
+        velocity = low + (high - low) * torch.rand(n, 3, device=device)
+        # One axis only, for a share of the robots: the cases a cube of random commands hardly contains.
+        axis = torch.randint(3, (n, 1), device=device)
+        single = torch.rand(n, 1, device=device) < cfg.single_axis_share
+        other = torch.arange(3, device=device) != axis
+        velocity = velocity.masked_fill(single & other, 0.0)
+        small = velocity[:, :2].norm(dim=1, keepdim=True) < cfg.small_command
+        horizontal = velocity[:, :2].masked_fill(small, 0.0)
+        standing = torch.rand(n, 1, device=device) < cfg.standing_share
+        sampled = torch.cat([horizontal, velocity[:, 2:]], dim=1).masked_fill(standing, 0.0)
+        masked_set_(self.commands[:, :3], mask, sampled)
+        masked_set_(self.commands[:, 3], mask, uniform(*cfg.ranges.heading, (n,), device))
+        masked_set_(self.time_left, mask, cfg.resampling_time_s)
+
+    def hold(self, commands: Tensor) -> None:
+        """Give all robots fixed commands (N, 3), which are neither sampled nor steered any more."""
+        self.commands[:, :3].copy_(commands)
+        self.held.fill_(True)
+        torch.gt(self.commands[:, :3].norm(dim=1), MOVING, out=self.is_moving)

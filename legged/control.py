@@ -1,0 +1,62 @@
+"""Action -> joint torque."""
+
+import torch
+from torch import Tensor
+
+from legged.config.schema import ControlConfig
+from legged.math import masked_set_
+from legged.robot import Robot
+
+
+class Control:
+    """Explicit control laws, evaluated at every physics step and clipped to the motors' effort limits.
+
+    P: stiffness * (action_scale * action + default - q) - damping * dq
+    V: stiffness * (action_scale * action - dq) - damping * ddq, with ddq over one physics step
+    T: action_scale * action
+    """
+
+    def __init__(self, robot: Robot, cfg: ControlConfig, num_envs: int, sim_dt: float, device: torch.device) -> None:
+        """Gains come from `cfg` if it names any, else from the robot.
+
+        Raises:
+            ConfigError: a gain pattern that matches no joint, or a joint without a gain.
+        """
+
+        def tensor(values: object) -> Tensor:
+            return torch.as_tensor(values, dtype=torch.float32, device=device)
+
+        self.control_type, self.action_scale, self.sim_dt = cfg.control_type, cfg.action_scale, sim_dt
+        stiffness, damping = control_gains(robot, cfg)
+        self.stiffness, self.damping = tensor(stiffness), tensor(damping)
+        """(D,) gains [N m/rad], [N m s/rad]."""
+        self.default_dof_pos = tensor(robot.default_dof_pos)
+        self.torque_limits = tensor(robot.torque_limits)
+        self.torques = torch.zeros(num_envs, robot.num_dof, device=device)
+        """(N, D) torques of the last physics step [N m]."""
+        self._last_dof_vel = torch.zeros_like(self.torques)
+
+    def compute(self, actions: Tensor, dof_pos: Tensor, dof_vel: Tensor) -> Tensor:
+        """Torques (N, D) [N m] for actions, joint angles [rad] and velocities [rad/s], each (N, D)."""
+        scaled = self.action_scale * actions
+        if self.control_type == "P":
+            torques = self.stiffness * (scaled + self.default_dof_pos - dof_pos) - self.damping * dof_vel
+        elif self.control_type == "V":
+            acceleration = (dof_vel - self._last_dof_vel) / self.sim_dt
+            torques = self.stiffness * (scaled - dof_vel) - self.damping * acceleration
+            self._last_dof_vel.copy_(dof_vel)
+        else:
+            torques = scaled
+        return torch.clamp(torques, -self.torque_limits, self.torque_limits, out=self.torques)
+
+    def reset(self, mask: Tensor) -> None:
+        """Forget the torques and velocities of the robots in `mask`."""
+        masked_set_(self.torques, mask, 0.0)
+        masked_set_(self._last_dof_vel, mask, 0.0)
+
+
+def control_gains(robot: Robot, cfg: ControlConfig) -> tuple[object, object]:
+    """(D,) stiffness and damping of a task: its own tables where it has them, else the robot's."""
+    stiffness = robot.gains(cfg.stiffness or robot.file.stiffness, "control.stiffness")
+    damping = robot.gains(cfg.damping or robot.file.damping, "control.damping")
+    return stiffness, damping

@@ -1,0 +1,335 @@
+"""The legged robot's MDP, top to bottom: one step, terminations, resets, observations, rewards.
+
+Formulas and names are legged_gym's (Rudin et al., arXiv 2109.11978); where it differs, the docstring says so.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from legged.commands import Commands
+from legged.config.loader import ConfigError, suggest
+from legged.config.schema import TaskConfig
+from legged.contacts import FeetContacts
+from legged.control import Control, control_gains
+from legged.curriculum import CommandCurriculum
+from legged.envs.base_task import BaseTask
+from legged.math import masked_set_, quat_rotate, uniform
+from legged.observations import ObservationGroup
+from legged.physics import make_physics
+from legged.randomization import Randomization
+from legged.rewards import Rewards
+from legged.robot import Robot, load_robot
+from legged.statistics import Statistics
+
+TERMINATION_FORCE = 1.0
+"""Contact force on a terminating shape that ends the episode [N]."""
+PENALISED_FORCE = 0.1
+"""Contact force on a penalised shape that counts as a collision [N]."""
+
+
+class LeggedRobot(BaseTask):
+    """A legged robot that follows velocity commands. Subclass it and add `_reward_<name>` or `_obs_<name>` methods;
+    the configuration names the ones that run. N robots, D joints, F feet, B tracked collision shapes.
+    """
+
+    def __init__(self, cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True) -> None:
+        """Build physics and MDP on `device`; with `graph`, the step is captured on a GPU.
+
+        Raises:
+            ConfigError: the configuration names something that does not exist; nothing is compiled then.
+            TermError: a term fails or cannot be captured.
+        """
+        robot = self.check(cfg)
+        device = torch.device(device)
+        super().__init__(cfg, robot.num_dof, device)
+        self.robot = robot
+        torch.manual_seed(cfg.env.seed)
+        n = self.num_envs
+        self.randomization = Randomization(cfg.domain_rand, n, self.dt, device)
+        self.physics = make_physics(robot, cfg.sim, n, device)
+        self.randomization.apply(self.physics)
+
+        state = self.physics.state
+        self.base_pos, self.base_quat = state.base_pos, state.base_quat
+        self.base_lin_vel, self.base_ang_vel = state.base_lin_vel, state.base_ang_vel
+        self.projected_gravity = state.projected_gravity
+        self.dof_pos, self.dof_vel = state.dof_pos, state.dof_vel
+        self.feet_pos, self.feet_vel = state.feet_pos, state.feet_vel
+        self.contact_forces = state.contact_forces
+        self.last_dof_vel = torch.zeros_like(self.dof_vel)
+
+        self.control = Control(robot, cfg.control, n, cfg.sim.dt, device)
+        self.torques, self.default_dof_pos = self.control.torques, self.control.default_dof_pos
+        self.command_sampler = Commands(cfg.commands, n, self.dt, device)
+        self.commands, self.is_moving = self.command_sampler.commands, self.command_sampler.is_moving
+        self.contacts = FeetContacts(n, len(robot.feet_indices), self.dt, device)
+        self.command_curriculum = CommandCurriculum(
+            cfg.commands.curriculum, self.command_sampler.full_ranges, self.dt, cfg.rewards.tracking_sigma
+        )
+        self.valid = torch.ones(n, dtype=torch.bool, device=device)
+        """(N,) robots whose physics is finite; the others are terminated and reset."""
+
+        self.feet_indices = torch.tensor(robot.feet_indices, device=device)
+        self.penalised_indices = torch.tensor(robot.penalised_indices, dtype=torch.long, device=device)
+        self.termination_indices = torch.tensor(robot.termination_indices, dtype=torch.long, device=device)
+        self.dof_vel_limits = torch.tensor(robot.dof_vel_limits, dtype=torch.float32, device=device)
+        self.dof_pos_limits = self._soft_limits(robot)
+        spawn = torch.tensor([0.0, 0.0, robot.file.spawn_height], device=device)
+        self._spawn_pos = spawn.expand(n, 3)
+        self._spawn_quat = torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).expand(n, 4)
+
+        scales = {name: scale for name, scale in cfg.rewards.scales.items() if scale != 0.0}
+        terms = {name: getattr(self, f"_reward_{name}") for name in scales}
+        self.rewards = Rewards(terms, scales, self.dt, cfg.rewards.only_positive_rewards, n, device)
+        self.episode_sums = self.rewards.episode_sums
+        self.observation_groups = {"actor": self._group("actor"), "critic": self._group("critic")}
+        self.statistics = Statistics(self.rewards.names, cfg.env.episode_length_s, device)
+        self._build_graph(graph)
+
+    @classmethod
+    def check(cls, cfg: TaskConfig) -> Robot:
+        """Everything that can be wrong with a configuration, before anything is built; returns the robot."""
+        robot = load_robot(cfg.robot)
+        rewards, terms = cls.terms("_reward_"), cls.terms("_obs_")
+        for name in cfg.rewards.scales:
+            if name not in rewards:
+                where = f"{cfg.task}: rewards.scales.{name}"
+                raise ConfigError(f"{where}: {cls.__name__} has no reward '{name}'{suggest(name, rewards)}")
+        for group, names in {"actor": cfg.observations.actor, "critic": cfg.observations.critic}.items():
+            for name in (*names, *cfg.observations.scales, *cfg.observations.noise):
+                if name not in terms:
+                    where = f"{cfg.task}: observations.{group}"
+                    raise ConfigError(f"{where}: {cls.__name__} has no observation '{name}'{suggest(name, terms)}")
+        control_gains(robot, cfg.control)
+        return robot
+
+    @classmethod
+    def terms(cls, prefix: str) -> set[str]:
+        """Names of the methods that begin with `prefix`, without it."""
+        return {name.removeprefix(prefix) for name in dir(cls) if name.startswith(prefix)}
+
+    # ---- one control step --------------------------------------------------------------------------------------------
+
+    def _step(self) -> None:
+        clip = self.cfg.control.clip_actions
+        torch.clamp(self._action_input, -clip, clip, out=self.actions)
+        for _ in range(self.cfg.control.decimation):
+            self.physics.set_torques(self.control.compute(self.actions, self.dof_pos, self.dof_vel))
+            self.physics.step()
+        self.physics.refresh()
+        self.episode_length_buf.add_(1)
+        self.contacts.update(self.contact_forces[:, self.feet_indices])
+
+        self.check_termination()
+        self.compute_reward()
+        self.track()
+        self.reset_idx(self.reset_buf)
+        self.randomization.push(self.physics, quat_rotate(self.base_quat, self.base_lin_vel), ~self.reset_buf)
+        self._observe()
+
+    def check_termination(self) -> None:
+        """Failures: a terminating shape feels a force, the base is too low or tilted, physics blew up. And time-outs."""
+        cfg = self.cfg.terminations
+        numbers = (self.base_pos, self.base_quat, self.base_lin_vel, self.base_ang_vel, self.dof_pos, self.dof_vel)
+        self.valid.copy_(torch.isfinite(torch.cat(numbers, dim=1).sum(dim=1)))
+        force = self.contact_forces[:, self.termination_indices].norm(dim=2)
+        failed = (force > TERMINATION_FORCE).any(dim=1) | ~self.valid
+        if cfg.min_base_height > 0.0:
+            failed = failed | (self.base_pos[:, 2] < cfg.min_base_height)
+        if cfg.max_tilt > 0.0:
+            failed = failed | (torch.acos((-self.projected_gravity[:, 2]).clamp(-1.0, 1.0)) > cfg.max_tilt)
+        self.terminated_buf.copy_(failed)
+        self.time_out_buf.copy_((self.episode_length_buf >= self.max_episode_length) & ~failed)
+        torch.logical_or(self.terminated_buf, self.time_out_buf, out=self.reset_buf)
+
+    def compute_reward(self) -> None:
+        """Judged on the command that the policy saw, before anything is reset."""
+        self.rew_buf.copy_(self.rewards.compute(self.valid))
+
+    def track(self) -> None:
+        """Record tracking errors and finished episodes; let the command curriculum judge the step."""
+        velocity = torch.cat([self.base_lin_vel[:, :2], self.base_ang_vel[:, 2:]], dim=1)
+        error = (self.commands[:, :3] - velocity).square()
+        self.statistics.add_step(error[:, :2].sum(dim=1), error[:, 2], self.valid, self.physics.overflowed)
+        self.statistics.add_episodes(
+            self.reset_buf, self.terminated_buf, self.episode_length_buf, self.rewards.sums
+        )
+        self.command_curriculum.update(self.commands[:, :3], velocity, self.valid)
+        self.command_sampler.ranges.copy_(self.command_curriculum.ranges)
+
+    def reset_idx(self, mask: Tensor) -> None:
+        """New episodes for the robots in `mask` (N,): joints near the default pose, base at its spawn height, moving."""
+        cfg, shape = self.cfg.init_state, self.dof_pos.shape
+        velocity = uniform(*cfg.base_velocity, (self.num_envs, 6), self.device)  # type: ignore[arg-type]
+        factor = uniform(*cfg.dof_pos_factor, tuple(shape), self.device)  # type: ignore[arg-type]
+        self.physics.write_state(
+            mask,
+            base_pos=self._spawn_pos,
+            base_quat=self._spawn_quat,
+            base_lin_vel=velocity[:, :3],
+            base_ang_vel=velocity[:, 3:],
+            dof_pos=self.default_dof_pos * factor,
+            dof_vel=torch.zeros_like(self.dof_vel),
+        )
+        self.control.reset(mask)
+        self.contacts.reset(mask)
+        self.rewards.reset(mask)
+        masked_set_(self.actions, mask, 0.0)
+        masked_set_(self.episode_length_buf, mask, 0)
+
+    def _observe(self) -> None:
+        self.physics.refresh()
+        self.command_sampler.update(self.reset_buf, self.base_quat)
+        for group in self.observation_groups.values():
+            group.compute()
+        self.last_actions.copy_(self.actions)
+        self.last_dof_vel.copy_(self.dof_vel)
+
+    # ---- observations: (N, width) each -------------------------------------------------------------------------------
+
+    def _obs_base_lin_vel(self) -> Tensor:
+        return self.base_lin_vel
+
+    def _obs_base_ang_vel(self) -> Tensor:
+        return self.base_ang_vel
+
+    def _obs_projected_gravity(self) -> Tensor:
+        return self.projected_gravity
+
+    def _obs_commands(self) -> Tensor:
+        return self.commands[:, :3]
+
+    def _obs_dof_pos(self) -> Tensor:
+        return self.dof_pos - self.default_dof_pos
+
+    def _obs_dof_vel(self) -> Tensor:
+        return self.dof_vel
+
+    def _obs_actions(self) -> Tensor:
+        return self.actions
+
+    # ---- rewards: (N,) each, times scale and control step ------------------------------------------------------------
+
+    def _reward_tracking_lin_vel(self) -> Tensor:
+        """Following the commanded horizontal velocity: exp(-|error|^2 / sigma)."""
+        error = (self.commands[:, :2] - self.base_lin_vel[:, :2]).square().sum(dim=1)
+        return torch.exp(-error / self.cfg.rewards.tracking_sigma)
+
+    def _reward_tracking_ang_vel(self) -> Tensor:
+        """Following the commanded yaw rate: exp(-error^2 / sigma)."""
+        error = (self.commands[:, 2] - self.base_ang_vel[:, 2]).square()
+        return torch.exp(-error / self.cfg.rewards.tracking_sigma)
+
+    def _reward_lin_vel_z(self) -> Tensor:
+        """Bouncing: squared vertical velocity [m^2/s^2]."""
+        return self.base_lin_vel[:, 2].square()
+
+    def _reward_ang_vel_xy(self) -> Tensor:
+        """Rolling and pitching: squared rates [rad^2/s^2]."""
+        return self.base_ang_vel[:, :2].square().sum(dim=1)
+
+    def _reward_orientation(self) -> Tensor:
+        """Leaning: squared horizontal part of gravity in the base frame."""
+        return self.projected_gravity[:, :2].square().sum(dim=1)
+
+    def _reward_base_height(self) -> Tensor:
+        """Squared distance from the wanted base height above the ground [m^2]."""
+        return (self.base_pos[:, 2] - self.cfg.rewards.base_height_target).square()
+
+    def _reward_torques(self) -> Tensor:
+        """Squared torques [N^2 m^2]."""
+        return self.torques.square().sum(dim=1)
+
+    def _reward_dof_vel(self) -> Tensor:
+        """Squared joint velocities [rad^2/s^2]."""
+        return self.dof_vel.square().sum(dim=1)
+
+    def _reward_dof_acc(self) -> Tensor:
+        """Squared joint accelerations over a control step [rad^2/s^4]."""
+        return ((self.last_dof_vel - self.dof_vel) / self.dt).square().sum(dim=1)
+
+    def _reward_action_rate(self) -> Tensor:
+        """Squared change of the actions."""
+        return (self.last_actions - self.actions).square().sum(dim=1)
+
+    def _reward_collision(self) -> Tensor:
+        """Number of penalised shapes that touch something."""
+        return (self.contact_forces[:, self.penalised_indices].norm(dim=2) > PENALISED_FORCE).sum(dim=1).float()
+
+    def _reward_termination(self) -> Tensor:
+        """Failing; added after the clip at zero."""
+        return self.terminated_buf.float()
+
+    def _reward_dof_pos_limits(self) -> Tensor:
+        """How far joints are outside their soft limits [rad]."""
+        low, high = self.dof_pos_limits[:, 0], self.dof_pos_limits[:, 1]
+        return ((low - self.dof_pos).clamp(min=0.0) + (self.dof_pos - high).clamp(min=0.0)).sum(dim=1)
+
+    def _reward_dof_vel_limits(self) -> Tensor:
+        """How far joint speeds exceed their soft limits, at most 1 rad/s a joint [rad/s]."""
+        limit = self.dof_vel_limits * self.cfg.rewards.soft_dof_vel_limit
+        return (self.dof_vel.abs() - limit).clamp(0.0, 1.0).sum(dim=1)
+
+    def _reward_torque_limits(self) -> Tensor:
+        """How far torques exceed their soft limits [N m]."""
+        limit = self.control.torque_limits * self.cfg.rewards.soft_torque_limit
+        return (self.torques.abs() - limit).clamp(min=0.0).sum(dim=1)
+
+    def _reward_feet_air_time(self) -> Tensor:
+        """Long swings: air time beyond the target, paid at touch-down while any velocity is commanded [s].
+
+        legged_gym asks for a horizontal command; turning on the spot is then never paid, and not learned.
+        """
+        swing = self.contacts.last_air_time - self.cfg.rewards.air_time_target_s
+        return (swing * self.contacts.first_contact).sum(dim=1) * self.is_moving
+
+    def _reward_stumble(self) -> Tensor:
+        """A foot hits something vertical: horizontal force above five times the vertical one."""
+        force = self.contact_forces[:, self.feet_indices]
+        return (force[:, :, :2].norm(dim=2) > 5.0 * force[:, :, 2].abs()).any(dim=1).float()
+
+    def _reward_stand_still(self) -> Tensor:
+        """Joint angles away from the default while no motion is commanded [rad]."""
+        return (self.dof_pos - self.default_dof_pos).abs().sum(dim=1) * ~self.is_moving
+
+    def _reward_feet_contact_forces(self) -> Tensor:
+        """Foot forces beyond the allowed [N]."""
+        force = self.contact_forces[:, self.feet_indices].norm(dim=2)
+        return (force - self.cfg.rewards.max_contact_force).clamp(min=0.0).sum(dim=1)
+
+    def _reward_no_fly(self) -> Tensor:
+        """Exactly one foot on the ground, the walk of a biped."""
+        touching = self.contact_forces[:, self.feet_indices, 2] > PENALISED_FORCE
+        return (touching.sum(dim=1) == 1).float()
+
+    # ---- construction and state --------------------------------------------------------------------------------------
+
+    def _group(self, name: str) -> ObservationGroup:
+        """The observation group `name`; only the actor's is noisy."""
+        cfg = self.cfg.observations
+        names = cfg.actor if name == "actor" else cfg.critic
+        scales: dict[str, Any] = dict(cfg.scales)
+        lin, ang = cfg.scales.get("base_lin_vel", 1.0), cfg.scales.get("base_ang_vel", 1.0)
+        scales.setdefault("commands", [lin, lin, ang])
+        noisy = name == "actor" and cfg.add_noise
+        noise = {term: half * cfg.noise_level for term, half in cfg.noise.items()} if noisy else {}
+        functions: dict[str, Callable[[], Tensor]] = {term: getattr(self, f"_obs_{term}") for term in names}
+        return ObservationGroup(functions, scales, noise, cfg.clip)
+
+    def _soft_limits(self, robot: Robot) -> Tensor:
+        """(D, 2) joint limits, shrunk about their middle by `soft_dof_pos_limit` [rad]."""
+        limits = torch.tensor(robot.dof_pos_limits, dtype=torch.float32, device=self.device)
+        middle, half = limits.mean(dim=1, keepdim=True), 0.5 * (limits[:, 1:] - limits[:, :1])
+        soft = half * self.cfg.rewards.soft_dof_pos_limit
+        bounded = torch.cat([middle - soft, middle + soft], dim=1)
+        return torch.where(torch.isfinite(bounded), bounded, limits)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"command_curriculum": self.command_curriculum.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.command_curriculum.load_state_dict(state["command_curriculum"])
+        self.command_sampler.ranges.copy_(self.command_curriculum.ranges)

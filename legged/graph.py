@@ -1,0 +1,109 @@
+"""The control step as one CUDA graph, and the guard that keeps it capturable on machines without a GPU."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+
+class TermError(RuntimeError):
+    """A `_reward_*` or `_obs_*` method failed; the text names it."""
+
+
+@contextmanager
+def calling(term: str) -> Iterator[None]:
+    """Name `term` in the error if the block fails, also while a graph is being captured."""
+    try:
+        yield
+    except TermError:
+        raise
+    except Exception as error:
+        raise TermError(f"{term}: {error}") from error
+
+
+class HostReadError(RuntimeError):
+    """Code of the step wants a tensor's value on the host."""
+
+
+class ForbidHostReads(TorchDispatchMode):
+    """Refuses what would make a GPU wait for the host, or what no graph can hold: `.item()`, `if tensor`, `nonzero`,
+    indexing by a mask.
+    """
+
+    READS = {
+        torch.ops.aten._local_scalar_dense.default: "reads a value on the host (.item(), float(tensor), if tensor)",
+        torch.ops.aten.nonzero.default: "has a result of unknown size (nonzero, where with one argument)",
+        torch.ops.aten.masked_select.default: "has a result of unknown size (masked_select)",
+    }
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        reason = self.READS.get(func)
+        if func in (torch.ops.aten.index.Tensor, torch.ops.aten.index_put_.default, torch.ops.aten.index_put.default):
+            if any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
+                reason = "indexes by a mask, whose size is unknown; use torch.where or masked_fill"
+        if reason:
+            raise HostReadError(f"{reason}; the step cannot be captured in a CUDA graph (--no-graph runs it eagerly)")
+        return func(*args, **(kwargs or {}))
+
+
+class StepGraph:
+    """Runs a step function: eagerly on the CPU, by replaying one captured CUDA graph on a GPU.
+
+    The function must only touch tensors of fixed address. The constructor calls it a few times (this compiles kernels
+    and checks that it can be captured), so the caller resets its state afterwards.
+    """
+
+    WARM_UP_STEPS = 3
+
+    def __init__(self, function: Callable[[], None], device: torch.device, enabled: bool) -> None:
+        """With `enabled` false the function runs eagerly and unchecked.
+
+        Raises:
+            TermError: a term of the task can't be captured.
+            HostReadError: another part of the step can't.
+        """
+        self._function = function
+        self._graph: torch.cuda.CUDAGraph | None = None
+        if not enabled:
+            return
+        if device.type != "cuda":
+            with ForbidHostReads():
+                function()
+            return
+        self._graph = self._capture(device)
+
+    def _capture(self, device: torch.device) -> "torch.cuda.CUDAGraph":
+        import warp as wp
+
+        stream = torch.cuda.Stream(device)
+        stream.wait_stream(torch.cuda.current_stream(device))
+        with torch.cuda.stream(stream):
+            for _ in range(self.WARM_UP_STEPS):
+                self._function()
+            with ForbidHostReads():  # a clear error before the driver's
+                self._function()
+        torch.cuda.current_stream(device).wait_stream(stream)
+        torch.cuda.synchronize(device)
+        graph = torch.cuda.CUDAGraph()
+        # Torch owns the capture; Warp is told of it, so that the solver's loop becomes a conditional node.
+        with torch.cuda.graph(graph, stream=stream):
+            warp_stream = wp.stream_from_torch(torch.cuda.current_stream(device))
+            with (
+                wp.ScopedStream(warp_stream, sync_enter=False),
+                wp.ScopedCapture(stream=warp_stream, external=True),
+            ):
+                self._function()
+        return graph
+
+    @property
+    def captured(self) -> bool:
+        """Whether a CUDA graph is replayed."""
+        return self._graph is not None
+
+    def __call__(self) -> None:
+        if self._graph is not None:
+            self._graph.replay()
+        else:
+            self._function()

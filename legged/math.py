@@ -1,0 +1,46 @@
+"""Quaternions (w, x, y, z) and in-place helpers, batched over the first dimension and free of host synchronisation."""
+
+import torch
+from torch import Tensor
+
+
+def quat_rotate(quat: Tensor, vec: Tensor) -> Tensor:
+    """Vectors (N, 3) in the body frame of `quat` (N, 4) -> world frame."""
+    w, xyz = quat[:, :1], quat[:, 1:]
+    t = 2.0 * torch.linalg.cross(xyz, vec)
+    return vec + w * t + torch.linalg.cross(xyz, t)
+
+
+def quat_rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
+    """Vectors (N, 3) in the world frame -> body frame of `quat` (N, 4)."""
+    w, xyz = quat[:, :1], quat[:, 1:]
+    t = 2.0 * torch.linalg.cross(xyz, vec)
+    return vec - w * t + torch.linalg.cross(xyz, t)
+
+
+def yaw_of(quat: Tensor) -> Tensor:
+    """Heading angle of the body's x axis in the world [rad], (N,)."""
+    w, x, y, z = quat.unbind(dim=1)
+    return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def wrap_to_pi(angle: Tensor) -> Tensor:
+    """The same angle in [-pi, pi)."""
+    return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi
+
+
+def uniform(low: float, high: float, shape: tuple[int, ...], device: torch.device) -> Tensor:
+    """Independent numbers U(low, high)."""
+    return low + (high - low) * torch.rand(shape, device=device)
+
+
+def masked_set_(target: Tensor, mask: Tensor, value: Tensor | float) -> None:
+    """target[mask] = value[mask] without an index list: rows of `target` (N, ...) where `mask` (N,) holds.
+
+    Other rows keep their bits, NaN included; `value` is a number or a tensor shaped like `target`.
+    """
+    rows = mask.view(-1, *[1] * (target.dim() - 1))
+    if isinstance(value, Tensor):
+        torch.where(rows, value, target, out=target)
+    else:
+        target.masked_fill_(rows, value)

@@ -1,0 +1,65 @@
+"""Observation groups: named terms, scaled, noised, clipped and laid side by side in one buffer."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from legged.graph import calling
+
+
+@dataclass(frozen=True)
+class ObservationTerm:
+    """One term of a group and where it lies in the buffer."""
+
+    name: str
+    function: Callable[[], Tensor]
+    columns: slice
+    scale: Tensor
+    """(width,) factors."""
+    noise: float
+    """Half width of the uniform noise, in the term's unit before scaling."""
+
+
+class ObservationGroup:
+    """What one network sees: (N, width), rewritten in place by `compute`."""
+
+    def __init__(
+        self,
+        functions: Mapping[str, Callable[[], Tensor]],
+        scales: Mapping[str, Sequence[float] | float],
+        noise: Mapping[str, float],
+        clip: float,
+    ) -> None:
+        """Functions by term, in order; each is called once to learn its width. No noise where none is named."""
+        self.clip = clip
+        self.terms: list[ObservationTerm] = []
+        start = 0
+        sample = None
+        for name, function in functions.items():
+            with calling(f"_obs_{name}"):
+                sample = function()
+                if sample.dim() != 2:
+                    raise ValueError(f"must return a tensor (num_envs, width), got {tuple(sample.shape)}")
+            width = sample.shape[1]
+            scale = torch.as_tensor(scales.get(name, 1.0), dtype=torch.float32, device=sample.device).expand(width)
+            self.terms.append(ObservationTerm(name, function, slice(start, start + width), scale, noise.get(name, 0.0)))
+            start += width
+        if sample is None:
+            raise ValueError("an observation group needs at least one term")
+        self.buffer = torch.zeros(sample.shape[0], start, device=sample.device)
+        self._scale = torch.cat([term.scale for term in self.terms])
+        half = torch.cat([torch.full_like(term.scale, term.noise) for term in self.terms])
+        self._noise = half if bool(half.any()) else None
+
+    def compute(self) -> None:
+        """Evaluate all terms into the buffer."""
+        values = []
+        for term in self.terms:
+            with calling(f"_obs_{term.name}"):
+                values.append(term.function())
+        raw = torch.cat(values, dim=1)
+        if self._noise is not None:
+            raw = raw + (2.0 * torch.rand_like(raw) - 1.0) * self._noise
+        torch.clamp(raw * self._scale, -self.clip, self.clip, out=self.buffer)

@@ -1,0 +1,24 @@
+"""Where the files beside the code lie: in a clone at the top level, in an installed wheel inside the package."""
+
+from pathlib import Path
+
+
+def data_folder(name: str) -> Path:
+    """The folder `name` ('cfg' or 'resources') of this installation.
+
+    Raises:
+        FileNotFoundError: the installation lacks it.
+    """
+    package = Path(__file__).resolve().parent
+    for folder in (package / name, package.parent / name):
+        if folder.is_dir():
+            return folder
+    raise FileNotFoundError(f"legged: the folder '{name}' is missing beside {package}; install the package again")
+
+
+def relative(path: Path) -> str:
+    """`path` as it is shortest to read: below the working directory if it lies there."""
+    try:
+        return str(path.resolve().relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)

@@ -1,0 +1,33 @@
+"""Physics engines behind one interface. A new one is a file here and a line in `make_physics`."""
+
+import torch
+
+from legged.config.loader import ConfigError
+from legged.config.schema import SimConfig
+from legged.physics.base import Physics, RandomizedField, RobotState
+from legged.robot import Robot
+
+__all__ = ["Physics", "RandomizedField", "RobotState", "make_physics", "resolve_physics"]
+
+
+def resolve_physics(name: str, device: torch.device) -> str:
+    """The back-end that `auto` means on a device: mujoco_warp on a GPU, the C engine without one.
+
+    Raises:
+        ConfigError: the C engine was asked for on a GPU.
+    """
+    if name == "auto":
+        return "mujoco_warp" if device.type == "cuda" else "mujoco"
+    if name == "mujoco" and device.type != "cpu":
+        raise ConfigError(f"sim.physics: 'mujoco' is the C engine and runs on the CPU; add --sim_device cpu (got {device})")
+    return name
+
+
+def make_physics(robot: Robot, sim: SimConfig, num_envs: int, device: torch.device) -> Physics:
+    """The back-end that `sim.physics` names. Engines are imported here, so that none is needed but the one used."""
+    name = resolve_physics(sim.physics, device)
+    if name == "mujoco_warp":
+        from legged.physics.mujoco_warp import MujocoWarpPhysics as Engine
+    else:
+        from legged.physics.mujoco import MujocoPhysics as Engine
+    return Engine(robot, sim, num_envs, device)

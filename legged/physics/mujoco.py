@@ -1,0 +1,104 @@
+"""The C engine on all CPU cores, through `mujoco.batch.Batch`: the default without a GPU, and the reference."""
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import Batch
+from torch import Tensor
+
+from legged.config.schema import SimConfig
+from legged.math import quat_rotate
+from legged.physics.base import FeetKinematics, Physics, RandomizedField, allocate_state, write_base
+from legged.physics.scene import build_model, contact_sensor_columns
+from legged.robot import Robot
+
+OVERFLOW = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
+
+
+class MujocoPhysics(Physics):
+    """N worlds in C MuJoCo, float64 inside, float32 outside."""
+
+    capturable = False
+
+    def __init__(self, robot: Robot, sim: SimConfig, num_envs: int, device: torch.device) -> None:
+        """Build the scene and place all robots at the model's initial state; `device` must be the CPU."""
+        if device.type != "cpu":
+            raise ValueError(f"the mujoco back-end runs on the CPU, not on {device}")
+        self.num_envs, self.dt, self.device = num_envs, sim.dt, device
+        self.model = build_model(robot, sim)
+        # A world that blows up must stay non-finite until the task sees it; the engine would put it back silently.
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.robot = robot
+        self.state = allocate_state(num_envs, robot, device)
+        self.overflowed = torch.zeros(num_envs, dtype=torch.bool)
+        self.batch = Batch(self.model, num_envs, sim.threads)
+        self._qpos = torch.from_numpy(self.batch.bind("qpos"))
+        self._qvel = torch.from_numpy(self.batch.bind("qvel"))
+        self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))
+        self._warmstart = self.batch.bind("qacc_warmstart")
+        start, end = contact_sensor_columns(self.model, robot)
+        self._forces = self.batch.bind("sensordata")[:, start:end]
+        self._stepped = torch.zeros(num_envs, 1, 1, dtype=torch.bool)  # false: reset since the last step
+        self._feet = FeetKinematics(self.model, robot, device)
+        self._down = torch.tensor([0.0, 0.0, -1.0]).expand(num_envs, 3)
+        self._warnings = self.batch.warning[:, OVERFLOW, 1].copy()
+        self.refresh()
+
+    def step(self) -> None:
+        self.batch.step()
+        self._stepped.fill_(True)
+        self._read_joints()
+
+    def refresh(self) -> None:
+        write_base(self.state, self._qpos, self._qvel, self._down)
+        self._read_joints()
+        self._feet.write(self.state)
+        forces = torch.from_numpy(self._forces.astype(np.float32)).view_as(self.state.contact_forces)
+        self.state.contact_forces.copy_(torch.where(self._stepped, -forces, 0.0))
+        warnings = self.batch.warning[:, OVERFLOW, 1]
+        self.overflowed.copy_(torch.from_numpy((warnings > self._warnings).any(axis=1)))
+        self._warnings = warnings.copy()
+
+    def _read_joints(self) -> None:
+        self.state.dof_pos.copy_(self._qpos[:, 7:])
+        self.state.dof_vel.copy_(self._qvel[:, 6:])
+
+    def set_torques(self, torques: Tensor) -> None:
+        self._ctrl.copy_(torques)
+
+    def write_state(
+        self,
+        mask: Tensor,
+        base_pos: Tensor,
+        base_quat: Tensor,
+        base_lin_vel: Tensor,
+        base_ang_vel: Tensor,
+        dof_pos: Tensor,
+        dof_vel: Tensor,
+    ) -> None:
+        rows = mask.view(-1, 1)
+        qpos = torch.cat([base_pos, base_quat, dof_pos], dim=1).to(torch.float64)
+        qvel = torch.cat([quat_rotate(base_quat, base_lin_vel), base_ang_vel, dof_vel], dim=1).to(torch.float64)
+        self._qpos.copy_(torch.where(rows, qpos, self._qpos))
+        self._qvel.copy_(torch.where(rows, qvel, self._qvel))
+        self._ctrl.masked_fill_(rows, 0.0)
+        self._warmstart[mask.numpy()] = 0.0
+        self._stepped.masked_fill_(mask.view(-1, 1, 1), False)
+
+    def push(self, mask: Tensor, lin_vel_xy: Tensor) -> None:
+        self._qvel[:, :2].add_(torch.where(mask.view(-1, 1), lin_vel_xy, 0.0))
+
+    def randomize(self, field: RandomizedField, values: Tensor) -> None:
+        array = values.double().numpy()
+        if field == "friction":
+            geoms = [self.model.geom(name).id for name in self.robot.contact_names]
+            self.batch.expand("geom_friction")[:, geoms, 0] = array[:, None]
+        else:
+            base = self.model.body(self.robot.file.base).id
+            self.batch.expand("body_mass")[:, base] = self.model.body_mass[base] + array
+            self.batch.set_const()
+
+    def copy_to(self, env_id: int, data: mujoco.MjData) -> None:
+        data.qpos[:] = self._qpos[env_id].numpy()
+        data.qvel[:] = self._qvel[env_id].numpy()
+        mujoco.mj_forward(self.model, data)

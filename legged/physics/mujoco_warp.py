@@ -1,0 +1,140 @@
+"""Batched MuJoCo on a GPU by mujoco-warp; also on Warp's CPU device, for tests and for comparison."""
+
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from legged.config.schema import SimConfig
+from legged.math import masked_set_, quat_rotate
+from legged.physics.base import FeetKinematics, Physics, RandomizedField, allocate_state, write_base
+from legged.physics.scene import build_model, contact_sensor_columns
+from legged.robot import Robot
+
+# Contacts or constraint rows were dropped; the other bits (iteration caps) are no loss.
+LOST = int(
+    mjw.OverflowType.NEFC | mjw.OverflowType.NJMAX_NNZ | mjw.OverflowType.BROADPHASE | mjw.OverflowType.NARROWPHASE
+)
+# Fields of the model that differ per world once friction or mass are drawn, and those that set_const derives from mass.
+PER_WORLD = ("geom_friction", "body_mass", "body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
+
+wp.config.log_level = wp.LOG_WARNING
+wp.init()
+
+
+class MujocoWarpPhysics(Physics):
+    """N worlds in mujoco-warp. All tensors of `state` and the engine's own arrays live on one device, at fixed
+    addresses, so that a step can be captured; on the CPU the step is captured here, by Warp.
+    """
+
+    capturable = True
+
+    def __init__(self, robot: Robot, sim: SimConfig, num_envs: int, device: torch.device) -> None:
+        """Build the scene on `device` and place all robots at the model's initial state; compiles on first use."""
+        self.num_envs, self.dt, self.device = num_envs, sim.dt, device
+        self.model = build_model(robot, sim)
+        self.robot = robot
+        self.state = allocate_state(num_envs, robot, device)
+        self.overflowed = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self._wp_device = wp.device_from_torch(device)
+        with wp.ScopedDevice(self._wp_device):
+            self._m = mjw.put_model(self.model, batch_sizes={name: num_envs for name in PER_WORLD})
+            self._m.opt.warn_overflow = 0  # counted in refresh instead of printed by each thread
+            self._d = mjw.make_data(self.model, nworld=num_envs, nconmax=sim.nconmax, njmax=sim.njmax)
+        d = self._d
+        self._qpos, self._qvel, self._ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
+        self._warmstart, self._sensordata = wp.to_torch(d.qacc_warmstart), wp.to_torch(d.sensordata)
+        self._overflow = wp.to_torch(d.overflow)
+        start, end = contact_sensor_columns(self.model, robot)
+        self._forces = self._sensordata[:, start:end]
+        self._feet = FeetKinematics(self.model, robot, device)
+        self._down = torch.tensor([0.0, 0.0, -1.0], device=device).expand(num_envs, 3)
+        self._advance: Callable[[], Any] = self._step
+        if self._wp_device.is_cpu:
+            self._advance = self._captured_step()
+        self.refresh()
+
+    def _step(self) -> None:
+        mjw.step(self._m, self._d)
+
+    def _captured_step(self) -> Callable[[], Any]:
+        """One step as a Warp graph on the CPU: the same arithmetic without the cost of launching from Python."""
+        start = [tensor.clone() for tensor in (self._qpos, self._qvel)]
+        with wp.ScopedDevice(self._wp_device):
+            self._step()  # compiles; recording does not execute
+            with wp.ScopedCapture(self._wp_device) as capture:
+                self._step()
+        for tensor, value in zip((self._qpos, self._qvel), start, strict=True):
+            tensor.copy_(value)
+        self._warmstart.zero_()
+        self._sensordata.zero_()
+        self._overflow.zero_()
+        return lambda: wp.capture_launch(capture.graph)
+
+    def _on_torch_stream(self) -> Any:
+        """Warp launches on the stream torch uses now, so that both stay in order, also while capturing."""
+        if self._wp_device.is_cpu:
+            return wp.ScopedDevice(self._wp_device)
+        stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
+        return wp.ScopedStream(stream, sync_enter=False)
+
+    def step(self) -> None:
+        with self._on_torch_stream():
+            self._advance()
+        self._read_joints()
+
+    def refresh(self) -> None:
+        write_base(self.state, self._qpos, self._qvel, self._down)
+        self._read_joints()
+        self._feet.write(self.state)
+        torch.neg(self._forces.view_as(self.state.contact_forces), out=self.state.contact_forces)
+        self.overflowed.copy_((self._overflow & LOST) != 0)
+        self._overflow.zero_()
+
+    def _read_joints(self) -> None:
+        self.state.dof_pos.copy_(self._qpos[:, 7:])
+        self.state.dof_vel.copy_(self._qvel[:, 6:])
+
+    def set_torques(self, torques: Tensor) -> None:
+        self._ctrl.copy_(torques)
+
+    def write_state(
+        self,
+        mask: Tensor,
+        base_pos: Tensor,
+        base_quat: Tensor,
+        base_lin_vel: Tensor,
+        base_ang_vel: Tensor,
+        dof_pos: Tensor,
+        dof_vel: Tensor,
+    ) -> None:
+        masked_set_(self._qpos, mask, torch.cat([base_pos, base_quat, dof_pos], dim=1))
+        masked_set_(self._qvel, mask, torch.cat([quat_rotate(base_quat, base_lin_vel), base_ang_vel, dof_vel], dim=1))
+        # mujoco-warp's own reset_data would drop the contacts of all worlds; these are all that carries over a step.
+        for tensor in (self._ctrl, self._warmstart, self._sensordata):
+            masked_set_(tensor, mask, 0.0)
+
+    def push(self, mask: Tensor, lin_vel_xy: Tensor) -> None:
+        masked_set_(self._qvel[:, :2], mask, self._qvel[:, :2] + lin_vel_xy)
+
+    def randomize(self, field: RandomizedField, values: Tensor) -> None:
+        if field == "friction":
+            geoms = [self.model.geom(name).id for name in self.robot.contact_names]
+            friction = wp.to_torch(self._m.geom_friction)
+            friction[:, geoms, 0] = values.to(self.device).unsqueeze(1).expand(-1, len(geoms))
+            return
+        base = self.model.body(self.robot.file.base).id
+        mass = wp.to_torch(self._m.body_mass)
+        mass[:, base] = float(self.model.body_mass[base]) + values.to(self.device)
+        with wp.ScopedDevice(self._wp_device):
+            mjw.set_const(self._m, self._d)
+
+    def copy_to(self, env_id: int, data: mujoco.MjData) -> None:
+        data.qpos[:] = self._qpos[env_id].cpu().numpy().astype(np.float64)
+        data.qvel[:] = self._qvel[env_id].cpu().numpy().astype(np.float64)
+        mujoco.mj_forward(self.model, data)

@@ -1,0 +1,42 @@
+"""What differs from robot to robot, and pushes."""
+
+import torch
+from torch import Tensor
+
+from legged.config.schema import DomainRandConfig
+from legged.math import masked_set_, uniform
+from legged.physics import Physics
+
+
+class Randomization:
+    """Draws friction and mass once, and pushes each robot at its own moments."""
+
+    def __init__(self, cfg: DomainRandConfig, num_envs: int, dt: float, device: torch.device) -> None:
+        """`dt` is the control step [s]. The first pushes are spread over a whole interval."""
+        self.cfg, self.dt, self.device = cfg, dt, device
+        low, high = cfg.friction_range
+        buckets = uniform(low, high, (cfg.friction_buckets,), device)
+        self.friction = buckets[torch.randint(cfg.friction_buckets, (num_envs,), device=device)]
+        """(N,) friction of each robot's shapes, if randomised."""
+        self.added_mass = uniform(*cfg.added_mass_range, (num_envs,), device)
+        """(N,) mass added to each base [kg], if randomised."""
+        self.push_time_left = uniform(0.0, cfg.push_interval_s, (num_envs,), device)
+        """(N,) time until the next push [s]."""
+
+    def apply(self, physics: Physics) -> None:
+        """Give the physics what was drawn, at start-up."""
+        if self.cfg.randomize_friction:
+            physics.randomize("friction", self.friction)
+        if self.cfg.randomize_base_mass:
+            physics.randomize("added_base_mass", self.added_mass)
+
+    def push(self, physics: Physics, base_lin_vel_w: Tensor, mask: Tensor) -> None:
+        """Set the horizontal velocity of the robots in `mask` that are due; `base_lin_vel_w` (N, 3) world frame [m/s]."""
+        if not self.cfg.push_robots:
+            return
+        self.push_time_left.sub_(self.dt)
+        due = (self.push_time_left <= 0.0) & mask
+        reach = self.cfg.max_push_vel_xy
+        target = uniform(-reach, reach, (len(due), 2), self.device)
+        physics.push(due, target - base_lin_vel_w[:, :2])
+        masked_set_(self.push_time_left, due, self.cfg.push_interval_s)

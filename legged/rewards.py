@@ -1,0 +1,61 @@
+"""Reward terms: scaled, summed, clipped and recorded per episode."""
+
+from collections.abc import Callable, Mapping
+
+import torch
+from torch import Tensor
+
+from legged.graph import calling
+from legged.math import masked_set_
+
+
+class Rewards:
+    """The sum of scale * dt * term. `termination` is added after the clip at zero, as in legged_gym."""
+
+    def __init__(
+        self,
+        functions: Mapping[str, Callable[[], Tensor]],
+        scales: Mapping[str, float],
+        dt: float,
+        only_positive: bool,
+        num_envs: int,
+        device: torch.device,
+    ) -> None:
+        """Functions and scales by term; `dt` is the control step [s]."""
+        self.functions = dict(functions)
+        self.names = tuple(functions)
+        self.scales = {name: scales[name] * dt for name in self.names}
+        self.only_positive = only_positive
+        self.num_envs = num_envs
+        self.total = torch.zeros(num_envs, device=device)
+        """(N,) reward of the last step."""
+        self.sums = torch.zeros(len(self.names), num_envs, device=device)
+        """(terms, N) sum of each scaled term over the episode so far."""
+        self.episode_sums = {name: self.sums[i] for i, name in enumerate(self.names)}
+        """The rows of `sums` by name."""
+
+    def compute(self, valid: Tensor) -> Tensor:
+        """Evaluate all terms; robots outside `valid` (N,), whose physics blew up, get zero."""
+        total = torch.zeros_like(self.total)
+        after_clip = None
+        for name, function in self.functions.items():
+            with calling(f"_reward_{name}"):
+                value = function()
+                if value.shape != (self.num_envs,):
+                    raise ValueError(f"must return a tensor ({self.num_envs},), got {tuple(value.shape)}")
+            value = torch.where(valid, value * self.scales[name], 0.0)
+            self.episode_sums[name].add_(value)
+            if name == "termination":
+                after_clip = value
+            else:
+                total = total + value
+        if self.only_positive:
+            total = total.clamp(min=0.0)
+        if after_clip is not None:
+            total = total + after_clip
+        self.total.copy_(total)
+        return self.total
+
+    def reset(self, mask: Tensor) -> None:
+        """Begin new sums for the robots in `mask`."""
+        masked_set_(self.sums.t(), mask, 0.0)

@@ -1,0 +1,86 @@
+"""Command-line arguments that train, play and evaluate share, and how they become a configuration."""
+
+import argparse
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from legged.config import ConfigError, parse_override
+from legged.registry import import_tasks
+
+EXIT_WRONG_INPUT = 2
+
+
+def add_task_arguments(parser: argparse.ArgumentParser) -> None:
+    """--task, --import, the devices, and free `key=value` overrides."""
+    parser.add_argument("--task", required=True, help="name of the task, e.g. anymal_c_flat")
+    parser.add_argument("--import", dest="module", help="module or .py file that registers tasks of your own")
+    parser.add_argument("--num_envs", type=int, help="number of robots (env.num_envs)")
+    parser.add_argument("--seed", type=int, help="random seed (env.seed)")
+    parser.add_argument("--sim_device", help="cpu or cuda[:i]; the GPU if there is one")
+    parser.add_argument("--no-graph", action="store_true", help="run the step eagerly instead of as one CUDA graph")
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="any field, e.g. rewards.scales.torques=-1e-4")
+
+
+def add_run_arguments(parser: argparse.ArgumentParser) -> None:
+    """Which policy to load."""
+    parser.add_argument("--experiment_name", help="folder under logs/; the task's name by default")
+    parser.add_argument("--load_run", help="run folder, by name or path; the newest by default")
+    parser.add_argument("--checkpoint", type=int, help="iteration of the checkpoint; the latest by default")
+
+
+def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
+    """All overrides of a command line; flags come after `key=value`s."""
+    flags = {
+        "num_envs": "env.num_envs",
+        "seed": "env.seed",
+        "max_iterations": "train.runner.max_iterations",
+        "experiment_name": "train.runner.experiment_name",
+        "run_name": "train.runner.run_name",
+    }
+    found = [parse_override(text) for text in args.overrides]
+    for flag, key in flags.items():
+        value = getattr(args, flag, None)
+        if value is not None:
+            found.append((key, value))
+    return found
+
+
+def pick_device(name: str | None, flag: str = "--sim_device") -> torch.device:
+    """The device that was asked for, else the GPU if there is one.
+
+    Raises:
+        ConfigError: no such device, or no GPU here.
+    """
+    if name is None:
+        return torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise ConfigError(f"{flag}: '{name}' is not a device (allowed: cpu, cuda, cuda:0, ...)") from error
+    if device.type not in ("cpu", "cuda"):
+        raise ConfigError(f"{flag}: '{name}' is not supported (allowed: cpu, cuda, cuda:0, ...)")
+    if device.type == "cuda":
+        if not torch.cuda.is_available():
+            raise ConfigError(f"{flag}: '{name}' was asked for, but torch sees no GPU here; leave it out to use the CPU")
+        if (device.index or 0) >= torch.cuda.device_count():
+            raise ConfigError(f"{flag}: '{name}': this machine has {torch.cuda.device_count()} GPU(s), counted from 0")
+        return torch.device("cuda", device.index or 0)
+    return device
+
+
+def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = None) -> int:
+    """Run a command; a wrong input ends with its message and exit code 2."""
+    try:
+        return main(argv)
+    except ConfigError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return EXIT_WRONG_INPUT
+
+
+def import_and_check(args: argparse.Namespace) -> None:
+    """Let the user's module register its tasks, if one was named."""
+    if args.module:
+        import_tasks(args.module)

@@ -1,0 +1,113 @@
+"""What is seen of a training: a compact live table, or plain lines where there is no terminal."""
+
+import sys
+from dataclasses import dataclass
+from datetime import timedelta
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+PLAIN_LINES_EVERY_S = 2.0
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One finished iteration."""
+
+    iteration: int
+    total: int
+    elapsed_s: float
+    eta_s: float
+    steps_per_s: float
+    collect_s: float
+    learn_s: float
+    reward: float
+    """Mean return of the last 100 episodes."""
+    action_std: float
+    values: dict[str, float]
+    """The task's log: `rew_<term>` per second of a full episode, `Metrics/...`."""
+
+    def metric(self, name: str) -> float:
+        """A metric of the task, NaN if it has none."""
+        return self.values.get(f"Metrics/{name}", float("nan"))
+
+    def line(self) -> str:
+        """The iteration on one line."""
+        return (
+            f"it {self.iteration}/{self.total}  {_time(self.elapsed_s)} < {_time(self.eta_s)}  "
+            f"{self.steps_per_s:,.0f} steps/s ({self.collect_s:.2f}+{self.learn_s:.2f} s)  reward {self.reward:.2f}  "
+            f"error {self.metric('lin_vel_rmse'):.3f} m/s {self.metric('ang_vel_rmse'):.3f} rad/s  "
+            f"falls {100 * self.metric('falls'):.1f} %  episode {self.metric('episode_length'):.0f}  "
+            f"std {self.action_std:.2f}" + self.warnings()
+        )
+
+    def warnings(self) -> str:
+        """What should never happen, if it did."""
+        text = ""
+        if self.metric("non_finite_worlds") > 0:
+            text += f"  ! {self.metric('non_finite_worlds'):.0f} robots reset after numbers overflowed"
+        if self.metric("contact_overflows") > 0:
+            text += f"  ! contacts lost in {self.metric('contact_overflows'):.0f} robot steps: raise sim.nconmax, sim.njmax"
+        return text
+
+    def table(self, title: str) -> Table:
+        """The iteration as a table, reward terms beside the state of training."""
+        left = {
+            "iteration": f"{self.iteration} / {self.total}",
+            "elapsed, to go": f"{_time(self.elapsed_s)}, {_time(self.eta_s)}",
+            "steps/s": f"{self.steps_per_s:,.0f}",
+            "collect + learn": f"{self.collect_s:.2f} + {self.learn_s:.2f} s",
+            "mean return": f"{self.reward:.2f}",
+            "velocity error": f"{self.metric('lin_vel_rmse'):.3f} m/s",
+            "yaw rate error": f"{self.metric('ang_vel_rmse'):.3f} rad/s",
+            "falls": f"{100 * self.metric('falls'):.1f} % of episodes",
+            "episode length": f"{self.metric('episode_length'):.0f} steps",
+            "action std": f"{self.action_std:.2f}",
+        }
+        known = ("lin_vel_rmse", "ang_vel_rmse", "falls", "episode_length", "non_finite_worlds", "contact_overflows")
+        other = {k.removeprefix("Metrics/"): v for k, v in self.values.items() if k.startswith("Metrics/")}
+        left.update({k.replace("_", " "): f"{v:.2f}" for k, v in other.items() if k not in known})
+        right = {k.removeprefix("rew_"): f"{v:+.4f}" for k, v in self.values.items() if k.startswith("rew_")}
+        table = Table(title=title, caption=self.warnings() or None, title_justify="left")
+        for name, justify in (("training", "left"), ("", "right"), ("reward per second", "left"), (" ", "right")):
+            table.add_column(name, justify=justify)  # type: ignore[arg-type]
+        left_rows, right_rows = list(left.items()), list(right.items())
+        for i in range(max(len(left_rows), len(right_rows))):
+            a = left_rows[i] if i < len(left_rows) else ("", "")
+            b = right_rows[i] if i < len(right_rows) else ("", "")
+            table.add_row(*a, *b)
+        return table
+
+
+class Display:
+    """Shows the progress of one training on the console. Use as a context."""
+
+    def __init__(self, title: str) -> None:
+        """`title` heads the live table."""
+        self.title = title
+        self._live = Live(console=Console(), refresh_per_second=4) if sys.stdout.isatty() else None
+        self._last_line_s = -PLAIN_LINES_EVERY_S
+
+    def __enter__(self) -> "Display":
+        if self._live:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live:
+            self._live.stop()
+
+    def show(self, progress: Progress) -> None:
+        """Show an iteration. Plain lines come at most every two seconds; the first and the last always do."""
+        if self._live:
+            self._live.update(progress.table(self.title))
+            return
+        due = progress.elapsed_s - self._last_line_s >= PLAIN_LINES_EVERY_S
+        if due or progress.iteration == progress.total:
+            self._last_line_s = progress.elapsed_s
+            print(progress.line(), flush=True)
+
+
+def _time(seconds: float) -> str:
+    return str(timedelta(seconds=round(seconds))).removeprefix("0:")

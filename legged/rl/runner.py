@@ -1,0 +1,177 @@
+"""rsl-rl's OnPolicyRunner with what it leaves out: task state in checkpoints, safe files, a clean stop."""
+
+import contextlib
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from rsl_rl.runners import OnPolicyRunner
+from rsl_rl.utils.logger import Logger
+
+from legged.config import ConfigError, TaskConfig
+from legged.envs import BaseTask
+from legged.paths import relative
+from legged.rl.display import Display, Progress
+
+
+class Interrupted(Exception):
+    """Training was asked to stop; raised at the end of an iteration, when networks and optimiser agree."""
+
+
+def runner_config(cfg: TaskConfig) -> dict[str, Any]:
+    """The dictionary rsl-rl wants."""
+    policy, algorithm, runner = cfg.train.policy, cfg.train.algorithm, cfg.train.runner
+    shared = {
+        "class_name": "MLPModel",
+        "activation": policy.activation,
+        "obs_normalization": policy.obs_normalization,
+    }
+    return {
+        "num_steps_per_env": runner.num_steps_per_env,
+        "save_interval": runner.save_interval,
+        "run_name": runner.run_name,
+        "logger": "tensorboard",
+        "check_for_nan": False,  # it would wait for the GPU at every step; the task terminates and counts such robots
+        "obs_groups": {"actor": ["actor"], "critic": ["critic"]},
+        "actor": {
+            **shared,
+            "hidden_dims": list(policy.actor_hidden_dims),
+            "distribution_cfg": {
+                "class_name": "GaussianDistribution",
+                "init_std": policy.init_noise_std,
+                "std_type": "scalar",
+            },
+        },
+        "critic": {**shared, "hidden_dims": list(policy.critic_hidden_dims)},
+        "algorithm": {"class_name": "PPO", **vars(algorithm)},
+    }
+
+
+class QuietLogger(Logger):
+    """rsl-rl's logger, writing to TensorBoard as ever but handing the console to our display."""
+
+    def __init__(self, *args: Any, display: Display | None = None, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.display = display
+        self.stop_requested = False
+        self.loop_s = 0.0
+        """Time spent in iterations so far, this process [s]."""
+
+    def log(self, it: int, start_it: int, total_it: int, collect_time: float, learn_time: float, **kwargs: Any) -> None:
+        """Write one iteration, show it, and stop if that was asked for."""
+        # An episode mean has no value (NaN) in a rollout in which none ended; leave it out rather than write NaN.
+        values: dict[str, float] = {}
+        for entry in self.ep_extras:
+            stacked = torch.stack([value.reshape(()) for value in entry.values()]).tolist()  # one transfer, not twenty
+            values.update({key: value for key, value in zip(entry, stacked, strict=True) if value == value})
+        self.ep_extras[:] = [dict(values)] if values else []  # a copy: rsl-rl puts tensors in
+        with contextlib.redirect_stdout(io.StringIO()):
+            super().log(it, start_it, total_it, collect_time, learn_time, **kwargs)
+        self.loop_s += collect_time + learn_time
+        if self.display is not None:
+            self.display.show(
+                Progress(
+                    iteration=it + 1,
+                    total=total_it,
+                    elapsed_s=self.loop_s,
+                    eta_s=self.loop_s / (it + 1 - start_it) * (total_it - it - 1),
+                    steps_per_s=self.cfg["num_steps_per_env"] * self.num_envs / (collect_time + learn_time),
+                    collect_s=collect_time,
+                    learn_s=learn_time,
+                    reward=sum(self.rewbuffer) / len(self.rewbuffer) if self.rewbuffer else float("nan"),
+                    action_std=float(kwargs["action_std"].detach().mean()),
+                    values=values,
+                )
+            )
+        if self.stop_requested and it + 1 < total_it:
+            raise Interrupted
+
+
+class Runner(OnPolicyRunner):
+    """Trains a task with rsl-rl's PPO."""
+
+    env: BaseTask
+
+    def __init__(
+        self, env: BaseTask, log_dir: Path | None = None, device: str = "cpu", display: Display | None = None
+    ) -> None:
+        """`log_dir` is where checkpoints and TensorBoard files go; without one nothing is written."""
+        config = runner_config(env.cfg)
+        with contextlib.redirect_stdout(io.StringIO()):
+            super().__init__(env, config, str(log_dir) if log_dir else None, device)
+        self.logger = QuietLogger(
+            log_dir=str(log_dir) if log_dir else None,
+            cfg=self.cfg,
+            env_cfg=env.cfg,
+            num_envs=env.num_envs,
+            is_distributed=self.is_distributed,
+            gpu_world_size=self.gpu_world_size,
+            gpu_global_rank=self.gpu_global_rank,
+            device=device,
+            display=display,
+        )
+        self.logger.git_status_repos = []  # the run folder holds the state of this code, see runs.code_state
+
+    def stop(self) -> None:
+        """Ask `learn` to stop after the iteration that is going on."""
+        self.logger.stop_requested = True
+
+    def train(self, until_iteration: int) -> bool:
+        """Learn up to iteration `until_iteration`; false if stopped before. Leaves a checkpoint either way."""
+        try:
+            self.learn(until_iteration - self.current_learning_iteration, init_at_random_ep_len=True)
+        except Interrupted:
+            log_dir = Path(self.logger.log_dir)
+            self.save(str(log_dir / f"model_{self.current_learning_iteration}.pt"))
+            self.logger.stop_logging_writer()
+            return False
+        return True
+
+    def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
+        """Write a checkpoint with the task's state, beside its final name and then renamed over it."""
+        saved = self.alg.save()
+        saved["iter"] = self.current_learning_iteration
+        saved["infos"] = {**(infos or {}), "task": self.env.cfg.task, "task_state": self.env.state_dict()}
+        saved["infos"]["learning_rate"] = self.alg.learning_rate
+        part = f"{path}.part"
+        torch.save(saved, part)
+        os.replace(part, path)
+        self.logger.save_model(path, self.current_learning_iteration)
+
+    def load(self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None) -> dict:
+        """Restore networks, optimiser, iteration count and the task's state from a checkpoint.
+
+        Raises:
+            ConfigError: the file is no checkpoint of this package, or of a network of another size.
+        """
+        try:
+            saved = torch.load(path, weights_only=False, map_location=map_location or self.device)
+        except Exception as error:  # torch raises half a dozen kinds for files that are none of its own
+            raise ConfigError(f"{path}: not a checkpoint ({type(error).__name__}: {str(error).splitlines()[0]})") from error
+        if not isinstance(saved, dict) or not {"actor_state_dict", "critic_state_dict", "iter"} <= saved.keys():
+            raise ConfigError(f"{path}: not a checkpoint of rsl-rl (no actor, critic and iteration in it)")
+        try:
+            self.alg.load(saved, load_cfg, strict)
+        except (RuntimeError, ValueError) as error:
+            raise ConfigError(_mismatch(path, saved, self.alg.get_policy().state_dict(), self.env)) from error
+        infos = saved.get("infos") or {}
+        # rsl-rl saves the index of the last finished iteration; going on from it would repeat that one.
+        self.current_learning_iteration = saved["iter"] + 1
+        if "learning_rate" in infos:
+            self.alg.learning_rate = infos["learning_rate"]
+        if "task_state" in infos:
+            self.env.load_state_dict(infos["task_state"])
+        return infos
+
+
+def _mismatch(path: str, saved: dict[str, Any], wanted: dict[str, Any], env: BaseTask) -> str:
+    """What differs between a checkpoint's network and the task's."""
+    found = saved["actor_state_dict"]
+    inputs = [next((t.shape[1] for t in state.values() if t.dim() == 2), None) for state in (found, wanted)]
+    text = f"{relative(Path(path))}: made for another task than '{env.cfg.task}'"
+    if inputs[0] != inputs[1]:
+        return f"{text}: its policy takes {inputs[0]} observations, the task has {inputs[1]}"
+    shapes = [[tuple(t.shape) for t in state.values() if t.dim() == 2] for state in (found, wanted)]
+    return f"{text}: its policy has layers {shapes[0]}, the task's configuration {shapes[1]}"

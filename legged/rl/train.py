@@ -1,0 +1,134 @@
+"""Train a policy: `python train.py --task anymal_c_flat`."""
+
+import argparse
+import signal
+import sys
+import time
+from pathlib import Path
+from types import FrameType
+
+import torch
+
+from legged.config import ConfigError, TaskConfig, to_yaml
+from legged.envs import LeggedRobot
+from legged.paths import relative
+from legged.registry import make_task, task_config
+from legged.rl.arguments import (
+    add_run_arguments,
+    add_task_arguments,
+    import_and_check,
+    overrides,
+    pick_device,
+    run_main,
+)
+from legged.rl.display import Display
+from legged.rl.runner import Runner
+from legged.rl.runs import create_run, find_checkpoint, find_run, run_config
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The command; returns its exit code."""
+    return run_main(_main, argv)
+
+
+def _main(argv: list[str] | None) -> int:
+    start = time.perf_counter()
+    parser = argparse.ArgumentParser(prog="train.py", description="Train a legged robot.")
+    add_task_arguments(parser)
+    add_run_arguments(parser)
+    parser.add_argument("--resume", action="store_true", help="go on from a checkpoint, in a new run folder")
+    parser.add_argument("--run_name", help="appended to the run folder's name")
+    parser.add_argument("--max_iterations", type=int, help="length of the whole training")
+    parser.add_argument("--rl_device", help="device of the networks; that of the simulation by default")
+    parser.add_argument("--headless", action="store_true", help="accepted for legged_gym's sake: training draws nothing")
+    parser.add_argument("--show", action="store_true", help="print the full configuration and stop")
+    args = parser.parse_intermixed_args(argv)
+
+    import_and_check(args)
+    device = pick_device(args.sim_device)
+    rl_device = pick_device(args.rl_device, "--rl_device") if args.rl_device else device
+    cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
+    if args.show:
+        print(to_yaml(cfg), end="")
+        return 0
+    checkpoint = _checkpoint(args, cfg) if args.resume or args.load_run or args.checkpoint is not None else None
+    folder = create_run(cfg)
+    if device.type == "cpu":
+        limit_threads()
+    print(describe(cfg, device, folder), flush=True)
+
+    task = make_task(cfg, device, graph=not args.no_graph)
+    with Display(f"{cfg.task}: {relative(folder)}") as display:
+        runner = Runner(task, folder, str(rl_device), display)
+        if checkpoint:
+            runner.load(str(checkpoint))
+            print(f"resumed {relative(checkpoint)} after iteration {runner.current_learning_iteration}", flush=True)
+        done = runner.current_learning_iteration
+        until = cfg.train.runner.max_iterations
+        if done >= until:
+            raise ConfigError(
+                f"--resume: {checkpoint} has finished {done} iterations of {until}; --max_iterations sets a larger total"
+            )
+        ready = time.perf_counter()
+        stopped_by = stop_on_signals(runner)
+        finished = runner.train(until)
+    _summary(runner, folder, ready - start, finished)
+    return 0 if finished else 128 + stopped_by[0]
+
+
+def describe(cfg: TaskConfig, device: torch.device, folder: Path) -> str:
+    """One line on what is about to run where."""
+    if device.type == "cpu":
+        engine = "mujoco-warp on the CPU" if cfg.sim.physics == "mujoco_warp" else "C MuJoCo on all cores"
+        where = f"no GPU in use: {engine}, settings of the task's cpu section"
+    else:
+        where = torch.cuda.get_device_name(device)
+    return f"{cfg.task}: {cfg.env.num_envs} robots, {cfg.train.runner.max_iterations} iterations, {where}; {relative(folder)}"
+
+
+def limit_threads() -> None:
+    """The C engine takes the cores; torch's small tensors are slower when its own threads compete for them."""
+    torch.set_num_threads(1)
+
+
+def _checkpoint(args: argparse.Namespace, cfg: TaskConfig) -> Path:
+    """The checkpoint to go on from; it must be of the same task's observations, which a look at its config tells."""
+    folder = find_run(cfg, args.load_run)
+    checkpoint = find_checkpoint(folder, args.checkpoint)
+    before = run_config(folder)
+    for group in ("actor", "critic"):
+        was, now = getattr(before.observations, group), getattr(cfg.observations, group)
+        if was != now:
+            raise ConfigError(
+                f"{relative(checkpoint)}: made for other observations: observations.{group} was {list(was)}, is {list(now)}"
+            )
+    return checkpoint
+
+
+def stop_on_signals(runner: Runner) -> list[int]:
+    """Ctrl-C and SIGTERM stop at the end of an iteration, a second one at once. Returns a list that gets the signal."""
+    received: list[int] = []
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        if received:
+            raise KeyboardInterrupt
+        received.append(number)
+        runner.stop()
+        print("stopping after this iteration, with a checkpoint; once more to stop at once", file=sys.stderr, flush=True)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handler)
+    return received
+
+
+def _summary(runner: Runner, folder: Path, start_up_s: float, finished: bool) -> None:
+    task: LeggedRobot = runner.env  # type: ignore[assignment]
+    steps = runner.logger.tot_timesteps
+    loop = runner.logger.loop_s
+    print(
+        f"{'finished' if finished else 'stopped'} after {runner.current_learning_iteration + 1} iterations: "
+        f"{steps:,} steps in {loop:.1f} s of training loop ({steps / max(loop, 1e-9):,.0f} steps/s), "
+        f"{start_up_s:.1f} s of start-up and kernel compilation\n"
+        f"checkpoint in {relative(folder)}; see it walk: python play.py --task {task.cfg.task}",
+        flush=True,
+    )

@@ -1,0 +1,8 @@
+"""Train a policy: python train.py --task anymal_c_flat"""
+
+import sys
+
+from legged.rl.train import main
+
+if __name__ == "__main__":
+    sys.exit(main())
