@@ -32,22 +32,29 @@ class Control:
         """(D,) gains [N m/rad], [N m s/rad]."""
         self.default_dof_pos = tensor(robot.default_dof_pos)
         self.torque_limits = tensor(robot.torque_limits)
+        self._lowest_torques = -self.torque_limits
         self.torques = torch.zeros(num_envs, robot.num_dof, device=device)
         """(N, D) torques of the last physics step [N m]."""
+        self._target = torch.zeros_like(self.torques)  # joint angles, velocities or torques
         self._last_dof_vel = torch.zeros_like(self.torques)
 
-    def compute(self, actions: Tensor, dof_pos: Tensor, dof_vel: Tensor) -> Tensor:
-        """Torques (N, D) [N m] for actions, joint angles [rad] and velocities [rad/s], each (N, D)."""
-        scaled = self.action_scale * actions
+    def set_actions(self, actions: Tensor) -> None:
+        """Take the actions (N, D) that the following calls of `compute` realise."""
+        torch.mul(actions, self.action_scale, out=self._target)
         if self.control_type == "P":
-            torques = self.stiffness * (scaled + self.default_dof_pos - dof_pos) - self.damping * dof_vel
+            self._target.add_(self.default_dof_pos)
+
+    def compute(self, dof_pos: Tensor, dof_vel: Tensor) -> Tensor:
+        """Torques (N, D) [N m] at joint angles [rad] and velocities [rad/s], each (N, D), for one physics step."""
+        if self.control_type == "P":
+            torques = torch.addcmul(self.stiffness * (self._target - dof_pos), self.damping, dof_vel, value=-1.0)
         elif self.control_type == "V":
             acceleration = (dof_vel - self._last_dof_vel) / self.sim_dt
-            torques = self.stiffness * (scaled - dof_vel) - self.damping * acceleration
+            torques = self.stiffness * (self._target - dof_vel) - self.damping * acceleration
             self._last_dof_vel.copy_(dof_vel)
         else:
-            torques = scaled
-        return torch.clamp(torques, -self.torque_limits, self.torque_limits, out=self.torques)
+            torques = self._target
+        return torch.clamp(torques, self._lowest_torques, self.torque_limits, out=self.torques)
 
     def reset(self, mask: Tensor) -> None:
         """Forget the torques and velocities of the robots in `mask`."""

@@ -25,6 +25,10 @@ class Rewards:
         self.functions = dict(functions)
         self.names = tuple(functions)
         self.scales = {name: scales[name] * dt for name in self.names}
+        factors = [self.scales[name] for name in self.names]
+        self._factors = torch.tensor(factors, device=device).view(len(factors), 1)
+        before_clip = [float(name != "termination") for name in self.names]
+        self._before_clip = torch.tensor(before_clip, device=device).view(len(factors), 1)
         self.only_positive = only_positive
         self.num_envs = num_envs
         self.total = torch.zeros(num_envs, device=device)
@@ -36,25 +40,22 @@ class Rewards:
 
     def compute(self, valid: Tensor) -> Tensor:
         """Evaluate all terms; robots outside `valid` (N,), whose physics blew up, get zero."""
-        total = torch.zeros_like(self.total)
-        after_clip = None
+        if not self.functions:
+            return self.total
+        values = []
         for name, function in self.functions.items():
             with calling(f"_reward_{name}"):
                 value = function()
                 if value.shape != (self.num_envs,):
                     raise ValueError(f"must return a tensor ({self.num_envs},), got {tuple(value.shape)}")
-            value = torch.where(valid, value * self.scales[name], 0.0)
-            self.episode_sums[name].add_(value)
-            if name == "termination":
-                after_clip = value
-            else:
-                total = total + value
-        if self.only_positive:
-            total = total.clamp(min=0.0)
-        if after_clip is not None:
-            total = total + after_clip
-        self.total.copy_(total)
-        return self.total
+            values.append(value)
+        # Stacked, so that scaling, masking and summing cost four launches and not four a term.
+        scaled = torch.where(valid, torch.stack(values) * self._factors, 0.0)
+        self.sums.add_(scaled)
+        if not self.only_positive:
+            return torch.sum(scaled, dim=0, out=self.total)
+        total = (scaled * self._before_clip).sum(dim=0).clamp(min=0.0)
+        return self.total.copy_(total + (scaled * (1.0 - self._before_clip)).sum(dim=0))
 
     def reset(self, mask: Tensor) -> None:
         """Begin new sums for the robots in `mask`."""

@@ -167,6 +167,15 @@ def from_dict(data: Mapping[str, Any], origins: Origins | None = None, source: s
     return build(TaskConfig, data, "", origins or {}, source)
 
 
+def override(cfg: TaskConfig, overrides: Iterable[tuple[str, Any]]) -> TaskConfig:
+    """`cfg` with some dotted paths replaced, checked again."""
+    data = to_dict(cfg)
+    origins: Origins = {}
+    for key, value in overrides:
+        merge(data, nest(key, value), "command line", origins)
+    return from_dict(data, origins, source=cfg.task)
+
+
 def build(schema: type[T], data: Any, path: str, origins: Origins, source: str) -> T:
     """An instance of the dataclass `schema` from a mapping, checked field by field."""
     where = f"{_origin(path, origins, source)}: {path or 'top level'}"

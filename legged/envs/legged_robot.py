@@ -116,8 +116,9 @@ class LeggedRobot(BaseTask):
     def _step(self) -> None:
         clip = self.cfg.control.clip_actions
         torch.clamp(self._action_input, -clip, clip, out=self.actions)
+        self.control.set_actions(self.actions)
         for _ in range(self.cfg.control.decimation):
-            self.physics.set_torques(self.control.compute(self.actions, self.dof_pos, self.dof_vel))
+            self.physics.set_torques(self.control.compute(self.dof_pos, self.dof_vel))
             self.physics.step()
         self.physics.refresh()
         self.episode_length_buf.add_(1)

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
 from legged.config.loader import ConfigError
-from legged.math import quat_rotate, quat_rotate_inverse
+from legged.math import quat_rotate
 from legged.robot import Robot
 
 RandomizedField = Literal["friction", "added_base_mass"]
@@ -120,39 +121,64 @@ def allocate_state(num_envs: int, robot: Robot, device: torch.device) -> RobotSt
     )
 
 
-class FeetKinematics:
-    """Forward kinematics of the feet through the hinges between base and foot, the same for every engine.
+@dataclass(frozen=True)
+class FootChains:
+    """The hinges between each foot and the base. Arrays are (levels, F, ...), from the foot's body up to the base's
+    child; lengths in metres, frames and axes in the body's own frame.
+    """
 
-    Engines compute these at the start of a step; computed here from the live joint state they are never stale, and
+    offset: np.ndarray
+    """(F, 3) centre of the foot shape in its body."""
+    joint: np.ndarray
+    """(levels, F) index of the hinge among the robot's joints."""
+    axis: np.ndarray
+    anchor: np.ndarray
+    body_pos: np.ndarray
+    body_quat: np.ndarray
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, robot: Robot) -> "FootChains":
+        """The chains of a robot.
+
+        Raises:
+            ConfigError: feet at different depths, or a body in between without exactly one hinge.
+        """
+        geoms = [model.geom(name) for name in robot.feet_names]
+        base = model.body(robot.file.base).id
+        bodies = [_chain(model, int(geom.bodyid[0]), base) for geom in geoms]
+        if len({len(chain) for chain in bodies}) != 1:
+            raise ConfigError(f"{robot.folder}: feet: all feet must hang on the same number of bodies")
+        body = np.array(bodies, dtype=int).T
+        if (model.body_jntnum[body] != 1).any():
+            raise ConfigError(f"{robot.folder}: feet: every body between base and foot needs exactly one hinge")
+        joint = model.body_jntadr[body]
+        return cls(
+            offset=np.array([geom.pos for geom in geoms]),
+            joint=model.jnt_dofadr[joint] - 6,
+            axis=model.jnt_axis[joint],
+            anchor=model.jnt_pos[joint],
+            body_pos=model.body_pos[body],
+            body_quat=model.body_quat[body],
+        )
+
+
+class FeetKinematics:
+    """Forward kinematics of the feet in torch.
+
+    Engines compute them at the start of a step; computed here from the live joint state they are never stale, and
     cost no engine call.
     """
 
-    def __init__(self, model: mujoco.MjModel, robot: Robot, device: torch.device) -> None:
-        geoms = [model.geom(name) for name in robot.feet_names]
-        base = model.body(robot.file.base).id
-        chains = [_chain(model, int(geom.bodyid[0]), base) for geom in geoms]
-        if len({len(chain) for chain in chains}) != 1:
-            raise ConfigError(f"{robot.folder}: feet: all feet must hang on the same number of bodies")
+    def __init__(self, model: mujoco.MjModel, robot: Robot) -> None:
+        chains = FootChains.of(model, robot)
 
-        def tensor(values: list[list[float]]) -> Tensor:
-            return torch.tensor(values, dtype=torch.float32, device=device)
+        def tensor(values: np.ndarray) -> Tensor:
+            return torch.tensor(values, dtype=torch.float32)
 
-        self.offset = tensor([geom.pos.tolist() for geom in geoms])  # (F, 3) in the foot's body
-        self.levels = []  # from the foot's body up to the base's child; each a tuple of (F, ...) tensors
-        for bodies in zip(*chains, strict=True):
-            joints = [int(model.body_jntadr[b]) for b in bodies]
-            if any(model.body_jntnum[b] != 1 for b in bodies):
-                raise ConfigError(f"{robot.folder}: feet: every body between base and foot needs exactly one hinge")
-            self.levels.append(
-                (
-                    torch.tensor([int(model.jnt_dofadr[j]) - 6 for j in joints], device=device),
-                    tensor([model.jnt_axis[j].tolist() for j in joints]),
-                    tensor([model.jnt_pos[j].tolist() for j in joints]),
-                    tensor([model.body_pos[b].tolist() for b in bodies]),
-                    tensor([model.body_quat[b].tolist() for b in bodies]),
-                )
-            )
-        self.turned = any(not torch.equal(quat, _upright(quat)) for *_, quat in self.levels)
+        self.offset = tensor(chains.offset)
+        tables = (chains.axis, chains.anchor, chains.body_pos, chains.body_quat)
+        self.levels = list(zip(torch.tensor(chains.joint), *map(tensor, tables), strict=True))
+        self.turned = not np.allclose(chains.body_quat, [1.0, 0.0, 0.0, 0.0])
 
     def write(self, state: RobotState) -> None:
         """The live base and joint state -> state.feet_pos, state.feet_vel."""
@@ -187,21 +213,8 @@ def _chain(model: mujoco.MjModel, body: int, base: int) -> list[int]:
     return chain
 
 
-def _upright(quat: Tensor) -> Tensor:
-    return torch.tensor([1.0, 0.0, 0.0, 0.0], device=quat.device).expand_as(quat)
-
-
 def _turn(vec: Tensor, axis: Tensor, angle: Tensor) -> Tensor:
     """Rodrigues' formula: `vec` turned by `angle` about the unit vector `axis`."""
     cos, sin = torch.cos(angle), torch.sin(angle)
     along = (axis * vec).sum(dim=2, keepdim=True)
     return cos * vec + sin * torch.linalg.cross(axis, vec) + (1.0 - cos) * along * axis
-
-
-def write_base(state: RobotState, qpos: Tensor, qvel: Tensor, down: Tensor) -> None:
-    """MuJoCo's free joint, position (N, 7+) and velocity (N, 6+: linear in the world, angular in the base), -> state."""
-    state.base_pos.copy_(qpos[:, :3])
-    state.base_quat.copy_(qpos[:, 3:7])
-    state.base_lin_vel.copy_(quat_rotate_inverse(state.base_quat, qvel[:, :3].to(torch.float32)))
-    state.base_ang_vel.copy_(qvel[:, 3:6])
-    state.projected_gravity.copy_(quat_rotate_inverse(state.base_quat, down))

@@ -7,8 +7,8 @@ from mujoco.batch import Batch
 from torch import Tensor
 
 from legged.config.schema import SimConfig
-from legged.math import quat_rotate
-from legged.physics.base import FeetKinematics, Physics, RandomizedField, allocate_state, write_base
+from legged.math import quat_rotate, quat_rotate_inverse
+from legged.physics.base import FeetKinematics, Physics, RandomizedField, allocate_state
 from legged.physics.scene import build_model, contact_sensor_columns
 from legged.robot import Robot
 
@@ -25,7 +25,7 @@ class MujocoPhysics(Physics):
         if device.type != "cpu":
             raise ValueError(f"the mujoco back-end runs on the CPU, not on {device}")
         self.num_envs, self.dt, self.device = num_envs, sim.dt, device
-        self.model = build_model(robot, sim)
+        self.model = build_model(robot, sim, contact_sensors=True)
         # A world that blows up must stay non-finite until the task sees it; the engine would put it back silently.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.robot = robot
@@ -39,7 +39,7 @@ class MujocoPhysics(Physics):
         start, end = contact_sensor_columns(self.model, robot)
         self._forces = self.batch.bind("sensordata")[:, start:end]
         self._stepped = torch.zeros(num_envs, 1, 1, dtype=torch.bool)  # false: reset since the last step
-        self._feet = FeetKinematics(self.model, robot, device)
+        self._feet = FeetKinematics(self.model, robot)
         self._down = torch.tensor([0.0, 0.0, -1.0]).expand(num_envs, 3)
         self._warnings = self.batch.warning[:, OVERFLOW, 1].copy()
         self.refresh()
@@ -50,11 +50,17 @@ class MujocoPhysics(Physics):
         self._read_joints()
 
     def refresh(self) -> None:
-        write_base(self.state, self._qpos, self._qvel, self._down)
+        state = self.state
+        state.base_pos.copy_(self._qpos[:, :3])
+        state.base_quat.copy_(self._qpos[:, 3:7])
+        # MuJoCo's free joint: linear velocity in the world frame, angular in the base's.
+        state.base_lin_vel.copy_(quat_rotate_inverse(state.base_quat, self._qvel[:, :3].to(torch.float32)))
+        state.base_ang_vel.copy_(self._qvel[:, 3:6])
+        state.projected_gravity.copy_(quat_rotate_inverse(state.base_quat, self._down))
         self._read_joints()
-        self._feet.write(self.state)
-        forces = torch.from_numpy(self._forces.astype(np.float32)).view_as(self.state.contact_forces)
-        self.state.contact_forces.copy_(torch.where(self._stepped, -forces, 0.0))
+        self._feet.write(state)
+        forces = torch.from_numpy(self._forces.astype(np.float32)).view_as(state.contact_forces)
+        state.contact_forces.copy_(torch.where(self._stepped, -forces, 0.0))
         warnings = self.batch.warning[:, OVERFLOW, 1]
         self.overflowed.copy_(torch.from_numpy((warnings > self._warnings).any(axis=1)))
         self._warnings = warnings.copy()

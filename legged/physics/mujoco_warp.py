@@ -1,6 +1,8 @@
 """Batched MuJoCo on a GPU by mujoco-warp; also on Warp's CPU device, for tests and for comparison."""
 
 from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -12,14 +14,11 @@ from torch import Tensor
 
 from legged.config.schema import SimConfig
 from legged.math import masked_set_, quat_rotate
-from legged.physics.base import FeetKinematics, Physics, RandomizedField, allocate_state, write_base
-from legged.physics.scene import build_model, contact_sensor_columns
+from legged.physics.base import Physics, RandomizedField, RobotState, allocate_state
+from legged.physics.readout import Readout
+from legged.physics.scene import build_model
 from legged.robot import Robot
 
-# Contacts or constraint rows were dropped; the other bits (iteration caps) are no loss.
-LOST = int(
-    mjw.OverflowType.NEFC | mjw.OverflowType.NJMAX_NNZ | mjw.OverflowType.BROADPHASE | mjw.OverflowType.NARROWPHASE
-)
 # Fields of the model that differ per world once friction or mass are drawn, and those that set_const derives from mass.
 PER_WORLD = ("geom_friction", "body_mass", "body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
 
@@ -39,25 +38,32 @@ class MujocoWarpPhysics(Physics):
         self.num_envs, self.dt, self.device = num_envs, sim.dt, device
         self.model = build_model(robot, sim)
         self.robot = robot
-        self.state = allocate_state(num_envs, robot, device)
         self.overflowed = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._wp_device = wp.device_from_torch(device)
         with wp.ScopedDevice(self._wp_device):
             self._m = mjw.put_model(self.model, batch_sizes={name: num_envs for name in PER_WORLD})
             self._m.opt.warn_overflow = 0  # counted in refresh instead of printed by each thread
             self._d = mjw.make_data(self.model, nworld=num_envs, nconmax=sim.nconmax, njmax=sim.njmax)
-        d = self._d
-        self._qpos, self._qvel, self._ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
-        self._warmstart, self._sensordata = wp.to_torch(d.qacc_warmstart), wp.to_torch(d.sensordata)
-        self._overflow = wp.to_torch(d.overflow)
-        start, end = contact_sensor_columns(self.model, robot)
-        self._forces = self._sensordata[:, start:end]
-        self._feet = FeetKinematics(self.model, robot, device)
-        self._down = torch.tensor([0.0, 0.0, -1.0], device=device).expand(num_envs, 3)
+            d = self._d
+            self._qpos, self._qvel, self._ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
+            self._warmstart, self._efc_force = wp.to_torch(d.qacc_warmstart), wp.to_torch(d.efc.force)
+            self.state = self._views(allocate_state(num_envs, robot, device))
+            self._readout = Readout(self._m, d, self.model, robot, self.state, self.overflowed)
         self._advance: Callable[[], Any] = self._step
         if self._wp_device.is_cpu:
             self._advance = self._captured_step()
         self.refresh()
+
+    def _views(self, state: RobotState) -> RobotState:
+        """`state` with the fields that the engine holds in our convention already as views of its own arrays."""
+        return replace(
+            state,
+            base_pos=self._qpos[:, :3],
+            base_quat=self._qpos[:, 3:7],
+            base_ang_vel=self._qvel[:, 3:6],
+            dof_pos=self._qpos[:, 7:],
+            dof_vel=self._qvel[:, 6:],
+        )
 
     def _step(self) -> None:
         mjw.step(self._m, self._d)
@@ -72,33 +78,27 @@ class MujocoWarpPhysics(Physics):
         for tensor, value in zip((self._qpos, self._qvel), start, strict=True):
             tensor.copy_(value)
         self._warmstart.zero_()
-        self._sensordata.zero_()
-        self._overflow.zero_()
+        self._efc_force.zero_()
+        wp.to_torch(self._d.overflow).zero_()
         return lambda: wp.capture_launch(capture.graph)
 
     def _on_torch_stream(self) -> Any:
         """Warp launches on the stream torch uses now, so that both stay in order, also while capturing."""
         if self._wp_device.is_cpu:
             return wp.ScopedDevice(self._wp_device)
-        stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
-        return wp.ScopedStream(stream, sync_enter=False)
+        stream = torch.cuda.current_stream(self.device)
+        if self._wp_device.stream.cuda_stream == stream.cuda_stream:
+            return nullcontext()  # a second Warp object for the same stream would not know of the capture on it
+        return wp.ScopedStream(wp.stream_from_torch(stream), sync_enter=False)
 
     def step(self) -> None:
         with self._on_torch_stream():
             self._advance()
-        self._read_joints()
 
     def refresh(self) -> None:
-        write_base(self.state, self._qpos, self._qvel, self._down)
-        self._read_joints()
-        self._feet.write(self.state)
-        torch.neg(self._forces.view_as(self.state.contact_forces), out=self.state.contact_forces)
-        self.overflowed.copy_((self._overflow & LOST) != 0)
-        self._overflow.zero_()
-
-    def _read_joints(self) -> None:
-        self.state.dof_pos.copy_(self._qpos[:, 7:])
-        self.state.dof_vel.copy_(self._qvel[:, 6:])
+        with self._on_torch_stream():
+            self._readout.kinematics()
+            self._readout.contact_forces()
 
     def set_torques(self, torques: Tensor) -> None:
         self._ctrl.copy_(torques)
@@ -115,8 +115,9 @@ class MujocoWarpPhysics(Physics):
     ) -> None:
         masked_set_(self._qpos, mask, torch.cat([base_pos, base_quat, dof_pos], dim=1))
         masked_set_(self._qvel, mask, torch.cat([quat_rotate(base_quat, base_lin_vel), base_ang_vel, dof_vel], dim=1))
-        # mujoco-warp's own reset_data would drop the contacts of all worlds; these are all that carries over a step.
-        for tensor in (self._ctrl, self._warmstart, self._sensordata):
+        # mujoco-warp's own reset_data would drop the contacts of all worlds; these are all that carries over a step,
+        # and contact forces are read from efc.force.
+        for tensor in (self._ctrl, self._warmstart, self._efc_force):
             masked_set_(tensor, mask, 0.0)
 
     def push(self, mask: Tensor, lin_vel_xy: Tensor) -> None:

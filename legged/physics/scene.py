@@ -8,12 +8,12 @@ from legged.robot import Robot
 FLOOR = "floor"
 
 
-def build_model(robot: Robot, sim: SimConfig) -> mujoco.MjModel:
+def build_model(robot: Robot, sim: SimConfig, contact_sensors: bool = False) -> mujoco.MjModel:
     """The scene of one world.
 
     The integrator is semi-implicit Euler: with torques from an explicit PD law it needs nothing better, and it is what
-    makes a step split exactly into torque and dynamics. Every tracked shape gets a contact sensor `contact_<shape>`,
-    the net force that the shape exerts, world frame [N].
+    makes a step split exactly into torque and dynamics. With `contact_sensors`, every tracked shape gets a sensor
+    `contact_<shape>`, the net force that the shape exerts, world frame [N].
     """
     spec = mujoco.MjSpec.from_file(str(robot.model_path))
     option = spec.option
@@ -33,7 +33,7 @@ def build_model(robot: Robot, sim: SimConfig) -> mujoco.MjModel:
         conaffinity=1,
         group=0,
     )
-    for name in robot.contact_names:
+    for name in robot.contact_names if contact_sensors else ():
         spec.add_sensor(
             name=f"contact_{name}",
             type=mujoco.mjtSensor.mjSENS_CONTACT,

@@ -1,0 +1,154 @@
+"""How well a policy tracks commands: `python -m legged.tools.evaluate --task anymal_c_flat [--physics mujoco]`.
+
+Prints a table and writes evaluation_<physics>.json and .png beside the checkpoint (or to --out).
+"""
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from legged.config import ConfigError
+from legged.paths import relative
+from legged.physics import resolve_physics
+from legged.rl.arguments import (
+    add_run_arguments,
+    add_task_arguments,
+    import_and_check,
+    overrides,
+    pick_device,
+    run_main,
+)
+from legged.rl.policy import find_policy, restore, undisturbed
+from legged.rl.runs import write_text
+from legged.tools.velocity_grid import Grid, measure
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The command; returns its exit code."""
+    return run_main(_main, argv)
+
+
+def _main(argv: list[str] | None) -> int:
+    parser = argparse.ArgumentParser(prog="evaluate", description=__doc__)
+    add_task_arguments(parser)
+    add_run_arguments(parser)
+    parser.add_argument("--physics", choices=["mujoco", "mujoco_warp"], help="engine; that of the device by default")
+    for axis, unit in (("vx", "m/s"), ("vy", "m/s"), ("yaw", "rad/s")):
+        parser.add_argument(f"--{axis}", default="-1:1:0.5", help=f"low:high:step of the command grid [{unit}]")
+    parser.add_argument("--robots", type=int, default=16, help="robots a cell")
+    parser.add_argument("--out", type=Path, help="folder for JSON and PNG; beside the checkpoint by default")
+    args = parser.parse_intermixed_args(argv)
+    import_and_check(args)
+    if args.robots < 1:
+        raise ConfigError(f"--robots: must be at least 1, got {args.robots}")
+    grid = Grid(axis_values("--vx", args.vx), axis_values("--vy", args.vy), axis_values("--yaw", args.yaw), args.robots)
+    device = torch.device("cpu") if args.physics == "mujoco" and args.sim_device is None else pick_device(args.sim_device)
+    if device.type == "cpu":
+        torch.set_num_threads(1)
+    engine = resolve_physics(args.physics or "auto", device)
+    policy = find_policy(args)
+    changes = undisturbed(grid.num_envs, grid.hold_s)
+    changes += [change for change in overrides(args) if change[0] != "train.runner.experiment_name"]
+    start = time.perf_counter()
+    task, runner = restore(policy, [*changes, ("sim.physics", engine)], device, graph=not args.no_graph)
+    result = measure(task, runner.get_inference_policy(str(device)), grid)
+    result = {
+        "task": policy.cfg.task,
+        "checkpoint": policy.checkpoint.name,
+        "physics": engine,
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+        "wall_s": time.perf_counter() - start,
+        **result,
+    }
+    folder = args.out or policy.folder
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"evaluation_{engine}.json"
+    write_text(path, json.dumps(result, indent=1))
+    plot(result, path.with_suffix(".png"))
+    print_report(result)
+    print(f"written: {relative(path)}, {relative(path.with_suffix('.png'))}")
+    return 0
+
+
+def axis_values(flag: str, text: str) -> list[float]:
+    """'-1:1:0.5' -> [-1, -0.5, 0, 0.5, 1]; a single number is a single value.
+
+    Raises:
+        ConfigError: not of that form.
+    """
+    try:
+        parts = [float(part) for part in text.split(":")]
+    except ValueError:
+        parts = []
+    if len(parts) == 1:
+        return parts
+    if len(parts) != 3 or parts[2] <= 0 or parts[1] < parts[0]:
+        raise ConfigError(f"{flag}: '{text}' is not of the form low:high:step, e.g. {flag}=-1:1:0.5")
+    low, high, step = parts
+    return [round(float(value), 6) for value in np.arange(low, high + 0.5 * step, step)]
+
+
+def print_report(result: dict[str, Any]) -> None:
+    """The figures over the grid, and the gait at 0.5 m/s."""
+    lin, ang, gait = result["rmse_lin"], result["rmse_ang"], result["gait"]
+    table = Table(title=f"{result['task']} ({result['checkpoint']}) in {result['physics']}", title_justify="left")
+    for name, justify in (("measure", "left"), ("value", "right"), ("where", "left")):
+        table.add_column(name, justify=justify)  # type: ignore[arg-type]
+    cells = f"{len(result['cells'])} cells x {result['robots_per_cell']} robots x {result['measured_s']:.0f} s"
+    table.add_row("velocity RMSE, mean", f"{lin['mean']:.3f} m/s", cells)
+    table.add_row("velocity RMSE, worst cell", f"{lin['worst']:.3f} m/s", _command(lin["worst_cell"]))
+    table.add_row("yaw rate RMSE, mean", f"{ang['mean']:.3f} rad/s", "")
+    table.add_row("yaw rate RMSE, worst cell", f"{ang['worst']:.3f} rad/s", _command(ang["worst_cell"]))
+    table.add_row("falls", f"{100 * result['falls']:.2f} %", "of the robots, within the hold")
+    if result["cost_of_transport"] is not None:
+        table.add_row("cost of transport", f"{result['cost_of_transport']:.2f}", "sum |torque * speed| / (weight * speed)")
+    at = _command(gait["command"])
+    table.add_row("duty factor", f"{gait['duty_factor']:.2f}", at)
+    table.add_row("steps per second and foot", f"{gait['steps_per_s']:.2f}", at)
+    table.add_row("base height", f"{gait['base_height']:.3f} m", at)
+    table.add_row("thigh or shank contact", f"{100 * gait['thigh_contact']:.2f} % of steps", at)
+    Console(width=110).print(table)
+
+
+def _command(cell: list[float]) -> str:
+    return f"at vx {cell[0]:g}, vy {cell[1]:g} m/s, yaw {cell[2]:g} rad/s"
+
+
+def plot(result: dict[str, Any], path: Path) -> None:
+    """Heat maps: for each (vx, vy) and each (vx, yaw), the mean over the third command."""
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    grid = result["grid"]
+    shape = tuple(len(grid[axis]) for axis in ("vx", "vy", "yaw"))
+    figure, axes = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained")
+    panels = (("rmse_lin", 2, "vy", "velocity RMSE [m/s]"), ("rmse_ang", 1, "yaw", "yaw rate RMSE [rad/s]"))
+    for axis, (name, over, other, label) in zip(axes, panels, strict=True):
+        values = np.array([cell[name] for cell in result["cells"]]).reshape(shape).mean(axis=over)
+        image = axis.imshow(values.T, origin="lower", aspect="auto", cmap="viridis_r", vmin=0.0)
+        axis.set_xticks(range(shape[0]), [f"{v:g}" for v in grid["vx"]])
+        axis.set_yticks(range(len(grid[other])), [f"{v:g}" for v in grid[other]])
+        axis.set_xlabel("commanded vx [m/s]")
+        axis.set_ylabel(f"commanded {other} [{'m/s' if other == 'vy' else 'rad/s'}]")
+        for (i, j), value in np.ndenumerate(values):
+            dark = value > 0.6 * values.max()
+            axis.text(i, j, f"{value:.2f}", ha="center", va="center", color="white" if dark else "black")
+        figure.colorbar(image, ax=axis, label=label)
+    figure.suptitle(f"{result['task']} in {result['physics']}, falls {100 * result['falls']:.1f} %")
+    part = path.with_name(f".{path.name}")
+    figure.savefig(part, dpi=110, format="png")
+    plt.close(figure)
+    part.replace(path)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
