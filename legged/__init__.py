@@ -1,7 +1,8 @@
 """Legged robots learn to walk: legged_gym's task on batched MuJoCo, trained by rsl-rl."""
 
+from legged.headless import HEADLESS  # noqa: I001  first: it sets MUJOCO_GL
 from legged.config import ConfigError, TaskConfig
 from legged.envs import LeggedRobot
 from legged.registry import make_task, register, task_config
 
-__all__ = ["ConfigError", "LeggedRobot", "TaskConfig", "make_task", "register", "task_config"]
+__all__ = ["HEADLESS", "ConfigError", "LeggedRobot", "TaskConfig", "make_task", "register", "task_config"]

@@ -30,11 +30,30 @@ class Commands:
         """(N,) time until the next sample [s]."""
         self.held = torch.zeros(num_envs, dtype=torch.bool, device=device)
         """(N,) robots whose command was given by `hold` and is not sampled."""
+        self._sample = torch.zeros(num_envs, 4, device=device)
+
+    def draw(self) -> None:
+        """Draw a new command for every robot, for those that `update` finds due."""
+        cfg, device, n = self.cfg, self.commands.device, len(self.commands)
+        low, high = self.ranges[:, 0], self.ranges[:, 1]
+        velocity = torch.addcmul(low, high - low, torch.rand(n, 3, device=device))
+        # One axis only, for a share of the robots: the cases a cube of random commands hardly contains.
+        axis = torch.randint(3, (n, 1), device=device)
+        chance = torch.rand(n, 2, device=device)
+        other = torch.arange(3, device=device) != axis
+        velocity = velocity.masked_fill((chance[:, :1] < cfg.single_axis_share) & other, 0.0)
+        small = velocity[:, :2].norm(dim=1, keepdim=True) < cfg.small_command
+        standing = chance[:, 1:] < cfg.standing_share
+        self._sample[:, :2].copy_(velocity[:, :2].masked_fill(small | standing, 0.0))
+        self._sample[:, 2:3].copy_(velocity[:, 2:].masked_fill(standing, 0.0))
+        self._sample[:, 3].copy_(uniform(*cfg.ranges.heading, (n,), device))
 
     def update(self, reset: Tensor, base_quat: Tensor) -> None:
-        """Sample where an episode begins or the time is up, then steer towards the headings."""
+        """Take the drawn command where an episode begins or the time is up, then steer towards the headings."""
         self.time_left.sub_(self.dt)
-        self._resample((reset | (self.time_left <= 0.5 * self.dt)) & ~self.held)
+        due = (reset | (self.time_left <= 0.5 * self.dt)) & ~self.held
+        masked_set_(self.commands, due, self._sample)
+        masked_set_(self.time_left, due, self.cfg.resampling_time_s)
         if self.cfg.heading_command:
             low, high = self.cfg.ranges.ang_vel_yaw
             error = wrap_to_pi(self.commands[:, 3] - yaw_of(base_quat))
@@ -42,23 +61,6 @@ class Commands:
                 torch.where(self.held, self.commands[:, 2], torch.clamp(HEADING_GAIN * error, low, high))
             )
         torch.gt(self.commands[:, :3].norm(dim=1), MOVING, out=self.is_moving)
-
-    def _resample(self, mask: Tensor) -> None:
-        cfg, device, n = self.cfg, self.commands.device, len(self.commands)
-        low, high = self.ranges[:, 0], self.ranges[:, 1]
-        velocity = low + (high - low) * torch.rand(n, 3, device=device)
-        # One axis only, for a share of the robots: the cases a cube of random commands hardly contains.
-        axis = torch.randint(3, (n, 1), device=device)
-        single = torch.rand(n, 1, device=device) < cfg.single_axis_share
-        other = torch.arange(3, device=device) != axis
-        velocity = velocity.masked_fill(single & other, 0.0)
-        small = velocity[:, :2].norm(dim=1, keepdim=True) < cfg.small_command
-        horizontal = velocity[:, :2].masked_fill(small, 0.0)
-        standing = torch.rand(n, 1, device=device) < cfg.standing_share
-        sampled = torch.cat([horizontal, velocity[:, 2:]], dim=1).masked_fill(standing, 0.0)
-        masked_set_(self.commands[:, :3], mask, sampled)
-        masked_set_(self.commands[:, 3], mask, uniform(*cfg.ranges.heading, (n,), device))
-        masked_set_(self.time_left, mask, cfg.resampling_time_s)
 
     def hold(self, commands: Tensor) -> None:
         """Give all robots fixed commands (N, 3), which are neither sampled nor steered any more."""

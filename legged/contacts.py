@@ -16,16 +16,14 @@ class FeetContacts:
 
     def __init__(self, num_envs: int, num_feet: int, dt: float, device: torch.device) -> None:
         """All feet start on the ground, at rest; `dt` is the control step [s]."""
-        shape = (num_envs, num_feet)
         self.dt = dt
-        self.in_contact = torch.zeros(shape, dtype=torch.bool, device=device)
-        self.first_contact = torch.zeros(shape, dtype=torch.bool, device=device)
-        """(N, F) the foot touched down at this step."""
-        self.air_time = torch.zeros(shape, device=device)
-        """(N, F) length of the swing that is going on, 0 in contact [s]."""
-        self.last_air_time = torch.zeros(shape, device=device)
-        """(N, F) length of the last finished swing, known from its touch-down on [s]."""
-        self._touching = torch.zeros(shape, dtype=torch.bool, device=device)
+        # Views of two blocks, so that a reset is two launches.
+        self._flags = torch.zeros(num_envs, 3, num_feet, dtype=torch.bool, device=device)
+        self._times = torch.zeros(num_envs, 2, num_feet, device=device)
+        self.in_contact, self.first_contact, self._touching = self._flags.unbind(dim=1)
+        """(N, F) the foot is on the ground; it touched down at this step."""
+        self.air_time, self.last_air_time = self._times.unbind(dim=1)
+        """(N, F) length of the swing that is going on, 0 in contact, and of the last finished one [s]."""
 
     def update(self, feet_forces: Tensor) -> None:
         """Advance by one control step; `feet_forces` (N, F, 3) in the world frame [N]."""
@@ -39,7 +37,5 @@ class FeetContacts:
 
     def reset(self, mask: Tensor) -> None:
         """Forget the past of the robots in `mask`."""
-        for tensor in (self.in_contact, self.first_contact, self._touching):
-            masked_set_(tensor, mask, False)
-        for tensor in (self.air_time, self.last_air_time):
-            masked_set_(tensor, mask, 0.0)
+        masked_set_(self._flags, mask, False)
+        masked_set_(self._times, mask, 0.0)

@@ -57,9 +57,9 @@ class Control:
         return torch.clamp(torques, self._lowest_torques, self.torque_limits, out=self.torques)
 
     def reset(self, mask: Tensor) -> None:
-        """Forget the torques and velocities of the robots in `mask`."""
-        masked_set_(self.torques, mask, 0.0)
-        masked_set_(self._last_dof_vel, mask, 0.0)
+        """Forget the past of the robots in `mask`, for the law that has one."""
+        if self.control_type == "V":
+            masked_set_(self._last_dof_vel, mask, 0.0)
 
 
 def control_gains(robot: Robot, cfg: ControlConfig) -> tuple[object, object]:

@@ -48,6 +48,34 @@ class ForbidHostReads(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
+class Branch:
+    """Work beside the main line of the step: on a GPU a second stream, in the captured graph a parallel branch.
+
+    The step's small launches are bound by latency, so independent ones are free side by side. Tensors that both lines
+    touch must be allocated before (a stream may reuse what another still reads), and `join` must come before the
+    next physics step (the solver's conditional node cannot be captured while a branch is open).
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        """On the CPU everything runs in order."""
+        self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
+
+    @contextmanager
+    def fork(self) -> Iterator[None]:
+        """The block may run at the same time as what follows it, up to `join`."""
+        if self._stream is None:
+            yield
+            return
+        self._stream.wait_stream(torch.cuda.current_stream(self._stream.device))
+        with torch.cuda.stream(self._stream):
+            yield
+
+    def join(self) -> None:
+        """What follows waits for the block."""
+        if self._stream is not None:
+            torch.cuda.current_stream(self._stream.device).wait_stream(self._stream)
+
+
 class StepGraph:
     """Runs a step function: eagerly on the CPU, by replaying one captured CUDA graph on a GPU.
 

@@ -22,6 +22,7 @@ class Randomization:
         """(N,) mass added to each base [kg], if randomised."""
         self.push_time_left = uniform(0.0, cfg.push_interval_s, (num_envs,), device)
         """(N,) time until the next push [s]."""
+        self._push_velocity = torch.zeros(num_envs, 2, device=device)
 
     def apply(self, physics: Physics) -> None:
         """Give the physics what was drawn, at start-up."""
@@ -30,13 +31,16 @@ class Randomization:
         if self.cfg.randomize_base_mass:
             physics.randomize("added_base_mass", self.added_mass)
 
-    def push(self, physics: Physics, base_lin_vel_w: Tensor, mask: Tensor) -> None:
-        """Set the horizontal velocity of the robots in `mask` that are due; `base_lin_vel_w` (N, 3) world frame [m/s]."""
+    def draw(self) -> None:
+        """Draw a push for every robot, for those that `push` finds due."""
+        reach = self.cfg.max_push_vel_xy
+        self._push_velocity.uniform_(-reach, reach)
+
+    def push(self, physics: Physics, mask: Tensor) -> None:
+        """Set the base's horizontal velocity, world frame, of the robots in `mask` (N,) that are due."""
         if not self.cfg.push_robots:
             return
         self.push_time_left.sub_(self.dt)
         due = (self.push_time_left <= 0.0) & mask
-        reach = self.cfg.max_push_vel_xy
-        target = uniform(-reach, reach, (len(due), 2), self.device)
-        physics.push(due, target - base_lin_vel_w[:, :2])
+        physics.push(due, self._push_velocity - physics.state.base_lin_vel_w[:, :2])
         masked_set_(self.push_time_left, due, self.cfg.push_interval_s)

@@ -83,9 +83,9 @@ class CommandCurriculumConfig:
     step: float = field(default=0.1, metadata=POSITIVE)
     """Share of the full range by which an axis is widened."""
     window_s: float = field(default=1.0, metadata=POSITIVE)
-    """Time over which tracking is averaged before an axis is judged [s]."""
-    threshold: float = field(default=0.8, metadata=UNIT)
-    """Mean of exp(-error^2 / tracking_sigma) of an axis above which it is widened."""
+    """Time over which velocities are averaged before an axis is judged [s]."""
+    threshold: float = field(default=0.75, metadata=UNIT)
+    """Share of the velocity asked for that robots must reach on average before an axis is widened."""
 
 
 @dataclass(frozen=True)

@@ -77,6 +77,10 @@ class BaseTask(VecEnv):
         """One control step, from `_action_input` to all buffers: no host reads, no new addresses."""
 
     @abstractmethod
+    def _draw(self) -> None:
+        """Draw the random numbers that the next reset uses."""
+
+    @abstractmethod
     def reset_idx(self, mask: Tensor) -> None:
         """Begin new episodes in the environments of `mask` (N,)."""
 
@@ -94,6 +98,7 @@ class BaseTask(VecEnv):
         """Begin a new episode in every environment; returns the observations."""
         with torch.inference_mode():
             self.reset_buf.fill_(True)
+            self._draw()
             self.reset_idx(self.reset_buf)
             self._observe()
             self.statistics.flush()
@@ -117,9 +122,13 @@ class BaseTask(VecEnv):
         extras: dict[str, Any] = {"time_outs": self.time_out_buf.clone()}
         self._steps_since_log += 1
         if self._steps_since_log == self.cfg.train.runner.num_steps_per_env:
-            extras["log"] = self.statistics.flush()
+            extras["log"] = self._log()
             self._steps_since_log = 0
         return self.get_observations(), self.rew_buf.clone(), self.reset_buf.clone(), extras
+
+    def _log(self) -> dict[str, Tensor]:
+        """What is logged of a rollout: fresh 0-dimensional tensors by their name in TensorBoard."""
+        return self.statistics.flush()
 
     def state_dict(self) -> dict[str, Any]:
         """What a resumed training must know of the task, beside the networks."""

@@ -16,7 +16,8 @@ from legged.contacts import FeetContacts
 from legged.control import Control, control_gains
 from legged.curriculum import CommandCurriculum
 from legged.envs.base_task import BaseTask
-from legged.math import masked_set_, quat_rotate, uniform
+from legged.graph import Branch
+from legged.math import masked_set_
 from legged.observations import ObservationGroup
 from legged.physics import make_physics
 from legged.randomization import Randomization
@@ -66,9 +67,8 @@ class LeggedRobot(BaseTask):
         self.command_sampler = Commands(cfg.commands, n, self.dt, device)
         self.commands, self.is_moving = self.command_sampler.commands, self.command_sampler.is_moving
         self.contacts = FeetContacts(n, len(robot.feet_indices), self.dt, device)
-        self.command_curriculum = CommandCurriculum(
-            cfg.commands.curriculum, self.command_sampler.full_ranges, self.dt, cfg.rewards.tracking_sigma
-        )
+        full_ranges = self.command_sampler.full_ranges
+        self.command_curriculum = CommandCurriculum(cfg.commands.curriculum, full_ranges, self.dt)
         self.valid = torch.ones(n, dtype=torch.bool, device=device)
         """(N,) robots whose physics is finite; the others are terminated and reset."""
 
@@ -77,9 +77,13 @@ class LeggedRobot(BaseTask):
         self.termination_indices = torch.tensor(robot.termination_indices, dtype=torch.long, device=device)
         self.dof_vel_limits = torch.tensor(robot.dof_vel_limits, dtype=torch.float32, device=device)
         self.dof_pos_limits = self._soft_limits(robot)
-        spawn = torch.tensor([0.0, 0.0, robot.file.spawn_height], device=device)
-        self._spawn_pos = spawn.expand(n, 3)
-        self._spawn_quat = torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).expand(n, 4)
+        self._spawn_pos = torch.zeros_like(self.base_pos)
+        self._spawn_pos[:, 2] = robot.file.spawn_height
+        self._spawn_quat = torch.zeros_like(self.base_quat)
+        self._spawn_quat[:, 0] = 1.0
+        self._reset_velocity = torch.zeros(2, n, 3, device=device)  # linear, angular
+        self._reset_dof_pos, self._reset_dof_vel = (torch.zeros(n, self.num_actions, device=device) for _ in range(2))
+        self._beside = Branch(device)
 
         scales = {name: scale for name, scale in cfg.rewards.scales.items() if scale != 0.0}
         terms = {name: getattr(self, f"_reward_{name}") for name in scales}
@@ -125,10 +129,13 @@ class LeggedRobot(BaseTask):
         self.contacts.update(self.contact_forces[:, self.feet_indices])
 
         self.check_termination()
+        with self._beside.fork():
+            self.track()
+            self._draw()
         self.compute_reward()
-        self.track()
+        self._beside.join()
         self.reset_idx(self.reset_buf)
-        self.randomization.push(self.physics, quat_rotate(self.base_quat, self.base_lin_vel), ~self.reset_buf)
+        self.randomization.push(self.physics, ~self.reset_buf)
         self._observe()
 
     def check_termination(self) -> None:
@@ -147,33 +154,36 @@ class LeggedRobot(BaseTask):
         torch.logical_or(self.terminated_buf, self.time_out_buf, out=self.reset_buf)
 
     def compute_reward(self) -> None:
-        """Judged on the command that the policy saw, before anything is reset."""
+        """Judged on the command that the policy saw, before anything is reset; ended episodes are recorded."""
         self.rew_buf.copy_(self.rewards.compute(self.valid))
+        self.statistics.add_episodes(self.reset_buf, self.terminated_buf, self.episode_length_buf, self.rewards.sums)
 
     def track(self) -> None:
-        """Record tracking errors and finished episodes; let the command curriculum judge the step."""
+        """Record tracking errors; let the command curriculum judge the step."""
         velocity = torch.cat([self.base_lin_vel[:, :2], self.base_ang_vel[:, 2:]], dim=1)
         error = (self.commands[:, :3] - velocity).square()
         self.statistics.add_step(error[:, :2].sum(dim=1), error[:, 2], self.valid, self.physics.overflowed)
-        self.statistics.add_episodes(
-            self.reset_buf, self.terminated_buf, self.episode_length_buf, self.rewards.sums
-        )
         self.command_curriculum.update(self.commands[:, :3], velocity, self.valid)
-        self.command_sampler.ranges.copy_(self.command_curriculum.ranges)
+        self.command_curriculum.write_ranges(self.command_sampler.ranges)
+
+    def _draw(self) -> None:
+        """Random numbers for every robot, used by those that are reset, pushed or given a new command."""
+        cfg = self.cfg.init_state
+        self._reset_dof_pos.uniform_(*cfg.dof_pos_factor).mul_(self.default_dof_pos)
+        self._reset_velocity.uniform_(*cfg.base_velocity)
+        self.command_sampler.draw()
+        self.randomization.draw()
 
     def reset_idx(self, mask: Tensor) -> None:
         """New episodes for the robots in `mask` (N,): joints near the default pose, base at its spawn height, moving."""
-        cfg, shape = self.cfg.init_state, self.dof_pos.shape
-        velocity = uniform(*cfg.base_velocity, (self.num_envs, 6), self.device)  # type: ignore[arg-type]
-        factor = uniform(*cfg.dof_pos_factor, tuple(shape), self.device)  # type: ignore[arg-type]
         self.physics.write_state(
             mask,
             base_pos=self._spawn_pos,
             base_quat=self._spawn_quat,
-            base_lin_vel=velocity[:, :3],
-            base_ang_vel=velocity[:, 3:],
-            dof_pos=self.default_dof_pos * factor,
-            dof_vel=torch.zeros_like(self.dof_vel),
+            base_lin_vel=self._reset_velocity[0],
+            base_ang_vel=self._reset_velocity[1],
+            dof_pos=self._reset_dof_pos,
+            dof_vel=self._reset_dof_vel,
         )
         self.control.reset(mask)
         self.contacts.reset(mask)
@@ -328,9 +338,13 @@ class LeggedRobot(BaseTask):
         bounded = torch.cat([middle - soft, middle + soft], dim=1)
         return torch.where(torch.isfinite(bounded), bounded, limits)
 
+    def _log(self) -> dict[str, Tensor]:
+        ranges = {f"Metrics/{name}": value for name, value in self.command_curriculum.metrics().items()}
+        return {**super()._log(), **ranges}
+
     def state_dict(self) -> dict[str, Any]:
         return {"command_curriculum": self.command_curriculum.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.command_curriculum.load_state_dict(state["command_curriculum"])
-        self.command_sampler.ranges.copy_(self.command_curriculum.ranges)
+        self.command_curriculum.write_ranges(self.command_sampler.ranges)

@@ -29,6 +29,8 @@ class RobotState:
     """(N, 4) orientation of the base, (w, x, y, z)."""
     base_lin_vel: Tensor
     """(N, 3) velocity of the base's origin, base frame [m/s]."""
+    base_lin_vel_w: Tensor
+    """(N, 3) the same, world frame [m/s]."""
     base_ang_vel: Tensor
     """(N, 3) angular velocity of the base, base frame [rad/s]."""
     projected_gravity: Tensor
@@ -111,6 +113,7 @@ def allocate_state(num_envs: int, robot: Robot, device: torch.device) -> RobotSt
         base_pos=zeros(3),
         base_quat=zeros(4),
         base_lin_vel=zeros(3),
+        base_lin_vel_w=zeros(3),
         base_ang_vel=zeros(3),
         projected_gravity=zeros(3),
         dof_pos=zeros(dofs),

@@ -54,7 +54,8 @@ class MujocoPhysics(Physics):
         state.base_pos.copy_(self._qpos[:, :3])
         state.base_quat.copy_(self._qpos[:, 3:7])
         # MuJoCo's free joint: linear velocity in the world frame, angular in the base's.
-        state.base_lin_vel.copy_(quat_rotate_inverse(state.base_quat, self._qvel[:, :3].to(torch.float32)))
+        state.base_lin_vel_w.copy_(self._qvel[:, :3])
+        state.base_lin_vel.copy_(quat_rotate_inverse(state.base_quat, state.base_lin_vel_w))
         state.base_ang_vel.copy_(self._qvel[:, 3:6])
         state.projected_gravity.copy_(quat_rotate_inverse(state.base_quat, self._down))
         self._read_joints()

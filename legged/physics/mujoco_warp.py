@@ -13,9 +13,9 @@ import warp as wp
 from torch import Tensor
 
 from legged.config.schema import SimConfig
-from legged.math import masked_set_, quat_rotate
+from legged.math import masked_set_
 from legged.physics.base import Physics, RandomizedField, RobotState, allocate_state
-from legged.physics.readout import Readout
+from legged.physics.exchange import Exchange
 from legged.physics.scene import build_model
 from legged.robot import Robot
 
@@ -46,9 +46,9 @@ class MujocoWarpPhysics(Physics):
             self._d = mjw.make_data(self.model, nworld=num_envs, nconmax=sim.nconmax, njmax=sim.njmax)
             d = self._d
             self._qpos, self._qvel, self._ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
-            self._warmstart, self._efc_force = wp.to_torch(d.qacc_warmstart), wp.to_torch(d.efc.force)
             self.state = self._views(allocate_state(num_envs, robot, device))
-            self._readout = Readout(self._m, d, self.model, robot, self.state, self.overflowed)
+            self._exchange = Exchange(self._m, d, self.model, robot, self.state, self.overflowed)
+        self._forces_read = False
         self._advance: Callable[[], Any] = self._step
         if self._wp_device.is_cpu:
             self._advance = self._captured_step()
@@ -60,6 +60,7 @@ class MujocoWarpPhysics(Physics):
             state,
             base_pos=self._qpos[:, :3],
             base_quat=self._qpos[:, 3:7],
+            base_lin_vel_w=self._qvel[:, :3],
             base_ang_vel=self._qvel[:, 3:6],
             dof_pos=self._qpos[:, 7:],
             dof_vel=self._qvel[:, 6:],
@@ -77,28 +78,30 @@ class MujocoWarpPhysics(Physics):
                 self._step()
         for tensor, value in zip((self._qpos, self._qvel), start, strict=True):
             tensor.copy_(value)
-        self._warmstart.zero_()
-        self._efc_force.zero_()
-        wp.to_torch(self._d.overflow).zero_()
+        for array in (self._d.qacc_warmstart, self._d.efc.force, self._d.overflow):
+            array.zero_()
         return lambda: wp.capture_launch(capture.graph)
 
     def _on_torch_stream(self) -> Any:
         """Warp launches on the stream torch uses now, so that both stay in order, also while capturing."""
         if self._wp_device.is_cpu:
-            return wp.ScopedDevice(self._wp_device)
+            return nullcontext()
         stream = torch.cuda.current_stream(self.device)
         if self._wp_device.stream.cuda_stream == stream.cuda_stream:
             return nullcontext()  # a second Warp object for the same stream would not know of the capture on it
         return wp.ScopedStream(wp.stream_from_torch(stream), sync_enter=False)
 
     def step(self) -> None:
-        with self._on_torch_stream():
+        with wp.ScopedDevice(self._wp_device), self._on_torch_stream():
             self._advance()
+        self._forces_read = False
 
     def refresh(self) -> None:
-        with self._on_torch_stream():
-            self._readout.kinematics()
-            self._readout.contact_forces()
+        with wp.ScopedDevice(self._wp_device), self._on_torch_stream():
+            self._exchange.kinematics()
+            if not self._forces_read:  # once a step: a reset in between has cleared its worlds' forces
+                self._exchange.contact_forces()
+                self._forces_read = True
 
     def set_torques(self, torques: Tensor) -> None:
         self._ctrl.copy_(torques)
@@ -113,12 +116,9 @@ class MujocoWarpPhysics(Physics):
         dof_pos: Tensor,
         dof_vel: Tensor,
     ) -> None:
-        masked_set_(self._qpos, mask, torch.cat([base_pos, base_quat, dof_pos], dim=1))
-        masked_set_(self._qvel, mask, torch.cat([quat_rotate(base_quat, base_lin_vel), base_ang_vel, dof_vel], dim=1))
-        # mujoco-warp's own reset_data would drop the contacts of all worlds; these are all that carries over a step,
-        # and contact forces are read from efc.force.
-        for tensor in (self._ctrl, self._warmstart, self._efc_force):
-            masked_set_(tensor, mask, 0.0)
+        # mujoco-warp's own reset_data would drop the contacts of all worlds.
+        with wp.ScopedDevice(self._wp_device), self._on_torch_stream():
+            self._exchange.write(mask, base_pos, base_quat, base_lin_vel, base_ang_vel, dof_pos, dof_vel)
 
     def push(self, mask: Tensor, lin_vel_xy: Tensor) -> None:
         masked_set_(self._qvel[:, :2], mask, self._qvel[:, :2] + lin_vel_xy)

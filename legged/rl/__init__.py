@@ -1,0 +1,1 @@
+"""Training and playing: what rsl-rl does not do."""

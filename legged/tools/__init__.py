@@ -1,0 +1,1 @@
+"""Commands beside train and play: `python -m legged.tools.<name>`."""

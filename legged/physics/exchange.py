@@ -1,4 +1,4 @@
-"""Reading mujoco-warp's state out for the task: one Warp launch for the robots' kinematics, two for contact forces.
+"""Between mujoco-warp's arrays and the task: one Warp launch to write states, one to read kinematics, two for forces.
 
 The same formulas in torch (base.py) take some 140 launches a control step, a third of a step's time at 4096 robots.
 """
@@ -110,7 +110,45 @@ def add_contact_forces(
         wp.atomic_add(contact_forces, worldid[i], second, on_second)
 
 
-class Readout:
+@wp.kernel
+def write_states(
+    mask: wp.array[wp.bool],
+    base_pos: wp.array2d[float],
+    base_quat: wp.array2d[float],
+    base_lin_vel: wp.array2d[float],
+    base_ang_vel: wp.array2d[float],
+    dof_pos: wp.array2d[float],
+    dof_vel: wp.array2d[float],
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    ctrl: wp.array2d[float],
+    warmstart: wp.array2d[float],
+    contact_forces: wp.array2d[wp.vec3],
+):
+    """One thread a world. Clears what would carry over a step: controls and the solver's warm start."""
+    world = wp.tid()
+    if not mask[world]:
+        return
+    quat = wp.vec4(base_quat[world, 0], base_quat[world, 1], base_quat[world, 2], base_quat[world, 3])
+    linear = rotate(quat, wp.vec3(base_lin_vel[world, 0], base_lin_vel[world, 1], base_lin_vel[world, 2]))
+    for i in range(3):
+        qpos[world, i] = base_pos[world, i]
+        qvel[world, i] = linear[i]
+        qvel[world, 3 + i] = base_ang_vel[world, i]
+    for i in range(4):
+        qpos[world, 3 + i] = quat[i]
+    for i in range(dof_pos.shape[1]):
+        qpos[world, 7 + i] = dof_pos[world, i]
+        qvel[world, 6 + i] = dof_vel[world, i]
+    for i in range(ctrl.shape[1]):
+        ctrl[world, i] = 0.0
+    for i in range(warmstart.shape[1]):
+        warmstart[world, i] = 0.0
+    for i in range(contact_forces.shape[1]):
+        contact_forces[world, i] = wp.vec3(0.0)
+
+
+class Exchange:
     """Launches the kernels above on fixed arrays, so that a capture can hold them."""
 
     def __init__(
@@ -140,6 +178,16 @@ class Readout:
         ]
         vectors = (state.base_lin_vel, state.projected_gravity, state.feet_pos, state.feet_vel)
         self._outputs = [*(wp.from_torch(t, dtype=wp.vec3) for t in vectors), wp.from_torch(overflowed)]
+
+    def write(self, mask: torch.Tensor, *values: torch.Tensor) -> None:
+        """Task -> engine, for the worlds of `mask`: values as Physics.write_state takes them, in its order."""
+        d = self._d
+        wp.launch(
+            write_states,
+            dim=self._state.feet_pos.shape[0],
+            inputs=[wp.from_torch(mask), *(wp.from_torch(value.contiguous()) for value in values)],
+            outputs=[d.qpos, d.qvel, d.ctrl, d.qacc_warmstart, self._contact_forces],
+        )
 
     def kinematics(self) -> None:
         """Engine -> base_lin_vel, projected_gravity, feet_pos, feet_vel, overflowed; clears the overflow flags."""

@@ -1,0 +1,66 @@
+"""MuJoCo's viewer with a robot that follows the keyboard."""
+
+import time
+from collections.abc import Callable
+
+import mujoco
+import mujoco.viewer
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from legged.envs import LeggedRobot
+
+STEP = (0.1, 0.1, 0.2)
+"""Change of vx, vy [m/s] and yaw rate [rad/s] by one key press."""
+UP, DOWN, LEFT, RIGHT, SPACE, COMMA, PERIOD, BACKSPACE = 265, 264, 263, 262, 32, 44, 46, 259
+HELP = """viewer: up/down vx, left/right yaw rate, comma/period vy, space stands still, backspace starts anew;
+close the window to record the video"""
+
+
+class Keyboard:
+    """Key presses -> a command (vx, vy, yaw rate), kept inside the ranges of the task."""
+
+    MOVES = {UP: (0, 1), DOWN: (0, -1), COMMA: (1, 1), PERIOD: (1, -1), LEFT: (2, 1), RIGHT: (2, -1)}
+
+    def __init__(self, low: list[float], high: list[float]) -> None:
+        """Lowest and highest command per axis."""
+        self.low, self.high = low, high
+        self.command = [0.0, 0.0, 0.0]
+        self.restart = False
+
+    def press(self, key: int) -> None:
+        """Take one key, by GLFW's code; others mean nothing."""
+        if key in self.MOVES:
+            axis, sign = self.MOVES[key]
+            moved = round(self.command[axis] + sign * STEP[axis], 3)
+            self.command[axis] = min(max(moved, self.low[axis]), self.high[axis])
+        elif key == SPACE:
+            self.command = [0.0, 0.0, 0.0]
+        elif key == BACKSPACE:
+            self.restart = True
+
+
+@torch.inference_mode()
+def view(task: LeggedRobot, act: Callable[[TensorDict], Tensor]) -> None:
+    """Show the task's first robot in real time until the window is closed."""
+    low, high = task.command_sampler.full_ranges.t().tolist()
+    keyboard = Keyboard(low, high)
+    model = task.physics.model  # type: ignore[attr-defined]
+    data = mujoco.MjData(model)
+    print(HELP)
+    task.reset()
+    with mujoco.viewer.launch_passive(model, data, key_callback=keyboard.press) as window:
+        while window.is_running():
+            begin = time.perf_counter()
+            if keyboard.restart:
+                task.reset()
+                keyboard.restart = False
+            command = torch.tensor(keyboard.command, device=task.device)  # type: ignore[arg-type]
+            task.command_sampler.hold(command.expand(task.num_envs, 3))
+            task._observe()
+            task.step(act(task.get_observations()))
+            with window.lock():
+                task.physics.copy_to(0, data)
+            window.sync()
+            time.sleep(max(0.0, task.dt - (time.perf_counter() - begin)))

@@ -1,0 +1,8 @@
+"""See a policy walk, and export it: python play.py --task anymal_c_flat"""
+
+import sys
+
+from legged.rl.play import main
+
+if __name__ == "__main__":
+    sys.exit(main())
