@@ -1,5 +1,6 @@
 """Action -> joint torque."""
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,15 +17,16 @@ class Control:
     T: action_scale * action
     """
 
-    def __init__(self, robot: Robot, cfg: ControlConfig, num_envs: int, sim_dt: float, device: torch.device) -> None:
-        """Gains come from `cfg` if it names any, else from the robot.
+    def __init__(self, robot: Robot, cfg: ControlConfig, torques: Tensor, sim_dt: float) -> None:
+        """Torques are written to `torques` (N, D), the physics' own tensor, which takes their device along. Gains come
+        from `cfg` if it names any, else from the robot.
 
         Raises:
             ConfigError: a gain pattern that matches no joint, or a joint without a gain.
         """
 
-        def tensor(values: object) -> Tensor:
-            return torch.as_tensor(values, dtype=torch.float32, device=device)
+        def tensor(values: np.ndarray) -> Tensor:
+            return torch.as_tensor(values, dtype=torch.float32, device=torques.device)
 
         self.control_type, self.action_scale, self.sim_dt = cfg.control_type, cfg.action_scale, sim_dt
         stiffness, damping = control_gains(robot, cfg)
@@ -33,7 +35,7 @@ class Control:
         self.default_dof_pos = tensor(robot.default_dof_pos)
         self.torque_limits = tensor(robot.torque_limits)
         self._lowest_torques = -self.torque_limits
-        self.torques = torch.zeros(num_envs, robot.num_dof, device=device)
+        self.torques = torques
         """(N, D) torques of the last physics step [N m]."""
         self._target = torch.zeros_like(self.torques)  # joint angles, velocities or torques
         self._last_dof_vel = torch.zeros_like(self.torques)
@@ -62,7 +64,7 @@ class Control:
             masked_set_(self._last_dof_vel, mask, 0.0)
 
 
-def control_gains(robot: Robot, cfg: ControlConfig) -> tuple[object, object]:
+def control_gains(robot: Robot, cfg: ControlConfig) -> tuple[np.ndarray, np.ndarray]:
     """(D,) stiffness and damping of a task: its own tables where it has them, else the robot's."""
     stiffness = robot.gains(cfg.stiffness or robot.file.stiffness, "control.stiffness")
     damping = robot.gains(cfg.damping or robot.file.damping, "control.damping")

@@ -51,7 +51,13 @@ class ObservationGroup:
         self.buffer = torch.zeros(sample.shape[0], start, device=sample.device)
         self._scale = torch.cat([term.scale for term in self.terms])
         half = torch.cat([torch.full_like(term.scale, term.noise) for term in self.terms])
-        self._noise = half if bool(half.any()) else None
+        self._noise_width = half * self._scale if bool(half.any()) else None
+        self._noise = torch.zeros_like(self.buffer)
+
+    def draw(self) -> None:
+        """Draw the noise of the next `compute`."""
+        if self._noise_width is not None:
+            self._noise.uniform_(-1.0, 1.0).mul_(self._noise_width)
 
     def compute(self) -> None:
         """Evaluate all terms into the buffer."""
@@ -60,6 +66,5 @@ class ObservationGroup:
             with calling(f"_obs_{term.name}"):
                 values.append(term.function())
         raw = torch.cat(values, dim=1)
-        if self._noise is not None:
-            raw = raw + (2.0 * torch.rand_like(raw) - 1.0) * self._noise
-        torch.clamp(raw * self._scale, -self.clip, self.clip, out=self.buffer)
+        torch.addcmul(self._noise, raw, self._scale, out=self.buffer)
+        self.buffer.clamp_(-self.clip, self.clip)

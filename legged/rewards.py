@@ -18,10 +18,10 @@ class Rewards:
         scales: Mapping[str, float],
         dt: float,
         only_positive: bool,
-        num_envs: int,
-        device: torch.device,
+        total: Tensor,
     ) -> None:
-        """Functions and scales by term; `dt` is the control step [s]."""
+        """Functions and scales by term; `dt` is the control step [s]; sums are written to `total` (N,)."""
+        num_envs, device = len(total), total.device
         self.functions = dict(functions)
         self.names = tuple(functions)
         self.scales = {name: scales[name] * dt for name in self.names}
@@ -31,7 +31,7 @@ class Rewards:
         self._before_clip = torch.tensor(before_clip, device=device).view(len(factors), 1)
         self.only_positive = only_positive
         self.num_envs = num_envs
-        self.total = torch.zeros(num_envs, device=device)
+        self.total = total
         """(N,) reward of the last step."""
         self.sums = torch.zeros(len(self.names), num_envs, device=device)
         """(terms, N) sum of each scaled term over the episode so far."""

@@ -62,7 +62,7 @@ class LeggedRobot(BaseTask):
         self.contact_forces = state.contact_forces
         self.last_dof_vel = torch.zeros_like(self.dof_vel)
 
-        self.control = Control(robot, cfg.control, n, cfg.sim.dt, device)
+        self.control = Control(robot, cfg.control, self.physics.torques, cfg.sim.dt)
         self.torques, self.default_dof_pos = self.control.torques, self.control.default_dof_pos
         self.command_sampler = Commands(cfg.commands, n, self.dt, device)
         self.commands, self.is_moving = self.command_sampler.commands, self.command_sampler.is_moving
@@ -87,7 +87,7 @@ class LeggedRobot(BaseTask):
 
         scales = {name: scale for name, scale in cfg.rewards.scales.items() if scale != 0.0}
         terms = {name: getattr(self, f"_reward_{name}") for name in scales}
-        self.rewards = Rewards(terms, scales, self.dt, cfg.rewards.only_positive_rewards, n, device)
+        self.rewards = Rewards(terms, scales, self.dt, cfg.rewards.only_positive_rewards, self.rew_buf)
         self.episode_sums = self.rewards.episode_sums
         self.observation_groups = {"actor": self._group("actor"), "critic": self._group("critic")}
         self.statistics = Statistics(self.rewards.names, cfg.env.episode_length_s, device)
@@ -122,8 +122,10 @@ class LeggedRobot(BaseTask):
         torch.clamp(self._action_input, -clip, clip, out=self.actions)
         self.control.set_actions(self.actions)
         for _ in range(self.cfg.control.decimation):
-            self.physics.set_torques(self.control.compute(self.dof_pos, self.dof_vel))
+            self.control.compute(self.dof_pos, self.dof_vel)
             self.physics.step()
+        with self._beside.fork():
+            self._draw()
         self.physics.refresh()
         self.episode_length_buf.add_(1)
         self.contacts.update(self.contact_forces[:, self.feet_indices])
@@ -131,7 +133,6 @@ class LeggedRobot(BaseTask):
         self.check_termination()
         with self._beside.fork():
             self.track()
-            self._draw()
         self.compute_reward()
         self._beside.join()
         self.reset_idx(self.reset_buf)
@@ -155,7 +156,7 @@ class LeggedRobot(BaseTask):
 
     def compute_reward(self) -> None:
         """Judged on the command that the policy saw, before anything is reset; ended episodes are recorded."""
-        self.rew_buf.copy_(self.rewards.compute(self.valid))
+        self.rewards.compute(self.valid)
         self.statistics.add_episodes(self.reset_buf, self.terminated_buf, self.episode_length_buf, self.rewards.sums)
 
     def track(self) -> None:
@@ -167,12 +168,14 @@ class LeggedRobot(BaseTask):
         self.command_curriculum.write_ranges(self.command_sampler.ranges)
 
     def _draw(self) -> None:
-        """Random numbers for every robot, used by those that are reset, pushed or given a new command."""
+        """Random numbers for every robot, used by those that are reset, pushed or given a new command, and noise."""
         cfg = self.cfg.init_state
         self._reset_dof_pos.uniform_(*cfg.dof_pos_factor).mul_(self.default_dof_pos)
         self._reset_velocity.uniform_(*cfg.base_velocity)
         self.command_sampler.draw()
         self.randomization.draw()
+        for group in self.observation_groups.values():
+            group.draw()
 
     def reset_idx(self, mask: Tensor) -> None:
         """New episodes for the robots in `mask` (N,): joints near the default pose, base at its spawn height, moving."""
@@ -227,12 +230,12 @@ class LeggedRobot(BaseTask):
     def _reward_tracking_lin_vel(self) -> Tensor:
         """Following the commanded horizontal velocity: exp(-|error|^2 / sigma)."""
         error = (self.commands[:, :2] - self.base_lin_vel[:, :2]).square().sum(dim=1)
-        return torch.exp(-error / self.cfg.rewards.tracking_sigma)
+        return torch.exp(error * (-1.0 / self.cfg.rewards.tracking_sigma))
 
     def _reward_tracking_ang_vel(self) -> Tensor:
         """Following the commanded yaw rate: exp(-error^2 / sigma)."""
         error = (self.commands[:, 2] - self.base_ang_vel[:, 2]).square()
-        return torch.exp(-error / self.cfg.rewards.tracking_sigma)
+        return torch.exp(error * (-1.0 / self.cfg.rewards.tracking_sigma))
 
     def _reward_lin_vel_z(self) -> Tensor:
         """Bouncing: squared vertical velocity [m^2/s^2]."""

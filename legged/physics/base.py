@@ -58,20 +58,18 @@ class Physics(ABC):
     state: RobotState
     capturable: bool
     """Whether step, refresh, write_state and push may run inside a CUDA graph capture."""
+    torques: Tensor
+    """(N, D) joint torques [N m]; written by the task before a step, in place, and held until written again."""
     overflowed: Tensor
     """(N,) bool: worlds that lost contacts or constraint rows for want of memory since the last refresh."""
 
     @abstractmethod
     def step(self) -> None:
-        """Advance by dt under the torques set last; dof_pos and dof_vel are live afterwards, the rest after refresh."""
+        """Advance by dt under `torques`; dof_pos and dof_vel are live afterwards, the rest after refresh."""
 
     @abstractmethod
     def refresh(self) -> None:
         """Make all of `state` agree with the engine: kinematics, no dynamics; forces stay those of the last step."""
-
-    @abstractmethod
-    def set_torques(self, torques: Tensor) -> None:
-        """(N, D) joint torques [N m] for the next steps."""
 
     @abstractmethod
     def write_state(
@@ -86,7 +84,7 @@ class Physics(ABC):
     ) -> None:
         """Put the worlds of `mask` (N,) into a state given in the frames of RobotState.
 
-        Clears their contact forces and the solver's warm start; other worlds stay bit-identical.
+        Clears their torques, contact forces and the solver's warm start; other worlds stay bit-identical.
         """
 
     @abstractmethod

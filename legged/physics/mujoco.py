@@ -30,6 +30,7 @@ class MujocoPhysics(Physics):
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.robot = robot
         self.state = allocate_state(num_envs, robot, device)
+        self.torques = torch.zeros(num_envs, robot.num_dof)
         self.overflowed = torch.zeros(num_envs, dtype=torch.bool)
         self.batch = Batch(self.model, num_envs, sim.threads)
         self._qpos = torch.from_numpy(self.batch.bind("qpos"))
@@ -45,6 +46,7 @@ class MujocoPhysics(Physics):
         self.refresh()
 
     def step(self) -> None:
+        self._ctrl.copy_(self.torques)
         self.batch.step()
         self._stepped.fill_(True)
         self._read_joints()
@@ -70,9 +72,6 @@ class MujocoPhysics(Physics):
         self.state.dof_pos.copy_(self._qpos[:, 7:])
         self.state.dof_vel.copy_(self._qvel[:, 6:])
 
-    def set_torques(self, torques: Tensor) -> None:
-        self._ctrl.copy_(torques)
-
     def write_state(
         self,
         mask: Tensor,
@@ -88,7 +87,7 @@ class MujocoPhysics(Physics):
         qvel = torch.cat([quat_rotate(base_quat, base_lin_vel), base_ang_vel, dof_vel], dim=1).to(torch.float64)
         self._qpos.copy_(torch.where(rows, qpos, self._qpos))
         self._qvel.copy_(torch.where(rows, qvel, self._qvel))
-        self._ctrl.masked_fill_(rows, 0.0)
+        self.torques.masked_fill_(rows, 0.0)
         self._warmstart[mask.numpy()] = 0.0
         self._stepped.masked_fill_(mask.view(-1, 1, 1), False)
 

@@ -45,7 +45,7 @@ class MujocoWarpPhysics(Physics):
             self._m.opt.warn_overflow = 0  # counted in refresh instead of printed by each thread
             self._d = mjw.make_data(self.model, nworld=num_envs, nconmax=sim.nconmax, njmax=sim.njmax)
             d = self._d
-            self._qpos, self._qvel, self._ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
+            self._qpos, self._qvel, self.torques = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
             self.state = self._views(allocate_state(num_envs, robot, device))
             self._exchange = Exchange(self._m, d, self.model, robot, self.state, self.overflowed)
         self._forces_read = False
@@ -102,9 +102,6 @@ class MujocoWarpPhysics(Physics):
             if not self._forces_read:  # once a step: a reset in between has cleared its worlds' forces
                 self._exchange.contact_forces()
                 self._forces_read = True
-
-    def set_torques(self, torques: Tensor) -> None:
-        self._ctrl.copy_(torques)
 
     def write_state(
         self,
