@@ -40,9 +40,9 @@ class ForbidHostReads(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         reason = self.READS.get(func)
-        if func in (torch.ops.aten.index.Tensor, torch.ops.aten.index_put_.default, torch.ops.aten.index_put.default):
-            if any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
-                reason = "indexes by a mask, whose size is unknown; use torch.where or masked_fill"
+        indexing = func in (torch.ops.aten.index.Tensor, torch.ops.aten.index_put_.default, torch.ops.aten.index_put.default)
+        if indexing and any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
+            reason = "indexes by a mask, whose size is unknown; use torch.where or masked_fill"
         if reason:
             raise HostReadError(f"{reason}; the step cannot be captured in a CUDA graph (--no-graph runs it eagerly)")
         return func(*args, **(kwargs or {}))

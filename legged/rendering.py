@@ -101,9 +101,9 @@ class Camera:
             matrix = self.data.body(f"{i}/{self.task.robot.file.base}").xmat.reshape(3, 3)
             yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
             turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-            above = bases[i] + [0.0, 0.0, 0.35]
+            above = bases[i] + np.array([0.0, 0.0, 0.35])
             self._arrow(above, turn @ commands[i], COMMANDED)
-            self._arrow(above + [0.0, 0.0, 0.06], turn @ actual[i], ACTUAL)
+            self._arrow(above + np.array([0.0, 0.0, 0.06]), turn @ actual[i], ACTUAL)
         return _write_on(self.renderer.render(), caption)
 
     def _arrow(self, start: np.ndarray, velocity: np.ndarray, colour: tuple[float, ...]) -> None:

@@ -187,9 +187,7 @@ def build(schema: type[T], data: Any, path: str, origins: Origins, source: str) 
     for key, value in data.items():
         dotted = f"{path}.{key}" if path else str(key)
         if key not in fields:
-            raise ConfigError(
-                f"{_origin(dotted, origins, source)}: {dotted}: unknown key '{key}'{suggest(str(key), fields)}"
-            )
+            raise ConfigError(f"{_origin(dotted, origins, source)}: {dotted}: unknown key '{key}'{suggest(str(key), fields)}")
         if dataclasses.is_dataclass(hints[key]):
             values[key] = build(hints[key], value, dotted, origins, source)  # type: ignore[arg-type]
             continue

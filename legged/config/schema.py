@@ -213,9 +213,7 @@ class ObservationsConfig:
     """What the policy sees, with noise."""
     critic: tuple[str, ...] = STATE_TERMS
     """What the value function sees, without noise."""
-    scales: dict[str, float] = field(
-        default_factory=lambda: {"base_lin_vel": 2.0, "base_ang_vel": 0.25, "dof_vel": 0.05}
-    )
+    scales: dict[str, float] = field(default_factory=lambda: {"base_lin_vel": 2.0, "base_ang_vel": 0.25, "dof_vel": 0.05})
     """Term -> factor; 1 where not named. `commands` are scaled like the velocities they ask for."""
     add_noise: bool = True
     """Add uniform noise to the actor's terms."""

@@ -25,9 +25,10 @@ def resolve_physics(name: str, device: torch.device) -> str:
 
 def make_physics(robot: Robot, sim: SimConfig, num_envs: int, device: torch.device) -> Physics:
     """The back-end that `sim.physics` names. Engines are imported here, so that none is needed but the one used."""
-    name = resolve_physics(sim.physics, device)
-    if name == "mujoco_warp":
-        from legged.physics.mujoco_warp import MujocoWarpPhysics as Engine
-    else:
-        from legged.physics.mujoco import MujocoPhysics as Engine
-    return Engine(robot, sim, num_envs, device)
+    if resolve_physics(sim.physics, device) == "mujoco_warp":
+        from legged.physics.mujoco_warp import MujocoWarpPhysics
+
+        return MujocoWarpPhysics(robot, sim, num_envs, device)
+    from legged.physics.mujoco import MujocoPhysics
+
+    return MujocoPhysics(robot, sim, num_envs, device)

@@ -14,9 +14,7 @@ from legged.physics.base import FootChains, RobotState
 from legged.robot import Robot
 
 # Contacts or constraint rows were dropped; the other bits (iteration caps) are no loss.
-LOST = int(
-    mjw.OverflowType.NEFC | mjw.OverflowType.NJMAX_NNZ | mjw.OverflowType.BROADPHASE | mjw.OverflowType.NARROWPHASE
-)
+LOST = int(mjw.OverflowType.NEFC | mjw.OverflowType.NJMAX_NNZ | mjw.OverflowType.BROADPHASE | mjw.OverflowType.NARROWPHASE)
 
 wp.set_module_options({"enable_backward": False})
 

@@ -5,9 +5,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import imageio
+import imageio.v3
 import numpy as np
 import torch
+from PIL import Image
 from rich.console import Console
 from rich.table import Table
 from tensordict import TensorDict
@@ -86,9 +87,7 @@ def default_output(folder: Path) -> Path:
 
 
 @torch.inference_mode()
-def record(
-    task: LeggedRobot, act: Callable[[TensorDict], Tensor], folder: Path | None, gif: bool
-) -> Table:
+def record(task: LeggedRobot, act: Callable[[TensorDict], Tensor], folder: Path | None, gif: bool) -> Table:
     """Let the robots follow the schedule; write play.mp4 (and .gif) to `folder`; returns a table of errors and falls."""
     camera = Camera(task, min(task.num_envs, 9)) if folder else None
     if folder:
@@ -137,8 +136,7 @@ def _caption(task: LeggedRobot) -> list[str]:
     wanted = task.commands[0, :3].tolist()
     actual = [*task.base_lin_vel[:, :2].mean(dim=0).tolist(), float(task.base_ang_vel[:, 2].mean())]
     return [
-        f"{name}  {v[0]:+.2f}  {v[1]:+.2f} m/s  {v[2]:+.2f} rad/s"
-        for name, v in (("commanded", wanted), ("actual", actual))
+        f"{name}  {v[0]:+.2f}  {v[1]:+.2f} m/s  {v[2]:+.2f} rad/s" for name, v in (("commanded", wanted), ("actual", actual))
     ]
 
 
@@ -147,16 +145,16 @@ def _write_video(frames: list[np.ndarray], folder: Path, gif: bool) -> None:
     video = folder / "play.mp4"
     part = folder / "play.part.mp4"
     try:
-        with imageio.get_writer(part, fps=FPS, codec="libx264", quality=7, macro_block_size=2) as writer:  # type: ignore[call-overload]
-            for frame in frames:
-                writer.append_data(frame)
+        imageio.v3.imwrite(part, np.stack(frames), fps=FPS, codec="libx264", quality=7, macro_block_size=2)
     except (ImportError, OSError, ValueError) as error:
         raise ConfigError(f"{video}: cannot write video ({error}); pip install 'imageio[ffmpeg]'") from error
     part.replace(video)
     print(f"video {relative(video)}")
     if gif:
         part = folder / "play.part.gif"
-        small = [frame[::2, ::2] for frame in frames[::2]]
-        imageio.mimsave(part, small, duration=2000.0 / FPS, loop=0, palettesize=64, subrectangles=True)  # type: ignore[call-overload]
+        pictures = [Image.fromarray(frame).resize((480, 270), Image.Resampling.LANCZOS) for frame in frames[:: FPS // 8]]
+        pictures = [picture.quantize(48, dither=Image.Dither.NONE) for picture in pictures]
+        first, *rest = pictures
+        first.save(part, save_all=True, append_images=rest, duration=1000 * (FPS // 8) // FPS, loop=0)
         part.replace(folder / "play.gif")
         print(f"video {relative(folder / 'play.gif')}")

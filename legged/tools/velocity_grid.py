@@ -105,9 +105,11 @@ def summarize(
 
     def per_cell(name: str) -> np.ndarray:
         values = sums.values[name].double().cpu().numpy()
-        return values.reshape(len(cells), grid.robots, -1).sum(axis=1).squeeze(-1) if values.ndim == 1 else values.reshape(
-            len(cells), grid.robots, -1
-        ).sum(axis=1)
+        return (
+            values.reshape(len(cells), grid.robots, -1).sum(axis=1).squeeze(-1)
+            if values.ndim == 1
+            else values.reshape(len(cells), grid.robots, -1).sum(axis=1)
+        )
 
     steps = np.maximum(per_cell("steps"), 1.0)
     lin, ang = np.sqrt(per_cell("lin") / steps), np.sqrt(per_cell("ang") / steps)
@@ -144,7 +146,7 @@ def summarize(
         "rmse_lin": {"mean": float(lin.mean()), "worst": float(lin.max()), "worst_cell": cells[lin.argmax()].tolist()},
         "rmse_ang": {"mean": float(ang.mean()), "worst": float(ang.max()), "worst_cell": cells[ang.argmax()].tolist()},
         "falls": float(falls.mean()),
-        **{name: _number(np.nanmean(values)) if moving.any() else None for name, values in transport.items()},
+        **{name: _number(float(np.nanmean(values))) if moving.any() else None for name, values in transport.items()},
         "gait": rows[reference],
         "cells": rows,
     }
