@@ -13,6 +13,7 @@ from legged.envs import LeggedRobot
 from legged.paths import relative
 from legged.registry import make_task, task_class, task_config
 from legged.rl.arguments import overrides
+from legged.rl.checkpoint import check_fits, read_checkpoint
 from legged.rl.runner import Runner
 from legged.rl.runs import find_checkpoint, find_run, run_config, shipped_policy
 
@@ -51,7 +52,9 @@ def find_policy(args: argparse.Namespace) -> TrainedPolicy:
     cfg = run_config(folder)
     if cfg.task != args.task:
         raise ConfigError(f"--load_run: {relative(folder)} was trained on '{cfg.task}', not on '{args.task}'")
-    return TrainedPolicy(cfg, find_checkpoint(folder, args.checkpoint))
+    checkpoint = find_checkpoint(folder, args.checkpoint)
+    check_fits(checkpoint, read_checkpoint(checkpoint), cfg)
+    return TrainedPolicy(cfg, checkpoint)
 
 
 def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:

@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import os
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from rsl_rl.utils.logger import Logger
 
 from legged.config import ConfigError, TaskConfig
 from legged.envs import BaseTask
-from legged.paths import relative
+from legged.rl.checkpoint import describe_mismatch, observation_layout, read_checkpoint, write_checkpoint
 from legged.rl.display import Display, Progress
 
 
@@ -130,48 +129,35 @@ class Runner(OnPolicyRunner):
         return True
 
     def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
-        """Write a checkpoint with the task's state, beside its final name and then renamed over it."""
+        """Write a checkpoint with the task's state."""
         saved = self.alg.save()
         saved["iter"] = self.current_learning_iteration
-        saved["infos"] = {**(infos or {}), "task": self.env.cfg.task, "task_state": self.env.state_dict()}
-        saved["infos"]["learning_rate"] = self.alg.learning_rate
-        part = f"{path}.part"
-        torch.save(saved, part)
-        os.replace(part, path)
+        saved["infos"] = {
+            **(infos or {}),
+            "task": self.env.cfg.task,
+            "task_state": self.env.state_dict(),
+            "observations": observation_layout(self.env),
+            "learning_rate": self.alg.learning_rate,
+        }
+        write_checkpoint(Path(path), saved)
         self.logger.save_model(path, self.current_learning_iteration)
 
     def load(self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None) -> dict:
         """Restore networks, optimiser, iteration count and the task's state from a checkpoint.
 
         Raises:
-            ConfigError: the file is no checkpoint of this package, or of a network of another size.
+            ConfigError: the file is no checkpoint, or of a network of another size.
         """
-        try:
-            saved = torch.load(path, weights_only=False, map_location=map_location or self.device)
-        except Exception as error:  # torch raises half a dozen kinds for files that are none of its own
-            raise ConfigError(f"{path}: not a checkpoint ({type(error).__name__}: {str(error).splitlines()[0]})") from error
-        if not isinstance(saved, dict) or not {"actor_state_dict", "critic_state_dict", "iter"} <= saved.keys():
-            raise ConfigError(f"{path}: not a checkpoint of rsl-rl (no actor, critic and iteration in it)")
+        saved = read_checkpoint(Path(path), map_location or self.device)
         try:
             self.alg.load(saved, load_cfg, strict)
         except (RuntimeError, ValueError) as error:
-            raise ConfigError(_mismatch(path, saved, self.alg.get_policy().state_dict(), self.env)) from error
+            policy = self.alg.get_policy().state_dict()
+            raise ConfigError(describe_mismatch(Path(path), saved, policy, self.env.cfg.task)) from error
         infos = saved.get("infos") or {}
         # rsl-rl saves the index of the last finished iteration; going on from it would repeat that one.
         self.current_learning_iteration = saved["iter"] + 1
-        if "learning_rate" in infos:
-            self.alg.learning_rate = infos["learning_rate"]
+        self.alg.learning_rate = infos.get("learning_rate", self.alg.learning_rate)
         if "task_state" in infos:
             self.env.load_state_dict(infos["task_state"])
         return infos
-
-
-def _mismatch(path: str, saved: dict[str, Any], wanted: dict[str, Any], env: BaseTask) -> str:
-    """What differs between a checkpoint's network and the task's."""
-    found = saved["actor_state_dict"]
-    inputs = [next((t.shape[1] for t in state.values() if t.dim() == 2), None) for state in (found, wanted)]
-    text = f"{relative(Path(path))}: made for another task than '{env.cfg.task}'"
-    if inputs[0] != inputs[1]:
-        return f"{text}: its policy takes {inputs[0]} observations, the task has {inputs[1]}"
-    shapes = [[tuple(t.shape) for t in state.values() if t.dim() == 2] for state in (found, wanted)]
-    return f"{text}: its policy has layers {shapes[0]}, the task's configuration {shapes[1]}"

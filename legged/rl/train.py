@@ -21,9 +21,10 @@ from legged.rl.arguments import (
     pick_device,
     run_main,
 )
+from legged.rl.checkpoint import check_fits, read_checkpoint
 from legged.rl.display import Display
 from legged.rl.runner import Runner
-from legged.rl.runs import create_run, find_checkpoint, find_run, run_config
+from legged.rl.runs import create_run, find_checkpoint, find_run
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -63,15 +64,9 @@ def _main(argv: list[str] | None) -> int:
         if checkpoint:
             runner.load(str(checkpoint))
             print(f"resumed {relative(checkpoint)} after iteration {runner.current_learning_iteration}", flush=True)
-        done = runner.current_learning_iteration
-        until = cfg.train.runner.max_iterations
-        if done >= until:
-            raise ConfigError(
-                f"--resume: {checkpoint} has finished {done} iterations of {until}; --max_iterations sets a larger total"
-            )
         ready = time.perf_counter()
         stopped_by = stop_on_signals(runner)
-        finished = runner.train(until)
+        finished = runner.train(cfg.train.runner.max_iterations)
     _summary(runner, folder, ready - start, finished)
     return 0 if finished else 128 + stopped_by[0]
 
@@ -92,17 +87,16 @@ def limit_threads() -> None:
 
 
 def _checkpoint(args: argparse.Namespace, cfg: TaskConfig) -> Path:
-    """The checkpoint to go on from; it must be of the same task's observations, which a look at its config tells."""
-    folder = find_run(cfg, args.load_run)
-    checkpoint = find_checkpoint(folder, args.checkpoint)
-    before = run_config(folder)
-    for group in ("actor", "critic"):
-        was, now = getattr(before.observations, group), getattr(cfg.observations, group)
-        if was != now:
-            raise ConfigError(
-                f"{relative(checkpoint)}: made for other observations: observations.{group} was {list(was)}, is {list(now)}"
-            )
-    return checkpoint
+    """The checkpoint to go on from, checked against the configuration before anything is built."""
+    path = find_checkpoint(find_run(cfg, args.load_run), args.checkpoint)
+    saved = read_checkpoint(path)
+    check_fits(path, saved, cfg)
+    done, until = saved["iter"] + 1, cfg.train.runner.max_iterations
+    if done >= until:
+        raise ConfigError(
+            f"--resume: {relative(path)} has finished {done} iterations of {until}; --max_iterations sets a larger total"
+        )
+    return path
 
 
 def stop_on_signals(runner: Runner) -> list[int]:

@@ -1,0 +1,109 @@
+"""Learning curves of runs: `python -m legged.tools.plot logs/anymal_c_flat/<run> [<run> ...] --out curve.png`.
+
+Reads the TensorBoard files; draws tracking error, return and falls over iterations, one line a run, and a time axis
+from the first run's iteration times.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from legged.config import ConfigError
+from legged.paths import relative
+from legged.rl.arguments import run_main
+
+CURVES = (
+    ("Metrics/lin_vel_rmse", "velocity error in training [m/s]", 1.0),
+    ("Metrics/ang_vel_rmse", "yaw rate error in training [rad/s]", 1.0),
+    ("Train/mean_reward", "return of an episode", 1.0),
+    ("Metrics/falls", "episodes that end in a fall [%]", 100.0),
+)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The command; returns its exit code."""
+    return run_main(_main, argv)
+
+
+def _main(argv: list[str] | None) -> int:
+    parser = argparse.ArgumentParser(prog="plot", description=__doc__)
+    parser.add_argument("runs", nargs="+", type=Path, help="run folders")
+    parser.add_argument("--out", type=Path, default=Path("learning_curve.png"), help="PNG file")
+    args = parser.parse_args(argv)
+    draw({run.name: read_scalars(run) for run in args.runs}, args.out)
+    print(f"written: {relative(args.out)}")
+    return 0
+
+
+def read_scalars(run: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Tag -> (iterations, values) of a run folder.
+
+    Raises:
+        ConfigError: it holds no TensorBoard file.
+    """
+    if not list(run.glob("events.out.tfevents.*")):
+        raise ConfigError(f"{run}: holds no TensorBoard file")
+    events = EventAccumulator(str(run), size_guidance={"scalars": 0})
+    events.Reload()
+    found = {}
+    for tag in events.Tags()["scalars"]:
+        entries = events.Scalars(tag)
+        found[tag] = (np.array([e.step for e in entries]), np.array([e.value for e in entries]))
+    return found
+
+
+def smooth(values: np.ndarray, width: int = 9) -> np.ndarray:
+    """Running mean over `width` values, shorter at the ends."""
+    width = min(width, len(values))
+    kernel = np.ones(width)
+    return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
+
+
+def draw(runs: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]], path: Path) -> None:
+    """One panel a curve, one line a run."""
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(2, 2, figsize=(10, 6), layout="constrained")
+    for axis, (tag, label, factor) in zip(axes.flat, CURVES, strict=True):
+        for name, scalars in runs.items():
+            if tag in scalars:
+                steps, values = scalars[tag]
+                axis.plot(steps + 1, smooth(factor * values), label=name, linewidth=1.5)
+        axis.set_xlabel("iteration")
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.3)
+        axis.set_ylim(bottom=min(0.0, axis.get_ylim()[0]))
+        _time_axis(axis, next(iter(runs.values())))
+    axes[0, 0].legend(fontsize="small")
+    part = path.with_name(f".{path.name}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(part, dpi=110, format="png")
+    plt.close(figure)
+    part.replace(path)
+
+
+def _time_axis(axis: Axes, scalars: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
+    """A second axis on top: seconds of training loop at the mean time of an iteration."""
+    if "Perf/collection_time" not in scalars:
+        return
+    per_iteration = float(np.mean(scalars["Perf/collection_time"][1]) + np.mean(scalars["Perf/learning_time"][1]))
+
+    def seconds(iterations: np.ndarray) -> np.ndarray:
+        return iterations * per_iteration
+
+    def iterations(seconds: np.ndarray) -> np.ndarray:
+        return seconds / per_iteration
+
+    top = axis.secondary_xaxis("top", functions=(seconds, iterations))  # type: ignore[arg-type]
+    top.set_xlabel("training loop [s]", fontsize="small")
+    top.tick_params(labelsize="small")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
