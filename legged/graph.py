@@ -20,7 +20,8 @@ def calling(term: str) -> Iterator[None]:
     except TermError:
         raise
     except Exception as error:
-        raise TermError(f"{term}: {error}") from error
+        text = str(error).splitlines()
+        raise TermError(f"{term}: {text[0] if text else type(error).__name__}") from error
 
 
 class HostReadError(RuntimeError):
@@ -44,7 +45,7 @@ class ForbidHostReads(TorchDispatchMode):
         if indexing and any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
             reason = "indexes by a mask, whose size is unknown; use torch.where or masked_fill"
         if reason:
-            raise HostReadError(f"{reason}; the step cannot be captured in a CUDA graph (--no-graph runs it eagerly)")
+            raise HostReadError(f"{reason}, which a CUDA graph cannot hold")
         return func(*args, **(kwargs or {}))
 
 
@@ -96,11 +97,15 @@ class StepGraph:
         self._graph: torch.cuda.CUDAGraph | None = None
         if not enabled:
             return
-        if device.type != "cuda":
-            with ForbidHostReads():
-                function()
-            return
-        self._graph = self._capture(device)
+        try:
+            if device.type != "cuda":
+                with ForbidHostReads():
+                    function()
+                return
+            self._graph = self._capture(device)
+        except Exception as error:
+            error.add_note("The step must fit one CUDA graph; --no-graph (graph=False) runs it eagerly instead.")
+            raise
 
     def _capture(self, device: torch.device) -> "torch.cuda.CUDAGraph":
         import warp as wp
@@ -110,19 +115,24 @@ class StepGraph:
         with torch.cuda.stream(stream):
             for _ in range(self.WARM_UP_STEPS):
                 self._function()
-            with ForbidHostReads():  # a clear error before the driver's
-                self._function()
         torch.cuda.current_stream(device).wait_stream(stream)
         torch.cuda.synchronize(device)
         graph = torch.cuda.CUDAGraph()
-        # Torch owns the capture; Warp is told of it, so that the solver's loop becomes a conditional node.
-        with torch.cuda.graph(graph, stream=stream):
-            warp_stream = wp.stream_from_torch(torch.cuda.current_stream(device))
-            with (
-                wp.ScopedStream(warp_stream, sync_enter=False),
-                wp.ScopedCapture(stream=warp_stream, external=True),
-            ):
-                self._function()
+        failure: Exception | None = None
+        try:
+            # Torch owns the capture; Warp is told of it, so that the solver's loop becomes a conditional node.
+            with torch.cuda.graph(graph, stream=stream):
+                warp_stream = wp.stream_from_torch(torch.cuda.current_stream(device))
+                with wp.ScopedStream(warp_stream, sync_enter=False), wp.ScopedCapture(stream=warp_stream, external=True):
+                    try:
+                        self._function()
+                    except Exception as error:
+                        failure = error
+                        raise
+        except Exception as error:
+            failure = failure or error  # ending a broken capture fails too, with an error that says nothing of the cause
+        if failure is not None:
+            raise failure
         return graph
 
     @property

@@ -8,7 +8,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -49,10 +49,11 @@ def _main(argv: list[str] | None) -> int:
 
 @torch.inference_mode()
 def measure(task: LeggedRobot, steps: int, repeats: int) -> dict[str, float]:
-    """Milliseconds per control step: the task's step, and the physics in it alone, in the same states.
+    """Milliseconds per control step: the task's step, and the physics in it alone.
 
-    Physics alone is `decimation` engine steps of the same model, sensors and states under the torques of the moment;
-    on a GPU it is one graph too.
+    Physics alone is `decimation` engine steps of the same model under the torques of the moment; on a GPU it is one
+    graph too. The two are timed in turns, step by step, so that both meet the states, contacts and clock rates of a
+    rollout: run by itself, physics without a controller or resets would soon simulate heaps of fallen robots.
     """
     begin = time.perf_counter()
     device = torch.device(task.device)
@@ -60,13 +61,9 @@ def measure(task: LeggedRobot, steps: int, repeats: int) -> dict[str, float]:
     for i in range(50):  # robots land and spread over the states of a training
         task.step(actions[i % 32])
     physics_only = _physics_step(task)
-    control, physics = [], []
-    for _ in range(repeats):  # taken in turns, so that a change of clock or load meets both
-        control.append(_time(lambda i: task.step(actions[i % 32]), steps, device))
-        physics.append(_time(lambda i: physics_only(), steps, device))
-        for i in range(10):
-            task.step(actions[i])
-    control_ms, physics_ms = sorted(control)[repeats // 2], sorted(physics)[repeats // 2]
+    turns = (lambda i: task.step(actions[i % 32]), lambda i: physics_only())
+    results = [_time_in_turns(turns, steps, device) for _ in range(repeats)]
+    control_ms, physics_ms = (sorted(times)[repeats // 2] for times in zip(*results, strict=True))
     return {
         "num_envs": task.num_envs,
         "control_step_ms": control_ms,
@@ -92,25 +89,32 @@ def _physics_step(task: LeggedRobot) -> Callable[[], None]:
     return StepGraph(run, torch.device(task.device), enabled=True)
 
 
-def _time(function: Callable[[int], object], steps: int, device: torch.device) -> float:
-    """Mean milliseconds per call. Device events bracket the calls; the host must not wait in between."""
+def _time_in_turns(functions: Sequence[Callable[[int], object]], steps: int, device: torch.device) -> list[float]:
+    """Mean milliseconds per call of each function, called in turns. On a GPU, waiting for the host in between raises."""
+    totals = [0.0] * len(functions)
     if device.type != "cuda":
-        start = time.perf_counter()
         for i in range(steps):
-            function(i)
-        return (time.perf_counter() - start) / steps * 1e3
-    first, last = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+            for k, function in enumerate(functions):
+                start = time.perf_counter()
+                function(i)
+                totals[k] += time.perf_counter() - start
+        return [total / steps * 1e3 for total in totals]
+    events = [[torch.cuda.Event(enable_timing=True) for _ in range(len(functions) + 1)] for _ in range(steps)]
     _synchronize(device)
     torch.cuda.set_sync_debug_mode("error")
     try:
-        first.record()
         for i in range(steps):
-            function(i)
-        last.record()
+            events[i][0].record()
+            for k, function in enumerate(functions):
+                function(i)
+                events[i][k + 1].record()
     finally:
         torch.cuda.set_sync_debug_mode("default")
     _synchronize(device)
-    return first.elapsed_time(last) / steps
+    for marks in events:
+        for k in range(len(functions)):
+            totals[k] += marks[k].elapsed_time(marks[k + 1])
+    return [total / steps for total in totals]
 
 
 def _synchronize(device: torch.device) -> None:
