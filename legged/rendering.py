@@ -72,7 +72,7 @@ class Camera:
         self.options = mujoco.MjvOption()
         self.options.geomgroup[3] = 0  # collision shapes
         self.view = mujoco.MjvCamera()
-        self.view.azimuth, self.view.elevation, self.view.distance = 130.0, -18.0, 2.6 + 1.25 * count**0.5
+        self.view.azimuth, self.view.elevation, self.view.distance = 130.0, -18.0, 2.0 + 1.1 * count**0.5
         columns = int(np.ceil(count**0.5))
         grid = np.array([[-(i // columns), i % columns] for i in range(count)], dtype=float)
         self.offsets = np.zeros((count, 3))
@@ -103,7 +103,7 @@ class Camera:
             turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
             above = bases[i] + np.array([0.0, 0.0, 0.35])
             self._arrow(above, turn @ commands[i], COMMANDED)
-            self._arrow(above + np.array([0.0, 0.0, 0.06]), turn @ actual[i], ACTUAL)
+            self._arrow(above + np.array([0.0, 0.0, 0.09]), turn @ actual[i], ACTUAL)
         return _write_on(self.renderer.render(), caption)
 
     def _arrow(self, start: np.ndarray, velocity: np.ndarray, colour: tuple[float, ...]) -> None:
@@ -116,7 +116,7 @@ class Camera:
         rgba = np.array(colour, dtype=np.float32)
         mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), rgba)
         end = start + 0.6 * np.array([*velocity, 0.0])
-        mujoco.mjv_connector(geom, kind, 0.018, start, end)
+        mujoco.mjv_connector(geom, kind, 0.03, start, end)
         scene.ngeom += 1
 
     def close(self) -> None:

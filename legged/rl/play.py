@@ -152,8 +152,8 @@ def _write_video(frames: list[np.ndarray], folder: Path, gif: bool) -> None:
     print(f"video {relative(video)}")
     if gif:
         part = folder / "play.part.gif"
-        pictures = [Image.fromarray(frame).resize((480, 270), Image.Resampling.LANCZOS) for frame in frames[:: FPS // 8]]
-        pictures = [picture.quantize(48, dither=Image.Dither.NONE) for picture in pictures]
+        pictures = [Image.fromarray(frame).resize((416, 234), Image.Resampling.LANCZOS) for frame in frames[:: FPS // 8]]
+        pictures = [picture.quantize(64, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE) for picture in pictures]
         first, *rest = pictures
         first.save(part, save_all=True, append_images=rest, duration=1000 * (FPS // 8) // FPS, loop=0)
         part.replace(folder / "play.gif")
