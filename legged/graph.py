@@ -37,9 +37,17 @@ class ForbidHostReads(TorchDispatchMode):
         torch.ops.aten._local_scalar_dense.default: "reads a value on the host (.item(), float(tensor), if tensor)",
         torch.ops.aten.nonzero.default: "has a result of unknown size (nonzero, where with one argument)",
         torch.ops.aten.masked_select.default: "has a result of unknown size (masked_select)",
+        torch.ops.aten._unique2.default: "has a result of unknown size (unique)",
+        torch.ops.aten.bincount.default: "has a result of unknown size (bincount)",
+        torch.ops.aten.repeat_interleave.Tensor: "has a result of unknown size (repeat_interleave by a tensor)",
+        torch.ops.aten.equal.default: "reads a value on the host (torch.equal)",
     }
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        with self:  # in inference mode composite operators (item, one-argument where) arrive whole: take them apart
+            result = func.decompose(*args, **(kwargs or {}))
+        if result is not NotImplemented:
+            return result
         reason = self.READS.get(func)
         indexing = func in (torch.ops.aten.index.Tensor, torch.ops.aten.index_put_.default, torch.ops.aten.index_put.default)
         if indexing and any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
@@ -114,6 +122,8 @@ class StepGraph:
         stream.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.stream(stream):
             for _ in range(self.WARM_UP_STEPS):
+                self._function()
+            with ForbidHostReads():  # says what is wrong, where a failed capture only says that something is
                 self._function()
         torch.cuda.current_stream(device).wait_stream(stream)
         torch.cuda.synchronize(device)

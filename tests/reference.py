@@ -1,0 +1,194 @@
+"""What the physics tests share: states to put robots in, a PD law, and single worlds of C MuJoCo as the reference."""
+
+from dataclasses import dataclass, fields, replace
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from legged.config.schema import SimConfig
+from legged.physics import Physics, RobotState
+from legged.physics.scene import build_model
+from legged.robot import Robot
+
+TOUCHING = 0.54982
+"""Base height at which the feet of the default pose end 1 mm above the ground [m]."""
+FIELDS = tuple(field.name for field in fields(RobotState))
+
+
+@dataclass(frozen=True)
+class States:
+    """The arguments of `Physics.write_state`, one row a world."""
+
+    base_pos: Tensor
+    base_quat: Tensor
+    base_lin_vel: Tensor
+    base_ang_vel: Tensor
+    dof_pos: Tensor
+    dof_vel: Tensor
+
+    @classmethod
+    def of(cls, physics: Physics) -> "States":
+        """Where the worlds are now."""
+        return cls(*(getattr(physics.state, field.name).clone() for field in fields(cls)))
+
+    def write(self, physics: Physics, mask: Tensor | None = None) -> None:
+        """Into the worlds of `mask`, by default all; refreshed."""
+        every = torch.ones(physics.num_envs, dtype=torch.bool)
+        physics.write_state(every if mask is None else mask, *(getattr(self, field.name) for field in fields(self)))
+        physics.refresh()
+
+
+def standing(robot: Robot, count: int, height: float = TOUCHING) -> States:
+    """At rest, level, in the default pose."""
+    zeros = torch.zeros(count, 3)
+    pos, quat = zeros.clone(), torch.zeros(count, 4)
+    pos[:, 2], quat[:, 0] = height, 1.0
+    angles = torch.tensor(robot.default_dof_pos, dtype=torch.float32).repeat(count, 1)
+    return States(pos, quat, zeros, zeros, angles, torch.zeros_like(angles))
+
+
+def random_states(robot: Robot, count: int, seed: int) -> States:
+    """Near the ground, tilted by about 10 degrees, any heading, everything moving."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(columns: int, half: float) -> Tensor:
+        return (2.0 * torch.rand(count, columns, generator=generator) - 1.0) * half
+
+    state = standing(robot, count)
+    tilt = torch.cat([torch.ones(count, 1), draw(2, 0.1), torch.zeros(count, 1)], dim=1)
+    yaw = draw(1, torch.pi)[:, 0] / 2.0
+    c, s = torch.cos(yaw), torch.sin(yaw)
+    w, x, y, _ = tilt.unbind(dim=1)
+    quat = torch.stack([c * w, c * x - s * y, c * y + s * x, s * w], dim=1)  # yaw after tilt
+    return States(
+        base_pos=state.base_pos + draw(3, 0.05) + torch.tensor([3.0, -2.0, 0.05]),
+        base_quat=quat / quat.norm(dim=1, keepdim=True),
+        base_lin_vel=draw(3, 0.5),
+        base_ang_vel=draw(3, 0.5),
+        dof_pos=state.dof_pos * (1.0 + draw(robot.num_dof, 0.3)),
+        dof_vel=draw(robot.num_dof, 1.0),
+    )
+
+
+def heaps(robot: Robot, count: int, seed: int) -> States:
+    """A little above the ground in any orientation, legs anywhere: they land on whatever comes first."""
+    generator = torch.Generator().manual_seed(seed)
+    state = random_states(robot, count, seed)
+    quat = torch.randn(count, 4, generator=generator)
+    low, high = torch.tensor([-0.4, -2.5, -2.5]), torch.tensor([0.4, 2.5, 2.5])
+    angles = low + (high - low) * torch.rand(count, robot.num_dof // 3, 3, generator=generator)
+    pos = state.base_pos.clone()
+    pos[:, 2] = 0.8
+    quat = quat / quat.norm(dim=1, keepdim=True)
+    return replace(state, base_pos=pos, base_quat=quat, dof_pos=angles.reshape(count, -1))
+
+
+def pd(angles: Tensor, rates: Tensor, targets: Tensor, stiffness: float = 90.0, damping: float = 4.0) -> Tensor:
+    """Explicit PD torques, clipped at ANYmal C's 80 N m."""
+    return (stiffness * (targets - angles) - damping * rates).clamp(-80.0, 80.0)
+
+
+def snapshot(physics: Physics) -> Tensor:
+    """(N, K) a copy of all of `state`."""
+    return torch.cat([getattr(physics.state, name).reshape(physics.num_envs, -1) for name in FIELDS], dim=1)
+
+
+def bits(tensor: Tensor) -> Tensor:
+    """The bit patterns, by which a NaN equals itself."""
+    return tensor.contiguous().view(torch.int32)
+
+
+def roll(physics: Physics, targets: Tensor, steps: int, stiffness: float = 90.0, damping: float = 4.0) -> Tensor:
+    """(steps, N, K) `state` after each of `steps` steps under PD towards the angles `targets` (N, D)."""
+    states = []
+    for _ in range(steps):
+        physics.torques.copy_(pd(physics.state.dof_pos, physics.state.dof_vel, targets, stiffness, damping))
+        physics.step()
+        physics.refresh()
+        states.append(snapshot(physics))
+    return torch.stack(states)
+
+
+class CWorlds:
+    """One MjData a world, stepped by mj_step: float64, no batching, no code of ours but the model."""
+
+    def __init__(self, robot: Robot, sim: SimConfig, states: States) -> None:
+        self.robot, self.model = robot, build_model(robot, sim)
+        self.shapes = {self.model.geom(name).id: i for i, name in enumerate(robot.contact_names)}
+        self.feet = [self.model.geom(name).id for name in robot.feet_names]
+        self._live = mujoco.MjData(self.model)
+        self.worlds = []
+        for i in range(len(states.base_pos)):
+            data = mujoco.MjData(self.model)
+            data.qpos[:] = torch.cat([states.base_pos[i], states.base_quat[i], states.dof_pos[i]]).numpy()
+            mujoco.mju_rotVecQuat(data.qvel[:3], states.base_lin_vel[i].double().numpy(), data.qpos[3:7])
+            data.qvel[3:] = torch.cat([states.base_ang_vel[i], states.dof_vel[i]]).numpy()
+            self.worlds.append(data)
+
+    def step(self, torques: Tensor) -> None:
+        for data, torque in zip(self.worlds, torques, strict=True):
+            data.ctrl[:] = torque.numpy()
+            mujoco.mj_step(self.model, data)
+
+    def steep_capsules(self) -> np.ndarray:
+        """(N,) whether a capsule steeper than 60 degrees touched the ground in the last step.
+
+        There mujoco-warp turns the friction pyramid another way than C MuJoCo (it gives up aligning it with the
+        capsule; see plane_capsule), so that sliding differs by what the pyramid's orientation makes.
+        """
+        found = []
+        for data in self.worlds:
+            geoms = [int(geom) for contact in data.contact for geom in contact.geom]
+            capsules = [geom for geom in geoms if self.model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE]
+            found.append(any(abs(data.geom_xmat[geom][8]) > 0.86 for geom in capsules))
+        return np.array(found)
+
+    def step_pd(self, targets: Tensor) -> None:
+        """One step under PD on these worlds' own joints."""
+        angles = torch.from_numpy(np.stack([data.qpos[7:] for data in self.worlds]))
+        rates = torch.from_numpy(np.stack([data.qvel[6:] for data in self.worlds]))
+        self.step(pd(angles, rates, targets.double()))
+
+    def observe(self) -> dict[str, np.ndarray]:
+        """All of RobotState."""
+        rows = [self._observe(data) for data in self.worlds]
+        return {name: np.stack([row[name] for row in rows]) for name in FIELDS}
+
+    def _observe(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
+        live = self._live  # after mj_step, data itself holds the kinematics of the state before
+        live.qpos[:], live.qvel[:] = data.qpos, data.qvel
+        mujoco.mj_kinematics(self.model, live)
+        mujoco.mj_comPos(self.model, live)
+        mujoco.mj_comVel(self.model, live)
+        to_base = live.body(self.robot.file.base).xmat.reshape(3, 3).T
+        velocity = np.zeros((len(self.feet), 6))
+        for i, foot in enumerate(self.feet):
+            mujoco.mj_objectVelocity(self.model, live, mujoco.mjtObj.mjOBJ_GEOM, foot, velocity[i], 0)
+        return {
+            "base_pos": data.qpos[:3],
+            "base_quat": data.qpos[3:7],
+            "base_lin_vel": to_base @ live.qvel[:3],
+            "base_lin_vel_w": data.qvel[:3],
+            "base_ang_vel": data.qvel[3:6],
+            "projected_gravity": to_base @ [0.0, 0.0, -1.0],
+            "dof_pos": data.qpos[7:],
+            "dof_vel": data.qvel[6:],
+            "feet_pos": live.geom_xpos[self.feet].copy(),
+            "feet_vel": velocity[:, 3:],
+            "contact_forces": self._contact_forces(data),
+        }
+
+    def _contact_forces(self, data: mujoco.MjData) -> np.ndarray:
+        """What the last step's solver left, summed over each shape's contacts, world frame."""
+        forces = np.zeros((len(self.shapes), 3))
+        wrench = np.zeros(6)
+        for i in range(data.ncon):
+            contact = data.contact[i]
+            mujoco.mj_contactForce(self.model, data, i, wrench)
+            on_second = contact.frame.reshape(3, 3).T @ wrench[:3]
+            for geom, force in ((contact.geom1, -on_second), (contact.geom2, on_second)):
+                if geom in self.shapes:
+                    forces[self.shapes[geom]] += force
+        return forces
