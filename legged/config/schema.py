@@ -35,7 +35,7 @@ class SimConfig:
     dt: float = field(default=0.005, metadata=POSITIVE)
     """Physics step [s]; the control step is `dt * control.decimation`."""
     cone: Literal["pyramidal", "elliptic"] = "pyramidal"
-    """Friction cone. Pyramidal with impratio 10: a standing ANYmal C sinks 1 cm from 2 s to 5 s; elliptic costs twice as much."""
+    """Friction cone. Pyramidal, impratio 10: a standing ANYmal C sinks 1 cm from 2 s to 5 s; elliptic costs twice as much."""
     impratio: float = field(default=10.0, metadata=POSITIVE)
     """Stiffness of friction relative to the normal direction; 1 lets loaded feet creep outward, 100 needs 50 or more
     iterations."""
