@@ -30,7 +30,10 @@ class Commands:
         """(N,) time until the next sample [s]."""
         self.held = torch.zeros(num_envs, dtype=torch.bool, device=device)
         """(N,) robots whose command was given by `hold` and is not sampled."""
+        self.standing = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        """(N,) robots that are asked to stand still, also in heading mode."""
         self._sample = torch.zeros(num_envs, 4, device=device)
+        self._sample_standing = torch.zeros_like(self.standing)
 
     def draw(self) -> None:
         """Draw a new command for every robot, for those that `update` finds due."""
@@ -46,6 +49,7 @@ class Commands:
         standing = chance[:, 1:] < cfg.standing_share
         self._sample[:, :2].copy_(velocity[:, :2].masked_fill(small | standing, 0.0))
         self._sample[:, 2:3].copy_(velocity[:, 2:].masked_fill(standing, 0.0))
+        self._sample_standing.copy_(standing[:, 0])
         self._sample[:, 3].copy_(uniform(*cfg.ranges.heading, (n,), device))
 
     def update(self, reset: Tensor, base_quat: Tensor) -> None:
@@ -53,12 +57,13 @@ class Commands:
         self.time_left.sub_(self.dt)
         due = (reset | (self.time_left <= 0.5 * self.dt)) & ~self.held
         masked_set_(self.commands, due, self._sample)
+        masked_set_(self.standing, due, self._sample_standing)
         masked_set_(self.time_left, due, self.cfg.resampling_time_s)
         if self.cfg.heading_command:
             low, high = self.cfg.ranges.ang_vel_yaw
             error = wrap_to_pi(self.commands[:, 3] - yaw_of(base_quat))
             self.commands[:, 2].copy_(
-                torch.where(self.held, self.commands[:, 2], torch.clamp(HEADING_GAIN * error, low, high))
+                torch.where(self.held | self.standing, self.commands[:, 2], (HEADING_GAIN * error).clamp(low, high))
             )
         torch.gt(self.commands[:, :3].norm(dim=1), MOVING, out=self.is_moving)
 

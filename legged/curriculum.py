@@ -20,10 +20,17 @@ class CommandCurriculum:
         self._full_limit = full_ranges.abs().amax(dim=1)
         self.window_steps = max(1, round(cfg.window_s / dt))
         device = full_ranges.device
-        self.share = torch.full((3,), cfg.start if cfg.enabled else 1.0, device=device)
+        self.share = torch.ones(3, device=device)
         """(3,) share of the full range that is in use."""
         self._sums = torch.zeros(2, 3, device=device)  # velocity reached in the direction asked for, velocity asked for
         self._steps = torch.zeros((), device=device)
+        self.reset()
+
+    def reset(self) -> None:
+        """Go back to the ranges that training starts with."""
+        self.share.fill_(self.cfg.start if self.cfg.enabled else 1.0)
+        self._sums.zero_()
+        self._steps.zero_()
 
     def write_ranges(self, ranges: Tensor) -> None:
         """Put the lowest and highest command of each axis now into `ranges` (3, 2)."""
@@ -56,5 +63,6 @@ class CommandCurriculum:
         return {"share": self.share.clone()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Go on from a saved state."""
-        self.share.copy_(state["share"].to(self.share.device))
+        """Go on from a saved state; a curriculum that is off keeps the full ranges."""
+        if self.cfg.enabled:
+            self.share.copy_(state["share"].to(self.share.device))

@@ -41,6 +41,6 @@ class Randomization:
         if not self.cfg.push_robots:
             return
         self.push_time_left.sub_(self.dt)
-        due = (self.push_time_left <= 0.0) & mask
+        due = (self.push_time_left <= 0.5 * self.dt) & mask
         physics.push(due, self._push_velocity - physics.state.base_lin_vel_w[:, :2])
         masked_set_(self.push_time_left, due, self.cfg.push_interval_s)

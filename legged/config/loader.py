@@ -62,7 +62,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
                 loader.dispose()
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not valid YAML: {error}") from error
     if data is None:
         return {}
@@ -158,8 +158,14 @@ def load_config(
     from_dict(*with_cpu(True), source=name)  # so that a mistake in `cpu:` is found on a GPU machine too
     merged, where = with_cpu(on_cpu)
     for key, value in overrides:
+        _refuse_task(key)
         merge(merged, nest(key, value), "command line", where)
     return from_dict(merged, where, source=name)
+
+
+def _refuse_task(key: str) -> None:
+    if key == "task":
+        raise ConfigError("command line: task: can't be overridden; choose the task with --task")
 
 
 def from_dict(data: Mapping[str, Any], origins: Origins | None = None, source: str = "config") -> TaskConfig:
@@ -172,6 +178,7 @@ def override(cfg: TaskConfig, overrides: Iterable[tuple[str, Any]]) -> TaskConfi
     data = to_dict(cfg)
     origins: Origins = {}
     for key, value in overrides:
+        _refuse_task(key)
         merge(data, nest(key, value), "command line", origins)
     return from_dict(data, origins, source=cfg.task)
 
@@ -192,7 +199,8 @@ def build(schema: type[T], data: Any, path: str, origins: Origins, source: str) 
             values[key] = build(hints[key], value, dotted, origins, source)  # type: ignore[arg-type]
             continue
         checked = _check(hints[key], value, dotted, origins, source)
-        _check_bounds(checked, fields[key].metadata, f"{_origin(dotted, origins, source)}: {dotted}")
+        if fields[key].metadata:
+            _check_bounds(checked, fields[key].metadata, f"{_origin(dotted, origins, source)}: {dotted}")
         if typing.get_origin(hints[key]) is dict:  # maps merge with the schema's default entries
             factory = fields[key].default_factory
             checked = {**(factory() if callable(factory) else {}), **checked}
@@ -261,6 +269,12 @@ def _check(kind: Any, value: Any, path: str, origins: Origins, source: str) -> A
 
 
 def _check_bounds(value: Any, bounds: Mapping[str, float], where: str) -> None:
+    if isinstance(value, tuple):
+        if not value:
+            raise ConfigError(f"{where}: must not be empty")
+        for i, item in enumerate(value):
+            _check_bounds(item, bounds, f"{where}[{i}]")
+        return
     if "min" in bounds and value < bounds["min"]:
         raise ConfigError(f"{where}: must be at least {bounds['min']}, got {value}")
     if "max" in bounds and value > bounds["max"]:

@@ -10,6 +10,8 @@ POSITIVE = {"above": 0}
 AT_LEAST_0 = {"min": 0}
 AT_LEAST_1 = {"min": 1}
 UNIT = {"min": 0, "max": 1}
+NOT_EMPTY = {"items": 1}
+"""For lists: bounds hold for every item, and a list with any bound must not be empty."""
 
 Range = tuple[float, float]
 
@@ -210,9 +212,9 @@ STATE_TERMS = ("base_lin_vel", "base_ang_vel", "projected_gravity", "commands", 
 class ObservationsConfig:
     """Observation groups, made of `_obs_<name>` terms in this order."""
 
-    actor: tuple[str, ...] = STATE_TERMS
+    actor: tuple[str, ...] = field(default=STATE_TERMS, metadata=NOT_EMPTY)
     """What the policy sees, with noise."""
-    critic: tuple[str, ...] = STATE_TERMS
+    critic: tuple[str, ...] = field(default=STATE_TERMS, metadata=NOT_EMPTY)
     """What the value function sees, without noise."""
     scales: dict[str, float] = field(default_factory=lambda: {"base_lin_vel": 2.0, "base_ang_vel": 0.25, "dof_vel": 0.05})
     """Term -> factor; 1 where not named. `commands` are scaled like the velocities they ask for."""
@@ -238,10 +240,10 @@ class ObservationsConfig:
 class PolicyConfig:
     """Networks of actor and critic."""
 
-    actor_hidden_dims: tuple[int, ...] = (512, 256, 128)
-    critic_hidden_dims: tuple[int, ...] = (512, 256, 128)
-    activation: str = "elu"
-    """Name of the activation function, as rsl-rl knows it."""
+    actor_hidden_dims: tuple[int, ...] = field(default=(512, 256, 128), metadata=AT_LEAST_1)
+    critic_hidden_dims: tuple[int, ...] = field(default=(512, 256, 128), metadata=AT_LEAST_1)
+    activation: Literal["elu", "selu", "relu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish"] = "elu"
+    """Activation function, by rsl-rl's names."""
     init_noise_std: float = field(default=1.0, metadata=POSITIVE)
     """Standard deviation of the actions before training."""
     obs_normalization: bool = False

@@ -92,6 +92,8 @@ class LeggedRobot(BaseTask):
         self.observation_groups = {"actor": self._group("actor"), "critic": self._group("critic")}
         self.statistics = Statistics(self.rewards.names, cfg.env.episode_length_s, device)
         self._build_graph(graph)
+        self.command_curriculum.reset()  # the trial steps are no training
+        self.command_curriculum.write_ranges(self.command_sampler.ranges)
 
     @classmethod
     def check(cls, cfg: TaskConfig) -> Robot:
@@ -102,12 +104,18 @@ class LeggedRobot(BaseTask):
             if name not in rewards:
                 where = f"{cfg.task}: rewards.scales.{name}"
                 raise ConfigError(f"{where}: {cls.__name__} has no reward '{name}'{suggest(name, rewards)}")
-        for group, names in {"actor": cfg.observations.actor, "critic": cfg.observations.critic}.items():
-            for name in (*names, *cfg.observations.scales, *cfg.observations.noise):
+        for part in ("actor", "critic", "scales", "noise"):
+            for name in getattr(cfg.observations, part):
                 if name not in terms:
-                    where = f"{cfg.task}: observations.{group}"
+                    where = f"{cfg.task}: observations.{part}"
                     raise ConfigError(f"{where}: {cls.__name__} has no observation '{name}'{suggest(name, terms)}")
         control_gains(robot, cfg.control)
+        if round(cfg.env.episode_length_s / cfg.dt) < 1:
+            raise ConfigError(f"{cfg.task}: env.episode_length_s: shorter than a control step of {cfg.dt} s")
+        samples = cfg.env.num_envs * cfg.train.runner.num_steps_per_env
+        if cfg.train.algorithm.num_mini_batches > samples:
+            where = f"{cfg.task}: train.algorithm.num_mini_batches"
+            raise ConfigError(f"{where}: more than the {samples} samples of an iteration (num_envs * num_steps_per_env)")
         return robot
 
     @classmethod

@@ -58,9 +58,11 @@ def check_fits(path: Path, saved: dict[str, Any], cfg: TaskConfig) -> None:
         shapes = layer_shapes(saved[f"{group}_state_dict"])
         wanted = tuple(getattr(cfg.observations, group))
         if group in layout and tuple(layout[group]) != wanted:
+            known = {term: width for terms in layout.values() for term, width in terms.items()}
+            size = sum(known[term] for term in wanted) if set(wanted) <= set(known) else "other"
             raise ConfigError(
                 f"{relative(path)}: made for other observations: its {group} takes {shapes[0][1]} numbers"
-                f" ({', '.join(layout[group])}), '{cfg.task}' gives {', '.join(wanted)}"
+                f" ({', '.join(layout[group])}), '{cfg.task}' gives {size} ({', '.join(wanted)})"
             )
         if tuple(shape[0] for shape in shapes[:-1]) != tuple(hidden):
             found = [shape[0] for shape in shapes[:-1]]

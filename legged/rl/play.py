@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from PIL import Image
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 from tensordict import TensorDict
 from torch import Tensor
@@ -62,7 +63,7 @@ def _main(argv: list[str] | None) -> int:
     if device.type == "cpu":
         torch.set_num_threads(1)
     policy = find_policy(args)
-    count = args.num_envs or 4
+    count = 4 if args.num_envs is None else args.num_envs
     seconds = sum(duration for duration, _ in SCHEDULE)
     changes = undisturbed(count, seconds) + [c for c in overrides(args) if c[0] != "train.runner.experiment_name"]
     task, runner = restore(policy, [*changes, ("env.num_envs", count)], device, graph=not args.no_graph)
@@ -96,7 +97,7 @@ def record(task: LeggedRobot, act: Callable[[TensorDict], Tensor], folder: Path 
     every = max(1, round(1.0 / (FPS * task.dt)))
     table = Table(title="following commands", title_justify="left")
     for name in ("vx, vy [m/s], yaw [rad/s]", "velocity RMSE", "yaw rate RMSE", "falls"):
-        table.add_column(name, justify="left" if name.startswith("vx") else "right")
+        table.add_column(escape(name), justify="left" if name.startswith("vx") else "right")
     low, high = task.command_sampler.full_ranges.cpu().numpy().T
     task.reset()
     start = time.perf_counter()

@@ -52,9 +52,7 @@ def find_policy(args: argparse.Namespace) -> TrainedPolicy:
     cfg = run_config(folder)
     if cfg.task != args.task:
         raise ConfigError(f"--load_run: {relative(folder)} was trained on '{cfg.task}', not on '{args.task}'")
-    checkpoint = find_checkpoint(folder, args.checkpoint)
-    check_fits(checkpoint, read_checkpoint(checkpoint), cfg)
-    return TrainedPolicy(cfg, checkpoint)
+    return TrainedPolicy(cfg, find_checkpoint(folder, args.checkpoint))
 
 
 def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:
@@ -80,6 +78,7 @@ def restore(
     """
     cfg = override(policy.cfg, changes)
     task_class(cfg.task).check(cfg)
+    check_fits(policy.checkpoint, read_checkpoint(policy.checkpoint), cfg)
     task = make_task(cfg, device, graph)
     runner = Runner(task, None, str(device))
     runner.load(str(policy.checkpoint))

@@ -73,7 +73,7 @@ def find_run(cfg: TaskConfig, load_run: str | None) -> Path:
         ConfigError: there is none.
     """
     parent = experiment_folder(cfg)
-    runs = sorted((p for p in parent.glob("*") if _checkpoints(p)), key=lambda p: p.stat().st_mtime)
+    runs = sorted((p for p in parent.glob("*") if _checkpoints(p)), key=_last_saved)
     if load_run in (None, "-1"):
         if not runs:
             raise ConfigError(f"--load_run: there is no run with a checkpoint in {relative(parent)}; train one first")
@@ -117,6 +117,11 @@ def run_config(folder: Path) -> TaskConfig:
     if not path.is_file():
         raise ConfigError(f"--load_run: {relative(folder)} is no run folder (it has no {CONFIG_FILE})")
     return from_dict(read_yaml(path), source=str(path))
+
+
+def _last_saved(folder: Path) -> float:
+    """When the latest checkpoint of a run was written; evaluations and videos in its folder do not count."""
+    return max(path.stat().st_mtime for path in _checkpoints(folder).values())
 
 
 def _checkpoints(folder: Path) -> dict[int, Path]:

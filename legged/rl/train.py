@@ -91,6 +91,8 @@ def _checkpoint(args: argparse.Namespace, cfg: TaskConfig) -> Path:
     path = find_checkpoint(find_run(cfg, args.load_run), args.checkpoint)
     saved = read_checkpoint(path)
     check_fits(path, saved, cfg)
+    if "optimizer_state_dict" not in saved:
+        raise ConfigError(f"{relative(path)}: holds no optimiser; it can be played, not trained on")
     done, until = saved["iter"] + 1, cfg.train.runner.max_iterations
     if done >= until:
         raise ConfigError(

@@ -50,6 +50,8 @@ def _main(argv: list[str] | None) -> int:
     import_and_check(args)
     if args.robots < 1:
         raise ConfigError(f"--robots: must be at least 1, got {args.robots}")
+    if args.num_envs is not None:
+        raise ConfigError("--num_envs: the grid says how many robots there are; --robots sets those of a cell")
     grid = Grid(axis_values("--vx", args.vx), axis_values("--vy", args.vy), axis_values("--yaw", args.yaw), args.robots)
     device = torch.device("cpu") if args.physics == "mujoco" and args.sim_device is None else pick_device(args.sim_device)
     if device.type == "cpu":
@@ -89,9 +91,10 @@ def axis_values(flag: str, text: str) -> list[float]:
         parts = [float(part) for part in text.split(":")]
     except ValueError:
         parts = []
-    if len(parts) == 1:
+    finite = all(np.isfinite(part) for part in parts)
+    if len(parts) == 1 and finite:
         return parts
-    if len(parts) != 3 or parts[2] <= 0 or parts[1] < parts[0]:
+    if len(parts) != 3 or not finite or parts[2] <= 0 or parts[1] < parts[0]:
         raise ConfigError(f"{flag}: '{text}' is not of the form low:high:step, e.g. {flag}=-1:1:0.5")
     low, high, step = parts
     return [round(float(value), 6) for value in np.arange(low, high + 0.5 * step, step)]
@@ -104,10 +107,12 @@ def print_report(result: dict[str, Any]) -> None:
     for name, justify in (("measure", "left"), ("value", "right"), ("where", "left")):
         table.add_column(name, justify=justify)  # type: ignore[arg-type]
     cells = f"{len(result['cells'])} cells x {result['robots_per_cell']} robots x {result['measured_s']:.0f} s"
-    table.add_row("velocity RMSE, mean", f"{lin['mean']:.3f} m/s", cells)
-    table.add_row("velocity RMSE, worst cell", f"{lin['worst']:.3f} m/s", _command(lin["worst_cell"]))
-    table.add_row("yaw rate RMSE, mean", f"{ang['mean']:.3f} rad/s", "")
-    table.add_row("yaw rate RMSE, worst cell", f"{ang['worst']:.3f} rad/s", _command(ang["worst_cell"]))
+    for name, unit, errors in (("velocity", "m/s", lin), ("yaw rate", "rad/s", ang)):
+        if errors["mean"] is None:
+            table.add_row(f"{name} RMSE", "none", "every robot fell before it was measured")
+            continue
+        table.add_row(f"{name} RMSE, mean", f"{errors['mean']:.3f} {unit}", cells)
+        table.add_row(f"{name} RMSE, worst cell", f"{errors['worst']:.3f} {unit}", _command(errors["worst_cell"]))
     table.add_row("falls", f"{100 * result['falls']:.2f} %", "of the robots, within the hold")
     if result["cost_of_transport"] is not None:
         table.add_row("cost of transport", f"{result['cost_of_transport']:.2f}", "sum |torque * speed| / (weight * speed)")
@@ -133,14 +138,14 @@ def plot(result: dict[str, Any], path: Path) -> None:
     figure, axes = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained")
     panels = (("rmse_lin", 2, "vy", "velocity RMSE [m/s]"), ("rmse_ang", 1, "yaw", "yaw rate RMSE [rad/s]"))
     for axis, (name, over, other, label) in zip(axes, panels, strict=True):
-        values = np.array([cell[name] for cell in result["cells"]]).reshape(shape).mean(axis=over)
+        values = np.nanmean(np.array([cell[name] for cell in result["cells"]], dtype=float).reshape(shape), axis=over)
         image = axis.imshow(values.T, origin="lower", aspect="auto", cmap="viridis_r", vmin=0.0)
         axis.set_xticks(range(shape[0]), [f"{v:g}" for v in grid["vx"]])
         axis.set_yticks(range(len(grid[other])), [f"{v:g}" for v in grid[other]])
         axis.set_xlabel("commanded vx [m/s]")
         axis.set_ylabel(f"commanded {other} [{'m/s' if other == 'vy' else 'rad/s'}]")
         for (i, j), value in np.ndenumerate(values):
-            dark = value > 0.6 * values.max()
+            dark = value > 0.6 * np.nanmax(values)
             axis.text(i, j, f"{value:.2f}", ha="center", va="center", color="white" if dark else "black")
         figure.colorbar(image, ax=axis, label=label)
     figure.suptitle(f"{result['task']} in {result['physics']}, falls {100 * result['falls']:.1f} %")

@@ -111,8 +111,10 @@ def summarize(
             else values.reshape(len(cells), grid.robots, -1).sum(axis=1)
         )
 
-    steps = np.maximum(per_cell("steps"), 1.0)
-    lin, ang = np.sqrt(per_cell("lin") / steps), np.sqrt(per_cell("ang") / steps)
+    counted = per_cell("steps")
+    steps = np.maximum(counted, 1.0)
+    # A cell in which every robot fell before it was measured has no error; 0 would look perfect.
+    lin, ang = (np.where(counted > 0, np.sqrt(per_cell(name) / steps), np.nan) for name in ("lin", "ang"))
     speed = per_cell("speed") / steps
     weight = task.robot.mass * GRAVITY
     moving = speed > SLOWEST
@@ -143,13 +145,21 @@ def summarize(
         "robots_per_cell": grid.robots,
         "hold_s": grid.hold_s,
         "measured_s": measured_s,
-        "rmse_lin": {"mean": float(lin.mean()), "worst": float(lin.max()), "worst_cell": cells[lin.argmax()].tolist()},
-        "rmse_ang": {"mean": float(ang.mean()), "worst": float(ang.max()), "worst_cell": cells[ang.argmax()].tolist()},
+        "rmse_lin": _mean_and_worst(lin, cells),
+        "rmse_ang": _mean_and_worst(ang, cells),
         "falls": float(falls.mean()),
         **{name: _number(float(np.nanmean(values))) if moving.any() else None for name, values in transport.items()},
         "gait": rows[reference],
         "cells": rows,
     }
+
+
+def _mean_and_worst(values: np.ndarray, cells: np.ndarray) -> dict[str, Any]:
+    """Over the cells that have a value; null if none has."""
+    if np.isnan(values).all():
+        return {"mean": None, "worst": None, "worst_cell": None}
+    worst = int(np.nanargmax(values))
+    return {"mean": float(np.nanmean(values)), "worst": float(values[worst]), "worst_cell": cells[worst].tolist()}
 
 
 def _number(value: float) -> float | None:

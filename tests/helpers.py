@@ -1,0 +1,98 @@
+"""What several test files need: small tasks on the C engine, which compiles nothing and is built in 40 ms."""
+
+import contextlib
+import io
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from legged.config import TaskConfig
+from legged.envs import LeggedRobot
+from legged.registry import make_task, task_config
+from legged.rl import train
+
+TASK = "anymal_c_flat"
+JOINTS = 12
+
+# One thread: the tests share their cores with whatever else runs.
+ENGINE = [("sim.physics", "mujoco"), ("sim.threads", 1)]
+
+# Nothing random beside the reset itself.
+CALM = [
+    ("observations.add_noise", False),
+    ("domain_rand.randomize_friction", False),
+    ("domain_rand.randomize_base_mass", False),
+    ("domain_rand.push_robots", False),
+]
+
+TINY_TRAINING = [
+    "sim.physics=mujoco",
+    "sim.threads=1",
+    "train.runner.num_steps_per_env=4",
+    "train.policy.actor_hidden_dims=[8]",
+    "train.policy.critic_hidden_dims=[8]",
+]
+
+
+def small_config(*overrides: tuple[str, Any], num_envs: int = 4) -> TaskConfig:
+    """anymal_c_flat as a machine without a GPU runs it, undisturbed, with a few robots."""
+    return task_config(TASK, [("env.num_envs", num_envs), *ENGINE, *CALM, *overrides], on_cpu=True)
+
+
+def small_task(*overrides: tuple[str, Any], num_envs: int = 4) -> LeggedRobot:
+    """The task of `small_config`."""
+    torch.set_num_threads(1)
+    return make_task(small_config(*overrides, num_envs=num_envs))
+
+
+def zero_actions(task: LeggedRobot) -> torch.Tensor:
+    """The actions that ask for the default pose."""
+    return torch.zeros(task.num_envs, task.num_actions)
+
+
+def tiny_run(*arguments: str, num_envs: int = 8, iterations: int = 2) -> Path:
+    """Train for a moment in the working directory, which the test has moved to its tmp_path; the new run folder."""
+    before = set(run_folders())
+    flags = ["--task", TASK, "--sim_device", "cpu", "--num_envs", str(num_envs), "--max_iterations", str(iterations)]
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(out):
+        code = train.main([*flags, *TINY_TRAINING, *arguments])
+    assert code == 0, out.getvalue()
+    (folder,) = set(run_folders()) - before
+    return folder
+
+
+def run_folders(logs: str = "logs") -> list[Path]:
+    """All run folders below logs/."""
+    return sorted(path for path in Path(logs).glob("*/*") if path.is_dir())
+
+
+def checkpoints(folder: Path) -> list[int]:
+    """Iterations that a run folder has checkpoints of."""
+    names = [re.fullmatch(r"model_(\d+)\.pt", path.name) for path in folder.glob("*.pt")]
+    return sorted(int(match.group(1)) for match in names if match)
+
+
+def call(main: Any, arguments: Sequence[str]) -> int:
+    """The exit code of a command, whether it returns one or argparse ends it."""
+    try:
+        return main(list(arguments))
+    except SystemExit as stop:
+        return int(stop.code or 0)
+
+
+@contextlib.contextmanager
+def kept_global_state() -> Iterator[None]:
+    """Put back what a command changes for its whole process: thread count and signal handlers."""
+    import signal
+
+    threads = torch.get_num_threads()
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)

@@ -1,0 +1,118 @@
+"""Rules about the code itself: how long files are, and which way imports point."""
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+
+import legged
+
+PACKAGE = Path(legged.__file__).parent
+FILES = sorted(PACKAGE.rglob("*.py"))
+LONGEST = 400
+
+
+def name_of(path: Path) -> str:
+    """legged/rl/train.py -> legged.rl.train."""
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports(path: Path) -> set[str]:
+    """Modules that a file imports anywhere in it, functions and annotations included, as dotted names."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return found
+
+
+def uses(path: Path, *modules: str) -> set[str]:
+    """Those of the modules that a file imports, or something inside them."""
+    return {module for module in modules for name in imports(path) if name == module or name.startswith(f"{module}.")}
+
+
+def test_the_rules_are_applied_to_all_of_the_package():
+    names = {name_of(path) for path in FILES}
+    assert {"legged.physics.mujoco_warp", "legged.rl.train", "legged.envs.legged_robot", "legged"} <= names
+    # The parser of imports sees what it should: a lazy import, and a plain one.
+    assert uses(PACKAGE / "graph.py", "warp") == {"warp"}
+    assert uses(PACKAGE / "rl" / "train.py", "legged.rl", "torch", "warp") == {"legged.rl", "torch"}
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_no_file_is_too_long_to_read(path):
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= LONGEST
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_warp_is_known_to_the_physics_and_to_the_graph_only(path):
+    name = name_of(path)
+    if not name.startswith("legged.physics"):
+        assert not uses(path, "mujoco_warp")
+        if name != "legged.graph":
+            assert not uses(path, "warp")
+
+
+LAYERS = {  # what a part of the package must not know
+    "legged.config": [
+        "legged.physics",
+        "legged.envs",
+        "legged.registry",
+        "legged.rl",
+        "legged.tools",
+        "legged.robot",
+        "torch",
+    ],
+    "legged.math": ["legged"],
+    "legged.graph": ["legged"],
+    "legged.robot": ["legged.physics", "legged.envs", "legged.registry", "legged.rl", "legged.tools", "torch"],
+    "legged.physics": ["legged.envs", "legged.registry", "legged.rl", "legged.tools", "legged.rewards", "legged.commands"],
+    **{
+        f"legged.{part}": ["legged.envs", "legged.registry", "legged.rl", "legged.tools", "mujoco"]
+        for part in (
+            "control",
+            "commands",
+            "contacts",
+            "curriculum",
+            "observations",
+            "rewards",
+            "statistics",
+            "randomization",
+        )
+    },
+    "legged.envs": ["legged.registry", "legged.rl", "legged.tools", "mujoco"],
+    "legged.registry": ["legged.rl", "legged.tools"],
+    "legged.rl": ["legged.tools"],
+}
+
+
+@pytest.mark.parametrize("part", LAYERS)
+def test_imports_point_one_way(part):
+    files = [path for path in FILES if name_of(path) == part or name_of(path).startswith(f"{part}.")]
+    assert files, f"there is no {part}"
+    found = {name_of(path): uses(path, *LAYERS[part]) for path in files}
+    assert not {name: modules for name, modules in found.items() if modules}
+
+
+def test_rsl_rl_is_known_to_its_boundary_only():
+    users = {name_of(path) for path in FILES if uses(path, "rsl_rl")}
+    assert users <= {"legged.envs.base_task", "legged.rl.runner"}
+
+
+def test_a_machine_without_a_gpu_imports_no_gpu_engine():
+    """The C engine must not cost the start-up of Warp, nor need it."""
+    import subprocess
+
+    code = (
+        "import sys\n"
+        "from legged.registry import make_task, task_config\n"
+        "task = make_task(task_config('anymal_c_flat', [('env.num_envs', 1), ('sim.threads', 1)], on_cpu=True))\n"
+        "print([name for name in ('warp', 'mujoco_warp') if name in sys.modules])\n"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent, check=False)
+    assert result.stdout.strip() == "[]", result.stdout + result.stderr
