@@ -68,7 +68,7 @@ class Commands:
         torch.gt(self.commands[:, :3].norm(dim=1), MOVING, out=self.is_moving)
 
     def hold(self, commands: Tensor) -> None:
-        """Give all robots fixed commands (N, 3), which are neither sampled nor steered any more."""
+        """Give all robots fixed commands, (N, 3) or one (3,) for all, which are neither sampled nor steered any more."""
         self.commands[:, :3].copy_(commands)
         self.held.fill_(True)
         torch.gt(self.commands[:, :3].norm(dim=1), MOVING, out=self.is_moving)

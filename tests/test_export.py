@@ -123,6 +123,7 @@ def test_an_export_that_computes_something_else_is_refused_by_name(runner, tmp_p
     monkeypatch.setattr(export_module, function, write_another)
     with pytest.raises(ExportError, match=rf"{file}: differs from the policy by"):
         export(runner, tmp_path)
+    assert not list(tmp_path.iterdir()), "a refused export must not look like one that passed"
 
 
 def test_an_export_that_gives_nan_is_refused(runner, tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from legged.commands import Commands
@@ -209,6 +210,13 @@ class LeggedRobot(BaseTask):
             group.compute()
         self.last_actions.copy_(self.actions)
         self.last_dof_vel.copy_(self.dof_vel)
+
+    @torch.inference_mode()
+    def hold_commands(self, commands: Tensor) -> TensorDict:
+        """Ask for fixed vx, vy [m/s], yaw rate [rad/s], (N, 3) or (3,), until told otherwise; returns observations."""
+        self.command_sampler.hold(commands)
+        self._observe()
+        return self.get_observations()
 
     # ---- observations: (N, width) each -------------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ import torch
 
 from legged.envs import LeggedRobot
 from legged.rl.runner import Runner
+from legged.rl.runs import write_text
 
 CHECKED_OBSERVATIONS = 1000
 LARGEST_DIFFERENCE = 1e-4
@@ -34,10 +35,11 @@ def export(runner: Runner, folder: Path) -> dict[str, float]:
     task: LeggedRobot = runner.env  # type: ignore[assignment]
     folder.mkdir(parents=True, exist_ok=True)
     metadata = describe(task)
-    script, network = folder / "policy.pt", folder / "policy.onnx"
     policy = runner.alg.get_policy()
     device = next(policy.parameters()).device
     observations = torch.randn(CHECKED_OBSERVATIONS, task.observation_groups["actor"].buffer.shape[1])
+    # Written beside their names and renamed once they have been read back and agree.
+    script, network = folder / "policy.pt.part", folder / "policy.onnx.part"
     try:
         policy.to("cpu").eval()
         with torch.inference_mode():
@@ -48,14 +50,19 @@ def export(runner: Runner, folder: Path) -> dict[str, float]:
         policy.to(device)
     with torch.inference_mode():
         from_script = torch.jit.load(str(script))(observations).numpy()
-    session = onnxruntime.InferenceSession(str(network), providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(network.read_bytes(), providers=["CPUExecutionProvider"])
     (from_onnx,) = session.run(None, {"obs": observations.numpy()})
-    found = {script.name: from_script, network.name: np.asarray(from_onnx)}
-    differences = {name: float(np.abs(value - wanted).max()) for name, value in found.items()}
-    for name, difference in differences.items():
+    differences = {}
+    for path, found in ((script, from_script), (network, np.asarray(from_onnx))):
+        difference = float(np.abs(found - wanted).max())
         if not difference <= LARGEST_DIFFERENCE:
-            raise ExportError(f"{folder / name}: differs from the policy by {difference:.1e} (allowed: {LARGEST_DIFFERENCE})")
-    _replace(folder / "policy.json", json.dumps(metadata, indent=1).encode())
+            script.unlink()
+            network.unlink()
+            raise ExportError(f"{path.stem}: differs from the policy by {difference:.1e} (allowed: {LARGEST_DIFFERENCE})")
+        differences[path.stem] = difference
+    for path in (script, network):
+        os.replace(path, path.with_suffix(""))
+    write_text(folder / "policy.json", json.dumps(metadata, indent=1))
     return differences
 
 
@@ -89,33 +96,23 @@ def describe(task: LeggedRobot) -> dict[str, Any]:
 
 
 def _write_torchscript(policy: Any, path: Path) -> None:
-    part = path.with_name(path.name + ".part")
-    torch.jit.script(policy.as_jit().to("cpu")).save(str(part))
-    os.replace(part, path)
+    torch.jit.script(policy.as_jit().to("cpu")).save(str(path))
 
 
 def _write_onnx(policy: Any, path: Path, metadata: dict[str, Any]) -> None:
     """rsl-rl's ONNX model with a free batch size and the metadata as JSON strings, one property a key."""
     module = policy.as_onnx(verbose=False).to("cpu").eval()
-    part = path.with_name(path.name + ".part")
     torch.onnx.export(
         module,
         module.get_dummy_inputs(),
-        str(part),
+        str(path),
         opset_version=18,
         input_names=["obs"],
         output_names=["actions"],
         dynamic_axes={"obs": {0: "batch"}, "actions": {0: "batch"}},
         dynamo=False,
     )
-    model = onnx.load(str(part))
+    model = onnx.load(str(path))
     onnx.helper.set_model_props(model, {key: json.dumps(value) for key, value in metadata.items()})
     onnx.checker.check_model(model)
-    part.unlink()
-    _replace(path, model.SerializeToString())
-
-
-def _replace(path: Path, data: bytes) -> None:
-    part = path.with_name(path.name + ".part")
-    part.write_bytes(data)
-    os.replace(part, path)
+    path.write_bytes(model.SerializeToString())

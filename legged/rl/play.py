@@ -104,9 +104,7 @@ def record(task: LeggedRobot, act: Callable[[TensorDict], Tensor], folder: Path 
     for seconds, wanted in SCHEDULE:
         command = np.clip(np.array(wanted), low, high)
         held = torch.tensor(command, dtype=torch.float32, device=task.device)  # type: ignore[arg-type]
-        task.command_sampler.hold(held.expand(task.num_envs, 3))
-        task._observe()
-        observations = task.get_observations()
+        observations = task.hold_commands(held)
         lin, ang, falls, measured = 0.0, 0.0, 0, 0
         steps = round(seconds / task.dt)
         for step in range(steps):

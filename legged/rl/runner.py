@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.utils.logger import Logger
+from torch.utils.tensorboard import SummaryWriter
 
 from legged.config import ConfigError, TaskConfig
 from legged.envs import BaseTask
@@ -57,6 +58,12 @@ class QuietLogger(Logger):
         self.stop_requested = False
         self.loop_s = 0.0
         """Time spent in iterations so far, this process [s]."""
+
+    def stop_logging_writer(self) -> None:
+        """Also end TensorBoard's writer and its thread, which rsl-rl leaves open."""
+        super().stop_logging_writer()
+        if isinstance(self.writer, SummaryWriter):
+            self.writer.close()
 
     def log(self, it: int, start_it: int, total_it: int, collect_time: float, learn_time: float, **kwargs: Any) -> None:
         """Write one iteration, show it, and stop if that was asked for."""

@@ -57,8 +57,8 @@ def code_state() -> str:
     root = Path(__file__).resolve().parent
 
     def git(*args: str) -> str:
-        result = subprocess.run(["git", "-C", str(root), *args], capture_output=True, text=True, check=True)
-        return result.stdout
+        result = subprocess.run(["git", "-C", str(root), *args], capture_output=True, check=True)
+        return result.stdout.decode("utf-8", errors="replace")
 
     try:
         return f"commit {git('rev-parse', 'HEAD')}\n{git('status', '--short')}\n{git('diff', 'HEAD')}"

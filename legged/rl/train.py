@@ -12,6 +12,7 @@ import torch
 from legged.config import ConfigError, TaskConfig, to_yaml
 from legged.envs import LeggedRobot
 from legged.paths import relative
+from legged.physics import resolve_physics
 from legged.registry import make_task, task_config
 from legged.rl.arguments import (
     add_run_arguments,
@@ -49,6 +50,7 @@ def _main(argv: list[str] | None) -> int:
     device = pick_device(args.sim_device)
     rl_device = pick_device(args.rl_device, "--rl_device") if args.rl_device else device
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
+    resolve_physics(cfg.sim.physics, device)
     if args.show:
         print(to_yaml(cfg), end="")
         return 0

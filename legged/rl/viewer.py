@@ -57,9 +57,7 @@ def view(task: LeggedRobot, act: Callable[[TensorDict], Tensor]) -> None:
                 task.reset()
                 keyboard.restart = False
             command = torch.tensor(keyboard.command, device=task.device)  # type: ignore[arg-type]
-            task.command_sampler.hold(command.expand(task.num_envs, 3))
-            task._observe()
-            task.step(act(task.get_observations()))
+            task.step(act(task.hold_commands(command)))
             with window.lock():
                 task.physics.copy_to(0, data)
             window.sync()
