@@ -32,13 +32,18 @@ class Progress:
         """A metric of the task, NaN if it has none."""
         return self.values.get(f"Metrics/{name}", float("nan"))
 
+    def text(self, name: str, spec: str, unit: str, factor: float = 1.0) -> str:
+        """A metric with its unit, a dash while it has no value."""
+        value = factor * self.metric(name)
+        return f"{value:{spec}} {unit}" if value == value else "-"
+
     def line(self) -> str:
         """The iteration on one line."""
         return (
             f"it {self.iteration}/{self.total}  {_time(self.elapsed_s)} < {_time(self.eta_s)}  "
             f"{self.steps_per_s:,.0f} steps/s ({self.collect_s:.2f}+{self.learn_s:.2f} s)  reward {self.reward:.2f}  "
-            f"error {self.metric('lin_vel_rmse'):.3f} m/s {self.metric('ang_vel_rmse'):.3f} rad/s  "
-            f"falls {100 * self.metric('falls'):.1f} %  episode {self.metric('episode_length'):.0f}  "
+            f"error {self.text('lin_vel_rmse', '.3f', 'm/s')} {self.text('ang_vel_rmse', '.3f', 'rad/s')}  "
+            f"falls {self.text('falls', '.1f', '%', 100)}  episode {self.text('episode_length', '.0f', 'steps')}  "
             f"std {self.action_std:.2f}" + self.warnings()
         )
 
@@ -59,10 +64,10 @@ class Progress:
             "steps/s": f"{self.steps_per_s:,.0f}",
             "collect + learn": f"{self.collect_s:.2f} + {self.learn_s:.2f} s",
             "mean return": f"{self.reward:.2f}",
-            "velocity error": f"{self.metric('lin_vel_rmse'):.3f} m/s",
-            "yaw rate error": f"{self.metric('ang_vel_rmse'):.3f} rad/s",
-            "falls": f"{100 * self.metric('falls'):.1f} % of episodes",
-            "episode length": f"{self.metric('episode_length'):.0f} steps",
+            "velocity error": self.text("lin_vel_rmse", ".3f", "m/s"),
+            "yaw rate error": self.text("ang_vel_rmse", ".3f", "rad/s"),
+            "falls": self.text("falls", ".1f", "% of episodes", 100),
+            "episode length": self.text("episode_length", ".0f", "steps"),
             "action std": f"{self.action_std:.2f}",
         }
         known = ("lin_vel_rmse", "ang_vel_rmse", "falls", "episode_length", "non_finite_worlds", "contact_overflows")

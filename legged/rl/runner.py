@@ -58,6 +58,12 @@ class QuietLogger(Logger):
         self.stop_requested = False
         self.loop_s = 0.0
         """Time spent in iterations so far, this process [s]."""
+        self.latest: dict[str, float] = {}
+        """The last value of everything the task logs; an iteration in which no episode ended has no episode means."""
+
+    def _store_code_state(self) -> list[str]:
+        """Nothing: the run folder holds the state of this code already, see runs.code_state."""
+        return []
 
     def stop_logging_writer(self) -> None:
         """Also end TensorBoard's writer and its thread, which rsl-rl leaves open."""
@@ -75,6 +81,7 @@ class QuietLogger(Logger):
         self.ep_extras[:] = [dict(values)] if values else []  # a copy: rsl-rl puts tensors in
         with contextlib.redirect_stdout(io.StringIO()):
             super().log(it, start_it, total_it, collect_time, learn_time, **kwargs)
+        self.latest.update(values)
         self.loop_s += collect_time + learn_time
         if self.display is not None:
             self.display.show(
@@ -88,7 +95,7 @@ class QuietLogger(Logger):
                     learn_s=learn_time,
                     reward=sum(self.rewbuffer) / len(self.rewbuffer) if self.rewbuffer else float("nan"),
                     action_std=float(kwargs["action_std"].detach().mean()),
-                    values=values,
+                    values=dict(self.latest),
                 )
             )
         if self.stop_requested and it + 1 < total_it:
@@ -118,7 +125,6 @@ class Runner(OnPolicyRunner):
             device=device,
             display=display,
         )
-        self.logger.git_status_repos = []  # the run folder holds the state of this code, see runs.code_state
 
     def stop(self) -> None:
         """Ask `learn` to stop after the iteration that is going on."""
