@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.envs import LeggedRobot
+from legged.rendering import display_model
 
 STEP = (0.1, 0.1, 0.2)
 """Change of vx, vy [m/s] and yaw rate [rad/s] by one key press."""
@@ -46,11 +47,17 @@ def view(task: LeggedRobot, act: Callable[[TensorDict], Tensor]) -> None:
     """Show the task's first robot in real time until the window is closed."""
     low, high = task.command_sampler.full_ranges.t().tolist()
     keyboard = Keyboard(low, high)
-    model = task.physics.model  # type: ignore[attr-defined]
+    model = display_model(task.robot, 1, 640, 480)
     data = mujoco.MjData(model)
+    simulated = mujoco.MjData(task.physics.model)  # type: ignore[attr-defined]
     print(HELP)
     task.reset()
-    with mujoco.viewer.launch_passive(model, data, key_callback=keyboard.press) as window:
+    panels = {"show_left_ui": False, "show_right_ui": False}
+    with mujoco.viewer.launch_passive(model, data, key_callback=keyboard.press, **panels) as window:
+        window.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+        window.cam.trackbodyid = model.body(f"0/{task.robot.file.base}").id
+        window.cam.distance, window.cam.azimuth, window.cam.elevation = 2.5, 130.0, -18.0
+        window.opt.geomgroup[3] = 0  # collision shapes
         while window.is_running():
             begin = time.perf_counter()
             if keyboard.restart:
@@ -59,6 +66,8 @@ def view(task: LeggedRobot, act: Callable[[TensorDict], Tensor]) -> None:
             command = torch.tensor(keyboard.command, device=task.device)  # type: ignore[arg-type]
             task.step(act(task.hold_commands(command)))
             with window.lock():
-                task.physics.copy_to(0, data)
+                task.physics.copy_to(0, simulated)
+                data.qpos[:], data.qvel[:] = simulated.qpos, simulated.qvel
+                mujoco.mj_forward(model, data)
             window.sync()
             time.sleep(max(0.0, task.dt - (time.perf_counter() - begin)))
