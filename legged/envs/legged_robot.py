@@ -92,7 +92,8 @@ class LeggedRobot(BaseTask):
         self.episode_sums = self.rewards.episode_sums
         self.observation_groups = {"actor": self._group("actor"), "critic": self._group("critic")}
         self.statistics = Statistics(self.rewards.names, cfg.env.episode_length_s, device)
-        self._build_graph(graph)
+        # A back-end that no graph can hold runs eagerly on a GPU; on the CPU nothing is captured, only checked.
+        self._build_graph(graph and (self.physics.capturable or device.type == "cpu"))
         self.command_curriculum.reset()  # the trial steps are no training
         self.command_curriculum.write_ranges(self.command_sampler.ranges)
 

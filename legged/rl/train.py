@@ -76,7 +76,9 @@ def _main(argv: list[str] | None) -> int:
 def describe(cfg: TaskConfig, device: torch.device, folder: Path) -> str:
     """One line on what is about to run where."""
     if device.type == "cpu":
-        engine = "mujoco-warp on the CPU" if cfg.sim.physics == "mujoco_warp" else "C MuJoCo on all cores"
+        engine = (
+            "mujoco-warp on the CPU" if cfg.sim.physics == "mujoco_warp" else f"C MuJoCo on {cfg.sim.threads or 'all'} cores"
+        )
         where = f"no GPU in use: {engine}, settings of the task's cpu section"
     else:
         where = torch.cuda.get_device_name(device)

@@ -103,11 +103,7 @@ def summarize(
 
     def per_cell(name: str) -> np.ndarray:
         values = sums.values[name].double().cpu().numpy()
-        return (
-            values.reshape(len(cells), grid.robots, -1).sum(axis=1).squeeze(-1)
-            if values.ndim == 1
-            else values.reshape(len(cells), grid.robots, -1).sum(axis=1)
-        )
+        return values.reshape(len(cells), grid.robots, *values.shape[1:]).sum(axis=1)
 
     counted = per_cell("steps")
     steps = np.maximum(counted, 1.0)
