@@ -30,6 +30,8 @@ class Commands:
         """(N,) time until the next sample [s]."""
         self.held = torch.zeros(num_envs, dtype=torch.bool, device=device)
         """(N,) robots whose command was given by `hold` and is not sampled."""
+        self.steered = torch.ones(num_envs, dtype=torch.bool, device=device)
+        """(N,) robots whose yaw rate follows from their heading, in heading mode."""
         self.standing = torch.zeros(num_envs, dtype=torch.bool, device=device)
         """(N,) robots that are asked to stand still, also in heading mode."""
         self._sample = torch.zeros(num_envs, 4, device=device)
@@ -62,13 +64,18 @@ class Commands:
         if self.cfg.heading_command:
             low, high = self.cfg.ranges.ang_vel_yaw
             error = wrap_to_pi(self.commands[:, 3] - yaw_of(base_quat))
-            self.commands[:, 2].copy_(
-                torch.where(self.held | self.standing, self.commands[:, 2], (HEADING_GAIN * error).clamp(low, high))
-            )
+            steered = self.steered & ~self.standing
+            self.commands[:, 2].copy_(torch.where(steered, (HEADING_GAIN * error).clamp(low, high), self.commands[:, 2]))
         torch.gt(self.commands[:, :3].norm(dim=1), MOVING, out=self.is_moving)
 
-    def hold(self, commands: Tensor) -> None:
-        """Give all robots fixed commands, (N, 3) or one (3,) for all, which are neither sampled nor steered any more."""
+    def hold(self, commands: Tensor, heading: Tensor | None = None) -> None:
+        """Give all robots fixed commands, (N, 3) or one (3,) for all, which are not sampled any more. With `heading` (N,)
+        [rad] and in heading mode, their yaw rate goes on steering them towards it.
+        """
         self.commands[:, :3].copy_(commands)
         self.held.fill_(True)
+        self.standing.fill_(False)
+        self.steered.fill_(heading is not None)
+        if heading is not None:
+            self.commands[:, 3].copy_(heading)
         torch.gt(self.commands[:, :3].norm(dim=1), MOVING, out=self.is_moving)

@@ -16,6 +16,11 @@ NOT_EMPTY = {"items": 1}
 Range = tuple[float, float]
 
 
+def _lattice(low: float, high: float, step: float = 0.1) -> tuple[float, ...]:
+    """low, low + step, ... high."""
+    return tuple(round(low + step * i, 6) for i in range(round((high - low) / step) + 1))
+
+
 @dataclass(frozen=True)
 class EnvConfig:
     """Size and length of the simulated batch."""
@@ -49,16 +54,51 @@ class SimConfig:
     """Contacts (and candidate pairs) allocated per robot in mujoco_warp, in a pool all robots share."""
     njmax: int = field(default=96, metadata=AT_LEAST_1)
     """Constraint rows allocated per robot in mujoco_warp: 4 a contact in the pyramidal cone, 1 a joint limit."""
+    self_collisions: bool = False
+    """Let the robot's shapes touch each other, except those of neighbouring bodies."""
+    terrain_collider: Literal["cells", "convex"] = "cells"
+    """How mujoco_warp meets a height map: `cells`, our own kernel with vertical faces; `convex`, its general collider on
+    one height field, three times slower and with ramps for steps, for shapes that `cells` does not know."""
     threads: int = field(default=0, metadata=AT_LEAST_0)
     """Threads of the C engine; 0 takes all cores."""
 
 
 @dataclass(frozen=True)
 class TerrainConfig:
-    """The ground."""
+    """The ground: a plane, or tiles of several types in rows of growing difficulty."""
 
-    mesh_type: Literal["plane"] = "plane"
-    """Kind of ground: an infinite horizontal plane."""
+    mesh_type: Literal["plane", "height_map"] = "plane"
+    """An infinite horizontal plane, or a height map of num_rows x num_cols tiles."""
+    curriculum: bool = True
+    """Robots move to harder rows while they succeed; otherwise all rows are hard, and robots stay where they are."""
+    proportions: dict[str, float] = field(default_factory=dict)
+    """Terrain type -> share of the columns; sums to 1. Types: legged/terrain/generators.py, TERRAIN_TYPES."""
+    num_rows: int = field(default=10, metadata=AT_LEAST_1)
+    """Levels of difficulty: row / num_rows."""
+    num_cols: int = field(default=20, metadata=AT_LEAST_1)
+    """Columns, each of one type."""
+    terrain_length: float = field(default=8.0, metadata=POSITIVE)
+    """Extent of a tile along x [m]."""
+    terrain_width: float = field(default=8.0, metadata=POSITIVE)
+    """Extent of a tile along y [m]."""
+    border_size: float = field(default=25.0, metadata=AT_LEAST_0)
+    """Width of the level ground around all tiles [m]."""
+    horizontal_scale: float = field(default=0.1, metadata=POSITIVE)
+    """Edge of a cell of the height map [m]."""
+    slope_threshold: float = field(default=0.2, metadata=AT_LEAST_0)
+    """On types made of steps, a difference between cells steeper than this (rise over run) is a vertical face."""
+    max_init_terrain_level: int = field(default=5, metadata=AT_LEAST_0)
+    """Highest row in which robots start training."""
+    spawn_range: float = field(default=1.0, metadata=AT_LEAST_0)
+    """Robots start at most this far from the middle of their tile, in x and in y [m]."""
+    measured_points_x: tuple[float, ...] = field(
+        default=tuple(round(0.1 * i - 0.8, 1) for i in range(17)), metadata=NOT_EMPTY
+    )
+    """Where heights are measured, forward of the base [m]."""
+    measured_points_y: tuple[float, ...] = field(
+        default=tuple(round(0.1 * i - 0.5, 1) for i in range(11)), metadata=NOT_EMPTY
+    )
+    """And to its left [m]."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +155,8 @@ class InitStateConfig:
 
     dof_pos_factor: Range = (0.5, 1.5)
     """Joint angles are the default ones times a number drawn from this range, per joint."""
+    yaw: Range = (0.0, 0.0)
+    """Heading of the base [rad]."""
     base_velocity: Range = (-0.5, 0.5)
     """Range of each component of the base's linear [m/s] and angular [rad/s] velocity."""
 
@@ -214,9 +256,13 @@ class ObservationsConfig:
 
     actor: tuple[str, ...] = field(default=STATE_TERMS, metadata=NOT_EMPTY)
     """What the policy sees, with noise."""
+    actor_history: int = field(default=1, metadata=AT_LEAST_1)
+    """Steps of the actor's terms that the policy sees side by side, oldest first; a new episode repeats its first."""
     critic: tuple[str, ...] = field(default=STATE_TERMS, metadata=NOT_EMPTY)
     """What the value function sees, without noise."""
-    scales: dict[str, float] = field(default_factory=lambda: {"base_lin_vel": 2.0, "base_ang_vel": 0.25, "dof_vel": 0.05})
+    scales: dict[str, float] = field(
+        default_factory=lambda: {"base_lin_vel": 2.0, "base_ang_vel": 0.25, "dof_vel": 0.05, "heights": 5.0}
+    )
     """Term -> factor; 1 where not named. `commands` are scaled like the velocities they ask for."""
     add_noise: bool = True
     """Add uniform noise to the actor's terms."""
@@ -229,6 +275,7 @@ class ObservationsConfig:
             "projected_gravity": 0.05,
             "dof_pos": 0.01,
             "dof_vel": 1.5,
+            "heights": 0.1,
         }
     )
     """Term -> half width of its uniform noise, in the term's unit before scaling."""

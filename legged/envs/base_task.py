@@ -88,10 +88,14 @@ class BaseTask(VecEnv):
     def _observe(self) -> None:
         """Bring state, commands and observations up to date after a reset."""
 
+    def reset_curricula(self) -> None:
+        """Go back to where training starts."""
+
     def _build_graph(self, enabled: bool) -> None:
         """Capture the step (on a GPU) or check that it could be (on the CPU), then start all episodes anew."""
         with torch.inference_mode():
             self._graph = StepGraph(self._step, self.device, enabled)  # type: ignore[arg-type]
+            self.reset_curricula()  # the trial steps are no training
         self.reset()
 
     def reset(self) -> TensorDict:

@@ -1,7 +1,4 @@
-"""The legged robot's MDP, top to bottom: one step, terminations, resets, observations, rewards.
-
-Formulas and names are legged_gym's (Rudin et al., arXiv 2109.11978); where it differs, the docstring says so.
-"""
+"""The legged robot's MDP, top to bottom: one step, terminations, resets. Observation and reward terms are in terms.py."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,6 +14,7 @@ from legged.contacts import FeetContacts
 from legged.control import Control, control_gains
 from legged.curriculum import CommandCurriculum
 from legged.envs.base_task import BaseTask
+from legged.envs.terms import Terms
 from legged.graph import Branch
 from legged.math import masked_set_
 from legged.observations import ObservationGroup
@@ -25,14 +23,15 @@ from legged.randomization import Randomization
 from legged.rewards import Rewards
 from legged.robot import Robot, load_robot
 from legged.statistics import Statistics
+from legged.terrain import Terrain, check_terrain
+from legged.terrain.curriculum import TerrainCurriculum
+from legged.terrain.scan import HeightScan
 
 TERMINATION_FORCE = 1.0
 """Contact force on a terminating shape that ends the episode [N]."""
-PENALISED_FORCE = 0.1
-"""Contact force on a penalised shape that counts as a collision [N]."""
 
 
-class LeggedRobot(BaseTask):
+class LeggedRobot(Terms, BaseTask):
     """A legged robot that follows velocity commands. Subclass it and add `_reward_<name>` or `_obs_<name>` methods;
     the configuration names the ones that run. N robots, D joints, F feet, B tracked collision shapes.
     """
@@ -51,7 +50,8 @@ class LeggedRobot(BaseTask):
         torch.manual_seed(cfg.env.seed)
         n = self.num_envs
         self.randomization = Randomization(cfg.domain_rand, n, self.dt, device)
-        self.physics = make_physics(robot, cfg.sim, n, device)
+        self.terrain = self.make_terrain()
+        self.physics = make_physics(robot, cfg.sim, n, device, self.terrain)
         self.randomization.apply(self.physics)
 
         state = self.physics.state
@@ -78,10 +78,18 @@ class LeggedRobot(BaseTask):
         self.termination_indices = torch.tensor(robot.termination_indices, dtype=torch.long, device=device)
         self.dof_vel_limits = torch.tensor(robot.dof_vel_limits, dtype=torch.float32, device=device)
         self.dof_pos_limits = self._soft_limits(robot)
-        self._spawn_pos = torch.zeros_like(self.base_pos)
-        self._spawn_pos[:, 2] = robot.file.spawn_height
-        self._spawn_quat = torch.zeros_like(self.base_quat)
-        self._spawn_quat[:, 0] = 1.0
+        self.height_scan = HeightScan(cfg.terrain, self.terrain, n, device)
+        self.measured_heights = self.height_scan.heights
+        self.terrain_curriculum: TerrainCurriculum | None = None
+        self.env_origins = torch.zeros(n, 3, device=device)
+        """(N, 3) where each robot starts, world frame [m]."""
+        if self.terrain is not None:
+            self.terrain_curriculum = TerrainCurriculum(cfg.terrain, self.terrain, n, device)
+            self.env_origins = self.terrain_curriculum.origins
+        self._spawn_offset = torch.zeros(n, 3, device=device)
+        self._spawn_offset[:, 2] = robot.file.spawn_height
+        self._spawn_quat = torch.zeros(n, 4, device=device)
+        self._spawn_yaw = torch.zeros(n, device=device)
         self._reset_velocity = torch.zeros(2, n, 3, device=device)  # linear, angular
         self._reset_dof_pos, self._reset_dof_vel = (torch.zeros(n, self.num_actions, device=device) for _ in range(2))
         self._beside = Branch(device)
@@ -94,8 +102,11 @@ class LeggedRobot(BaseTask):
         self.statistics = Statistics(self.rewards.names, cfg.env.episode_length_s, device)
         # A back-end that no graph can hold runs eagerly on a GPU; on the CPU nothing is captured, only checked.
         self._build_graph(graph and (self.physics.capturable or device.type == "cpu"))
-        self.command_curriculum.reset()  # the trial steps are no training
-        self.command_curriculum.write_ranges(self.command_sampler.ranges)
+
+    def make_terrain(self) -> Terrain | None:
+        """The ground the configuration asks for; None for a plane. A subclass may return a terrain of its own."""
+        cfg = self.cfg.terrain
+        return None if cfg.mesh_type == "plane" else Terrain.build(cfg, self.cfg.env.seed)
 
     @classmethod
     def check(cls, cfg: TaskConfig) -> Robot:
@@ -112,6 +123,7 @@ class LeggedRobot(BaseTask):
                     where = f"{cfg.task}: observations.{part}"
                     raise ConfigError(f"{where}: {cls.__name__} has no observation '{name}'{suggest(name, terms)}")
         control_gains(robot, cfg.control)
+        check_terrain(cfg.terrain, cfg.task)
         if round(cfg.env.episode_length_s / cfg.dt) < 1:
             raise ConfigError(f"{cfg.task}: env.episode_length_s: shorter than a control step of {cfg.dt} s")
         samples = cfg.env.num_envs * cfg.train.runner.num_steps_per_env
@@ -137,6 +149,7 @@ class LeggedRobot(BaseTask):
         with self._beside.fork():
             self._draw()
         self.physics.refresh()
+        self.height_scan.update(self.base_pos, self.base_quat)
         self.episode_length_buf.add_(1)
         self.contacts.update(self.contact_forces[:, self.feet_indices])
 
@@ -145,6 +158,9 @@ class LeggedRobot(BaseTask):
             self.track()
         self.compute_reward()
         self._beside.join()
+        if self.terrain_curriculum is not None:
+            asked = self.commands[:, :2].norm(dim=1) * self.cfg.env.episode_length_s
+            self.terrain_curriculum.update(self.reset_buf, self.base_pos, asked)
         self.reset_idx(self.reset_buf)
         self.randomization.push(self.physics, ~self.reset_buf)
         self._observe()
@@ -157,11 +173,15 @@ class LeggedRobot(BaseTask):
         force = self.contact_forces[:, self.termination_indices].norm(dim=2)
         failed = (force > TERMINATION_FORCE).any(dim=1) | ~self.valid
         if cfg.min_base_height > 0.0:
-            failed = failed | (self.base_pos[:, 2] < cfg.min_base_height)
+            failed = failed | (self.base_pos[:, 2] - self.height_scan.ground < cfg.min_base_height)
         if cfg.max_tilt > 0.0:
             failed = failed | (torch.acos((-self.projected_gravity[:, 2]).clamp(-1.0, 1.0)) > cfg.max_tilt)
         self.terminated_buf.copy_(failed)
-        self.time_out_buf.copy_((self.episode_length_buf >= self.max_episode_length) & ~failed)
+        over = self.episode_length_buf >= self.max_episode_length
+        if self.terrain is not None:
+            x, y = self.terrain.reach  # a robot that walked off the map is not judged for it
+            over = over | (self.base_pos[:, 0].abs() > x) | (self.base_pos[:, 1].abs() > y)
+        self.time_out_buf.copy_(over & ~failed)
         torch.logical_or(self.terminated_buf, self.time_out_buf, out=self.reset_buf)
 
     def compute_reward(self) -> None:
@@ -182,6 +202,11 @@ class LeggedRobot(BaseTask):
         cfg = self.cfg.init_state
         self._reset_dof_pos.uniform_(*cfg.dof_pos_factor).mul_(self.default_dof_pos)
         self._reset_velocity.uniform_(*cfg.base_velocity)
+        self._spawn_yaw.uniform_(*cfg.yaw)
+        if self.terrain_curriculum is not None:
+            reach = self.cfg.terrain.spawn_range
+            self._spawn_offset[:, :2].uniform_(-reach, reach)
+            self.terrain_curriculum.draw()
         self.command_sampler.draw()
         self.randomization.draw()
         for group in self.observation_groups.values():
@@ -189,9 +214,11 @@ class LeggedRobot(BaseTask):
 
     def reset_idx(self, mask: Tensor) -> None:
         """New episodes for the robots in `mask` (N,): joints near the default pose, base at its spawn height, moving."""
+        torch.cos(0.5 * self._spawn_yaw, out=self._spawn_quat[:, 0])
+        torch.sin(0.5 * self._spawn_yaw, out=self._spawn_quat[:, 3])
         self.physics.write_state(
             mask,
-            base_pos=self._spawn_pos,
+            base_pos=self.env_origins + self._spawn_offset,
             base_quat=self._spawn_quat,
             base_lin_vel=self._reset_velocity[0],
             base_ang_vel=self._reset_velocity[1],
@@ -206,135 +233,25 @@ class LeggedRobot(BaseTask):
 
     def _observe(self) -> None:
         self.physics.refresh()
+        self.height_scan.update(self.base_pos, self.base_quat)
         self.command_sampler.update(self.reset_buf, self.base_quat)
         for group in self.observation_groups.values():
+            group.advance()
             group.compute()
+            group.restart(self.reset_buf)
         self.last_actions.copy_(self.actions)
         self.last_dof_vel.copy_(self.dof_vel)
 
     @torch.inference_mode()
-    def hold_commands(self, commands: Tensor) -> TensorDict:
-        """Ask for fixed vx, vy [m/s], yaw rate [rad/s], (N, 3) or (3,), until told otherwise; returns observations."""
-        self.command_sampler.hold(commands)
-        self._observe()
-        return self.get_observations()
-
-    # ---- observations: (N, width) each -------------------------------------------------------------------------------
-
-    def _obs_base_lin_vel(self) -> Tensor:
-        return self.base_lin_vel
-
-    def _obs_base_ang_vel(self) -> Tensor:
-        return self.base_ang_vel
-
-    def _obs_projected_gravity(self) -> Tensor:
-        return self.projected_gravity
-
-    def _obs_commands(self) -> Tensor:
-        return self.commands[:, :3]
-
-    def _obs_dof_pos(self) -> Tensor:
-        return self.dof_pos - self.default_dof_pos
-
-    def _obs_dof_vel(self) -> Tensor:
-        return self.dof_vel
-
-    def _obs_actions(self) -> Tensor:
-        return self.actions
-
-    # ---- rewards: (N,) each, times scale and control step ------------------------------------------------------------
-
-    def _reward_tracking_lin_vel(self) -> Tensor:
-        """Following the commanded horizontal velocity: exp(-|error|^2 / sigma)."""
-        error = (self.commands[:, :2] - self.base_lin_vel[:, :2]).square().sum(dim=1)
-        return torch.exp(error * (-1.0 / self.cfg.rewards.tracking_sigma))
-
-    def _reward_tracking_ang_vel(self) -> Tensor:
-        """Following the commanded yaw rate: exp(-error^2 / sigma)."""
-        error = (self.commands[:, 2] - self.base_ang_vel[:, 2]).square()
-        return torch.exp(error * (-1.0 / self.cfg.rewards.tracking_sigma))
-
-    def _reward_lin_vel_z(self) -> Tensor:
-        """Bouncing: squared vertical velocity [m^2/s^2]."""
-        return self.base_lin_vel[:, 2].square()
-
-    def _reward_ang_vel_xy(self) -> Tensor:
-        """Rolling and pitching: squared rates [rad^2/s^2]."""
-        return self.base_ang_vel[:, :2].square().sum(dim=1)
-
-    def _reward_orientation(self) -> Tensor:
-        """Leaning: squared horizontal part of gravity in the base frame."""
-        return self.projected_gravity[:, :2].square().sum(dim=1)
-
-    def _reward_base_height(self) -> Tensor:
-        """Squared distance from the wanted base height above the ground [m^2]."""
-        return (self.base_pos[:, 2] - self.cfg.rewards.base_height_target).square()
-
-    def _reward_torques(self) -> Tensor:
-        """Squared torques [N^2 m^2]."""
-        return self.torques.square().sum(dim=1)
-
-    def _reward_dof_vel(self) -> Tensor:
-        """Squared joint velocities [rad^2/s^2]."""
-        return self.dof_vel.square().sum(dim=1)
-
-    def _reward_dof_acc(self) -> Tensor:
-        """Squared joint accelerations over a control step [rad^2/s^4]."""
-        return ((self.last_dof_vel - self.dof_vel) / self.dt).square().sum(dim=1)
-
-    def _reward_action_rate(self) -> Tensor:
-        """Squared change of the actions."""
-        return (self.last_actions - self.actions).square().sum(dim=1)
-
-    def _reward_collision(self) -> Tensor:
-        """Number of penalised shapes that touch something."""
-        return (self.contact_forces[:, self.penalised_indices].norm(dim=2) > PENALISED_FORCE).sum(dim=1).float()
-
-    def _reward_termination(self) -> Tensor:
-        """Failing; added after the clip at zero."""
-        return self.terminated_buf.float()
-
-    def _reward_dof_pos_limits(self) -> Tensor:
-        """How far joints are outside their soft limits [rad]."""
-        low, high = self.dof_pos_limits[:, 0], self.dof_pos_limits[:, 1]
-        return ((low - self.dof_pos).clamp(min=0.0) + (self.dof_pos - high).clamp(min=0.0)).sum(dim=1)
-
-    def _reward_dof_vel_limits(self) -> Tensor:
-        """How far joint speeds exceed their soft limits, at most 1 rad/s a joint [rad/s]."""
-        limit = self.dof_vel_limits * self.cfg.rewards.soft_dof_vel_limit
-        return (self.dof_vel.abs() - limit).clamp(0.0, 1.0).sum(dim=1)
-
-    def _reward_torque_limits(self) -> Tensor:
-        """How far torques exceed their soft limits [N m]."""
-        limit = self.control.torque_limits * self.cfg.rewards.soft_torque_limit
-        return (self.torques.abs() - limit).clamp(min=0.0).sum(dim=1)
-
-    def _reward_feet_air_time(self) -> Tensor:
-        """Long swings: air time beyond the target, paid at touch-down while any velocity is commanded [s].
-
-        legged_gym asks for a horizontal command; turning on the spot is then never paid, and not learned.
+    def hold_commands(self, commands: Tensor, heading: Tensor | None = None) -> TensorDict:
+        """Ask for fixed vx, vy [m/s], yaw rate [rad/s], (N, 3) or (3,), until told otherwise; returns observations. With
+        `heading` (N,) [rad] and in heading mode, the yaw rate steers towards it instead.
         """
-        swing = self.contacts.last_air_time - self.cfg.rewards.air_time_target_s
-        return (swing * self.contacts.first_contact).sum(dim=1) * self.is_moving
-
-    def _reward_stumble(self) -> Tensor:
-        """A foot hits something vertical: horizontal force above five times the vertical one."""
-        force = self.contact_forces[:, self.feet_indices]
-        return (force[:, :, :2].norm(dim=2) > 5.0 * force[:, :, 2].abs()).any(dim=1).float()
-
-    def _reward_stand_still(self) -> Tensor:
-        """Joint angles away from the default while no motion is commanded [rad]."""
-        return (self.dof_pos - self.default_dof_pos).abs().sum(dim=1) * ~self.is_moving
-
-    def _reward_feet_contact_forces(self) -> Tensor:
-        """Foot forces beyond the allowed [N]."""
-        force = self.contact_forces[:, self.feet_indices].norm(dim=2)
-        return (force - self.cfg.rewards.max_contact_force).clamp(min=0.0).sum(dim=1)
-
-    def _reward_no_fly(self) -> Tensor:
-        """Exactly one foot on the ground, the walk of a biped."""
-        touching = self.contact_forces[:, self.feet_indices, 2] > PENALISED_FORCE
-        return (touching.sum(dim=1) == 1).float()
+        self.command_sampler.hold(commands, heading)
+        for group in self.observation_groups.values():
+            group.compute()
+            group.restart(self.episode_length_buf == 0)
+        return self.get_observations()
 
     # ---- construction and state --------------------------------------------------------------------------------------
 
@@ -348,7 +265,8 @@ class LeggedRobot(BaseTask):
         noisy = name == "actor" and cfg.add_noise
         noise = {term: half * cfg.noise_level for term, half in cfg.noise.items()} if noisy else {}
         functions: dict[str, Callable[[], Tensor]] = {term: getattr(self, f"_obs_{term}") for term in names}
-        return ObservationGroup(functions, scales, noise, cfg.clip)
+        history = cfg.actor_history if name == "actor" else 1
+        return ObservationGroup(functions, scales, noise, cfg.clip, history)
 
     def _soft_limits(self, robot: Robot) -> Tensor:
         """(D, 2) joint limits, shrunk about their middle by `soft_dof_pos_limit` [rad]."""
@@ -358,13 +276,25 @@ class LeggedRobot(BaseTask):
         bounded = torch.cat([middle - soft, middle + soft], dim=1)
         return torch.where(torch.isfinite(bounded), bounded, limits)
 
+    def reset_curricula(self) -> None:
+        self.command_curriculum.reset()
+        self.command_curriculum.write_ranges(self.command_sampler.ranges)
+        if self.terrain_curriculum is not None:
+            self.terrain_curriculum.reset()
+
     def _log(self) -> dict[str, Tensor]:
         ranges = {f"Metrics/{name}": value for name, value in self.command_curriculum.metrics().items()}
-        return {**super()._log(), **ranges}
+        levels = self.terrain_curriculum.metrics() if self.terrain_curriculum is not None else {}
+        return {**super()._log(), **ranges, **levels}
 
     def state_dict(self) -> dict[str, Any]:
-        return {"command_curriculum": self.command_curriculum.state_dict()}
+        state = {"command_curriculum": self.command_curriculum.state_dict()}
+        if self.terrain_curriculum is not None:
+            state["terrain_curriculum"] = self.terrain_curriculum.state_dict()
+        return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.command_curriculum.load_state_dict(state["command_curriculum"])
         self.command_curriculum.write_ranges(self.command_sampler.ranges)
+        if self.terrain_curriculum is not None and "terrain_curriculum" in state:
+            self.terrain_curriculum.load_state_dict(state["terrain_curriculum"])

@@ -6,6 +6,7 @@ from legged.config.loader import ConfigError
 from legged.config.schema import SimConfig
 from legged.physics.base import Physics, RandomizedField, RobotState
 from legged.robot import Robot
+from legged.terrain import Terrain
 
 __all__ = ["Physics", "RandomizedField", "RobotState", "make_physics", "resolve_physics"]
 
@@ -23,12 +24,16 @@ def resolve_physics(name: str, device: torch.device) -> str:
     return name
 
 
-def make_physics(robot: Robot, sim: SimConfig, num_envs: int, device: torch.device) -> Physics:
-    """The back-end that `sim.physics` names. Engines are imported here, so that none is needed but the one used."""
+def make_physics(
+    robot: Robot, sim: SimConfig, num_envs: int, device: torch.device, terrain: Terrain | None = None
+) -> Physics:
+    """The back-end that `sim.physics` names, on a plane or on `terrain`. Engines are imported here, so that none is needed
+    but the one used.
+    """
     if resolve_physics(sim.physics, device) == "mujoco_warp":
         from legged.physics.mujoco_warp import MujocoWarpPhysics
 
-        return MujocoWarpPhysics(robot, sim, num_envs, device)
+        return MujocoWarpPhysics(robot, sim, num_envs, device, terrain)
     from legged.physics.mujoco import MujocoPhysics
 
-    return MujocoPhysics(robot, sim, num_envs, device)
+    return MujocoPhysics(robot, sim, num_envs, device, terrain)

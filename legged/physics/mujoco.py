@@ -11,6 +11,7 @@ from legged.math import quat_rotate, quat_rotate_inverse
 from legged.physics.base import FeetKinematics, Physics, RandomizedField, allocate_state
 from legged.physics.scene import build_model, contact_sensor_columns
 from legged.robot import Robot
+from legged.terrain import Terrain
 
 OVERFLOW = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
 
@@ -20,12 +21,14 @@ class MujocoPhysics(Physics):
 
     capturable = False
 
-    def __init__(self, robot: Robot, sim: SimConfig, num_envs: int, device: torch.device) -> None:
+    def __init__(
+        self, robot: Robot, sim: SimConfig, num_envs: int, device: torch.device, terrain: Terrain | None = None
+    ) -> None:
         """Build the scene and place all robots at the model's initial state; `device` must be the CPU."""
         if device.type != "cpu":
             raise ValueError(f"the mujoco back-end runs on the CPU, not on {device}")
         self.num_envs, self.dt, self.device = num_envs, sim.dt, device
-        self.model = build_model(robot, sim, contact_sensors=True)
+        self.model = build_model(robot, sim, terrain, contact_sensors=True)
         # A world that blows up must stay non-finite until the task sees it; the engine would put it back silently.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.robot = robot

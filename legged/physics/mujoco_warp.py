@@ -16,8 +16,10 @@ from legged.config.schema import SimConfig
 from legged.math import masked_set_
 from legged.physics.base import Physics, RandomizedField, RobotState, allocate_state
 from legged.physics.exchange import Exchange
-from legged.physics.scene import build_model
+from legged.physics.scene import FLOOR, build_model
+from legged.physics.terrain_contact import TerrainContact
 from legged.robot import Robot
+from legged.terrain import Terrain
 
 # Fields of the model that differ per world once friction or mass are drawn, and those that set_const derives from mass.
 PER_WORLD = ("geom_friction", "body_mass", "body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
@@ -33,10 +35,13 @@ class MujocoWarpPhysics(Physics):
 
     capturable = True
 
-    def __init__(self, robot: Robot, sim: SimConfig, num_envs: int, device: torch.device) -> None:
+    def __init__(
+        self, robot: Robot, sim: SimConfig, num_envs: int, device: torch.device, terrain: Terrain | None = None
+    ) -> None:
         """Build the scene on `device` and place all robots at the model's initial state; compiles on first use."""
         self.num_envs, self.dt, self.device = num_envs, sim.dt, device
-        self.model = build_model(robot, sim)
+        cells = terrain is not None and sim.terrain_collider == "cells"
+        self.model = build_model(robot, sim, terrain, "none" if cells else "height_field")
         self.robot = robot
         self.overflowed = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._wp_device = wp.device_from_torch(device)
@@ -44,6 +49,8 @@ class MujocoWarpPhysics(Physics):
             self._m = mjw.put_model(self.model, batch_sizes={name: num_envs for name in PER_WORLD})
             self._m.opt.warn_overflow = 0  # counted in refresh instead of printed by each thread
             self._d = mjw.make_data(self.model, nworld=num_envs, nconmax=sim.nconmax, njmax=sim.njmax)
+            if terrain is not None and cells:
+                TerrainContact(self._m, self._d, self.model, FLOOR, terrain.height_map)
             d = self._d
             self._qpos, self._qvel, self.torques = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
             self.state = self._views(allocate_state(num_envs, robot, device))

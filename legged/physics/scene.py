@@ -1,15 +1,30 @@
 """Robot, ground, sensors and solver options -> one MjModel that every MuJoCo back-end runs."""
 
+from typing import Literal
+
 import mujoco
 
 from legged.config.schema import SimConfig
+from legged.physics.terrain_geoms import add_height_field, add_terrain
 from legged.robot import Robot
+from legged.terrain import Terrain
 
 FLOOR = "floor"
+"""The ground's geom, where it is a plane or stands for a height map that mujoco-warp does not collide with itself."""
+GroundShapes = Literal["exact", "height_field", "none"]
 
 
-def build_model(robot: Robot, sim: SimConfig, contact_sensors: bool = False) -> mujoco.MjModel:
-    """The scene of one world.
+def build_model(
+    robot: Robot,
+    sim: SimConfig,
+    terrain: Terrain | None = None,
+    ground: GroundShapes = "exact",
+    contact_sensors: bool = False,
+) -> mujoco.MjModel:
+    """The scene of one world, on a plane or on `terrain`.
+
+    A terrain is made of height fields and boxes that are exactly its height map (`exact`), of one height field whose
+    steps are ramps (`height_field`), or of a placeholder for a collider of our own (`none`).
 
     The integrator is semi-implicit Euler: with torques from an explicit PD law it needs nothing better, and it is what
     makes a step split exactly into torque and dynamics. With `contact_sensors`, every tracked shape gets a sensor
@@ -24,15 +39,25 @@ def build_model(robot: Robot, sim: SimConfig, contact_sensors: bool = False) -> 
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.iterations = sim.iterations
     option.ls_iterations = sim.ls_iterations
+    if sim.self_collisions:
+        for geom in spec.geoms:
+            if geom.name in robot.contact_names:
+                geom.conaffinity |= geom.contype
     # Contacts with the ground need no condim above the robot's own 3; friction is the robot's (its shapes have priority).
-    spec.worldbody.add_geom(
-        name=FLOOR,
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[0, 0, 1],
-        contype=2,
-        conaffinity=1,
-        group=0,
-    )
+    if terrain is None or ground == "none":
+        touches = terrain is None
+        spec.worldbody.add_geom(
+            name=FLOOR,
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            size=[0, 0, 1],
+            contype=2 if touches else 0,
+            conaffinity=1 if touches else 0,
+            group=0,
+        )
+    elif ground == "height_field":
+        add_height_field(spec, terrain.height_map)
+    else:
+        add_terrain(spec, terrain)
     for name in robot.contact_names if contact_sensors else ():
         spec.add_sensor(
             name=f"contact_{name}",

@@ -26,8 +26,9 @@ class ExportError(RuntimeError):
 def export(runner: Runner, folder: Path) -> dict[str, float]:
     """Write policy.pt (TorchScript) and policy.onnx to `folder`; returns the largest difference of each to the policy.
 
-    Both take one flat observation (batch, width) and give actions (batch, joints), without noise. The metadata is in
-    the ONNX file and beside it in policy.json.
+    Both take one flat observation (batch, width) and give actions (batch, joints), without noise. With a history of H
+    steps, width is H times that of the layout, oldest step first. The metadata is in the ONNX file and beside it in
+    policy.json.
 
     Raises:
         ExportError: a file computes something else.
@@ -82,6 +83,7 @@ def describe(task: LeggedRobot) -> dict[str, Any]:
         "task": cfg.task,
         "robot": robot.name,
         "observation": layout,
+        "observation_history": task.observation_groups["actor"].history,
         "observation_clip": cfg.observations.clip,
         "joint_names": list(robot.joint_names),
         "default_joint_angles": control.default_dof_pos.tolist(),

@@ -1,4 +1,6 @@
-"""Time of a control step, and how much of it is physics: `python -m legged.tools.benchmark --task anymal_c_flat`.
+"""Time of a control step, and how much of it is physics: `python -m legged.tools.benchmark --task anymal_c`.
+
+With `--grounds` the task is timed on a plane, on its terrain met by our collider, and by mujoco-warp's general one.
 
 On a GPU it also proves that the step never waits for the host: the timed steps run under torch's sync debug mode
 "error", which raises at any synchronisation.
@@ -10,13 +12,24 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
+from legged.config import ConfigError, override
 from legged.envs import LeggedRobot
+from legged.physics import resolve_physics
 from legged.registry import make_task, task_config
 from legged.rl.arguments import add_task_arguments, import_and_check, overrides, pick_device, run_main
 from legged.rl.runs import write_text
+
+GROUNDS: dict[str, list[tuple[str, Any]]] = {
+    "plane": [("terrain.mesh_type", "plane")],
+    "terrain, our collider": [("sim.terrain_collider", "cells")],
+    # It needs room for its candidate pairs and for more contacts.
+    "terrain, general collider": [("sim.terrain_collider", "convex"), ("sim.nconmax", 64), ("sim.njmax", 256)],
+}
+"""What --grounds compares."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -29,6 +42,7 @@ def _main(argv: list[str] | None) -> int:
     add_task_arguments(parser)
     parser.add_argument("--steps", type=int, default=200, help="control steps per measurement")
     parser.add_argument("--repeats", type=int, default=5, help="measurements; the median is reported")
+    parser.add_argument("--grounds", action="store_true", help="compare plane, our terrain collider and the general one")
     parser.add_argument("--json", type=Path, help="also write the result to this file")
     args = parser.parse_intermixed_args(argv)
     import_and_check(args)
@@ -36,14 +50,21 @@ def _main(argv: list[str] | None) -> int:
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
     if device.type == "cpu":
         torch.set_num_threads(1)
-    start = time.perf_counter()
-    task = make_task(cfg, device, graph=not args.no_graph)
-    _synchronize(device)
-    result = measure(task, args.steps, args.repeats)
-    result["build_s"] = time.perf_counter() - start - result.pop("measuring_s")
-    print(report(task, result))
+    if args.grounds and resolve_physics(cfg.sim.physics, device) != "mujoco_warp":
+        raise ConfigError("--grounds: compares colliders of mujoco_warp; add sim.physics=mujoco_warp")
+    if args.grounds and cfg.terrain.mesh_type == "plane":
+        raise ConfigError(f"--grounds: the task '{cfg.task}' has no terrain (terrain.mesh_type is plane)")
+    results = {}
+    for name, changes in (GROUNDS if args.grounds else {"": []}).items():
+        start = time.perf_counter()
+        task = make_task(override(cfg, changes), device, graph=not args.no_graph)
+        _synchronize(device)
+        result = measure(task, args.steps, args.repeats)
+        result["build_s"] = time.perf_counter() - start - result.pop("measuring_s")
+        print((f"{name}: " if name else "") + report(task, result), flush=True)
+        results[name] = result
     if args.json:
-        write_text(args.json, json.dumps(result, indent=1))
+        write_text(args.json, json.dumps(results if args.grounds else results[""], indent=1))
     return 0
 
 
@@ -71,6 +92,7 @@ def measure(task: LeggedRobot, steps: int, repeats: int) -> dict[str, float]:
         "ratio": control_ms / physics_ms,
         "env_steps_per_s": task.num_envs / control_ms * 1e3,
         "captured": float(task.captured),
+        "overflows": float(task.statistics.flush()["Metrics/contact_overflows"]),
         "measuring_s": time.perf_counter() - begin,
     }
 
@@ -131,6 +153,7 @@ def report(task: LeggedRobot, result: dict[str, float]) -> str:
         f"{task.cfg.task}, {task.num_envs} robots, {where}, {how}\n"
         f"  control step  {result['control_step_ms']:.3f} ms  ({result['env_steps_per_s']:,.0f} robot steps/s)\n"
         f"  physics alone {result['physics_ms']:.3f} ms  (control step = {result['ratio']:.3f} x physics)\n"
+        f"  steps of a robot that lost contacts for want of memory: {result['overflows']:.0f}\n"
         f"  build, with kernel compilation where not cached: {result['build_s']:.1f} s"
     )
 

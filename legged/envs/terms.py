@@ -1,0 +1,187 @@
+"""Observation and reward terms of a legged robot, and everything they may read.
+
+Formulas and names are legged_gym's (Rudin et al., arXiv 2109.11978); where a term differs, its docstring says so.
+"""
+
+import torch
+from torch import Tensor
+
+from legged.config.schema import TaskConfig
+from legged.contacts import FeetContacts
+from legged.control import Control
+from legged.terrain.scan import HeightScan
+
+PENALISED_FORCE = 0.1
+"""Contact force on a penalised shape that counts as a collision [N]."""
+
+
+class Terms:
+    """The methods `_obs_<name>` and `_reward_<name>` that a configuration can name. N robots, D joints, F feet, B tracked
+    collision shapes; the task allocates what is declared here.
+    """
+
+    cfg: TaskConfig
+    dt: float
+    """Control step [s]."""
+    base_pos: Tensor
+    """(N, 3) base in the world [m]; `base_quat` (N, 4) is its orientation (w, x, y, z)."""
+    base_quat: Tensor
+    base_lin_vel: Tensor
+    """(N, 3) velocity in the base frame [m/s]; `base_ang_vel` (N, 3) [rad/s]."""
+    base_ang_vel: Tensor
+    projected_gravity: Tensor
+    """(N, 3) direction of gravity in the base frame."""
+    dof_pos: Tensor
+    """(N, D) joint angles [rad]; `dof_vel`, and `last_dof_vel` a control step before [rad/s]."""
+    dof_vel: Tensor
+    last_dof_vel: Tensor
+    default_dof_pos: Tensor
+    """(D,) joint angles at action 0 [rad]."""
+    dof_pos_limits: Tensor
+    """(D, 2) soft limits [rad]; `dof_vel_limits` (D,) [rad/s]."""
+    dof_vel_limits: Tensor
+    torques: Tensor
+    """(N, D) [N m]."""
+    actions: Tensor
+    """(N, D) of this step; `last_actions` of the step before."""
+    last_actions: Tensor
+    commands: Tensor
+    """(N, 4) vx, vy [m/s], yaw rate [rad/s], heading [rad]; `is_moving` (N,) whether any velocity is commanded."""
+    is_moving: Tensor
+    feet_pos: Tensor
+    """(N, F, 3) in the world [m]; `feet_vel` (N, F, 3) [m/s]."""
+    feet_vel: Tensor
+    contact_forces: Tensor
+    """(N, B, 3) in the world [N]; `feet_indices` and `penalised_indices` pick among the shapes."""
+    feet_indices: Tensor
+    penalised_indices: Tensor
+    contacts: FeetContacts
+    """Contact and swing times of the feet."""
+    control: Control
+    height_scan: HeightScan
+    """Heights of the ground: `measured_heights` (N, P) around each robot, `.ground` (N,) under it, world frame [m]."""
+    measured_heights: Tensor
+    terminated_buf: Tensor
+    """(N,) the episode ends now in a failure."""
+
+    # ---- observations: (N, width) each -------------------------------------------------------------------------------
+
+    def _obs_base_lin_vel(self) -> Tensor:
+        return self.base_lin_vel
+
+    def _obs_base_ang_vel(self) -> Tensor:
+        return self.base_ang_vel
+
+    def _obs_projected_gravity(self) -> Tensor:
+        return self.projected_gravity
+
+    def _obs_commands(self) -> Tensor:
+        return self.commands[:, :3]
+
+    def _obs_dof_pos(self) -> Tensor:
+        return self.dof_pos - self.default_dof_pos
+
+    def _obs_dof_vel(self) -> Tensor:
+        return self.dof_vel
+
+    def _obs_actions(self) -> Tensor:
+        return self.actions
+
+    def _obs_heights(self) -> Tensor:
+        """The ground around the robot, relative to half a metre below its base and within 1 m of that [m]."""
+        return (self.base_pos[:, 2:3] - 0.5 - self.measured_heights).clamp(-1.0, 1.0)
+
+    # ---- rewards: (N,) each, times scale and control step ------------------------------------------------------------
+
+    def _reward_tracking_lin_vel(self) -> Tensor:
+        """Following the commanded horizontal velocity: exp(-|error|^2 / sigma)."""
+        error = (self.commands[:, :2] - self.base_lin_vel[:, :2]).square().sum(dim=1)
+        return torch.exp(error * (-1.0 / self.cfg.rewards.tracking_sigma))
+
+    def _reward_tracking_ang_vel(self) -> Tensor:
+        """Following the commanded yaw rate: exp(-error^2 / sigma)."""
+        error = (self.commands[:, 2] - self.base_ang_vel[:, 2]).square()
+        return torch.exp(error * (-1.0 / self.cfg.rewards.tracking_sigma))
+
+    def _reward_lin_vel_z(self) -> Tensor:
+        """Bouncing: squared vertical velocity [m^2/s^2]."""
+        return self.base_lin_vel[:, 2].square()
+
+    def _reward_ang_vel_xy(self) -> Tensor:
+        """Rolling and pitching: squared rates [rad^2/s^2]."""
+        return self.base_ang_vel[:, :2].square().sum(dim=1)
+
+    def _reward_orientation(self) -> Tensor:
+        """Leaning: squared horizontal part of gravity in the base frame."""
+        return self.projected_gravity[:, :2].square().sum(dim=1)
+
+    def _reward_base_height(self) -> Tensor:
+        """Squared distance from the wanted base height above the mean of the ground around [m^2]."""
+        height = self.base_pos[:, 2] - self.measured_heights.mean(dim=1)
+        return (height - self.cfg.rewards.base_height_target).square()
+
+    def _reward_torques(self) -> Tensor:
+        """Squared torques [N^2 m^2]."""
+        return self.torques.square().sum(dim=1)
+
+    def _reward_dof_vel(self) -> Tensor:
+        """Squared joint velocities [rad^2/s^2]."""
+        return self.dof_vel.square().sum(dim=1)
+
+    def _reward_dof_acc(self) -> Tensor:
+        """Squared joint accelerations over a control step [rad^2/s^4]."""
+        return ((self.last_dof_vel - self.dof_vel) / self.dt).square().sum(dim=1)
+
+    def _reward_action_rate(self) -> Tensor:
+        """Squared change of the actions."""
+        return (self.last_actions - self.actions).square().sum(dim=1)
+
+    def _reward_collision(self) -> Tensor:
+        """Number of penalised shapes that touch something."""
+        return (self.contact_forces[:, self.penalised_indices].norm(dim=2) > PENALISED_FORCE).sum(dim=1).float()
+
+    def _reward_termination(self) -> Tensor:
+        """Failing; added after the clip at zero."""
+        return self.terminated_buf.float()
+
+    def _reward_dof_pos_limits(self) -> Tensor:
+        """How far joints are outside their soft limits [rad]."""
+        low, high = self.dof_pos_limits[:, 0], self.dof_pos_limits[:, 1]
+        return ((low - self.dof_pos).clamp(min=0.0) + (self.dof_pos - high).clamp(min=0.0)).sum(dim=1)
+
+    def _reward_dof_vel_limits(self) -> Tensor:
+        """How far joint speeds exceed their soft limits, at most 1 rad/s a joint [rad/s]."""
+        limit = self.dof_vel_limits * self.cfg.rewards.soft_dof_vel_limit
+        return (self.dof_vel.abs() - limit).clamp(0.0, 1.0).sum(dim=1)
+
+    def _reward_torque_limits(self) -> Tensor:
+        """How far torques exceed their soft limits [N m]."""
+        limit = self.control.torque_limits * self.cfg.rewards.soft_torque_limit
+        return (self.torques.abs() - limit).clamp(min=0.0).sum(dim=1)
+
+    def _reward_feet_air_time(self) -> Tensor:
+        """Long swings: air time beyond the target, paid at touch-down while any velocity is commanded [s].
+
+        legged_gym asks for a horizontal command; turning on the spot is then never paid, and not learned.
+        """
+        swing = self.contacts.last_air_time - self.cfg.rewards.air_time_target_s
+        return (swing * self.contacts.first_contact).sum(dim=1) * self.is_moving
+
+    def _reward_stumble(self) -> Tensor:
+        """A foot hits something vertical: horizontal force above five times the vertical one."""
+        force = self.contact_forces[:, self.feet_indices]
+        return (force[:, :, :2].norm(dim=2) > 5.0 * force[:, :, 2].abs()).any(dim=1).float()
+
+    def _reward_stand_still(self) -> Tensor:
+        """Joint angles away from the default while no motion is commanded [rad]."""
+        return (self.dof_pos - self.default_dof_pos).abs().sum(dim=1) * ~self.is_moving
+
+    def _reward_feet_contact_forces(self) -> Tensor:
+        """Foot forces beyond the allowed [N]."""
+        force = self.contact_forces[:, self.feet_indices].norm(dim=2)
+        return (force - self.cfg.rewards.max_contact_force).clamp(min=0.0).sum(dim=1)
+
+    def _reward_no_fly(self) -> Tensor:
+        """Exactly one foot on the ground, the walk of a biped."""
+        touching = self.contact_forces[:, self.feet_indices, 2] > PENALISED_FORCE
+        return (touching.sum(dim=1) == 1).float()

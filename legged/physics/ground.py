@@ -1,0 +1,317 @@
+"""A height map on the device, and what of it a sphere or a capsule can touch: Warp functions, geometry only.
+
+A shape is looked at as probes: spheres (a sphere, the ends of a capsule, the corners of a box with radius 0) and what lies
+between the ends of a capsule. Each looks at the few cells under it: the cell's surface below, the vertical faces and
+their rims beside it.
+"""
+
+import numpy as np
+import warp as wp
+
+from legged.terrain import HeightMap
+
+wp.set_module_options({"enable_backward": False})
+
+FACE = wp.constant(1e-4)
+"""Neighbouring surfaces further apart than this are separated by a vertical face [m]."""
+RIDGE = wp.constant(0.02)
+"""Drop in slope (rise over run) across a crease from which on a capsule can rest on it between its ends."""
+SAME = wp.constant(0.999)
+"""Cosine between the normals of neighbouring surfaces above which they count as one."""
+NOTHING = wp.constant(1e6)
+"""Distance of what is not there [m]."""
+
+
+@wp.struct
+class Ground:
+    """A height map on the device."""
+
+    corners: wp.array2d[wp.vec4]
+    """(X, Y) corner heights of each cell: at (0, 0), (1, 0), (0, 1), (1, 1) [m]."""
+    ceiling: wp.array2d[float]
+    """(X, Y) the highest corner within reach of a probe's end."""
+    wide_ceiling: wp.array2d[float]
+    """(X, Y) the highest corner within half the longest capsule."""
+    x: float
+    """World x of the outer corner of cell (0, 0)."""
+    y: float
+    cell: float
+    """Edge of a cell [m]."""
+    reach: int
+    """Cells beyond a probe's own that the largest probe can touch."""
+
+
+@wp.struct
+class Hit:
+    """A possible contact of a sphere around `point`."""
+
+    dist: float
+    """Distance of the point to the ground, not yet less the radius [m]."""
+    normal: wp.vec3
+    point: wp.vec3
+    face: bool
+    """With a vertical face or its rim, not with a surface."""
+
+
+@wp.func
+def cell_of(ground: Ground, x: float, y: float) -> wp.vec2i:
+    """The cell that holds a world point; the nearest one outside the map."""
+    i = wp.int32(wp.floor((x - ground.x) / ground.cell))
+    j = wp.int32(wp.floor((y - ground.y) / ground.cell))
+    i = wp.clamp(i, 0, ground.corners.shape[0] - 1)
+    j = wp.clamp(j, 0, ground.corners.shape[1] - 1)
+    return wp.vec2i(i, j)
+
+
+@wp.func
+def corners_of(ground: Ground, i: int, j: int) -> wp.vec4:
+    """Corner heights of a cell; beyond the map, those of the cell at its border."""
+    i = wp.clamp(i, 0, ground.corners.shape[0] - 1)
+    j = wp.clamp(j, 0, ground.corners.shape[1] - 1)
+    return ground.corners[i, j]
+
+
+@wp.func
+def surface(ground: Ground, i: int, j: int, x: float, y: float) -> wp.vec3:
+    """(height, slope along x, slope along y) of cell (i, j)'s own surface at a world point, clamped to the cell."""
+    c = corners_of(ground, i, j)
+    u = wp.clamp((x - ground.x) / ground.cell - float(i), 0.0, 1.0)
+    v = wp.clamp((y - ground.y) / ground.cell - float(j), 0.0, 1.0)
+    along_x = wp.lerp(c[1] - c[0], c[3] - c[2], v)
+    along_y = wp.lerp(c[2] - c[0], c[3] - c[1], u)
+    height = wp.lerp(wp.lerp(c[0], c[1], u), wp.lerp(c[2], c[3], u), v)
+    return wp.vec3(height, along_x / ground.cell, along_y / ground.cell)
+
+
+@wp.func
+def on_plane(p: wp.vec3, foot: wp.vec3, s: wp.vec3) -> Hit:
+    """Distance of `p` to the tangent plane of a surface `s` at the point `foot`."""
+    normal = wp.normalize(wp.vec3(-s[1], -s[2], 1.0))
+    hit = Hit()
+    hit.point = p
+    hit.normal = normal
+    hit.dist = wp.dot(p - foot, normal)
+    return hit
+
+
+@wp.func
+def leave_sideways(ground: Ground, i: int, j: int, p: wp.vec3, top: Hit) -> Hit:
+    """For a point below its cell's surface: the shortest way out, up or through a vertical face beside it."""
+    best = top
+    x0 = ground.x + float(i) * ground.cell
+    y0 = ground.y + float(j) * ground.cell
+    for side in range(4):
+        sign = float(2 * (side % 2) - 1)
+        step = 2 * (side % 2) - 1
+        hit = Hit()
+        hit.point = p
+        if side < 2:
+            hit.normal = wp.vec3(sign, 0.0, 0.0)
+            hit.dist = -wp.where(side == 0, p[0] - x0, x0 + ground.cell - p[0])
+            outside = surface(ground, i + step, j, p[0], p[1])
+        else:
+            hit.normal = wp.vec3(0.0, sign, 0.0)
+            hit.dist = -wp.where(side == 2, p[1] - y0, y0 + ground.cell - p[1])
+            outside = surface(ground, i, j + step, p[0], p[1])
+        if outside[0] < p[2] and hit.dist > best.dist:
+            best = hit
+    return best
+
+
+@wp.func
+def beside(ground: Ground, i: int, j: int, ni: int, nj: int, p: wp.vec3) -> Hit:
+    """What of cell (ni, nj) a point over cell (i, j) can touch: its face, its rim, or its surface where it rises."""
+    x0 = ground.x + float(ni) * ground.cell
+    y0 = ground.y + float(nj) * ground.cell
+    qx = wp.clamp(p[0], x0, x0 + ground.cell)
+    qy = wp.clamp(p[1], y0, y0 + ground.cell)
+    s = surface(ground, ni, nj, qx, qy)
+    # The ground just before the cell, on the point's side: what of the face is above that is in the open.
+    before = -NOTHING
+    if ni != i:
+        before = wp.max(before, surface(ground, ni - wp.sign(ni - i), nj, qx, qy)[0])
+    if nj != j:
+        before = wp.max(before, surface(ground, ni, nj - wp.sign(nj - j), qx, qy)[0])
+    hit = Hit()
+    hit.point = p
+    hit.dist = NOTHING
+    if s[0] > before + FACE:
+        hit.face = True
+        if p[2] > before:
+            to = p - wp.vec3(qx, qy, wp.min(p[2], s[0]))
+            hit.dist = wp.length(to)
+            hit.normal = wp.normalize(to)
+            if hit.dist < 1e-6:  # the point is on the face itself: leave towards the open side
+                hit.normal = wp.normalize(wp.vec3(float(i - ni), float(j - nj), 0.0))
+    elif s[0] > before - FACE:
+        # One surface with a crease: a plane counts only where its nearest point is on this cell.
+        plane = on_plane(p, wp.vec3(qx, qy, s[0]), s)
+        x = p[0] - plane.dist * plane.normal[0]
+        y = p[1] - plane.dist * plane.normal[1]
+        if x > x0 and x < x0 + ground.cell and y > y0 and y < y0 + ground.cell:
+            hit = plane
+    return hit
+
+
+@wp.func
+def rim_or_ridge(ground: Ground, a: wp.vec3, b: wp.vec3, axis: int, line: int) -> Hit:
+    """Where a segment a-b meets the `line`-th grid line across `axis` (0: x, 1: y): distance of the segment's axis to the
+    rim of a vertical face there, or to the ridge of a joined surface.
+
+    dist is NOTHING where the nearest point is an end of the segment, which is a probe of its own.
+    """
+    hit = Hit()
+    hit.dist = NOTHING
+    d = b - a
+    at = wp.where(axis == 0, ground.x, ground.y) + float(line) * ground.cell
+    t = 0.5
+    if wp.abs(d[axis]) > 1e-9:
+        t = wp.clamp((at - a[axis]) / d[axis], 0.0, 1.0)
+    p = a + t * d
+    cell = cell_of(ground, p[0], p[1])
+    low_i, low_j, high_i, high_j = cell[0], cell[1], cell[0], cell[1]
+    if axis == 0:
+        low_i, high_i = line - 1, line
+        p[0] = at
+    else:
+        low_j, high_j = line - 1, line
+        p[1] = at
+    s_low = surface(ground, low_i, low_j, p[0], p[1])
+    s_high = surface(ground, high_i, high_j, p[0], p[1])
+    rise = s_high[0] - s_low[0]
+    if wp.abs(rise) > FACE:
+        # In the vertical plane across the rim: the segment's point nearest to the rim, and its side of it.
+        rim = wp.max(s_low[0], s_high[0])
+        open_side = -wp.sign(rise)
+        across, up = d[axis], d[2]
+        length_sq = across * across + up * up
+        if length_sq < 1e-12:
+            return hit  # the segment lies along the rim; its ends do
+        t = ((at - a[axis]) * across + (rim - a[2]) * up) / length_sq
+        if t <= 0.0 or t >= 1.0:
+            return hit
+        scale = 1.0 / wp.sqrt(length_sq)
+        normal = wp.vec2(-up * scale, across * scale)  # (across, up)
+        if normal[0] * open_side + normal[1] < 0.0:
+            normal = -normal
+        if normal[0] * open_side < -1e-3 or normal[1] < -1e-3:
+            return hit  # nearest is the face or the tread, not the rim
+        p = a + t * d
+        dist = (p[axis] - at) * normal[0] + (p[2] - rim) * normal[1]
+        if dist > -ground.cell:
+            hit.dist = dist
+            hit.point = p
+            if axis == 0:
+                hit.normal = wp.vec3(normal[0], 0.0, normal[1])
+            else:
+                hit.normal = wp.vec3(0.0, normal[0], normal[1])
+    elif t > 0.0 and t < 1.0 and s_low[1 + axis] - s_high[1 + axis] > RIDGE:
+        mean = 0.5 * (s_low + s_high)
+        hit = on_plane(p, wp.vec3(p[0], p[1], mean[0]), mean)
+    return hit
+
+
+MOST = 6
+"""Contacts of one probe at most: the surfaces and faces around a sphere in a corner."""
+mat_hits = wp.types.matrix(shape=(MOST, 3), dtype=float)
+vec_hits = wp.types.vector(length=MOST, dtype=float)
+
+
+@wp.struct
+class Hits:
+    """Up to MOST contacts of a probe."""
+
+    count: int
+    dist: vec_hits
+    normal: mat_hits
+    point: mat_hits
+
+
+@wp.func
+def add(hits: Hits, hit: Hit) -> Hits:
+    """One more, if there is room."""
+    k = hits.count
+    if k < MOST:
+        hits.dist[k] = hit.dist
+        for axis in range(3):
+            hits.normal[k, axis] = hit.normal[axis]
+            hits.point[k, axis] = hit.point[axis]
+        hits.count = k + 1
+    return hits
+
+
+@wp.func
+def around_point(ground: Ground, p: wp.vec3, near: float) -> Hits:
+    """What the ground offers to a sphere around `p` that reaches out to `near`."""
+    hits = Hits()
+    cell = cell_of(ground, p[0], p[1])
+    i, j = cell[0], cell[1]
+    if p[2] - near > ground.ceiling[i, j]:
+        return hits
+    s = surface(ground, i, j, p[0], p[1])
+    own = on_plane(p, wp.vec3(p[0], p[1], s[0]), s)
+    if own.dist < 0.0:
+        own = leave_sideways(ground, i, j, p, own)
+    if own.dist < near:
+        hits = add(hits, own)
+    crease = Hit()
+    crease.dist = NOTHING
+    for di in range(-ground.reach, ground.reach + 1):
+        x = ground.x + float(i + di) * ground.cell
+        dx = p[0] - wp.clamp(p[0], x, x + ground.cell)
+        for dj in range(-ground.reach, ground.reach + 1):
+            y = ground.y + float(j + dj) * ground.cell
+            dy = p[1] - wp.clamp(p[1], y, y + ground.cell)
+            if (di != 0 or dj != 0) and dx * dx + dy * dy < near * near:
+                hit = beside(ground, i, j, i + di, j + dj, p)
+                if hit.face and hit.dist < near:
+                    hits = add(hits, hit)
+                elif hit.dist < crease.dist:
+                    crease = hit
+    if crease.dist < near and wp.dot(crease.normal, own.normal) < SAME:
+        hits = add(hits, crease)
+    return hits
+
+
+@wp.func
+def between_ends(ground: Ground, a: wp.vec3, b: wp.vec3, near: float) -> Hits:
+    """What touches a capsule a-b between its ends: the nearest rim or ridge of each half."""
+    hits = Hits()
+    middle = 0.5 * (a + b)
+    cell = cell_of(ground, middle[0], middle[1])
+    if wp.min(a[2], b[2]) - near > ground.wide_ceiling[cell[0], cell[1]]:
+        return hits
+    first = Hit()
+    second = Hit()
+    first.dist = NOTHING
+    second.dist = NOTHING
+    for axis in range(2):
+        start = wp.where(axis == 0, ground.x, ground.y)
+        low = wp.int32(wp.floor((wp.min(a[axis], b[axis]) - near - start) / ground.cell)) + 1
+        high = wp.int32(wp.floor((wp.max(a[axis], b[axis]) + near - start) / ground.cell))
+        for line in range(low, high + 1):
+            hit = rim_or_ridge(ground, a, b, axis, line)
+            if hit.dist < near:
+                if wp.length_sq(hit.point - a) < wp.length_sq(hit.point - b):
+                    if hit.dist < first.dist:
+                        first = hit
+                elif hit.dist < second.dist:
+                    second = hit
+    if first.dist < near:
+        hits = add(hits, first)
+    if second.dist < near:
+        hits = add(hits, second)
+    return hits
+
+
+def ground_of(height_map: HeightMap, largest: float, longest: float) -> Ground:
+    """The map on Warp's current device, for probes of at most that radius and capsules of at most that length [m]."""
+    reach = int(np.ceil(largest / height_map.cell - 1e-9))
+    wide = int(np.ceil((0.5 * longest + largest) / height_map.cell))
+    ground = Ground()
+    ground.corners = wp.array(height_map.corners, dtype=wp.vec4)
+    ground.ceiling = wp.array(height_map.ceiling(reach), dtype=float)
+    ground.wide_ceiling = wp.array(height_map.ceiling(wide), dtype=float)
+    ground.x, ground.y = height_map.origin
+    ground.cell, ground.reach = height_map.cell, reach
+    return ground

@@ -1,0 +1,98 @@
+"""The terrain curriculum: robots move to harder tiles while they get across, and back while they do not."""
+
+import torch
+from torch import Tensor
+
+from legged.config.schema import TerrainConfig
+from legged.terrain.terrain import Terrain
+
+
+class TerrainCurriculum:
+    """Which tile each robot lives on: its column (a terrain type) for good, its row (a level) by success.
+
+    As in legged_gym: a robot that got further than half a tile from where it started moves up, one that got less than
+    half as far as its command asked moves down, and from the top it goes to a random level. A policy that is always
+    promoted thus has a mean level of 6.0 over ten rows, not 9.
+    """
+
+    def __init__(self, cfg: TerrainConfig, terrain: Terrain, num_envs: int, device: torch.device) -> None:
+        """Robots are spread evenly over the columns, at levels up to cfg.max_init_terrain_level."""
+        self.enabled = cfg.curriculum
+        self.rows, columns = terrain.origins.shape[:2]
+        highest = cfg.max_init_terrain_level if cfg.curriculum else self.rows - 1
+        self.levels = torch.randint(0, min(highest, self.rows - 1) + 1, (num_envs,), device=device)
+        """(N,) row of each robot's tile."""
+        self._first_levels = self.levels.clone()
+        self.columns = torch.arange(num_envs, device=device) * columns // num_envs
+        """(N,) column of each robot's tile."""
+        self.origins = torch.zeros(num_envs, 3, device=device)
+        """(N, 3) where each robot's tile has its middle, world frame [m]."""
+        self.names = terrain.type_names
+        kinds = torch.tensor([self.names.index(name) for name in terrain.types], device=device)
+        self._of_type = torch.nn.functional.one_hot(kinds[self.columns], len(self.names)).t().float()  # (K, N)
+        self._tiles = torch.tensor(terrain.origins, dtype=torch.float32, device=device).flatten(0, 1)
+        self._count = columns
+        self._far = 0.5 * min(terrain.tile_size)
+        self._random = torch.zeros_like(self.levels)
+        self._sums = torch.zeros(3, len(self.names), device=device)  # per type: episodes, promoted, demoted
+        self._place()
+
+    def reset(self) -> None:
+        """Go back to the levels that training starts with."""
+        self.levels.copy_(self._first_levels)
+        self._sums.zero_()
+        self._place()
+
+    def draw(self) -> None:
+        """Draw a level for every robot, for those that finish the hardest one."""
+        self._random.random_(0, self.rows)
+
+    def update(self, mask: Tensor, base_pos: Tensor, asked: Tensor) -> None:
+        """Judge the robots of `mask` (N,), whose episodes end: where they are (N, 3), and how far their command asked
+        them to go in an episode (N,) [m].
+        """
+        if not self.enabled:
+            return
+        walked = (base_pos[:, :2] - self.origins[:, :2]).norm(dim=1)
+        up = mask & (walked > self._far)
+        down = mask & (walked < 0.5 * asked) & ~up
+        self._sums.add_(torch.stack([mask.float(), up.float(), down.float()]) @ self._of_type.t())
+        moved = (self.levels + up.long() - down.long()).clamp(min=0)
+        self.levels.copy_(torch.where(moved >= self.rows, self._random, moved))
+        self._place()
+
+    def place_at(self, levels: Tensor, columns: Tensor) -> None:
+        """Put the robots on given tiles, (N,) each, where they stay."""
+        self.enabled = False
+        self.levels.copy_(levels)
+        self.columns.copy_(columns)
+        self._place()
+
+    def _place(self) -> None:
+        torch.index_select(self._tiles, 0, self.levels * self._count + self.columns, out=self.origins)
+
+    def metrics(self) -> dict[str, Tensor]:
+        """Per type: mean level, and shares of the episodes since the last call that moved up and down. Fresh tensors."""
+        if not self.enabled:
+            return {}
+        sums = self._sums.clone()
+        self._sums.zero_()
+        levels = self._of_type @ self.levels.float() / self._of_type.sum(dim=1)
+        log = {"Terrain/level": self.levels.float().mean()}
+        log |= {f"Terrain/level_{name}": level for name, level in zip(self.names, levels.unbind(), strict=True)}
+        for what, share in (("promoted", sums[1] / sums[0]), ("demoted", sums[2] / sums[0])):
+            log |= {f"Terrain/{what}_{name}": value for name, value in zip(self.names, share.unbind(), strict=True)}
+        return log
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """What a resumed run needs."""
+        return {"levels": self.levels.clone()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Go on from a saved state; with another number of robots, from levels drawn out of the saved ones."""
+        saved = state["levels"].to(self.levels.device).clamp(max=self.rows - 1)
+        if len(saved) != len(self.levels):
+            saved = saved[torch.randint(len(saved), self.levels.shape, device=saved.device)]
+        if self.enabled:
+            self.levels.copy_(saved)
+            self._place()

@@ -1,0 +1,166 @@
+"""Tiles of terrain: one small function a type, numpy only. Names and sizes are legged_gym's (arXiv 2109.11978).
+
+Every generator takes a `Tile` of zeros and the size of its difficulty, in metres or degrees, and fills in the heights of
+the cells [m]. Robots start in the middle and walk outward, so `stairs_up` has its platform at the bottom.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import atan, degrees, radians, tan
+
+import numpy as np
+
+HOLE_DEPTH = 1.0
+"""Depth of gaps and of the space between stepping stones: more than a leg's length [m]."""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A rectangle of square cells: `heights` (length, width) [m], one per cell, x along the first axis."""
+
+    heights: np.ndarray
+    cell: float
+    """Edge of a cell [m]."""
+    rng: np.random.Generator
+    """Source of all randomness of the tile."""
+
+    def cells(self, metres: float) -> int:
+        """A length in whole cells."""
+        return int(metres / self.cell + 1e-6)
+
+    def from_centre(self) -> np.ndarray:
+        """(length, width) distance of each cell's centre from the tile's, as the larger of |x| and |y| [m]."""
+        x, y = (np.abs(np.arange(n) - 0.5 * (n - 1)) * self.cell for n in self.heights.shape)
+        return np.maximum(x[:, None], y[None, :])
+
+    def middle(self, side: float) -> tuple[slice, slice]:
+        """The cells of a square of that side [m] in the middle."""
+        spans = []
+        for n in self.heights.shape:
+            first = (n - self.cells(side)) // 2
+            spans.append(slice(first, n - first))
+        return spans[0], spans[1]
+
+
+def slope(tile: Tile, degrees_up: float, platform: float = 3.0) -> None:
+    """A pyramid with a flat top (or, for a negative angle, bottom) and its foot at the tile's edge."""
+    distance = np.minimum(0.5 * min(tile.heights.shape) * tile.cell - tile.from_centre(), 1e6)
+    edge = 0.5 * (min(tile.heights.shape) * tile.cell - platform)
+    tile.heights[:] = tan(radians(degrees_up)) * np.clip(distance, 0.0, edge)
+
+
+def rough_slope(tile: Tile, degrees_up: float, platform: float = 3.0) -> None:
+    """A pyramid with bumps of up to 5 cm, in steps of 5 mm, drawn every 0.2 m and joined by straight lines."""
+    slope(tile, degrees_up, platform)
+    tile.heights[:] += bumps(tile, 0.05)
+
+
+def bumps(tile: Tile, amplitude: float, step: float = 0.005, spacing: float = 0.2) -> np.ndarray:
+    """(length, width) heights of rough ground: U(-amplitude, amplitude) on a coarse lattice, linear in between."""
+    levels = np.arange(-amplitude, amplitude + 0.5 * step, step)
+    every = max(1, tile.cells(spacing))
+    counts = [n // every + 2 for n in tile.heights.shape]
+    lattice = tile.rng.choice(levels, counts)
+    x, y = (np.arange(n) / every for n in tile.heights.shape)
+    along = np.array([np.interp(x, np.arange(counts[0]), column) for column in lattice.T]).T
+    return np.array([np.interp(y, np.arange(counts[1]), row) for row in along])
+
+
+def stairs(tile: Tile, riser: float, platform: float = 3.0, tread: float = 0.31) -> None:
+    """Rings of steps up to a platform in the middle (down, for a negative riser). The tread is cut to whole cells."""
+    width, across = tile.cells(tread), tile.cells(platform)
+    first = 0
+    while min(tile.heights.shape) - 2 * first > across:
+        first += width
+        tile.heights[first : tile.heights.shape[0] - first, first : tile.heights.shape[1] - first] += riser
+
+
+def obstacles(tile: Tile, height: float, platform: float = 3.0, count: int = 20) -> None:
+    """Rectangular blocks and pits of 1 to 2 m, as high or deep as `height` or half of it, anywhere but in the middle."""
+    rows, columns = tile.heights.shape
+    sides = [tile.cells(0.1 * tenths) for tenths in range(10, 20, 4)]
+    for _ in range(count):
+        length, width = tile.rng.choice(sides, 2)
+        x = tile.rng.integers(0, max(1, rows - length))
+        y = tile.rng.integers(0, max(1, columns - width))
+        tile.heights[x : x + length, y : y + width] = height * tile.rng.choice([-1.0, -0.5, 0.5, 1.0])
+    tile.heights[tile.middle(platform)] = 0.0
+
+
+def stepping_stones(tile: Tile, stone: float, platform: float = 4.0, gap: float = 0.1) -> None:
+    """Square stones of side `stone`, in rows shifted against each other, with gaps around them."""
+    side, between = max(1, tile.cells(stone)), tile.cells(gap)
+    rows, columns = tile.heights.shape
+    tile.heights[:] = -HOLE_DEPTH
+    for x in range(0, rows, side + between):
+        for y in range(-int(tile.rng.integers(0, side)), columns, side + between):
+            tile.heights[x : x + side, max(0, y) : max(0, y + side)] = 0.0
+    tile.heights[tile.middle(platform)] = 0.0
+
+
+def gap(tile: Tile, width: float, platform: float = 3.0) -> None:
+    """A ditch around the platform."""
+    tile.heights[tile.middle(platform + 2.0 * tile.cells(width) * tile.cell)] = -HOLE_DEPTH
+    tile.heights[tile.middle(platform)] = 0.0
+
+
+def pit(tile: Tile, depth: float, platform: float = 4.0) -> None:
+    """A square hole in which robots start."""
+    tile.heights[tile.middle(platform)] = -depth
+
+
+def waves(tile: Tile, amplitude: float, length: float = 2.0) -> None:
+    """Sine waves in both directions, level at the tile's edge: heights from -amplitude to amplitude."""
+    x, y = ((np.arange(n) + 0.5) * tile.cell for n in tile.heights.shape)
+    pattern = np.sin(2.0 * np.pi * x[:, None] / length) + np.sin(2.0 * np.pi * y[None, :] / length)
+    fade = np.clip((0.5 * min(tile.heights.shape) * tile.cell - tile.from_centre()) / (0.5 * length), 0.0, 1.0)
+    tile.heights[:] = 0.5 * amplitude * pattern * fade
+
+
+def flat(tile: Tile, size: float = 0.0) -> None:
+    """Level ground, however difficult."""
+
+
+@dataclass(frozen=True)
+class TerrainType:
+    """A kind of tile: how it is made, and how large its difficulty is."""
+
+    generate: Callable[[Tile, float], None]
+    """Fills a tile; its second argument is the size below."""
+    size: Callable[[float], float]
+    """Difficulty (0 is the easiest of training, 1 one row beyond its hardest) -> size, in `unit`."""
+    unit: str
+    what: str
+    """What the size measures."""
+    stepped: bool
+    """Made of steps with vertical faces, not of slopes."""
+    platform: float = 3.0
+    """Side of the level square in the middle [m]."""
+
+
+def _angle(difficulty: float) -> float:
+    """Rise over run 0.4 * difficulty, as an angle [degrees]."""
+    return degrees(atan(0.4 * difficulty))
+
+
+def _riser(difficulty: float) -> float:
+    return 0.05 + 0.18 * difficulty
+
+
+TERRAIN_TYPES: dict[str, TerrainType] = {
+    "flat": TerrainType(flat, lambda d: 0.0, "m", "height", stepped=False, platform=0.0),
+    "slope_up": TerrainType(lambda t, s: slope(t, -s), _angle, "degrees", "angle", stepped=False),
+    "slope_down": TerrainType(slope, _angle, "degrees", "angle", stepped=False),
+    "rough_slope_up": TerrainType(lambda t, s: rough_slope(t, -s), _angle, "degrees", "angle", stepped=False),
+    "rough_slope_down": TerrainType(rough_slope, _angle, "degrees", "angle", stepped=False),
+    "waves": TerrainType(waves, lambda d: 0.2 * d, "m", "amplitude", stepped=False, platform=0.0),
+    "stairs_up": TerrainType(lambda t, s: stairs(t, -s), _riser, "m", "step height", stepped=True),
+    "stairs_down": TerrainType(stairs, _riser, "m", "step height", stepped=True),
+    "obstacles": TerrainType(obstacles, lambda d: 0.05 + 0.2 * d, "m", "height", stepped=True),
+    "stepping_stones": TerrainType(
+        stepping_stones, lambda d: 1.5 * (1.05 - d), "m", "stone size", stepped=True, platform=4.0
+    ),
+    "gap": TerrainType(gap, lambda d: 1.0 * d, "m", "width", stepped=True),
+    "pit": TerrainType(pit, lambda d: 1.0 * d, "m", "depth", stepped=True, platform=4.0),
+}
+"""Every type, by the name under which `terrain.proportions` asks for it."""

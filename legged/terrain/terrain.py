@@ -1,0 +1,151 @@
+"""The ground of a task: tiles of many types and difficulties in one height map."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from legged.config.loader import ConfigError, suggest
+from legged.config.schema import TerrainConfig
+from legged.terrain.generators import TERRAIN_TYPES, Tile
+from legged.terrain.height_map import HeightMap
+
+SPAWN_SQUARE = 2.0
+"""Robots start at the height of the highest point in a square of this side in the middle of their tile [m]."""
+EDGE = 1.0
+"""Robots closer than this to the end of the map have left it [m]."""
+
+
+@dataclass(frozen=True)
+class TileSpec:
+    """What is asked of one tile."""
+
+    type: str
+    size: float
+    """In the unit of the type [m or degrees]."""
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """R x C tiles with a level border, centred on the world's origin; rows along x, columns along y."""
+
+    height_map: HeightMap
+    types: tuple[str, ...]
+    """(C,) type of each column."""
+    origins: np.ndarray
+    """(R, C, 3) middle of each tile, at the height at which robots stand there, world frame [m]."""
+    tile_size: tuple[float, float]
+    """Extent of a tile along x and y [m]."""
+    border: float
+    """Width of the level ground around the tiles [m]."""
+
+    @classmethod
+    def build(cls, cfg: TerrainConfig, seed: int) -> "Terrain":
+        """The terrain of a training: columns are types by their proportions, rows get harder."""
+        columns = column_types(cfg.proportions, cfg.num_cols)
+        rng = np.random.default_rng(seed)
+        rows = []
+        for row in range(cfg.num_rows):
+            # Without a curriculum every row is as hard as the upper rows of one.
+            d = row / cfg.num_rows if cfg.curriculum else float(rng.choice([0.5, 0.75, 0.9]))
+            rows.append([TileSpec(name, TERRAIN_TYPES[name].size(d)) for name in columns])
+        return cls.of_tiles(rows, cfg, rng)
+
+    @classmethod
+    def of_tiles(cls, rows: Sequence[Sequence[TileSpec]], cfg: TerrainConfig, rng: np.random.Generator) -> "Terrain":
+        """A terrain of the given tiles; of `cfg` only sizes and the slope threshold count."""
+        cell = cfg.horizontal_scale
+        length, width, border = (round(x / cell) for x in (cfg.terrain_length, cfg.terrain_width, cfg.border_size))
+        count = (len(rows), len(rows[0]))
+        shape = (count[0] * length + 2 * border, count[1] * width + 2 * border)
+        heights = np.zeros(shape)
+        steepest = np.full(shape, np.inf)
+        origin = (-0.5 * shape[0] * cell, -0.5 * shape[1] * cell)
+        origins = np.zeros((*count, 3))
+        for r, row in enumerate(rows):
+            for c, spec in enumerate(row):
+                kind = TERRAIN_TYPES[spec.type]
+                tile = Tile(np.zeros((length, width)), cell, rng)
+                kind.generate(tile, spec.size)
+                x, y = border + r * length, border + c * width
+                heights[x : x + length, y : y + width] = tile.heights
+                if kind.stepped:
+                    steepest[x : x + length, y : y + width] = cfg.slope_threshold
+                origins[r, c] = (
+                    origin[0] + (x + 0.5 * length) * cell,
+                    origin[1] + (y + 0.5 * width) * cell,
+                    tile.heights[tile.middle(SPAWN_SQUARE)].max(),
+                )
+        return cls(
+            height_map=HeightMap.of(heights, cell, origin, steepest),
+            types=tuple(spec.type for spec in rows[0]),
+            origins=origins,
+            tile_size=(length * cell, width * cell),
+            border=border * cell,
+        )
+
+    @cached_property
+    def type_names(self) -> tuple[str, ...]:
+        """The types there are, each once, in the order of the columns."""
+        return tuple(dict.fromkeys(self.types))
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """|x| and |y| beyond which a robot has left the map [m]."""
+        x, y = self.height_map.size
+        return 0.5 * x - EDGE, 0.5 * y - EDGE
+
+
+def column_types(proportions: dict[str, float], num_cols: int) -> list[str]:
+    """The type of each column: the one whose share of the unit interval holds the column's middle."""
+    names = [name for name, share in proportions.items() if share > 0.0]
+    ends = np.cumsum([proportions[name] for name in names])
+    middles = (np.arange(num_cols) + 0.5) / num_cols
+    return [names[min(int(np.searchsorted(ends, m)), len(names) - 1)] for m in middles]
+
+
+def check_terrain(cfg: TerrainConfig, task: str) -> None:
+    """Everything that can be wrong with a terrain's configuration.
+
+    Raises:
+        ConfigError: names the field.
+    """
+    if cfg.mesh_type == "plane":
+        return
+    where = f"{task}: terrain"
+    for name, share in cfg.proportions.items():
+        if name not in TERRAIN_TYPES:
+            raise ConfigError(f"{where}.proportions.{name}: there is no terrain type '{name}'{suggest(name, TERRAIN_TYPES)}")
+        if share < 0.0:
+            raise ConfigError(f"{where}.proportions.{name}: must be at least 0, got {share}")
+    total = sum(cfg.proportions.values())
+    if abs(total - 1.0) > 1e-6:
+        listed = ", ".join(f"{name} {share:g}" for name, share in cfg.proportions.items())
+        raise ConfigError(f"{where}.proportions: must sum to 1, got {total:g} ({listed})")
+    found = column_types(cfg.proportions, cfg.num_cols)
+    for name, share in cfg.proportions.items():
+        if share > 0.0 and name not in found:
+            raise ConfigError(
+                f"{where}.proportions.{name}: {share:g} of num_cols = {cfg.num_cols} columns is less than one;"
+                " ask for more columns or leave the type out"
+            )
+        kind = TERRAIN_TYPES[name]
+        side = min(cfg.terrain_length, cfg.terrain_width)
+        if share > 0.0 and side <= kind.platform:
+            raise ConfigError(
+                f"{where}: a tile of {cfg.terrain_length:g} x {cfg.terrain_width:g} m (terrain_length, terrain_width) is not"
+                f" larger than the platform of '{name}', {kind.platform:g} m"
+            )
+    if cfg.max_init_terrain_level >= cfg.num_rows:
+        raise ConfigError(
+            f"{where}.max_init_terrain_level: must be below num_rows = {cfg.num_rows}, got {cfg.max_init_terrain_level}"
+        )
+    side = min(cfg.terrain_length, cfg.terrain_width)
+    if cfg.spawn_range >= 0.5 * side:
+        raise ConfigError(
+            f"{where}.spawn_range: robots would start up to {cfg.spawn_range:g} m from the middle of a tile of {side:g} m,"
+            " outside it"
+        )
+    if cfg.border_size < 2.0 * EDGE:
+        raise ConfigError(f"{where}.border_size: must be at least {2.0 * EDGE:g}, got {cfg.border_size:g}")
