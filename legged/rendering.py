@@ -16,14 +16,8 @@ SPACING = 1.9
 """Distance between neighbours [m]."""
 
 
-def display_model(robot: Robot, count: int, width: int, height: int) -> mujoco.MjModel:
-    """`count` copies of the robot over one checkered floor under a sky; for drawing, not for simulating."""
-    scene = mujoco.MjSpec()
-    scene.visual.global_.offwidth, scene.visual.global_.offheight = width, height
-    scene.visual.quality.shadowsize = scene.visual.quality.offsamples = 0  # ten times faster without a GPU
-    scene.visual.headlight.ambient, scene.visual.headlight.diffuse = [0.45] * 3, [0.5] * 3
-    scene.visual.map.zfar = 60
-    scene.stat.extent, scene.stat.center = 4.0, [0, 0, 0.4]
+def add_sky(scene: mujoco.MjSpec) -> None:
+    """A pale blue sky, white at the horizon."""
     scene.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -33,6 +27,17 @@ def display_model(robot: Robot, count: int, width: int, height: int) -> mujoco.M
         width=256,
         height=1536,
     )
+
+
+def display_model(robot: Robot, count: int, width: int, height: int) -> mujoco.MjModel:
+    """`count` copies of the robot over one checkered floor under a sky; for drawing, not for simulating."""
+    scene = mujoco.MjSpec()
+    scene.visual.global_.offwidth, scene.visual.global_.offheight = width, height
+    scene.visual.quality.shadowsize = scene.visual.quality.offsamples = 0  # ten times faster without a GPU
+    scene.visual.headlight.ambient, scene.visual.headlight.diffuse = [0.45] * 3, [0.5] * 3
+    scene.visual.map.zfar = 60
+    scene.stat.extent, scene.stat.center = 4.0, [0, 0, 0.4]
+    add_sky(scene)
     scene.add_texture(
         name="checker",
         type=mujoco.mjtTexture.mjTEXTURE_2D,

@@ -71,6 +71,16 @@ LAYERS = {  # what a part of the package must not know
     "legged.math": ["legged"],
     "legged.graph": ["legged"],
     "legged.robot": ["legged.physics", "legged.envs", "legged.registry", "legged.rl", "legged.tools", "torch"],
+    "legged.terrain": [
+        "legged.physics",
+        "legged.envs",
+        "legged.registry",
+        "legged.rl",
+        "legged.tools",
+        "legged.robot",
+        "mujoco",
+    ],
+    **{f"legged.terrain.{part}": ["torch"] for part in ("generators", "height_map", "terrain")},
     "legged.physics": ["legged.envs", "legged.registry", "legged.rl", "legged.tools", "legged.rewards", "legged.commands"],
     **{
         f"legged.{part}": ["legged.envs", "legged.registry", "legged.rl", "legged.tools", "mujoco"]

@@ -180,8 +180,8 @@ def _rectangles(low: np.ndarray, flat: np.ndarray) -> Iterator[tuple[slice, slic
         allowed = wanted | (low > top + SAME)
         across = _run(allowed[i, :], j)
         along = _run(allowed[:, j], i)
-        one = _run(allowed[:, across].all(axis=1), i), across
-        other = along, _run(allowed[along].all(axis=0), j)
+        one = _run(np.asarray(allowed[:, across].all(axis=1)), i), across
+        other = along, _run(np.asarray(allowed[along].all(axis=0)), j)
         best = max(one, other, key=lambda spans: int(wanted[spans].sum()))
         open_cells[best] &= ~wanted[best]
         yield *best, top

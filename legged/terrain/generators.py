@@ -34,17 +34,17 @@ class Tile:
         return np.maximum(x[:, None], y[None, :])
 
     def middle(self, side: float) -> tuple[slice, slice]:
-        """The cells of a square of that side [m] in the middle."""
+        """The cells of a square of that side [m] in the middle, or what of it is on the tile."""
         spans = []
         for n in self.heights.shape:
-            first = (n - self.cells(side)) // 2
+            first = max(0, (n - self.cells(side)) // 2)
             spans.append(slice(first, n - first))
         return spans[0], spans[1]
 
 
 def slope(tile: Tile, degrees_up: float, platform: float = 3.0) -> None:
     """A pyramid with a flat top (or, for a negative angle, bottom) and its foot at the tile's edge."""
-    distance = np.minimum(0.5 * min(tile.heights.shape) * tile.cell - tile.from_centre(), 1e6)
+    distance = 0.5 * min(tile.heights.shape) * tile.cell - tile.from_centre()
     edge = 0.5 * (min(tile.heights.shape) * tile.cell - platform)
     tile.heights[:] = tan(radians(degrees_up)) * np.clip(distance, 0.0, edge)
 
