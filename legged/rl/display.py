@@ -44,8 +44,22 @@ class Progress:
             f"{self.steps_per_s:,.0f} steps/s ({self.collect_s:.2f}+{self.learn_s:.2f} s)  reward {self.reward:.2f}  "
             f"error {self.text('lin_vel_rmse', '.3f', 'm/s')} {self.text('ang_vel_rmse', '.3f', 'rad/s')}  "
             f"falls {self.text('falls', '.1f', '%', 100)}  episode {self.text('episode_length', '.0f', 'steps')}  "
-            f"std {self.action_std:.2f}" + self.warnings()
+            f"std {self.action_std:.2f}" + self.level() + self.warnings()
         )
+
+    def level(self) -> str:
+        """The mean terrain level, if there is one."""
+        return f"  level {self.values['Terrain/level']:.2f}" if "Terrain/level" in self.values else ""
+
+    def levels(self) -> dict[str, str]:
+        """Terrain type -> mean level, and shares of episodes that moved up and down."""
+        found = {}
+        for key, level in self.values.items():
+            name = key.removeprefix("Terrain/level_")
+            if name != key:
+                up, down = (self.values.get(f"Terrain/{what}_{name}", float("nan")) for what in ("promoted", "demoted"))
+                found[name] = f"level {level:.2f}  +{100 * up:.0f} % -{100 * down:.0f} %"
+        return found
 
     def warnings(self) -> str:
         """What should never happen, if it did."""
@@ -73,7 +87,10 @@ class Progress:
         known = ("lin_vel_rmse", "ang_vel_rmse", "falls", "episode_length", "non_finite_worlds", "contact_overflows")
         other = {k.removeprefix("Metrics/"): v for k, v in self.values.items() if k.startswith("Metrics/")}
         left.update({k.replace("_", " "): f"{v:.2f}" for k, v in other.items() if k not in known})
+        if "Terrain/level" in self.values:
+            left["terrain level"] = f"{self.values['Terrain/level']:.2f}"
         right = {k.removeprefix("rew_"): f"{v:+.4f}" for k, v in self.values.items() if k.startswith("rew_")}
+        right.update(self.levels())
         table = Table(title=title, caption=self.warnings() or None, title_justify="left")
         for name, justify in (("training", "left"), ("", "right"), ("reward per second", "left"), (" ", "right")):
             table.add_column(name, justify=justify)  # type: ignore[arg-type]

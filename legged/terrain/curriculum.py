@@ -72,11 +72,13 @@ class TerrainCurriculum:
         torch.index_select(self._tiles, 0, self.levels * self._count + self.columns, out=self.origins)
 
     def metrics(self) -> dict[str, Tensor]:
-        """Per type: mean level, and shares of the episodes since the last call that moved up and down. Fresh tensors."""
+        """Fresh tensors: per type the mean level, and the shares of ended episodes that moved up and down, averaged over
+        about the last ten calls (one rollout ends few episodes of each type).
+        """
         if not self.enabled:
             return {}
         sums = self._sums.clone()
-        self._sums.zero_()
+        self._sums.mul_(0.9)
         levels = self._of_type @ self.levels.float() / self._of_type.sum(dim=1)
         log = {"Terrain/level": self.levels.float().mean()}
         log |= {f"Terrain/level_{name}": level for name, level in zip(self.names, levels.unbind(), strict=True)}
