@@ -13,6 +13,7 @@ import torch
 from legged.config import ConfigError, TaskConfig, load_config, suggest
 from legged.envs import LeggedRobot
 from legged.paths import data_folder
+from legged.terrain import Terrain
 
 
 @dataclass(frozen=True)
@@ -67,9 +68,12 @@ def task_config(name: str, overrides: Iterable[tuple[str, Any]] = (), on_cpu: bo
     return cfg
 
 
-def make_task(cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True) -> LeggedRobot:
-    """Build the task that a configuration describes."""
-    return task_class(cfg.task)(cfg, device, graph)
+def make_task(
+    cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None
+) -> LeggedRobot:
+    """Build the task that a configuration describes, on its own terrain or on the one given."""
+    other_ground = {} if terrain is None else {"terrain": terrain}  # a user's constructor may not know the argument
+    return task_class(cfg.task)(cfg, device, graph, **other_ground)
 
 
 def import_tasks(name: str) -> None:

@@ -5,8 +5,13 @@ import numpy as np
 import pytest
 import torch
 
+from legged.config import override
 from legged.registry import make_task, task_config
-from legged.rendering import Camera
+from legged.rendering import Camera, display_model
+from legged.rendering.follower import BEHIND, CUT, FLATTEST, FRONT, Follower
+from legged.rendering.paint import LOW, MIDDLE
+from legged.rl.playground import SETTING, Playground
+from legged.terrain import HeightMap
 
 WIDTH, HEIGHT = 320, 180
 
@@ -100,3 +105,158 @@ def test_caption_is_drawn_in_the_upper_left_corner_only(camera):
     text = captioned[: HEIGHT // 4, : WIDTH // 2].astype(int)
     assert (text.max(axis=2) - text.min(axis=2) > 60).any()  # letters in the colours of the arrows
     assert not differ(camera.picture(), plain).any()  # nothing stays
+
+
+# ---- on terrain ------------------------------------------------------------------------------------------------------
+
+
+def on_terrain(name: str, num_envs: int = 2):
+    """Robots in the middle of tiles with steps of 0.19 m."""
+    changes = {"env.num_envs": num_envs, "sim.physics": "mujoco", "sim.threads": 1, "env.seed": 5}
+    cfg = task_config("anymal_c", changes.items(), on_cpu=True)
+    ground = Playground.of(cfg, name, 0.8)
+    cfg = override(cfg, [*SETTING, *ground.changes(cfg)])
+    task = make_task(cfg, terrain=ground.build(cfg))
+    ground.place(task)
+    task.reset()
+    task.commands.zero_()
+    task.base_lin_vel.zero_()
+    return task
+
+
+@pytest.fixture(scope="module")
+def pit():
+    return on_terrain("stairs_up")
+
+
+@pytest.fixture
+def camera_in_pit(camera, pit):
+    found = Camera(pit, count=2, width=WIDTH, height=HEIGHT)
+    yield found
+    found.close()
+
+
+def cold(picture: np.ndarray) -> float:
+    """Share of pixels of deep ground, which is bluish but darker than the sky."""
+    r, b = picture[:, :, 0].astype(int), picture[:, :, 2].astype(int)
+    return float(((b > r + 8) & (b < 190)).mean())
+
+
+def warm(picture: np.ndarray) -> float:
+    """Share of pixels of high ground, which is orange but not as red as the robots."""
+    r, g, b = (picture[:, :, i].astype(int) for i in range(3))
+    return float(((r > b + 45) & (r < 2 * g)).mean())
+
+
+def test_the_ground_is_in_the_picture(camera_in_pit):
+    """At the foot of stairs it is cold, on top of a pyramid it is warm; either way there are the robots and risers."""
+    deep = camera_in_pit.picture()
+    top = Camera(on_terrain("stairs_down"), count=2, width=WIDTH, height=HEIGHT)
+    high = top.picture()
+    top.close()
+    assert cold(deep) > 0.1 > 0.01 > cold(high)
+    assert warm(high) > 0.1 > 0.01 > warm(deep)
+    for picture in (deep, high):
+        assert 0.005 < red(picture).mean() < 0.3
+
+
+def test_colours_span_the_heights_there_are_and_level_ground_is_checkered(pit):
+    model = display_model(pit.robot, 0, WIDTH, HEIGHT, pit.terrain)
+    tops = model.geom_pos[:, 2] + model.geom_size[:, 2]
+    lowest = float(pit.terrain.height_map.corners.min())
+    assert lowest < -1.5
+    np.testing.assert_allclose(model.geom_rgba[tops.argmin(), :3], LOW, atol=1e-6)
+    half = int(np.abs(tops - 0.5 * lowest).argmin())
+    expected = MIDDLE + tops[half] / lowest * (LOW - MIDDLE)
+    np.testing.assert_allclose(model.geom_rgba[half, :3], expected, atol=1e-5)
+    assert ((model.geom_matid >= 0) == (np.abs(tops) < 1e-6)).all()
+
+
+def test_steps_show_as_edges_without_shadows(camera_in_pit):
+    """Along a column of pixels that sees the stairs brightness changes often and clearly: treads and risers."""
+    picture = camera_in_pit.picture().astype(float).mean(axis=2)
+    edges = (np.abs(np.diff(picture, axis=0)) > 15).sum(axis=0)
+    assert np.median(edges) >= 6
+
+
+def test_on_terrain_robots_are_where_they_are(camera_in_pit, pit):
+    camera_in_pit.picture()
+    bases = camera_in_pit.data.qpos.reshape(2, -1)[:, :3]
+    np.testing.assert_allclose(bases, pit.base_pos.numpy(), atol=1e-5)
+    assert np.linalg.norm(bases[0] - bases[1]) > 7.0
+
+
+def test_the_camera_follows_the_chosen_robot(camera_in_pit, pit):
+    for robot in (1, 0):
+        camera_in_pit.followed = robot
+        picture = camera_in_pit.picture()
+        np.testing.assert_allclose(camera_in_pit.view.lookat, pit.base_pos[robot].numpy(), atol=1e-5)
+        middle = red(picture)[HEIGHT // 3 : 2 * HEIGHT // 3, WIDTH // 3 : 2 * WIDTH // 3]
+        assert middle.sum() > 0.5 * red(picture).sum()
+
+
+def test_feet_have_dark_spots_below_them(camera_in_pit, pit):
+    camera_in_pit.picture()
+    scene = camera_in_pit.renderer.scene
+    drawn = [scene.geoms[i] for i in range(scene.ngeom) if scene.geoms[i].rgba[3] < 0.5]
+    assert len(drawn) == 8
+    feet = pit.feet_pos.reshape(-1, 3).numpy()
+    np.testing.assert_allclose([geom.pos[:2] for geom in drawn], feet[:, :2], atol=1e-4)
+    ground = pit.terrain.height_map.height_at(feet[:, 0], feet[:, 1])
+    np.testing.assert_allclose([geom.pos[2] for geom in drawn], ground, atol=1e-4)
+
+
+def level(height: float = 0.0) -> HeightMap:
+    return HeightMap.of(np.full((200, 200), height), 0.1, (-10.0, -10.0), np.full((200, 200), np.inf))
+
+
+def test_a_follower_converges_without_jumps():
+    follower = Follower(level())
+    follower.update(np.array([0.0, 0.0, 0.5]))
+    np.testing.assert_allclose(follower.lookat, [0.0, 0.0, 0.5])
+    target = np.array([0.6, -0.4, 0.8])
+    before = np.array(follower.lookat)
+    for _ in range(150):
+        follower.update(target)
+        assert np.linalg.norm(follower.lookat - before) < 0.2 * np.linalg.norm(target - [0.0, 0.0, 0.5])
+        before = np.array(follower.lookat)
+    np.testing.assert_allclose(follower.lookat, target, atol=1e-3)
+    assert follower.elevation == FLATTEST
+
+
+def test_a_follower_cuts_to_a_robot_that_was_put_elsewhere():
+    follower = Follower(level())
+    follower.update(np.zeros(3))
+    follower.update(np.array([CUT + 0.1, 0.0, 0.0]))
+    np.testing.assert_allclose(follower.lookat, [CUT + 0.1, 0.0, 0.0])
+
+
+def test_a_follower_looks_over_the_rim_of_a_pit():
+    """2 m wide and 1.5 m deep: from the flattest elevation the camera would stand inside the ground."""
+    heights = np.zeros((200, 200))
+    heights[90:110, 90:110] = -1.5
+    ground = HeightMap.of(heights, 0.1, (-10.0, -10.0), np.full((200, 200), 0.2))
+    follower = Follower(ground)
+    follower.update(np.array([0.0, 0.0, -1.0]))
+    steep = follower.elevation
+    assert steep < FLATTEST - 10.0
+    follower.update(np.array([0.3, 0.0, -1.0]))
+    assert abs(follower.elevation - steep) < 3.0
+    view = mujoco.MjvCamera()
+    follower.aim(view)
+    e, a = np.radians([view.elevation, view.azimuth])
+    eye = view.lookat - view.distance * np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    along = np.linspace(0.3, 1.0, 50)[:, None]
+    sight = (1.0 - along) * view.lookat + along * eye
+    assert (sight[:, 2] > ground.height_at(sight[:, 0], sight[:, 1])).all()
+
+
+def test_a_follower_sees_the_faces_of_steps():
+    """A step up at x = 1, and one down at x = -5: they are seen from the side on which they are."""
+    heights = np.zeros((200, 200))
+    heights[110:] = 0.3
+    heights[:50] = 0.3
+    follower = Follower(HeightMap.of(heights, 0.1, (-10.0, -10.0), np.full((200, 200), 0.2)))
+    for x, azimuth in ((0.0, BEHIND), (-6.0, FRONT), (-3.0, BEHIND), (4.0, BEHIND)):
+        follower.update(np.array([x, 0.0, 0.5]))
+        assert follower.azimuth == azimuth

@@ -6,8 +6,9 @@ import pytest
 from helpers import TASK, call
 from PIL import Image
 
+from legged.rendering.paint import HIGH, LOW, MIDDLE, colour
 from legged.tools import show_terrain
-from legged.tools.terrain_picture import HIGH, LOW, MIDDLE, Camera, colour
+from legged.tools.terrain_picture import Camera
 
 
 @pytest.fixture(scope="module")

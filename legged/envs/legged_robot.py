@@ -36,8 +36,11 @@ class LeggedRobot(Terms, BaseTask):
     the configuration names the ones that run. N robots, D joints, F feet, B tracked collision shapes.
     """
 
-    def __init__(self, cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True) -> None:
-        """Build physics and MDP on `device`; with `graph`, the step is captured on a GPU.
+    def __init__(
+        self, cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None
+    ) -> None:
+        """Build physics and MDP on `device`; with `graph`, the step is captured on a GPU. A `terrain` takes the place of
+        the one that the configuration asks for.
 
         Raises:
             ConfigError: the configuration names something that does not exist; nothing is compiled then.
@@ -50,7 +53,7 @@ class LeggedRobot(Terms, BaseTask):
         torch.manual_seed(cfg.env.seed)
         n = self.num_envs
         self.randomization = Randomization(cfg.domain_rand, n, self.dt, device)
-        self.terrain = self.make_terrain()
+        self.terrain = terrain or self.make_terrain()
         self.physics = make_physics(robot, cfg.sim, n, device, self.terrain)
         self.randomization.apply(self.physics)
 

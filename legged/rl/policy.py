@@ -16,6 +16,7 @@ from legged.rl.arguments import overrides
 from legged.rl.checkpoint import check_fits, read_checkpoint
 from legged.rl.runner import Runner
 from legged.rl.runs import find_checkpoint, find_run, run_config, shipped_policy
+from legged.terrain import Terrain
 
 
 @dataclass(frozen=True)
@@ -69,9 +70,14 @@ def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:
 
 
 def restore(
-    policy: TrainedPolicy, changes: Iterable[tuple[str, Any]], device: torch.device, graph: bool = True
+    policy: TrainedPolicy,
+    changes: Iterable[tuple[str, Any]],
+    device: torch.device,
+    graph: bool = True,
+    terrain: Terrain | None = None,
 ) -> tuple[LeggedRobot, Runner]:
-    """The task with some settings changed, and a runner that holds the policy; nothing is written.
+    """The task with some settings changed, on its own terrain or on the one given, and a runner that holds the policy;
+    nothing is written.
 
     Raises:
         ConfigError: the checkpoint does not fit the task.
@@ -79,7 +85,7 @@ def restore(
     cfg = override(policy.cfg, changes)
     task_class(cfg.task).check(cfg)
     check_fits(policy.checkpoint, read_checkpoint(policy.checkpoint), cfg)
-    task = make_task(cfg, device, graph)
+    task = make_task(cfg, device, graph, terrain)
     runner = Runner(task, None, str(device))
     runner.load(str(policy.checkpoint))
     return task, runner

@@ -11,12 +11,14 @@ from torch import Tensor
 
 from legged.envs import LeggedRobot
 from legged.rendering import display_model
+from legged.rl.playground import Playground
 
 STEP = (0.1, 0.1, 0.2)
 """Change of vx, vy [m/s] and yaw rate [rad/s] by one key press."""
-UP, DOWN, LEFT, RIGHT, SPACE, COMMA, PERIOD, BACKSPACE = 265, 264, 263, 262, 32, 44, 46, 259
+UP, DOWN, LEFT, RIGHT, SPACE, COMMA, PERIOD, BACKSPACE, NEXT = 265, 264, 263, 262, 32, 44, 46, 259, ord("N")
 HELP = """viewer: up/down vx, left/right yaw rate, comma/period vy, space stands still, backspace starts anew;
 close the window to record the video"""
+HELP_ON_TERRAIN = "n goes to the next tile"
 
 
 class Keyboard:
@@ -29,6 +31,8 @@ class Keyboard:
         self.low, self.high = low, high
         self.command = [0.0, 0.0, 0.0]
         self.restart = False
+        self.tile = 0
+        """How many times the next tile was asked for."""
 
     def press(self, key: int) -> None:
         """Take one key, by GLFW's code; others mean nothing."""
@@ -40,29 +44,35 @@ class Keyboard:
             self.command = [0.0, 0.0, 0.0]
         elif key == BACKSPACE:
             self.restart = True
+        elif key == NEXT:
+            self.tile += 1
+            self.restart = True
 
 
 @torch.inference_mode()
-def view(task: LeggedRobot, act: Callable[[TensorDict], Tensor]) -> None:
-    """Show the task's first robot in real time until the window is closed."""
+def view(task: LeggedRobot, act: Callable[[TensorDict], Tensor], playground: Playground | None = None) -> None:
+    """Show the task's first robot in real time until the window is closed; on terrain, on a tile of the playground."""
     low, high = task.command_sampler.full_ranges.t().tolist()
     keyboard = Keyboard(low, high)
-    model = display_model(task.robot, 1, 640, 480)
+    model = display_model(task.robot, 1, 640, 480, task.terrain)
     data = mujoco.MjData(model)
     simulated = mujoco.MjData(task.physics.model)  # type: ignore[attr-defined]
     print(HELP)
-    task.reset()
+    if playground:
+        print(HELP_ON_TERRAIN)
+    begin_anew(task, playground, keyboard)
     panels = {"show_left_ui": False, "show_right_ui": False}
     with mujoco.viewer.launch_passive(model, data, key_callback=keyboard.press, **panels) as window:
         window.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
         window.cam.trackbodyid = model.body(f"0/{task.robot.file.base}").id
-        window.cam.distance, window.cam.azimuth, window.cam.elevation = 2.5, 130.0, -18.0
+        window.cam.distance, window.cam.azimuth, window.cam.elevation = (
+            (2.5, 130.0, -18.0) if task.terrain is None else (4.0, 62.0, -35.0)
+        )
         window.opt.geomgroup[3] = 0  # collision shapes
         while window.is_running():
             begin = time.perf_counter()
             if keyboard.restart:
-                task.reset()
-                keyboard.restart = False
+                begin_anew(task, playground, keyboard)
             command = torch.tensor(keyboard.command, device=task.device)  # type: ignore[arg-type]
             task.step(act(task.hold_commands(command)))
             with window.lock():
@@ -71,3 +81,13 @@ def view(task: LeggedRobot, act: Callable[[TensorDict], Tensor]) -> None:
                 mujoco.mj_forward(model, data)
             window.sync()
             time.sleep(max(0.0, task.dt - (time.perf_counter() - begin)))
+
+
+def begin_anew(task: LeggedRobot, playground: Playground | None, keyboard: Keyboard) -> None:
+    """Put the robots back to their start, on terrain on the tile that the keyboard asks for, and name it."""
+    if playground and task.terrain:
+        playground.place(task, keyboard.tile)
+    task.reset()
+    keyboard.restart = False
+    if playground and task.terrain:
+        print(playground.label(task.terrain, task.base_pos[0].tolist()))

@@ -1,6 +1,7 @@
-"""How well a policy tracks commands: `python -m legged.tools.evaluate --task anymal_c_flat [--physics mujoco]`.
+"""How good a policy is: `python -m legged.tools.evaluate --task anymal_c_flat [--physics mujoco]`.
 
-Prints a table and writes evaluation_<physics>.json and .png beside the checkpoint (or to --out).
+How well it tracks commands, for tasks with terrain on rough ground; and there, how hard a terrain it still crosses. Prints
+tables and writes evaluation_<physics>.json and .png and success_<physics>.png beside the checkpoint (or to --out).
 """
 
 import argparse
@@ -16,7 +17,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from legged.config import ConfigError
+from legged.config import ConfigError, override
 from legged.paths import relative
 from legged.physics import resolve_physics
 from legged.rl.arguments import (
@@ -27,9 +28,11 @@ from legged.rl.arguments import (
     pick_device,
     run_main,
 )
-from legged.rl.policy import find_policy, restore, undisturbed
+from legged.rl.policy import TrainedPolicy, find_policy, restore, undisturbed
 from legged.rl.runs import write_text
-from legged.tools.velocity_grid import Grid, measure
+from legged.tools.success import chosen_types, on_terrain, sweep
+from legged.tools.success_report import plot_success, print_success, with_other_engine
+from legged.tools.velocity_grid import ROUGH_SPAWN, Grid, measure, rough_ground, rough_side
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -45,11 +48,17 @@ def _main(argv: list[str] | None) -> int:
     for axis, unit in (("vx", "m/s"), ("vy", "m/s"), ("yaw", "rad/s")):
         parser.add_argument(f"--{axis}", default="-1:1:0.5", help=f"low:high:step of the command grid [{unit}]")
     parser.add_argument("--robots", type=int, default=16, help="robots a cell")
+    parser.add_argument("--types", help="terrain types to cross, e.g. stairs_up,pit; those of the training by default")
+    parser.add_argument("--full", action="store_true", help="all sizes of a type, 256 robots each")
+    parser.add_argument("--robots-per-point", type=int, help="robots for each size of a type; 32, or 256 with --full")
     parser.add_argument("--out", type=Path, help="folder for JSON and PNG; beside the checkpoint by default")
     args = parser.parse_intermixed_args(argv)
     import_and_check(args)
     if args.robots < 1:
         raise ConfigError(f"--robots: must be at least 1, got {args.robots}")
+    a_point = args.robots_per_point if args.robots_per_point is not None else (256 if args.full else 32)
+    if a_point < 1:
+        raise ConfigError(f"--robots-per-point: must be at least 1, got {a_point}")
     if args.num_envs is not None:
         raise ConfigError("--num_envs: the grid says how many robots there are; --robots sets those of a cell")
     grid = Grid(axis_values("--vx", args.vx), axis_values("--vy", args.vy), axis_values("--yaw", args.yaw), args.robots)
@@ -58,27 +67,76 @@ def _main(argv: list[str] | None) -> int:
         torch.set_num_threads(1)
     engine = resolve_physics(args.physics or "auto", device)
     policy = find_policy(args)
-    changes = undisturbed(grid.num_envs, grid.hold_s)
-    changes += [change for change in overrides(args) if change[0] != "train.runner.experiment_name"]
+    types = chosen_types(policy.cfg, args.types)
+    asked = [change for change in overrides(args) if change[0] != "train.runner.experiment_name"]
+    asked.append(("sim.physics", engine))
     start = time.perf_counter()
-    task, runner = restore(policy, [*changes, ("sim.physics", engine)], device, graph=not args.no_graph)
-    result = measure(task, runner.get_inference_policy(str(device)), grid)
-    result = {
+    figures = track(policy, grid, asked, device, graph=not args.no_graph)
+    lost = figures.pop("contact_overflows")
+    rough = policy.cfg.terrain.mesh_type != "plane"
+    header = {
         "task": policy.cfg.task,
         "checkpoint": policy.checkpoint.name,
         "physics": engine,
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+    }
+    success = None
+    if types:
+        success = sweep(policy, types, a_point, args.full, asked, device, not args.no_graph, tell)
+    result = {
+        **header,
         "wall_s": time.perf_counter() - start,
-        **result,
+        **({"rough": {"bumps": 0.05, **figures, "contact_overflows": lost}} if rough else figures),
+        **({} if success is None else {"success": success}),
     }
     folder = args.out or policy.folder
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"evaluation_{engine}.json"
-    write_text(path, json.dumps(result, indent=1))
-    plot(result, path.with_suffix(".png"))
-    print_report(result)
-    print(f"written: {relative(path)}, {relative(path.with_suffix('.png'))}")
+    write_text(path, json.dumps(result, indent=1, allow_nan=False))
+    written = [path, path.with_suffix(".png")]
+    tracking = {**header, **figures, "ground": "on rough ground, " if rough else ""}
+    plot(tracking, written[1])
+    print_report(tracking)
+    warn_of_overflows("tracking", lost)
+    if success is not None:
+        written.append(folder / f"success_{engine}.png")
+        plot_success(with_other_engine(result, path), written[2])
+        print_success(success)
+        warn_of_overflows("success", success["contact_overflows"])
+    print(f"written: {', '.join(relative(one) for one in written)}")
     return 0
+
+
+def track(
+    policy: TrainedPolicy, grid: Grid, asked: list[tuple[str, Any]], device: torch.device, graph: bool
+) -> dict[str, Any]:
+    """The grid, on a plane or, for tasks with terrain, on bumpy level ground; `asked` is what the command line changes."""
+    changes = undisturbed(grid.num_envs, grid.hold_s)
+    terrain = None
+    if policy.cfg.terrain.mesh_type == "plane":
+        changes += asked
+    else:
+        changes += [*on_terrain(policy.cfg, rough_side(grid), ROUGH_SPAWN), *asked]
+        cfg = override(policy.cfg, changes)
+        terrain = rough_ground(cfg.terrain, cfg.env.seed)
+        tell(f"tracking on rough ground: {len(grid.cells)} commands x {grid.robots} robots")
+    task, runner = restore(policy, changes, device, graph, terrain)
+    return measure(task, runner.get_inference_policy(str(device)), grid)
+
+
+def tell(line: str) -> None:
+    """Show how far a long evaluation is, at once."""
+    print(line, flush=True)
+
+
+def warn_of_overflows(what: str, lost: int) -> None:
+    """Results with lost contacts are not to be trusted; say so."""
+    if lost:
+        print(
+            f"warning: {what}: contacts were lost for want of memory, {lost} times (robots x steps); raise sim.nconmax and"
+            " sim.njmax",
+            file=sys.stderr,
+        )
 
 
 def axis_values(flag: str, text: str) -> list[float]:
@@ -103,7 +161,10 @@ def axis_values(flag: str, text: str) -> list[float]:
 def print_report(result: dict[str, Any]) -> None:
     """The figures over the grid, and the gait at 0.5 m/s."""
     lin, ang, gait = result["rmse_lin"], result["rmse_ang"], result["gait"]
-    table = Table(title=f"{result['task']} ({result['checkpoint']}) in {result['physics']}", title_justify="left")
+    title = f"{result['task']} ({result['checkpoint']}) in {result['physics']}"
+    if result["ground"]:
+        title += ", on level ground with bumps of up to 5 cm"
+    table = Table(title=title, title_justify="left")
     for name, justify in (("measure", "left"), ("value", "right"), ("where", "left")):
         table.add_column(name, justify=justify)  # type: ignore[arg-type]
     cells = f"{len(result['cells'])} cells x {result['robots_per_cell']} robots x {result['measured_s']:.0f} s"
@@ -148,7 +209,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
             dark = value > 0.6 * np.nanmax(values)
             axis.text(i, j, f"{value:.2f}", ha="center", va="center", color="white" if dark else "black")
         figure.colorbar(image, ax=axis, label=label)
-    figure.suptitle(f"{result['task']} in {result['physics']}, falls {100 * result['falls']:.1f} %")
+    figure.suptitle(f"{result['task']} in {result['physics']}, {result['ground']}falls {100 * result['falls']:.1f} %")
     part = path.with_name(f".{path.name}")
     figure.savefig(part, dpi=110, format="png")
     plt.close(figure)

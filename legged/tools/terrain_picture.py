@@ -8,21 +8,13 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from legged.config import ConfigError
-from legged.physics.terrain_geoms import add_terrain
 from legged.rendering import add_sky
+from legged.rendering.paint import DEPTH, add_painted_terrain
 from legged.robot import Robot
 from legged.terrain import Terrain
 
-DEPTH = 0.6
-"""Ground that is shown below the lowest point [m]."""
-LOW, MIDDLE, HIGH = np.array([[0.42, 0.52, 0.58], [0.80, 0.77, 0.70], [0.78, 0.58, 0.42]])
-"""Colours of the deepest, the level and the highest ground."""
-
-
 SUN = np.array([0.39, -0.54, -0.75])
 """Direction of its light: from the left, so that risers which face the camera are lit, if less than treads."""
-LEVEL_RANGE = 0.9
-"""Heights, up and down, over which the colours change [m]."""
 FIELD_OF_VIEW = 30.0
 """Of the camera, from bottom to top [degrees]."""
 
@@ -131,39 +123,11 @@ def _model(terrain: Terrain, places: Sequence[Place], robot: Robot, width: int, 
         specular=[0.0] * 3,
         castshadow=True,
     )
-    for geom in add_terrain(scene, terrain, collide=False, depth=DEPTH):
-        _paint(scene, geom, terrain)
+    add_painted_terrain(scene, terrain)
     for i in range(len(places)):
         frame = scene.worldbody.add_frame()
         scene.attach(mujoco.MjSpec.from_file(str(robot.model_path)), prefix=f"{i}/", frame=frame)
     return scene.compile()
-
-
-def _paint(scene: mujoco.MjSpec, geom: mujoco.MjsGeom, terrain: Terrain) -> None:
-    """Colour by height: one colour a box, a texture on a height field."""
-    if geom.type == mujoco.mjtGeom.mjGEOM_BOX:
-        geom.rgba = [*colour(np.array(geom.pos[2] + geom.size[2])), 1.0]
-        return
-    shape = scene.hfield(geom.hfieldname)
-    heights = geom.pos[2] + shape.size[2] * np.array(shape.userdata).reshape(shape.nrow, shape.ncol)
-    pixels = (255 * colour(heights)).astype(np.uint8)
-    scene.add_texture(
-        name=geom.name,
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        width=shape.ncol,
-        height=shape.nrow,
-        nchannel=3,
-        data=pixels.ravel().tolist(),
-    )
-    material = scene.add_material(name=geom.name, specular=0.0)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = geom.name
-    geom.material = geom.name
-
-
-def colour(heights: np.ndarray) -> np.ndarray:
-    """(..., 3) colours between 0 and 1 of heights [m]."""
-    t = np.clip(heights / LEVEL_RANGE, -1.0, 1.0)
-    return np.stack([np.interp(t, (-1.0, 0.0, 1.0), stops) for stops in np.array([LOW, MIDDLE, HIGH]).T], axis=-1)
 
 
 def _pose(model: mujoco.MjModel, data: mujoco.MjData, terrain: Terrain, places: Sequence[Place], robot: Robot) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
+from math import ceil
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,13 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged.config.schema import TerrainConfig
 from legged.envs import LeggedRobot
+from legged.terrain import Terrain, TileSpec
 
 GRAVITY = 9.81
+ROUGH_SPAWN = 2.0
+"""On rough ground robots start at most this far from the middle, in x and in y, so that they meet different bumps [m]."""
 SLOWEST = 0.1
 """Cost of transport is not defined for robots slower than this [m/s]."""
 
@@ -46,22 +51,58 @@ def measure(task: LeggedRobot, act: Callable[[TensorDict], Tensor], grid: Grid) 
     """Run the grid on a task of grid.num_envs robots; returns plain numbers and lists, one entry a cell in "cells".
 
     A robot that falls counts as a fall and is measured up to its fall. Errors are instantaneous, per control step.
+    `contact_overflows` counts the robots and steps in which contacts were lost for want of memory.
     """
     cells = grid.cells
     device = torch.device(task.device)
     commands = torch.tensor(cells, dtype=torch.float32, device=device).repeat_interleave(grid.robots, dim=0)
     task.reset()
     observations = task.hold_commands(commands)
-    sums = _Sums(task)
+    sums, overflows = _Sums(task), Overflows()
     alive = torch.ones(task.num_envs, dtype=torch.bool, device=device)
     settle, steps = round(grid.settle_s / task.dt), round(grid.hold_s / task.dt)
     for step in range(steps):
-        observations, _, _, _ = task.step(act(observations))
+        observations, _, _, extras = task.step(act(observations))
+        overflows.add(extras)
         alive &= ~task.terminated_buf
         if step >= settle:
             sums.add(task, alive)
     fell = (~alive).float()
-    return summarize(task, grid, cells, sums, fell, (steps - settle) * task.dt)
+    result = summarize(task, grid, cells, sums, fell, (steps - settle) * task.dt)
+    return {**result, "contact_overflows": overflows.total(task)}
+
+
+class Overflows:
+    """Contacts that were lost for want of memory: robots times control steps. The task's own count begins anew with every
+    rollout that it logs.
+    """
+
+    NAME = "Metrics/contact_overflows"
+
+    def __init__(self) -> None:
+        self._logged: list[Tensor] = []
+
+    def add(self, extras: dict[str, Any]) -> None:
+        """Keep what a step returned, if it closed a rollout."""
+        if "log" in extras:
+            self._logged.append(extras["log"][self.NAME])
+
+    def total(self, task: LeggedRobot) -> int:
+        """All since the task was reset; to be asked once."""
+        return int(sum(self._logged, task.statistics.flush()[self.NAME]))
+
+
+def rough_ground(cfg: TerrainConfig, seed: int) -> Terrain:
+    """One level tile with bumps of up to 5 cm, on which all robots of a grid start; the configuration says how large it
+    is (see `rough_side`).
+    """
+    return Terrain.of_tiles([[TileSpec("rough_slope_up", 0.0)]], cfg, np.random.default_rng(seed))
+
+
+def rough_side(grid: Grid) -> float:
+    """Side of a tile that nobody leaves while it holds its command [m]: 20 m for 1.4 m/s and 4 s."""
+    fastest = float(np.linalg.norm(grid.cells[:, :2], axis=1).max())
+    return 2.0 * ceil(ROUGH_SPAWN + fastest * grid.hold_s + 1.5)
 
 
 class _Sums:
@@ -86,7 +127,7 @@ class _Sums:
             "power": power.abs().sum(dim=1),
             "positive_power": power.clamp(min=0.0).sum(dim=1),
             "speed": task.base_lin_vel[:, :2].norm(dim=1),
-            "height": task.base_pos[:, 2],
+            "height": task.base_pos[:, 2] - task.height_scan.ground,
             "collision": collision.any(dim=1).float(),
             "stance": (task.contact_forces[:, task.feet_indices, 2] > 1.0).float(),
             "touch_downs": task.contacts.first_contact.float(),

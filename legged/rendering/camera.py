@@ -8,67 +8,30 @@ from PIL import Image, ImageDraw, ImageFont
 
 from legged.config import ConfigError
 from legged.envs import LeggedRobot
-from legged.robot import Robot
+from legged.rendering.follower import Follower
+from legged.rendering.scene import display_model
+from legged.terrain import HeightMap
 
 COMMANDED = (0.10, 0.75, 0.25, 1.0)
 ACTUAL = (0.15, 0.45, 0.95, 1.0)
+SHADE = (0.05, 0.05, 0.05, 0.4)
 SPACING = 1.9
 """Distance between neighbours [m]."""
 
 
-def add_sky(scene: mujoco.MjSpec) -> None:
-    """A pale blue sky, white at the horizon."""
-    scene.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.62, 0.76, 0.90],
-        rgb2=[0.94, 0.96, 0.98],
-        width=256,
-        height=1536,
-    )
-
-
-def display_model(robot: Robot, count: int, width: int, height: int) -> mujoco.MjModel:
-    """`count` copies of the robot over one checkered floor under a sky; for drawing, not for simulating."""
-    scene = mujoco.MjSpec()
-    scene.visual.global_.offwidth, scene.visual.global_.offheight = width, height
-    scene.visual.quality.shadowsize = scene.visual.quality.offsamples = 0  # ten times faster without a GPU
-    scene.visual.headlight.ambient, scene.visual.headlight.diffuse = [0.45] * 3, [0.5] * 3
-    scene.visual.map.zfar = 60
-    scene.stat.extent, scene.stat.center = 4.0, [0, 0, 0.4]
-    add_sky(scene)
-    scene.add_texture(
-        name="checker",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=[0.80, 0.82, 0.84],
-        rgb2=[0.70, 0.73, 0.76],
-        width=512,
-        height=512,
-    )
-    ground = scene.add_material(name="ground", texrepeat=[1, 1], texuniform=True)
-    ground.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "checker"
-    scene.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], material="ground")
-    scene.worldbody.add_light(
-        pos=[0, 0, 20], dir=[-0.3, 0.35, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, diffuse=[0.5] * 3
-    )
-    for i in range(count):
-        frame = scene.worldbody.add_frame()
-        scene.attach(mujoco.MjSpec.from_file(str(robot.model_path)), prefix=f"{i}/", frame=frame)
-    return scene.compile()
-
-
 class Camera:
-    """Draws the first `count` robots of a task, side by side on one floor, from a camera that follows them."""
+    """Draws the first `count` robots of a task: on a plane side by side, from a camera that follows them all; on terrain
+    where they are, from one that follows the robot `followed`.
+    """
 
     def __init__(self, task: LeggedRobot, count: int, width: int = 960, height: int = 540) -> None:
         """Raises ConfigError where nothing can be rendered."""
         self.task, self.count = task, count
-        self.model = display_model(task.robot, count, width, height)
+        self.followed = 0
+        self.model = display_model(task.robot, count, width, height, task.terrain)
         self.data = mujoco.MjData(self.model)
         try:
-            self.renderer = mujoco.Renderer(self.model, height, width)
+            self.renderer = mujoco.Renderer(self.model, height, width, max_geom=self.model.ngeom + 1000)
         except Exception as error:  # each GL back-end fails in its own way
             raise ConfigError(
                 f"cannot render here ({error}); without a display MUJOCO_GL=egl or MUJOCO_GL=osmesa and their"
@@ -78,10 +41,14 @@ class Camera:
         self.options.geomgroup[3] = 0  # collision shapes
         self.view = mujoco.MjvCamera()
         self.view.azimuth, self.view.elevation, self.view.distance = 130.0, -18.0, 2.0 + 1.1 * count**0.5
-        columns = int(np.ceil(count**0.5))
-        grid = np.array([[-(i // columns), i % columns] for i in range(count)], dtype=float)
         self.offsets = np.zeros((count, 3))
-        self.offsets[:, :2] = SPACING * (grid - grid.mean(axis=0))
+        self._follower: Follower | None = None
+        if task.terrain is None:
+            columns = int(np.ceil(count**0.5))
+            grid = np.array([[-(i // columns), i % columns] for i in range(count)], dtype=float)
+            self.offsets[:, :2] = SPACING * (grid - grid.mean(axis=0))
+        else:
+            self._follower = Follower(task.terrain.height_map)
         self._single = mujoco.MjData(task.physics.model)  # type: ignore[attr-defined]
         self._lookat: np.ndarray | None = None
 
@@ -96,10 +63,10 @@ class Camera:
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
         bases = self.data.qpos.reshape(self.count, size)[:, :3]
-        centre = np.array([*bases[:, :2].mean(axis=0), 0.4])
-        self._lookat = centre if self._lookat is None else 0.9 * self._lookat + 0.1 * centre  # no shaking
-        self.view.lookat[:] = self._lookat
+        self._point(bases)
         self.renderer.update_scene(self.data, self.view, self.options)
+        if self.task.terrain is not None:
+            self._shade_feet(self.task.terrain.height_map)
         commands = self.task.commands[: self.count, :2].cpu().numpy()
         actual = self.task.base_lin_vel[: self.count, :2].cpu().numpy()
         for i in range(self.count):
@@ -111,18 +78,45 @@ class Camera:
             self._arrow(above + np.array([0.0, 0.0, 0.09]), turn @ actual[i], ACTUAL)
         return _write_on(self.renderer.render(), caption)
 
+    def _point(self, bases: np.ndarray) -> None:
+        """Turn the camera to robots at `bases` (count, 3), world frame [m]."""
+        if self._follower is not None:
+            self._follower.update(bases[self.followed])
+            self._follower.aim(self.view)
+            return
+        centre = np.array([*bases[:, :2].mean(axis=0), 0.4])
+        self._lookat = centre if self._lookat is None else 0.9 * self._lookat + 0.1 * centre  # no shaking
+        self.view.lookat[:] = self._lookat
+
+    def _shade_feet(self, ground: HeightMap) -> None:
+        """A dark spot on the ground below each foot, in place of shadows: it shows where feet stand, and which ones."""
+        feet = self.task.feet_pos[: self.count].reshape(-1, 3).cpu().numpy()
+        below = ground.height_at(feet[:, 0], feet[:, 1])
+        for foot, height in zip(feet, below, strict=True):
+            radius = 0.09 * np.clip(1.0 - (foot[2] - height) / 0.4, 0.3, 1.0)
+            self._decorate(mujoco.mjtGeom.mjGEOM_ELLIPSOID, SHADE, [radius, radius, 0.02], [*foot[:2], height])
+
+    def _decorate(
+        self, kind: mujoco.mjtGeom, colour: Sequence[float], size: Sequence[float], pos: Sequence[float]
+    ) -> mujoco.MjvGeom | None:
+        """Add a shape to the picture alone, upright at `pos`; None where there is no room."""
+        scene = self.renderer.scene
+        if scene.ngeom >= scene.maxgeom:
+            return None
+        geom = scene.geoms[scene.ngeom]
+        rgba = np.array(colour, dtype=np.float32)
+        mujoco.mjv_initGeom(geom, kind, np.array(size, dtype=float), np.array(pos, dtype=float), np.eye(3).ravel(), rgba)
+        scene.ngeom += 1
+        return geom
+
     def _arrow(self, start: np.ndarray, velocity: np.ndarray, colour: tuple[float, ...]) -> None:
         """An arrow of 0.6 m per m/s."""
-        scene = self.renderer.scene
-        if np.linalg.norm(velocity) < 0.03 or scene.ngeom >= scene.maxgeom:
+        if np.linalg.norm(velocity) < 0.03:
             return
-        geom = scene.geoms[scene.ngeom]
         kind = mujoco.mjtGeom.mjGEOM_ARROW
-        rgba = np.array(colour, dtype=np.float32)
-        mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), rgba)
-        end = start + 0.6 * np.array([*velocity, 0.0])
-        mujoco.mjv_connector(geom, kind, 0.03, start, end)
-        scene.ngeom += 1
+        geom = self._decorate(kind, colour, [0.0] * 3, [0.0] * 3)
+        if geom is not None:
+            mujoco.mjv_connector(geom, kind, 0.03, start, start + 0.6 * np.array([*velocity, 0.0]))
 
     def close(self) -> None:
         """Free the renderer."""

@@ -1,0 +1,66 @@
+"""What is drawn: robots on a floor or a terrain, under a sky."""
+
+from collections.abc import Sequence
+
+import mujoco
+
+from legged.rendering.paint import add_horizon, add_painted_terrain
+from legged.robot import Robot
+from legged.terrain import Terrain
+
+
+def add_sky(scene: mujoco.MjSpec) -> None:
+    """A pale blue sky, white at the horizon."""
+    scene.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.62, 0.76, 0.90],
+        rgb2=[0.94, 0.96, 0.98],
+        width=256,
+        height=1536,
+    )
+
+
+def display_model(robot: Robot, count: int, width: int, height: int, terrain: Terrain | None = None) -> mujoco.MjModel:
+    """`count` copies of the robot over one checkered floor, or a terrain, under a sky; for drawing, not for simulating."""
+    scene = mujoco.MjSpec()
+    scene.visual.global_.offwidth, scene.visual.global_.offheight = width, height
+    scene.visual.quality.shadowsize = scene.visual.quality.offsamples = 0  # ten times faster without a GPU
+    scene.visual.map.zfar = 60
+    scene.stat.extent, scene.stat.center = 4.0, [0, 0, 0.4]
+    add_sky(scene)
+    if terrain is None:
+        _add_floor(scene)
+        _light(scene, [-0.3, 0.35, -1], ambient=0.45, headlight=0.5, sun=0.5)
+    else:
+        add_painted_terrain(scene, terrain, checkered=True)
+        add_horizon(scene, terrain)
+        # Little light from the camera and much from the left behind it: treads, risers and flanks differ.
+        _light(scene, [0.3, -0.35, -0.9], ambient=0.42, headlight=0.12, sun=0.62)
+    for i in range(count):
+        frame = scene.worldbody.add_frame()
+        scene.attach(mujoco.MjSpec.from_file(str(robot.model_path)), prefix=f"{i}/", frame=frame)
+    return scene.compile()
+
+
+def _add_floor(scene: mujoco.MjSpec) -> None:
+    """A checkered plane."""
+    scene.add_texture(
+        name="checker",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.80, 0.82, 0.84],
+        rgb2=[0.70, 0.73, 0.76],
+        width=512,
+        height=512,
+    )
+    ground = scene.add_material(name="ground", texrepeat=[1, 1], texuniform=True)
+    ground.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "checker"
+    scene.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], material="ground")
+
+
+def _light(scene: mujoco.MjSpec, direction: Sequence[float], ambient: float, headlight: float, sun: float) -> None:
+    """A sun that shines in a direction, and a light at the camera."""
+    scene.visual.headlight.ambient, scene.visual.headlight.diffuse = [ambient] * 3, [headlight] * 3
+    scene.worldbody.add_light(pos=[0, 0, 20], dir=direction, type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, diffuse=[sun] * 3)

@@ -1,0 +1,129 @@
+"""The ground that play shows: a few tiles of chosen types and sizes, in which every robot has its place."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from legged.config import ConfigError, TaskConfig, suggest
+from legged.envs import LeggedRobot
+from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, check_terrain
+
+DIFFICULTIES = (0.5, 0.8)
+"""Of the tiles on which robots start, and of those behind them, which they reach."""
+COLUMNS = 4
+"""Tiles side by side where there is only one type; those of random types differ."""
+SETTING: tuple[tuple[str, Any], ...] = (
+    ("terrain.border_size", 3.0),
+    ("terrain.spawn_range", 0.3),
+    ("init_state.yaw", [0.0, 0.0]),
+)
+"""Overrides that others may follow: little ground around the tiles, starts near their middle, facing along x."""
+ROWS_NEEDED = 128
+"""Constraint rows that a robot on steps needs in mujoco-warp."""
+
+
+@dataclass(frozen=True)
+class Playground:
+    """Two rows of tiles, each column of one type. Robots start in the middle of the first row's and walk along x, out of
+    their tile and into the one behind it.
+    """
+
+    rows: tuple[tuple[TileSpec, ...], tuple[TileSpec, ...]]
+    order: tuple[int, ...]
+    """Columns in the order in which robots are put there: those worth seeing first."""
+
+    @classmethod
+    def of(cls, cfg: TaskConfig, name: str | None, difficulty: float | None) -> "Playground | None":
+        """What --terrain and --difficulty ask for: COLUMNS tiles of the type `name`, else one of each of the task's own
+        types; None for a task on a plane.
+
+        Raises:
+            ConfigError: no such type, or no such difficulty.
+        """
+        if difficulty is not None and not 0.0 <= difficulty <= 1.0:
+            raise ConfigError(f"--difficulty: must be between 0 and 1, got {difficulty:g}")
+        if name is not None and name not in TERRAIN_TYPES:
+            raise ConfigError(f"--terrain: there is no terrain type '{name}'{suggest(name, TERRAIN_TYPES)}")
+        if name is None and cfg.terrain.mesh_type == "plane":
+            if difficulty is not None:
+                raise ConfigError(f"--difficulty: {cfg.task} stands on a plane; name a type with --terrain")
+            return None
+        columns: Sequence[str]
+        if name is None:
+            check_terrain(cfg.terrain, cfg.task)
+            shares = cfg.terrain.proportions
+            columns = [kind for kind, share in shares.items() if share > 0.0]
+            order = sorted(range(len(columns)), key=lambda c: -shares[columns[c]])
+        else:
+            columns = [name] * COLUMNS
+            order = sorted(range(COLUMNS), key=lambda c: abs(c - 0.5 * (COLUMNS - 1)))
+        front, back = (
+            tuple(TileSpec(kind, TERRAIN_TYPES[kind].size(d)) for kind in columns)
+            for d in (DIFFICULTIES if difficulty is None else (difficulty, difficulty))
+        )
+        return cls((front, back), tuple(order))
+
+    @property
+    def types(self) -> list[str]:
+        """The types there are, each once."""
+        return list(dict.fromkeys(spec.type for spec in self.rows[0]))
+
+    def changes(self, cfg: TaskConfig) -> list[tuple[str, Any]]:
+        """Overrides under which a task of configuration `cfg` stands on this ground; what its policy sees stays."""
+        shares = dict.fromkeys(cfg.terrain.proportions, 0.0) | dict.fromkeys(self.types, 1.0 / len(self.types))
+        return [
+            ("terrain.mesh_type", "height_map"),
+            ("terrain.curriculum", False),
+            ("terrain.proportions", shares),
+            ("terrain.num_rows", len(self.rows)),
+            ("terrain.num_cols", len(self.rows[0])),
+            ("terrain.max_init_terrain_level", 0),
+            ("sim.njmax", max(cfg.sim.njmax, ROWS_NEEDED)),
+        ]
+
+    def build(self, cfg: TaskConfig) -> Terrain:
+        """The terrain; `cfg`, with the changes above, says how large tiles are.
+
+        Raises:
+            ConfigError: too small.
+        """
+        check_terrain(cfg.terrain, cfg.task)
+        return Terrain.of_tiles(self.rows, cfg.terrain, np.random.default_rng(cfg.env.seed))
+
+    def columns(self, num_envs: int, shift: int = 0) -> list[int]:
+        """The column of each of that many robots; `shift` moves all on to the next ones in `order`."""
+        return [self.order[(i + shift) % len(self.order)] for i in range(num_envs)]
+
+    def place(self, task: LeggedRobot, shift: int = 0) -> None:
+        """Give every robot its tile, where its next episodes begin."""
+        assert task.terrain_curriculum is not None, "the task stands on a plane"
+        columns = torch.tensor(self.columns(task.num_envs, shift), device=task.device)  # type: ignore[arg-type]
+        task.terrain_curriculum.place_at(torch.zeros_like(columns), columns)
+
+    def label(self, terrain: Terrain, base_pos: Sequence[float]) -> str:
+        """Type and size of the tile below `base_pos` (x, y, ...), or of the nearest one: 'stairs_up, step height 0.19 m'."""
+        first = terrain.origins[0, 0]
+        r, c = (
+            int(np.clip(np.round((base_pos[axis] - first[axis]) / terrain.tile_size[axis]), 0, count - 1))
+            for axis, count in enumerate(terrain.origins.shape[:2])
+        )
+        return label(self.rows[r][c].type, [self.rows[r][c].size])
+
+    def labels(self) -> dict[str, str]:
+        """Type -> its name with the sizes there are of it."""
+        return {
+            kind: label(kind, list(dict.fromkeys(spec.size for row in self.rows for spec in row if spec.type == kind)))
+            for kind in self.types
+        }
+
+
+def label(kind: str, sizes: Sequence[float]) -> str:
+    """'stairs_up, step height 0.14 to 0.19 m'."""
+    info = TERRAIN_TYPES[kind]
+    if kind == "flat":
+        return kind
+    numbers = " to ".join(f"{size:.0f}" if info.unit == "degrees" else f"{size:.2f}" for size in sizes)
+    return f"{kind}, {info.what} {numbers} {info.unit}"
