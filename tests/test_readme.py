@@ -10,11 +10,12 @@ import torch
 
 from legged.registry import import_tasks, make_task, task_config
 from legged.rl import play, train
-from legged.tools import benchmark, evaluate, plot
+from legged.tools import benchmark, evaluate, plot, show_terrain
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 POLICY = ROOT / "resources" / "policies" / "anymal_c_flat"
+ROUGH = ROOT / "resources" / "policies" / "anymal_c"
 
 
 def test_the_example_task_trains_without_touching_the_package(tmp_path, monkeypatch):
@@ -40,6 +41,7 @@ def test_the_example_task_trains_without_touching_the_package(tmp_path, monkeypa
         ("python -m legged.tools.evaluate", evaluate.main),
         ("python -m legged.tools.benchmark", benchmark.main),
         ("python -m legged.tools.plot", plot.main),
+        ("python -m legged.tools.show_terrain", show_terrain.main),
     ],
 )
 def test_every_flag_that_is_shown_exists(name, main, capsys):
@@ -81,7 +83,53 @@ def test_numbers_of_the_results_table_are_those_of_the_shipped_evaluation():
         assert f"{gait['duty_factor']:.2f}, {gait['steps_per_s']:.2f}" in row
 
 
-def test_shipped_checkpoint_is_finite_and_of_this_task():
-    saved = torch.load(POLICY / "model.pt", weights_only=False, map_location="cpu")
-    assert saved["infos"]["task"] == "anymal_c_flat"
+def test_shipped_policy_climbs_stairs_in_c_mujoco(tmp_path, monkeypatch):
+    """Six robots of each step height; up to 0.15 m, all of them. 0.3 m is beyond what it can, so the test can tell."""
+    monkeypatch.chdir(tmp_path)
+    grid = ["--vx=0.5", "--vy=0", "--yaw=0", "--robots", "4", "--physics", "mujoco"]
+    success = ["--types", "stairs_up", "--robots-per-point", "6"]
+    assert evaluate.main(["--task", "anymal_c", "--load_run", str(ROUGH), "--out", ".", *grid, *success]) == 0
+    result = json.loads(Path("evaluation_mujoco.json").read_text())
+    share = {point["size"]: point["share"] for point in result["success"]["types"]["stairs_up"]["points"]}
+    assert share[0.05] == share[0.1] == share[0.15] == 1.0
+    assert share[0.3] < 1.0
+    assert result["rough"]["rmse_lin"]["mean"] < 0.15
+    assert result["rough"]["falls"] == 0.0
+
+
+def shares(physics: str) -> dict[tuple[str, float], float]:
+    """(type, size) -> success of the shipped evaluation."""
+    types = json.loads((ROUGH / f"evaluation_{physics}.json").read_text())["success"]["types"]
+    return {(name, point["size"]): point["share"] for name, entry in types.items() for point in entry["points"]}
+
+
+def test_numbers_of_the_rough_results_are_those_of_the_shipped_evaluation():
+    rows = {"stairs up, 0.20 m": ("stairs_up", 0.2), "stairs down, 0.20 m": ("stairs_down", 0.2)}
+    rows |= {"obstacles, 0.20 m": ("obstacles", 0.2), "slope up, 25 degrees": ("slope_up", 25.0)}
+    both = [shares(physics) for physics in ("mujoco_warp", "mujoco")]
+    for label, key in rows.items():
+        wanted = " | ".join(f"{100 * found[key]:.0f} %" for found in both)
+        assert f"| {label} | {wanted} |" in README
+    rough = [json.loads((ROUGH / f"evaluation_{p}.json").read_text())["rough"] for p in ("mujoco_warp", "mujoco")]
+    for label, key in (("velocity RMSE", "rmse_lin"), ("yaw rate RMSE", "rmse_ang")):
+        (row,) = re.findall(rf"\| {label}, mean \(worst cell\) [^|]*\|(.*)\n", README)
+        wanted = " | ".join(f"{one[key]['mean']:.3f} ({one[key]['worst']:.3f})" for one in rough)
+        assert wanted in row
+    assert rough[0]["falls"] == rough[1]["falls"] == 0.0
+
+
+@pytest.mark.parametrize("policy", [POLICY, ROUGH], ids=lambda path: path.name)
+def test_shipped_checkpoint_is_finite_and_of_its_task(policy):
+    saved = torch.load(policy / "model.pt", weights_only=False, map_location="cpu")
+    assert saved["infos"]["task"] == policy.name
     assert all(torch.isfinite(tensor).all() for tensor in saved["actor_state_dict"].values())
+
+
+def test_a_policy_without_its_optimiser_is_exported(tmp_path):
+    """As the one for rough terrain is shipped."""
+    assert "optimizer_state_dict" not in torch.load(ROUGH / "model.pt", weights_only=False, map_location="cpu")
+    arguments = ["--task", "anymal_c", "--load_run", str(ROUGH), "--out", str(tmp_path), "--no-video", "--headless"]
+    assert play.main([*arguments, "--terrain", "flat", "--num_envs", "1"]) == 0
+    described = json.loads((tmp_path / "exported" / "policy.json").read_text())
+    assert sum(term["size"] for term in described["observation"]) == 235
+    assert described["observation_history"] == 1

@@ -156,14 +156,17 @@ class Runner(OnPolicyRunner):
         self.logger.save_model(path, self.current_learning_iteration)
 
     def load(self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None) -> dict:
-        """Restore networks, optimiser, iteration count and the task's state from a checkpoint.
+        """Restore networks, optimiser (if the checkpoint holds it; shipped ones do not), iteration count and the task's
+        state from a checkpoint.
 
         Raises:
             ConfigError: the file is no checkpoint, or of a network of another size.
         """
         saved = read_checkpoint(Path(path), map_location or self.device)
+        parts = load_cfg or dict.fromkeys(("actor", "critic", "iteration"), True)
+        parts = {"optimizer": "optimizer_state_dict" in saved, **parts}
         try:
-            self.alg.load(saved, load_cfg, strict)
+            self.alg.load(saved, parts, strict)
         except (RuntimeError, ValueError) as error:
             policy = self.alg.get_policy().state_dict()
             raise ConfigError(describe_mismatch(Path(path), saved, policy, self.env.cfg.task)) from error

@@ -13,6 +13,8 @@ from legged.paths import relative
 from legged.rendering import Camera
 
 FPS = 25
+GIF_S = 12.0
+"""Length of a GIF; as many seconds of the film as a page can take [s]."""
 
 
 class Video:
@@ -75,7 +77,8 @@ def _write_mp4(frames: list[np.ndarray], path: Path) -> None:
 
 def _write_gif(frames: list[np.ndarray], path: Path) -> None:
     part = path.with_suffix(".part.gif")
-    pictures = [Image.fromarray(frame).resize((416, 234), Image.Resampling.LANCZOS) for frame in frames[:: FPS // 8]]
+    shown = frames[: round(GIF_S * FPS) : FPS // 8]
+    pictures = [Image.fromarray(frame).resize((416, 234), Image.Resampling.LANCZOS) for frame in shown]
     pictures = [picture.quantize(64, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE) for picture in pictures]
     first, *rest = pictures
     first.save(part, save_all=True, append_images=rest, duration=1000 * (FPS // 8) // FPS, loop=0)

@@ -1,7 +1,8 @@
 """Learning curves of runs: `python -m legged.tools.plot logs/anymal_c_flat/<run> [<run> ...] --out curve.png`.
 
 Reads the TensorBoard files; draws tracking error, return and falls over iterations, one line a run, and a time axis
-from the first run's iteration times.
+from the first run's iteration times. Of runs on terrain, also the mean level of each type and the shares of episodes after
+which robots moved up and down, as means over the runs.
 """
 
 import argparse
@@ -25,6 +26,13 @@ CURVES = (
 )
 
 
+LEVEL = "Terrain/level_"
+ALWAYS_PROMOTED = 6.0
+"""Mean level over ten rows of robots that are always promoted: from the top they go to a random row."""
+Scalars = dict[str, tuple[np.ndarray, np.ndarray]]
+"""Tag -> (iterations, values)."""
+
+
 def main(argv: list[str] | None = None) -> int:
     """The command; returns its exit code."""
     return run_main(_main, argv)
@@ -40,8 +48,8 @@ def _main(argv: list[str] | None) -> int:
     return 0
 
 
-def read_scalars(run: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Tag -> (iterations, values) of a run folder.
+def read_scalars(run: Path) -> Scalars:
+    """All scalars of a run folder.
 
     Raises:
         ConfigError: it holds no TensorBoard file.
@@ -64,23 +72,29 @@ def smooth(values: np.ndarray, width: int = 9) -> np.ndarray:
     return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
 
 
-def draw(runs: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]], path: Path) -> None:
-    """One panel a curve, one line a run."""
+def draw(runs: dict[str, Scalars], path: Path) -> None:
+    """One panel a curve, one line a run; and, on terrain, one panel for levels and one for moves, one line a type."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(2, 2, figsize=(10, 6), layout="constrained")
-    for axis, (tag, label, factor) in zip(axes.flat, CURVES, strict=True):
+    first = next(iter(runs.values()))
+    types = [tag.removeprefix(LEVEL) for tag in first if tag.startswith(LEVEL)]
+    rows = 3 if types else 2
+    figure, axes = plt.subplots(rows, 2, figsize=(10, 3 * rows), layout="constrained")
+    for axis, (tag, label, factor) in zip(axes.flat, CURVES, strict=False):
         for name, scalars in runs.items():
             if tag in scalars:
                 steps, values = scalars[tag]
                 axis.plot(steps + 1, smooth(factor * values), label=name, linewidth=1.5)
-        axis.set_xlabel("iteration")
         axis.set_ylabel(label)
-        axis.grid(alpha=0.3)
         axis.set_ylim(bottom=min(0.0, axis.get_ylim()[0]))
-        _time_axis(axis, next(iter(runs.values())))
     axes[0, 0].legend(fontsize="small")
+    if types:
+        _draw_levels(axes[2, 0], axes[2, 1], list(runs.values()), types)
+    for axis in axes.flat:
+        axis.set_xlabel("iteration")
+        axis.grid(alpha=0.3)
+        _time_axis(axis, first)
     part = path.with_name(f".{path.name}")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(part, dpi=110, format="png")
@@ -88,7 +102,30 @@ def draw(runs: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]], path: Path) 
     part.replace(path)
 
 
-def _time_axis(axis: Axes, scalars: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
+def _draw_levels(levels: Axes, moves: Axes, runs: list[Scalars], types: list[str]) -> None:
+    """Mean level, and shares of episodes after which robots moved up (solid) and down (dashed), of each type."""
+    for i, name in enumerate(types):
+        colour = f"C{i}"
+        levels.plot(*mean_of(runs, LEVEL + name), color=colour, label=name.replace("_", " "), linewidth=1.2)
+        for what, line in (("promoted", "-"), ("demoted", "--")):
+            steps, share = mean_of(runs, f"Terrain/{what}_{name}")
+            moves.plot(steps, smooth(100.0 * share, 25), line, color=colour, linewidth=1.2)
+    levels.axhline(ALWAYS_PROMOTED, color="0.3", linestyle=":", linewidth=1.4)
+    levels.set_ylabel("mean terrain level (dotted: always up)")
+    levels.set_ylim(bottom=0.0)
+    levels.legend(fontsize="small", ncols=2)
+    moves.set_ylabel("moved up, dashed: down [% of episodes]")
+    moves.set_ylim(0.0, 100.0)
+
+
+def mean_of(runs: list[Scalars], tag: str) -> tuple[np.ndarray, np.ndarray]:
+    """Iterations, counted from 1, and the mean of the runs over those that all of them have."""
+    found = [dict(zip(*run[tag], strict=True)) for run in runs if tag in run]
+    steps = sorted(set.intersection(*(set(values) for values in found))) if found else []
+    return np.array(steps) + 1, np.array([np.mean([values[step] for values in found]) for step in steps])
+
+
+def _time_axis(axis: Axes, scalars: Scalars) -> None:
     """A second axis on top: seconds of training loop at the mean time of an iteration."""
     if "Perf/collection_time" not in scalars:
         return
