@@ -289,7 +289,9 @@ def between_ends(ground: Ground, a: wp.vec3, b: wp.vec3, near: float) -> Hits:
         start = wp.where(axis == 0, ground.x, ground.y)
         low = wp.int32(wp.floor((wp.min(a[axis], b[axis]) - near - start) / ground.cell)) + 1
         high = wp.int32(wp.floor((wp.max(a[axis], b[axis]) + near - start) / ground.cell))
-        for line in range(low, high + 1):
+        # Within the map: a world that blew up could ask for billions of lines.
+        last = wp.where(axis == 0, ground.corners.shape[0], ground.corners.shape[1]) - 1
+        for line in range(wp.clamp(low, 1, last), wp.clamp(high, 1, last) + 1):
             hit = rim_or_ridge(ground, a, b, axis, line)
             if hit.dist < near:
                 if wp.length_sq(hit.point - a) < wp.length_sq(hit.point - b):
