@@ -94,14 +94,16 @@ class StepGraph:
 
     WARM_UP_STEPS = 3
 
-    def __init__(self, function: Callable[[], None], device: torch.device, enabled: bool) -> None:
+    def __init__(
+        self, function: Callable[[], None], device: torch.device, enabled: bool, warm_up_steps: int = WARM_UP_STEPS
+    ) -> None:
         """With `enabled` false the function runs eagerly and unchecked.
 
         Raises:
             TermError: a term of the task can't be captured.
             HostReadError: another part of the step can't.
         """
-        self._function = function
+        self._function, self._warm_up_steps = function, warm_up_steps
         self._graph: torch.cuda.CUDAGraph | None = None
         if not enabled:
             return
@@ -121,7 +123,7 @@ class StepGraph:
         stream = torch.cuda.Stream(device)
         stream.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.stream(stream):
-            for _ in range(self.WARM_UP_STEPS):
+            for _ in range(self._warm_up_steps):
                 self._function()
             with ForbidHostReads():  # says what is wrong, where a failed capture only says that something is
                 self._function()

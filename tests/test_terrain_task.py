@@ -242,7 +242,7 @@ def test_without_a_curriculum_rows_are_hard_and_robots_stay():
     task.step(zero_actions(task))
     assert task.reset_buf.all()
     torch.testing.assert_close(task.terrain_curriculum.levels, before)
-    assert "Terrain/level" not in task._log()
+    assert "Terrain/level" not in task.log_rollout()
     risers = -task.terrain.origins[:, task.terrain.types.index("stairs_up"), 2] / 9  # nine of them down to the middle
     assert set(np.round(risers, 3)) <= {0.14, 0.185, 0.212}
 
@@ -255,7 +255,7 @@ def test_the_step_judges_levels_and_logs_them(task):
     task.episode_length_buf = torch.full((8,), task.max_episode_length)
     task.step(zero_actions(task))
     assert task.terrain_curriculum.levels.tolist() == [0] * 8  # asked for 10 m, walked none
-    assert task._log()["Terrain/demoted_stairs_up"] == 1.0
+    assert task.log_rollout()["Terrain/demoted_stairs_up"] == 1.0
 
 
 def test_levels_are_displayed():

@@ -326,6 +326,9 @@ class RunnerConfig:
     """Iterations of the whole training; a resumed run goes on up to this number."""
     save_interval: int = field(default=50, metadata=AT_LEAST_1)
     """Iterations between two checkpoints."""
+    loop: Literal["stock", "captured"] = "stock"
+    """`stock`: rsl-rl's own training loop. `captured`: the same arithmetic without the host in between, on a GPU as CUDA
+    graphs; it falls back to `stock` where a feature needs that."""
     experiment_name: str = ""
     """Folder under logs/; the task's name when empty."""
     run_name: str = ""

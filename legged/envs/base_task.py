@@ -126,11 +126,18 @@ class BaseTask(VecEnv):
         extras: dict[str, Any] = {"time_outs": self.time_out_buf.clone()}
         self._steps_since_log += 1
         if self._steps_since_log == self.cfg.train.runner.num_steps_per_env:
-            extras["log"] = self._log()
+            extras["log"] = self.log_rollout()
             self._steps_since_log = 0
         return self.get_observations(), self.rew_buf.clone(), self.reset_buf.clone(), extras
 
-    def _log(self) -> dict[str, Tensor]:
+    def step_in_place(self, actions: Tensor) -> None:
+        """One control step, without copies or a graph of its own: for who captures more than the step. Results are in
+        `rew_buf`, `reset_buf`, `time_out_buf` and the buffers of `observation_groups`.
+        """
+        self._action_input.copy_(actions)
+        self._step()
+
+    def log_rollout(self) -> dict[str, Tensor]:
         """What is logged of a rollout: fresh 0-dimensional tensors by their name in TensorBoard."""
         return self.statistics.flush()
 

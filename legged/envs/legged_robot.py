@@ -285,10 +285,10 @@ class LeggedRobot(Terms, BaseTask):
         if self.terrain_curriculum is not None:
             self.terrain_curriculum.reset()
 
-    def _log(self) -> dict[str, Tensor]:
+    def log_rollout(self) -> dict[str, Tensor]:
         ranges = {f"Metrics/{name}": value for name, value in self.command_curriculum.metrics().items()}
         levels = self.terrain_curriculum.metrics() if self.terrain_curriculum is not None else {}
-        return {**super()._log(), **ranges, **levels}
+        return {**super().log_rollout(), **ranges, **levels}
 
     def state_dict(self) -> dict[str, Any]:
         state = {"command_curriculum": self.command_curriculum.state_dict()}

@@ -39,6 +39,7 @@ def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
         "max_iterations": "train.runner.max_iterations",
         "experiment_name": "train.runner.experiment_name",
         "run_name": "train.runner.run_name",
+        "runner": "train.runner.loop",
     }
     found = [parse_override(text) for text in args.overrides]
     for flag, key in flags.items():

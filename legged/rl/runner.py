@@ -20,7 +20,7 @@ class Interrupted(Exception):
     """Training was asked to stop; raised at the end of an iteration, when networks and optimiser agree."""
 
 
-def runner_config(cfg: TaskConfig) -> dict[str, Any]:
+def runner_config(cfg: TaskConfig, algorithm_class: str) -> dict[str, Any]:
     """The dictionary rsl-rl wants."""
     policy, algorithm, runner = cfg.train.policy, cfg.train.algorithm, cfg.train.runner
     shared = {
@@ -45,7 +45,7 @@ def runner_config(cfg: TaskConfig) -> dict[str, Any]:
             },
         },
         "critic": {**shared, "hidden_dims": list(policy.critic_hidden_dims)},
-        "algorithm": {"class_name": "PPO", **vars(algorithm)},
+        "algorithm": {"class_name": algorithm_class, **vars(algorithm)},
     }
 
 
@@ -106,12 +106,14 @@ class Runner(OnPolicyRunner):
     """Trains a task with rsl-rl's PPO."""
 
     env: BaseTask
+    ALGORITHM = "PPO"
+    """Class of the learner, by rsl-rl's names or as module:class."""
 
     def __init__(
         self, env: BaseTask, log_dir: Path | None = None, device: str = "cpu", display: Display | None = None
     ) -> None:
         """`log_dir` is where checkpoints and TensorBoard files go; without one nothing is written."""
-        config = runner_config(env.cfg)
+        config = runner_config(env.cfg, self.ALGORITHM)
         with contextlib.redirect_stdout(io.StringIO()):
             super().__init__(env, config, str(log_dir) if log_dir else None, device)
         self.logger = QuietLogger(

@@ -22,6 +22,7 @@ from legged.rl.arguments import (
     pick_device,
     run_main,
 )
+from legged.rl.captured import CapturedRunner
 from legged.rl.checkpoint import check_fits, read_checkpoint
 from legged.rl.display import Display
 from legged.rl.runner import Runner
@@ -42,6 +43,7 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("--run_name", help="appended to the run folder's name")
     parser.add_argument("--max_iterations", type=int, help="length of the whole training")
     parser.add_argument("--rl_device", help="device of the networks; that of the simulation by default")
+    parser.add_argument("--runner", choices=["stock", "captured"], help="training loop (train.runner.loop)")
     parser.add_argument("--headless", action="store_true", help="accepted for legged_gym's sake: training draws nothing")
     parser.add_argument("--show", action="store_true", help="print the full configuration and stop")
     args = parser.parse_intermixed_args(argv)
@@ -62,7 +64,8 @@ def _main(argv: list[str] | None) -> int:
 
     task = make_task(cfg, device, graph=not args.no_graph)
     with Display(f"{cfg.task}: {relative(folder)}") as display:
-        runner = Runner(task, folder, str(rl_device), display)
+        kind = CapturedRunner if cfg.train.runner.loop == "captured" else Runner
+        runner = kind(task, folder, str(rl_device), display)
         if checkpoint:
             runner.load(str(checkpoint))
             print(f"resumed {relative(checkpoint)} after iteration {runner.current_learning_iteration}", flush=True)

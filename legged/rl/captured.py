@@ -1,0 +1,140 @@
+"""Training in which an iteration is two calls: a rollout and an update, on a GPU one CUDA graph each."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from legged.envs import BaseTask
+from legged.graph import StepGraph
+from legged.rl.display import Display
+from legged.rl.ppo import DevicePPO
+from legged.rl.rollout import Rollout
+from legged.rl.runner import Runner
+
+ROLLOUTS_TO_WARM_UP = 1
+"""Steps have been warmed up when the task was built."""
+
+
+class CapturedRunner(Runner):
+    """As Runner, with the host out of the loop: it launches, and reads what is logged once an iteration.
+
+    Checkpoints, configuration and logs are those of Runner, and so is `learn` where a feature needs it (`why_stock`).
+    """
+
+    alg: DevicePPO
+    ALGORITHM = "legged.rl.ppo:DevicePPO"
+
+    def __init__(
+        self, env: BaseTask, log_dir: Path | None = None, device: str = "cpu", display: Display | None = None
+    ) -> None:
+        super().__init__(env, log_dir, device, display)
+        self.why_stock = self.alg.why_stock
+        """What keeps training on rsl-rl's own loop; empty if nothing does."""
+        if torch.device(device) != torch.device(env.device):  # type: ignore[arg-type]
+            self.why_stock = f"the task is on {env.device}, the networks are on {device}"
+
+    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
+        """Train for a number of iterations."""
+        if self.why_stock:
+            print(f"rsl-rl's own training loop: {self.why_stock}", flush=True)
+            super().learn(num_learning_iterations, init_at_random_ep_len)
+            return
+        self.alg.train_mode()
+        rollout = Rollout(self.env, self.alg)
+        collect, update = self._capture(rollout)
+        if init_at_random_ep_len:
+            length = self.env.episode_length_buf
+            self.env.episode_length_buf = torch.randint_like(length, high=int(self.env.max_episode_length))
+        self.logger.init_logging_writer()
+        first = self.current_learning_iteration
+        total = first + num_learning_iterations
+        for iteration in range(first, total):
+            clock = Clock(torch.device(self.device))
+            collect()
+            clock.lap()
+            update()
+            clock.lap()
+            self.current_learning_iteration = iteration
+            self._log(iteration, first, total, rollout, clock)
+            if self.logger.writer is not None and iteration % self.cfg["save_interval"] == 0:
+                self.save(str(Path(self.logger.log_dir) / f"model_{iteration}.pt"))
+        if self.logger.writer is not None:
+            self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
+            self.logger.stop_logging_writer()
+
+    def _capture(self, rollout: Rollout) -> tuple[Callable[[], None], Callable[[], None]]:
+        """Rollout and update as graphs, where the task's step is one; networks and task are as before afterwards."""
+        device = torch.device(self.device)
+        enabled = self.env.captured
+        task_state = self.env.state_dict()
+        collect = StepGraph(rollout.collect, device, enabled, ROLLOUTS_TO_WARM_UP)
+        before = [(tensor, tensor.clone()) for tensor in self.alg.tensors()]
+        fresh = not self.alg.optimizer.state
+        update = StepGraph(self.alg.learn, device, enabled)
+        with torch.no_grad():
+            for tensor, value in before:
+                tensor.copy_(value)
+            if fresh:  # the optimiser's moments came to be while warming up
+                for state in self.alg.optimizer.state.values():
+                    for tensor in state.values():
+                        tensor.zero_()
+        if enabled:
+            rollout.forget()
+            self.env.reset_curricula()
+            self.env.load_state_dict(task_state)
+            self.env.reset()
+        return collect, update
+
+    def _log(self, iteration: int, first: int, total: int, rollout: Rollout, clock: "Clock") -> None:
+        """Read what is logged, which waits for the iteration to end."""
+        logger = self.logger
+        ended, returns, lengths = rollout.ended.tolist()
+        if ended:
+            logger.rewbuffer.clear()
+            logger.rewbuffer.append(returns / ended)
+            logger.lenbuffer.clear()
+            logger.lenbuffer.append(lengths / ended)
+        if logger.writer is not None:
+            logger.ep_extras.append(self.env.log_rollout())
+        collect_s, learn_s = clock.seconds()
+        logger.log(
+            it=iteration,
+            start_it=first,
+            total_it=total,
+            collect_time=collect_s,
+            learn_time=learn_s,
+            loss_dict=self.alg.losses(),
+            learning_rate=self.alg.learning_rate,
+            action_std=self.alg.action_std().detach(),
+            rnd_weight=None,
+        )
+
+
+class Clock:
+    """Times of laps on a device; on a GPU measured there, without making anything wait."""
+
+    def __init__(self, device: torch.device) -> None:
+        """Starts at once."""
+        self._cuda = device.type == "cuda"
+        self._marks: list[Any] = []
+        self.lap()
+
+    def lap(self) -> None:
+        """End a lap."""
+        if self._cuda:
+            mark = torch.cuda.Event(enable_timing=True)
+            mark.record()
+            self._marks.append(mark)
+        else:
+            self._marks.append(time.perf_counter())
+
+    def seconds(self) -> list[float]:
+        """Each lap's time [s]; waits for the last one to end."""
+        pairs = list(zip(self._marks, self._marks[1:], strict=False))
+        if not self._cuda:
+            return [end - start for start, end in pairs]
+        self._marks[-1].synchronize()
+        return [1e-3 * start.elapsed_time(end) for start, end in pairs]

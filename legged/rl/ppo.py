@@ -1,0 +1,208 @@
+"""rsl-rl's PPO, updated without a host read: the same losses and steps, in closed form, on data shuffled once."""
+
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.modules.distribution import GaussianDistribution
+from rsl_rl.modules.normalization import EmpiricalNormalization
+from torch import Tensor
+
+LOWEST_RATE, HIGHEST_RATE, RATE_STEP = 1e-5, 1e-2, 1.5
+"""Bounds of the adaptive learning rate and the factor by which it moves, as in rsl-rl."""
+FEW = 1e-8
+HALF_LOG_2PI = 0.9189385332046727
+"""0.5 * log(2 pi)."""
+
+
+class DevicePPO(PPO):
+    """PPO (Schulman et al., arXiv 1707.06347) as rsl-rl computes it, for Gaussian MLP policies.
+
+    What differs is where and how often: the learning rate is a tensor on the device; samples are shuffled into contiguous
+    memory once an update, not gathered for every mini-batch; log-probability, entropy and divergence of the Gaussian are
+    written out; the optimiser is fused; and losses are summed on the device and read once. Where a feature needs rsl-rl's
+    own update (`why_stock`), that runs.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self._rate: Tensor | None = None
+        super().__init__(*args, **kwargs)
+        self.why_stock = self._why_stock()
+        """What keeps the update on rsl-rl's own path; empty if nothing does."""
+        if not self.why_stock:
+            self._rate = torch.tensor(self._initial_rate, device=self.device)
+            parameters = [p for p in (*self.actor.parameters(), *self.critic.parameters()) if p.requires_grad]
+            capturable = self._rate.is_cuda
+            self.optimizer = torch.optim.Adam(parameters, lr=self._rate, fused=True, capturable=capturable)
+        self._losses = torch.zeros(3, device=self.device)
+
+    def tensors(self) -> list[Tensor]:
+        """Everything that an update changes: parameters, normalisers, moments of the optimiser, learning rate."""
+        models = [tensor for model in (self.actor, self.critic) for tensor in model.state_dict(keep_vars=True).values()]
+        moments = [tensor for state in self.optimizer.state.values() for tensor in state.values()]
+        assert self._rate is not None
+        return [*models, *moments, self._rate]
+
+    def _why_stock(self) -> str:
+        if self.rnd:
+            return "random network distillation"
+        if self.symmetry:
+            return "symmetry"
+        if self.is_multi_gpu:
+            return "several GPUs"
+        if self.use_mixed_precision:
+            return "mixed precision"
+        for name, model in (("actor", self.actor), ("critic", self.critic)):
+            if type(model) is not MLPModel:
+                return f"the {name} is a {type(model).__name__}"
+        if type(self.actor.distribution) is not GaussianDistribution:
+            return f"actions are {type(self.actor.distribution).__name__}"
+        if type(self.optimizer) is not torch.optim.Adam:
+            return f"the optimiser is {type(self.optimizer).__name__}"
+        return ""
+
+    @property
+    def learning_rate(self) -> float:  # type: ignore[override]
+        """The learning rate now; reading it waits for the device."""
+        return self._initial_rate if self._rate is None else float(self._rate)
+
+    @learning_rate.setter
+    def learning_rate(self, value: float | Tensor) -> None:
+        if self._rate is None:
+            self._initial_rate = float(value)
+        else:
+            self._rate.fill_(value)
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
+        """As rsl-rl, of a checkpoint of either class."""
+        iteration = super().load(loaded_dict, load_cfg, strict)
+        if self._rate is not None:  # loading puts the saved number in place of the tensor
+            for group in self.optimizer.param_groups:
+                self._rate.fill_(group["lr"])
+                group.update(lr=self._rate, fused=True, capturable=self._rate.is_cuda)
+            for state in self.optimizer.state.values():
+                state["step"] = state["step"].to(self.device, torch.float32)
+        return iteration
+
+    def save(self) -> dict:
+        """As rsl-rl, whose optimiser is not fused and has its learning rate and step counts on the host."""
+        saved = super().save()
+        if self._rate is not None:
+            optimizer = saved["optimizer_state_dict"]
+            plain = {"lr": self.learning_rate, "fused": None, "capturable": False}
+            saved["optimizer_state_dict"] = {
+                "state": {key: {**state, "step": state["step"].cpu()} for key, state in optimizer["state"].items()},
+                "param_groups": [{**group, **plain} for group in optimizer["param_groups"]],
+            }
+        return saved
+
+    def update(self) -> dict[str, float]:
+        """All epochs over the stored rollout; returns the mean losses."""
+        if self.why_stock:
+            return super().update()
+        self.learn()
+        self.storage.clear()
+        return self.losses()
+
+    def learn(self) -> None:
+        """All epochs over the stored rollout: no host read, so that one graph can hold it."""
+        self._losses.zero_()
+        batches = self._mini_batches()
+        for _ in range(self.num_learning_epochs):
+            for batch in batches:
+                self._losses += self._step(*batch)
+        self._losses /= self.num_learning_epochs * self.num_mini_batches
+        self._update_normalizers()
+
+    def losses(self) -> dict[str, float]:
+        """Mean losses of the last update, read from the device."""
+        return dict(zip(("value", "surrogate", "entropy"), self._losses.tolist(), strict=True))
+
+    @torch.no_grad()
+    def _mini_batches(self) -> list[tuple[Tensor, ...]]:
+        """The rollout, shuffled: for each mini-batch of n samples the networks' inputs, actions (n, D), old
+        log-probabilities, advantages, old values, returns (n,) each, and the old Gaussian's mean (n, D) and std (n, D).
+        """
+        st = self.storage
+        count = st.num_envs * st.num_transitions_per_env // self.num_mini_batches
+        order = self._order(count * self.num_mini_batches)
+        inputs = [torch.cat([st.observations[name] for name in m.obs_groups], dim=-1) for m in (self.actor, self.critic)]
+        assert st.distribution_params is not None
+        single = (st.actions_log_prob, st.advantages, st.values, st.returns)
+        columns = [*inputs, st.actions, *(tensor.squeeze(-1) for tensor in single), *st.distribution_params]
+        shuffled = [column.flatten(0, 1).index_select(0, order).split(count) for column in columns]
+        return list(zip(*shuffled, strict=True))
+
+    def _order(self, count: int) -> Tensor:
+        """A random permutation of `count` samples; by sorting, which a graph can hold."""
+        return torch.rand(count, device=self.device).argsort()
+
+    def _step(
+        self,
+        actor_input: Tensor,
+        critic_input: Tensor,
+        actions: Tensor,
+        old_log_prob: Tensor,
+        advantages: Tensor,
+        old_values: Tensor,
+        returns: Tensor,
+        old_mean: Tensor,
+        old_std: Tensor,
+    ) -> Tensor:
+        """One mini-batch: adapt the learning rate, step down the gradient; returns value loss, surrogate, entropy (3,)."""
+        if self.normalize_advantage_per_mini_batch:
+            advantages = (advantages - advantages.mean()) / (advantages.std() + FEW)
+        mean = self.actor.mlp(self.actor.obs_normalizer(actor_input))
+        values = self.critic.mlp(self.critic.obs_normalizer(critic_input)).squeeze(-1)
+        std = self.action_std()
+        log_prob = gaussian_log_prob(actions, mean, std)
+        entropy = std.log().sum() + actions.shape[1] * (0.5 + HALF_LOG_2PI)
+        if self.desired_kl is not None and self.schedule == "adaptive":
+            self._adapt_rate(old_mean, old_std, mean.detach(), std.detach())
+
+        ratio = torch.exp(log_prob - old_log_prob)
+        clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
+        surrogate = torch.max(-advantages * ratio, -advantages * clipped).mean()
+        value_loss = (values - returns).square()
+        if self.use_clipped_value_loss:
+            near = old_values + (values - old_values).clamp(-self.clip_param, self.clip_param)
+            value_loss = torch.max(value_loss, (near - returns).square())
+        value_loss = value_loss.mean()
+        loss = surrogate + self.value_loss_coef * value_loss - self.entropy_coef * entropy
+
+        self.optimizer.zero_grad()
+        loss.backward()
+        for model in (self.actor, self.critic):
+            torch.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
+        self.optimizer.step()
+        return torch.stack([value_loss, surrogate, entropy]).detach()
+
+    def action_std(self) -> Tensor:
+        """(D,) standard deviation of the actions."""
+        distribution = self.actor.distribution
+        if distribution.std_type == "scalar":
+            return distribution.std_param.clamp(*distribution.std_range)
+        return distribution.log_std_param.clamp(*distribution.log_std_range).exp()
+
+    @torch.no_grad()
+    def _adapt_rate(self, old_mean: Tensor, old_std: Tensor, mean: Tensor, std: Tensor) -> None:
+        """Move the learning rate towards the wanted mean divergence KL(old || new)."""
+        moved = (old_std.square() + (old_mean - mean).square()) / (2.0 * std.square())
+        kl = (torch.log(std / old_std) + moved - 0.5).sum(dim=1).mean()
+        assert self._rate is not None
+        slower = (self._rate / RATE_STEP).clamp(min=LOWEST_RATE)
+        faster = (self._rate * RATE_STEP).clamp(max=HIGHEST_RATE)
+        rate = torch.where((kl < 0.5 * self.desired_kl) & (kl > 0.0), faster, self._rate)
+        self._rate.copy_(torch.where(kl > 2.0 * self.desired_kl, slower, rate))
+
+    def _update_normalizers(self) -> None:
+        observations = self.storage.observations.flatten(0, 1)
+        for model in (self.actor, self.critic):
+            if isinstance(model.obs_normalizer, EmpiricalNormalization):
+                model.update_normalization(observations)
+
+
+def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """Log-density (n,) of `x` (n, D) under a Gaussian of mean (n, D) and standard deviation (D,)."""
+    return -0.5 * ((x - mean) / std).square().sum(dim=1) - std.log().sum() - x.shape[1] * HALF_LOG_2PI

@@ -1,0 +1,230 @@
+"""The captured training loop computes what rsl-rl's does: rollouts bit by bit, updates to float tolerance."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import checkpoints, kept_global_state, small_config, small_task, tiny_run
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+
+from legged.graph import ForbidHostReads
+from legged.rl.captured import CapturedRunner, Clock
+from legged.rl.ppo import DevicePPO
+from legged.rl.rollout import Rollout
+from legged.rl.runner import Runner
+from legged.tools.plot import read_scalars
+
+ROBOTS, STEPS = 48, 8
+SAMPLES = ROBOTS * STEPS
+LEARNING = {"num_mini_batches": 4, "num_learning_epochs": 3, "entropy_coef": 0.01, "learning_rate": 1e-3}
+
+
+@pytest.fixture(autouse=True)
+def workplace(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with kept_global_state():
+        yield
+
+
+def observe() -> TensorDict:
+    return TensorDict({"actor": torch.randn(ROBOTS, 7), "critic": torch.randn(ROBOTS, 9)}, batch_size=[ROBOTS])
+
+
+def learner(kind, normalized=False, std_type="scalar", **options):
+    """A learner on made-up data with weights that depend on nothing else."""
+    torch.manual_seed(0)
+    groups = {"actor": ["actor"], "critic": ["critic"]}
+    gaussian = {"class_name": "GaussianDistribution", "init_std": 0.5, "std_type": std_type}
+    actor = MLPModel(observe(), groups, "actor", 3, [16, 16], "elu", normalized, gaussian)
+    critic = MLPModel(observe(), groups, "critic", 1, [16, 16], "elu", normalized)
+    return kind(actor, critic, RolloutStorage("rl", ROBOTS, STEPS, observe(), [3]), **{**LEARNING, **options})
+
+
+def fill(alg, seed):
+    """A rollout of noise through rsl-rl's own functions."""
+    torch.manual_seed(seed)
+    with torch.inference_mode():
+        for _ in range(STEPS):
+            alg.act(observe())
+            ends = torch.rand(ROBOTS)
+            alg.process_env_step(observe(), torch.randn(ROBOTS), ends < 0.1, {"time_outs": ends < 0.04})
+        alg.compute_returns(observe())
+
+
+VARIANTS = {
+    "plain": {},
+    "normalised": {"normalized": True},
+    "log std": {"std_type": "log"},
+    "fixed rate": {"schedule": "fixed"},
+    "free values": {"use_clipped_value_loss": False, "value_loss_coef": 0.5},
+    "advantages per batch": {"normalize_advantage_per_mini_batch": True},
+    "tight clips": {"clip_param": 0.05, "max_grad_norm": 0.1},
+}
+
+
+@pytest.mark.parametrize("options", VARIANTS.values(), ids=VARIANTS)
+def test_an_update_is_that_of_rsl_rl(options, monkeypatch):
+    """Losses, learning rate, parameters and moments over three updates on the same data in the same order."""
+    stock, ours = learner(PPO, **options), learner(DevicePPO, **options)
+    assert ours.why_stock == ""
+    order = torch.Generator().manual_seed(1)
+    rates = []
+    for seed in range(3):
+        fill(stock, seed)
+        fill(ours, seed)
+        permutation = torch.randperm(SAMPLES, generator=order)
+        monkeypatch.setattr(torch, "randperm", lambda *_, p=permutation, **__: p)
+        monkeypatch.setattr(ours, "_order", lambda _, p=permutation: p)
+        wanted = stock.update()
+        monkeypatch.undo()
+        monkeypatch.setattr(ours, "_order", lambda _, p=permutation: p)
+        assert ours.update() == pytest.approx(wanted, rel=1e-4, abs=1e-6)
+        assert ours.learning_rate == pytest.approx(stock.learning_rate, rel=1e-5)
+        rates.append(ours.learning_rate)
+    assert len(set(rates)) > 1 or options.get("schedule") == "fixed"
+    for model in ("actor", "critic"):
+        mine, theirs = (getattr(alg, model).state_dict() for alg in (ours, stock))
+        for name, tensor in theirs.items():
+            torch.testing.assert_close(mine[name], tensor, rtol=1e-3, atol=2e-5, msg=name)
+    moments = [alg.optimizer.state_dict()["state"] for alg in (ours, stock)]
+    assert len(moments[0]) == len(moments[1]) == 13
+    for key, theirs in moments[1].items():
+        torch.testing.assert_close(moments[0][key]["exp_avg"], theirs["exp_avg"], rtol=1e-2, atol=1e-5)
+        assert float(moments[0][key]["step"]) == float(theirs["step"])
+
+
+def task_and_runner(kind=Runner, *overrides, num_envs=12):
+    task = small_task(*overrides, ("train.runner.num_steps_per_env", STEPS), num_envs=num_envs)
+    torch.manual_seed(3)
+    return task, kind(task, None, "cpu")
+
+
+def test_a_rollout_is_that_of_rsl_rl():
+    """Actions, values, rewards with bootstrapped time-outs, returns: bit by bit, with noise, commands and resets drawn
+    alike; the observation stored at t is the one that was acted on.
+    """
+    first, runner = task_and_runner()
+    stock = runner.alg
+    torch.manual_seed(7)
+    first.reset()
+    first.episode_length_buf = torch.arange(12) + first.max_episode_length - 6  # some end by time, at different steps
+    with torch.inference_mode():
+        observations = first.get_observations()
+        for _ in range(STEPS):
+            observations, rewards, dones, extras = first.step(stock.act(observations))
+            stock.process_env_step(observations, rewards, dones, extras)
+        stock.compute_returns(observations)
+
+    second, captured = task_and_runner(CapturedRunner)
+    torch.manual_seed(7)
+    second.reset()
+    second.episode_length_buf = torch.arange(12) + second.max_episode_length - 6
+    rollout = Rollout(second, captured.alg)
+    rollout.collect()
+    ours = captured.alg.storage
+    assert stock.storage.dones.sum() > 3
+    for name in ("actions", "values", "rewards", "dones", "returns", "advantages"):
+        torch.testing.assert_close(getattr(ours, name), getattr(stock.storage, name), rtol=0, atol=0, msg=name)
+    for name in ("actor", "critic"):
+        torch.testing.assert_close(ours.observations[name], stock.storage.observations[name], rtol=0, atol=0)
+    torch.testing.assert_close(ours.actions_log_prob, stock.storage.actions_log_prob, rtol=1e-5, atol=1e-5)
+    for mine, theirs in zip(ours.distribution_params, stock.storage.distribution_params, strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=0, atol=0)
+
+
+def test_ended_episodes_are_counted_over_rollouts():
+    """Two episodes end in the second rollout, after 8 + 3 and 8 + 5 steps of it."""
+    task, runner = task_and_runner(CapturedRunner, num_envs=2)
+    task.reset()
+    rollout = Rollout(task, runner.alg)
+    rollout.collect()
+    assert rollout.ended.tolist() == [0.0, 0.0, 0.0]
+    task.episode_length_buf = task.max_episode_length - torch.tensor([3, 5])
+    rewards = runner.alg.storage.rewards.sum()
+    rollout.collect()
+    ended, returns, lengths = rollout.ended.tolist()
+    assert (ended, lengths) == (2.0, 24.0)
+    assert returns == returns
+    assert returns != rewards
+
+
+def test_nothing_in_an_iteration_reads_on_the_host():
+    task, runner = task_and_runner(CapturedRunner)
+    rollout = Rollout(task, runner.alg)
+    with ForbidHostReads():
+        rollout.collect()
+        runner.alg.learn()
+
+
+def test_the_learning_rate_is_changed_in_place():
+    alg = learner(DevicePPO)
+    address = alg.optimizer.param_groups[0]["lr"].data_ptr()
+    fill(alg, 0)
+    alg.update()
+    assert alg.learning_rate != pytest.approx(1e-3)
+    assert alg.optimizer.param_groups[0]["lr"].data_ptr() == address
+    alg.learning_rate = 3e-4
+    assert alg.learning_rate == pytest.approx(3e-4)
+    assert float(alg.optimizer.param_groups[0]["lr"]) == pytest.approx(3e-4)
+
+
+def test_features_that_need_rsl_rls_update_are_named():
+    alg = learner(DevicePPO, use_mixed_precision=True)
+    assert alg.why_stock == "mixed precision"
+    assert learner(DevicePPO, optimizer="sgd").why_stock == "the optimiser is SGD"
+    fill(alg, 0)
+    assert set(alg.update()) == {"value", "surrogate", "entropy"}  # by rsl-rl's own
+
+
+@pytest.mark.parametrize(("first", "second"), [("stock", "captured"), ("captured", "stock"), ("captured", "captured")])
+def test_checkpoints_are_exchanged_between_the_loops(first, second):
+    """A run begun with one loop goes on with the other: counts of optimiser steps and the learning rate continue."""
+    begun = tiny_run("--runner", first, "train.algorithm.learning_rate=2e-4")
+    resumed = tiny_run("--runner", second, "--resume", iterations=3)
+    before, after = (torch.load(run / f"model_{i}.pt", weights_only=False) for run, i in ((begun, 1), (resumed, 2)))
+    assert checkpoints(resumed) == [2]
+    steps = [{int(s["step"]) for s in saved["optimizer_state_dict"]["state"].values()} for saved in (before, after)]
+    assert steps == [{40}, {60}]
+    for saved in (before, after):
+        (group,) = saved["optimizer_state_dict"]["param_groups"]
+        assert isinstance(group["lr"], float)
+        assert group["lr"] == pytest.approx(saved["infos"]["learning_rate"])
+        assert not group["capturable"]
+
+
+def test_both_loops_log_the_same_things():
+    tags = {}
+    for loop in ("stock", "captured"):
+        folder: Path = tiny_run("--runner", loop, "env.episode_length_s=0.1")
+        tags[loop] = set(read_scalars(folder))
+    assert tags["stock"] == tags["captured"]
+    assert {"Train/mean_reward", "Loss/value", "Metrics/falls", "Perf/learning_time"} <= tags["captured"]
+
+
+def test_the_captured_loop_stops_when_asked():
+    task = small_task(num_envs=4)
+    runner = CapturedRunner(task, Path("run"), "cpu")
+    Path("run").mkdir()
+    runner.stop()
+    assert not runner.train(5)
+    assert checkpoints(Path("run")) == [0]
+
+
+def test_the_loop_is_a_setting():
+    assert small_config(("train.runner.loop", "captured")).train.runner.loop == "captured"
+    assert small_config().train.runner.loop == "stock"
+
+
+def test_laps_are_timed():
+    import time
+
+    clock = Clock(torch.device("cpu"))
+    time.sleep(0.02)
+    clock.lap()
+    clock.lap()
+    first, second = clock.seconds()
+    assert 0.02 <= first < 0.5
+    assert 0.0 <= second < 0.01
