@@ -1,4 +1,5 @@
-"""Time of a control step, and how much of it is physics: `python -m legged.tools.benchmark --task anymal_c`.
+"""Time of a control step, of the physics in it, and of a training iteration around it:
+`python -m legged.tools.benchmark --task anymal_c [--num_envs 8192]`.
 
 With `--grounds` the task is timed on a plane, on its terrain met by our collider, and by mujoco-warp's general one.
 
@@ -7,11 +8,15 @@ On a GPU it also proves that the step never waits for the host: the timed steps 
 """
 
 import argparse
+import contextlib
+import io
 import json
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import torch
@@ -21,6 +26,9 @@ from legged.envs import LeggedRobot
 from legged.physics import resolve_physics
 from legged.registry import make_task, task_config
 from legged.rl.arguments import add_task_arguments, import_and_check, overrides, pick_device, run_main
+from legged.rl.captured import CapturedRunner
+from legged.rl.display import Progress
+from legged.rl.runner import Runner
 from legged.rl.runs import write_text
 
 GROUNDS: dict[str, list[tuple[str, Any]]] = {
@@ -30,6 +38,10 @@ GROUNDS: dict[str, list[tuple[str, Any]]] = {
     "terrain, general collider": [("sim.terrain_collider", "convex"), ("sim.nconmax", 64), ("sim.njmax", 256)],
 }
 """What --grounds compares."""
+
+
+LOOPS: dict[str, type[Runner]] = {"stock": Runner, "captured": CapturedRunner}
+"""Training loops that are timed."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -42,6 +54,7 @@ def _main(argv: list[str] | None) -> int:
     add_task_arguments(parser)
     parser.add_argument("--steps", type=int, default=200, help="control steps per measurement")
     parser.add_argument("--repeats", type=int, default=5, help="measurements; the median is reported")
+    parser.add_argument("--iterations", type=int, help="of each training loop; 20 by default, 3 on the CPU, 0 for none")
     parser.add_argument("--grounds", action="store_true", help="compare plane, our terrain collider and the general one")
     parser.add_argument("--json", type=Path, help="also write the result to this file")
     args = parser.parse_intermixed_args(argv)
@@ -54,13 +67,19 @@ def _main(argv: list[str] | None) -> int:
         raise ConfigError("--grounds: compares colliders of mujoco_warp; add sim.physics=mujoco_warp")
     if args.grounds and cfg.terrain.mesh_type == "plane":
         raise ConfigError(f"--grounds: the task '{cfg.task}' has no terrain (terrain.mesh_type is plane)")
+    count = args.iterations if args.iterations is not None else (3 if device.type == "cpu" else 20)
     results = {}
     for name, changes in (GROUNDS if args.grounds else {"": []}).items():
         start = time.perf_counter()
         task = make_task(override(cfg, changes), device, graph=not args.no_graph)
         _synchronize(device)
-        result = measure(task, args.steps, args.repeats)
-        result["build_s"] = time.perf_counter() - start - result.pop("measuring_s")
+        build_s = time.perf_counter() - start
+        result = {**measure(task, args.steps, args.repeats), "build_s": build_s}
+        if not args.grounds and count > 0:
+            result["iterations"] = {loop: time_iterations(kind, task, count) for loop, kind in LOOPS.items()}
+        if device.type == "cuda":
+            free, whole = torch.cuda.mem_get_info(device)
+            result["gpu_memory_gib"] = (whole - free) / 2**30
         print((f"{name}: " if name else "") + report(task, result), flush=True)
         results[name] = result
     if args.json:
@@ -69,14 +88,13 @@ def _main(argv: list[str] | None) -> int:
 
 
 @torch.inference_mode()
-def measure(task: LeggedRobot, steps: int, repeats: int) -> dict[str, float]:
+def measure(task: LeggedRobot, steps: int, repeats: int) -> dict[str, Any]:
     """Milliseconds per control step: the task's step, and the physics in it alone.
 
     Physics alone is `decimation` engine steps of the same model under the torques of the moment; on a GPU it is one
     graph too. The two are timed in turns, step by step, so that both meet the states, contacts and clock rates of a
     rollout: run by itself, physics without a controller or resets would soon simulate heaps of fallen robots.
     """
-    begin = time.perf_counter()
     device = torch.device(task.device)
     actions = 0.3 * torch.randn(32, task.num_envs, task.num_actions, device=device)
     for i in range(50):  # robots land and spread over the states of a training
@@ -84,16 +102,18 @@ def measure(task: LeggedRobot, steps: int, repeats: int) -> dict[str, float]:
     physics_only = _physics_step(task)
     turns = (lambda i: task.step(actions[i % 32]), lambda i: physics_only())
     results = [_time_in_turns(turns, steps, device) for _ in range(repeats)]
-    control_ms, physics_ms = (sorted(times)[repeats // 2] for times in zip(*results, strict=True))
+    control, physics = (sorted(times) for times in zip(*results, strict=True))
+    control_ms, physics_ms = (median(times) for times in (control, physics))
     return {
         "num_envs": task.num_envs,
         "control_step_ms": control_ms,
+        "control_step_ms_range": [control[0], control[-1]],
         "physics_ms": physics_ms,
+        "physics_ms_range": [physics[0], physics[-1]],
         "ratio": control_ms / physics_ms,
         "env_steps_per_s": task.num_envs / control_ms * 1e3,
         "captured": float(task.captured),
         "overflows": float(task.statistics.flush()["Metrics/contact_overflows"]),
-        "measuring_s": time.perf_counter() - begin,
     }
 
 
@@ -144,18 +164,62 @@ def _synchronize(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def report(task: LeggedRobot, result: dict[str, float]) -> str:
+class Recorder:
+    """Stands in for the display of a training and keeps its times."""
+
+    def __init__(self) -> None:
+        self.progress: list[Progress] = []
+
+    def show(self, progress: Progress) -> None:
+        """Keep an iteration."""
+        self.progress.append(progress)
+
+
+def time_iterations(kind: type[Runner], task: LeggedRobot, count: int) -> dict[str, Any]:
+    """Train for `count` iterations with a training loop, from new networks; milliseconds of rollout, update and both
+    (medians, and the range of both), the first iteration left out.
+    """
+    recorder = Recorder()
+    with tempfile.TemporaryDirectory() as folder:
+        runner = kind(task, Path(folder), str(task.device), recorder)  # type: ignore[arg-type]
+        with contextlib.redirect_stdout(io.StringIO()) as said:
+            runner.learn(count + 1, init_at_random_ep_len=True)
+    seen = recorder.progress[1:]
+    whole = sorted(1e3 * (progress.collect_s + progress.learn_s) for progress in seen)
+    steps = task.cfg.train.runner.num_steps_per_env
+    return {
+        "rollout_ms": 1e3 * median([progress.collect_s for progress in seen]),
+        "update_ms": 1e3 * median([progress.learn_s for progress in seen]),
+        "iteration_ms": median(whole),
+        "iteration_ms_range": [whole[0], whole[-1]],
+        "steps_per_iteration": steps,
+        "robot_steps_per_s": task.num_envs * steps / median(whole) * 1e3,
+        "note": said.getvalue().strip(),
+    }
+
+
+def report(task: LeggedRobot, result: dict[str, Any]) -> str:
     """The result in words."""
     device = torch.device(task.device)
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
     how = "one CUDA graph, no host synchronisation in the timed steps" if task.captured else "eager"
-    return (
-        f"{task.cfg.task}, {task.num_envs} robots, {where}, {how}\n"
-        f"  control step  {result['control_step_ms']:.3f} ms  ({result['env_steps_per_s']:,.0f} robot steps/s)\n"
-        f"  physics alone {result['physics_ms']:.3f} ms  (control step = {result['ratio']:.3f} x physics)\n"
-        f"  steps of a robot that lost contacts for want of memory: {result['overflows']:.0f}\n"
-        f"  build, with kernel compilation where not cached: {result['build_s']:.1f} s"
-    )
+    lines = [
+        f"{task.cfg.task}, {task.num_envs} robots, {where}, {how}",
+        f"  control step  {result['control_step_ms']:.3f} ms  ({result['env_steps_per_s']:,.0f} robot steps/s)",
+        f"  physics alone {result['physics_ms']:.3f} ms  (control step = {result['ratio']:.3f} x physics)",
+        f"  steps of a robot that lost contacts for want of memory: {result['overflows']:.0f}",
+        f"  build, with kernel compilation where not cached: {result['build_s']:.1f} s",
+    ]
+    for loop, times in result.get("iterations", {}).items():
+        beyond = times["iteration_ms"] - times["steps_per_iteration"] * result["physics_ms"]
+        lines.append(
+            f"  {loop} training: rollout {times['rollout_ms']:.1f} + update {times['update_ms']:.1f} ms = iteration"
+            f" {times['iteration_ms']:.1f} ms, {beyond:.1f} ms beyond its physics ({times['robot_steps_per_s']:,.0f} robot"
+            " steps/s)" + (f"; {times['note']}" if times["note"] else "")
+        )
+    if "gpu_memory_gib" in result:
+        lines.append(f"  GPU memory in use: {result['gpu_memory_gib']:.1f} GiB")
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":
