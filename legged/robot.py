@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from legged.config.loader import ConfigError, build, read_yaml, suggest
+from legged.mirror import Mirror
 from legged.paths import data_folder
 
 
@@ -60,6 +61,8 @@ class Robot:
     termination_indices: tuple[int, ...]
     mass: float
     """Total mass [kg]."""
+    mirror: Mirror | None
+    """Which joints and feet are each other's left and right; None if the robot is not symmetric."""
 
     @property
     def num_dof(self) -> int:
@@ -105,6 +108,7 @@ def load_robot(name: str) -> Robot:
     shapes = tuple(model.geom(i).name for i in range(model.ngeom) if model.geom_contype[i] or model.geom_conaffinity[i])
     if "" in shapes:
         raise ConfigError(f"{folder / file.model}: every collision geom needs a name")
+    feet = match_names(file.feet, shapes, f"{path}: feet")
     return Robot(
         name=folder.name,
         folder=folder,
@@ -115,10 +119,11 @@ def load_robot(name: str) -> Robot:
         dof_vel_limits=match_values(file.velocity_limit, names, f"{path}: velocity_limit"),
         torque_limits=model.actuator_forcerange[:, 1].copy(),
         contact_names=shapes,
-        feet_indices=match_names(file.feet, shapes, f"{path}: feet"),
+        feet_indices=feet,
         penalised_indices=match_names(file.penalize_contacts_on, shapes, f"{path}: penalize_contacts_on"),
         termination_indices=match_names(file.terminate_after_contacts_on, shapes, f"{path}: terminate_after_contacts_on"),
         mass=float(model.body_mass.sum()),
+        mirror=Mirror.of(model, [joint.id for joint in joints], [shapes[i] for i in feet]),
     )
 
 

@@ -125,6 +125,16 @@ class LeggedRobot(Terms, BaseTask):
                 if name not in terms:
                     where = f"{cfg.task}: observations.{part}"
                     raise ConfigError(f"{where}: {cls.__name__} has no observation '{name}'{suggest(name, terms)}")
+        if cfg.train.algorithm.symmetry:
+            where = f"{cfg.task}: train.algorithm.symmetry"
+            if robot.mirror is None:
+                raise ConfigError(f"{where}: '{robot.name}' is not the same left and right (joints and feet at zero angles)")
+            for name in (*cfg.observations.actor, *cfg.observations.critic):
+                if name not in cls.MIRRORED:
+                    raise ConfigError(f"{where}: {cls.__name__}.MIRRORED does not say how observation '{name}' is mirrored")
+            y = cfg.terrain.measured_points_y
+            if sorted(y) != sorted(-value for value in y):
+                raise ConfigError(f"{where}: terrain.measured_points_y are not the same left and right: {list(y)}")
         control_gains(robot, cfg.control)
         check_terrain(cfg.terrain, cfg.task)
         if round(cfg.env.episode_length_s / cfg.dt) < 1:

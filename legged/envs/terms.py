@@ -3,6 +3,8 @@
 Formulas and names are legged_gym's (Rudin et al., arXiv 2109.11978); where a term differs, its docstring says so.
 """
 
+from typing import Literal
+
 import torch
 from torch import Tensor
 
@@ -11,6 +13,9 @@ from legged.contacts import FeetContacts
 from legged.control import Control
 from legged.terrain.scan import HeightScan
 
+MirrorKind = Literal["same", "vector", "rotation", "command", "joints", "feet", "heights"]
+"""`vector`: (x, y, z) of a velocity or direction; `rotation`: of an angular velocity; `command`: (vx, vy, yaw rate);
+`joints`, `feet`: a number for each; `heights`: the height scan; `same`: numbers that know no side."""
 PENALISED_FORCE = 0.1
 """Contact force on a penalised shape that counts as a collision [N]."""
 
@@ -20,6 +25,17 @@ class Terms:
     collision shapes; the task allocates what is declared here.
     """
 
+    MIRRORED: dict[str, MirrorKind] = {
+        "base_lin_vel": "vector",
+        "base_ang_vel": "rotation",
+        "projected_gravity": "vector",
+        "commands": "command",
+        "dof_pos": "joints",
+        "dof_vel": "joints",
+        "actions": "joints",
+        "heights": "heights",
+    }
+    """Observation term -> how its numbers change when left and right are exchanged; a subclass adds its own terms'."""
     cfg: TaskConfig
     dt: float
     """Control step [s]."""

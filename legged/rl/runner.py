@@ -11,9 +11,10 @@ from rsl_rl.utils.logger import Logger
 from torch.utils.tensorboard import SummaryWriter
 
 from legged.config import ConfigError, TaskConfig
-from legged.envs import BaseTask
+from legged.envs import BaseTask, LeggedRobot
 from legged.rl.checkpoint import describe_mismatch, observation_layout, read_checkpoint, write_checkpoint
 from legged.rl.display import Display, Progress
+from legged.rl.symmetry import MirrorImages, augment
 
 
 class Interrupted(Exception):
@@ -22,7 +23,10 @@ class Interrupted(Exception):
 
 def runner_config(cfg: TaskConfig, algorithm_class: str) -> dict[str, Any]:
     """The dictionary rsl-rl wants."""
-    policy, algorithm, runner = cfg.train.policy, cfg.train.algorithm, cfg.train.runner
+    policy, runner = cfg.train.policy, cfg.train.runner
+    settings = dict(vars(cfg.train.algorithm))
+    if settings.pop("symmetry"):
+        settings["symmetry_cfg"] = {"data_augmentation_func": augment, "use_data_augmentation": True}
     shared = {
         "class_name": "MLPModel",
         "activation": policy.activation,
@@ -45,7 +49,7 @@ def runner_config(cfg: TaskConfig, algorithm_class: str) -> dict[str, Any]:
             },
         },
         "critic": {**shared, "hidden_dims": list(policy.critic_hidden_dims)},
-        "algorithm": {"class_name": algorithm_class, **vars(algorithm)},
+        "algorithm": {"class_name": algorithm_class, **settings},
     }
 
 
@@ -114,6 +118,8 @@ class Runner(OnPolicyRunner):
     ) -> None:
         """`log_dir` is where checkpoints and TensorBoard files go; without one nothing is written."""
         config = runner_config(env.cfg, self.ALGORITHM)
+        if env.cfg.train.algorithm.symmetry and isinstance(env, LeggedRobot):
+            env.mirror_images = MirrorImages(env)  # type: ignore[attr-defined]  # where `augment` finds them
         with contextlib.redirect_stdout(io.StringIO()):
             super().__init__(env, config, str(log_dir) if log_dir else None, device)
         self.logger = QuietLogger(

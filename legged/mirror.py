@@ -1,0 +1,52 @@
+"""The left-right symmetry of a robot, found in its model."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+FLIP = np.array([1.0, -1.0, 1.0])
+"""Reflection in the base's xz plane."""
+APART = 0.01
+"""How far a joint or foot may be from where its partner is mirrored to [m]."""
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """Partners on the other side, of D joints and F feet; what lies in the middle is its own partner."""
+
+    joints: tuple[int, ...]
+    """(D,) for each joint, the one whose angle it takes over in the mirrored robot."""
+    signs: tuple[float, ...]
+    """(D,) 1 or -1: that angle's sign."""
+    feet: tuple[int, ...]
+    """(F,) for each foot, the one whose place it takes over."""
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, joints: Sequence[int], feet: Sequence[str]) -> "Mirror | None":
+        """That of a robot with the hinges `joints` (ids) and the shapes `feet`, by where they are at zero angles; None if
+        some have no partner.
+        """
+        data = mujoco.MjData(model)
+        data.qpos[:] = 0.0
+        data.qpos[3] = 1.0  # the base level at the origin
+        mujoco.mj_kinematics(model, data)
+        anchors, axes = data.xanchor[list(joints)], data.xaxis[list(joints)]
+        # Joints of a hip may share a point; a reflection keeps the sizes of an axis' components, which tells them apart.
+        partners = _partners(np.hstack([anchors, np.abs(axes)]), np.hstack([anchors * FLIP, np.abs(axes)]))
+        centres = np.array([data.geom(name).xpos for name in feet])
+        foot_partners = _partners(centres, centres * FLIP)
+        if partners is None or foot_partners is None:
+            return None
+        # An axis is a pseudo-vector: the reflection keeps its y and turns x and z around.
+        signs = np.sign((-FLIP * axes * axes[partners]).sum(axis=1))
+        return cls(tuple(partners), tuple(float(sign) for sign in signs), tuple(foot_partners))
+
+
+def _partners(places: np.ndarray, reflected: np.ndarray) -> list[int] | None:
+    """For each row of `places` the row of `reflected` that lies there; None if one has none."""
+    distance = np.linalg.norm(places[:, None] - reflected[None], axis=2)
+    if distance.size == 0 or (distance.min(axis=1) > APART).any():
+        return None
+    return [int(i) for i in distance.argmin(axis=1)]
