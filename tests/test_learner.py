@@ -11,6 +11,7 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
 from legged.graph import ForbidHostReads
+from legged.registry import task_config
 from legged.rl.captured import CapturedRunner, Clock
 from legged.rl.ppo import DevicePPO
 from legged.rl.rollout import Rollout
@@ -214,8 +215,9 @@ def test_the_captured_loop_stops_when_asked():
 
 
 def test_the_loop_is_a_setting():
-    assert small_config(("train.runner.loop", "captured")).train.runner.loop == "captured"
-    assert small_config().train.runner.loop == "stock"
+    assert small_config(("train.runner.loop", "stock")).train.runner.loop == "stock"
+    assert task_config("anymal_c").train.runner.loop == "stock"
+    assert small_config().train.runner.loop == "captured"  # without a GPU
 
 
 def test_laps_are_timed():

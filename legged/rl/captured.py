@@ -1,7 +1,9 @@
 """Training in which an iteration is two calls: a rollout and an update, on a GPU one CUDA graph each."""
 
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +57,8 @@ class CapturedRunner(Runner):
             clock = Clock(torch.device(self.device))
             collect()
             clock.lap()
-            update()
+            with cores(self.env.cfg.sim.threads):
+                update()
             clock.lap()
             self.current_learning_iteration = iteration
             self._log(iteration, first, total, rollout, clock)
@@ -111,6 +114,19 @@ class CapturedRunner(Runner):
             action_std=self.alg.action_std().detach(),
             rnd_weight=None,
         )
+
+
+@contextmanager
+def cores(count: int) -> Iterator[None]:
+    """Let torch use `count` threads (0: one a core) on the CPU, where else it uses one and leaves the cores to physics: an
+    update's matrices are large enough for all, a control step's are not.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(count or os.cpu_count() or 1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 class Clock:
