@@ -172,6 +172,18 @@ def test_the_learning_rate_is_changed_in_place():
     assert float(alg.optimizer.param_groups[0]["lr"]) == pytest.approx(3e-4)
 
 
+def test_normalisers_are_updated_in_place():
+    """A captured rollout reads them where they were when it was captured."""
+    alg = learner(DevicePPO, normalized=True)
+    before = {name: tensor.data_ptr() for name, tensor in alg.actor.obs_normalizer.state_dict().items()}
+    fill(alg, 0)
+    alg.update()
+    after = alg.actor.obs_normalizer.state_dict()
+    assert {name: tensor.data_ptr() for name, tensor in after.items()} == before
+    assert int(after["count"]) == SAMPLES
+    assert after["_mean"].abs().max() > 0.0
+
+
 def test_features_that_need_rsl_rls_update_are_named():
     alg = learner(DevicePPO, use_mixed_precision=True)
     assert alg.why_stock == "mixed precision"

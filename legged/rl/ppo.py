@@ -197,10 +197,22 @@ class DevicePPO(PPO):
         self._rate.copy_(torch.where(kl > 2.0 * self.desired_kl, slower, rate))
 
     def _update_normalizers(self) -> None:
-        observations = self.storage.observations.flatten(0, 1)
         for model in (self.actor, self.critic):
             if isinstance(model.obs_normalizer, EmpiricalNormalization):
-                model.update_normalization(observations)
+                inputs = torch.cat([self.storage.observations[name] for name in model.obs_groups], dim=-1)
+                update_normalizer(model.obs_normalizer, inputs.flatten(0, 1))
+
+
+@torch.no_grad()
+def update_normalizer(normalizer: EmpiricalNormalization, x: Tensor) -> None:
+    """Take samples (n, width) into the running mean and variance, as rsl-rl does, but in place: a graph knows addresses."""
+    mean, variance = x.mean(dim=0, keepdim=True), x.var(dim=0, unbiased=False, keepdim=True)
+    normalizer.count += len(x)
+    rate = len(x) / normalizer.count
+    moved = mean - normalizer._mean
+    normalizer._mean += rate * moved
+    normalizer._var += rate * (variance - normalizer._var + moved * (mean - normalizer._mean))
+    torch.sqrt(normalizer._var, out=normalizer._std)
 
 
 def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
