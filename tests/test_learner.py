@@ -12,7 +12,7 @@ from tensordict import TensorDict
 
 from legged.graph import ForbidHostReads
 from legged.registry import task_config
-from legged.rl.captured import CapturedRunner, Clock
+from legged.rl.captured import CapturedRunner, Clock, copies
 from legged.rl.ppo import DevicePPO
 from legged.rl.rollout import Rollout
 from legged.rl.runner import Runner
@@ -242,3 +242,13 @@ def test_laps_are_timed():
     first, second = clock.seconds()
     assert 0.02 <= first < 0.5
     assert 0.0 <= second < 0.01
+
+
+def test_a_snapshot_leaves_no_gradient_node_alive():
+    # It is taken on one CUDA stream and the update captured on another; see captured.copies.
+    parameter = torch.nn.Parameter(torch.ones(3))
+    (snapshot,) = copies([parameter])
+    assert snapshot.grad_fn is None
+    with torch.no_grad():
+        parameter += 1.0
+    assert snapshot.tolist() == [1.0, 1.0, 1.0]

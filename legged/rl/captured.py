@@ -2,12 +2,13 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from legged.envs import BaseTask
 from legged.graph import StepGraph
@@ -74,7 +75,7 @@ class CapturedRunner(Runner):
         enabled = self.env.captured
         task_state = self.env.state_dict()
         collect = StepGraph(rollout.collect, device, enabled, ROLLOUTS_TO_WARM_UP)
-        before = [(tensor, tensor.clone()) for tensor in self.alg.tensors()]
+        before = list(zip(self.alg.tensors(), copies(self.alg.tensors()), strict=True))
         fresh = not self.alg.optimizer.state
         update = StepGraph(self.alg.learn, device, enabled)
         with torch.no_grad():
@@ -114,6 +115,14 @@ class CapturedRunner(Runner):
             action_std=self.alg.action_std().detach(),
             rnd_weight=None,
         )
+
+
+@torch.no_grad()
+def copies(tensors: Iterable[Tensor]) -> list[Tensor]:
+    """Copies outside autograd: one that knew its parameter would keep the node that accumulates the parameter's gradient,
+    and with it the stream the copy was made on, which no capture on another stream may wait for.
+    """
+    return [tensor.clone() for tensor in tensors]
 
 
 @contextmanager
