@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import TASK, call, kept_global_state, run_folders, small_config, tiny_run
+from helpers import TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
 
 from legged import make_task
 from legged.config import override
@@ -16,17 +16,7 @@ from legged.tools import evaluate
 from legged.tools.evaluate import axis_values
 from legged.tools.velocity_grid import Grid, measure
 
-
-@pytest.fixture(autouse=True)
-def workplace(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with kept_global_state():
-        yield
-
-
-def stand(observations) -> torch.Tensor:
-    """The policy that keeps the default pose."""
-    return torch.zeros(len(observations["actor"]), 12)
+pytestmark = pytest.mark.usefixtures("workplace")
 
 
 def on_grid(grid: Grid, act=stand, *settings):
