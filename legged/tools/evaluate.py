@@ -65,7 +65,7 @@ def _main(argv: list[str] | None) -> int:
     device = torch.device("cpu") if args.physics == "mujoco" and args.sim_device is None else pick_device(args.sim_device)
     if device.type == "cpu":
         torch.set_num_threads(1)
-    engine = resolve_physics(args.physics or "auto", device)
+    engine = resolve_physics(args.physics or "auto", device, "--physics")
     policy = find_policy(args)
     types = chosen_types(policy.cfg, args.types)
     asked = [change for change in overrides(args) if change[0] != "train.runner.experiment_name"]

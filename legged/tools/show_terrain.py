@@ -49,14 +49,14 @@ def _main(argv: list[str] | None) -> int:
                 f"{args.task}: stands on a plane (terrain.mesh_type), there is no terrain to show; --types shows types of"
                 " your choice"
             )
-        check_terrain(cfg.terrain, args.task)
+        check_terrain(cfg.terrain, cfg.origins)
         terrain = Terrain.build(cfg.terrain, cfg.env.seed)
         types: Sequence[str] = terrain.type_names
         levels = [f"{row / cfg.terrain.num_rows:g}" if cfg.terrain.curriculum else "" for row in range(cfg.terrain.num_rows)]
     else:
         types = chosen_types(args.types)
         sizes = replace(cfg.terrain, mesh_type="height_map", num_rows=1, num_cols=len(types), max_init_terrain_level=0)
-        check_terrain(replace(sizes, proportions=dict.fromkeys(types, 1.0 / len(types))), args.task)
+        check_terrain(replace(sizes, proportions=dict.fromkeys(types, 1.0 / len(types))), cfg.origins)
         terrain = tiles(cfg.terrain, [types[::-1]], args.difficulty, cfg.env.seed)  # the map's first column is the rightmost
         levels = [f"{args.difficulty:g}"]
     args.out.mkdir(parents=True, exist_ok=True)
