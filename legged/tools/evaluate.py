@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from legged.config import ConfigError, override
-from legged.paths import relative
+from legged.paths import relative, replacing
 from legged.physics import resolve_physics
 from legged.rl.arguments import (
     add_run_arguments,
@@ -210,10 +210,9 @@ def plot(result: dict[str, Any], path: Path) -> None:
             axis.text(i, j, f"{value:.2f}", ha="center", va="center", color="white" if dark else "black")
         figure.colorbar(image, ax=axis, label=label)
     figure.suptitle(f"{result['task']} in {result['physics']}, {result['ground']}falls {100 * result['falls']:.1f} %")
-    part = path.with_name(f".{path.name}")
-    figure.savefig(part, dpi=110, format="png")
+    with replacing(path) as part:
+        figure.savefig(part, dpi=110, format="png")
     plt.close(figure)
-    part.replace(path)
 
 
 if __name__ == "__main__":
