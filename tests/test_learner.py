@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import checkpoints, kept_global_state, small_config, small_task, tiny_run
+from helpers import checkpoints, small_config, small_task, tiny_run
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
@@ -22,12 +22,7 @@ ROBOTS, STEPS = 48, 8
 SAMPLES = ROBOTS * STEPS
 LEARNING = {"num_mini_batches": 4, "num_learning_epochs": 3, "entropy_coef": 0.01, "learning_rate": 1e-3}
 
-
-@pytest.fixture(autouse=True)
-def workplace(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with kept_global_state():
-        yield
+pytestmark = pytest.mark.usefixtures("workplace")
 
 
 def observe() -> TensorDict:

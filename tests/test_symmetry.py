@@ -5,7 +5,7 @@ import dataclasses
 import mujoco
 import pytest
 import torch
-from helpers import call, kept_global_state, small_config, small_task, tiny_run
+from helpers import call, small_config, small_task, tiny_run
 from reference import random_states
 from tensordict import TensorDict
 
@@ -21,12 +21,7 @@ from legged.rl.symmetry import MirrorImages, augment
 SYMMETRIC = ("train.algorithm.symmetry", True)
 ONE_CORE = ("sim.physics", "mujoco"), ("sim.threads", 1)
 
-
-@pytest.fixture(autouse=True)
-def workplace(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with kept_global_state():
-        yield
+pytestmark = pytest.mark.usefixtures("workplace")
 
 
 def rough_task(name: str) -> LeggedRobot:

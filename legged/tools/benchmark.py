@@ -63,7 +63,7 @@ def _main(argv: list[str] | None) -> int:
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
     if device.type == "cpu":
         torch.set_num_threads(1)
-    if args.grounds and resolve_physics(cfg.sim.physics, device) != "mujoco_warp":
+    if args.grounds and resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics")) != "mujoco_warp":
         raise ConfigError("--grounds: compares colliders of mujoco_warp; add sim.physics=mujoco_warp")
     if args.grounds and cfg.terrain.mesh_type == "plane":
         raise ConfigError(f"--grounds: the task '{cfg.task}' has no terrain (terrain.mesh_type is plane)")
