@@ -54,7 +54,7 @@ class LeggedRobot(Terms, BaseTask):
         n = self.num_envs
         self.randomization = Randomization(cfg.domain_rand, n, self.dt, device)
         self.terrain = terrain or self.make_terrain()
-        self.physics = make_physics(robot, cfg.sim, n, device, self.terrain)
+        self.physics = make_physics(robot, cfg.sim, n, device, self.terrain, self.randomization.fields)
         self.randomization.apply(self.physics)
 
         state = self.physics.state

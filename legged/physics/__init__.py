@@ -1,5 +1,7 @@
 """Physics engines behind one interface. A new one is a file here and a line in `make_physics`."""
 
+from collections.abc import Collection
+
 import torch
 
 from legged.config.loader import ConfigError
@@ -25,15 +27,20 @@ def resolve_physics(name: str, device: torch.device) -> str:
 
 
 def make_physics(
-    robot: Robot, sim: SimConfig, num_envs: int, device: torch.device, terrain: Terrain | None = None
+    robot: Robot,
+    sim: SimConfig,
+    num_envs: int,
+    device: torch.device,
+    terrain: Terrain | None = None,
+    randomized: Collection[RandomizedField] = (),
 ) -> Physics:
     """The back-end that `sim.physics` names, on a plane or on `terrain`. Engines are imported here, so that none is needed
-    but the one used.
+    but the one used. What is `randomized` next may be compiled together with the rest; other fields take their time.
     """
     if resolve_physics(sim.physics, device) == "mujoco_warp":
         from legged.physics.mujoco_warp import MujocoWarpPhysics
 
-        return MujocoWarpPhysics(robot, sim, num_envs, device, terrain)
+        return MujocoWarpPhysics(robot, sim, num_envs, device, terrain, randomized)
     from legged.physics.mujoco import MujocoPhysics
 
     return MujocoPhysics(robot, sim, num_envs, device, terrain)
