@@ -1,6 +1,7 @@
 """Physics engines behind one interface. A new one is a file here and a line in `make_physics`."""
 
 from collections.abc import Collection
+from pathlib import Path
 
 import torch
 
@@ -10,7 +11,7 @@ from legged.physics.base import Physics, RandomizedField, RobotState
 from legged.robot import Robot
 from legged.terrain import Terrain
 
-__all__ = ["Physics", "RandomizedField", "RobotState", "make_physics", "resolve_physics"]
+__all__ = ["Physics", "RandomizedField", "RobotState", "kernel_cache", "make_physics", "resolve_physics"]
 
 
 def resolve_physics(name: str, device: torch.device) -> str:
@@ -44,3 +45,10 @@ def make_physics(
     from legged.physics.mujoco import MujocoPhysics
 
     return MujocoPhysics(robot, sim, num_envs, device, terrain)
+
+
+def kernel_cache() -> Path:
+    """The folder in which Warp keeps compiled kernels."""
+    from legged.physics.kernels import cache_folder
+
+    return cache_folder()

@@ -18,6 +18,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,15 @@ PLAIN_LINES_EVERY_S = 5.0
 STALLED_S = 300.0
 """Without a module finished for this long, compiling processes are ended [s]."""
 MOST_PROCESSES = 16
+TILED_COSTS = 20
+"""Kernels on tiles may need linear algebra of CUDA's libraries, which takes as long as so many others."""
 CUDA_BLOCK_DIM, CPU_BLOCK_DIM = 256, 1
 """Threads per block that Warp takes where a launch does not say; each block size is compiled by itself."""
+
+
+def cache_folder() -> Path:
+    """Where Warp keeps what it has compiled, for its version."""
+    return Path(wp.config.kernel_cache_dir)
 
 
 @dataclass(frozen=True)
@@ -41,7 +49,7 @@ class Build:
 
     def cached(self, device: Any) -> bool:
         """Whether Warp's cache holds it for the device's architecture."""
-        folder = Path(wp.config.kernel_cache_dir) / self.module.get_module_identifier(self.block_dim)
+        folder = cache_folder() / self.module.get_module_identifier(self.block_dim)
         pattern = "*.o" if device.is_cpu else f"*.sm{device.get_cuda_compile_arch()}*"
         return any(folder.glob(pattern))
 
@@ -59,10 +67,10 @@ def compile_ahead(device: Any, functions: Iterable[Callable[[], object]]) -> int
     if len(missing) < 2 or sys.platform != "linux":  # forking is safe on Linux only
         return 0
     total = len(missing)
-    with _Line(total) as line, _Lock(Path(wp.config.kernel_cache_dir)) as lock:
+    with _Line(total) as line, _Lock(cache_folder()) as lock:
         while missing:
             if lock.acquire():
-                _compile_all(missing, device, line)
+                _compile_all(missing, device, partial(line.show, total - len(missing)))
                 break
             time.sleep(POLL_S)
             missing = [build for build in missing if not build.cached(device)]
@@ -71,14 +79,14 @@ def compile_ahead(device: Any, functions: Iterable[Callable[[], object]]) -> int
 
 
 def launched(device: Any, functions: Iterable[Callable[[], object]]) -> list[Build]:
-    """What `functions` launch on a device, those with most kernels first."""
-    found: dict[Build, None] = {}
+    """What `functions` launch on a device, the slowest to compile first."""
+    found: dict[Build, int] = {}
 
-    def note(kernel: Any, dim: Any = 0, *_: Any, block_dim: int | None = None, **__: Any) -> None:
+    def note(kernel: Any, dim: Any = 0, *_: Any, block_dim: int | None = None, tiled: bool = False, **__: Any) -> None:
         if kernel.is_generic or math.prod(dim if isinstance(dim, list | tuple) else (dim,)) == 0:
             return  # a generic kernel becomes one when it is given its arguments
         size = CPU_BLOCK_DIM if device.is_cpu else block_dim or CUDA_BLOCK_DIM
-        found[Build(kernel.module, size)] = None
+        found[Build(kernel.module, size)] = TILED_COSTS * tiled + len(kernel.module.kernels)
 
     def once(condition: Any, while_body: Callable[..., None], stream: Any = None, **arguments: Any) -> None:
         while_body(**arguments)
@@ -87,10 +95,13 @@ def launched(device: Any, functions: Iterable[Callable[[], object]]) -> list[Bui
         for branch in filter(None, (on_true, on_false)):
             branch(**arguments)
 
-    with wp.ScopedDevice(device), _instead(launch=note, launch_tiled=note, capture_while=once, capture_if=both):
+    with (
+        wp.ScopedDevice(device),
+        _instead(launch=note, launch_tiled=partial(note, tiled=True), capture_while=once, capture_if=both),
+    ):
         for function in functions:
             function()
-    return sorted(found, key=lambda build: -len(build.module.kernels))
+    return sorted(found, key=lambda build: -found[build])
 
 
 @contextmanager
@@ -106,8 +117,10 @@ def _instead(**functions: Callable[..., None]) -> Iterator[None]:
             setattr(wp, name, function)
 
 
-def _compile_all(builds: list[Build], device: Any, line: "_Line") -> None:
-    """Compile in forked processes, which take their work from a pipe; returns when all of them have ended."""
+def _compile_all(builds: list[Build], device: Any, show: Callable[[int], None]) -> None:
+    """Compile in forked processes, which take their work from a pipe, and show how many modules are done; returns when all
+    processes have ended.
+    """
     work, give = os.pipe()
     os.write(give, b"".join(struct.pack("=H", i) for i in range(len(builds))))
     os.close(give)
@@ -125,7 +138,7 @@ def _compile_all(builds: list[Build], device: Any, line: "_Line") -> None:
                     done, since = finished, time.monotonic()
                 elif time.monotonic() - since > STALLED_S:
                     break
-                line.show(done)
+                show(done)
         finally:
             for child in running:
                 os.kill(child, 9)
@@ -189,10 +202,10 @@ class _Line:
         end = "\r" if sys.stdout.isatty() else ""
         print(f"{end}compiled {self._total} kernel modules in {time.monotonic() - self._start:.1f} s", flush=True)
 
-    def show(self, done: int) -> None:
-        """`done` modules are compiled."""
+    def show(self, before: int, more: int = 0) -> None:
+        """`before` and `more` modules are compiled."""
         now = time.monotonic()
-        text = f"compiling {min(done + 1, self._total)} of {self._total} kernel modules ..."
+        text = f"compiling {min(before + more + 1, self._total)} of {self._total} kernel modules ..."
         if sys.stdout.isatty():
             print(f"\r{text}", end="", flush=True)
         elif now - self._shown >= PLAIN_LINES_EVERY_S:
