@@ -52,16 +52,8 @@ def workplace(tmp_path, monkeypatch):
 @contextlib.contextmanager
 def two_processes(script, *arguments: str):
     """torchrun with two processes, its output in out.txt; killed in the end, with its children."""
-    command = [
-        sys.executable,
-        "-m",
-        "torch.distributed.run",
-        "--standalone",
-        "--nproc-per-node",
-        "2",
-        str(script),
-        *arguments,
-    ]
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    command = [*launch, str(script), *arguments]
     paths = os.pathsep.join(str(path) for path in (REPOSITORY, TESTS))
     with open("out.txt", "w") as out:
         environment = {**os.environ, "PYTHONPATH": paths}
@@ -157,7 +149,9 @@ def as_rank(monkeypatch, rank: int, count: int) -> None:
 
 
 def test_robots_differ_between_processes_and_their_ground_does_not(monkeypatch):
-    ground = [("terrain.num_rows", 2), ("terrain.num_cols", 4), ("terrain.border_size", 2.0)]
+    kinds = dict.fromkeys(task_config("anymal_c").terrain.proportions, 0.0) | {"rough_slope_up": 0.5, "obstacles": 0.5}
+    sizes = [("terrain.num_rows", 2), ("terrain.num_cols", 2), ("terrain.border_size", 2.0)]
+    ground = [("terrain.proportions", kinds), *sizes]
     cfg = task_config("anymal_c", [("env.num_envs", 4), ("sim.threads", 1), *ground], on_cpu=True)
     alone = make_task(cfg)
     tasks = []
