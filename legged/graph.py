@@ -130,10 +130,12 @@ class StepGraph:
         torch.cuda.current_stream(device).wait_stream(stream)
         torch.cuda.synchronize(device)
         graph = torch.cuda.CUDAGraph()
+        # Of several processes each has a thread that looks after its collectives, and may ask CUDA about them meanwhile.
+        error_mode = "thread_local" if torch.distributed.is_initialized() else "global"
         failure: Exception | None = None
         try:
             # Torch owns the capture; Warp is told of it, so that the solver's loop becomes a conditional node.
-            with torch.cuda.graph(graph, stream=stream):
+            with torch.cuda.graph(graph, stream=stream, capture_error_mode=error_mode):
                 warp_stream = wp.stream_from_torch(torch.cuda.current_stream(device))
                 with wp.ScopedStream(warp_stream, sync_enter=False), wp.ScopedCapture(stream=warp_stream, external=True):
                     try:

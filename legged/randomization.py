@@ -5,7 +5,7 @@ from torch import Tensor
 
 from legged.config.schema import DomainRandConfig
 from legged.math import masked_set_, uniform
-from legged.physics import Physics
+from legged.physics import Physics, RandomizedField
 
 
 class Randomization:
@@ -24,12 +24,20 @@ class Randomization:
         """(N,) time until the next push [s]."""
         self._push_velocity = torch.zeros(num_envs, 2, device=device)
 
+    @property
+    def fields(self) -> dict[RandomizedField, Tensor]:
+        """What is randomised of the physics, and what was drawn for it."""
+        drawn: dict[RandomizedField, Tensor] = {}
+        if self.cfg.randomize_friction:
+            drawn["friction"] = self.friction
+        if self.cfg.randomize_base_mass:
+            drawn["added_base_mass"] = self.added_mass
+        return drawn
+
     def apply(self, physics: Physics) -> None:
         """Give the physics what was drawn, at start-up."""
-        if self.cfg.randomize_friction:
-            physics.randomize("friction", self.friction)
-        if self.cfg.randomize_base_mass:
-            physics.randomize("added_base_mass", self.added_mass)
+        for field, values in self.fields.items():
+            physics.randomize(field, values)
 
     def draw(self) -> None:
         """Draw a push for every robot, for those that `push` finds due."""

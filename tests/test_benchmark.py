@@ -54,3 +54,55 @@ def test_iterations_are_counted_without_the_first(kind):
 def test_grounds_need_mujoco_warp_and_terrain(arguments, words, capsys):
     assert call(benchmark.main, arguments) == 2
     assert words in capsys.readouterr().err
+
+
+def test_sizes_are_compared_in_processes_of_their_own(tmp_path, capfd):
+    """Of three sizes the last wants 480 TB for the actions alone, which no process can have."""
+    too_many = 10_000_000_000_000
+    small = [text for text in SMALL if text not in ("--num_envs", "8")]
+    steps = ["--steps", "2", "--repeats", "1", "--iterations", "1", "--json", str(tmp_path / "s.json")]
+    assert benchmark.main(["--task", "anymal_c_flat", *small, *steps, "--scale", f"4,16,{too_many}"]) == 0
+    result = json.loads((tmp_path / "s.json").read_text())
+    assert (result["task"], result["device"], result["loop"]) == ("anymal_c_flat", "CPU", "captured")
+    first, second, last = result["sizes"]
+    for row, robots in ((first, 4), (second, 16)):
+        assert row["num_envs"] == robots
+        assert row["env_steps_per_s"] == pytest.approx(robots / row["control_step_ms"] * 1e3)
+        assert row["robot_steps_per_s"] == pytest.approx(4 * robots / row["iteration_ms"] * 1e3)
+    assert last == {"num_envs": too_many, "failed": "out of memory"}
+    out = capfd.readouterr().out
+    title, heading, *rows = out.splitlines()
+    assert title == "anymal_c_flat, CPU, captured training"
+    assert heading.split() == ["robots", "control", "step", "steps/s", "iteration", "training", "steps/s", "GPU", "memory"]
+    assert [row.split()[0] for row in rows] == ["4", "16", f"{too_many:,}"]
+    assert rows[2].endswith("  out of memory")
+    assert not list(tmp_path.glob("logs*"))
+
+
+def test_a_size_that_fails_otherwise_is_told_too(tmp_path, capfd, monkeypatch):
+    (tmp_path / "broken.py").write_text(
+        "from legged import LeggedRobot, register\n"
+        "class Broken(LeggedRobot):\n"
+        "    def _obs_broken(self):\n"
+        "        raise ValueError('no such thing')\n"
+        "register('broken', {'extends': 'anymal_c_flat', 'observations': {'actor': ['broken']}}, Broken)\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    arguments = ["--task", "broken", "--import", "broken.py", "--sim_device", "cpu", "--scale", "4"]
+    assert benchmark.main(arguments) == 1
+    out, err = capfd.readouterr()
+    assert out.splitlines()[-1].split()[0] == "4"
+    assert "no such thing" in out
+    assert "Traceback" in err
+
+
+@pytest.mark.parametrize("sizes", ["", "4,", "0", "many", "-4", "1e3"])
+def test_sizes_are_numbers(sizes, capsys):
+    assert call(benchmark.main, ["--task", "anymal_c_flat", "--sim_device", "cpu", f"--scale={sizes}"]) == 2
+    assert "is not a list of numbers of robots" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("other", [["--num_envs", "4"], ["--grounds"]])
+def test_scale_sets_the_number_of_robots_itself(other, capsys):
+    assert call(benchmark.main, ["--task", "anymal_c", "--sim_device", "cpu", "--scale", "4", *other]) == 2
+    assert f"leave out {other[0]}" in capsys.readouterr().err

@@ -11,7 +11,7 @@ from helpers import POLICY
 
 from legged.registry import import_tasks, make_task, task_config
 from legged.rl import play, train
-from legged.tools import benchmark, evaluate, plot, show_terrain
+from legged.tools import benchmark, evaluate, plot, show_terrain, warmup
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -41,6 +41,7 @@ def test_the_example_task_trains_without_touching_the_package(tmp_path, monkeypa
         ("python -m legged.tools.evaluate", evaluate.main),
         ("python -m legged.tools.benchmark", benchmark.main),
         ("python -m legged.tools.plot", plot.main),
+        ("python -m legged.tools.warmup", warmup.main),
         ("python -m legged.tools.show_terrain", show_terrain.main),
     ],
 )

@@ -28,11 +28,12 @@ class EnvConfig:
     """Size and length of the simulated batch."""
 
     num_envs: int = field(default=4096, metadata=AT_LEAST_1)
-    """Robots simulated side by side."""
+    """Robots simulated side by side, on each GPU."""
     episode_length_s: float = field(default=20.0, metadata=POSITIVE)
     """Time-out of an episode [s]."""
     seed: int = field(default=1, metadata=AT_LEAST_0)
-    """Seed of torch's generators; physics itself draws no random numbers."""
+    """Seed of torch's generators, and of the terrain; physics itself draws no random numbers. With several GPUs the robots of
+    each have their own, seed + rank."""
 
 
 @dataclass(frozen=True)

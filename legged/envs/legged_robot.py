@@ -20,6 +20,7 @@ from legged.math import masked_set_
 from legged.observations import ObservationGroup
 from legged.physics import make_physics
 from legged.randomization import Randomization
+from legged.ranks import Ranks
 from legged.rewards import Rewards
 from legged.robot import Robot, load_robot
 from legged.statistics import Statistics
@@ -50,11 +51,11 @@ class LeggedRobot(Terms, BaseTask):
         device = torch.device(device)
         super().__init__(cfg, robot.num_dof, device)
         self.robot = robot
-        torch.manual_seed(cfg.env.seed)
+        torch.manual_seed(cfg.env.seed + Ranks.now().rank)  # other robots on each GPU, on the same ground
         n = self.num_envs
         self.randomization = Randomization(cfg.domain_rand, n, self.dt, device)
         self.terrain = terrain or self.make_terrain()
-        self.physics = make_physics(robot, cfg.sim, n, device, self.terrain)
+        self.physics = make_physics(robot, cfg.sim, n, device, self.terrain, self.randomization.fields)
         self.randomization.apply(self.physics)
 
         state = self.physics.state

@@ -1,5 +1,8 @@
 """Physics engines behind one interface. A new one is a file here and a line in `make_physics`."""
 
+from collections.abc import Collection
+from pathlib import Path
+
 import torch
 
 from legged.config.loader import ConfigError
@@ -8,7 +11,7 @@ from legged.physics.base import Physics, RandomizedField, RobotState
 from legged.robot import Robot
 from legged.terrain import Terrain
 
-__all__ = ["Physics", "RandomizedField", "RobotState", "make_physics", "resolve_physics"]
+__all__ = ["Physics", "RandomizedField", "RobotState", "kernel_cache", "make_physics", "resolve_physics"]
 
 
 def resolve_physics(name: str, device: torch.device, where: str = "sim.physics") -> str:
@@ -25,15 +28,27 @@ def resolve_physics(name: str, device: torch.device, where: str = "sim.physics")
 
 
 def make_physics(
-    robot: Robot, sim: SimConfig, num_envs: int, device: torch.device, terrain: Terrain | None = None
+    robot: Robot,
+    sim: SimConfig,
+    num_envs: int,
+    device: torch.device,
+    terrain: Terrain | None = None,
+    randomized: Collection[RandomizedField] = (),
 ) -> Physics:
     """The back-end that `sim.physics` names, on a plane or on `terrain`. Engines are imported here, so that none is needed
-    but the one used.
+    but the one used. What is `randomized` next may be compiled together with the rest; other fields take their time.
     """
     if resolve_physics(sim.physics, device) == "mujoco_warp":
         from legged.physics.mujoco_warp import MujocoWarpPhysics
 
-        return MujocoWarpPhysics(robot, sim, num_envs, device, terrain)
+        return MujocoWarpPhysics(robot, sim, num_envs, device, terrain, randomized)
     from legged.physics.mujoco import MujocoPhysics
 
     return MujocoPhysics(robot, sim, num_envs, device, terrain)
+
+
+def kernel_cache() -> Path:
+    """The folder in which Warp keeps compiled kernels."""
+    from legged.physics.kernels import cache_folder
+
+    return cache_folder()

@@ -1,6 +1,6 @@
 """Batched MuJoCo on a GPU by mujoco-warp; also on Warp's CPU device, for tests and for comparison."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
@@ -16,6 +16,7 @@ from legged.config.schema import SimConfig
 from legged.math import masked_set_
 from legged.physics.base import Physics, RandomizedField, RobotState, allocate_state
 from legged.physics.exchange import Exchange
+from legged.physics.kernels import compile_ahead
 from legged.physics.scene import FLOOR, build_model
 from legged.physics.terrain_contact import TerrainContact
 from legged.robot import Robot
@@ -36,9 +37,17 @@ class MujocoWarpPhysics(Physics):
     capturable = True
 
     def __init__(
-        self, robot: Robot, sim: SimConfig, num_envs: int, device: torch.device, terrain: Terrain | None = None
+        self,
+        robot: Robot,
+        sim: SimConfig,
+        num_envs: int,
+        device: torch.device,
+        terrain: Terrain | None = None,
+        randomized: Collection[RandomizedField] = (),
     ) -> None:
-        """Build the scene on `device` and place all robots at the model's initial state; compiles on first use."""
+        """Build the scene on `device` and place all robots at the model's initial state; compiles on first use, for
+        `randomized` fields too.
+        """
         self.num_envs, self.dt, self.device = num_envs, sim.dt, device
         cells = terrain is not None and sim.terrain_collider == "cells"
         self.model = build_model(robot, sim, terrain, "none" if cells else "height_field")
@@ -55,6 +64,9 @@ class MujocoWarpPhysics(Physics):
             self._qpos, self._qvel, self.torques = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
             self.state = self._views(allocate_state(num_envs, robot, device))
             self._exchange = Exchange(self._m, d, self.model, robot, self.state, self.overflowed)
+        exchanges = (self._exchange.kinematics, self._exchange.contact_forces)
+        constants = (self._set_constants,) if "added_base_mass" in randomized else ()
+        compile_ahead(self._wp_device, (self._step, *exchanges, *constants))
         self._forces_read = False
         self._advance: Callable[[], Any] = self._step
         if self._wp_device.is_cpu:
@@ -75,6 +87,9 @@ class MujocoWarpPhysics(Physics):
 
     def _step(self) -> None:
         mjw.step(self._m, self._d)
+
+    def _set_constants(self) -> None:
+        mjw.set_const(self._m, self._d)
 
     def _captured_step(self) -> Callable[[], Any]:
         """One step as a Warp graph on the CPU: the same arithmetic without the cost of launching from Python."""
@@ -137,7 +152,7 @@ class MujocoWarpPhysics(Physics):
         mass = wp.to_torch(self._m.body_mass)
         mass[:, base] = float(self.model.body_mass[base]) + values.to(self.device)
         with wp.ScopedDevice(self._wp_device):
-            mjw.set_const(self._m, self._d)
+            self._set_constants()
 
     def copy_to(self, env_id: int, data: mujoco.MjData) -> None:
         data.qpos[:] = self._qpos[env_id].cpu().numpy().astype(np.float64)

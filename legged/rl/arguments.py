@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from legged.config import ConfigError, parse_override
+from legged.ranks import Ranks
 from legged.registry import import_tasks
 
 EXIT_WRONG_INPUT = 2
@@ -50,13 +51,26 @@ def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
 
 
 def pick_device(name: str | None, flag: str = "--sim_device") -> torch.device:
-    """The device that was asked for, else the GPU if there is one.
+    """The device that was asked for, else the GPU if there is one; under torchrun the GPU of this process's number.
 
     Raises:
-        ConfigError: no such device, or no GPU here.
+        ConfigError: no such device, no GPU here, or under torchrun another one than its own.
     """
+    ranks = Ranks.now()
+    own = f"cuda:{ranks.local_rank}"
     if name is None:
-        return torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
+        if not torch.cuda.is_available():
+            return torch.device("cpu")
+        name = own
+    if ranks.several and name not in ("cpu", "cuda", own):
+        raise ConfigError(f"{flag}: '{name}' is one device for {ranks.count} processes; leave it out, and each gets its own")
+    if ranks.several and name == own and ranks.local_rank >= torch.cuda.device_count():
+        have = torch.cuda.device_count()
+        raise ConfigError(
+            f"{ranks.local_count} processes want a GPU each, but torch sees {have} here; --nproc-per-node {have}"
+        )
+    if ranks.several and name == "cuda":
+        name = own
     try:
         device = torch.device(name)
     except RuntimeError as error:
@@ -77,7 +91,8 @@ def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = N
     try:
         return main(argv)
     except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
+        ranks = Ranks.now()
+        print(f"rank {ranks.rank}: error: {error}" if ranks.several else f"error: {error}", file=sys.stderr)
         return EXIT_WRONG_INPUT
 
 

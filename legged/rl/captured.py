@@ -12,6 +12,7 @@ from torch import Tensor
 
 from legged.envs import BaseTask
 from legged.graph import StepGraph
+from legged.ranks import Ranks
 from legged.rl.display import Display
 from legged.rl.ppo import DevicePPO
 from legged.rl.rollout import Rollout
@@ -46,6 +47,8 @@ class CapturedRunner(Runner):
             super().learn(num_learning_iterations, init_at_random_ep_len)
             return
         self.alg.train_mode()
+        if self.is_distributed:
+            self.alg.broadcast_parameters()
         rollout = Rollout(self.env, self.alg)
         collect, update = self._capture(rollout)
         if init_at_random_ep_len:
@@ -58,7 +61,7 @@ class CapturedRunner(Runner):
             clock = Clock(torch.device(self.device))
             collect()
             clock.lap()
-            with cores(self.env.cfg.sim.threads):
+            with cores(self.env.cfg.sim.threads or (os.cpu_count() or 1) // Ranks.now().local_count):
                 update()
             clock.lap()
             self.current_learning_iteration = iteration
@@ -127,11 +130,11 @@ def copies(tensors: Iterable[Tensor]) -> list[Tensor]:
 
 @contextmanager
 def cores(count: int) -> Iterator[None]:
-    """Let torch use `count` threads (0: one a core) on the CPU, where else it uses one and leaves the cores to physics: an
+    """Let torch use `count` threads (at least one) on the CPU, where else it uses one and leaves the cores to physics: an
     update's matrices are large enough for all, a control step's are not.
     """
     before = torch.get_num_threads()
-    torch.set_num_threads(count or os.cpu_count() or 1)
+    torch.set_num_threads(max(count, 1))
     try:
         yield
     finally:

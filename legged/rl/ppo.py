@@ -9,6 +9,8 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.modules.normalization import EmpiricalNormalization
 from torch import Tensor
 
+from legged.rl.distributed import sum_over_ranks_
+
 LOWEST_RATE, HIGHEST_RATE, RATE_STEP = 1e-5, 1e-2, 1.5
 """Bounds of the adaptive learning rate and the factor by which it moves, as in rsl-rl."""
 FEW = 1e-8
@@ -35,6 +37,8 @@ class DevicePPO(PPO):
             parameters = [p for p in (*self.actor.parameters(), *self.critic.parameters()) if p.requires_grad]
             capturable = self._rate.is_cuda
             self.optimizer = torch.optim.Adam(parameters, lr=self._rate, fused=True, capturable=capturable)
+            if self.is_multi_gpu:
+                self._shared = SharedGradients(parameters, self.gpu_world_size)
         self._losses = torch.zeros(3, device=self.device)
 
     def tensors(self) -> list[Tensor]:
@@ -49,8 +53,6 @@ class DevicePPO(PPO):
             return "random network distillation"
         if self.symmetry:
             return "symmetry"
-        if self.is_multi_gpu:
-            return "several GPUs"
         if self.use_mixed_precision:
             return "mixed precision"
         for name, model in (("actor", self.actor), ("critic", self.critic)):
@@ -158,9 +160,6 @@ class DevicePPO(PPO):
         std = self.action_std()
         log_prob = gaussian_log_prob(actions, mean, std)
         entropy = std.log().sum() + actions.shape[1] * (0.5 + HALF_LOG_2PI)
-        if self.desired_kl is not None and self.schedule == "adaptive":
-            self._adapt_rate(old_mean, old_std, mean.detach(), std.detach())
-
         ratio = torch.exp(log_prob - old_log_prob)
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate = torch.max(-advantages * ratio, -advantages * clipped).mean()
@@ -171,8 +170,16 @@ class DevicePPO(PPO):
         value_loss = value_loss.mean()
         loss = surrogate + self.value_loss_coef * value_loss - self.entropy_coef * entropy
 
-        self.optimizer.zero_grad()
-        loss.backward()
+        kl = divergence(old_mean, old_std, mean.detach(), std.detach())
+        if self.is_multi_gpu:
+            self._shared.zero_()
+            loss.backward()
+            self._shared.average_(kl)
+        else:
+            self.optimizer.zero_grad()
+            loss.backward()
+        if self.desired_kl is not None and self.schedule == "adaptive":
+            self._adapt_rate(kl)
         for model in (self.actor, self.critic):
             torch.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
         self.optimizer.step()
@@ -186,10 +193,8 @@ class DevicePPO(PPO):
         return distribution.log_std_param.clamp(*distribution.log_std_range).exp()
 
     @torch.no_grad()
-    def _adapt_rate(self, old_mean: Tensor, old_std: Tensor, mean: Tensor, std: Tensor) -> None:
-        """Move the learning rate towards the wanted mean divergence KL(old || new)."""
-        moved = (old_std.square() + (old_mean - mean).square()) / (2.0 * std.square())
-        kl = (torch.log(std / old_std) + moved - 0.5).sum(dim=1).mean()
+    def _adapt_rate(self, kl: Tensor) -> None:
+        """Move the learning rate so that the mean divergence `kl` () becomes the wanted one."""
         assert self._rate is not None
         slower = (self._rate / RATE_STEP).clamp(min=LOWEST_RATE)
         faster = (self._rate * RATE_STEP).clamp(max=HIGHEST_RATE)
@@ -205,14 +210,54 @@ class DevicePPO(PPO):
 
 @torch.no_grad()
 def update_normalizer(normalizer: EmpiricalNormalization, x: Tensor) -> None:
-    """Take samples (n, width) into the running mean and variance, as rsl-rl does, but in place: a graph knows addresses."""
+    """Take samples (n, width) of all processes into the running mean and variance, as rsl-rl does, but in place: a graph
+    knows addresses.
+    """
     mean, variance = x.mean(dim=0, keepdim=True), x.var(dim=0, unbiased=False, keepdim=True)
-    normalizer.count += len(x)
-    rate = len(x) / normalizer.count
+    count = len(x)
+    if torch.distributed.is_initialized():
+        count *= torch.distributed.get_world_size()
+        own_mean = mean
+        mean = sum_over_ranks_(own_mean * len(x)) / count
+        variance = sum_over_ranks_((variance + (own_mean - mean).square()) * len(x)) / count
+    normalizer.count += count
+    rate = count / normalizer.count
     moved = mean - normalizer._mean
     normalizer._mean += rate * moved
     normalizer._var += rate * (variance - normalizer._var + moved * (mean - normalizer._mean))
     torch.sqrt(normalizer._var, out=normalizer._std)
+
+
+@torch.no_grad()
+def divergence(old_mean: Tensor, old_std: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """Mean () of KL(old || new) over Gaussians of means (n, D) and standard deviations (n, D), new ones (D,)."""
+    moved = (old_std.square() + (old_mean - mean).square()) / (2.0 * std.square())
+    return (torch.log(std / old_std) + moved - 0.5).sum(dim=1).mean()
+
+
+class SharedGradients:
+    """The gradients of all parameters side by side in one buffer, which is averaged over processes in one go, and at the
+    end of it the divergence from which the learning rate follows: so all processes take the same step.
+    """
+
+    def __init__(self, parameters: list[torch.nn.Parameter], count: int) -> None:
+        """Makes the parameters' gradients views of the buffer; there are `count` processes."""
+        self._count = count
+        self._buffer = torch.zeros(sum(p.numel() for p in parameters) + 1, device=parameters[0].device)
+        pieces = self._buffer[:-1].split([p.numel() for p in parameters])
+        for parameter, piece in zip(parameters, pieces, strict=True):
+            parameter.grad = piece.view_as(parameter)
+
+    def zero_(self) -> None:
+        """Begin a mini-batch; what follows adds to the gradients in place."""
+        self._buffer.zero_()
+
+    def average_(self, kl: Tensor) -> None:
+        """Gradients and `kl` () of this process become those of all."""
+        self._buffer[-1] = kl
+        sum_over_ranks_(self._buffer)
+        self._buffer /= self._count
+        kl.copy_(self._buffer[-1])
 
 
 def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:

@@ -12,8 +12,10 @@ from torch.utils.tensorboard import SummaryWriter
 
 from legged.config import ConfigError, TaskConfig
 from legged.envs import BaseTask, LeggedRobot
+from legged.ranks import Ranks
 from legged.rl.checkpoint import describe_mismatch, observation_layout, read_checkpoint, write_checkpoint
 from legged.rl.display import Display, Progress
+from legged.rl.distributed import RankLost, any_rank, join, leave
 from legged.rl.symmetry import MirrorImages, augment
 
 
@@ -65,6 +67,11 @@ class QuietLogger(Logger):
         self.latest: dict[str, float] = {}
         """The last value of everything the task logs; an iteration in which no episode ended has no episode means."""
 
+    @property
+    def steps_per_iteration(self) -> int:
+        """Steps of all robots, on all GPUs."""
+        return self.cfg["num_steps_per_env"] * self.num_envs * self.gpu_world_size
+
     def _store_code_state(self) -> list[str]:
         """Nothing: the run folder holds the state of this code already, see runs.code_state."""
         return []
@@ -76,7 +83,7 @@ class QuietLogger(Logger):
             self.writer.close()
 
     def log(self, it: int, start_it: int, total_it: int, collect_time: float, learn_time: float, **kwargs: Any) -> None:
-        """Write one iteration, show it, and stop if that was asked for."""
+        """Write one iteration, show it, and stop if that was asked for, of any process."""
         # An episode mean has no value (NaN) in a rollout in which none ended; leave it out rather than write NaN.
         values: dict[str, float] = {}
         for entry in self.ep_extras:
@@ -94,7 +101,7 @@ class QuietLogger(Logger):
                     total=total_it,
                     elapsed_s=self.loop_s,
                     eta_s=self.loop_s / (it + 1 - start_it) * (total_it - it - 1),
-                    steps_per_s=self.cfg["num_steps_per_env"] * self.num_envs / (collect_time + learn_time),
+                    steps_per_s=self.steps_per_iteration / (collect_time + learn_time),
                     collect_s=collect_time,
                     learn_s=learn_time,
                     reward=sum(self.rewbuffer) / len(self.rewbuffer) if self.rewbuffer else float("nan"),
@@ -102,7 +109,7 @@ class QuietLogger(Logger):
                     values=dict(self.latest),
                 )
             )
-        if self.stop_requested and it + 1 < total_it:
+        if any_rank(self.stop_requested, torch.device(self.device)) and it + 1 < total_it:
             raise Interrupted
 
 
@@ -139,15 +146,40 @@ class Runner(OnPolicyRunner):
         self.logger.stop_requested = True
 
     def train(self, until_iteration: int) -> bool:
-        """Learn up to iteration `until_iteration`; false if stopped before. Leaves a checkpoint either way."""
+        """Learn up to iteration `until_iteration`; false if stopped before. Leaves a checkpoint either way, and the other
+        processes, if there are any.
+
+        Raises:
+            RankLost: one of those has died.
+        """
+        finished = True
         try:
             self.learn(until_iteration - self.current_learning_iteration, init_at_random_ep_len=True)
         except Interrupted:
-            log_dir = Path(self.logger.log_dir)
-            self.save(str(log_dir / f"model_{self.current_learning_iteration}.pt"))
-            self.logger.stop_logging_writer()
-            return False
-        return True
+            finished = False
+            if self.logger.writer is not None:
+                self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
+                self.logger.stop_logging_writer()
+        except RuntimeError as error:
+            if self.is_distributed and "by peer" in str(error):  # gloo notices; with NCCL torchrun ends who waits
+                raise RankLost(f"rank {self.gpu_global_rank}: another process has ended; torchrun says which") from error
+            raise
+        leave()
+        return finished
+
+    def _configure_multi_gpu(self) -> None:
+        """As rsl-rl, and on the CPU too: each process of torchrun has the device it was given, and meets the others."""
+        ranks = Ranks.now()
+        self.is_distributed = ranks.several
+        self.gpu_world_size, self.gpu_global_rank, self.gpu_local_rank = ranks.count, ranks.rank, ranks.local_rank
+        self.cfg["multi_gpu"] = None
+        if ranks.several:
+            self.cfg["multi_gpu"] = {
+                "global_rank": ranks.rank,
+                "local_rank": ranks.local_rank,
+                "world_size": ranks.count,
+            }
+            join(ranks, torch.device(self.device))
 
     def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
         """Write a checkpoint with the task's state."""

@@ -1,6 +1,8 @@
 """Train a policy: `python train.py --task anymal_c_flat`."""
 
 import argparse
+import contextlib
+import os
 import signal
 import sys
 import time
@@ -9,10 +11,12 @@ from types import FrameType
 
 import torch
 
+from legged.clock import STARTED_S
 from legged.config import ConfigError, TaskConfig, to_yaml
 from legged.envs import LeggedRobot
 from legged.paths import relative
 from legged.physics import resolve_physics
+from legged.ranks import Ranks
 from legged.registry import make_task, task_config
 from legged.rl.arguments import (
     add_run_arguments,
@@ -25,6 +29,7 @@ from legged.rl.arguments import (
 from legged.rl.captured import CapturedRunner
 from legged.rl.checkpoint import check_fits, read_checkpoint
 from legged.rl.display import Display
+from legged.rl.distributed import RankLost
 from legged.rl.runner import Runner
 from legged.rl.runs import create_run, find_checkpoint, find_run
 
@@ -35,7 +40,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _main(argv: list[str] | None) -> int:
-    start = time.perf_counter()
+    start = STARTED_S if argv is None else time.perf_counter()  # as a command, imports are part of it
     parser = argparse.ArgumentParser(prog="train.py", description="Train a legged robot.")
     add_task_arguments(parser)
     add_run_arguments(parser)
@@ -57,13 +62,28 @@ def _main(argv: list[str] | None) -> int:
         print(to_yaml(cfg), end="")
         return 0
     checkpoint = _checkpoint(args, cfg) if args.resume or args.load_run or args.checkpoint is not None else None
-    folder = create_run(cfg)
     if device.type == "cpu":
         limit_threads()
-    print(describe(cfg, device, folder), flush=True)
+    if Ranks.now().first:
+        return _train(args, cfg, device, rl_device, checkpoint, start)
+    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        return _train(args, cfg, device, rl_device, checkpoint, start)
 
+
+def _train(
+    args: argparse.Namespace,
+    cfg: TaskConfig,
+    device: torch.device,
+    rl_device: torch.device,
+    checkpoint: Path | None,
+    start: float,
+) -> int:
+    """Build and train; returns the exit code. Of several processes the first one has a run folder and a display."""
+    folder = create_run(cfg) if Ranks.now().first else None
+    if folder:
+        print(describe(cfg, device, folder), flush=True)
     task = make_task(cfg, device, graph=not args.no_graph)
-    with Display(f"{cfg.task}: {relative(folder)}") as display:
+    with Display(f"{cfg.task}: {relative(folder)}") if folder else contextlib.nullcontext() as display:
         kind = CapturedRunner if cfg.train.runner.loop == "captured" else Runner
         runner = kind(task, folder, str(rl_device), display)
         if checkpoint:
@@ -71,9 +91,14 @@ def _main(argv: list[str] | None) -> int:
             print(f"resumed {relative(checkpoint)} after iteration {runner.current_learning_iteration}", flush=True)
         ready = time.perf_counter()
         stopped_by = stop_on_signals(runner)
-        finished = runner.train(cfg.train.runner.max_iterations)
-    _summary(runner, folder, ready - start, finished)
-    return 0 if finished else 128 + stopped_by[0]
+        try:
+            finished = runner.train(cfg.train.runner.max_iterations)
+        except RankLost as lost:
+            print(lost, file=sys.stderr, flush=True)
+            return 1
+    if folder:
+        _summary(runner, folder, ready - start, finished)
+    return 0 if finished else 128 + (stopped_by or [signal.SIGTERM])[0]
 
 
 def describe(cfg: TaskConfig, device: torch.device, folder: Path) -> str:
@@ -85,7 +110,10 @@ def describe(cfg: TaskConfig, device: torch.device, folder: Path) -> str:
         where = f"no GPU in use: {engine}, settings of the task's cpu section"
     else:
         where = torch.cuda.get_device_name(device)
-    return f"{cfg.task}: {cfg.env.num_envs} robots, {cfg.train.runner.max_iterations} iterations, {where}; {relative(folder)}"
+    ranks = Ranks.now()
+    share = f" on each of {ranks.count} processes" if ranks.several else ""
+    robots = f"{cfg.env.num_envs} robots{share}"
+    return f"{cfg.task}: {robots}, {cfg.train.runner.max_iterations} iterations, {where}; {relative(folder)}"
 
 
 def limit_threads() -> None:
@@ -109,15 +137,22 @@ def _checkpoint(args: argparse.Namespace, cfg: TaskConfig) -> Path:
 
 
 def stop_on_signals(runner: Runner) -> list[int]:
-    """Ctrl-C and SIGTERM stop at the end of an iteration, a second one at once. Returns a list that gets the signal."""
+    """Ctrl-C and SIGTERM stop at the end of an iteration, a second one at once. Returns a list that gets the signal.
+
+    Of several processes all stop as soon as one is asked to. There a second signal changes nothing: torchrun passes on what
+    the terminal has sent already, and kills who takes more than half a minute.
+    """
     received: list[int] = []
+    ranks = Ranks.now()
 
     def handler(number: int, frame: FrameType | None) -> None:
-        if received:
+        if received and not ranks.several:
             raise KeyboardInterrupt
+        if not received and ranks.first:
+            once_more = "" if ranks.several else "; once more to stop at once"
+            print(f"stopping after this iteration, with a checkpoint{once_more}", file=sys.stderr, flush=True)
         received.append(number)
         runner.stop()
-        print("stopping after this iteration, with a checkpoint; once more to stop at once", file=sys.stderr, flush=True)
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, handler)
@@ -131,7 +166,7 @@ def _summary(runner: Runner, folder: Path, start_up_s: float, finished: bool) ->
     print(
         f"{'finished' if finished else 'stopped'} after {runner.current_learning_iteration + 1} iterations: "
         f"{steps:,} steps in {loop:.1f} s of training loop ({steps / max(loop, 1e-9):,.0f} steps/s), "
-        f"{start_up_s:.1f} s of start-up and kernel compilation\n"
+        f"{start_up_s:.1f} s of start-up, imports and kernel compilation included\n"
         f"checkpoint in {relative(folder)}; see it walk: python play.py --task {task.cfg.task}",
         flush=True,
     )

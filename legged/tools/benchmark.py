@@ -1,7 +1,8 @@
 """Time of a control step, of the physics in it, and of a training iteration around it:
 `python -m legged.tools.benchmark --task anymal_c [--num_envs 8192]`.
 
-With `--grounds` the task is timed on a plane, on its terrain met by our collider, and by mujoco-warp's general one.
+With `--grounds` the task is timed on a plane, on its terrain met by our collider, and by mujoco-warp's general one; with
+`--scale 1024,4096,16384` with each of these numbers of robots, in a process of its own.
 
 On a GPU it also proves that the step never waits for the host: the timed steps run under torch's sync debug mode
 "error", which raises at any synchronisation.
@@ -30,6 +31,7 @@ from legged.rl.captured import CapturedRunner
 from legged.rl.display import Progress
 from legged.rl.runner import Runner
 from legged.rl.runs import write_text
+from legged.tools.scale import scale
 
 GROUNDS: dict[str, list[tuple[str, Any]]] = {
     "plane": [("terrain.mesh_type", "plane")],
@@ -56,6 +58,8 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("--repeats", type=int, default=5, help="measurements; the median is reported")
     parser.add_argument("--iterations", type=int, help="of each training loop; 20 by default, 3 on the CPU, 0 for none")
     parser.add_argument("--grounds", action="store_true", help="compare plane, our terrain collider and the general one")
+    parser.add_argument("--scale", help="numbers of robots to compare, e.g. 1024,4096,16384; runs one training loop")
+    parser.add_argument("--runner", choices=list(LOOPS), help="time this training loop only (train.runner.loop)")
     parser.add_argument("--json", type=Path, help="also write the result to this file")
     args = parser.parse_intermixed_args(argv)
     import_and_check(args)
@@ -63,6 +67,8 @@ def _main(argv: list[str] | None) -> int:
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
     if device.type == "cpu":
         torch.set_num_threads(1)
+    if args.scale is not None:
+        return scale(args, cfg, device)
     if args.grounds and resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics")) != "mujoco_warp":
         raise ConfigError("--grounds: compares colliders of mujoco_warp; add sim.physics=mujoco_warp")
     if args.grounds and cfg.terrain.mesh_type == "plane":
@@ -76,7 +82,8 @@ def _main(argv: list[str] | None) -> int:
         build_s = time.perf_counter() - start
         result = {**measure(task, args.steps, args.repeats), "build_s": build_s}
         if not args.grounds and count > 0:
-            result["iterations"] = {loop: time_iterations(kind, task, count) for loop, kind in LOOPS.items()}
+            loops = {args.runner: LOOPS[args.runner]} if args.runner else LOOPS
+            result["iterations"] = {loop: time_iterations(kind, task, count) for loop, kind in loops.items()}
         if device.type == "cuda":
             free, whole = torch.cuda.mem_get_info(device)
             result["gpu_memory_gib"] = (whole - free) / 2**30

@@ -1,0 +1,213 @@
+"""Compiles the Warp kernels that a model launches before any of them is: those that the cache lacks, on all cores.
+
+Left alone, Warp compiles a module at the first launch of one of its kernels, one after the other. Here a dry run, in which
+launches are noted instead of made, tells which modules a model needs. Forked processes then compile the missing ones into
+Warp's cache: within one process NVRTC compiles one program at a time, whatever the number of threads. Who comes second, the
+other ranks of a training on several GPUs for instance, waits for the first instead of compiling the same.
+
+All of this only saves time: a module that is missing afterwards is compiled by Warp when it is launched.
+"""
+
+import math
+import os
+import struct
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+POLL_S = 0.1
+PLAIN_LINES_EVERY_S = 5.0
+STALLED_S = 300.0
+"""Without a module finished for this long, compiling processes are ended [s]."""
+MOST_PROCESSES = 16
+TILED_COSTS = 20
+"""Kernels on tiles may need linear algebra of CUDA's libraries, which takes as long as so many others."""
+CUDA_BLOCK_DIM, CPU_BLOCK_DIM = 256, 1
+"""Threads per block that Warp takes where a launch does not say; each block size is compiled by itself."""
+
+
+def cache_folder() -> Path:
+    """Where Warp keeps what it has compiled, for its version."""
+    return Path(wp.config.kernel_cache_dir)
+
+
+@dataclass(frozen=True)
+class Build:
+    """A Warp module for one block size: what is compiled as one."""
+
+    module: Any
+    block_dim: int
+
+    def cached(self, device: Any) -> bool:
+        """Whether Warp's cache holds it for the device's architecture."""
+        folder = cache_folder() / self.module.get_module_identifier(self.block_dim)
+        pattern = "*.o" if device.is_cpu else f"*.sm{device.get_cuda_compile_arch()}*"
+        return any(folder.glob(pattern))
+
+    def compile(self, device: Any) -> None:
+        """Into the cache; unlike `wp.load_module` without loading, which a forked process must not do."""
+        self.module._compile(device, options=self.module.resolve_options(wp.config, block_dim=self.block_dim))
+
+
+def compile_ahead(device: Any, functions: Iterable[Callable[[], object]]) -> int:
+    """Compile what `functions` launch on a Warp device and the cache lacks; returns how many modules that were.
+
+    The functions are called with kernels left out, so that what they read holds numbers without meaning.
+    """
+    missing = [build for build in launched(device, functions) if not build.cached(device)]
+    if len(missing) < 2 or sys.platform != "linux":  # forking is safe on Linux only
+        return 0
+    total = len(missing)
+    with _Line(total) as line, _Lock(cache_folder()) as lock:
+        while missing:
+            if lock.acquire():
+                _compile_all(missing, device, partial(line.show, total - len(missing)))
+                break
+            time.sleep(POLL_S)
+            missing = [build for build in missing if not build.cached(device)]
+            line.show(total - len(missing))
+    return total
+
+
+def launched(device: Any, functions: Iterable[Callable[[], object]]) -> list[Build]:
+    """What `functions` launch on a device, the slowest to compile first."""
+    found: dict[Build, int] = {}
+
+    def note(kernel: Any, dim: Any = 0, *_: Any, block_dim: int | None = None, tiled: bool = False, **__: Any) -> None:
+        if kernel.is_generic or math.prod(dim if isinstance(dim, list | tuple) else (dim,)) == 0:
+            return  # a generic kernel becomes one when it is given its arguments
+        size = CPU_BLOCK_DIM if device.is_cpu else block_dim or CUDA_BLOCK_DIM
+        found[Build(kernel.module, size)] = TILED_COSTS * tiled + len(kernel.module.kernels)
+
+    def once(condition: Any, while_body: Callable[..., None], stream: Any = None, **arguments: Any) -> None:
+        while_body(**arguments)
+
+    def both(condition: Any, on_true: Any = None, on_false: Any = None, stream: Any = None, **arguments: Any) -> None:
+        for branch in filter(None, (on_true, on_false)):
+            branch(**arguments)
+
+    with (
+        wp.ScopedDevice(device),
+        _instead(launch=note, launch_tiled=partial(note, tiled=True), capture_while=once, capture_if=both),
+    ):
+        for function in functions:
+            function()
+    return sorted(found, key=lambda build: -found[build])
+
+
+@contextmanager
+def _instead(**functions: Callable[..., None]) -> Iterator[None]:
+    """Warp with some of its functions replaced."""
+    before = {name: getattr(wp, name) for name in functions}
+    for name, function in functions.items():
+        setattr(wp, name, function)
+    try:
+        yield
+    finally:
+        for name, function in before.items():
+            setattr(wp, name, function)
+
+
+def _compile_all(builds: list[Build], device: Any, show: Callable[[int], None]) -> None:
+    """Compile in forked processes, which take their work from a pipe, and show how many modules are done; returns when all
+    processes have ended.
+    """
+    work, give = os.pipe()
+    os.write(give, b"".join(struct.pack("=H", i) for i in range(len(builds))))
+    os.close(give)
+    with tempfile.TemporaryDirectory(prefix="legged_") as scratch:
+        count = min(len(os.sched_getaffinity(0)), len(builds), MOST_PROCESSES)
+        running = {_fork(work, builds, device, scratch) for _ in range(count)}
+        os.close(work)
+        done, since = 0, time.monotonic()
+        try:
+            while running:
+                time.sleep(POLL_S)
+                running -= {child for child in running if os.waitpid(child, os.WNOHANG)[0]}
+                finished = sum(build.cached(device) for build in builds)
+                if finished > done:
+                    done, since = finished, time.monotonic()
+                elif time.monotonic() - since > STALLED_S:
+                    break
+                show(done)
+        finally:
+            for child in running:
+                os.kill(child, 9)
+                os.waitpid(child, 0)
+
+
+def _fork(work: int, builds: list[Build], device: Any, scratch: str) -> int:
+    """A process that compiles what it reads from `work`, with temporary files in `scratch`; returns its id."""
+    parent = os.getpid()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Python warns of threads; the child needs none of them and no lock of theirs
+        child = os.fork()
+    if child:
+        return child
+    try:
+        tempfile.tempdir = scratch
+        while (item := os.read(work, 2)) and os.getppid() == parent:
+            builds[struct.unpack("=H", item)[0]].compile(device)
+    finally:
+        os._exit(0)  # none of the parent's clean-up; an error comes again where Warp compiles the module itself
+
+
+class _Lock:
+    """Held by the process that compiles into a cache."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._file = open(folder / "legged.lock", "w")  # noqa: SIM115 (closed by __exit__)
+
+    def __enter__(self) -> "_Lock":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        import fcntl
+
+        fcntl.flock(self._file, fcntl.LOCK_UN)  # closing is not enough while a child has it open
+        self._file.close()
+
+    def acquire(self) -> bool:
+        """Whether it is ours now; does not wait."""
+        import fcntl
+
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return False
+        return True
+
+
+class _Line:
+    """Progress, on one line of a terminal; elsewhere as plain lines, now and then."""
+
+    def __init__(self, total: int) -> None:
+        self._total, self._start, self._shown = total, time.monotonic(), -math.inf
+
+    def __enter__(self) -> "_Line":
+        self.show(0)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        end = "\r" if sys.stdout.isatty() else ""
+        print(f"{end}compiled {self._total} kernel modules in {time.monotonic() - self._start:.1f} s", flush=True)
+
+    def show(self, before: int, more: int = 0) -> None:
+        """`before` and `more` modules are compiled."""
+        now = time.monotonic()
+        text = f"compiling {min(before + more + 1, self._total)} of {self._total} kernel modules ..."
+        if sys.stdout.isatty():
+            print(f"\r{text}", end="", flush=True)
+        elif now - self._shown >= PLAIN_LINES_EVERY_S:
+            self._shown = now
+            print(text, flush=True)

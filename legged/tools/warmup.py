@@ -1,0 +1,39 @@
+"""Makes the next start a warm one: `python -m legged.tools.warmup --task anymal_c [--num_envs 8192]`.
+
+Builds the task as train.py would, with the same arguments, and stops there: Warp's cache then holds every kernel of it for
+this machine's GPU (or, with sim.physics=mujoco_warp and no GPU, for its CPU).
+"""
+
+import argparse
+import sys
+import time
+
+from legged.clock import STARTED_S
+from legged.physics import kernel_cache, resolve_physics
+from legged.registry import make_task, task_config
+from legged.rl.arguments import add_task_arguments, import_and_check, overrides, pick_device, run_main
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The command; returns its exit code."""
+    return run_main(_main, argv)
+
+
+def _main(argv: list[str] | None) -> int:
+    start = STARTED_S if argv is None else time.perf_counter()
+    parser = argparse.ArgumentParser(prog="warmup", description=__doc__)
+    add_task_arguments(parser)
+    args = parser.parse_intermixed_args(argv)
+    import_and_check(args)
+    device = pick_device(args.sim_device)
+    cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
+    if resolve_physics(cfg.sim.physics, device) == "mujoco":
+        print(f"{cfg.task}: nothing to do, C MuJoCo compiles no kernels")
+        return 0
+    make_task(cfg, device, graph=not args.no_graph)
+    print(f"{cfg.task}: ready in {time.perf_counter() - start:.1f} s, its kernels are in {kernel_cache()}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

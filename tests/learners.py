@@ -1,0 +1,35 @@
+"""Learners on made-up data, for comparing one with another."""
+
+import torch
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+
+ROBOTS, STEPS = 48, 8
+SAMPLES = ROBOTS * STEPS
+LEARNING = {"num_mini_batches": 4, "num_learning_epochs": 3, "entropy_coef": 0.01, "learning_rate": 1e-3}
+
+
+def observe() -> TensorDict:
+    return TensorDict({"actor": torch.randn(ROBOTS, 7), "critic": torch.randn(ROBOTS, 9)}, batch_size=[ROBOTS])
+
+
+def learner(kind, normalized=False, std_type="scalar", **options):
+    """A learner on made-up data with weights that depend on nothing else."""
+    torch.manual_seed(0)
+    groups = {"actor": ["actor"], "critic": ["critic"]}
+    gaussian = {"class_name": "GaussianDistribution", "init_std": 0.5, "std_type": std_type}
+    actor = MLPModel(observe(), groups, "actor", 3, [16, 16], "elu", normalized, gaussian)
+    critic = MLPModel(observe(), groups, "critic", 1, [16, 16], "elu", normalized)
+    return kind(actor, critic, RolloutStorage("rl", ROBOTS, STEPS, observe(), [3]), **{**LEARNING, **options})
+
+
+def fill(alg, seed):
+    """A rollout of noise through rsl-rl's own functions."""
+    torch.manual_seed(seed)
+    with torch.inference_mode():
+        for _ in range(STEPS):
+            alg.act(observe())
+            ends = torch.rand(ROBOTS)
+            alg.process_env_step(observe(), torch.randn(ROBOTS), ends < 0.1, {"time_outs": ends < 0.04})
+        alg.compute_returns(observe())
