@@ -54,7 +54,8 @@ def backend(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-@pytest.fixture
-def physics(backend: str, make_physics: Callable[..., Physics]) -> Physics:
+@pytest.fixture(params=["mujoco", "mujoco_warp", "mujoco_warp, fused solver"])
+def physics(request: pytest.FixtureRequest, make_physics: Callable[..., Physics]) -> Physics:
     """Six worlds with the shipped solver options, in whatever state the last test left them."""
-    return make_physics(backend)
+    name, _, solver = request.param.partition(", ")
+    return make_physics(name, constraint_solver="fused") if solver else make_physics(name)

@@ -53,6 +53,9 @@ class SimConfig:
     """Cap of Newton solver iterations per physics step."""
     ls_iterations: int = field(default=20, metadata=AT_LEAST_1)
     """Cap of line-search iterations per solver iteration."""
+    constraint_solver: Literal["rounds", "fused"] = "rounds"
+    """How mujoco_warp solves for contact forces: `rounds`, its own Newton solver, a few launches a round until the last world
+    has converged; `fused`, the same iteration as one launch in which every world ends by itself (pyramidal cones only)."""
     nconmax: int = field(default=24, metadata=AT_LEAST_1)
     """Contacts (and candidate pairs) allocated per robot in mujoco_warp, in a pool all robots share."""
     njmax: int = field(default=96, metadata=AT_LEAST_1)
@@ -331,9 +334,9 @@ class RunnerConfig:
     """Iterations of the whole training; a resumed run goes on up to this number."""
     save_interval: int = field(default=50, metadata=AT_LEAST_1)
     """Iterations between two checkpoints."""
-    loop: Literal["stock", "captured"] = "stock"
-    """`stock`: rsl-rl's own training loop. `captured`: the same arithmetic without the host in between, on a GPU as CUDA
-    graphs; it falls back to `stock` where a feature needs that."""
+    loop: Literal["stock", "captured"] = "captured"
+    """`captured`: rsl-rl's arithmetic without the host in between, on a GPU as CUDA graphs; it falls back to `stock` where
+    a feature needs that, and says why. `stock`: rsl-rl's own training loop."""
     experiment_name: str = ""
     """Folder under logs/; the task's name when empty."""
     run_name: str = ""

@@ -15,6 +15,7 @@ from torch import Tensor
 from legged.config.schema import SimConfig
 from legged.math import masked_set_
 from legged.physics.base import Physics, RandomizedField, RobotState, allocate_state
+from legged.physics.constraint_solver import ConstraintSolver
 from legged.physics.exchange import Exchange
 from legged.physics.kernels import compile_ahead
 from legged.physics.scene import FLOOR, build_model
@@ -64,6 +65,11 @@ class MujocoWarpPhysics(Physics):
             self._qpos, self._qvel, self.torques = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
             self.state = self._views(allocate_state(num_envs, robot, device))
             self._exchange = Exchange(self._m, d, self.model, robot, self.state, self.overflowed)
+            self._solver = ConstraintSolver(self._m, d) if sim.constraint_solver == "fused" else None
+            if self._solver is not None:
+                self._m.opt.run_qacc_smooth = False  # ours does not start from it
+        if not self.model.dof_damping.any():
+            self._m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # nothing to integrate implicitly
         exchanges = (self._exchange.kinematics, self._exchange.contact_forces)
         constants = (self._set_constants,) if "added_base_mass" in randomized else ()
         compile_ahead(self._wp_device, (self._step, *exchanges, *constants))
@@ -86,7 +92,16 @@ class MujocoWarpPhysics(Physics):
         )
 
     def _step(self) -> None:
-        mjw.step(self._m, self._d)
+        m, d = self._m, self._d
+        if self._solver is None:
+            mjw.step(m, d)
+            return
+        mjw.fwd_position(m, d, factorize=False)
+        mjw.fwd_velocity(m, d)
+        mjw.fwd_actuation(m, d)
+        mjw.fwd_acceleration(m, d)
+        self._solver.solve()
+        mjw.euler(m, d)
 
     def _set_constants(self) -> None:
         mjw.set_const(self._m, self._d)
