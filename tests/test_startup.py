@@ -9,13 +9,18 @@ import pytest
 from legged.startup import importing
 
 
+def fail_to_import():
+    with importing():
+        assert not gc.isenabled()
+        raise ImportError
+
+
 @pytest.mark.parametrize("enabled", [True, False])
 def test_the_collector_is_as_it_was_after_imports_even_failed_ones(enabled):
     (gc.enable if enabled else gc.disable)()
     try:
-        with pytest.raises(ImportError), importing():
-            assert not gc.isenabled()
-            raise ImportError
+        with pytest.raises(ImportError):
+            fail_to_import()
         assert gc.isenabled() == enabled
     finally:
         gc.enable()
