@@ -64,6 +64,8 @@ def _main(argv: list[str] | None) -> int:
     checkpoint = _checkpoint(args, cfg) if args.resume or args.load_run or args.checkpoint is not None else None
     if device.type == "cpu":
         limit_threads()
+    else:
+        torch.cuda.set_device(device)  # what names no device must not end up on the first GPU
     if Ranks.now().first:
         return _train(args, cfg, device, rl_device, checkpoint, start)
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
