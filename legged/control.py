@@ -1,5 +1,7 @@
 """Action -> joint torque."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -64,8 +66,14 @@ class Control:
             masked_set_(self._last_dof_vel, mask, 0.0)
 
 
-def control_gains(robot: Robot, cfg: ControlConfig) -> tuple[np.ndarray, np.ndarray]:
-    """(D,) stiffness and damping of a task: its own tables where it has them, else the robot's."""
-    stiffness = robot.gains(cfg.stiffness or robot.file.stiffness, "control.stiffness")
-    damping = robot.gains(cfg.damping or robot.file.damping, "control.damping")
-    return stiffness, damping
+def control_gains(robot: Robot, cfg: ControlConfig, where: Callable[[str], str] = str) -> tuple[np.ndarray, np.ndarray]:
+    """(D,) stiffness and damping of a task: its own tables where it has them, else the robot's. `where` makes of a dotted
+    path how an error begins.
+    """
+
+    def gains(name: str, own: dict[str, float], robots: dict[str, float]) -> np.ndarray:
+        if own:
+            return robot.gains(own, where(f"control.{name}"))
+        return robot.gains(robots, f"{robot.folder / 'robot.yaml'}: {name}")
+
+    return gains("stiffness", cfg.stiffness, robot.file.stiffness), gains("damping", cfg.damping, robot.file.damping)

@@ -1,5 +1,9 @@
-"""Where the files beside the code lie: in a clone at the top level, in an installed wheel inside the package."""
+"""Where the files beside the code lie: in a clone at the top level, in an installed wheel inside the package; and how files
+are written: whole or not at all.
+"""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -22,3 +26,14 @@ def relative(path: Path) -> str:
         return str(path.resolve().relative_to(Path.cwd()))
     except ValueError:
         return str(path)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A file beside `path` to write to, with the same ending; it takes the place of `path` if nothing fails, else it goes."""
+    part = path.with_name(f".{path.name}")
+    try:
+        yield part
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from legged.config.loader import ConfigError, build, read_yaml, suggest
+from legged.config.origins import Origins
 from legged.mirror import Mirror
 from legged.paths import data_folder
 
@@ -81,20 +82,20 @@ class Robot:
         return match_values(table, self.joint_names, where)
 
 
-def load_robot(name: str) -> Robot:
-    """The robot of that name under resources/robots/, or in the folder `name`.
+def load_robot(name: str, where: str = "robot") -> Robot:
+    """The robot of that name under resources/robots/, or in the folder `name`; `where` says who asks for it.
 
     Raises:
         ConfigError: no such robot, or robot.yaml and model do not fit together.
     """
-    folder = _folder(name)
+    folder = _folder(name, where)
     path = folder / "robot.yaml"
     data = read_yaml(path)
     missing = [k for k in ("model", "base", "spawn_height", "default_joint_angles", "feet") if k not in data]
     missing += [k for k in ("stiffness", "damping", "velocity_limit") if k not in data]
     if missing:
         raise ConfigError(f"{path}: missing: {', '.join(missing)}")
-    file = build(RobotFile, data, "", {}, str(path))
+    file = build(RobotFile, data, "", Origins(), str(path))
     if not (folder / file.model).is_file():
         raise ConfigError(f"{path}: model: there is no file '{file.model}' in {folder}")
     try:
@@ -127,13 +128,13 @@ def load_robot(name: str) -> Robot:
     )
 
 
-def _folder(name: str) -> Path:
+def _folder(name: str, where: str) -> Path:
     robots = data_folder("resources") / "robots"
     for folder in (robots / name, Path(name)):
         if (folder / "robot.yaml").is_file():
             return folder.resolve()
     known = [p.parent.name for p in robots.glob("*/robot.yaml")]
-    raise ConfigError(f"robot: there is no robot '{name}'{suggest(name, known)}")
+    raise ConfigError(f"{where}: there is no robot '{name}'{suggest(name, known)}")
 
 
 def _check_layout(model: mujoco.MjModel, file: RobotFile, path: Path, names: tuple[str, ...]) -> None:

@@ -1,12 +1,14 @@
-"""Fixtures: the robot, and physics engines that are built once and shared."""
+"""Fixtures: a working directory, the robot, and physics engines that are built once and shared."""
 
 import legged.headless  # noqa: F401, I001  (chooses how to render, before MuJoCo is imported)
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 import torch
+from helpers import kept_global_state
 
 from legged.config.schema import SimConfig
 from legged.physics import Physics
@@ -14,6 +16,16 @@ from legged.physics import make_physics as build_physics
 from legged.robot import Robot, load_robot
 
 torch.set_num_threads(1)  # tensors are small here; a second thread only costs
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Commands run in the test's own folder, and what they change for the whole process is put back. A file asks for it with
+    `pytestmark = pytest.mark.usefixtures("workplace")`.
+    """
+    monkeypatch.chdir(tmp_path)
+    with kept_global_state():
+        yield
 
 
 @pytest.fixture(scope="session")

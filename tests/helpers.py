@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 
 from legged.config import TaskConfig
 from legged.envs import LeggedRobot
@@ -16,6 +17,8 @@ from legged.rl import train
 
 TASK = "anymal_c_flat"
 JOINTS = 12
+POLICY = Path(__file__).resolve().parents[1] / "resources" / "policies" / TASK
+"""The policy of that task which comes with the package."""
 
 # One thread: the tests share their cores with whatever else runs.
 ENGINE = [("sim.physics", "mujoco"), ("sim.threads", 1)]
@@ -51,6 +54,11 @@ def small_task(*overrides: tuple[str, Any], num_envs: int = 4) -> LeggedRobot:
 def zero_actions(task: LeggedRobot) -> torch.Tensor:
     """The actions that ask for the default pose."""
     return torch.zeros(task.num_envs, task.num_actions)
+
+
+def stand(observations: TensorDict) -> torch.Tensor:
+    """The policy that keeps the default pose."""
+    return torch.zeros(len(observations["actor"]), JOINTS)
 
 
 def tiny_run(*arguments: str, num_envs: int = 8, iterations: int = 2) -> Path:

@@ -58,32 +58,17 @@ def test_warp_is_known_to_the_physics_and_to_the_graph_only(path):
             assert not uses(path, "warp")
 
 
+ABOVE = ["legged.envs", "legged.registry", "legged.rl", "legged.tools"]
 LAYERS = {  # what a part of the package must not know
-    "legged.config": [
-        "legged.physics",
-        "legged.envs",
-        "legged.registry",
-        "legged.rl",
-        "legged.tools",
-        "legged.robot",
-        "torch",
-    ],
+    "legged.config": ["legged.robot", "legged.physics", *ABOVE, "torch"],
     "legged.math": ["legged"],
     "legged.graph": ["legged"],
-    "legged.robot": ["legged.physics", "legged.envs", "legged.registry", "legged.rl", "legged.tools", "torch"],
-    "legged.terrain": [
-        "legged.physics",
-        "legged.envs",
-        "legged.registry",
-        "legged.rl",
-        "legged.tools",
-        "legged.robot",
-        "mujoco",
-    ],
+    "legged.robot": ["legged.physics", *ABOVE, "torch"],
+    "legged.terrain": ["legged.robot", "legged.physics", *ABOVE, "mujoco"],
     **{f"legged.terrain.{part}": ["torch"] for part in ("generators", "height_map", "terrain")},
-    "legged.physics": ["legged.envs", "legged.registry", "legged.rl", "legged.tools", "legged.rewards", "legged.commands"],
+    "legged.physics": [*ABOVE, "legged.rewards", "legged.commands"],
     **{
-        f"legged.{part}": ["legged.envs", "legged.registry", "legged.rl", "legged.tools", "mujoco"]
+        f"legged.{part}": [*ABOVE, "mujoco"]
         for part in (
             "control",
             "commands",

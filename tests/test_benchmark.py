@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from helpers import call, kept_global_state, small_task
+from helpers import call, small_task
 
 from legged.rl.captured import CapturedRunner
 from legged.rl.runner import Runner
@@ -11,12 +11,7 @@ from legged.tools import benchmark
 
 SMALL = ["--sim_device", "cpu", "--num_envs", "8", "sim.physics=mujoco", "sim.threads=1", "train.runner.num_steps_per_env=4"]
 
-
-@pytest.fixture(autouse=True)
-def workplace(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with kept_global_state():
-        yield
+pytestmark = pytest.mark.usefixtures("workplace")
 
 
 def test_times_of_step_physics_and_iterations_are_written(tmp_path, capsys):

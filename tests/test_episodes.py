@@ -6,11 +6,8 @@ from helpers import small_config, small_task, zero_actions
 
 from legged.envs import LeggedRobot
 
-
-@pytest.fixture(autouse=True)
-def workplace(tmp_path, monkeypatch):
-    """MuJoCo writes its warnings about numbers that are not finite to MUJOCO_LOG.TXT in the working directory."""
-    monkeypatch.chdir(tmp_path)
+# MuJoCo writes its warnings about numbers that are not finite to MUJOCO_LOG.TXT in the working directory.
+pytestmark = pytest.mark.usefixtures("workplace")
 
 
 def standing(*settings, num_envs: int = 4) -> LeggedRobot:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import TASK, call, kept_global_state, run_folders, small_config, tiny_run
+from helpers import TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
 
 from legged import make_task
 from legged.config import override
@@ -16,17 +16,7 @@ from legged.tools import evaluate
 from legged.tools.evaluate import axis_values
 from legged.tools.velocity_grid import Grid, measure
 
-
-@pytest.fixture(autouse=True)
-def workplace(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with kept_global_state():
-        yield
-
-
-def stand(observations) -> torch.Tensor:
-    """The policy that keeps the default pose."""
-    return torch.zeros(len(observations["actor"]), 12)
+pytestmark = pytest.mark.usefixtures("workplace")
 
 
 def on_grid(grid: Grid, act=stand, *settings):
@@ -146,7 +136,7 @@ def test_evaluate_writes_json_and_picture_beside_the_checkpoint(run, capsys):
         "cpu",
     )
     assert (run / "evaluation_mujoco.png").read_bytes().startswith(b"\x89PNG")
-    assert not list(run.glob("*.part")) + list(run.glob(".evaluation*"))
+    assert not list(run.glob(".*"))  # nothing half written
     for words in ("velocity RMSE, mean", f"{result['rmse_lin']['mean']:.3f} m/s", "falls", "evaluation_mujoco.json"):
         assert words in out
 
@@ -226,5 +216,5 @@ def test_play_records_a_short_video_where_something_can_be_drawn(run, capsys, mo
     ]
     assert call(play.main, arguments) == 0
     assert os.path.getsize(tmp_path / "play.mp4") > 1000
-    assert not list(tmp_path.glob("*.part*"))
+    assert not list(tmp_path.glob(".*"))  # nothing half written
     assert "recorded 28 frames" in capsys.readouterr().out  # 1.1 s at 25 frames a second: steps 0, 2, ... 54

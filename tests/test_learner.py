@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import checkpoints, kept_global_state, small_config, small_task, tiny_run
+from helpers import checkpoints, small_config, small_task, tiny_run
 from learners import SAMPLES, STEPS, fill, learner
 from rsl_rl.algorithms import PPO
+from tensordict import TensorDict
 
 from legged.graph import ForbidHostReads
 from legged.registry import task_config
@@ -16,13 +17,24 @@ from legged.rl.rollout import Rollout
 from legged.rl.runner import Runner
 from legged.tools.plot import read_scalars
 
+pytestmark = pytest.mark.usefixtures("workplace")
 
-@pytest.fixture(autouse=True)
-def workplace(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with kept_global_state():
-        yield
 
+def mirrored(env, obs, actions):
+    """A made-up mirror: the columns the other way round, the first with its sign changed."""
+
+    def image(x):
+        flipped = x.flip(1)
+        return torch.cat([x, torch.cat([-flipped[:, :1], flipped[:, 1:]], dim=1)])
+
+    seen = None
+    if obs is not None:
+        groups = {name: image(group) for name, group in obs.items()}
+        seen = TensorDict(groups, batch_size=[2 * len(obs)], device=obs.device)
+    return seen, None if actions is None else image(actions)
+
+
+MIRROR = {"env": None, "data_augmentation_func": mirrored, "use_data_augmentation": True}
 
 VARIANTS = {
     "plain": {},
@@ -31,6 +43,8 @@ VARIANTS = {
     "fixed rate": {"schedule": "fixed"},
     "free values": {"use_clipped_value_loss": False, "value_loss_coef": 0.5},
     "advantages per batch": {"normalize_advantage_per_mini_batch": True},
+    "symmetry": {"symmetry_cfg": MIRROR, "normalize_advantage_per_mini_batch": True},
+    "symmetry, normalised": {"symmetry_cfg": MIRROR, "normalized": True},
     "tight clips": {"clip_param": 0.05, "max_grad_norm": 0.1},
 }
 
@@ -156,6 +170,7 @@ def test_normalisers_are_updated_in_place():
 def test_features_that_need_rsl_rls_update_are_named():
     alg = learner(DevicePPO, use_mixed_precision=True)
     assert alg.why_stock == "mixed precision"
+    assert learner(DevicePPO, symmetry_cfg={**MIRROR, "use_mirror_loss": True}).why_stock == "a mirror loss"
     assert learner(DevicePPO, optimizer="sgd").why_stock == "the optimiser is SGD"
     fill(alg, 0)
     assert set(alg.update()) == {"value", "surrogate", "entropy"}  # by rsl-rl's own

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers import POLICY
 
 from legged.registry import import_tasks, make_task, task_config
 from legged.rl import play, train
@@ -14,7 +15,6 @@ from legged.tools import benchmark, evaluate, plot, show_terrain, warmup
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-POLICY = ROOT / "resources" / "policies" / "anymal_c_flat"
 ROUGH = ROOT / "resources" / "policies" / "anymal_c"
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import ENGINE, TASK, kept_global_state, small_config
+from helpers import ENGINE, POLICY, small_config, stand
 
 from legged import make_task
 from legged.config import override
@@ -27,19 +27,7 @@ from legged.tools.success import (
     wilson,
 )
 
-POLICY = Path(__file__).resolve().parents[1] / "resources" / "policies" / TASK
-
-
-@pytest.fixture(autouse=True)
-def workplace(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with kept_global_state():
-        yield
-
-
-def stand(observations) -> torch.Tensor:
-    """The policy that keeps the default pose."""
-    return torch.zeros(len(observations["actor"]), 12)
+pytestmark = pytest.mark.usefixtures("workplace")
 
 
 def task_on(name, sizes, num_envs, *settings, side=success.TILE, spawn_range=success.SPAWN_RANGE):

@@ -5,8 +5,7 @@ import math
 from pathlib import Path
 
 import pytest
-import torch
-from helpers import TASK, call, kept_global_state, run_folders, small_config, tiny_run
+from helpers import POLICY, TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
 
 from legged import make_task
 from legged.config import ConfigError, override
@@ -23,19 +22,7 @@ from legged.tools.success import (
 from legged.tools.success_report import is_beyond, panels_of, with_other_engine
 from legged.tools.velocity_grid import Grid, measure, rough_ground, rough_side
 
-POLICY = Path(__file__).resolve().parents[1] / "resources" / "policies" / TASK
-
-
-@pytest.fixture(autouse=True)
-def workplace(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with kept_global_state():
-        yield
-
-
-def stand(observations) -> torch.Tensor:
-    """The policy that keeps the default pose."""
-    return torch.zeros(len(observations["actor"]), 12)
+pytestmark = pytest.mark.usefixtures("workplace")
 
 
 # ---- types and sizes -------------------------------------------------------------------------------------------------

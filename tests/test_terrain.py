@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from legged.config import ConfigError
+from legged.config.loader import merge
+from legged.config.origins import Origins
 from legged.config.schema import TerrainConfig
 from legged.terrain import TERRAIN_TYPES, HeightMap, Terrain, TileSpec, check_terrain
 from legged.terrain.height_map import CORNERS, join
@@ -252,9 +254,11 @@ def test_corners_are_listed_with_x_first():
     ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
 )
 def test_wrong_terrain_is_named(changes, words):
+    origins = Origins()
+    merge({}, {"terrain": changes}, "my_task.yaml", origins)
     with pytest.raises(ConfigError) as error:
-        check_terrain(replace(CFG, **changes), "my_task")
-    for word in ["my_task: terrain", *words]:
+        check_terrain(replace(CFG, **changes), origins)
+    for word in ["my_task.yaml: terrain.", *words]:
         assert word in str(error.value)
 
 
@@ -270,4 +274,4 @@ def test_wrong_terrain_is_named(changes, words):
     ],
 )
 def test_right_terrain_passes(changes):
-    check_terrain(replace(CFG, **changes), "my_task")
+    check_terrain(replace(CFG, **changes), Origins())

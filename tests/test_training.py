@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from helpers import TASK, TINY_TRAINING, call, checkpoints, kept_global_state, run_folders, tiny_run
+from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, tiny_run
 
 from legged.config import from_dict
 from legged.config.loader import read_yaml
@@ -27,12 +27,7 @@ REPOSITORY = Path(train.__file__).parents[2]
 UPDATES = 20  # optimiser steps per iteration: 5 epochs of 4 mini-batches
 SIZES = ["train.policy.actor_hidden_dims=[8]", "train.policy.critic_hidden_dims=[8]"]
 
-
-@pytest.fixture(autouse=True)
-def workplace(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with kept_global_state():
-        yield
+pytestmark = pytest.mark.usefixtures("workplace")
 
 
 def saved(folder: Path, iteration: int) -> dict:

@@ -15,12 +15,7 @@ from legged.tools import benchmark, evaluate
 
 SMALLER = 'observations.actor=["base_ang_vel", "projected_gravity", "commands", "dof_pos", "dof_vel"]'  # 33 numbers
 
-
-@pytest.fixture(autouse=True)
-def workplace(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with kept_global_state():
-        yield
+pytestmark = pytest.mark.usefixtures("workplace")
 
 
 @pytest.fixture(scope="module")
@@ -95,20 +90,23 @@ def test_a_missing_task_and_an_unknown_flag(fails, main):
         ("env.num_envs=3.5", ("env.num_envs: expected a whole number",)),
         ("sim.dt=0", ("sim.dt: must be above 0",)),
         ("commands.ranges.lin_vel_x=[1, -1]", ("commands.ranges.lin_vel_x", "low <= high")),
-        ("rewards.scales.torqes=-1", (TASK, "rewards.scales.torqes", "no reward 'torqes'", "did you mean 'torques'?")),
-        ("observations.actor=[dof_poss]", (TASK, "observations.actor", "'dof_poss'", "did you mean 'dof_pos'?")),
-        ("observations.critic=[dof_poss]", (TASK, "observations.critic", "did you mean 'dof_pos'?")),
+        (
+            "rewards.scales.torqes=-1",
+            ("command line: rewards.scales.torqes", "no reward 'torqes'", "did you mean 'torques'?"),
+        ),
+        ("observations.actor=[dof_poss]", ("command line: observations.actor", "'dof_poss'", "did you mean 'dof_pos'?")),
+        ("observations.critic=[dof_poss]", ("command line: observations.critic", "did you mean 'dof_pos'?")),
         ("observations.scales.dof_poss=1", ("observations.scales", "did you mean 'dof_pos'?")),
         ("observations.noise.dof_poss=1", ("observations.noise", "did you mean 'dof_pos'?")),
         ("observations.actor=[]", ("observations.actor",)),
-        ("control.stiffness.XYZ=1", ("control.stiffness", "'XYZ'", "LF_HAA")),
+        ("control.stiffness.XYZ=1", ("command line: control.stiffness", "'XYZ'", "LF_HAA")),
         ("control.stiffness.HAA=1", ("control.stiffness", "LF_HFE")),  # then no pattern is left for the other joints
-        ("robot=anymal_x", ("robot", "'anymal_x'", "did you mean 'anymal_c'?")),
+        ("robot=anymal_x", ("command line: robot", "'anymal_x'", "did you mean 'anymal_c'?")),
         ("sim.physics=physx", ("sim.physics", "'physx'", "mujoco_warp")),
         ("train.policy.activation=eluu", ("train.policy.activation", "'eluu'", "elu")),
         ("train.policy.actor_hidden_dims=[0]", ("train.policy.actor_hidden_dims",)),
-        ("env.episode_length_s=0.001", ("env.episode_length_s",)),
-        ("train.algorithm.num_mini_batches=1000000", ("num_mini_batches",)),
+        ("env.episode_length_s=0.001", ("command line: env.episode_length_s", "at least", "0.02 s", "got 0.001")),
+        ("train.algorithm.num_mini_batches=1000000", ("command line: train.algorithm.num_mini_batches", "got 1000000")),
         ("task=another", ("task",)),
         ("num_envs", ("'num_envs' is not of the form section.key=value",)),
     ],
@@ -120,7 +118,7 @@ def test_a_mistake_in_an_override(fails, argument, words):
 def test_a_mistake_in_a_file_of_a_user_s_task(fails, tmp_path):
     (tmp_path / "mine.yaml").write_text(f"extends: {TASK}\nrewards:\n  scales: {{walk_nicely: 1}}\n")
     (tmp_path / "my_tasks.py").write_text("import legged\nlegged.register('mine', 'mine.yaml')\n")
-    fails(train.main, ["--import", "my_tasks.py", "--task", "mine"], "mine: rewards.scales.walk_nicely", "has no reward")
+    fails(train.main, ["--import", "my_tasks.py", "--task", "mine"], "mine.yaml: rewards.scales.walk_nicely", "has no reward")
 
 
 @pytest.mark.parametrize("module", ["no_such_module", "no_such_file.py"])

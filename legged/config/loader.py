@@ -12,11 +12,11 @@ from typing import Any, Literal, TypeVar, Union
 
 import yaml
 
+from legged.config.origins import Origins
 from legged.config.schema import TaskConfig
 from legged.paths import data_folder
 
 T = TypeVar("T")
-Origins = dict[str, str]
 
 
 class ConfigError(ValueError):
@@ -75,36 +75,33 @@ def merge(base: dict[str, Any], top: Mapping[str, Any], source: str, origins: Or
     """Lays `top` over `base` in place: maps merge, lists and scalars replace. Notes in `origins` who set each path."""
     for key, value in top.items():
         path = f"{prefix}{key}"
-        if isinstance(value, Mapping) and isinstance(base.get(key), dict):
-            merge(base[key], value, source, origins, f"{path}.")
-            continue
         if isinstance(value, Mapping):
-            base[key] = {}
-            origins[path] = source
+            if not isinstance(base.get(key), dict):
+                base[key] = {}
+                origins.note(path, source)
             merge(base[key], value, source, origins, f"{path}.")
             continue
         base[key] = value
-        origins[path] = source
+        origins.note(path, source)
 
 
-def _read_chain(source: Path | Mapping[str, Any], seen: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Origins]:
-    """A file (or a mapping in a user's code) laid over the files it extends."""
+def _read_chain(source: Path | Mapping[str, Any], name: str, seen: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Origins]:
+    """A file (or a mapping in a user's code), called `name` in errors, laid over the files it extends."""
     if isinstance(source, Path):
         if source in seen:
             raise ConfigError(f"{source}: extends itself: {' -> '.join(p.name for p in (*seen, source))}")
         data, folders, seen = read_yaml(source), [source.parent, data_folder("cfg")], (*seen, source)
     else:
         data, folders = copy.deepcopy(dict(source)), [data_folder("cfg")]
-    name = str(source) if isinstance(source, Path) else "registered config"
     parent = data.pop("extends", None)
     merged: dict[str, Any] = {}
-    origins: Origins = {}
+    origins = Origins()
     if parent is not None:
         found = [folder / f"{parent}.yaml" for folder in folders if (folder / f"{parent}.yaml").is_file()]
         if not found:
             names = {p.stem for folder in folders for p in folder.glob("*.yaml")}
             raise ConfigError(f"{name}: extends: there is no '{parent}'{suggest(str(parent), names)}")
-        merged, origins = _read_chain(found[0], seen)
+        merged, origins = _read_chain(found[0], str(found[0]), seen)
     merge(merged, data, name, origins)
     return merged, origins
 
@@ -139,20 +136,21 @@ def load_config(
     Raises:
         ConfigError: unknown key, wrong type or value, with file and dotted path.
     """
-    data, origins = _read_chain(source)
     name = str(source) if isinstance(source, Path) else f"registered config of '{task}'"
+    data, origins = _read_chain(source, name)
     cpu = data.pop("cpu", {})
     if not isinstance(cpu, dict):
-        raise ConfigError(f"{origins.get('cpu', name)}: cpu: expected a mapping of sections, got {cpu!r}")
+        raise ConfigError(f"{origins.where('cpu')}: expected a mapping of sections, got {cpu!r}")
     data["task"] = task
 
     def with_cpu(apply: bool) -> tuple[dict[str, Any], Origins]:
-        merged: dict[str, Any] = {}
-        where: Origins = {}
-        merge(merged, data, "", {})
-        where.update(origins)
+        merged = copy.deepcopy(data)
+        where = Origins(origins)
         if apply:
-            merge(merged, cpu, f"{origins.get('cpu', name)}: cpu", where)
+            set_here = Origins()
+            merge(merged, cpu, "", set_here)
+            for path in set_here:
+                where.note(path, origins.of(f"cpu.{path}") + ": cpu")
         return merged, where
 
     from_dict(*with_cpu(True), source=name)  # so that a mistake in `cpu:` is found on a GPU machine too
@@ -169,14 +167,19 @@ def _refuse_task(key: str) -> None:
 
 
 def from_dict(data: Mapping[str, Any], origins: Origins | None = None, source: str = "config") -> TaskConfig:
-    """TaskConfig from nested plain values; `origins` maps dotted paths to the file that set them."""
-    return build(TaskConfig, data, "", origins or {}, source)
+    """TaskConfig from nested plain values; `origins` says who set them, if not all are from `source`."""
+    if origins is None:
+        origins = Origins()
+        merge({}, data, source, origins)
+    cfg = build(TaskConfig, data, "", origins, source)
+    cfg.origins.update(origins)
+    return cfg
 
 
 def override(cfg: TaskConfig, overrides: Iterable[tuple[str, Any]]) -> TaskConfig:
-    """`cfg` with some dotted paths replaced, checked again."""
+    """`cfg` with some dotted paths replaced, by the command line or by what it asks for, checked again."""
     data = to_dict(cfg)
-    origins: Origins = {}
+    origins = Origins(cfg.origins)
     for key, value in overrides:
         _refuse_task(key)
         merge(data, nest(key, value), "command line", origins)
@@ -188,7 +191,7 @@ def build(schema: type[T], data: Any, path: str, origins: Origins, source: str) 
     where = f"{_origin(path, origins, source)}: {path or 'top level'}"
     if not isinstance(data, Mapping):
         raise ConfigError(f"{where}: expected a mapping with keys of {schema.__name__}, got {data!r}")
-    fields = {f.name: f for f in dataclasses.fields(schema)}  # type: ignore[arg-type]
+    fields = {f.name: f for f in dataclasses.fields(schema) if f.compare}  # type: ignore[arg-type]
     hints = typing.get_type_hints(schema)
     values: dict[str, Any] = {}
     for key, value in data.items():
@@ -209,12 +212,8 @@ def build(schema: type[T], data: Any, path: str, origins: Origins, source: str) 
 
 
 def _origin(path: str, origins: Origins, source: str) -> str:
-    """The file that set `path`, or the nearest section above it."""
-    while path:
-        if path in origins:
-            return origins[path]
-        path = path.rpartition(".")[0]
-    return source
+    """Who gave the value at `path`; `source` where nobody in particular did."""
+    return origins.of(path) if path and origins else source
 
 
 def _check(kind: Any, value: Any, path: str, origins: Origins, source: str) -> Any:
@@ -286,7 +285,7 @@ def _check_bounds(value: Any, bounds: Mapping[str, float], where: str) -> None:
 def to_dict(config: Any) -> Any:
     """Nested plain values of a configuration, as YAML can write them."""
     if dataclasses.is_dataclass(config):
-        return {f.name: to_dict(getattr(config, f.name)) for f in dataclasses.fields(config)}
+        return {f.name: to_dict(getattr(config, f.name)) for f in dataclasses.fields(config) if f.compare}
     if isinstance(config, Mapping):
         return {k: to_dict(v) for k, v in config.items()}
     if isinstance(config, list | tuple):

@@ -6,6 +6,8 @@ Defaults are legged_gym's (v1.0.2, arXiv 2109.11978) where it has the field. A f
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from legged.config.origins import Origins
+
 POSITIVE = {"above": 0}
 AT_LEAST_0 = {"min": 0}
 AT_LEAST_1 = {"min": 1}
@@ -368,6 +370,8 @@ class TaskConfig:
     train: TrainConfig = TrainConfig()
     custom: dict[str, Any] = field(default_factory=dict)
     """Free space for a user's own terms: `self.cfg.custom["name"]`."""
+    origins: Origins = field(default_factory=Origins, repr=False, compare=False)
+    """Who set what; no setting itself (`compare` says so), so neither read from files nor written to them."""
 
     @property
     def dt(self) -> float:

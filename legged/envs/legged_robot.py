@@ -115,19 +115,20 @@ class LeggedRobot(Terms, BaseTask):
     @classmethod
     def check(cls, cfg: TaskConfig) -> Robot:
         """Everything that can be wrong with a configuration, before anything is built; returns the robot."""
-        robot = load_robot(cfg.robot)
+        origins = cfg.origins
+        robot = load_robot(cfg.robot, origins.where("robot"))
         rewards, terms = cls.terms("_reward_"), cls.terms("_obs_")
         for name in cfg.rewards.scales:
             if name not in rewards:
-                where = f"{cfg.task}: rewards.scales.{name}"
+                where = origins.where(f"rewards.scales.{name}")
                 raise ConfigError(f"{where}: {cls.__name__} has no reward '{name}'{suggest(name, rewards)}")
         for part in ("actor", "critic", "scales", "noise"):
             for name in getattr(cfg.observations, part):
                 if name not in terms:
-                    where = f"{cfg.task}: observations.{part}"
+                    where = origins.where(f"observations.{part}" + (f".{name}" if part in ("scales", "noise") else ""))
                     raise ConfigError(f"{where}: {cls.__name__} has no observation '{name}'{suggest(name, terms)}")
         if cfg.train.algorithm.symmetry:
-            where = f"{cfg.task}: train.algorithm.symmetry"
+            where = origins.where("train.algorithm.symmetry")
             if robot.mirror is None:
                 raise ConfigError(f"{where}: '{robot.name}' is not the same left and right (joints and feet at zero angles)")
             for name in (*cfg.observations.actor, *cfg.observations.critic):
@@ -135,15 +136,21 @@ class LeggedRobot(Terms, BaseTask):
                     raise ConfigError(f"{where}: {cls.__name__}.MIRRORED does not say how observation '{name}' is mirrored")
             y = cfg.terrain.measured_points_y
             if sorted(y) != sorted(-value for value in y):
-                raise ConfigError(f"{where}: terrain.measured_points_y are not the same left and right: {list(y)}")
-        control_gains(robot, cfg.control)
-        check_terrain(cfg.terrain, cfg.task)
+                points = f"terrain.measured_points_y ({origins.of('terrain.measured_points_y')})"
+                raise ConfigError(f"{where}: {points} are not the same left and right: {list(y)}")
+        control_gains(robot, cfg.control, origins.where)
+        check_terrain(cfg.terrain, origins)
         if round(cfg.env.episode_length_s / cfg.dt) < 1:
-            raise ConfigError(f"{cfg.task}: env.episode_length_s: shorter than a control step of {cfg.dt} s")
+            where, given = origins.where("env.episode_length_s"), cfg.env.episode_length_s
+            raise ConfigError(
+                f"{where}: must be at least a control step of {cfg.dt:g} s (sim.dt * control.decimation), got {given:g}"
+            )
         samples = cfg.env.num_envs * cfg.train.runner.num_steps_per_env
         if cfg.train.algorithm.num_mini_batches > samples:
-            where = f"{cfg.task}: train.algorithm.num_mini_batches"
-            raise ConfigError(f"{where}: more than the {samples} samples of an iteration (num_envs * num_steps_per_env)")
+            where, given = origins.where("train.algorithm.num_mini_batches"), cfg.train.algorithm.num_mini_batches
+            raise ConfigError(
+                f"{where}: must be at most the {samples} samples of an iteration (num_envs * num_steps_per_env), got {given}"
+            )
         return robot
 
     @classmethod

@@ -15,8 +15,8 @@ from legged.terrain import Terrain
 __all__ = ["Physics", "RandomizedField", "RobotState", "kernel_cache", "make_physics", "resolve_physics"]
 
 
-def resolve_physics(name: str, device: torch.device) -> str:
-    """The back-end that `auto` means on a device: mujoco_warp on a GPU, the C engine without one.
+def resolve_physics(name: str, device: torch.device, where: str = "sim.physics") -> str:
+    """The back-end that `auto` means on a device: mujoco_warp on a GPU, the C engine without one. `where` says who asks.
 
     Raises:
         ConfigError: the C engine was asked for on a GPU.
@@ -24,7 +24,7 @@ def resolve_physics(name: str, device: torch.device) -> str:
     if name == "auto":
         return "mujoco_warp" if device.type == "cuda" else "mujoco"
     if name == "mujoco" and device.type != "cpu":
-        raise ConfigError(f"sim.physics: 'mujoco' is the C engine and runs on the CPU; add --sim_device cpu (got {device})")
+        raise ConfigError(f"{where}: 'mujoco' is the C engine and runs on the CPU; add --sim_device cpu (got {device})")
     return name
 
 

@@ -6,10 +6,9 @@ import mujoco
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from legged.config import ConfigError
 from legged.envs import LeggedRobot
 from legged.rendering.follower import Follower
-from legged.rendering.scene import display_model
+from legged.rendering.scene import display_model, make_renderer
 from legged.terrain import HeightMap
 
 COMMANDED = (0.10, 0.75, 0.25, 1.0)
@@ -30,13 +29,7 @@ class Camera:
         self.followed = 0
         self.model = display_model(task.robot, count, width, height, task.terrain)
         self.data = mujoco.MjData(self.model)
-        try:
-            self.renderer = mujoco.Renderer(self.model, height, width, max_geom=self.model.ngeom + 1000)
-        except Exception as error:  # each GL back-end fails in its own way
-            raise ConfigError(
-                f"cannot render here ({error}); without a display MUJOCO_GL=egl or MUJOCO_GL=osmesa and their"
-                " libraries are needed, or play with --no-video"
-            ) from error
+        self.renderer = make_renderer(self.model, width, height, ", or play with --no-video")
         self.options = mujoco.MjvOption()
         self.options.geomgroup[3] = 0  # collision shapes
         self.view = mujoco.MjvCamera()

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import mujoco
 
+from legged.config import ConfigError
 from legged.rendering.paint import add_horizon, add_painted_terrain
 from legged.robot import Robot
 from legged.terrain import Terrain
@@ -42,6 +43,21 @@ def display_model(robot: Robot, count: int, width: int, height: int, terrain: Te
         frame = scene.worldbody.add_frame()
         scene.attach(mujoco.MjSpec.from_file(str(robot.model_path)), prefix=f"{i}/", frame=frame)
     return scene.compile()
+
+
+def make_renderer(model: mujoco.MjModel, width: int, height: int, instead: str = "") -> mujoco.Renderer:
+    """What draws a model.
+
+    Raises:
+        ConfigError: nothing can be drawn on this machine; `instead` is what the user might do then.
+    """
+    try:
+        return mujoco.Renderer(model, height, width, max_geom=model.ngeom + 1000)
+    except Exception as error:  # each GL back-end fails in its own way
+        raise ConfigError(
+            f"cannot render here ({error}); without a display MUJOCO_GL=egl or MUJOCO_GL=osmesa and their libraries are"
+            f" needed{instead}"
+        ) from error
 
 
 def _add_floor(scene: mujoco.MjSpec) -> None:

@@ -1,6 +1,5 @@
 """Checkpoint files: written whole or not at all, and checked before anything is built from them."""
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -8,14 +7,13 @@ import torch
 
 from legged.config import ConfigError, TaskConfig
 from legged.envs import BaseTask
-from legged.paths import relative
+from legged.paths import relative, replacing
 
 
 def write_checkpoint(path: Path, saved: dict[str, Any]) -> None:
-    """Write beside the final name, then rename over it."""
-    part = path.with_name(path.name + ".part")
-    torch.save(saved, part)
-    os.replace(part, path)
+    """Write a checkpoint that is whole or not there."""
+    with replacing(path) as part:
+        torch.save(saved, part)
 
 
 def read_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:

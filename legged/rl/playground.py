@@ -53,7 +53,7 @@ class Playground:
             return None
         columns: Sequence[str]
         if name is None:
-            check_terrain(cfg.terrain, cfg.task)
+            check_terrain(cfg.terrain, cfg.origins)
             shares = cfg.terrain.proportions
             columns = [kind for kind, share in shares.items() if share > 0.0]
             order = sorted(range(len(columns)), key=lambda c: -shares[columns[c]])
@@ -90,7 +90,7 @@ class Playground:
         Raises:
             ConfigError: too small.
         """
-        check_terrain(cfg.terrain, cfg.task)
+        check_terrain(cfg.terrain, cfg.origins)
         return Terrain.of_tiles(self.rows, cfg.terrain, np.random.default_rng(cfg.env.seed))
 
     def columns(self, num_envs: int, shift: int = 0) -> list[int]:

@@ -14,6 +14,8 @@ from legged.rl.distributed import sum_over_ranks_
 LOWEST_RATE, HIGHEST_RATE, RATE_STEP = 1e-5, 1e-2, 1.5
 """Bounds of the adaptive learning rate and the factor by which it moves, as in rsl-rl."""
 FEW = 1e-8
+LOSSES = ("value", "surrogate", "entropy", "symmetry")
+"""What is logged of an update, by rsl-rl's names; the last, how far the policy is from its mirror image, with symmetry."""
 HALF_LOG_2PI = 0.9189385332046727
 """0.5 * log(2 pi)."""
 
@@ -39,7 +41,7 @@ class DevicePPO(PPO):
             self.optimizer = torch.optim.Adam(parameters, lr=self._rate, fused=True, capturable=capturable)
             if self.is_multi_gpu:
                 self._shared = SharedGradients(parameters, self.gpu_world_size)
-        self._losses = torch.zeros(3, device=self.device)
+        self._losses = torch.zeros(len(LOSSES) if self.symmetry else len(LOSSES) - 1, device=self.device)
 
     def tensors(self) -> list[Tensor]:
         """Everything that an update changes: parameters, normalisers, moments of the optimiser, learning rate."""
@@ -51,8 +53,8 @@ class DevicePPO(PPO):
     def _why_stock(self) -> str:
         if self.rnd:
             return "random network distillation"
-        if self.symmetry:
-            return "symmetry"
+        if self.symmetry and (self.symmetry.use_mirror_loss or not self.symmetry.use_data_augmentation):
+            return "a mirror loss"
         if self.use_mixed_precision:
             return "mixed precision"
         for name, model in (("actor", self.actor), ("critic", self.critic)):
@@ -119,21 +121,36 @@ class DevicePPO(PPO):
 
     def losses(self) -> dict[str, float]:
         """Mean losses of the last update, read from the device."""
-        return dict(zip(("value", "surrogate", "entropy"), self._losses.tolist(), strict=True))
+        return dict(zip(LOSSES, self._losses.tolist(), strict=False))
 
     @torch.no_grad()
     def _mini_batches(self) -> list[tuple[Tensor, ...]]:
         """The rollout, shuffled: for each mini-batch of n samples the networks' inputs, actions (n, D), old
         log-probabilities, advantages, old values, returns (n,) each, and the old Gaussian's mean (n, D) and std (n, D).
+
+        With symmetry, each but the last two also holds the mirror images, after the samples: 2 n.
         """
         st = self.storage
-        count = st.num_envs * st.num_transitions_per_env // self.num_mini_batches
-        order = self._order(count * self.num_mini_batches)
-        inputs = [torch.cat([st.observations[name] for name in m.obs_groups], dim=-1) for m in (self.actor, self.critic)]
-        assert st.distribution_params is not None
+        observations, actions = st.observations.flatten(0, 1), st.actions.flatten(0, 1)
+        samples = len(actions)
+        if self.symmetry:
+            observations, actions = self.symmetry.data_augmentation_func(
+                env=self.symmetry.env, obs=observations, actions=actions
+            )
+        images = len(actions) // samples
+        count = samples // self.num_mini_batches
+        order = self._order(count * self.num_mini_batches).view(self.num_mini_batches, count)
+        imaged = torch.cat([order + i * samples for i in range(images)], dim=1)
+        repeated = order.repeat(1, images)
+        inputs = [torch.cat([observations[name] for name in m.obs_groups], dim=-1) for m in (self.actor, self.critic)]
         single = (st.actions_log_prob, st.advantages, st.values, st.returns)
-        columns = [*inputs, st.actions, *(tensor.squeeze(-1) for tensor in single), *st.distribution_params]
-        shuffled = [column.flatten(0, 1).index_select(0, order).split(count) for column in columns]
+        assert st.distribution_params is not None
+        columns = [
+            *((column, imaged) for column in (*inputs, actions)),
+            *((column.flatten(), repeated) for column in single),
+            *((column.flatten(0, 1), order) for column in st.distribution_params),
+        ]
+        shuffled = [column.index_select(0, index.flatten()).split(index.shape[1]) for column, index in columns]
         return list(zip(*shuffled, strict=True))
 
     def _order(self, count: int) -> Tensor:
@@ -152,9 +169,11 @@ class DevicePPO(PPO):
         old_mean: Tensor,
         old_std: Tensor,
     ) -> Tensor:
-        """One mini-batch: adapt the learning rate, step down the gradient; returns value loss, surrogate, entropy (3,)."""
+        """One mini-batch: adapt the learning rate, step down the gradient; returns its losses, as in `LOSSES`."""
+        samples = len(old_mean)
         if self.normalize_advantage_per_mini_batch:
-            advantages = (advantages - advantages.mean()) / (advantages.std() + FEW)
+            own = advantages[:samples]
+            advantages = (advantages - own.mean()) / (own.std() + FEW)
         mean = self.actor.mlp(self.actor.obs_normalizer(actor_input))
         values = self.critic.mlp(self.critic.obs_normalizer(critic_input)).squeeze(-1)
         std = self.action_std()
@@ -170,7 +189,12 @@ class DevicePPO(PPO):
         value_loss = value_loss.mean()
         loss = surrogate + self.value_loss_coef * value_loss - self.entropy_coef * entropy
 
-        kl = divergence(old_mean, old_std, mean.detach(), std.detach())
+        losses = [value_loss, surrogate, entropy]
+        if self.symmetry:
+            images = self.symmetry.data_augmentation_func(env=self.symmetry.env, obs=None, actions=mean[:samples])[1]
+            losses.append((mean[samples:] - images[samples:]).square().mean())
+
+        kl = divergence(old_mean, old_std, mean[:samples].detach(), std.detach())
         if self.is_multi_gpu:
             self._shared.zero_()
             loss.backward()
@@ -183,7 +207,7 @@ class DevicePPO(PPO):
         for model in (self.actor, self.critic):
             torch.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
         self.optimizer.step()
-        return torch.stack([value_loss, surrogate, entropy]).detach()
+        return torch.stack(losses).detach()
 
     def action_std(self) -> Tensor:
         """(D,) standard deviation of the actions."""

@@ -1,6 +1,5 @@
 """Run folders: logs/<experiment>/<date_time>_<run>/ with configuration, code state, TensorBoard and checkpoints."""
 
-import os
 import re
 import subprocess
 from datetime import datetime
@@ -8,7 +7,7 @@ from pathlib import Path
 
 from legged.config import ConfigError, TaskConfig, from_dict, suggest, to_yaml
 from legged.config.loader import read_yaml
-from legged.paths import data_folder, relative
+from legged.paths import data_folder, relative, replacing
 
 LOGS = Path("logs")
 CONFIG_FILE = "config.yaml"
@@ -46,10 +45,9 @@ def create_run(cfg: TaskConfig) -> Path:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file beside its name and rename it, so that it is whole or not there."""
-    part = path.with_name(path.name + ".part")
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, path)
+    """Write a file that is whole or not there."""
+    with replacing(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def code_state() -> str:

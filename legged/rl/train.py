@@ -57,7 +57,7 @@ def _main(argv: list[str] | None) -> int:
     device = pick_device(args.sim_device)
     rl_device = pick_device(args.rl_device, "--rl_device") if args.rl_device else device
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
-    resolve_physics(cfg.sim.physics, device)
+    resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics"))
     if args.show:
         print(to_yaml(cfg), end="")
         return 0

@@ -9,7 +9,7 @@ from PIL import Image
 
 from legged.config import ConfigError
 from legged.envs import LeggedRobot
-from legged.paths import relative
+from legged.paths import relative, replacing
 from legged.rendering import Camera
 
 FPS = 25
@@ -66,21 +66,19 @@ def velocities(task: LeggedRobot, robots: slice) -> list[str]:
 
 
 def _write_mp4(frames: list[np.ndarray], path: Path) -> None:
-    part = path.with_suffix(".part.mp4")
     try:
-        imageio.v3.imwrite(part, np.stack(frames), fps=FPS, codec="libx264", quality=7, macro_block_size=2)
+        with replacing(path) as part:
+            imageio.v3.imwrite(part, np.stack(frames), fps=FPS, codec="libx264", quality=7, macro_block_size=2)
     except (ImportError, OSError, ValueError) as error:
         raise ConfigError(f"{path}: cannot write video ({error}); pip install 'imageio[ffmpeg]'") from error
-    part.replace(path)
     print(f"video {relative(path)}")
 
 
 def _write_gif(frames: list[np.ndarray], path: Path) -> None:
-    part = path.with_suffix(".part.gif")
     shown = frames[: round(GIF_S * FPS) : FPS // 8]
     pictures = [Image.fromarray(frame).resize((416, 234), Image.Resampling.LANCZOS) for frame in shown]
     pictures = [picture.quantize(64, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE) for picture in pictures]
     first, *rest = pictures
-    first.save(part, save_all=True, append_images=rest, duration=1000 * (FPS // 8) // FPS, loop=0)
-    part.replace(path)
+    with replacing(path) as part:
+        first.save(part, save_all=True, append_images=rest, duration=1000 * (FPS // 8) // FPS, loop=0)
     print(f"video {relative(path)}")

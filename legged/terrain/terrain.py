@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from legged.config.loader import ConfigError, suggest
+from legged.config.origins import Origins
 from legged.config.schema import TerrainConfig
 from legged.terrain.generators import TERRAIN_TYPES, Tile
 from legged.terrain.height_map import HeightMap
@@ -105,47 +106,56 @@ def column_types(proportions: dict[str, float], num_cols: int) -> list[str]:
     return [names[min(int(np.searchsorted(ends, m)), len(names) - 1)] for m in middles]
 
 
-def check_terrain(cfg: TerrainConfig, task: str) -> None:
+def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
     """Everything that can be wrong with a terrain's configuration.
 
     Raises:
-        ConfigError: names the field.
+        ConfigError: names the field, and who set it and what it does not fit, by the `origins` of the task's configuration.
     """
     if cfg.mesh_type == "plane":
         return
-    where = f"{task}: terrain"
+
+    def where(field: str) -> str:
+        return origins.where(f"terrain.{field}")
+
+    def among(field: str) -> str:
+        return f"{field} = {getattr(cfg, field)} ({origins.of(f'terrain.{field}')})"
+
     for name, share in cfg.proportions.items():
+        at = where(f"proportions.{name}")
         if name not in TERRAIN_TYPES:
-            raise ConfigError(f"{where}.proportions.{name}: there is no terrain type '{name}'{suggest(name, TERRAIN_TYPES)}")
+            raise ConfigError(f"{at}: there is no terrain type '{name}'{suggest(name, TERRAIN_TYPES)}")
         if share < 0.0:
-            raise ConfigError(f"{where}.proportions.{name}: must be at least 0, got {share}")
+            raise ConfigError(f"{at}: must be at least 0, got {share}")
     total = sum(cfg.proportions.values())
     if abs(total - 1.0) > 1e-6:
         listed = ", ".join(f"{name} {share:g}" for name, share in cfg.proportions.items())
-        raise ConfigError(f"{where}.proportions: must sum to 1, got {total:g} ({listed})")
+        raise ConfigError(f"{where('proportions')}: must sum to 1, got {total:g} ({listed})")
     found = column_types(cfg.proportions, cfg.num_cols)
     for name, share in cfg.proportions.items():
         if share > 0.0 and name not in found:
             raise ConfigError(
-                f"{where}.proportions.{name}: {share:g} of num_cols = {cfg.num_cols} columns is less than one;"
+                f"{where(f'proportions.{name}')}: {share:g} of {among('num_cols')} columns is less than one;"
                 " ask for more columns or leave the type out"
             )
         kind = TERRAIN_TYPES[name]
         side = min(cfg.terrain_length, cfg.terrain_width)
         if share > 0.0 and side <= kind.platform:
+            short = "terrain_length" if cfg.terrain_length <= cfg.terrain_width else "terrain_width"
             raise ConfigError(
-                f"{where}: a tile of {cfg.terrain_length:g} x {cfg.terrain_width:g} m (terrain_length, terrain_width) is not"
-                f" larger than the platform of '{name}', {kind.platform:g} m"
+                f"{where(short)}: a tile of {cfg.terrain_length:g} x {cfg.terrain_width:g} m (terrain_length, terrain_width)"
+                f" is not larger than the platform of '{name}', {kind.platform:g} m"
+                f" (proportions.{name}: {origins.of(f'terrain.proportions.{name}')})"
             )
     if cfg.max_init_terrain_level >= cfg.num_rows:
         raise ConfigError(
-            f"{where}.max_init_terrain_level: must be below num_rows = {cfg.num_rows}, got {cfg.max_init_terrain_level}"
+            f"{where('max_init_terrain_level')}: must be below {among('num_rows')}, got {cfg.max_init_terrain_level}"
         )
     side = min(cfg.terrain_length, cfg.terrain_width)
     if cfg.spawn_range >= 0.5 * side:
         raise ConfigError(
-            f"{where}.spawn_range: robots would start up to {cfg.spawn_range:g} m from the middle of a tile of {side:g} m,"
-            " outside it"
+            f"{where('spawn_range')}: robots would start up to {cfg.spawn_range:g} m from the middle of a tile of {side:g} m,"
+            f" outside it ({among('terrain_length')}, {among('terrain_width')})"
         )
     if cfg.border_size < 2.0 * EDGE:
-        raise ConfigError(f"{where}.border_size: must be at least {2.0 * EDGE:g}, got {cfg.border_size:g}")
+        raise ConfigError(f"{where('border_size')}: must be at least {2.0 * EDGE:g}, got {cfg.border_size:g}")

@@ -69,7 +69,7 @@ def _main(argv: list[str] | None) -> int:
         torch.set_num_threads(1)
     if args.scale is not None:
         return scale(args, cfg, device)
-    if args.grounds and resolve_physics(cfg.sim.physics, device) != "mujoco_warp":
+    if args.grounds and resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics")) != "mujoco_warp":
         raise ConfigError("--grounds: compares colliders of mujoco_warp; add sim.physics=mujoco_warp")
     if args.grounds and cfg.terrain.mesh_type == "plane":
         raise ConfigError(f"--grounds: the task '{cfg.task}' has no terrain (terrain.mesh_type is plane)")

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from legged.config import ConfigError, override
-from legged.paths import relative
+from legged.paths import relative, replacing
 from legged.physics import resolve_physics
 from legged.rl.arguments import (
     add_run_arguments,
@@ -65,7 +65,7 @@ def _main(argv: list[str] | None) -> int:
     device = torch.device("cpu") if args.physics == "mujoco" and args.sim_device is None else pick_device(args.sim_device)
     if device.type == "cpu":
         torch.set_num_threads(1)
-    engine = resolve_physics(args.physics or "auto", device)
+    engine = resolve_physics(args.physics or "auto", device, "--physics")
     policy = find_policy(args)
     types = chosen_types(policy.cfg, args.types)
     asked = [change for change in overrides(args) if change[0] != "train.runner.experiment_name"]
@@ -210,10 +210,9 @@ def plot(result: dict[str, Any], path: Path) -> None:
             axis.text(i, j, f"{value:.2f}", ha="center", va="center", color="white" if dark else "black")
         figure.colorbar(image, ax=axis, label=label)
     figure.suptitle(f"{result['task']} in {result['physics']}, {result['ground']}falls {100 * result['falls']:.1f} %")
-    part = path.with_name(f".{path.name}")
-    figure.savefig(part, dpi=110, format="png")
+    with replacing(path) as part:
+        figure.savefig(part, dpi=110, format="png")
     plt.close(figure)
-    part.replace(path)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged.config import ConfigError
-from legged.paths import relative
+from legged.paths import relative, replacing
 from legged.rl.arguments import run_main
 
 CURVES = (
@@ -95,11 +95,10 @@ def draw(runs: dict[str, Scalars], path: Path) -> None:
         axis.set_xlabel("iteration")
         axis.grid(alpha=0.3)
         _time_axis(axis, first)
-    part = path.with_name(f".{path.name}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(part, dpi=110, format="png")
+    with replacing(path) as part:
+        figure.savefig(part, dpi=110, format="png")
     plt.close(figure)
-    part.replace(path)
 
 
 def _draw_levels(levels: Axes, moves: Axes, runs: list[Scalars], types: list[str]) -> None:

@@ -5,7 +5,7 @@ Writes terrain_map.png, the heights seen from above, and terrain.png, one tile o
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from PIL import Image
 from legged.config import ConfigError, TaskConfig
 from legged.config.loader import suggest
 from legged.config.schema import TerrainConfig
-from legged.paths import relative
+from legged.paths import relative, replacing
 from legged.registry import task_config
 from legged.rl.arguments import add_task_arguments, import_and_check, overrides, run_main
 from legged.robot import load_robot
@@ -49,20 +49,22 @@ def _main(argv: list[str] | None) -> int:
                 f"{args.task}: stands on a plane (terrain.mesh_type), there is no terrain to show; --types shows types of"
                 " your choice"
             )
-        check_terrain(cfg.terrain, args.task)
+        check_terrain(cfg.terrain, cfg.origins)
         terrain = Terrain.build(cfg.terrain, cfg.env.seed)
         types: Sequence[str] = terrain.type_names
         levels = [f"{row / cfg.terrain.num_rows:g}" if cfg.terrain.curriculum else "" for row in range(cfg.terrain.num_rows)]
     else:
         types = chosen_types(args.types)
         sizes = replace(cfg.terrain, mesh_type="height_map", num_rows=1, num_cols=len(types), max_init_terrain_level=0)
-        check_terrain(replace(sizes, proportions=dict.fromkeys(types, 1.0 / len(types))), args.task)
+        check_terrain(replace(sizes, proportions=dict.fromkeys(types, 1.0 / len(types))), cfg.origins)
         terrain = tiles(cfg.terrain, [types[::-1]], args.difficulty, cfg.env.seed)  # the map's first column is the rightmost
         levels = [f"{args.difficulty:g}"]
     args.out.mkdir(parents=True, exist_ok=True)
     map_path, picture_path = args.out / "terrain_map.png", args.out / "terrain.png"
-    _write(map_path, lambda part: draw_map(terrain, levels, part))
-    _write(picture_path, lambda part: Image.fromarray(picture(cfg, types, args.difficulty)).save(part, format="PNG"))
+    with replacing(map_path) as part:
+        draw_map(terrain, levels, part)
+    with replacing(picture_path) as part:
+        Image.fromarray(picture(cfg, types, args.difficulty)).save(part, format="PNG")
     print(f"written: {relative(map_path)}, {relative(picture_path)}")
     return 0
 
@@ -161,13 +163,6 @@ def draw_map(terrain: Terrain, levels: Sequence[str], path: Path) -> None:
     bar.ax.minorticks_off()
     figure.savefig(path, dpi=130, format="png", bbox_inches="tight")
     plt.close(figure)
-
-
-def _write(path: Path, save: Callable[[Path], None]) -> None:
-    """Write beside the file, then rename."""
-    part = path.with_name(f".{path.name}")
-    save(part)
-    part.replace(path)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import matplotlib
 from rich.console import Console
 from rich.table import Table
 
+from legged.paths import replacing
 from legged.terrain import TERRAIN_TYPES
 
 PANELS = {
@@ -109,10 +110,9 @@ def plot_success(results: list[dict[str, Any]], path: Path) -> None:
     rule = results[0]["success"]["definition"]
     text = f"{results[0]['task']}: robots that get {rule['distance_m']:g} m from their start within {rule['time_s']:g} s"
     figure.suptitle(text if columns > 1 else text.replace(": ", "\n"), fontsize="medium" if columns == 1 else "large")
-    part = path.with_name(f".{path.name}")
-    figure.savefig(part, dpi=110, format="png")
+    with replacing(path) as part:
+        figure.savefig(part, dpi=110, format="png")
     plt.close(figure)
-    part.replace(path)
 
 
 def _draw_panel(axis: Any, results: list[dict[str, Any]], names: tuple[str, ...]) -> None:

@@ -7,8 +7,7 @@ import mujoco
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from legged.config import ConfigError
-from legged.rendering import add_sky
+from legged.rendering import add_sky, make_renderer
 from legged.rendering.paint import DEPTH, add_painted_terrain
 from legged.robot import Robot
 from legged.terrain import Terrain
@@ -43,13 +42,7 @@ def render(terrain: Terrain, places: Sequence[Place], robot: Robot, width: int =
     model = _model(terrain, places, robot, width, height)
     data = mujoco.MjData(model)
     _pose(model, data, terrain, places, robot)
-    try:
-        renderer = mujoco.Renderer(model, height, width, max_geom=model.ngeom + 1000)
-    except Exception as error:  # each GL back-end fails in its own way
-        raise ConfigError(
-            f"cannot render here ({error}); without a display MUJOCO_GL=egl or MUJOCO_GL=osmesa and their"
-            " libraries are needed"
-        ) from error
+    renderer = make_renderer(model, width, height)
     options = mujoco.MjvOption()
     options.geomgroup[3] = 0  # collision shapes
     try:

@@ -1,0 +1,24 @@
+"""Who set which field of a configuration, for errors that name a file."""
+
+
+class Origins(dict[str, str]):
+    """Dotted path -> who set it: 'cfg/mine.yaml', 'cfg/mine.yaml: cpu', 'command line'."""
+
+    def note(self, path: str, source: str) -> None:
+        """`source` set `path`: what it replaces, above and below, is forgotten."""
+        for old in [key for key in self if key.startswith(f"{path}.") or path.startswith(f"{key}.")]:
+            del self[old]
+        self[path] = source
+
+    def of(self, path: str) -> str:
+        """Who set `path`, or, of a section, everyone who set something in it; 'the default' when nobody did.
+
+        An item of a list, `path[2]`, comes from whoever gave the list.
+        """
+        path = path.partition("[")[0]
+        found = [source for key, source in self.items() if key == path or key.startswith(f"{path}.")]
+        return ", ".join(dict.fromkeys(found)) or "the default"
+
+    def where(self, path: str) -> str:
+        """'cfg/mine.yaml: terrain.border_size': how an error about the value at `path` begins."""
+        return f"{self.of(path)}: {path}"
