@@ -33,3 +33,20 @@ def fill(alg, seed):
             ends = torch.rand(ROBOTS)
             alg.process_env_step(observe(), torch.randn(ROBOTS), ends < 0.1, {"time_outs": ends < 0.04})
         alg.compute_returns(observe())
+
+
+def mirrored(env, obs, actions):
+    """A made-up mirror: the columns the other way round, the first with its sign changed."""
+
+    def image(x):
+        flipped = x.flip(1)
+        return torch.cat([x, torch.cat([-flipped[:, :1], flipped[:, 1:]], dim=1)])
+
+    seen = None
+    if obs is not None:
+        groups = {name: image(group) for name, group in obs.items()}
+        seen = TensorDict(groups, batch_size=[2 * len(obs)], device=obs.device)
+    return seen, None if actions is None else image(actions)
+
+
+MIRROR = {"env": None, "data_augmentation_func": mirrored, "use_data_augmentation": True}

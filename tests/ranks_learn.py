@@ -6,7 +6,7 @@ Prints `rank <r> <case> equal` for each case that holds.
 import sys
 
 import torch
-from learners import SAMPLES, fill, learner
+from learners import MIRROR, SAMPLES, fill, learner
 from rsl_rl.algorithms import PPO
 
 from legged.graph import ForbidHostReads
@@ -19,6 +19,7 @@ CASES = {
     "normalised": {"normalized": True},
     "per mini-batch": {"normalize_advantage_per_mini_batch": True},
     "fixed rate": {"schedule": "fixed"},
+    "symmetric": {"symmetry_cfg": MIRROR},
 }
 
 

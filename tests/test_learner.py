@@ -5,9 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import checkpoints, small_config, small_task, tiny_run
-from learners import SAMPLES, STEPS, fill, learner
+from learners import MIRROR, SAMPLES, STEPS, fill, learner
 from rsl_rl.algorithms import PPO
-from tensordict import TensorDict
 
 from legged.graph import ForbidHostReads
 from legged.registry import task_config
@@ -19,22 +18,6 @@ from legged.tools.plot import read_scalars
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
-
-def mirrored(env, obs, actions):
-    """A made-up mirror: the columns the other way round, the first with its sign changed."""
-
-    def image(x):
-        flipped = x.flip(1)
-        return torch.cat([x, torch.cat([-flipped[:, :1], flipped[:, 1:]], dim=1)])
-
-    seen = None
-    if obs is not None:
-        groups = {name: image(group) for name, group in obs.items()}
-        seen = TensorDict(groups, batch_size=[2 * len(obs)], device=obs.device)
-    return seen, None if actions is None else image(actions)
-
-
-MIRROR = {"env": None, "data_augmentation_func": mirrored, "use_data_augmentation": True}
 
 VARIANTS = {
     "plain": {},

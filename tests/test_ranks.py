@@ -19,6 +19,8 @@ from legged.registry import make_task, task_config
 from legged.rl import train
 from legged.rl.arguments import pick_device
 
+pytestmark = pytest.mark.usefixtures("workplace")
+
 REPOSITORY = Path(train.__file__).parents[2]
 TESTS = Path(__file__).parent
 TRAIN = ["--task", TASK, "--sim_device", "cpu", "--num_envs", "8", *TINY_TRAINING]
@@ -42,11 +44,6 @@ def spy(runner, until):
 Runner.train = spy
 sys.exit(train.main())
 """
-
-
-@pytest.fixture(autouse=True)
-def workplace(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
 
 
 @contextlib.contextmanager
@@ -110,7 +107,7 @@ def test_updates_of_several_processes_are_those_of_rsl_rl():
     with two_processes(TESTS / "ranks_learn.py") as process:
         out = ended(process, 0)
     for rank in (0, 1):
-        for case in ("plain", "normalised", "per mini-batch", "fixed rate"):
+        for case in ("plain", "normalised", "per mini-batch", "fixed rate", "symmetric"):
             assert f"rank {rank} {case} equal" in out
 
 

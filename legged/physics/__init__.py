@@ -9,6 +9,7 @@ from legged.config.loader import ConfigError
 from legged.config.schema import SimConfig
 from legged.physics.base import Physics, RandomizedField, RobotState
 from legged.robot import Robot
+from legged.startup import importing
 from legged.terrain import Terrain
 
 __all__ = ["Physics", "RandomizedField", "RobotState", "kernel_cache", "make_physics", "resolve_physics"]
@@ -39,7 +40,8 @@ def make_physics(
     but the one used. What is `randomized` next may be compiled together with the rest; other fields take their time.
     """
     if resolve_physics(sim.physics, device) == "mujoco_warp":
-        from legged.physics.mujoco_warp import MujocoWarpPhysics
+        with importing():
+            from legged.physics.mujoco_warp import MujocoWarpPhysics
 
         return MujocoWarpPhysics(robot, sim, num_envs, device, terrain, randomized)
     from legged.physics.mujoco import MujocoPhysics

@@ -64,10 +64,10 @@ def compile_ahead(device: Any, functions: Iterable[Callable[[], object]]) -> int
     The functions are called with kernels left out, so that what they read holds numbers without meaning.
     """
     missing = [build for build in launched(device, functions) if not build.cached(device)]
-    if len(missing) < 2 or sys.platform != "linux":  # forking is safe on Linux only
+    if not missing or sys.platform != "linux":  # forking is safe on Linux only
         return 0
     total = len(missing)
-    with _Line(total) as line, _Lock(cache_folder()) as lock:
+    with Line(total) as line, _Lock(cache_folder()) as lock:
         while missing:
             if lock.acquire():
                 _compile_all(missing, device, partial(line.show, total - len(missing)))
@@ -75,7 +75,9 @@ def compile_ahead(device: Any, functions: Iterable[Callable[[], object]]) -> int
             time.sleep(POLL_S)
             missing = [build for build in missing if not build.cached(device)]
             line.show(total - len(missing))
-    return total
+        compiled = total - sum(not build.cached(device) for build in missing)
+        line.end(compiled)
+    return compiled
 
 
 def launched(device: Any, functions: Iterable[Callable[[], object]]) -> list[Build]:
@@ -188,26 +190,35 @@ class _Lock:
         return True
 
 
-class _Line:
+class Line:
     """Progress, on one line of a terminal; elsewhere as plain lines, now and then."""
 
     def __init__(self, total: int) -> None:
         self._total, self._start, self._shown = total, time.monotonic(), -math.inf
+        self._terminal = sys.stdout.isatty()
 
-    def __enter__(self) -> "_Line":
+    def __enter__(self) -> "Line":
         self.show(0)
         return self
 
     def __exit__(self, *_: object) -> None:
-        end = "\r" if sys.stdout.isatty() else ""
-        print(f"{end}compiled {self._total} kernel modules in {time.monotonic() - self._start:.1f} s", flush=True)
+        if self._terminal:
+            print(flush=True)
 
     def show(self, before: int, more: int = 0) -> None:
         """`before` and `more` modules are compiled."""
         now = time.monotonic()
-        text = f"compiling {min(before + more + 1, self._total)} of {self._total} kernel modules ..."
-        if sys.stdout.isatty():
-            print(f"\r{text}", end="", flush=True)
-        elif now - self._shown >= PLAIN_LINES_EVERY_S:
+        if self._terminal or now - self._shown >= PLAIN_LINES_EVERY_S:
             self._shown = now
+            self._print(f"compiling {min(before + more + 1, self._total)} of {self._total} kernel modules ...")
+
+    def end(self, done: int) -> None:
+        """`done` modules were compiled; those that were not are left to Warp, with its errors if there are any."""
+        rest = "" if done == self._total else f" of {self._total}, the others follow one by one"
+        self._print(f"compiled {done} kernel modules in {time.monotonic() - self._start:.1f} s{rest}")
+
+    def _print(self, text: str) -> None:
+        if self._terminal:
+            print(f"\r\x1b[2K{text}", end="", flush=True)
+        else:
             print(text, flush=True)

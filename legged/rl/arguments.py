@@ -10,6 +10,7 @@ import torch
 from legged.config import ConfigError, parse_override
 from legged.ranks import Ranks
 from legged.registry import import_tasks
+from legged.startup import is_a_command
 
 EXIT_WRONG_INPUT = 2
 
@@ -87,7 +88,9 @@ def pick_device(name: str | None, flag: str = "--sim_device") -> torch.device:
 
 
 def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = None) -> int:
-    """Run a command; a wrong input ends with its message and exit code 2."""
+    """Run a command, of this process if it has no `argv` of its own; a wrong input ends with its message and exit code 2."""
+    if argv is None:
+        is_a_command()
     try:
         return main(argv)
     except ConfigError as error:

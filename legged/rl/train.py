@@ -11,7 +11,6 @@ from types import FrameType
 
 import torch
 
-from legged.clock import STARTED_S
 from legged.config import ConfigError, TaskConfig, to_yaml
 from legged.envs import LeggedRobot
 from legged.paths import relative
@@ -32,6 +31,7 @@ from legged.rl.display import Display
 from legged.rl.distributed import RankLost
 from legged.rl.runner import Runner
 from legged.rl.runs import create_run, find_checkpoint, find_run
+from legged.startup import STARTED_S
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -64,6 +64,8 @@ def _main(argv: list[str] | None) -> int:
     checkpoint = _checkpoint(args, cfg) if args.resume or args.load_run or args.checkpoint is not None else None
     if device.type == "cpu":
         limit_threads()
+    else:
+        torch.cuda.set_device(device)  # what names no device must not end up on the first GPU
     if Ranks.now().first:
         return _train(args, cfg, device, rl_device, checkpoint, start)
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):

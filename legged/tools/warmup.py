@@ -8,10 +8,10 @@ import argparse
 import sys
 import time
 
-from legged.clock import STARTED_S
 from legged.physics import kernel_cache, resolve_physics
 from legged.registry import make_task, task_config
 from legged.rl.arguments import add_task_arguments, import_and_check, overrides, pick_device, run_main
+from legged.startup import STARTED_S
 
 
 def main(argv: list[str] | None = None) -> int:
