@@ -12,6 +12,7 @@ from legged.config import ConfigError
 from legged.config.schema import SimConfig
 from legged.physics import resolve_physics
 from legged.physics.mujoco import MujocoPhysics
+from legged.physics.mujoco_warp import absent_stages
 
 
 def only(index: int) -> torch.Tensor:
@@ -262,3 +263,23 @@ def test_copy_to_shows_one_world_as_it_is_now(physics, robot):
     np.testing.assert_allclose(data.qvel[6:], state.dof_vel[4], atol=1e-5)
     feet = [data.geom(name).xpos for name in robot.feet_names]
     np.testing.assert_allclose(feet, state.feet_pos[4], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("joint", "actuator", "left_out"),
+    [
+        ("", "", {"EULERDAMP", "FRICTIONLOSS"}),
+        ('damping="1"', "", {"FRICTIONLOSS"}),
+        ('frictionloss="1"', "", {"EULERDAMP"}),
+        ("", 'damping="1"', {"FRICTIONLOSS"}),
+    ],
+)
+def test_only_stages_without_work_are_left_out(joint, actuator, left_out):
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody><body><joint name='j' {joint}/><geom size='.1'/></body></worldbody>"
+        f"<actuator><motor joint='j' {actuator}/></actuator></mujoco>"
+    )
+    flags = absent_stages(model)
+    assert {
+        name for name in ("EULERDAMP", "FRICTIONLOSS") if flags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")
+    } == left_out

@@ -30,6 +30,18 @@ wp.config.log_level = wp.LOG_WARNING
 wp.init()
 
 
+def absent_stages(model: mujoco.MjModel) -> int:
+    """Flags of the stages that have nothing to do in `model`: mujoco-warp would still launch them."""
+    bits, flags = mujoco.mjtDisableBit, 0
+    if not any(
+        a.any() for a in (model.dof_damping, model.dof_dampingpoly, model.actuator_damping, model.actuator_dampingpoly)
+    ):
+        flags |= bits.mjDSBL_EULERDAMP  # no damping to integrate implicitly
+    if not (model.dof_frictionloss.any() or model.tendon_frictionloss.any()):
+        flags |= bits.mjDSBL_FRICTIONLOSS
+    return flags
+
+
 class MujocoWarpPhysics(Physics):
     """N worlds in mujoco-warp. All tensors of `state` and the engine's own arrays live on one device, at fixed
     addresses, so that a step can be captured; on the CPU the step is captured here, by Warp.
@@ -68,8 +80,7 @@ class MujocoWarpPhysics(Physics):
             self._solver = ConstraintSolver(self._m, d) if sim.constraint_solver == "fused" else None
             if self._solver is not None:
                 self._m.opt.run_qacc_smooth = False  # ours does not start from it
-        if not self.model.dof_damping.any():
-            self._m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # nothing to integrate implicitly
+            self._m.opt.disableflags |= absent_stages(self.model)
         exchanges = (self._exchange.kinematics, self._exchange.contact_forces)
         constants = (self._set_constants,) if "added_base_mass" in randomized else ()
         compile_ahead(self._wp_device, (self._step, *exchanges, *constants))
