@@ -37,8 +37,11 @@ class EnvConfig:
 class SimConfig:
     """Physics time step, engine and contact solver."""
 
-    physics: Literal["auto", "mujoco_warp", "mujoco"] = "auto"
-    """Engine: `mujoco_warp` (GPU, or Warp's CPU device), `mujoco` (C engine, all CPU cores), `auto` by device."""
+    physics: Literal["auto", "mujoco_warp", "mujoco", "newton"] = "auto"
+    """Engine: `mujoco_warp` (GPU, or Warp's CPU device), `mujoco` (C engine, all CPU cores), `newton` (GPU, or Warp's CPU
+    device), `auto` by device."""
+    solver: Literal["mujoco", "steel", "kamino", "featherstone", "xpbd"] = "mujoco"
+    """Solver of `newton`; the other engines have their own."""
     dt: float = field(default=0.005, metadata=POSITIVE)
     """Physics step [s]; the control step is `dt * control.decimation`."""
     cone: Literal["pyramidal", "elliptic"] = "pyramidal"
@@ -51,9 +54,10 @@ class SimConfig:
     ls_iterations: int = field(default=20, metadata=AT_LEAST_1)
     """Cap of line-search iterations per solver iteration."""
     nconmax: int = field(default=24, metadata=AT_LEAST_1)
-    """Contacts (and candidate pairs) allocated per robot in mujoco_warp, in a pool all robots share."""
+    """Contacts (and candidate pairs) allocated per robot in mujoco_warp and newton, in a pool all robots share."""
     njmax: int = field(default=96, metadata=AT_LEAST_1)
-    """Constraint rows allocated per robot in mujoco_warp: 4 a contact in the pyramidal cone, 1 a joint limit."""
+    """Constraint rows allocated per robot in mujoco_warp and in Newton's MuJoCo solver: 4 a contact in the pyramidal cone, 1
+    a joint limit."""
     self_collisions: bool = False
     """Let the robot's shapes touch each other, except those of neighbouring bodies."""
     terrain_collider: Literal["cells", "convex"] = "cells"

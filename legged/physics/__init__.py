@@ -30,7 +30,12 @@ def make_physics(
     """The back-end that `sim.physics` names, on a plane or on `terrain`. Engines are imported here, so that none is needed
     but the one used.
     """
-    if resolve_physics(sim.physics, device) == "mujoco_warp":
+    engine = resolve_physics(sim.physics, device)
+    if engine == "newton":
+        from legged.physics.newton import NewtonPhysics
+
+        return NewtonPhysics(robot, sim, num_envs, device, terrain)
+    if engine == "mujoco_warp":
         from legged.physics.mujoco_warp import MujocoWarpPhysics
 
         return MujocoWarpPhysics(robot, sim, num_envs, device, terrain)

@@ -1,0 +1,114 @@
+"""Newton's solvers, each with settings under which a quadruped of 50 kg stands and walks at steps of 5 ms."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import newton
+from newton.solvers import SolverBase, SolverFeatherstone, SolverKamino, SolverMuJoCo, SolverSteel, SolverXPBD
+
+from legged.config.schema import SimConfig
+
+
+@dataclass(frozen=True)
+class SolverSetup:
+    """How one of Newton's solvers is built and stepped."""
+
+    make: Callable[[newton.Model, SimConfig], SolverBase]
+    substeps: int = 1
+    """Steps of the solver in one physics step, under the same torques."""
+    gap: float = 0.0
+    """Distance at which shapes become candidates for contact [m]."""
+    contact: tuple[float, float, float] | None = None
+    """Stiffness [N/m], damping [N s/m] and slope of friction [N s/m] of contacts, for a solver that has no other; the
+    solver uses them as they are, not scaled by the masses as MuJoCo does."""
+    own_contacts: bool = False
+    """It finds contacts itself, in place of Newton's collision pipeline."""
+    pipeline: dict[str, Any] = field(default_factory=dict)
+    """Options of the collision pipeline."""
+    reports_forces: bool = True
+    """It says what force each contact had; otherwise they are computed here, by the solver's law."""
+    maximal: bool = False
+    """It moves bodies only; joint angles are computed from them after a step."""
+    register: Callable[[newton.ModelBuilder], None] | None = None
+    """Adds the solver's own attributes to a builder."""
+
+    @property
+    def averages_friction(self) -> bool:
+        """It takes the mean of the two shapes' friction, where MuJoCo takes the robot's, which has priority."""
+        return not self.own_contacts
+
+    @property
+    def friction_factor(self) -> float:
+        """What the robot's friction is multiplied by, the ground's being 0, so that the mean is the robot's own."""
+        return 2.0 if self.averages_friction else 1.0
+
+
+def _mujoco(model: newton.Model, sim: SimConfig) -> SolverMuJoCo:
+    """The options that scene.py gives C MuJoCo. Memory, the caps of the solver, and the cone are the task's."""
+    solver = SolverMuJoCo(
+        model,
+        integrator="euler",
+        solver="newton",
+        cone=sim.cone,
+        impratio=sim.impratio,
+        iterations=sim.iterations,
+        ls_iterations=sim.ls_iterations,
+        nconmax=sim.nconmax,
+        njmax=sim.njmax,
+        kinematic_switchable_roots=False,  # else every robot carries a weld that is never used
+    )
+    solver.mjw_model.opt.warn_overflow = 0  # counted in refresh instead of printed by each thread
+    return solver
+
+
+def _steel(model: newton.Model, sim: SimConfig) -> SolverSteel:
+    return SolverSteel(
+        model,
+        enable_joint_limits=True,
+        joint_limit_activation_gap=0.1,  # [rad]; by default every limit of every joint takes a row in every step
+        articulation_constraint_max=sim.njmax,
+        warn_constraint_overflow=False,  # counted in refresh
+    )
+
+
+def _kamino(model: newton.Model, sim: SimConfig) -> SolverKamino:
+    return SolverKamino(model, SolverKamino.Config(use_collision_detector=False))
+
+
+SOLVERS = {
+    "mujoco": SolverSetup(_mujoco, own_contacts=True),
+    # Gauss-Seidel on joint coordinates. Contacts a little before touching keep the feet from sinking in within a step.
+    "steel": SolverSetup(
+        _steel,
+        gap=0.01,
+        register=SolverSteel.register_custom_attributes,
+    ),
+    "kamino": SolverSetup(_kamino, gap=0.01, maximal=True, register=SolverKamino.register_custom_attributes),
+    # Explicit springs: at 4e4 N/m a foot sinks in by 3 mm, and friction of 3000 N s/m lets a loaded foot creep by 1.5 cm/s.
+    # Stiffer or with fewer substeps the foot chatters, and the robot sinks.
+    "featherstone": SolverSetup(
+        lambda model, sim: SolverFeatherstone(model, angular_damping=0.0),
+        substeps=16,
+        contact=(4e4, 500.0, 3000.0),
+        reports_forces=False,
+    ),
+    # Friction acts against slip within a substep only: without contacts that remember where they began ("sticky") loaded
+    # feet creep outward by centimetres a second. With fewer substeps or iterations it blows up.
+    "xpbd": SolverSetup(
+        lambda model, sim: SolverXPBD(model, iterations=8),
+        substeps=4,
+        gap=0.01,
+        pipeline={"contact_matching": "sticky", "contact_matching_pos_threshold": 0.005},
+        maximal=True,
+    ),
+}
+
+
+def solver_setup(name: str) -> SolverSetup:
+    """The setup of `sim.solver`.
+
+    Raises:
+        ConfigError: Newton's solver cannot hold a robot.
+    """
+    return SOLVERS[name]
