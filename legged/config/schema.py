@@ -14,6 +14,7 @@ NOT_EMPTY = {"items": 1}
 """For lists: bounds hold for every item, and a list with any bound must not be empty."""
 
 Range = tuple[float, float]
+NewtonSolver = Literal["mujoco", "steel", "kamino", "featherstone", "xpbd", "semi_implicit"]
 
 
 def _lattice(low: float, high: float, step: float = 0.1) -> tuple[float, ...]:
@@ -40,8 +41,9 @@ class SimConfig:
     physics: Literal["auto", "mujoco_warp", "mujoco", "newton"] = "auto"
     """Engine: `mujoco_warp` (GPU, or Warp's CPU device), `mujoco` (C engine, all CPU cores), `newton` (GPU, or Warp's CPU
     device), `auto` by device."""
-    solver: Literal["mujoco", "steel", "kamino", "featherstone", "xpbd"] = "mujoco"
-    """Solver of `newton`; the other engines have their own."""
+    solver: NewtonSolver = "mujoco"
+    """Solver of `newton`; the other engines have their own. Each comes with settings under which a quadruped stands:
+    legged/physics/newton_solvers.py."""
     dt: float = field(default=0.005, metadata=POSITIVE)
     """Physics step [s]; the control step is `dt * control.decimation`."""
     cone: Literal["pyramidal", "elliptic"] = "pyramidal"

@@ -1,5 +1,7 @@
 """Physics engines behind one interface. A new one is a file here and a line in `make_physics`."""
 
+from importlib.util import find_spec
+
 import torch
 
 from legged.config.loader import ConfigError
@@ -8,20 +10,28 @@ from legged.physics.base import Physics, RandomizedField, RobotState
 from legged.robot import Robot
 from legged.terrain import Terrain
 
-__all__ = ["Physics", "RandomizedField", "RobotState", "make_physics", "resolve_physics"]
+__all__ = ["Physics", "RandomizedField", "RobotState", "engine_name", "make_physics", "resolve_physics"]
 
 
 def resolve_physics(name: str, device: torch.device) -> str:
     """The back-end that `auto` means on a device: mujoco_warp on a GPU, the C engine without one.
 
     Raises:
-        ConfigError: the C engine was asked for on a GPU.
+        ConfigError: the C engine was asked for on a GPU, or an engine that is not installed.
     """
     if name == "auto":
         return "mujoco_warp" if device.type == "cuda" else "mujoco"
     if name == "mujoco" and device.type != "cpu":
         raise ConfigError(f"sim.physics: 'mujoco' is the C engine and runs on the CPU; add --sim_device cpu (got {device})")
+    if name == "newton" and find_spec("newton") is None:
+        raise ConfigError("sim.physics: 'newton' needs the package newton, which is not installed here: pip install newton")
     return name
+
+
+def engine_name(sim: SimConfig, device: torch.device) -> str:
+    """What files and tables call the engine: mujoco, mujoco_warp, or newton_<solver>."""
+    engine = resolve_physics(sim.physics, device)
+    return f"newton_{sim.solver}" if engine == "newton" else engine
 
 
 def make_physics(

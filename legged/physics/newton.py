@@ -15,7 +15,7 @@ from legged.physics.base import RandomizedField
 from legged.physics.exchange import LOST
 from legged.physics.newton_exchange import NewtonExchange
 from legged.physics.newton_model import build_newton_model
-from legged.physics.newton_solvers import solver_setup
+from legged.physics.newton_solvers import SOLVERS
 from legged.physics.scene import build_model
 from legged.physics.warp_physics import WarpPhysics
 from legged.robot import Robot
@@ -32,13 +32,9 @@ class NewtonPhysics(WarpPhysics):
     def __init__(
         self, robot: Robot, sim: SimConfig, num_envs: int, device: torch.device, terrain: Terrain | None = None
     ) -> None:
-        """Build the scene on `device` and place all robots at the model's initial state; compiles on first use.
-
-        Raises:
-            ConfigError: the solver can't hold a robot.
-        """
+        """Build the scene on `device` and place all robots at the model's initial state; compiles on first use."""
         super().__init__(robot, num_envs, sim.dt, device)
-        self._setup = setup = solver_setup(sim.solver)
+        self._setup = setup = SOLVERS[sim.solver]
         self.model = build_model(robot, sim, terrain, "none")
         with wp.ScopedDevice(self._wp_device), warnings.catch_warnings():
             # Newton names MuJoCo 3.17; the contract holds with the one that we use, and is tested with it.

@@ -19,7 +19,7 @@ from rich.table import Table
 
 from legged.config import ConfigError, override
 from legged.paths import relative
-from legged.physics import resolve_physics
+from legged.physics import engine_name
 from legged.rl.arguments import (
     add_run_arguments,
     add_task_arguments,
@@ -44,7 +44,6 @@ def _main(argv: list[str] | None) -> int:
     parser = argparse.ArgumentParser(prog="evaluate", description=__doc__)
     add_task_arguments(parser)
     add_run_arguments(parser)
-    parser.add_argument("--physics", choices=["mujoco", "mujoco_warp"], help="engine; that of the device by default")
     for axis, unit in (("vx", "m/s"), ("vy", "m/s"), ("yaw", "rad/s")):
         parser.add_argument(f"--{axis}", default="-1:1:0.5", help=f"low:high:step of the command grid [{unit}]")
     parser.add_argument("--robots", type=int, default=16, help="robots a cell")
@@ -65,11 +64,11 @@ def _main(argv: list[str] | None) -> int:
     device = torch.device("cpu") if args.physics == "mujoco" and args.sim_device is None else pick_device(args.sim_device)
     if device.type == "cpu":
         torch.set_num_threads(1)
-    engine = resolve_physics(args.physics or "auto", device)
     policy = find_policy(args)
     types = chosen_types(policy.cfg, args.types)
-    asked = [change for change in overrides(args) if change[0] != "train.runner.experiment_name"]
-    asked.append(("sim.physics", engine))
+    # The engine is that of the device, not that of the training.
+    asked = [("sim.physics", "auto"), *(one for one in overrides(args) if one[0] != "train.runner.experiment_name")]
+    engine = engine_name(override(policy.cfg, asked).sim, device)
     start = time.perf_counter()
     figures = track(policy, grid, asked, device, graph=not args.no_graph)
     lost = figures.pop("contact_overflows")
