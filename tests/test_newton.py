@@ -8,13 +8,15 @@ import importlib.util
 from dataclasses import dataclass, fields, replace
 from typing import get_args
 
+import numpy as np
 import pytest
 import torch
 from reference import TOUCHING, CWorlds, States, bits, pd, random_states, roll, snapshot, standing
 
 from legged.config import ConfigError
-from legged.config.schema import NewtonSolver, SimConfig
-from legged.physics import Physics, engine_name, resolve_physics
+from legged.config.schema import NewtonSolver, SimConfig, TerrainConfig
+from legged.physics import Physics, engine_name, make_physics, resolve_physics
+from legged.terrain import Terrain, TileSpec
 
 N = 4
 GRAVITY = 9.81
@@ -142,6 +144,16 @@ def test_writing_a_world_and_blowing_it_up_leaves_the_others_bit_identical(newto
     assert torch.equal(bits(roll(newton, start.dof_pos, 20)), bits(expected))
 
 
+def test_the_recorded_step_is_the_eager_one(newton, robot, monkeypatch):
+    """What a solver decides on the host is fixed when its step is recorded; nothing it decides may change later."""
+    states = random_states(robot, N, seed=7)
+    states.write(newton)
+    recorded = roll(newton, states.dof_pos, 6)
+    monkeypatch.setattr(newton, "_advance", newton._step)
+    states.write(newton)
+    assert torch.equal(bits(roll(newton, states.dof_pos, 6)), bits(recorded))
+
+
 def test_a_push_is_felt_by_its_worlds_only(newton, robot):
     states = random_states(robot, N, seed=10)
     states.base_pos[:, 2] += 1.0
@@ -189,6 +201,29 @@ def test_added_base_mass_is_drawn_per_world(newton, solver, robot):
     newton.randomize("added_base_mass", torch.zeros(N))
     tolerance = TOLERANCES[solver].weight + 0.015  # it has not quite come to rest; nor has it in C MuJoCo
     torch.testing.assert_close(carried, (robot.mass + added) * GRAVITY, rtol=tolerance, atol=0.0)
+
+
+# ---- other grounds and shapes -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("solver", "near"), [("mujoco", 2e-3), ("steel", 0.01)])
+def test_it_stands_on_terrain_like_c_mujoco(robot, solver, near):
+    """On bumps and on a slope of 15 degrees; the ground is one height field here, and many in C MuJoCo."""
+    cfg = TerrainConfig(mesh_type="height_map", terrain_length=4.0, terrain_width=4.0, border_size=2.0)
+    tiles = [[TileSpec("rough_slope_up", 0.0), TileSpec("slope_up", 15.0)]]
+    terrain = Terrain.of_tiles(tiles, cfg, np.random.default_rng(1))
+    states = standing(robot, 2)
+    states.base_pos[:] = torch.tensor(terrain.origins[0], dtype=torch.float32) - torch.tensor([1.2, 0.0, 0.0])
+    ground = terrain.height_map.height_at(states.base_pos[:, 0].numpy(), states.base_pos[:, 1].numpy())
+    states.base_pos[:, 2] = torch.tensor(ground, dtype=torch.float32) + 0.65
+    found = []
+    for sim in (SimConfig(physics="mujoco", threads=1), SimConfig(physics="newton", solver=solver)):
+        physics = make_physics(robot, sim, 2, torch.device("cpu"), terrain)
+        states.write(physics)
+        roll(physics, states.dof_pos, 200)
+        found.append(physics.state)
+    torch.testing.assert_close(found[1].base_pos, found[0].base_pos, atol=near, rtol=0.0)
+    torch.testing.assert_close(found[1].projected_gravity, found[0].projected_gravity, atol=0.02, rtol=0.0)
 
 
 # ---- choosing a solver ---------------------------------------------------------------------------------------------------
