@@ -226,6 +226,23 @@ def test_it_stands_on_terrain_like_c_mujoco(robot, solver, near):
     torch.testing.assert_close(found[1].projected_gravity, found[0].projected_gravity, atol=0.02, rtol=0.0)
 
 
+@pytest.mark.parametrize("solver", ["mujoco", "steel"])
+def test_legs_touch_each_other_if_asked(robot, solver):
+    """In the air with the hips turned inward, as far as they go: left and right thighs meet, and push apart alike."""
+    states = standing(robot, 2, height=2.0)
+    states.dof_pos[:, 0::6], states.dof_pos[:, 3::6] = -0.72, 0.72
+    thighs = [i for i, name in enumerate(robot.contact_names) if "THIGH" in name]
+    for asked in (True, False):
+        sim = SimConfig(physics="newton", solver=solver, self_collisions=asked)
+        physics = make_physics(robot, sim, 2, torch.device("cpu"))
+        states.write(physics)
+        roll(physics, states.dof_pos, 1)
+        forces = physics.state.contact_forces
+        assert (forces[:, thighs].norm(dim=2) > 100.0).all() == asked
+        assert (forces != 0.0).any() == asked
+        assert (forces.sum(dim=1).norm(dim=1) < 1.0).all()
+
+
 # ---- choosing a solver ---------------------------------------------------------------------------------------------------
 
 

@@ -42,6 +42,7 @@ def make_physics(
     """
     engine = resolve_physics(sim.physics, device)
     if engine == "newton":
+        import legged.physics.warp_physics  # noqa: F401  (settings of Warp, before Newton declares its kernels)
         from legged.physics.newton import NewtonPhysics
 
         return NewtonPhysics(robot, sim, num_envs, device, terrain)

@@ -1,4 +1,4 @@
-"""Between Newton's arrays and those of the task: conventions, contact forces by shape, and the penalty law of contacts.
+"""Between Newton's arrays and those of the task: conventions, and contact forces by shape.
 
 Newton: quaternions (x, y, z, w); velocity of a body's centre of mass, world frame; angular velocity, world frame. The
 task's arrays are in MuJoCo's layout: (w, x, y, z); velocity of the base's origin, world frame; angular, base frame.
@@ -7,14 +7,13 @@ task's arrays are in MuJoCo's layout: (w, x, y, z); velocity of the base's origi
 from typing import Any
 
 import mujoco
-import newton
 import numpy as np
 import torch
 import warp as wp
 
 from legged.physics.base import RobotState
 from legged.physics.exchange import StateExchange, rotate, rotate_inverse
-from legged.physics.newton_model import Layout
+from legged.physics.newton_simulation import Simulation
 from legged.robot import Robot
 
 wp.set_module_options({"enable_backward": False})
@@ -128,76 +127,12 @@ def take_flags(flags: wp.array[Any], lost: int, overflow: wp.array[int]):
     flags[world] = flags.dtype(0)
 
 
-@wp.func
-def point_motion(
-    body: int,
-    point: wp.vec3,
-    body_q: wp.array[wp.transform],
-    body_qd: wp.array[wp.spatial_vector],
-    body_com: wp.array[wp.vec3],
-):
-    """World position and velocity of a contact point given in its body, or in the world if it has none."""
-    if body < 0:
-        return point, wp.vec3(0.0)
-    at = wp.transform_point(body_q[body], point)
-    arm = at - wp.transform_point(body_q[body], body_com[body])
-    return at, wp.spatial_top(body_qd[body]) + wp.cross(wp.spatial_bottom(body_qd[body]), arm)
-
-
-@wp.kernel
-def penalty_forces(
-    count: wp.array[int],
-    shape0: wp.array[int],
-    shape1: wp.array[int],
-    point0: wp.array[wp.vec3],
-    point1: wp.array[wp.vec3],
-    normal: wp.array[wp.vec3],
-    margin0: wp.array[float],
-    margin1: wp.array[float],
-    body_of_shape: wp.array[int],
-    friction: wp.array[float],
-    body_q: wp.array[wp.transform],
-    body_qd: wp.array[wp.spatial_vector],
-    body_com: wp.array[wp.vec3],
-    stiffness: float,
-    damping: float,
-    slope: float,
-    force: wp.array[wp.spatial_vector],
-):
-    """One thread a contact: the force on its first shape by the law of Newton's solvers with springs in contacts.
-
-    The spring pushes in proportion to depth, the damper against approach; friction opposes sliding in proportion to its
-    speed, up to Coulomb's limit of the mean coefficient.
-    """
-    i = wp.tid()
-    if i >= count[0]:
-        return
-    force[i] = wp.spatial_vector()
-    first, second = shape0[i], shape1[i]
-    up = -normal[i]  # towards the first shape
-    at0, velocity0 = point_motion(body_of_shape[first], point0[i], body_q, body_qd, body_com)
-    at1, velocity1 = point_motion(body_of_shape[second], point1[i], body_q, body_qd, body_com)
-    depth = margin0[i] + margin1[i] - wp.dot(up, at0 - at1)
-    if depth <= 0.0:
-        return
-    velocity = velocity0 - velocity1
-    approach = wp.max(-wp.dot(up, velocity), 0.0)
-    press = stiffness * depth + damping * approach
-    sliding = velocity - up * wp.dot(up, velocity)
-    resist = wp.min(slope * wp.length(sliding), 0.5 * (friction[first] + friction[second]) * press)
-    force[i] = wp.spatial_vector(press * up - resist * wp.normalize(sliding), wp.vec3(0.0))
-
-
 class NewtonExchange(StateExchange):
-    """Launches the kernels above on fixed arrays: `state` is the one that the solver starts a step from."""
+    """Launches the kernels above on fixed arrays: those of a simulation, and the task's."""
 
     def __init__(
         self,
-        newton_model: newton.Model,
-        layout: Layout,
-        newton_state: newton.State,
-        control: newton.Control,
-        contacts: newton.Contacts,
+        simulation: Simulation,
         model: mujoco.MjModel,
         robot: Robot,
         state: RobotState,
@@ -206,31 +141,29 @@ class NewtonExchange(StateExchange):
         torques: wp.array,
         overflowed: torch.Tensor,
     ) -> None:
-        """`qpos`, `qvel`, `torques` are the task's side, (N, ...). Call with the model's device as Warp's current one."""
-        count = len(qpos)
+        """All after `simulation` is the task's side, arrays (N, ...). Call with the device as Warp's current one."""
+        count, layout = len(qpos), simulation.layout
         self._overflow = wp.zeros(count, dtype=int)
-        nothing = wp.zeros((count, 0), dtype=float)  # the solver is asked to clear its warm start
+        nothing = wp.zeros((count, 0), dtype=float)  # the solver clears its warm start itself
         super().__init__(model, robot, state, qpos, qvel, torques, nothing, self._overflow, 1, overflowed)
-        self._model, self._layout, self._contacts = newton_model, layout, contacts
+        self._simulation = simulation
         self._qpos, self._qvel, self._torques = qpos, qvel, torques
-        self._joint_q = newton_state.joint_q.reshape((count, layout.coords))
-        self._joint_qd = newton_state.joint_qd.reshape((count, layout.dofs))
-        self._joint_f = control.joint_f.reshape((count, layout.dofs))
-        self._dof_q, self._dof_qd = wp.array(layout.dof_q, dtype=int), wp.array(layout.dof_qd, dtype=int)
-        base_com = newton_model.body_com.numpy()[layout.base :: layout.bodies]
-        self._base_com = wp.array(base_com[:count], dtype=wp.vec3)
-        tracked = np.full(newton_model.shape_count, -1)
+        self._joint_q = simulation.state.joint_q.reshape((count, layout.coords))
+        self._joint_qd = simulation.state.joint_qd.reshape((count, layout.dofs))
+        self._joint_f = simulation.control.joint_f.reshape((count, layout.dofs))
+        self._dof_qd = wp.array(layout.dof_qd, dtype=int)
+        base_com = simulation.model.body_com.numpy().reshape(count, layout.bodies, 3)[:, layout.base]
+        self._convention = [
+            wp.array(base_com, dtype=wp.vec3),
+            layout.root_q,
+            layout.root_qd,
+            wp.array(layout.dof_q, dtype=int),
+            self._dof_qd,
+        ]
+        tracked = np.full(simulation.model.shape_count, -1)
         worlds = tracked[: count * layout.num_shapes].reshape(count, layout.num_shapes)
         worlds[:, layout.shapes] = np.arange(len(layout.shapes))
         self._tracked = wp.array(tracked, dtype=int)
-        self.force = wp.zeros(max(contacts.rigid_contact_max, 1), dtype=wp.spatial_vector)
-        """Force on the first shape of each contact, for solvers that don't report it."""
-        self.reported: wp.array | None = None
-        """The same, where the solver does."""
-
-    @property
-    def _convention(self) -> list[Any]:
-        return [self._base_com, self._layout.root_q, self._layout.root_qd, self._dof_q, self._dof_qd]
 
     def apply_torques(self) -> None:
         """Task -> generalised forces of the joints."""
@@ -246,43 +179,19 @@ class NewtonExchange(StateExchange):
         inputs = [mask, self._qpos, self._qvel, *self._convention]
         wp.launch(put_states, dim=len(self._qpos), inputs=inputs, outputs=[self._joint_q, self._joint_qd])
 
-    def note_lost_contacts(self, flags: wp.array | None, lost: int) -> None:
-        """Keep until the next refresh what was lost in this step: in the pool of contacts, and, if the solver says so, by
-        the bits `lost` of its `flags` (N,), which are cleared.
+    def note_lost_contacts(self) -> None:
+        """Keep until the next refresh what was lost in this step: in the pool of contacts, or by the solver's flags, which
+        are cleared.
         """
-        contacts = self._contacts
+        simulation, contacts = self._simulation, self._simulation.contacts
         inputs = [contacts.rigid_contact_count, contacts.rigid_contact_max]
         wp.launch(flag_lost_contacts, dim=len(self._qpos), inputs=inputs, outputs=[self._overflow])
-        if flags is not None:
-            wp.launch(take_flags, dim=len(self._qpos), inputs=[flags, lost], outputs=[self._overflow])
-
-    def penalty_forces(self, state: newton.State, law: tuple[float, float, float]) -> None:
-        """`force` of the contacts at the bodies' present state, with stiffness, damping and slope of friction."""
-        model, contacts = self._model, self._contacts
-        wp.launch(
-            penalty_forces,
-            dim=contacts.rigid_contact_max,
-            inputs=[
-                contacts.rigid_contact_count,
-                contacts.rigid_contact_shape0,
-                contacts.rigid_contact_shape1,
-                contacts.rigid_contact_point0,
-                contacts.rigid_contact_point1,
-                contacts.rigid_contact_normal,
-                contacts.rigid_contact_margin0,
-                contacts.rigid_contact_margin1,
-                model.shape_body,
-                model.shape_material_mu,
-                state.body_q,
-                state.body_qd,
-                model.body_com,
-                *law,
-            ],
-            outputs=[self.force],
-        )
+        if simulation.lost is not None:
+            inputs = [simulation.lost, simulation.lost_bits]
+            wp.launch(take_flags, dim=len(self._qpos), inputs=inputs, outputs=[self._overflow])
 
     def contact_forces(self) -> None:
-        contacts = self._contacts
+        contacts = self._simulation.contacts
         self._contact_forces.zero_()
         wp.launch(
             add_shape_forces,
@@ -291,9 +200,9 @@ class NewtonExchange(StateExchange):
                 contacts.rigid_contact_count,
                 contacts.rigid_contact_shape0,
                 contacts.rigid_contact_shape1,
-                self.force if self.reported is None else self.reported,
+                self._simulation.force,
                 self._tracked,
-                self._model.shape_world,
+                self._simulation.model.shape_world,
             ],
             outputs=[self._contact_forces],
         )

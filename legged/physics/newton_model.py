@@ -7,6 +7,7 @@ import newton
 import numpy as np
 
 from legged.physics.newton_solvers import SolverSetup
+from legged.physics.scene import robot_spec
 from legged.physics.terrain_geoms import lattice_heights
 from legged.robot import Robot
 from legged.terrain import Terrain
@@ -63,23 +64,20 @@ def build_newton_model(
     points, where steps are ramps one cell wide. `device` is Warp's.
     """
     world = _builder(setup)
-    world.add_mjcf(
-        str(robot.model_path),
-        enable_self_collisions=self_collisions,
-        parse_visuals=False,
-        parse_sites=False,
-    )
+    # Which shapes may touch is written in the model, and Newton reads it when it reads the model.
+    source = robot_spec(robot, True).to_xml() if self_collisions else str(robot.model_path)
+    world.add_mjcf(source, enable_self_collisions=self_collisions, parse_visuals=False, parse_sites=False)
     for shape in range(world.shape_count):
         world.shape_gap[shape] = setup.gap
-        if setup.contact is not None:
-            world.shape_material_ke[shape], world.shape_material_kd[shape], world.shape_material_kf[shape] = setup.contact
+        if setup.springs is not None:
+            world.shape_material_ke[shape], world.shape_material_kd[shape], world.shape_material_kf[shape] = setup.springs
     layout = Layout.of(world, robot)
     scene = _builder(setup)
     scene.replicate(world, num_envs)
     # The ground is no part of a world: within one MJCF without self-collisions nothing would touch it.
     ground = newton.ModelBuilder.ShapeConfig(gap=setup.gap, mu=0.0 if setup.averages_friction else 1.0)
-    if setup.contact is not None:
-        ground.ke, ground.kd, ground.kf = setup.contact
+    if setup.springs is not None:
+        ground.ke, ground.kd, ground.kf = setup.springs
     if terrain is None:
         scene.add_ground_plane(cfg=ground)
     else:

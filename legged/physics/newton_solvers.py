@@ -27,15 +27,13 @@ class SolverSetup:
     """Steps of the solver in one physics step, under the same torques."""
     gap: float = 0.0
     """Distance at which shapes become candidates for contact [m]."""
-    contact: tuple[float, float, float] | None = None
-    """Stiffness [N/m], damping [N s/m] and slope of friction [N s/m] of contacts, for a solver that has no other; the
-    solver uses them as they are, not scaled by the masses as MuJoCo does."""
+    springs: tuple[float, float, float] | None = None
+    """Stiffness [N/m], damping [N s/m] and slope of friction [N s/m] of contacts, for a solver that makes them of springs,
+    as they are and not scaled by masses as in MuJoCo. Such a solver does not report forces: they are computed here."""
     own_contacts: bool = False
     """It finds contacts itself, in place of Newton's collision pipeline."""
     pipeline: dict[str, Any] = field(default_factory=dict)
     """Options of the collision pipeline."""
-    reports_forces: bool = True
-    """It says what force each contact had; otherwise they are computed here, by the solver's law."""
     maximal: bool = False
     """It moves bodies only; joint angles are computed from them after a step."""
     register: Callable[[newton.ModelBuilder], None] | None = None
@@ -48,7 +46,9 @@ class SolverSetup:
 
     @property
     def friction_factor(self) -> float:
-        """What the robot's friction is multiplied by, the ground's being 0, so that the mean is the robot's own."""
+        """What the robot's friction is multiplied by, the ground's being 0, so that their mean is the robot's own. Where
+        its shapes touch each other, that doubles it.
+        """
         return 2.0 if self.averages_friction else 1.0
 
 
@@ -100,16 +100,14 @@ SOLVERS = {
     "featherstone": SolverSetup(
         lambda model, sim: SolverFeatherstone(model, angular_damping=0.0, update_mass_matrix_interval=FEATHERSTONE_SUBSTEPS),
         substeps=FEATHERSTONE_SUBSTEPS,
-        contact=SPRINGS,
-        reports_forces=False,
+        springs=SPRINGS,
     ),
     # Bodies hang together by springs too: at the default of 1e4 N/m the robot sags in them by centimetres, and with 20
     # substeps it sinks to 0.41 m within a second.
     "semi_implicit": SolverSetup(
         lambda model, sim: SolverSemiImplicit(model, angular_damping=0.0, joint_attach_ke=1e5, joint_attach_kd=400.0),
         substeps=50,
-        contact=SPRINGS,
-        reports_forces=False,
+        springs=SPRINGS,
         maximal=True,
     ),
     # Friction acts against slip within a substep only: without contacts that remember where they began ("sticky") the robot

@@ -16,6 +16,7 @@ from legged.physics.exchange import StateExchange
 from legged.robot import Robot
 
 wp.config.log_level = wp.LOG_WARNING
+wp.config.enable_backward = False  # nothing here is differentiated, and adjoints double the time to compile
 wp.init()
 
 
