@@ -1,14 +1,17 @@
 """One policy in every engine: the command, its table and its files."""
 
 import json
+from typing import get_args
 
 import pytest
 from helpers import TASK, call, kept_global_state, tiny_run
+from rich.console import Console
 
+from legged.config.schema import NewtonSolver
 from legged.tools import crossing, evaluate
 
 GRID = ["--vx=0:0.5:0.5", "--vy=0", "--yaw=0", "--robots", "1"]
-ENGINES = ["mujoco_warp", "mujoco", *(f"newton_{name}" for name in crossing.get_args(crossing.NewtonSolver))]
+ENGINES = ["mujoco_warp", "mujoco", *(f"newton_{name}" for name in get_args(NewtonSolver))]
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +64,7 @@ def test_an_engine_in_which_everybody_fell_is_shown_without_numbers(tmp_path, ca
     rows = [result("mujoco"), result("newton_xpbd", rmse_lin=None, rmse_ang=None, cost_of_transport=None, falls=1.0)]
     summary = {"task": TASK, "checkpoint": "m.pt", "grid": {"vx": [0], "vy": [0], "yaw": [0]}, "robots_per_cell": 2}
     summary["engines"] = rows
-    crossing.Console(width=110).print(crossing.report(summary))
+    Console(width=110).print(crossing.report(summary))
     line = next(line for line in capsys.readouterr().out.splitlines() if "newton_xpbd" in line)
     assert line.count("none") == 3
     assert "100.0 %" in line
