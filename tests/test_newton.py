@@ -203,6 +203,25 @@ def test_added_base_mass_is_drawn_per_world(newton, solver, robot):
     torch.testing.assert_close(carried, (robot.mass + added) * GRAVITY, rtol=tolerance, atol=0.0)
 
 
+@pytest.mark.parametrize(
+    ("solver", "memory"),
+    [("mujoco", {"nconmax": 1}), ("mujoco", {"njmax": 8}), ("steel", {"njmax": 8}), ("xpbd", {"nconmax": 1})],
+)
+def test_lost_contacts_are_reported_until_the_next_refresh(make_physics, robot, solver, memory):
+    """Of robots with all their legs in the ground. (SolverMuJoCo makes room for the contacts it starts with, whatever it is
+    asked.) In the air nothing is lost, and the flag is gone.
+    """
+    physics = make_physics("newton", num_envs=N, solver=solver, **memory)
+    states = standing(robot, N, height=0.2)
+    states.write(physics)
+    assert not physics.overflowed.any()
+    physics.step()
+    standing(robot, N, height=2.0).write(physics)
+    assert physics.overflowed.all()
+    roll(physics, states.dof_pos, 1)
+    assert not physics.overflowed.any()
+
+
 # ---- other grounds and shapes -------------------------------------------------------------------------------------------
 
 
