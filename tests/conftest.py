@@ -48,7 +48,7 @@ def make_physics(robot: Robot) -> Callable[..., Physics]:
     return make
 
 
-@pytest.fixture(params=["mujoco", "mujoco_warp"])
+@pytest.fixture(params=["mujoco", "mujoco_warp", "newton"])
 def backend(request: pytest.FixtureRequest) -> str:
     """Every back-end; a test that asks for this holds for all of them."""
     return request.param

@@ -241,8 +241,15 @@ def test_the_c_engine_on_a_gpu_is_an_error_that_says_what_to_do():
 
 def test_make_physics_builds_what_is_named(make_physics, backend):
     built = make_physics(backend)
-    assert type(built).__name__ == {"mujoco": "MujocoPhysics", "mujoco_warp": "MujocoWarpPhysics"}[backend]
-    assert built.capturable == (backend == "mujoco_warp")
+    assert (
+        type(built).__name__
+        == {
+            "mujoco": "MujocoPhysics",
+            "mujoco_warp": "MujocoWarpPhysics",
+            "newton": "NewtonPhysics",
+        }[backend]
+    )
+    assert built.capturable == (backend != "mujoco")
 
 
 def test_the_c_engine_is_not_built_for_a_gpu(robot):

@@ -28,6 +28,7 @@ def test_the_example_task_trains_without_touching_the_package(tmp_path, monkeypa
     assert list(tmp_path.glob("logs/anymal_c_careful/*/model_0.pt"))
 
     import_tasks(str(path))
+    task_config("anymal_c_careful")  # with a GPU's settings
     task = make_task(task_config("anymal_c_careful", [("env.num_envs", 2), ("sim.physics", "mujoco")], on_cpu=True))
     assert task.observation_groups["critic"].buffer.shape == (2, 52)  # 48 and four feet
     assert "foot_slip" in task.rewards.names
@@ -134,3 +135,15 @@ def test_a_policy_without_its_optimiser_is_exported(tmp_path):
     described = json.loads((tmp_path / "exported" / "policy.json").read_text())
     assert sum(term["size"] for term in described["observation"]) == 235
     assert described["observation_history"] == 1
+
+
+def test_numbers_of_the_table_of_engines_are_those_of_the_shipped_crossing():
+    result = json.loads((POLICY / "crossing.json").read_text())
+    assert len(result["engines"]) == 8
+    for row in result["engines"]:
+        (shown,) = re.findall(rf"\| {row['physics']} \|(.*)\|\n", README)
+        numbers = (row["rmse_lin"], row["rmse_ang"], 100.0 * row["falls"], row["cost_of_transport"], row["base_height"])
+        forms = ("{:.3f}", "{:.3f}", "{:.1f} %", "{:.2f}", "{:.3f}")
+        assert [cell.strip() for cell in shown.split("|")] == [
+            form.format(number) for form, number in zip(forms, numbers, strict=True)
+        ]

@@ -1,6 +1,7 @@
 """The task on the C engine: observations, resets, terminations, and what rsl-rl relies on."""
 
 import math
+from typing import ClassVar
 
 import pytest
 import torch
@@ -255,6 +256,8 @@ def test_a_seed_fixes_the_whole_trajectory_whatever_the_number_of_threads():
 class Hopper(LeggedRobot):
     """A task with a reward and an observation of its own."""
 
+    MIRRORED: ClassVar = {**LeggedRobot.MIRRORED, "feet_height": "feet"}
+
     def _reward_height(self):
         return self.base_pos[:, 2] * self.cfg.custom["weight"]
 
@@ -268,6 +271,8 @@ class Reads(LeggedRobot):
 
 
 class Masks(LeggedRobot):
+    MIRRORED: ClassVar = {**LeggedRobot.MIRRORED, "masks": "joints"}
+
     def _obs_masks(self):
         return self.dof_pos[self.dof_pos > -100.0].view(self.num_envs, -1)
 

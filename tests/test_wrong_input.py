@@ -121,6 +121,26 @@ def test_a_mistake_in_a_file_of_a_user_s_task(fails, tmp_path):
     fails(train.main, ["--import", "my_tasks.py", "--task", "mine"], "mine.yaml: rewards.scales.walk_nicely", "has no reward")
 
 
+@pytest.mark.parametrize("main", [train.main, play.main, evaluate.main, benchmark.main])
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (
+            ["--physics", "newtn"],
+            ("command line: sim.physics: unknown value 'newtn'", "did you mean 'newton'?", "mujoco_warp"),
+        ),
+        (
+            ["--physics", "newton", "--solver", "kamio"],
+            ("command line: sim.solver: unknown value 'kamio'", "did you mean 'kamino'?", "featherstone"),
+        ),
+        (["--solver", "kamino"], ("--solver: 'kamino'", "add --physics newton")),
+        (["--physics", "mujoco", "--solver", "kamino"], ("--solver: 'kamino'", "add --physics newton (got mujoco)")),
+    ],
+)
+def test_an_engine_or_a_solver_that_is_not_there(fails, run, main, arguments, words):
+    fails(main, task(*arguments), *words)
+
+
 @pytest.mark.parametrize("module", ["no_such_module", "no_such_file.py"])
 def test_a_module_that_is_not_there(fails, module):
     fails(train.main, task("--import", module), "--import", module)

@@ -16,6 +16,7 @@ NOT_EMPTY = {"items": 1}
 """For lists: bounds hold for every item, and a list with any bound must not be empty."""
 
 Range = tuple[float, float]
+NewtonSolver = Literal["mujoco", "steel", "kamino", "featherstone", "xpbd", "semi_implicit"]
 
 
 def _lattice(low: float, high: float, step: float = 0.1) -> tuple[float, ...]:
@@ -40,8 +41,12 @@ class EnvConfig:
 class SimConfig:
     """Physics time step, engine and contact solver."""
 
-    physics: Literal["auto", "mujoco_warp", "mujoco"] = "auto"
-    """Engine: `mujoco_warp` (GPU, or Warp's CPU device), `mujoco` (C engine, all CPU cores), `auto` by device."""
+    physics: Literal["auto", "mujoco_warp", "mujoco", "newton"] = "auto"
+    """Engine: `mujoco_warp` (GPU, or Warp's CPU device), `mujoco` (C engine, all CPU cores), `newton` (GPU, or Warp's CPU
+    device), `auto` by device."""
+    solver: NewtonSolver = "mujoco"
+    """Solver of `newton`; the other engines have their own. Each comes with settings under which a quadruped stands:
+    legged/physics/newton_solvers.py."""
     dt: float = field(default=0.005, metadata=POSITIVE)
     """Physics step [s]; the control step is `dt * control.decimation`."""
     cone: Literal["pyramidal", "elliptic"] = "pyramidal"
@@ -57,9 +62,10 @@ class SimConfig:
     """How mujoco_warp solves for contact forces: `rounds`, its own Newton solver, a few launches a round until the last world
     has converged; `fused`, the same iteration as one launch in which every world ends by itself (pyramidal cones only)."""
     nconmax: int = field(default=24, metadata=AT_LEAST_1)
-    """Contacts (and candidate pairs) allocated per robot in mujoco_warp, in a pool all robots share."""
+    """Contacts (and candidate pairs) allocated per robot in mujoco_warp and newton, in a pool all robots share."""
     njmax: int = field(default=96, metadata=AT_LEAST_1)
-    """Constraint rows allocated per robot in mujoco_warp: 4 a contact in the pyramidal cone, 1 a joint limit."""
+    """Constraint rows allocated per robot in mujoco_warp and in Newton's MuJoCo solver: 4 a contact in the pyramidal cone, 1
+    a joint limit."""
     self_collisions: bool = False
     """Let the robot's shapes touch each other, except those of neighbouring bodies."""
     terrain_collider: Literal["cells", "convex"] = "cells"

@@ -128,12 +128,13 @@ class LeggedRobot(Terms, BaseTask):
                     where = origins.where(f"observations.{part}" + (f".{name}" if part in ("scales", "noise") else ""))
                     raise ConfigError(f"{where}: {cls.__name__} has no observation '{name}'{suggest(name, terms)}")
         if cfg.train.algorithm.symmetry:
-            where = origins.where("train.algorithm.symmetry")
+            where, otherwise = origins.where("train.algorithm.symmetry"), "false learns without mirror images"
             if robot.mirror is None:
-                raise ConfigError(f"{where}: '{robot.name}' is not the same left and right (joints and feet at zero angles)")
+                raise ConfigError(f"{where}: '{robot.name}' is lopsided (joints and feet at zero angles); {otherwise}")
             for name in (*cfg.observations.actor, *cfg.observations.critic):
                 if name not in cls.MIRRORED:
-                    raise ConfigError(f"{where}: {cls.__name__}.MIRRORED does not say how observation '{name}' is mirrored")
+                    missing = f"{cls.__name__}.MIRRORED does not say how observation '{name}' is mirrored"
+                    raise ConfigError(f"{where}: {missing}; {otherwise}")
             y = cfg.terrain.measured_points_y
             if sorted(y) != sorted(-value for value in y):
                 points = f"terrain.measured_points_y ({origins.of('terrain.measured_points_y')})"

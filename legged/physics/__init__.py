@@ -1,6 +1,7 @@
 """Physics engines behind one interface. A new one is a file here and a line in `make_physics`."""
 
 from collections.abc import Collection
+from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -12,20 +13,28 @@ from legged.robot import Robot
 from legged.startup import importing
 from legged.terrain import Terrain
 
-__all__ = ["Physics", "RandomizedField", "RobotState", "kernel_cache", "make_physics", "resolve_physics"]
+__all__ = ["Physics", "RandomizedField", "RobotState", "engine_name", "kernel_cache", "make_physics", "resolve_physics"]
 
 
 def resolve_physics(name: str, device: torch.device, where: str = "sim.physics") -> str:
     """The back-end that `auto` means on a device: mujoco_warp on a GPU, the C engine without one. `where` says who asks.
 
     Raises:
-        ConfigError: the C engine was asked for on a GPU.
+        ConfigError: the C engine was asked for on a GPU, or an engine that is not installed.
     """
     if name == "auto":
         return "mujoco_warp" if device.type == "cuda" else "mujoco"
     if name == "mujoco" and device.type != "cpu":
         raise ConfigError(f"{where}: 'mujoco' is the C engine and runs on the CPU; add --sim_device cpu (got {device})")
+    if name == "newton" and find_spec("newton") is None:
+        raise ConfigError(f"{where}: 'newton' needs the package newton, which is not installed here: pip install newton")
     return name
+
+
+def engine_name(sim: SimConfig, device: torch.device, where: str = "sim.physics") -> str:
+    """What files and tables call the engine: mujoco, mujoco_warp, or newton_<solver>. Raises as `resolve_physics`."""
+    engine = resolve_physics(sim.physics, device, where)
+    return f"newton_{sim.solver}" if engine == "newton" else engine
 
 
 def make_physics(
@@ -39,7 +48,14 @@ def make_physics(
     """The back-end that `sim.physics` names, on a plane or on `terrain`. Engines are imported here, so that none is needed
     but the one used. What is `randomized` next may be compiled together with the rest; other fields take their time.
     """
-    if resolve_physics(sim.physics, device) == "mujoco_warp":
+    engine = resolve_physics(sim.physics, device)
+    if engine == "newton":
+        with importing():
+            import legged.physics.warp_physics  # noqa: F401  (settings of Warp, before Newton declares its kernels)
+            from legged.physics.newton import NewtonPhysics
+
+        return NewtonPhysics(robot, sim, num_envs, device, terrain)
+    if engine == "mujoco_warp":
         with importing():
             from legged.physics.mujoco_warp import MujocoWarpPhysics
 

@@ -3,6 +3,7 @@
 The same formulas in torch (base.py) take some 140 launches a control step, a third of a step's time at 4096 robots.
 """
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 import mujoco
@@ -146,27 +147,34 @@ def write_states(
         contact_forces[world, i] = wp.vec3(0.0)
 
 
-class Exchange:
-    """Launches the kernels above on fixed arrays, so that a capture can hold them."""
+class StateExchange(ABC):
+    """Launches the kernels that write states and read kinematics on fixed arrays, so that a capture can hold them."""
 
     def __init__(
-        self, m: Any, d: Any, model: mujoco.MjModel, robot: Robot, state: RobotState, overflowed: torch.Tensor
+        self,
+        model: mujoco.MjModel,
+        robot: Robot,
+        state: RobotState,
+        qpos: wp.array,
+        qvel: wp.array,
+        torques: wp.array,
+        warmstart: wp.array,
+        overflow: wp.array,
+        lost: int,
+        overflowed: torch.Tensor,
     ) -> None:
-        """`m`, `d` are mujoco-warp's model and data; call with their device as Warp's current one."""
-        self._m, self._d, self._state = m, d, state
+        """Arrays are (N, ...), `qpos` and `qvel` in MuJoCo's layout; the bits `lost` of `overflow` mean that contacts were
+        dropped. Call with the arrays' device as Warp's current one.
+        """
         chains = FootChains.of(model, robot)
-        shapes = [-1] * model.ngeom
-        for index, name in enumerate(robot.contact_names):
-            shapes[model.geom(name).id] = index
-        self._shape_of_geom = wp.array(shapes, dtype=int)
-        self._contact_ids = wp.array(range(d.naconmax), dtype=int)
-        self._forces = wp.zeros(d.naconmax, dtype=wp.spatial_vector)
+        self._state = state
         self._contact_forces = wp.from_torch(state.contact_forces, dtype=wp.vec3)
+        self._written = [qpos, qvel, torques, warmstart, self._contact_forces]
         self._inputs = [
-            d.qpos,
-            d.qvel,
-            d.overflow,
-            LOST,
+            qpos,
+            qvel,
+            overflow,
+            lost,
             wp.array(chains.offset, dtype=wp.vec3),
             wp.array(chains.joint, dtype=int),
             wp.array(chains.axis, dtype=wp.vec3),
@@ -178,22 +186,40 @@ class Exchange:
         self._outputs = [*(wp.from_torch(t, dtype=wp.vec3) for t in vectors), wp.from_torch(overflowed)]
 
     def write(self, mask: torch.Tensor, *values: torch.Tensor) -> None:
-        """Task -> engine, for the worlds of `mask`: values as Physics.write_state takes them, in its order."""
-        d = self._d
-        wp.launch(
-            write_states,
-            dim=self._state.feet_pos.shape[0],
-            inputs=[wp.from_torch(mask), *(wp.from_torch(value.contiguous()) for value in values)],
-            outputs=[d.qpos, d.qvel, d.ctrl, d.qacc_warmstart, self._contact_forces],
-        )
+        """Task -> engine, for the worlds of `mask`: values as Physics.write_state takes them, in its order.
+
+        mujoco-warp's own reset_data would drop the contacts of all worlds.
+        """
+        inputs = [wp.from_torch(mask), *(wp.from_torch(value.contiguous()) for value in values)]
+        wp.launch(write_states, dim=self._state.feet_pos.shape[0], inputs=inputs, outputs=self._written)
 
     def kinematics(self) -> None:
         """Engine -> base_lin_vel, projected_gravity, feet_pos, feet_vel, overflowed; clears the overflow flags."""
         dim = self._state.feet_pos.shape[:2]
         wp.launch(read_kinematics, dim=tuple(dim), inputs=self._inputs, outputs=self._outputs)
 
+    @abstractmethod
     def contact_forces(self) -> None:
         """Engine -> contact_forces, as the last step's solver left them."""
+
+
+class Exchange(StateExchange):
+    """The same with the arrays of mujoco-warp, and its contact forces."""
+
+    def __init__(
+        self, m: Any, d: Any, model: mujoco.MjModel, robot: Robot, state: RobotState, overflowed: torch.Tensor
+    ) -> None:
+        """`m`, `d` are mujoco-warp's model and data; call with their device as Warp's current one."""
+        super().__init__(model, robot, state, d.qpos, d.qvel, d.ctrl, d.qacc_warmstart, d.overflow, LOST, overflowed)
+        self._m, self._d = m, d
+        shapes = [-1] * model.ngeom
+        for index, name in enumerate(robot.contact_names):
+            shapes[model.geom(name).id] = index
+        self._shape_of_geom = wp.array(shapes, dtype=int)
+        self._contact_ids = wp.array(range(d.naconmax), dtype=int)
+        self._forces = wp.zeros(d.naconmax, dtype=wp.spatial_vector)
+
+    def contact_forces(self) -> None:
         m, d = self._m, self._d
         mjw.contact_force(m, d, self._contact_ids, True, self._forces)
         self._contact_forces.zero_()

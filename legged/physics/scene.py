@@ -14,6 +14,16 @@ FLOOR = "floor"
 GroundShapes = Literal["exact", "height_field", "none"]
 
 
+def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
+    """The robot alone; with `self_collisions` its shapes touch each other, except those of neighbouring bodies."""
+    spec = mujoco.MjSpec.from_file(str(robot.model_path))
+    if self_collisions:
+        for geom in spec.geoms:
+            if geom.name in robot.contact_names:
+                geom.conaffinity |= geom.contype
+    return spec
+
+
 def build_model(
     robot: Robot,
     sim: SimConfig,
@@ -30,7 +40,7 @@ def build_model(
     makes a step split exactly into torque and dynamics. With `contact_sensors`, every tracked shape gets a sensor
     `contact_<shape>`, the net force that the shape exerts, world frame [N].
     """
-    spec = mujoco.MjSpec.from_file(str(robot.model_path))
+    spec = robot_spec(robot, sim.self_collisions)
     option = spec.option
     option.timestep = sim.dt
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
@@ -39,10 +49,6 @@ def build_model(
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.iterations = sim.iterations
     option.ls_iterations = sim.ls_iterations
-    if sim.self_collisions:
-        for geom in spec.geoms:
-            if geom.name in robot.contact_names:
-                geom.conaffinity |= geom.contype
     # Contacts with the ground need no condim above the robot's own 3; friction is the robot's (its shapes have priority).
     if terrain is None or ground == "none":
         touches = terrain is None

@@ -67,8 +67,13 @@ def add_height_field(
     Where corners of neighbouring cells disagree, its point lies at their mean.
     """
     add = _Geoms(spec, ground, float(ground.corners.min()) - depth, _attributes(material, collide))
-    add.surface(0, 0, _lattice(ground.corners)[0])
+    add.surface(0, 0, lattice_heights(ground))
     return add.added[0]
+
+
+def lattice_heights(ground: HeightMap) -> np.ndarray:
+    """(X + 1, Y + 1) heights at the corners of all cells [m]; where neighbours disagree, their mean."""
+    return _lattice(ground.corners)[0]
 
 
 @dataclass

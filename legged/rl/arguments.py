@@ -16,11 +16,13 @@ EXIT_WRONG_INPUT = 2
 
 
 def add_task_arguments(parser: argparse.ArgumentParser) -> None:
-    """--task, --import, the devices, and free `key=value` overrides."""
+    """--task, --import, engine and devices, and free `key=value` overrides."""
     parser.add_argument("--task", required=True, help="name of the task, e.g. anymal_c_flat")
     parser.add_argument("--import", dest="module", help="module or .py file that registers tasks of your own")
     parser.add_argument("--num_envs", type=int, help="number of robots (env.num_envs)")
     parser.add_argument("--seed", type=int, help="random seed (env.seed)")
+    parser.add_argument("--physics", metavar="ENGINE", help="mujoco_warp, mujoco or newton; that of the device by default")
+    parser.add_argument("--solver", metavar="NAME", help="solver of newton (sim.solver), e.g. xpbd; mujoco by default")
     parser.add_argument("--sim_device", help="cpu or cuda[:i]; the GPU if there is one")
     parser.add_argument("--no-graph", action="store_true", help="run the step eagerly instead of as one CUDA graph")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="any field, e.g. rewards.scales.torques=-1e-4")
@@ -34,7 +36,11 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
-    """All overrides of a command line; flags come after `key=value`s."""
+    """All overrides of a command line; flags come after `key=value`s.
+
+    Raises:
+        ConfigError: not of the form `key=value`, or --solver without the engine whose it is.
+    """
     flags = {
         "num_envs": "env.num_envs",
         "seed": "env.seed",
@@ -42,12 +48,17 @@ def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
         "experiment_name": "train.runner.experiment_name",
         "run_name": "train.runner.run_name",
         "runner": "train.runner.loop",
+        "physics": "sim.physics",
+        "solver": "sim.solver",
     }
     found = [parse_override(text) for text in args.overrides]
     for flag, key in flags.items():
         value = getattr(args, flag, None)
         if value is not None:
             found.append((key, value))
+    engine = dict(found).get("sim.physics")
+    if args.solver is not None and engine != "newton":
+        raise ConfigError(f"--solver: '{args.solver}' would be a solver of newton; add --physics newton (got {engine})")
     return found
 
 

@@ -14,7 +14,7 @@ import torch
 from legged.config import ConfigError, TaskConfig, to_yaml
 from legged.envs import LeggedRobot
 from legged.paths import relative
-from legged.physics import resolve_physics
+from legged.physics import engine_name, resolve_physics
 from legged.ranks import Ranks
 from legged.registry import make_task, task_config
 from legged.rl.arguments import (
@@ -106,9 +106,8 @@ def _train(
 def describe(cfg: TaskConfig, device: torch.device, folder: Path) -> str:
     """One line on what is about to run where."""
     if device.type == "cpu":
-        engine = (
-            "mujoco-warp on the CPU" if cfg.sim.physics == "mujoco_warp" else f"C MuJoCo on {cfg.sim.threads or 'all'} cores"
-        )
+        engines = {"mujoco_warp": "mujoco-warp on the CPU", "mujoco": f"C MuJoCo on {cfg.sim.threads or 'all'} cores"}
+        engine = engines.get(engine_name(cfg.sim, device), f"Newton's {cfg.sim.solver} solver on the CPU")
         where = f"no GPU in use: {engine}, settings of the task's cpu section"
     else:
         where = torch.cuda.get_device_name(device)

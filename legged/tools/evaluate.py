@@ -1,7 +1,8 @@
 """How good a policy is: `python -m legged.tools.evaluate --task anymal_c_flat [--physics mujoco]`.
 
 How well it tracks commands, for tasks with terrain on rough ground; and there, how hard a terrain it still crosses. Prints
-tables and writes evaluation_<physics>.json and .png and success_<physics>.png beside the checkpoint (or to --out).
+tables and writes evaluation_<physics>.json and .png and success_<physics>.png beside the checkpoint (or to --out). With
+`--physics all`, the same commands in every engine and solver: crossing.json and .png.
 """
 
 import argparse
@@ -19,7 +20,7 @@ from rich.table import Table
 
 from legged.config import ConfigError, override
 from legged.paths import relative, replacing
-from legged.physics import resolve_physics
+from legged.physics import engine_name
 from legged.rl.arguments import (
     add_run_arguments,
     add_task_arguments,
@@ -28,11 +29,13 @@ from legged.rl.arguments import (
     pick_device,
     run_main,
 )
-from legged.rl.policy import TrainedPolicy, find_policy, restore, undisturbed
+from legged.rl.policy import find_policy
 from legged.rl.runs import write_text
-from legged.tools.success import chosen_types, on_terrain, sweep
+from legged.tools.crossing import EVERYWHERE, cross
+from legged.tools.success import chosen_types, sweep
 from legged.tools.success_report import plot_success, print_success, with_other_engine
-from legged.tools.velocity_grid import ROUGH_SPAWN, Grid, measure, rough_ground, rough_side
+from legged.tools.tracking import ready_to_track, tell
+from legged.tools.velocity_grid import Grid, measure
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -44,7 +47,6 @@ def _main(argv: list[str] | None) -> int:
     parser = argparse.ArgumentParser(prog="evaluate", description=__doc__)
     add_task_arguments(parser)
     add_run_arguments(parser)
-    parser.add_argument("--physics", choices=["mujoco", "mujoco_warp"], help="engine; that of the device by default")
     for axis, unit in (("vx", "m/s"), ("vy", "m/s"), ("yaw", "rad/s")):
         parser.add_argument(f"--{axis}", default="-1:1:0.5", help=f"low:high:step of the command grid [{unit}]")
     parser.add_argument("--robots", type=int, default=16, help="robots a cell")
@@ -65,13 +67,22 @@ def _main(argv: list[str] | None) -> int:
     device = torch.device("cpu") if args.physics == "mujoco" and args.sim_device is None else pick_device(args.sim_device)
     if device.type == "cpu":
         torch.set_num_threads(1)
-    engine = resolve_physics(args.physics or "auto", device, "--physics")
+    everywhere = args.physics == EVERYWHERE
+    if everywhere:
+        for flag in ("solver", "types", "robots_per_point"):
+            if getattr(args, flag) is not None:
+                raise ConfigError(f"--{flag.replace('_', '-')}: --physics {EVERYWHERE} tracks commands in every solver, only")
+        args.physics = None
     policy = find_policy(args)
+    if everywhere:
+        asked = [one for one in overrides(args) if one[0] != "train.runner.experiment_name"]
+        return cross(policy, grid, asked, device, not args.no_graph, args.out or policy.folder)
     types = chosen_types(policy.cfg, args.types)
-    asked = [change for change in overrides(args) if change[0] != "train.runner.experiment_name"]
-    asked.append(("sim.physics", engine))
+    # The engine is that of the device, not that of the training.
+    asked = [("sim.physics", "auto"), *(one for one in overrides(args) if one[0] != "train.runner.experiment_name")]
+    engine = engine_name(override(policy.cfg, asked).sim, device, "--physics" if args.physics else "sim.physics")
     start = time.perf_counter()
-    figures = track(policy, grid, asked, device, graph=not args.no_graph)
+    figures = measure(*ready_to_track(policy, grid, asked, device, graph=not args.no_graph), grid)
     lost = figures.pop("contact_overflows")
     rough = policy.cfg.terrain.mesh_type != "plane"
     header = {
@@ -105,28 +116,6 @@ def _main(argv: list[str] | None) -> int:
         warn_of_overflows("success", success["contact_overflows"])
     print(f"written: {', '.join(relative(one) for one in written)}")
     return 0
-
-
-def track(
-    policy: TrainedPolicy, grid: Grid, asked: list[tuple[str, Any]], device: torch.device, graph: bool
-) -> dict[str, Any]:
-    """The grid, on a plane or, for tasks with terrain, on bumpy level ground; `asked` is what the command line changes."""
-    changes = undisturbed(grid.num_envs, grid.hold_s)
-    terrain = None
-    if policy.cfg.terrain.mesh_type == "plane":
-        changes += asked
-    else:
-        changes += [*on_terrain(policy.cfg, rough_side(grid), ROUGH_SPAWN), *asked]
-        cfg = override(policy.cfg, changes)
-        terrain = rough_ground(cfg.terrain, cfg.env.seed)
-        tell(f"tracking on rough ground: {len(grid.cells)} commands x {grid.robots} robots")
-    task, runner = restore(policy, changes, device, graph, terrain)
-    return measure(task, runner.get_inference_policy(str(device)), grid)
-
-
-def tell(line: str) -> None:
-    """Show how far a long evaluation is, at once."""
-    print(line, flush=True)
 
 
 def warn_of_overflows(what: str, lost: int) -> None:

@@ -2,12 +2,13 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import matplotlib
 from rich.console import Console
 from rich.table import Table
 
+from legged.config.schema import NewtonSolver
 from legged.paths import replacing
 from legged.terrain import TERRAIN_TYPES
 
@@ -18,7 +19,11 @@ PANELS = {
     "rough slopes": ("rough_slope_up", "rough_slope_down"),
 }
 """Types that share a panel; every other type has one of its own."""
-ENGINES = {"mujoco_warp": ("mujoco-warp", "-", "o"), "mujoco": ("C MuJoCo", "--", "s")}
+ENGINES = {
+    "mujoco_warp": ("mujoco-warp", "-", "o"),
+    "mujoco": ("C MuJoCo", "--", "s"),
+    **{f"newton_{solver}": (f"Newton, {solver}", "-.", "^") for solver in get_args(NewtonSolver)},
+}
 """Engine -> its label, line and marker."""
 COLORS = ("#1f6fb4", "#d9541e")
 TRAINED: dict[str, Any] = {"color": "0.25", "ls": ":", "lw": 1.4, "zorder": 2}

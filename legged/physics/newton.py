@@ -1,0 +1,103 @@
+"""Newton's solvers behind the interface: on a GPU, or on Warp's CPU device."""
+
+import newton
+import torch
+import warp as wp
+from torch import Tensor
+
+from legged.config.schema import SimConfig
+from legged.math import masked_set_
+from legged.physics.base import RandomizedField
+from legged.physics.newton_exchange import NewtonExchange
+from legged.physics.newton_simulation import Simulation
+from legged.physics.scene import build_model
+from legged.physics.warp_physics import WarpPhysics
+from legged.robot import Robot
+from legged.terrain import Terrain
+
+
+class NewtonPhysics(WarpPhysics):
+    """N worlds in one of Newton's solvers (`sim.solver`). The state that the task sees is a copy in its own conventions,
+    made after every step and written back by resets and pushes.
+    """
+
+    _exchange: NewtonExchange
+
+    def __init__(
+        self, robot: Robot, sim: SimConfig, num_envs: int, device: torch.device, terrain: Terrain | None = None
+    ) -> None:
+        """Build the scene on `device` and place all robots at the model's initial state; compiles on first use."""
+        super().__init__(robot, num_envs, sim.dt, device)
+        self.model = build_model(robot, sim, terrain, "none")
+        self.torques = torch.zeros(num_envs, robot.num_dof, device=device)
+        self._qpos = torch.zeros(num_envs, 7 + robot.num_dof, device=device)
+        self._qvel = torch.zeros(num_envs, 6 + robot.num_dof, device=device)
+        self.state = self._allocate_state()
+        # Newton's masks have one place more than there are worlds: for what is in none of them.
+        self._mask = torch.zeros(num_envs + 1, dtype=torch.bool, device=device)
+        self._wp_mask = wp.from_torch(self._mask)
+        with wp.ScopedDevice(self._wp_device):
+            self._simulation = Simulation(robot, sim, num_envs, terrain, self._wp_device)
+            qpos, qvel, torques = (wp.from_torch(tensor) for tensor in (self._qpos, self._qvel, self.torques))
+            self._exchange = NewtonExchange(
+                self._simulation, self.model, robot, self.state, qpos, qvel, torques, self.overflowed
+            )
+            self._exchange.read()
+        if self._wp_device.is_cpu:
+            start = self._qpos.clone()
+            self._advance = self._record_step()
+            self._qpos.copy_(start)
+            self._qvel.zero_()
+            self._mask[:-1].fill_(True)
+            self._simulation.forget(self._wp_mask)
+            self._put()
+        self.refresh()
+
+    def _step(self) -> None:
+        self._exchange.apply_torques()
+        self._simulation.step(self.dt)
+        self._exchange.note_lost_contacts()
+        self._exchange.read()
+
+    def _put(self) -> None:
+        """The task's state of the worlds of `_mask` into Newton's joints and bodies."""
+        self._exchange.put(self._wp_mask)
+        self._simulation.place_bodies(self._wp_mask)
+
+    def write_state(
+        self,
+        mask: Tensor,
+        base_pos: Tensor,
+        base_quat: Tensor,
+        base_lin_vel: Tensor,
+        base_ang_vel: Tensor,
+        dof_pos: Tensor,
+        dof_vel: Tensor,
+    ) -> None:
+        with self._on_device():
+            self._mask[:-1].copy_(mask)
+            self._simulation.forget(self._wp_mask)
+            self._exchange.write(mask, base_pos, base_quat, base_lin_vel, base_ang_vel, dof_pos, dof_vel)
+            self._put()
+
+    def push(self, mask: Tensor, lin_vel_xy: Tensor) -> None:
+        masked_set_(self._qvel[:, :2], mask, self._qvel[:, :2] + lin_vel_xy)
+        with self._on_device():
+            self._mask[:-1].copy_(mask)
+            self._put()
+
+    def randomize(self, field: RandomizedField, values: Tensor) -> None:
+        model, layout, setup = self._simulation.model, self._simulation.layout, self._simulation.setup
+        values = values.to(self.device)
+        if field == "friction":
+            shapes = len(layout.shapes)
+            friction = wp.to_torch(model.shape_material_mu)[: self.num_envs * layout.num_shapes].view(self.num_envs, -1)
+            friction[:, layout.shapes] = (values * setup.friction_factor).unsqueeze(1).expand(-1, shapes)
+            changed = newton.ModelFlags.SHAPE_PROPERTIES
+        else:
+            mass = float(self.model.body(self.robot.file.base).mass[0]) + values
+            wp.to_torch(model.body_mass).view(self.num_envs, -1)[:, layout.base] = mass
+            wp.to_torch(model.body_inv_mass).view(self.num_envs, -1)[:, layout.base] = 1.0 / mass
+            changed = newton.ModelFlags.BODY_INERTIAL_PROPERTIES
+        with self._on_device():
+            self._simulation.solver.notify_model_changed(changed)
