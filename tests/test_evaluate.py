@@ -11,7 +11,7 @@ from helpers import TASK, call, kept_global_state, run_folders, small_config, st
 from legged import make_task
 from legged.config import override
 from legged.rl import play
-from legged.rl.policy import undisturbed
+from legged.rl.policy import TrainedPolicy, undisturbed
 from legged.tools import evaluate
 from legged.tools.evaluate import axis_values
 from legged.tools.velocity_grid import Grid, measure
@@ -218,3 +218,10 @@ def test_play_records_a_short_video_where_something_can_be_drawn(run, capsys, mo
     assert os.path.getsize(tmp_path / "play.mp4") > 1000
     assert not list(tmp_path.glob(".*"))  # nothing half written
     assert "recorded 28 frames" in capsys.readouterr().out  # 1.1 s at 25 frames a second: steps 0, 2, ... 54
+
+
+def test_evaluations_of_a_shipped_policy_do_not_touch_the_package(tmp_path):
+    shipped = TrainedPolicy(small_config(), tmp_path / "resources" / "policies" / TASK / "model.pt")
+    assert shipped.output("evaluate") == Path("logs") / "evaluate" / TASK
+    own = TrainedPolicy(small_config(), tmp_path / "logs" / TASK / "run" / "model_1.pt")
+    assert own.output("evaluate") == tmp_path / "logs" / TASK / "run"

@@ -11,7 +11,7 @@ from helpers import POLICY
 
 from legged.registry import import_tasks, make_task, task_config
 from legged.rl import play, train
-from legged.tools import benchmark, evaluate, plot, show_terrain, warmup
+from legged.tools import benchmark, compare, evaluate, plot, show_terrain, warmup
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -41,6 +41,7 @@ def test_the_example_task_trains_without_touching_the_package(tmp_path, monkeypa
         ("python play.py", play.main),
         ("python -m legged.tools.evaluate", evaluate.main),
         ("python -m legged.tools.benchmark", benchmark.main),
+        ("python -m legged.tools.compare", compare.main),
         ("python -m legged.tools.plot", plot.main),
         ("python -m legged.tools.warmup", warmup.main),
         ("python -m legged.tools.show_terrain", show_terrain.main),
@@ -75,9 +76,11 @@ def test_shipped_policy_follows_commands_in_c_mujoco(tmp_path, capsys):
 
 
 def test_numbers_of_the_results_table_are_those_of_the_shipped_evaluation():
-    for engine, label in (("mujoco_warp", "1, mujoco-warp"), ("mujoco", "1, C MuJoCo")):
-        result = json.loads((POLICY / f"evaluation_{engine}.json").read_text())
-        (row,) = re.findall(rf"\| {label} \|(.*)\n", README)
+    columns = [(seed, *engine) for seed in (1, 2, 3) for engine in (("mujoco_warp", "mujoco-warp"), ("mujoco", "C MuJoCo"))]
+    for seed, engine, label in columns:
+        folder = POLICY if seed == 1 else POLICY / f"seed_{seed}"
+        result = json.loads((folder / f"evaluation_{engine}.json").read_text())
+        (row,) = re.findall(rf"\| {seed}, {label} \|(.*)\n", README)
         lin, ang, gait = result["rmse_lin"], result["rmse_ang"], result["gait"]
         assert f"{lin['mean']:.3f} ({lin['worst']:.3f})" in row
         assert f"{ang['mean']:.3f} ({ang['worst']:.3f})" in row
@@ -99,28 +102,63 @@ def test_shipped_policy_climbs_stairs_in_c_mujoco(tmp_path, monkeypatch):
     assert result["rough"]["falls"] == 0.0
 
 
-def shares(physics: str) -> dict[tuple[str, float], float]:
-    """(type, size) -> success of the shipped evaluation."""
-    types = json.loads((ROUGH / f"evaluation_{physics}.json").read_text())["success"]["types"]
-    return {(name, point["size"]): point["share"] for name, entry in types.items() for point in entry["points"]}
+def seeds(physics: str) -> list[dict]:
+    """The shipped evaluations of the rough task's three seeds."""
+    return [json.loads((ROUGH / seed / f"evaluation_{physics}.json").read_text()) for seed in ("", "seed_2", "seed_3")]
 
 
-def test_numbers_of_the_rough_results_are_those_of_the_shipped_evaluation():
-    rows = {"stairs up, 0.20 m": ("stairs_up", 0.2), "stairs down, 0.20 m": ("stairs_down", 0.2)}
-    rows |= {"obstacles, 0.20 m": ("obstacles", 0.2), "slope up, 25 degrees": ("slope_up", 25.0)}
-    both = [shares(physics) for physics in ("mujoco_warp", "mujoco")]
-    for label, key in rows.items():
-        wanted = " | ".join(f"{100 * found[key]:.0f} %" for found in both)
-        assert f"| {label} | {wanted} |" in README
-    rough = [json.loads((ROUGH / f"evaluation_{p}.json").read_text())["rough"] for p in ("mujoco_warp", "mujoco")]
-    for label, key in (("velocity RMSE", "rmse_lin"), ("yaw rate RMSE", "rmse_ang")):
-        (row,) = re.findall(rf"\| {label}, mean \(worst cell\) [^|]*\|(.*)\n", README)
-        wanted = " | ".join(f"{one[key]['mean']:.3f} ({one[key]['worst']:.3f})" for one in rough)
-        assert wanted in row
-    assert rough[0]["falls"] == rough[1]["falls"] == 0.0
+def of_seeds(values: list[float], decimals: int, unit: str = "") -> str:
+    """As the README writes them: mean (lowest to highest)."""
+    middle = sum(values) / len(values)
+    edges = 0 if unit else decimals
+    return f"{middle:.{decimals}f}{unit} ({min(values):.{edges}f} to {max(values):.{edges}f})"
 
 
-@pytest.mark.parametrize("policy", [POLICY, ROUGH], ids=lambda path: path.name)
+def share(result: dict, terrain: str, size: float) -> float:
+    """Success [%] at a size."""
+    (point,) = [point for point in result["success"]["types"][terrain]["points"] if point["size"] == size]
+    return 100.0 * point["share"]
+
+
+def test_numbers_of_the_rough_results_are_those_of_the_shipped_evaluations():
+    both = [seeds(physics) for physics in ("mujoco_warp", "mujoco")]
+    for label, terrain, size in (
+        ("stairs up, 0.20 m", "stairs_up", 0.2),
+        ("stairs down, 0.20 m", "stairs_down", 0.2),
+        ("obstacles, 0.20 m", "obstacles", 0.2),
+        ("slope up, 22 degrees", "slope_up", 22.0),
+        ("stairs up, 0.25 m", "stairs_up", 0.25),
+        ("stairs down, 0.25 m", "stairs_down", 0.25),
+        ("slope up, 30 degrees", "slope_up", 30.0),
+    ):
+        cells = [of_seeds([share(result, terrain, size) for result in results], 1, " %") for results in both]
+        assert f"| {label} | {' | '.join(cells)} |" in README
+    for key in ("rmse_lin", "rmse_ang"):
+        for part in ("mean", "worst"):
+            cells = [of_seeds([result["rough"][key][part] for result in results], 3) for results in both]
+            assert f"| {' | '.join(cells)} |" in README
+    cells = [of_seeds([100.0 * result["rough"]["falls"] for result in results], 2) for results in both]
+    assert f"| falls [%] | {' | '.join(cells)} |" in README
+
+
+def test_numbers_of_the_blind_policies_are_those_of_the_shipped_evaluations():
+    files = ("anymal_c_blind", "mujoco_warp"), ("anymal_c_blind", "mujoco"), ("anymal_c_proprio", "mujoco_warp")
+    results = [json.loads((ROUGH.parent / task / f"evaluation_{engine}.json").read_text()) for task, engine in files]
+    for label, terrain, size in (
+        ("stairs up, 0.10 m", "stairs_up", 0.1),
+        ("stairs up, 0.20 m", "stairs_up", 0.2),
+        ("stairs down, 0.20 m", "stairs_down", 0.2),
+        ("obstacles, 0.20 m", "obstacles", 0.2),
+        ("slope up, 22 degrees", "slope_up", 22.0),
+    ):
+        cells = [f"{share(result, terrain, size):.0f} %" for result in results]
+        assert f"| {label} | {' | '.join(cells)} |" in README
+    errors = [result["rough"] for result in results]
+    cells = [f"{error['rmse_lin']['mean']:.3f}, {error['rmse_ang']['mean']:.3f}" for error in errors]
+    assert f"RMSE on rough ground | {' | '.join(cells)} |" in README
+
+
+@pytest.mark.parametrize("policy", sorted(ROUGH.parent.iterdir()), ids=lambda path: path.name)
 def test_shipped_checkpoint_is_finite_and_of_its_task(policy):
     saved = torch.load(policy / "model.pt", weights_only=False, map_location="cpu")
     assert saved["infos"]["task"] == policy.name

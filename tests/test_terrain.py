@@ -250,6 +250,10 @@ def test_corners_are_listed_with_x_first():
         ({"spawn_range": 4.0}, ["spawn_range", "4 m", "outside"]),
         ({"max_init_terrain_level": 10}, ["max_init_terrain_level", "num_rows = 10", "got 10"]),
         ({"border_size": 1.9}, ["border_size", "at least 2", "1.9"]),
+        (
+            {"horizontal_scale": 0.02},
+            ["horizontal_scale", "86 x 166 m in cells of 0.02 m are 35,690,000", "16,777,216"],
+        ),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
 )

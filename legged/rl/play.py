@@ -76,7 +76,7 @@ def _main(argv: list[str] | None) -> int:
     task, runner = restore(policy, changes, device, graph=not args.no_graph, terrain=terrain)
     print(f"{policy.cfg.task}: {relative(policy.checkpoint)}")
 
-    folder = args.out or default_output(policy.folder)
+    folder = args.out or policy.output("play")
     differences = export(runner, folder / "exported")
     for name, difference in differences.items():
         print(f"exported {relative(folder / 'exported' / name)}, largest difference to the policy {difference:.1e}")
@@ -88,11 +88,6 @@ def _main(argv: list[str] | None) -> int:
     result = walk_out(task, act, playground, film, args.gif) if playground else record(task, act, film, args.gif)
     Console(width=90).print(result)
     return 0
-
-
-def default_output(folder: Path) -> Path:
-    """The run folder; for the shipped policy, which may lie where nothing can be written, logs/play/<task>."""
-    return Path("logs") / "play" / folder.name if folder.parent.name == "policies" else folder
 
 
 @torch.inference_mode()

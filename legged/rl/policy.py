@@ -31,6 +31,12 @@ class TrainedPolicy:
         """The run folder, or the shipped policy's."""
         return self.checkpoint.parent
 
+    def output(self, what: str) -> Path:
+        """Where files about it go by default: the run folder; logs/<what>/<task> for a policy that is shipped, whose folder
+        belongs to the package and may not be writable.
+        """
+        return Path("logs") / what / self.folder.name if self.folder.parent.name == "policies" else self.folder
+
 
 def find_policy(args: argparse.Namespace) -> TrainedPolicy:
     """What --task, --load_run and --checkpoint name: the newest run of the task, else the policy that is shipped.

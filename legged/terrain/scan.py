@@ -27,25 +27,25 @@ class HeightScan:
         """(N,) height of the ground under each base [m]."""
         if terrain is not None:
             ground = terrain.height_map
-            self._cell = ground.cell
-            self._origin = torch.tensor(ground.origin, dtype=torch.float32, device=device)
             lowest = torch.tensor(ground.scan_map(), device=device)
-            self._columns = lowest.shape[1]
-            self._last = torch.tensor([lowest.shape[0] - 1, lowest.shape[1] - 1], device=device)
+            self._cell, self._columns = ground.cell, lowest.shape[1]
+            self._origin = torch.tensor(ground.origin, dtype=torch.float32, device=device)
+            self._last = [float(size - 1) for size in lowest.shape]
             self._map = lowest.flatten()
+            # In cells, and with the base's own place as the last point, so that one lookup finds all.
+            self._x, self._y = (torch.cat([self.points, torch.zeros(1, 2, device=device)]) / ground.cell).T.contiguous()
 
     def update(self, base_pos: Tensor, base_quat: Tensor) -> None:
-        """Look up the heights for bases at (N, 3), (N, 4) in the world."""
+        """Look up the heights for bases at (N, 3), (N, 4) in the world; outside the map, those at its border."""
         if self._on_plane:
             return
-        yaw = yaw_of(base_quat).unsqueeze(1)
+        yaw = yaw_of(base_quat).nan_to_num().unsqueeze(1)
         cos, sin = torch.cos(yaw), torch.sin(yaw)
-        x, y = self.points.unbind(dim=1)
-        self.heights.copy_(self._lookup(base_pos[:, :1] + cos * x - sin * y, base_pos[:, 1:2] + sin * x + cos * y))
-        self.ground.copy_(self._lookup(base_pos[:, 0], base_pos[:, 1]))
-
-    def _lookup(self, x: Tensor, y: Tensor) -> Tensor:
-        """Heights at world points of any shape; outside the map, those at its border."""
-        row = ((x - self._origin[0]) / self._cell).nan_to_num().floor().long().clamp(min=0).minimum(self._last[0])
-        column = ((y - self._origin[1]) / self._cell).nan_to_num().floor().long().clamp(min=0).minimum(self._last[1])
-        return self._map[row * self._columns + column]
+        row, column = ((base_pos[:, :2] - self._origin) / self._cell).nan_to_num().split(1, dim=1)
+        rows = row.addcmul(cos, self._x).addcmul_(sin, self._y, value=-1.0).clamp_(0.0, self._last[0]).floor_()
+        columns = column.addcmul(sin, self._x).addcmul_(cos, self._y).clamp_(0.0, self._last[1]).floor_()
+        # Numbered in float32, which is exact: `check_terrain` admits no larger map.
+        cells = columns.add_(rows, alpha=self._columns).int()
+        found = self._map[cells]
+        self.heights.copy_(found[:, :-1])
+        self.ground.copy_(found[:, -1])

@@ -16,6 +16,8 @@ SPAWN_SQUARE = 2.0
 """Robots start at the height of the highest point in a square of this side in the middle of their tile [m]."""
 EDGE = 1.0
 """Robots closer than this to the end of the map have left it [m]."""
+MOST_CELLS = 2**24
+"""As many as float32 can number, which the height scan does."""
 
 
 @dataclass(frozen=True)
@@ -159,3 +161,11 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
         )
     if cfg.border_size < 2.0 * EDGE:
         raise ConfigError(f"{where('border_size')}: must be at least {2.0 * EDGE:g}, got {cfg.border_size:g}")
+    tiles = (cfg.num_rows * cfg.terrain_length, cfg.num_cols * cfg.terrain_width)
+    x, y = (size + 2.0 * cfg.border_size for size in tiles)
+    cells = x * y / cfg.horizontal_scale**2
+    if cells > MOST_CELLS:
+        raise ConfigError(
+            f"{where('horizontal_scale')}: {x:g} x {y:g} m in cells of {cfg.horizontal_scale:g} m are"
+            f" {cells:,.0f} cells, more than {MOST_CELLS:,}; ask for larger cells or fewer tiles"
+        )

@@ -53,7 +53,11 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("--types", help="terrain types to cross, e.g. stairs_up,pit; those of the training by default")
     parser.add_argument("--full", action="store_true", help="all sizes of a type, 256 robots each")
     parser.add_argument("--robots-per-point", type=int, help="robots for each size of a type; 32, or 256 with --full")
-    parser.add_argument("--out", type=Path, help="folder for JSON and PNG; beside the checkpoint by default")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        help="folder for JSON and PNG; by default beside the checkpoint, or logs/evaluate for a shipped one",
+    )
     args = parser.parse_intermixed_args(argv)
     import_and_check(args)
     if args.robots < 1:
@@ -76,7 +80,7 @@ def _main(argv: list[str] | None) -> int:
     policy = find_policy(args)
     if everywhere:
         asked = [one for one in overrides(args) if one[0] != "train.runner.experiment_name"]
-        return cross(policy, grid, asked, device, not args.no_graph, args.out or policy.folder)
+        return cross(policy, grid, asked, device, not args.no_graph, args.out or policy.output("evaluate"))
     types = chosen_types(policy.cfg, args.types)
     # The engine is that of the device, not that of the training.
     asked = [("sim.physics", "auto"), *(one for one in overrides(args) if one[0] != "train.runner.experiment_name")]
@@ -100,7 +104,7 @@ def _main(argv: list[str] | None) -> int:
         **({"rough": {"bumps": 0.05, **figures, "contact_overflows": lost}} if rough else figures),
         **({} if success is None else {"success": success}),
     }
-    folder = args.out or policy.folder
+    folder = args.out or policy.output("evaluate")
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"evaluation_{engine}.json"
     write_text(path, json.dumps(result, indent=1, allow_nan=False))
