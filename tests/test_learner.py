@@ -70,8 +70,9 @@ def task_and_runner(kind=Runner, *overrides, num_envs=12):
 
 
 def test_a_rollout_is_that_of_rsl_rl():
-    """Actions, values, rewards with bootstrapped time-outs, returns: bit by bit, with noise, commands and resets drawn
-    alike; the observation stored at t is the one that was acted on.
+    """Observations, actions and ends of episodes bit by bit, with noise, commands and resets drawn alike; values, rewards
+    with bootstrapped time-outs and returns to float tolerance, because all steps are judged at once. The observation
+    stored at t is the one that was acted on.
     """
     first, runner = task_and_runner()
     stock = runner.alg
@@ -93,8 +94,10 @@ def test_a_rollout_is_that_of_rsl_rl():
     rollout.collect()
     ours = captured.alg.storage
     assert stock.storage.dones.sum() > 3
-    for name in ("actions", "values", "rewards", "dones", "returns", "advantages"):
+    for name in ("actions", "dones"):
         torch.testing.assert_close(getattr(ours, name), getattr(stock.storage, name), rtol=0, atol=0, msg=name)
+    for name in ("values", "rewards", "returns", "advantages"):
+        torch.testing.assert_close(getattr(ours, name), getattr(stock.storage, name), rtol=1e-5, atol=1e-5, msg=name)
     for name in ("actor", "critic"):
         torch.testing.assert_close(ours.observations[name], stock.storage.observations[name], rtol=0, atol=0)
     torch.testing.assert_close(ours.actions_log_prob, stock.storage.actions_log_prob, rtol=1e-5, atol=1e-5)

@@ -285,5 +285,5 @@ class SharedGradients:
 
 
 def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    """Log-density (n,) of `x` (n, D) under a Gaussian of mean (n, D) and standard deviation (D,)."""
-    return -0.5 * ((x - mean) / std).square().sum(dim=1) - std.log().sum() - x.shape[1] * HALF_LOG_2PI
+    """Log-density (...,) of `x` (..., D) under a Gaussian of mean (..., D) and standard deviation (D,)."""
+    return -0.5 * ((x - mean) / std).square().sum(dim=-1) - std.log().sum() - x.shape[-1] * HALF_LOG_2PI

@@ -1,7 +1,10 @@
 """A rollout without a host read: policy, sampling, task and returns, written straight into rsl-rl's storage."""
 
+from collections.abc import Mapping
+
 import torch
 from rsl_rl.models import MLPModel
+from tensordict import TensorDict
 from torch import Tensor
 
 from legged.envs import BaseTask
@@ -17,6 +20,9 @@ class Rollout:
         st = alg.storage
         if st.distribution_params is None:
             st.distribution_params = (torch.zeros_like(st.actions), torch.zeros_like(st.actions))
+        self._observations = {name: group.buffer for name, group in env.observation_groups.items()}
+        self._cut_off = torch.zeros_like(st.rewards)
+        """(T, N, 1) whether the step ended its episode by time."""
         self._return = torch.zeros(env.num_envs, device=env.device)
         self._length = torch.zeros(env.num_envs, device=env.device)
         self.ended = torch.zeros(3, device=env.device)
@@ -34,28 +40,34 @@ class Rollout:
         self.ended.zero_()
         for t in range(st.num_transitions_per_env):
             self._step(t)
-        self._returns(self._values())
+        self._judge()
+        self._returns()
 
     def _step(self, t: int) -> None:
         env, alg, st = self.env, self.alg, self.alg.storage
-        for name, group in env.observation_groups.items():
-            st.observations[name][t].copy_(group.buffer)
-        mean, std = alg.actor.mlp(self._input(alg.actor)), alg.action_std()
-        actions = torch.addcmul(mean, std, torch.randn_like(mean))
-        values = self._values()
+        for name, now in self._observations.items():
+            st.observations[name][t].copy_(now)
+        mean = alg.actor.mlp(self._input(alg.actor, self._observations))
+        actions = torch.addcmul(mean, alg.action_std(), torch.randn_like(mean))
         st.actions[t].copy_(actions)
-        st.values[t].copy_(values)
-        st.actions_log_prob[t].copy_(gaussian_log_prob(actions, mean, std).unsqueeze(1))
         st.distribution_params[0][t].copy_(mean)
-        st.distribution_params[1][t].copy_(std.expand_as(mean))
 
         env.step_in_place(actions.to(env.device))
 
-        # The value of the state that was acted on stands for the one that a time-out cut off, as in rsl-rl.
-        cut_off = env.time_out_buf.unsqueeze(1) * values
-        st.rewards[t].copy_(env.rew_buf.unsqueeze(1) + alg.gamma * cut_off)
+        st.rewards[t].copy_(env.rew_buf.unsqueeze(1))
         st.dones[t].copy_(env.reset_buf.unsqueeze(1))
+        self._cut_off[t].copy_(env.time_out_buf.unsqueeze(1))
         self._count()
+
+    def _judge(self) -> None:
+        """What acting did not need, for all steps at once: log-probabilities, values, and what they add to rewards."""
+        alg, st = self.alg, self.alg.storage
+        std = alg.action_std()
+        st.distribution_params[1].copy_(std.expand_as(st.actions))
+        st.actions_log_prob.copy_(gaussian_log_prob(st.actions, st.distribution_params[0], std).unsqueeze(-1))
+        st.values.copy_(alg.critic.mlp(self._input(alg.critic, st.observations)))
+        # The value of the state that was acted on stands for the one that a time-out cut off, as in rsl-rl.
+        st.rewards.add_(alg.gamma * self._cut_off * st.values)
 
     def _count(self) -> None:
         """Returns and lengths of episodes, for the log."""
@@ -68,20 +80,16 @@ class Rollout:
         self._return.masked_fill_(done, 0.0)
         self._length.masked_fill_(done, 0.0)
 
-    def _input(self, model: MLPModel) -> Tensor:
-        """What a network is given now: its observation groups side by side, normalised."""
-        groups = self.env.observation_groups
-        return model.obs_normalizer(torch.cat([groups[name].buffer for name in model.obs_groups], dim=1))
+    @staticmethod
+    def _input(model: MLPModel, observations: Mapping[str, Tensor] | TensorDict) -> Tensor:
+        """What a network is given of `observations` by group (..., width): its groups side by side, normalised."""
+        return model.obs_normalizer(torch.cat([observations[name] for name in model.obs_groups], dim=-1))
 
-    def _values(self) -> Tensor:
-        """(N, 1) value of the state now."""
-        return self.alg.critic.mlp(self._input(self.alg.critic))
-
-    def _returns(self, last_values: Tensor) -> None:
+    def _returns(self) -> None:
         """Generalised advantage estimation (Schulman et al., arXiv 1506.02438), backwards over the storage."""
         alg, st = self.alg, self.alg.storage
-        advantage = torch.zeros_like(last_values)
-        following = last_values
+        following = alg.critic.mlp(self._input(alg.critic, self._observations))
+        advantage = torch.zeros_like(following)
         for t in reversed(range(st.num_transitions_per_env)):
             alive = 1.0 - st.dones[t].float()
             delta = st.rewards[t] + alive * alg.gamma * following - st.values[t]

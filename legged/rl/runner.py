@@ -125,6 +125,7 @@ class Runner(OnPolicyRunner):
     ) -> None:
         """`log_dir` is where checkpoints and TensorBoard files go; without one nothing is written."""
         config = runner_config(env.cfg, self.ALGORITHM)
+        torch.backends.cuda.matmul.allow_tf32 = env.cfg.train.runner.matmul == "tf32"  # of this process
         if env.cfg.train.algorithm.symmetry and isinstance(env, LeggedRobot):
             env.mirror_images = MirrorImages(env)  # type: ignore[attr-defined]  # where `augment` finds them
         with contextlib.redirect_stdout(io.StringIO()):

@@ -31,6 +31,7 @@ from legged.rl.captured import CapturedRunner
 from legged.rl.display import Progress
 from legged.rl.runner import Runner
 from legged.rl.runs import write_text
+from legged.tools.kernel_times import kernel_times, table
 from legged.tools.scale import scale
 
 GROUNDS: dict[str, list[tuple[str, Any]]] = {
@@ -41,6 +42,8 @@ GROUNDS: dict[str, list[tuple[str, Any]]] = {
 }
 """What --grounds compares."""
 
+KERNEL_STEPS = 20
+"""Control steps that --kernels looks at."""
 
 LOOPS: dict[str, type[Runner]] = {"stock": Runner, "captured": CapturedRunner}
 """Training loops that are timed."""
@@ -60,6 +63,7 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("--grounds", action="store_true", help="compare plane, our terrain collider and the general one")
     parser.add_argument("--scale", help="numbers of robots to compare, e.g. 1024,4096,16384; runs one training loop")
     parser.add_argument("--runner", choices=list(LOOPS), help="time this training loop only (train.runner.loop)")
+    parser.add_argument("--kernels", type=int, metavar="COUNT", help="also list this many kernels that take longest (GPU)")
     parser.add_argument("--json", type=Path, help="also write the result to this file")
     args = parser.parse_intermixed_args(argv)
     import_and_check(args)
@@ -67,6 +71,8 @@ def _main(argv: list[str] | None) -> int:
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
     if device.type == "cpu":
         torch.set_num_threads(1)
+    if args.kernels is not None and device.type != "cuda":
+        raise ConfigError(f"--kernels: needs a GPU, and the task is on {device}")
     if args.scale is not None:
         return scale(args, cfg, device)
     if args.grounds and resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics")) != "mujoco_warp":
@@ -81,6 +87,10 @@ def _main(argv: list[str] | None) -> int:
         _synchronize(device)
         build_s = time.perf_counter() - start
         result = {**measure(task, args.steps, args.repeats), "build_s": build_s}
+        if args.kernels is not None:
+            times = kernel_times(task, KERNEL_STEPS)
+            result["kernels"] = [vars(time) for time in times]
+            print(table(times, args.kernels), flush=True)
         if not args.grounds and count > 0:
             loops = {args.runner: LOOPS[args.runner]} if args.runner else LOOPS
             result["iterations"] = {loop: time_iterations(kind, task, count) for loop, kind in loops.items()}
