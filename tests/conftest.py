@@ -54,8 +54,8 @@ def backend(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-@pytest.fixture(params=["mujoco", "mujoco_warp", "mujoco_warp, fused solver"])
+@pytest.fixture(params=["mujoco", "mujoco_warp", "mujoco_warp, rounds"])
 def physics(request: pytest.FixtureRequest, make_physics: Callable[..., Physics]) -> Physics:
     """Six worlds with the shipped solver options, in whatever state the last test left them."""
     name, _, solver = request.param.partition(", ")
-    return make_physics(name, constraint_solver="fused") if solver else make_physics(name)
+    return make_physics(name, constraint_solver=solver) if solver else make_physics(name)

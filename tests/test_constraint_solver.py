@@ -105,7 +105,7 @@ def test_without_constraints_the_acceleration_is_that_of_a_free_body():
 @pytest.mark.parametrize("start", [random_states, heaps])
 def test_robots_are_pushed_as_by_mujoco_warps_own_solver(robot, make_physics, start):
     """Ten steps from the same states: the two solvers stop at their tolerance, on different sides of the minimum."""
-    engines = [make_physics("mujoco_warp", constraint_solver=solver) for solver in ("rounds", "fused")]
+    engines = [make_physics("mujoco_warp", constraint_solver=solver) for solver in ("rounds", "auto")]
     states = start(robot, 6, seed=4)
     for engine in engines:
         states.write(engine)
@@ -117,7 +117,7 @@ def test_robots_are_pushed_as_by_mujoco_warps_own_solver(robot, make_physics, st
 
 
 def test_a_world_that_is_no_number_ends_and_harms_no_neighbour(robot, make_physics):
-    engine = make_physics("mujoco_warp", constraint_solver="fused")
+    engine = make_physics("mujoco_warp")
     states = random_states(robot, 6, seed=5)
     states.write(engine)
     roll(engine, states.dof_pos, 4)

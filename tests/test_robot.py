@@ -72,7 +72,10 @@ def test_body_frames_are_parallel_at_zero_angles(model):
 
 
 def test_drawn_shapes_neither_collide_nor_weigh(model):
-    """The base's mass is the data sheet's alone, and no geom without a name can touch anything."""
+    """The base's mass is the data sheet's alone, no geom without a name can touch anything, and none is simulated."""
+    simulated, model = model, mujoco.MjModel.from_xml_path(str(load_robot("anymal_c").model_path))
+    assert all(simulated.geom(i).name for i in range(simulated.ngeom))
+    np.testing.assert_array_equal(simulated.body_mass, model.body_mass)
     drawn = [i for i in range(model.ngeom) if model.geom(i).name == ""]
     assert len(drawn) > 20
     assert (model.geom_contype[drawn] == 0).all()

@@ -58,9 +58,10 @@ class SimConfig:
     """Cap of Newton solver iterations per physics step."""
     ls_iterations: int = field(default=20, metadata=AT_LEAST_1)
     """Cap of line-search iterations per solver iteration."""
-    constraint_solver: Literal["rounds", "fused"] = "rounds"
-    """How mujoco_warp solves for contact forces: `rounds`, its own Newton solver, a few launches a round until the last world
-    has converged; `fused`, the same iteration as one launch in which every world ends by itself (pyramidal cones only)."""
+    constraint_solver: Literal["auto", "fused", "rounds"] = "auto"
+    """How mujoco_warp solves for contact forces: `rounds`, its own Newton solver, ten launches a round until the last world
+    has converged; `fused`, the same iteration as one launch in which every world ends by itself; `auto`, `fused` for a model
+    that it knows (pyramidal cones, 32 degrees of freedom)."""
     nconmax: int = field(default=24, metadata=AT_LEAST_1)
     """Contacts (and candidate pairs) allocated per robot in mujoco_warp and newton, in a pool all robots share."""
     njmax: int = field(default=96, metadata=AT_LEAST_1)

@@ -12,20 +12,27 @@ from typing import Any
 import mujoco
 import warp as wp
 
-from legged.config import ConfigError
-
 LANES = 32
 """Threads that solve one world on a GPU; on the CPU it is one."""
 SHARED_BYTES = 48 * 1024
 """Memory that a block of threads may share."""
 
-# Written for a warp: loops over rows or degrees of freedom are dealt out to the lanes, `meet` separates phases that write
-# what others read, `sum` adds up over the lanes. With a single lane the same text is the serial solver.
+# Written for a warp. On a GPU each lane holds what belongs to one degree of freedom (its row of a matrix too) and to every
+# 32nd constraint row, in registers; others get it by FROM, which all lanes must reach together, so outside EACH. On the CPU
+# one thread holds everything and the same text is the serial solver. What all lanes read often is in shared memory; `meet`
+# separates phases that write it from those that read.
 SOURCE = """
+    const int NV = %(nv)d, ROWS = %(rows)d, STEP = %(step)d;
 #if defined(__CUDA_ARCH__)
-    #define LEGGED_SHARED __shared__
-    const int lanes = 32;
-    const int lane = threadIdx.x & 31;
+    #define LEGGED_SHARED __shared__ alignas(16)
+    #define EACH(i) if (const int i = threadIdx.x & 31; i < NV)
+    #define EACH_FROM(i, first) EACH(i)
+    #define ONLY(i, wanted) if (const int i = threadIdx.x & 31; i == (wanted))
+    #define EACH_ROW(r, q) _Pragma("unroll") for (int q = 0, r = threadIdx.x & 31; q < HELD; ++q, r += 32) if (r < rows)
+    #define OF(values, i) values[0]
+    #define FROM(values, i) __shfl_sync(0xffffffffu, values[0], i)
+    #define ENTRY_FROM(matrix, i, j) __shfl_sync(0xffffffffu, matrix[0][j], i)
+    const int DOFS = 1, HELD = (ROWS + 31) / 32, lanes = 32, lane = threadIdx.x & 31;
     auto meet = []() { __syncwarp(); };
     auto sum = [](float x) {
         for (int apart = 16; apart > 0; apart >>= 1) x += __shfl_xor_sync(0xffffffffu, x, apart);
@@ -33,16 +40,25 @@ SOURCE = """
     };
 #else
     #define LEGGED_SHARED
-    const int lanes = 1;
-    const int lane = 0;
+    #define EACH(i) for (int i = 0; i < NV; ++i)
+    #define EACH_FROM(i, first) for (int i = first; i < NV; ++i)
+    #define ONLY(i, wanted) if (const int i = (wanted); true)
+    #define EACH_ROW(r, q) for (int r = 0, q = 0; r < rows; ++r, ++q)
+    #define OF(values, i) values[i]
+    #define FROM(values, i) values[i]
+    #define ENTRY_FROM(matrix, i, j) matrix[i][j]
+    const int DOFS = NV, HELD = ROWS, lanes = 1, lane = 0;
     auto meet = []() {};
     auto sum = [](float x) { return x; };
 #endif
     auto most = [](float p, float q) { return p > q ? p : q; };
-    const int NV = %(nv)d, ROWS = %(rows)d, STEP = %(step)d;  // an odd row length spreads columns over all banks
-    LEGGED_SHARED float J[ROWS * STEP], D[ROWS], x[ROWS], jv[ROWS], loss[ROWS], force[ROWS], sides[ROWS];
-    LEGGED_SHARED float M[NV * STEP], H[NV * STEP];
-    LEGGED_SHARED float a[NV], Ma[NV], Ms[NV], smooth[NV], grad[NV], s[NV];
+    LEGGED_SHARED float J[ROWS * STEP];
+    LEGGED_SHARED float M[NV * STEP];
+    LEGGED_SHARED float shown[STEP];  // a vector over degrees of freedom, for those who hold rows
+    LEGGED_SHARED float force[ROWS], curvature[ROWS];
+    float D[HELD], loss[HELD], x[HELD], jv[HELD], sides[HELD];  // of constraint rows
+    float a[DOFS], Ma[DOFS], Ms[DOFS], smooth[DOFS], grad[DOFS], s[DOFS], inverse[DOFS], column_of_L[DOFS];
+    float H[DOFS][NV];
     const float TINY = 1e-15f;
 
     const int ne = equalities.data[world], nf = ne + frictions.data[world];
@@ -50,33 +66,34 @@ SOURCE = """
     const int width = jacobian.shape[2];  // padded
 
     // Derivative of a row's cost at x. `side` tells the pieces of its cost apart: the curvature where it is quadratic.
-    auto pull = [&](int r, float at, float& side) {
-        side = D[r];
+    auto pull = [&](int r, int q, float at, float& side) {
+        side = D[q];
         if (r >= nf && at >= 0.0f) { side = 0.0f; return 0.0f; }
         if (r >= ne && r < nf) {
-            if (D[r] * at > loss[r]) { side = -1.0f; return loss[r]; }
-            if (D[r] * at < -loss[r]) { side = -2.0f; return -loss[r]; }
+            if (D[q] * at > loss[q]) { side = -1.0f; return loss[q]; }
+            if (D[q] * at < -loss[q]) { side = -2.0f; return -loss[q]; }
         }
-        return D[r] * at;
+        return D[q] * at;
     };
 
     meet();  // of the world before
     for (int k = lane; k < NV * STEP; k += lanes) M[k] = 0.0f;
     for (int k = lane; k < rows * NV; k += lanes)
         J[(k / NV) * STEP + k %% NV] = jacobian.data[((long long)world * jacobian.shape[1] + k / NV) * width + k %% NV];
-    for (int r = lane; r < rows; r += lanes) {
+    EACH_ROW(r, q) {
         const int at = world * stiffness.shape[1] + r;
-        D[r] = stiffness.data[at];
-        loss[r] = frictionloss.data[at];
-        sides[r] = -3.0f;
+        D[q] = stiffness.data[at];
+        loss[q] = frictionloss.data[at];
+        sides[q] = -3.0f;
     }
-    for (int i = lane; i < NV; i += lanes) {
-        a[i] = warmstart.data[world * warmstart.shape[1] + i];
-        smooth[i] = qfrc_smooth.data[world * qfrc_smooth.shape[1] + i];
+    EACH(i) {
+        OF(a, i) = warmstart.data[world * warmstart.shape[1] + i];
+        OF(smooth, i) = qfrc_smooth.data[world * qfrc_smooth.shape[1] + i];
+        shown[i] = OF(a, i);
     }
     meet();
     float trace = 0.0f;
-    for (int i = lane; i < NV; i += lanes) {
+    EACH(i) {
         const int from = row_start.data[i], count = row_count.data[i];
         for (int k = from; k < from + count; ++k) {
             const int j = column.data[k];
@@ -88,104 +105,118 @@ SOURCE = """
     }
     const float scale = 1.0f / most(TINY, sum(trace));
     meet();
-    for (int i = lane; i < NV; i += lanes) {
+    EACH(i) {
         float total = 0.0f;
-        for (int j = 0; j < NV; ++j) total += M[i * STEP + j] * a[j];
-        Ma[i] = total;
+        #pragma unroll
+        for (int j = 0; j < NV; ++j) total += M[i * STEP + j] * shown[j];
+        OF(Ma, i) = total;
     }
-    for (int r = lane; r < rows; r += lanes) {
+    EACH_ROW(r, q) {
         float total = -reference.data[world * reference.shape[1] + r];
-        for (int j = 0; j < NV; ++j) total += J[r * STEP + j] * a[j];
-        x[r] = total;
+        #pragma unroll
+        for (int j = 0; j < NV; ++j) total += J[r * STEP + j] * shown[j];
+        x[q] = total;
     }
 
     int round = 0;
     while (true) {
         // Forces, the rows that changed sides, and the gradient.
         float changed = 0.0f;
-        for (int r = lane; r < rows; r += lanes) {
+        EACH_ROW(r, q) {
             float side;
-            force[r] = -pull(r, x[r], side);
-            if (side != sides[r]) changed += 1.0f;
-            sides[r] = side;
+            force[r] = -pull(r, q, x[q], side);
+            curvature[r] = most(side, 0.0f);
+            if (side != sides[q]) changed += 1.0f;
+            sides[q] = side;
         }
         changed = sum(changed);
         meet();
         float squares = 0.0f;
-        for (int i = lane; i < NV; i += lanes) {
+        EACH(i) {
             float pushed = 0.0f;
+            #pragma unroll 4
             for (int r = 0; r < rows; ++r) pushed += J[r * STEP + i] * force[r];
             qfrc_constraint.data[world * qfrc_constraint.shape[1] + i] = pushed;
-            grad[i] = Ma[i] - smooth[i] - pushed;
-            squares += grad[i] * grad[i];
+            OF(grad, i) = OF(Ma, i) - OF(smooth, i) - pushed;
+            squares += OF(grad, i) * OF(grad, i);
         }
         squares = sum(squares);
         if (round == most_rounds || scale * sqrtf(squares) < tolerance || (round > 0 && changed == 0.0f)) break;
 
-        // Hessian M + J^T diag(curvature) J, its Cholesky factor (lower), and the step s = -H^-1 grad.
-        for (int k = lane; k < NV * (NV + 1) / 2; k += lanes) {
-            int i = (int)((sqrtf(8.0f * k + 1.0f) - 1.0f) * 0.5f);
-            while ((i + 1) * (i + 2) / 2 <= k) ++i;
-            while (i * (i + 1) / 2 > k) --i;
-            const int j = k - i * (i + 1) / 2;
-            float total = M[i * STEP + j];
-            for (int r = 0; r < rows; ++r) total += most(sides[r], 0.0f) * J[r * STEP + i] * J[r * STEP + j];
-            H[i * STEP + j] = total;
+        // Hessian M + J^T diag(curvature) J.
+        EACH(i) {
+            #pragma unroll
+            for (int j = 0; j < NV; ++j) OF(H, i)[j] = M[i * STEP + j];
         }
-        meet();
+        for (int r = 0; r < rows; ++r) {
+            if (curvature[r] == 0.0f) continue;
+            EACH(i) {
+                const float part = curvature[r] * J[r * STEP + i];
+                #pragma unroll
+                for (int j = 0; j < NV; ++j) OF(H, i)[j] += part * J[r * STEP + j];
+            }
+        }
+        // H = L diag(d) L^T, with L below the diagonal, L^T above it, and 1 / d apart.
+        #pragma unroll
         for (int k = 0; k < NV; ++k) {
-            const float root = sqrtf(most(H[k * STEP + k], TINY));
-            meet();
-            for (int i = k + lane; i < NV; i += lanes) H[i * STEP + k] = i == k ? root : H[i * STEP + k] / root;
-            meet();
-            for (int i = k + 1 + lane; i < NV; i += lanes)
-                for (int j = k + 1; j <= i; ++j) H[i * STEP + j] -= H[i * STEP + k] * H[j * STEP + k];
-            meet();
+            const float over = 1.0f / most(ENTRY_FROM(H, k, k), TINY);
+            EACH_FROM(i, k) OF(column_of_L, i) = i > k ? OF(H, i)[k] * over : 0.0f;
+            #pragma unroll
+            for (int j = k + 1; j < NV; ++j) {
+                const float below = ENTRY_FROM(H, j, k);
+                EACH_FROM(i, j) OF(H, i)[j] -= OF(column_of_L, i) * below;
+                ONLY(i, k) OF(H, i)[j] = below * over;
+            }
+            EACH_FROM(i, k + 1) OF(H, i)[k] = i > k ? OF(column_of_L, i) : OF(H, i)[k];
+            ONLY(i, k) OF(inverse, i) = over;
         }
-        for (int i = lane; i < NV; i += lanes) s[i] = -grad[i];
+        // The step s = -H^-1 grad.
+        EACH(i) OF(s, i) = -OF(grad, i);
+        #pragma unroll
+        for (int k = 0; k < NV - 1; ++k) {
+            const float known = FROM(s, k);
+            EACH_FROM(i, k + 1) if (i > k) OF(s, i) -= OF(H, i)[k] * known;
+        }
+        EACH(i) OF(s, i) *= OF(inverse, i);
+        #pragma unroll
+        for (int k = NV - 1; k > 0; --k) {
+            const float known = FROM(s, k);
+            EACH(i) if (i < k) OF(s, i) -= OF(H, i)[k] * known;
+        }
+        EACH(i) shown[i] = OF(s, i);
         meet();
-        for (int k = 0; k < NV; ++k) {
-            const float solved = s[k] / H[k * STEP + k];
-            meet();
-            for (int i = k + lane; i < NV; i += lanes) s[i] = i == k ? solved : s[i] - H[i * STEP + k] * solved;
-            meet();
-        }
-        for (int k = NV - 1; k >= 0; --k) {
-            const float solved = s[k] / H[k * STEP + k];
-            meet();
-            for (int i = lane; i <= k; i += lanes) s[i] = i == k ? solved : s[i] - H[k * STEP + i] * solved;
-            meet();
-        }
 
         // Along the step: derivative slope + alpha * bend of the inertial part, and of every row.
         float slope = 0.0f, bend = 0.0f, length = 0.0f, decrement = 0.0f;
-        for (int i = lane; i < NV; i += lanes) {
+        EACH(i) {
             float total = 0.0f;
-            for (int j = 0; j < NV; ++j) total += M[i * STEP + j] * s[j];
-            Ms[i] = total;
-            slope += s[i] * (Ma[i] - smooth[i]);
-            bend += s[i] * total;
-            length += s[i] * s[i];
-            decrement -= s[i] * grad[i];
+            #pragma unroll
+            for (int j = 0; j < NV; ++j) total += M[i * STEP + j] * shown[j];
+            OF(Ms, i) = total;
+            slope += OF(s, i) * (OF(Ma, i) - OF(smooth, i));
+            bend += OF(s, i) * total;
+            length += OF(s, i) * OF(s, i);
+            decrement -= OF(s, i) * OF(grad, i);
         }
         slope = sum(slope);
         bend = sum(bend);
         length = sum(length);
         decrement = sum(decrement);
         if (!(scale * 0.5f * decrement >= tolerance)) break;  // nothing to gain; also where something is not a number
-        for (int r = lane; r < rows; r += lanes) {
+        EACH_ROW(r, q) {
             float total = 0.0f;
-            for (int j = 0; j < NV; ++j) total += J[r * STEP + j] * s[j];
-            jv[r] = total;
+            #pragma unroll
+            for (int j = 0; j < NV; ++j) total += J[r * STEP + j] * shown[j];
+            jv[q] = total;
         }
         const float flat = tolerance * ls_tolerance * sqrtf(length) / scale;
         float alpha = 1.0f, low = 0.0f, high = -1.0f;
         for (int k = 0; k < most_searches; ++k) {
             float first = 0.0f, second = 0.0f;
-            for (int r = lane; r < rows; r += lanes) {
+            EACH_ROW(r, q) {
                 float side;
-                first += jv[r] * pull(r, x[r] + alpha * jv[r], side);
-                second += jv[r] * jv[r] * most(side, 0.0f);
+                first += jv[q] * pull(r, q, x[q] + alpha * jv[q], side);
+                second += jv[q] * jv[q] * most(side, 0.0f);
             }
             first = sum(first) + slope + alpha * bend;
             second = sum(second) + bend;
@@ -196,28 +227,42 @@ SOURCE = """
             if (high > 0.0f && (next <= low || next >= high)) next = 0.5f * (low + high);
             alpha = next;
         }
-        for (int i = lane; i < NV; i += lanes) {
-            a[i] += alpha * s[i];
-            Ma[i] += alpha * Ms[i];
+        EACH(i) {
+            OF(a, i) += alpha * OF(s, i);
+            OF(Ma, i) += alpha * OF(Ms, i);
         }
-        for (int r = lane; r < rows; r += lanes) x[r] += alpha * jv[r];
+        EACH_ROW(r, q) x[q] += alpha * jv[q];
         ++round;
     }
 
-    for (int i = lane; i < NV; i += lanes) {
-        qacc.data[world * qacc.shape[1] + i] = a[i];
-        inertial.data[world * inertial.shape[1] + i] = Ma[i];
+    EACH(i) {
+        qacc.data[world * qacc.shape[1] + i] = OF(a, i);
+        inertial.data[world * inertial.shape[1] + i] = OF(Ma, i);
     }
     for (int r = lane; r < rows; r += lanes) efc_force.data[world * efc_force.shape[1] + r] = force[r];
     if (lane == 0) rounds.data[world] = round;
     #undef LEGGED_SHARED
+    #undef EACH
+    #undef EACH_FROM
+    #undef ONLY
+    #undef EACH_ROW
+    #undef OF
+    #undef FROM
+    #undef ENTRY_FROM
 """
+
+
+def row_length(nv: int) -> int:
+    """Floats from one row of a matrix in shared memory to the next: whole vectors of four, an odd number of them, so that
+    lanes that read rows side by side meet different banks.
+    """
+    return 4 * (-(-nv // 4) | 1)
 
 
 def solver_kernel(nv: int, rows: int) -> Any:
     """The kernel for models of `nv` degrees of freedom and at most `rows` constraint rows; launched for (worlds, lanes)."""
 
-    @wp.func_native(SOURCE % {"nv": nv, "rows": rows, "step": nv | 1})
+    @wp.func_native(SOURCE % {"nv": nv, "rows": rows, "step": row_length(nv)})
     def solve_world(
         world: int,
         most_rounds: int,
@@ -303,13 +348,9 @@ class ConstraintSolver:
     """Constraint forces and accelerations of all worlds, from what mujoco-warp has put into its data."""
 
     def __init__(self, m: Any, d: Any) -> None:
-        """For mujoco-warp's model and data; call with their device as Warp's current one.
-
-        Raises:
-            ConfigError: the model has what this solver does not know.
+        """For mujoco-warp's model and data, of which there is nothing to say by `why_not`; call with their device as Warp's
+        current one.
         """
-        if reason := self.why_not(m, d):
-            raise ConfigError(f"sim.constraint_solver=fused: {reason}; sim.constraint_solver=rounds takes it")
         self._kernel = solver_kernel(m.nv, d.njmax)
         self._lanes = 1 if d.qacc.device.is_cpu else LANES
         efc, opt = d.efc, m.opt
@@ -323,7 +364,9 @@ class ConstraintSolver:
     @staticmethod
     def why_not(m: Any, d: Any) -> str:
         """What of a model this solver does not know; empty if nothing."""
-        floats = (d.njmax + 2 * m.nv) * (m.nv | 1) + 6 * d.njmax + 6 * m.nv
+        if m.nv > LANES:
+            return f"it takes at most {LANES} degrees of freedom, the model has {m.nv}"
+        floats = (d.njmax + m.nv + 1) * row_length(m.nv) + 2 * d.njmax
         if 4 * floats > SHARED_BYTES:
             return f"{d.njmax} constraint rows (sim.njmax) of {m.nv} numbers do not fit a GPU's shared memory"
         if m.is_sparse:

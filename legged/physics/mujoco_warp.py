@@ -9,6 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from legged.config import ConfigError
 from legged.config.schema import SimConfig
 from legged.math import masked_set_
 from legged.physics.base import RandomizedField
@@ -17,6 +18,7 @@ from legged.physics.exchange import Exchange
 from legged.physics.kernels import compile_ahead
 from legged.physics.scene import FLOOR, build_model
 from legged.physics.terrain_contact import TerrainContact
+from legged.physics.torque_step import TorqueStep
 from legged.physics.warp_physics import WarpPhysics
 from legged.robot import Robot
 from legged.terrain import Terrain
@@ -65,9 +67,16 @@ class MujocoWarpPhysics(WarpPhysics):
             self._qpos, self._qvel, self.torques = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
             self.state = self._allocate_state()
             self._exchange = Exchange(self._m, d, self.model, robot, self.state, self.overflowed)
-            self._solver = ConstraintSolver(self._m, d) if sim.constraint_solver == "fused" else None
+            self._solver: ConstraintSolver | None = None
+            if sim.constraint_solver != "rounds" and (why_not := ConstraintSolver.why_not(self._m, d)) == "":
+                self._solver = ConstraintSolver(self._m, d)
+            elif sim.constraint_solver == "fused":
+                raise ConfigError(f"sim.constraint_solver=fused: {why_not}; sim.constraint_solver=auto takes what fits")
+            self._torque_step: TorqueStep | None = None
             if self._solver is not None:
                 self._m.opt.run_qacc_smooth = False  # ours does not start from it
+                if TorqueStep.moved_by_torques(self.model):
+                    self._torque_step = TorqueStep(self.model, self._m, d)
             self._m.opt.disableflags |= absent_stages(self.model)
         exchanges = (self._exchange.kinematics, self._exchange.contact_forces)
         constants = (self._set_constants,) if "added_base_mass" in randomized else ()
@@ -81,7 +90,18 @@ class MujocoWarpPhysics(WarpPhysics):
         if self._solver is None:
             mjw.step(m, d)
             return
-        mjw.fwd_position(m, d, factorize=False)
+        mjw.fwd_kinematics(m, d)
+        mjw.crb(m, d)
+        mjw.collision(m, d)
+        mjw.make_constraint(m, d)
+        if self._torque_step is not None:
+            mjw.com_vel(m, d)
+            mjw.rne(m, d)
+            self._torque_step.sum_forces()
+            self._solver.solve()
+            self._torque_step.integrate()
+            return
+        mjw.transmission(m, d)
         mjw.fwd_velocity(m, d)
         mjw.fwd_actuation(m, d)
         mjw.fwd_acceleration(m, d)

@@ -11,6 +11,8 @@ from legged.terrain import Terrain
 
 FLOOR = "floor"
 """The ground's geom, where it is a plane or stands for a height map that mujoco-warp does not collide with itself."""
+UNTOUCHED = 1 << 30
+"""A collision type that nothing collides with, of a shape that is no mere decoration."""
 GroundShapes = Literal["exact", "height_field", "none"]
 
 
@@ -41,6 +43,7 @@ def build_model(
     `contact_<shape>`, the net force that the shape exerts, world frame [N].
     """
     spec = robot_spec(robot, sim.self_collisions)
+    spec.compiler.discardvisual = True  # pictures have a model of their own
     option = spec.option
     option.timestep = sim.dt
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
@@ -56,7 +59,7 @@ def build_model(
             name=FLOOR,
             type=mujoco.mjtGeom.mjGEOM_PLANE,
             size=[0, 0, 1],
-            contype=2 if touches else 0,
+            contype=2 if touches else UNTOUCHED,
             conaffinity=1 if touches else 0,
             group=0,
         )
