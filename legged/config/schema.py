@@ -344,8 +344,8 @@ class RunnerConfig:
     loop: Literal["stock", "captured"] = "captured"
     """`captured`: rsl-rl's arithmetic without the host in between, on a GPU as CUDA graphs; it falls back to `stock` where
     a feature needs that, and says why. `stock`: rsl-rl's own training loop."""
-    matmul: Literal["float32", "tf32"] = "float32"
-    """Matrix products of the networks on a GPU while training; `tf32` keeps 10 of 23 bits of the factors and is faster."""
+    matmul: Literal["float32", "tf32"] = "tf32"
+    """Matrix products of the networks on a GPU while training; `tf32` keeps 10 of the factors' 23 bits and is faster."""
     experiment_name: str = ""
     """Folder under logs/; the task's name when empty."""
     run_name: str = ""

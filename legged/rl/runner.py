@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import time
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from legged.rl.checkpoint import describe_mismatch, observation_layout, read_che
 from legged.rl.display import Display, Progress
 from legged.rl.distributed import RankLost, any_rank, join, leave
 from legged.rl.symmetry import MirrorImages, augment
+from legged.startup import STARTED_S
 
 
 class Interrupted(Exception):
@@ -192,6 +194,7 @@ class Runner(OnPolicyRunner):
             "task_state": self.env.state_dict(),
             "observations": observation_layout(self.env),
             "learning_rate": self.alg.learning_rate,
+            "wall_s": time.perf_counter() - STARTED_S,  # since this process began
         }
         write_checkpoint(Path(path), saved)
         self.logger.save_model(path, self.current_learning_iteration)

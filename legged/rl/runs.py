@@ -71,7 +71,7 @@ def find_run(cfg: TaskConfig, load_run: str | None) -> Path:
         ConfigError: there is none.
     """
     parent = experiment_folder(cfg)
-    runs = sorted((p for p in parent.glob("*") if _checkpoints(p)), key=_last_saved)
+    runs = sorted((p for p in parent.glob("*") if checkpoints(p)), key=_last_saved)
     if load_run in (None, "-1"):
         if not runs:
             raise ConfigError(f"--load_run: there is no run with a checkpoint in {relative(parent)}; train one first")
@@ -88,7 +88,7 @@ def find_checkpoint(folder: Path, checkpoint: int | None) -> Path:
     Raises:
         ConfigError: there is none.
     """
-    found = _checkpoints(folder)
+    found = checkpoints(folder)
     if not found:
         raise ConfigError(f"--load_run: {relative(folder)} holds no checkpoint (model_<iteration>.pt)")
     if checkpoint is None or checkpoint == -1:
@@ -119,11 +119,11 @@ def run_config(folder: Path) -> TaskConfig:
 
 def _last_saved(folder: Path) -> float:
     """When the latest checkpoint of a run was written; evaluations and videos in its folder do not count."""
-    return max(path.stat().st_mtime for path in _checkpoints(folder).values())
+    return max(path.stat().st_mtime for path in checkpoints(folder).values())
 
 
-def _checkpoints(folder: Path) -> dict[int, Path]:
-    """Checkpoints of a folder by iteration; the one of a shipped policy counts as 0."""
+def checkpoints(folder: Path) -> dict[int, Path]:
+    """Checkpoints of a folder by iteration, in that order; the one of a shipped policy counts as 0."""
     found: dict[int, Path] = {}
     for path in folder.glob("model*.pt"):
         match = re.fullmatch(r"model_(\d+)\.pt", path.name)
@@ -131,4 +131,4 @@ def _checkpoints(folder: Path) -> dict[int, Path]:
             found[int(match.group(1))] = path
         elif path.name == SHIPPED_MODEL:
             found[0] = path
-    return found
+    return dict(sorted(found.items()))

@@ -60,7 +60,8 @@ def _measured(
     """One engine's figures. Speed is that of the whole evaluation loop, without start-up and compilation."""
     name = engine_name(override(policy.cfg, asked).sim, device)
     tell(f"{name}: {len(grid.cells)} commands x {grid.robots} robots")
-    task, act = ready_to_track(policy, grid, asked, device, graph)
+    task, runner = ready_to_track(policy, grid, asked, device, graph)
+    act = runner.get_inference_policy(str(device))
     start = time.perf_counter()
     figures = measure(task, act, grid)
     seconds = time.perf_counter() - start

@@ -86,7 +86,8 @@ def _main(argv: list[str] | None) -> int:
     asked = [("sim.physics", "auto"), *(one for one in overrides(args) if one[0] != "train.runner.experiment_name")]
     engine = engine_name(override(policy.cfg, asked).sim, device, "--physics" if args.physics else "sim.physics")
     start = time.perf_counter()
-    figures = measure(*ready_to_track(policy, grid, asked, device, graph=not args.no_graph), grid)
+    task, runner = ready_to_track(policy, grid, asked, device, graph=not args.no_graph)
+    figures = measure(task, runner.get_inference_policy(str(device)), grid)
     lost = figures.pop("contact_overflows")
     rough = policy.cfg.terrain.mesh_type != "plane"
     header = {

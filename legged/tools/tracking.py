@@ -1,23 +1,21 @@
 """A policy in the task it is measured in: what evaluating in one engine and in all of them share."""
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
-from tensordict import TensorDict
-from torch import Tensor
 
 from legged.config import override
 from legged.envs import LeggedRobot
 from legged.rl.policy import TrainedPolicy, restore, undisturbed
+from legged.rl.runner import Runner
 from legged.tools.success import on_terrain
 from legged.tools.velocity_grid import ROUGH_SPAWN, Grid, rough_ground, rough_side
 
 
 def ready_to_track(
     policy: TrainedPolicy, grid: Grid, asked: list[tuple[str, Any]], device: torch.device, graph: bool
-) -> tuple[LeggedRobot, Callable[[TensorDict], Tensor]]:
-    """A task of grid.num_envs robots and the policy's actions in it; `asked` is what the command line changes.
+) -> tuple[LeggedRobot, Runner]:
+    """A task of grid.num_envs robots and a runner that holds the policy; `asked` is what the command line changes.
 
     On a plane or, for tasks with terrain, on bumpy level ground.
     """
@@ -30,8 +28,7 @@ def ready_to_track(
         cfg = override(policy.cfg, changes)
         terrain = rough_ground(cfg.terrain, cfg.env.seed)
         tell(f"tracking on rough ground: {len(grid.cells)} commands x {grid.robots} robots")
-    task, runner = restore(policy, changes, device, graph, terrain)
-    return task, runner.get_inference_policy(str(device))
+    return restore(policy, changes, device, graph, terrain)
 
 
 def tell(line: str) -> None:
