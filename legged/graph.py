@@ -95,22 +95,28 @@ class StepGraph:
     WARM_UP_STEPS = 3
 
     def __init__(
-        self, function: Callable[[], None], device: torch.device, enabled: bool, warm_up_steps: int = WARM_UP_STEPS
+        self,
+        function: Callable[[], None],
+        device: torch.device,
+        enabled: bool,
+        warm_up_steps: int = WARM_UP_STEPS,
+        rehearse: Callable[[], None] | None = None,
     ) -> None:
-        """With `enabled` false the function runs eagerly and unchecked.
+        """With `enabled` false the function runs eagerly and unchecked. Of a function that does the same many times,
+        `rehearse` does it once: enough to warm up, and to check.
 
         Raises:
             TermError: a term of the task can't be captured.
             HostReadError: another part of the step can't.
         """
-        self._function, self._warm_up_steps = function, warm_up_steps
+        self._function, self._rehearse, self._warm_up_steps = function, rehearse or function, warm_up_steps
         self._graph: torch.cuda.CUDAGraph | None = None
         if not enabled:
             return
         try:
             if device.type != "cuda":
                 with ForbidHostReads():
-                    function()
+                    self._rehearse()
                 return
             self._graph = self._capture(device)
         except Exception as error:
@@ -124,9 +130,9 @@ class StepGraph:
         stream.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.stream(stream):
             for _ in range(self._warm_up_steps):
-                self._function()
+                self._rehearse()
             with ForbidHostReads():  # says what is wrong, where a failed capture only says that something is
-                self._function()
+                self._rehearse()
         torch.cuda.current_stream(device).wait_stream(stream)
         torch.cuda.synchronize(device)
         graph = torch.cuda.CUDAGraph()

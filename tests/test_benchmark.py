@@ -3,8 +3,9 @@
 import json
 
 import pytest
-from helpers import call, small_task
+from helpers import call, small_config, small_task
 
+from legged.registry import make_task
 from legged.rl.captured import CapturedRunner
 from legged.rl.runner import Runner
 from legged.tools import benchmark
@@ -32,6 +33,17 @@ def test_times_of_step_physics_and_iterations_are_written(tmp_path, capsys):
     assert "stock training" in said
     assert "captured training" in said
     assert not list(tmp_path.glob("logs*"))
+
+
+def test_mujoco_warps_own_step_is_timed_beside_ours():
+    """Both move the robots; on the CPU too ours takes less."""
+    task = make_task(small_config(("sim.physics", "mujoco_warp"), num_envs=8))
+    before = task.physics.state.base_pos.clone()
+    result = benchmark.measure(task, 10, 3)
+    assert not before.equal(task.physics.state.base_pos)
+    assert result["library_ms"] > result["physics_ms"] > 0.0
+    low, high = result["library_ms_range"]
+    assert low <= result["library_ms"] <= high
 
 
 @pytest.mark.parametrize("kind", [Runner, CapturedRunner])

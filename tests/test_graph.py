@@ -119,6 +119,15 @@ def test_step_graph_checks_once_and_then_runs_plainly_on_the_cpu():
     assert not step.captured
 
 
+def test_a_rehearsal_stands_in_where_the_graph_is_checked():
+    calls = []
+    step = StepGraph(lambda: calls.append("all"), CPU, enabled=True, rehearse=lambda: calls.append("one"))
+    step()
+    assert calls == ["one", "all"]
+    with pytest.raises(HostReadError):
+        StepGraph(lambda: None, CPU, enabled=True, rehearse=lambda: NUMBERS[0].item())
+
+
 def test_step_graph_refuses_a_step_with_a_host_read():
     with pytest.raises(HostReadError, match="reads a value on the host") as error:
         StepGraph(lambda: NUMBERS[0].item(), CPU, enabled=True)

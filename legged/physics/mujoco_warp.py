@@ -108,6 +108,14 @@ class MujocoWarpPhysics(WarpPhysics):
         self._solver.solve()
         mjw.euler(m, d)
 
+    def library_step(self) -> None:
+        """A physics step as mujoco-warp makes it by itself, to compare with."""
+        with self._on_device():
+            asked = self._m.opt.run_qacc_smooth
+            self._m.opt.run_qacc_smooth = True  # its solver starts from it
+            mjw.step(self._m, self._d)
+            self._m.opt.run_qacc_smooth = asked
+
     def _set_constants(self) -> None:
         mjw.set_const(self._m, self._d)
 

@@ -77,10 +77,10 @@ class CapturedRunner(Runner):
         device = torch.device(self.device)
         enabled = self.env.captured
         task_state = self.env.state_dict()
-        collect = StepGraph(rollout.collect, device, enabled, ROLLOUTS_TO_WARM_UP)
+        collect = StepGraph(rollout.collect, device, enabled, ROLLOUTS_TO_WARM_UP, lambda: rollout.collect(1))
         before = list(zip(self.alg.tensors(), copies(self.alg.tensors()), strict=True))
         fresh = not self.alg.optimizer.state
-        update = StepGraph(self.alg.learn, device, enabled)
+        update = StepGraph(self.alg.learn, device, enabled, rehearse=lambda: self.alg.learn(1))
         with torch.no_grad():
             for tensor, value in before:
                 tensor.copy_(value)

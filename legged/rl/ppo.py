@@ -109,11 +109,11 @@ class DevicePPO(PPO):
         self.storage.clear()
         return self.losses()
 
-    def learn(self) -> None:
-        """All epochs over the stored rollout: no host read, so that one graph can hold it."""
+    def learn(self, epochs: int | None = None) -> None:
+        """All epochs over the stored rollout, or the first `epochs`: no host read, so that one graph can hold it."""
         self._losses.zero_()
         batches = self._mini_batches()
-        for _ in range(self.num_learning_epochs):
+        for _ in range(epochs or self.num_learning_epochs):
             for batch in batches:
                 self._losses += self._step(*batch)
         self._losses /= self.num_learning_epochs * self.num_mini_batches

@@ -34,11 +34,10 @@ class Rollout:
         self._length.zero_()
 
     @torch.no_grad()
-    def collect(self) -> None:
-        """T steps into the storage, with returns and advantages."""
-        st = self.alg.storage
+    def collect(self, steps: int | None = None) -> None:
+        """T steps into the storage, with returns and advantages; `steps`, to rehearse, takes fewer of them."""
         self.ended.zero_()
-        for t in range(st.num_transitions_per_env):
+        for t in range(steps or self.alg.storage.num_transitions_per_env):
             self._step(t)
         self._judge()
         self._returns()

@@ -24,6 +24,7 @@ import torch
 
 from legged.config import ConfigError, override
 from legged.envs import LeggedRobot
+from legged.graph import StepGraph
 from legged.physics import resolve_physics
 from legged.registry import make_task, task_config
 from legged.rl.arguments import add_task_arguments, import_and_check, overrides, pick_device, run_main
@@ -109,43 +110,45 @@ def measure(task: LeggedRobot, steps: int, repeats: int) -> dict[str, Any]:
     """Milliseconds per control step: the task's step, and the physics in it alone.
 
     Physics alone is `decimation` engine steps of the same model under the torques of the moment; on a GPU it is one
-    graph too. The two are timed in turns, step by step, so that both meet the states, contacts and clock rates of a
-    rollout: run by itself, physics without a controller or resets would soon simulate heaps of fallen robots.
+    graph too, and so are as many of mujoco-warp's own steps, where ours are made of its parts. All are timed in turns,
+    step by step, so that they meet the states, contacts and clock rates of a rollout: run by itself, physics without a
+    controller or resets would soon simulate heaps of fallen robots.
     """
     device = torch.device(task.device)
     actions = 0.3 * torch.randn(32, task.num_envs, task.num_actions, device=device)
     for i in range(50):  # robots land and spread over the states of a training
         task.step(actions[i % 32])
-    physics_only = _physics_step(task)
-    turns = (lambda i: task.step(actions[i % 32]), lambda i: physics_only())
+    steps_of = {"physics": task.physics.step}
+    if library := getattr(task.physics, "library_step", None):
+        steps_of["library"] = library
+    alone = {name: _control_period(task, step) for name, step in steps_of.items()}
+    turns = [lambda i: task.step(actions[i % 32]), *(lambda _, run=run: run() for run in alone.values())]
     results = [_time_in_turns(turns, steps, device) for _ in range(repeats)]
-    control, physics = (sorted(times) for times in zip(*results, strict=True))
-    control_ms, physics_ms = (median(times) for times in (control, physics))
+    control, *others = (sorted(times) for times in zip(*results, strict=True))
+    control_ms = median(control)
+    times: dict[str, Any] = {}
+    for name, measured in zip(alone, others, strict=True):
+        times |= {f"{name}_ms": median(measured), f"{name}_ms_range": [measured[0], measured[-1]]}
     return {
         "num_envs": task.num_envs,
         "control_step_ms": control_ms,
         "control_step_ms_range": [control[0], control[-1]],
-        "physics_ms": physics_ms,
-        "physics_ms_range": [physics[0], physics[-1]],
-        "ratio": control_ms / physics_ms,
+        **times,
+        "ratio": control_ms / times["physics_ms"],
         "env_steps_per_s": task.num_envs / control_ms * 1e3,
         "captured": float(task.captured),
         "overflows": float(task.statistics.flush()["Metrics/contact_overflows"]),
     }
 
 
-def _physics_step(task: LeggedRobot) -> Callable[[], None]:
+def _control_period(task: LeggedRobot, step: Callable[[], None]) -> Callable[[], None]:
     """The engine steps of one control step, as a graph where the task's step is one."""
 
     def run() -> None:
         for _ in range(task.cfg.control.decimation):
-            task.physics.step()
+            step()
 
-    if not task.captured:
-        return run
-    from legged.graph import StepGraph
-
-    return StepGraph(run, torch.device(task.device), enabled=True)
+    return StepGraph(run, torch.device(task.device), enabled=True) if task.captured else run
 
 
 def _time_in_turns(functions: Sequence[Callable[[int], object]], steps: int, device: torch.device) -> list[float]:
@@ -224,6 +227,7 @@ def report(task: LeggedRobot, result: dict[str, Any]) -> str:
         f"{task.cfg.task}, {task.num_envs} robots, {where}, {how}",
         f"  control step  {result['control_step_ms']:.3f} ms  ({result['env_steps_per_s']:,.0f} robot steps/s)",
         f"  physics alone {result['physics_ms']:.3f} ms  (control step = {result['ratio']:.3f} x physics)",
+        *([f"  mujoco_warp.step alone {result['library_ms']:.3f} ms"] if "library_ms" in result else []),
         f"  steps of a robot that lost contacts for want of memory: {result['overflows']:.0f}",
         f"  build, with kernel compilation where not cached: {result['build_s']:.1f} s",
     ]
