@@ -54,8 +54,15 @@ def backend(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-@pytest.fixture(params=["mujoco", "mujoco_warp", "mujoco_warp, rounds"])
+STEPS = {
+    "mujoco_warp, rounds": {"constraint_solver": "rounds"},
+    "mujoco_warp, fused": {"smooth_dynamics": "fused"},
+}
+"""Other ways of mujoco_warp to make a step."""
+
+
+@pytest.fixture(params=["mujoco", "mujoco_warp", *STEPS])
 def physics(request: pytest.FixtureRequest, make_physics: Callable[..., Physics]) -> Physics:
     """Six worlds with the shipped solver options, in whatever state the last test left them."""
-    name, _, solver = request.param.partition(", ")
-    return make_physics(name, constraint_solver=solver) if solver else make_physics(name)
+    name, _, _ = request.param.partition(", ")
+    return make_physics(name, **STEPS.get(request.param, {}))

@@ -17,6 +17,7 @@ from legged.physics.constraint_solver import ConstraintSolver
 from legged.physics.exchange import Exchange
 from legged.physics.kernels import compile_ahead
 from legged.physics.scene import FLOOR, build_model
+from legged.physics.smooth_dynamics import SmoothDynamics
 from legged.physics.terrain_contact import TerrainContact
 from legged.physics.torque_step import TorqueStep
 from legged.physics.warp_physics import WarpPhysics
@@ -76,7 +77,10 @@ class MujocoWarpPhysics(WarpPhysics):
             if self._solver is not None:
                 self._m.opt.run_qacc_smooth = False  # ours does not start from it
                 if TorqueStep.moved_by_torques(self.model):
-                    self._torque_step = TorqueStep(self.model, self._m, d)
+                    base, fused = self.model.body(robot.file.base).id, sim.smooth_dynamics == "fused"
+                    self._torque_step = TorqueStep(self.model, self._m, self._d, base, fused)
+            if sim.smooth_dynamics == "fused" and (why_not := self._not_fused()):
+                raise ConfigError(f"sim.smooth_dynamics=fused: {why_not}")
             self._m.opt.disableflags |= absent_stages(self.model)
         exchanges = (self._exchange.kinematics, self._exchange.contact_forces)
         constants = (self._set_constants,) if "added_base_mass" in randomized else ()
@@ -90,23 +94,28 @@ class MujocoWarpPhysics(WarpPhysics):
         if self._solver is None:
             mjw.step(m, d)
             return
-        mjw.fwd_kinematics(m, d)
-        mjw.crb(m, d)
-        mjw.collision(m, d)
-        mjw.make_constraint(m, d)
         if self._torque_step is not None:
-            mjw.com_vel(m, d)
-            mjw.rne(m, d)
+            self._torque_step.place()
+            mjw.collision(m, d)
+            mjw.make_constraint(m, d)
             self._torque_step.sum_forces()
             self._solver.solve()
             self._torque_step.integrate()
             return
-        mjw.transmission(m, d)
+        mjw.fwd_position(m, d, factorize=False)
         mjw.fwd_velocity(m, d)
         mjw.fwd_actuation(m, d)
         mjw.fwd_acceleration(m, d)
         self._solver.solve()
         mjw.euler(m, d)
+
+    def _not_fused(self) -> str:
+        """What keeps joints and masses from being computed in one launch; empty if nothing does."""
+        if self._solver is None:
+            return "needs sim.constraint_solver=fused"
+        if self._torque_step is None:
+            return "more than torques moves the robot: springs, dampers, geared or affine actuators, a fluid"
+        return SmoothDynamics.why_not(self.model)
 
     def library_step(self) -> None:
         """A physics step as mujoco-warp makes it by itself, to compare with."""

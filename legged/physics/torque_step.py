@@ -12,6 +12,8 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
+from legged.physics.smooth_dynamics import SmoothDynamics
+
 NEFC, BROADPHASE, NARROWPHASE = (int(getattr(mjw.OverflowType, n)) for n in ("NEFC", "BROADPHASE", "NARROWPHASE"))
 
 wp.set_module_options({"enable_backward": False})
@@ -84,16 +86,20 @@ def integrate(
 
 
 class TorqueStep:
-    """Launches those two on mujoco-warp's arrays."""
+    """Launches on mujoco-warp's arrays what comes before contacts, between them and the solver, and after it."""
 
-    def __init__(self, model: mujoco.MjModel, m: Any, d: Any) -> None:
-        """For a model that `moved_by_torques`; call with the arrays' device as Warp's current one."""
+    def __init__(self, model: mujoco.MjModel, m: Any, d: Any, base: int, fused: bool) -> None:
+        """For a model that `moved_by_torques`, whose free body is `base`; with `fused`, poses, inertias and forces are one
+        launch. Call with the arrays' device as Warp's current one.
+        """
         free = np.array([-np.inf, np.inf])
         controls = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, free)
         forces = np.where(model.actuator_forcelimited[:, None], model.actuator_forcerange, free)
-        lowest, highest = np.maximum(controls, forces)[:, 0], np.minimum(controls, forces)[:, 1]
-        limits = [wp.array(values, dtype=float) for values in (lowest, highest)]
-        self._forces = (d.nworld, m.nv), [d.ctrl, *limits, d.qfrc_bias], [d.qfrc_smooth]
+        limits = np.stack([np.maximum(controls, forces)[:, 0], np.minimum(controls, forces)[:, 1]])
+        self._m, self._d = m, d
+        self._dynamics = SmoothDynamics(model, m, d, base, limits) if fused else None
+        lowest, highest = (wp.array(values, dtype=float) for values in limits)
+        self._forces = (d.nworld, m.nv), [d.ctrl, lowest, highest, d.qfrc_bias], [d.qfrc_smooth]
         state = [d.qpos, d.qvel, d.qacc_warmstart, d.overflow]
         counts = [d.nefc, d.nacon, d.ncollision, d.njmax, d.naconmax]
         self._integration = (d.nworld, m.njnt), [m.opt.timestep, d.qacc, *counts], state
@@ -118,8 +124,20 @@ class TorqueStep:
             and (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE).all()
         )
 
+    def place(self) -> None:
+        """From qpos: where shapes are, and what contacts need to know of the robot."""
+        if self._dynamics is not None:
+            self._dynamics.launch()  # forces too
+            return
+        mjw.fwd_kinematics(self._m, self._d)
+        mjw.crb(self._m, self._d)
+
     def sum_forces(self) -> None:
-        """From controls and bias forces: qfrc_smooth."""
+        """From qvel and controls: qfrc_smooth."""
+        if self._dynamics is not None:
+            return
+        mjw.com_vel(self._m, self._d)
+        mjw.rne(self._m, self._d)
         dim, inputs, outputs = self._forces
         wp.launch(sum_forces, dim=dim, inputs=inputs, outputs=outputs)
 
