@@ -96,7 +96,8 @@ def test_a_size_that_fails_otherwise_is_told_too(tmp_path, capfd, monkeypatch):
         "class Broken(LeggedRobot):\n"
         "    def _obs_broken(self):\n"
         "        raise ValueError('no such thing')\n"
-        "register('broken', {'extends': 'anymal_c_flat', 'observations': {'actor': ['broken']}}, Broken)\n"
+        "cfg = {'extends': 'anymal_c_flat', 'observations': {'actor': ['broken']}}\n"
+        "register('broken', {**cfg, 'train': {'algorithm': {'symmetry': False}}}, Broken)\n"
     )
     monkeypatch.chdir(tmp_path)
     arguments = ["--task", "broken", "--import", "broken.py", "--sim_device", "cpu", "--scale", "4"]

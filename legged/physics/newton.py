@@ -8,6 +8,7 @@ from torch import Tensor
 from legged.config.schema import SimConfig
 from legged.math import masked_set_
 from legged.physics.base import RandomizedField
+from legged.physics.kernels import compile_ahead
 from legged.physics.newton_exchange import NewtonExchange
 from legged.physics.newton_simulation import Simulation
 from legged.physics.scene import build_model
@@ -43,13 +44,17 @@ class NewtonPhysics(WarpPhysics):
                 self._simulation, self.model, robot, self.state, qpos, qvel, torques, self.overflowed
             )
             self._exchange.read()
-        if self._wp_device.is_cpu:
             start = self._qpos.clone()
+        compile_ahead(
+            self._wp_device, (self._step, self._put, self._exchange.kinematics, self._exchange.contact_forces, self._forget)
+        )
+        if self._wp_device.is_cpu:
             self._advance = self._record_step()
+        with wp.ScopedDevice(self._wp_device):  # what was tried left its traces
             self._qpos.copy_(start)
             self._qvel.zero_()
             self._mask[:-1].fill_(True)
-            self._simulation.forget(self._wp_mask)
+            self._forget()
             self._put()
         self.refresh()
 
@@ -58,6 +63,10 @@ class NewtonPhysics(WarpPhysics):
         self._simulation.step(self.dt)
         self._exchange.note_lost_contacts()
         self._exchange.read()
+
+    def _forget(self) -> None:
+        """Clear what the worlds of `_mask` would carry over a step."""
+        self._simulation.forget(self._wp_mask)
 
     def _put(self) -> None:
         """The task's state of the worlds of `_mask` into Newton's joints and bodies."""
@@ -76,7 +85,7 @@ class NewtonPhysics(WarpPhysics):
     ) -> None:
         with self._on_device():
             self._mask[:-1].copy_(mask)
-            self._simulation.forget(self._wp_mask)
+            self._forget()
             self._exchange.write(mask, base_pos, base_quat, base_lin_vel, base_ang_vel, dof_pos, dof_vel)
             self._put()
 
