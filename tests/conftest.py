@@ -56,7 +56,7 @@ def backend(request: pytest.FixtureRequest) -> str:
 
 STEPS = {
     "mujoco_warp, rounds": {"constraint_solver": "rounds"},
-    "mujoco_warp, fused": {"smooth_dynamics": "fused"},
+    "mujoco_warp, stages": {"smooth_dynamics": "stages"},
 }
 """Other ways of mujoco_warp to make a step."""
 

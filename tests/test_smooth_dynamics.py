@@ -9,6 +9,7 @@ import warp as wp
 from legged.config import ConfigError
 from legged.config.schema import SimConfig
 from legged.physics.scene import build_model
+from legged.physics.kernels import launched
 from legged.physics.smooth_dynamics import SmoothDynamics
 
 CROOKED = """
@@ -94,8 +95,17 @@ def test_poses_inertias_and_forces_are_those_of_c_mujoco(robot, build):
         np.testing.assert_allclose(found["qfrc_smooth"][i], forces, rtol=1e-5, atol=1e-3)
 
 
+@pytest.mark.parametrize(("way", "one_launch"), [("auto", True), ("fused", True), ("stages", False)])
+def test_a_shipped_robot_takes_one_launch_unless_asked_for_stages(make_physics, way, one_launch):
+    sim = {} if way == "auto" else {"smooth_dynamics": way}
+    physics = make_physics("mujoco_warp", **sim)
+    modules = " ".join(build.module.name for build in launched(wp.get_device("cpu"), (physics._step,)))
+    assert ("dynamics_kernel" in modules) == one_launch
+    assert ("mujoco_warp._src.smooth" in modules) != one_launch
+
+
 def test_what_it_does_not_compute_is_refused(make_physics):
-    with pytest.raises(ConfigError, match=r"smooth_dynamics=fused: needs sim\.constraint_solver=fused"):
+    with pytest.raises(ConfigError, match=r"smooth_dynamics=fused: needs the fused sim\.constraint_solver"):
         make_physics("mujoco_warp", num_envs=1, smooth_dynamics="fused", constraint_solver="rounds")
     welded = CROOKED.replace("<actuator>", '<equality><weld body1="hand" body2="tail"/></equality><actuator>')
     assert "equality constraints" in SmoothDynamics.why_not(mujoco.MjModel.from_xml_string(welded))

@@ -68,19 +68,8 @@ class MujocoWarpPhysics(WarpPhysics):
             self._qpos, self._qvel, self.torques = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
             self.state = self._allocate_state()
             self._exchange = Exchange(self._m, d, self.model, robot, self.state, self.overflowed)
-            self._solver: ConstraintSolver | None = None
-            if sim.constraint_solver != "rounds" and (why_not := ConstraintSolver.why_not(self._m, d)) == "":
-                self._solver = ConstraintSolver(self._m, d)
-            elif sim.constraint_solver == "fused":
-                raise ConfigError(f"sim.constraint_solver=fused: {why_not}; sim.constraint_solver=auto takes what fits")
-            self._torque_step: TorqueStep | None = None
-            if self._solver is not None:
-                self._m.opt.run_qacc_smooth = False  # ours does not start from it
-                if TorqueStep.moved_by_torques(self.model):
-                    base, fused = self.model.body(robot.file.base).id, sim.smooth_dynamics == "fused"
-                    self._torque_step = TorqueStep(self.model, self._m, self._d, base, fused)
-            if sim.smooth_dynamics == "fused" and (why_not := self._not_fused()):
-                raise ConfigError(f"sim.smooth_dynamics=fused: {why_not}")
+            self._solver = self._choose_solver(sim)
+            self._torque_step = self._choose_torque_step(sim)
             self._m.opt.disableflags |= absent_stages(self.model)
         exchanges = (self._exchange.kinematics, self._exchange.contact_forces)
         constants = (self._set_constants,) if "added_base_mass" in randomized else ()
@@ -109,13 +98,31 @@ class MujocoWarpPhysics(WarpPhysics):
         self._solver.solve()
         mjw.euler(m, d)
 
-    def _not_fused(self) -> str:
-        """What keeps joints and masses from being computed in one launch; empty if nothing does."""
+    def _choose_solver(self, sim: SimConfig) -> ConstraintSolver | None:
+        """Ours, or none for mujoco-warp's own."""
+        if sim.constraint_solver == "rounds":
+            return None
+        if why_not := ConstraintSolver.why_not(self._m, self._d):
+            if sim.constraint_solver == "fused":
+                raise ConfigError(f"sim.constraint_solver=fused: {why_not}; sim.constraint_solver=auto takes what fits")
+            return None
+        self._m.opt.run_qacc_smooth = False  # ours does not start from it
+        return ConstraintSolver(self._m, self._d)
+
+    def _choose_torque_step(self, sim: SimConfig) -> TorqueStep | None:
+        """What replaces mujoco-warp's stages around our solver, where the model allows it."""
         if self._solver is None:
-            return "needs sim.constraint_solver=fused"
-        if self._torque_step is None:
-            return "more than torques moves the robot: springs, dampers, geared or affine actuators, a fluid"
-        return SmoothDynamics.why_not(self.model)
+            why_not = "needs the fused sim.constraint_solver"
+        elif not TorqueStep.moved_by_torques(self.model):
+            why_not = "more than torques moves the robot: springs, dampers, geared or affine actuators, a fluid"
+        else:
+            why_not = SmoothDynamics.why_not(self.model)
+        if sim.smooth_dynamics == "fused" and why_not:
+            raise ConfigError(f"sim.smooth_dynamics=fused: {why_not}; sim.smooth_dynamics=auto takes what fits")
+        if self._solver is None or not TorqueStep.moved_by_torques(self.model):
+            return None
+        base, fused = self.model.body(self.robot.file.base).id, sim.smooth_dynamics != "stages" and why_not == ""
+        return TorqueStep(self.model, self._m, self._d, base, fused)
 
     def library_step(self) -> None:
         """A physics step as mujoco-warp makes it by itself, to compare with."""
