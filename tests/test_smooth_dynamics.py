@@ -8,8 +8,8 @@ import warp as wp
 
 from legged.config import ConfigError
 from legged.config.schema import SimConfig
-from legged.physics.scene import build_model
 from legged.physics.kernels import launched
+from legged.physics.scene import build_model
 from legged.physics.smooth_dynamics import SmoothDynamics
 
 CROOKED = """
