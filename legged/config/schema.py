@@ -73,8 +73,8 @@ class SimConfig:
     self_collisions: bool = False
     """Let the robot's shapes touch each other, except those of neighbouring bodies."""
     terrain_collider: Literal["cells", "convex"] = "cells"
-    """How mujoco_warp meets a height map: `cells`, our own kernel with vertical faces; `convex`, its general collider on
-    one height field, three times slower and with ramps for steps, for shapes that `cells` does not know."""
+    """How mujoco_warp and Newton's MuJoCo solver meet a height map: `cells`, our own kernel with vertical faces; `convex`,
+    the general collider on one height field, three times slower and with ramps for steps, for shapes unknown to `cells`."""
     threads: int = field(default=0, metadata=AT_LEAST_0)
     """Threads of the C engine; 0 takes all cores."""
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -63,7 +64,9 @@ class MujocoWarpPhysics(WarpPhysics):
             self._m.opt.warn_overflow = 0  # counted in refresh instead of printed by each thread
             self._d = mjw.make_data(self.model, nworld=num_envs, nconmax=sim.nconmax, njmax=sim.njmax)
             if terrain is not None and cells:
-                TerrainContact(self._m, self._d, self.model, FLOOR, terrain.height_map)
+                of_robot = (self.model.geom_contype != 0) & (self.model.geom_bodyid != 0)
+                shapes, floor = np.flatnonzero(of_robot), self.model.geom(FLOOR).id
+                TerrainContact(self._m, self._d, self.model, floor, terrain.height_map, shapes)
             d = self._d
             self._qpos, self._qvel, self.torques = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
             self.state = self._allocate_state()

@@ -6,9 +6,10 @@ from typing import Any
 import newton
 import numpy as np
 
+from legged.config.schema import SimConfig
 from legged.physics.newton_solvers import SolverSetup
 from legged.physics.scene import robot_spec
-from legged.physics.terrain_geoms import lattice_heights
+from legged.physics.terrain_geoms import DEPTH, lattice_heights
 from legged.robot import Robot
 from legged.terrain import Terrain
 
@@ -58,15 +59,16 @@ class Layout:
 
 
 def build_newton_model(
-    robot: Robot, setup: SolverSetup, self_collisions: bool, num_envs: int, terrain: Terrain | None, device: Any
+    robot: Robot, setup: SolverSetup, sim: SimConfig, num_envs: int, terrain: Terrain | None, device: Any
 ) -> tuple[newton.Model, Layout]:
     """N robots from the robot's MJCF on one ground that all of them share: a plane, or the height map as one field of
-    points, where steps are ramps one cell wide. `device` is Warp's.
+    points, where steps are ramps one cell wide. Where our collider takes its place (`meets_cells`), a plane far below
+    stands for it. `device` is Warp's.
     """
     world = _builder(setup)
     # Which shapes may touch is written in the model, and Newton reads it when it reads the model.
-    source = robot_spec(robot, True).to_xml() if self_collisions else str(robot.model_path)
-    world.add_mjcf(source, enable_self_collisions=self_collisions, parse_visuals=False, parse_sites=False)
+    source = robot_spec(robot, True).to_xml() if sim.self_collisions else str(robot.model_path)
+    world.add_mjcf(source, enable_self_collisions=sim.self_collisions, parse_visuals=False, parse_sites=False)
     for shape in range(world.shape_count):
         world.shape_gap[shape] = setup.gap
         if setup.springs is not None:
@@ -80,12 +82,19 @@ def build_newton_model(
         ground.ke, ground.kd, ground.kf = setup.springs
     if terrain is None:
         scene.add_ground_plane(cfg=ground)
+    elif meets_cells(setup, sim):
+        scene.add_ground_plane(height=float(terrain.height_map.corners.min()) - DEPTH, cfg=ground)
     else:
         _add_height_field(scene, terrain, ground)
     model = scene.finalize(device)
     friction = model.shape_material_mu.numpy()
     model.shape_material_mu.assign(friction * setup.friction_factor)
     return model, layout
+
+
+def meets_cells(setup: SolverSetup, sim: SimConfig) -> bool:
+    """Whether a height map is met by our own collider, which appends to mujoco-warp's contacts."""
+    return setup.own_contacts and sim.terrain_collider == "cells"
 
 
 def _builder(setup: SolverSetup) -> newton.ModelBuilder:

@@ -4,14 +4,16 @@ import warnings
 from typing import Any
 
 import newton
+import numpy as np
 import warp as wp
 from newton.solvers import SolverBase, SolverMuJoCo, SolverSteel
 
 from legged.config.schema import SimConfig
 from legged.physics.exchange import LOST
-from legged.physics.newton_model import build_newton_model
+from legged.physics.newton_model import build_newton_model, meets_cells
 from legged.physics.newton_solvers import SOLVERS
 from legged.physics.newton_springs import launch_spring_forces
+from legged.physics.terrain_contact import TerrainContact
 from legged.robot import Robot
 from legged.terrain import Terrain
 
@@ -22,7 +24,7 @@ class Simulation:
     def __init__(self, robot: Robot, sim: SimConfig, num_envs: int, terrain: Terrain | None, device: Any) -> None:
         """Build the scene and its solver; `device` is Warp's, and must be its current one."""
         self.setup = setup = SOLVERS[sim.solver]
-        self.model, self.layout = build_newton_model(robot, setup, sim.self_collisions, num_envs, terrain, device)
+        self.model, self.layout = build_newton_model(robot, setup, sim, num_envs, terrain, device)
         self.state, self._next = self.model.state(), self.model.state()
         self.control = self.model.control()
         capacity = sim.nconmax * num_envs
@@ -35,6 +37,8 @@ class Simulation:
             # Newton names MuJoCo 3.17; the contract is tested with the one that we use.
             warnings.filterwarnings("ignore", "MuJoCo dependency version mismatch", newton.NewtonWarning)
             self.solver = setup.make(self.model, sim)
+        if terrain is not None and meets_cells(setup, sim):
+            self._meet_cells(terrain)
         if self._pipeline is None:
             capacity = self.solver.get_max_contact_count()
             self.contacts = newton.Contacts(capacity, 0, device=device)
@@ -50,6 +54,14 @@ class Simulation:
         else:
             self.force = self._observables.contact_f
         """Force on the first shape of each contact in the last substep, world frame [N]."""
+
+    def _meet_cells(self, terrain: Terrain) -> None:
+        """Give Newton's MuJoCo solver the collider that mujoco_warp has, with vertical faces."""
+        solver = self.solver
+        assert isinstance(solver, SolverMuJoCo)
+        model = solver.mj_model
+        robot, (ground,) = np.flatnonzero(model.geom_bodyid), np.flatnonzero(model.geom_bodyid == 0)
+        TerrainContact(solver.mjw_model, solver.mjw_data, model, int(ground), terrain.height_map, robot)
 
     def _request(self) -> SolverBase.Observables | None:
         """What the solver is to report of a step beside the state."""

@@ -8,7 +8,7 @@ contact point lies halfway between the two surfaces, as in MuJoCo. Friction dire
 where MuJoCo turns them along a capsule on a plane; the friction cone is the same.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -81,16 +81,14 @@ class Probe:
         return bool((self.start != self.end).any())
 
 
-def probes_of(model: mujoco.MjModel) -> Iterator[Probe]:
-    """The probes of all shapes that collide with terrain (contype 1, see scene.py).
+def probes_of(model: mujoco.MjModel, shapes: Iterable[int]) -> Iterator[Probe]:
+    """The probes of those geoms.
 
     Raises:
         ConfigError: a shape that is neither sphere, capsule nor box.
     """
     kinds = mujoco.mjtGeom
-    for i in range(model.ngeom):
-        if not model.geom_contype[i] or model.geom_bodyid[i] == 0:
-            continue
+    for i in shapes:
         kind, size = model.geom_type[i], model.geom_size[i]
         centre = np.zeros(3)
         if kind == kinds.mjGEOM_SPHERE:
@@ -235,19 +233,21 @@ def touch_ground(
 class TerrainContact:
     """Appends the contacts with a height map to mujoco-warp's, at the end of its collision stage."""
 
-    def __init__(self, m: Any, d: Any, model: mujoco.MjModel, terrain: str, height_map: HeightMap) -> None:
-        """`m`, `d` are mujoco-warp's model and data; `terrain` names the static geom that stands for the map. Call with
-        their device as Warp's current one.
+    def __init__(
+        self, m: Any, d: Any, model: mujoco.MjModel, terrain: int, height_map: HeightMap, shapes: Iterable[int]
+    ) -> None:
+        """`m`, `d` are mujoco-warp's model and data; `terrain` is the static geom that stands for the map, `shapes` are
+        the geoms that meet it. Call with their device as Warp's current one.
 
         Raises:
             ConfigError: a colliding shape that is neither sphere, capsule nor box.
         """
-        probes = list(probes_of(model))
+        probes = list(probes_of(model, shapes))
         largest = max(probe.radius for probe in probes) + float((model.geom_margin + model.geom_gap).max())
         longest = max(float(np.linalg.norm(probe.end - probe.start)) for probe in probes)
         self._inputs = [
             ground_of(height_map, largest, longest),
-            model.geom(terrain).id,
+            terrain,
             wp.array([probe.geom for probe in probes], dtype=int),
             wp.array([probe.start for probe in probes], dtype=wp.vec3),
             wp.array([probe.end for probe in probes], dtype=wp.vec3),
