@@ -11,10 +11,11 @@ from helpers import POLICY
 
 from legged.registry import import_tasks, make_task, task_config
 from legged.rl import play, train
-from legged.tools import benchmark, compare, evaluate, plot, show_terrain, warmup
+from legged.tools import benchmark, compare, evaluate, plot, show_terrain, time_to_walk, warmup
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+SPEED = (ROOT / "SPEED.md").read_text(encoding="utf-8")
 ROUGH = ROOT / "resources" / "policies" / "anymal_c"
 
 
@@ -43,13 +44,16 @@ def test_the_example_task_trains_without_touching_the_package(tmp_path, monkeypa
         ("python -m legged.tools.benchmark", benchmark.main),
         ("python -m legged.tools.compare", compare.main),
         ("python -m legged.tools.plot", plot.main),
+        ("python -m legged.tools.time_to_walk", time_to_walk.main),
         ("python -m legged.tools.warmup", warmup.main),
         ("python -m legged.tools.show_terrain", show_terrain.main),
     ],
 )
 def test_every_flag_that_is_shown_exists(name, main, capsys):
     shown = {
-        word.split("=")[0] for line in re.findall(rf"{re.escape(name)}([^\n`#&]*)", README) for word in shlex.split(line)
+        word.split("=")[0]
+        for line in re.findall(rf"{re.escape(name)}([^\n`#&]*)", README + SPEED)
+        for word in shlex.split(line)
     }
     with pytest.raises(SystemExit) as stop:
         main(["--help"])
@@ -60,7 +64,7 @@ def test_every_flag_that_is_shown_exists(name, main, capsys):
 
 
 def test_links_and_pictures_are_there():
-    for target in re.findall(r"\]\((?!http)([^)]+)\)", README):
+    for target in re.findall(r"\]\((?!http)([^)]+)\)", README + SPEED):
         assert (ROOT / target).is_file(), target
 
 
@@ -175,13 +179,33 @@ def test_a_policy_without_its_optimiser_is_exported(tmp_path):
     assert described["observation_history"] == 1
 
 
-def test_numbers_of_the_table_of_engines_are_those_of_the_shipped_crossing():
-    result = json.loads((POLICY / "crossing.json").read_text())
-    assert len(result["engines"]) == 8
-    for row in result["engines"]:
-        (shown,) = re.findall(rf"\| {row['physics']} \|(.*)\|\n", README)
-        numbers = (row["rmse_lin"], row["rmse_ang"], 100.0 * row["falls"], row["cost_of_transport"], row["base_height"])
-        forms = ("{:.3f}", "{:.3f}", "{:.1f} %", "{:.2f}", "{:.3f}")
-        assert [cell.strip() for cell in shown.split("|")] == [
-            form.format(number) for form, number in zip(forms, numbers, strict=True)
-        ]
+@pytest.mark.parametrize(
+    ("label", "folder"),
+    [
+        ("mujoco_warp (shipped)", POLICY),
+        ("newton_mujoco", POLICY / "newton_mujoco"),
+        ("newton_steel", POLICY / "newton_steel"),
+        ("mujoco_warp, then 50 iterations in newton_xpbd", POLICY / "newton_xpbd"),
+    ],
+)
+def test_numbers_of_the_table_of_engines_are_those_of_the_crossings(label, folder):
+    shown = re.findall(rf"\n\| {re.escape(label)} \|(.*)\|\n", README)[0].split("|")
+    rows = {row["physics"]: row for row in json.loads((folder / "crossing.json").read_text())["engines"]}
+    columns = ("mujoco", "steel", "kamino", "featherstone", "xpbd", "semi_implicit")
+    for cell, solver in zip(shown, columns, strict=True):
+        row = rows.pop(f"newton_{solver}")
+        fallen = f", {100.0 * row['falls']:.0f} % fall" if row["falls"] else ""
+        assert cell.strip() == f"{row['rmse_lin']:.3f}, {row['rmse_ang']:.3f}{fallen}"
+        if solver == "mujoco":
+            alike = [rows.pop(name) for name in ("mujoco_warp", "mujoco")]
+            assert all(abs(other[key] - row[key]) < 1e-3 for other in alike for key in ("rmse_lin", "rmse_ang", "falls"))
+    assert not rows
+
+
+@pytest.mark.parametrize("engine", ["newton_mujoco", "newton_steel", "newton_xpbd"])
+def test_numbers_of_the_table_of_trainings_are_those_of_the_evaluations(engine):
+    result = json.loads((POLICY / engine / f"evaluation_{engine}.json").read_text())
+    shown = [row for row in README.splitlines() if re.match(rf"\| (50 iterations in )?{engine} \| [\d.]+ s ", row)]
+    errors = [f"{result[key]['mean']:.3f} ({result[key]['worst']:.3f})" for key in ("rmse_lin", "rmse_ang")]
+    cells = [f"{errors[0]} m/s", f"{errors[1]} rad/s", f"{100.0 * result['falls']:.2f} %"]
+    assert [row.strip("| ").split(" | ")[3:] for row in shown] == [cells]
