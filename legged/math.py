@@ -18,6 +18,17 @@ def quat_rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
     return vec - w * t + torch.linalg.cross(xyz, t)
 
 
+def quat_to_matrix(quat: Tensor) -> Tensor:
+    """Rotation matrices (N, 3, 3) from the body frame of `quat` (N, 4) to the world frame."""
+    w, x, y, z = quat.t().contiguous()
+    rows = (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row) for row in rows]).permute(2, 0, 1)
+
+
 def yaw_of(quat: Tensor) -> Tensor:
     """Heading angle of the body's x axis in the world [rad], (N,)."""
     w, x, y, z = quat.unbind(dim=1)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from legged.math import masked_set_, quat_rotate, quat_rotate_inverse, uniform, wrap_to_pi, yaw_of
+from legged.math import masked_set_, quat_rotate, quat_rotate_inverse, quat_to_matrix, uniform, wrap_to_pi, yaw_of
 
 QUARTER_TURN_ABOUT_Z = torch.tensor([[0.5**0.5, 0.0, 0.0, 0.5**0.5]])
 
@@ -121,3 +121,13 @@ def test_masked_set_takes_tensors_of_any_rank():
     masked_set_(blocks, mask, torch.ones(3, 2, 2))
     assert flags.tolist() == [True, False, True]
     assert blocks.sum(dim=(1, 2)).tolist() == [4.0, 0.0, 4.0]
+
+
+def test_matrices_rotate_as_quaternions_do():
+    generator = torch.Generator().manual_seed(4)
+    quats = torch.nn.functional.normalize(torch.randn(20, 4, generator=generator), dim=1)
+    vectors = torch.randn(20, 3, generator=generator)
+    turned = (quat_to_matrix(quats) @ vectors.unsqueeze(2)).squeeze(2)
+    torch.testing.assert_close(turned, quat_rotate(quats, vectors), atol=1e-6, rtol=0.0)
+    around_z = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    torch.testing.assert_close(quat_to_matrix(QUARTER_TURN_ABOUT_Z)[0], around_z, atol=1e-6, rtol=0.0)

@@ -5,12 +5,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import mujoco
-import numpy as np
 import torch
 from torch import Tensor
 
-from legged.config.loader import ConfigError
-from legged.math import quat_rotate
 from legged.robot import Robot
 
 RandomizedField = Literal["friction", "added_base_mass"]
@@ -120,102 +117,3 @@ def allocate_state(num_envs: int, robot: Robot, device: torch.device) -> RobotSt
         feet_vel=zeros(feet, 3),
         contact_forces=zeros(shapes, 3),
     )
-
-
-@dataclass(frozen=True)
-class FootChains:
-    """The hinges between each foot and the base. Arrays are (levels, F, ...), from the foot's body up to the base's
-    child; lengths in metres, frames and axes in the body's own frame.
-    """
-
-    offset: np.ndarray
-    """(F, 3) centre of the foot shape in its body."""
-    joint: np.ndarray
-    """(levels, F) index of the hinge among the robot's joints."""
-    axis: np.ndarray
-    anchor: np.ndarray
-    body_pos: np.ndarray
-    body_quat: np.ndarray
-
-    @classmethod
-    def of(cls, model: mujoco.MjModel, robot: Robot) -> "FootChains":
-        """The chains of a robot.
-
-        Raises:
-            ConfigError: feet at different depths, or a body in between without exactly one hinge.
-        """
-        geoms = [model.geom(name) for name in robot.feet_names]
-        base = model.body(robot.file.base).id
-        bodies = [_chain(model, int(geom.bodyid[0]), base) for geom in geoms]
-        if len({len(chain) for chain in bodies}) != 1:
-            raise ConfigError(f"{robot.folder}: feet: all feet must hang on the same number of bodies")
-        body = np.array(bodies, dtype=int).T
-        if (model.body_jntnum[body] != 1).any():
-            raise ConfigError(f"{robot.folder}: feet: every body between base and foot needs exactly one hinge")
-        joint = model.body_jntadr[body]
-        return cls(
-            offset=np.array([geom.pos for geom in geoms]),
-            joint=model.jnt_dofadr[joint] - 6,
-            axis=model.jnt_axis[joint],
-            anchor=model.jnt_pos[joint],
-            body_pos=model.body_pos[body],
-            body_quat=model.body_quat[body],
-        )
-
-
-class FeetKinematics:
-    """Forward kinematics of the feet in torch.
-
-    Engines compute them at the start of a step; computed here from the live joint state they are never stale, and
-    cost no engine call.
-    """
-
-    def __init__(self, model: mujoco.MjModel, robot: Robot) -> None:
-        chains = FootChains.of(model, robot)
-
-        def tensor(values: np.ndarray) -> Tensor:
-            return torch.tensor(values, dtype=torch.float32)
-
-        self.offset = tensor(chains.offset)
-        tables = (chains.axis, chains.anchor, chains.body_pos, chains.body_quat)
-        self.levels = list(zip(torch.tensor(chains.joint), *map(tensor, tables), strict=True))
-        self.turned = not np.allclose(chains.body_quat, [1.0, 0.0, 0.0, 0.0])
-
-    def write(self, state: RobotState) -> None:
-        """The live base and joint state -> state.feet_pos, state.feet_vel."""
-        worlds, feet = state.feet_pos.shape[:2]
-        point = self.offset.expand(worlds, feet, 3)
-        velocity = torch.zeros_like(point)
-        for joint, axis, anchor, pos, quat in self.levels:
-            angle, rate = state.dof_pos[:, joint].unsqueeze(2), state.dof_vel[:, joint].unsqueeze(2)
-            axis = axis.expand_as(point)
-            point = _turn(point - anchor, axis, angle)
-            velocity = _turn(velocity, axis, angle) + rate * torch.linalg.cross(axis, point)
-            point = point + anchor
-            if self.turned:
-                flat = quat.repeat(worlds, 1)
-                point = quat_rotate(flat, point.reshape(-1, 3)).view_as(point)
-                velocity = quat_rotate(flat, velocity.reshape(-1, 3)).view_as(point)
-            point = point + pos
-        omega = state.base_ang_vel.unsqueeze(1).expand_as(point)
-        velocity = velocity + state.base_lin_vel.unsqueeze(1) + torch.linalg.cross(omega, point)
-        quat = state.base_quat.repeat_interleave(feet, dim=0)
-        position = quat_rotate(quat, point.reshape(-1, 3)).view_as(point)
-        torch.add(state.base_pos.unsqueeze(1), position, out=state.feet_pos)
-        state.feet_vel.copy_(quat_rotate(quat, velocity.reshape(-1, 3)).view_as(point))
-
-
-def _chain(model: mujoco.MjModel, body: int, base: int) -> list[int]:
-    """Bodies from `body` up to the child of `base`."""
-    chain = []
-    while body not in (0, base):
-        chain.append(body)
-        body = int(model.body_parentid[body])
-    return chain
-
-
-def _turn(vec: Tensor, axis: Tensor, angle: Tensor) -> Tensor:
-    """Rodrigues' formula: `vec` turned by `angle` about the unit vector `axis`."""
-    cos, sin = torch.cos(angle), torch.sin(angle)
-    along = (axis * vec).sum(dim=2, keepdim=True)
-    return cos * vec + sin * torch.linalg.cross(axis, vec) + (1.0 - cos) * along * axis

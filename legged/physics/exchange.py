@@ -11,7 +11,8 @@ import mujoco_warp as mjw
 import torch
 import warp as wp
 
-from legged.physics.base import FootChains, RobotState
+from legged.physics.base import RobotState
+from legged.physics.feet import FootChains
 from legged.robot import Robot
 
 # Contacts or constraint rows were dropped; the other bits (iteration caps) are no loss.

@@ -98,6 +98,15 @@ def pick_device(name: str | None, flag: str = "--sim_device") -> torch.device:
     return device
 
 
+def settle_on(device: torch.device) -> None:
+    """Set torch up for a command that runs on `device`."""
+    if device.type == "cpu":
+        # The C engine takes the cores; torch's small tensors are slower when its own threads compete for them.
+        torch.set_num_threads(1)
+    else:
+        torch.cuda.set_device(device)  # what names no device must not end up on the first GPU
+
+
 def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = None) -> int:
     """Run a command, of this process if it has no `argv` of its own; a wrong input ends with its message and exit code 2."""
     if argv is None:

@@ -23,6 +23,7 @@ from legged.rl.arguments import (
     overrides,
     pick_device,
     run_main,
+    settle_on,
 )
 from legged.rl.export import export
 from legged.rl.outing import EPISODE_S, walk_out
@@ -60,8 +61,7 @@ def _main(argv: list[str] | None) -> int:
     args = parser.parse_intermixed_args(argv)
     import_and_check(args)
     device = pick_device(args.sim_device)
-    if device.type == "cpu":
-        torch.set_num_threads(1)
+    settle_on(device)
     policy = find_policy(args)
     asked = [change for change in overrides(args) if change[0] != "train.runner.experiment_name"]
     wanted = override(policy.cfg, asked)

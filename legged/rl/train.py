@@ -24,6 +24,7 @@ from legged.rl.arguments import (
     overrides,
     pick_device,
     run_main,
+    settle_on,
 )
 from legged.rl.captured import CapturedRunner
 from legged.rl.checkpoint import check_fits, read_checkpoint
@@ -62,10 +63,7 @@ def _main(argv: list[str] | None) -> int:
         print(to_yaml(cfg), end="")
         return 0
     checkpoint = _checkpoint(args, cfg) if args.resume or args.load_run or args.checkpoint is not None else None
-    if device.type == "cpu":
-        limit_threads()
-    else:
-        torch.cuda.set_device(device)  # what names no device must not end up on the first GPU
+    settle_on(device)
     if Ranks.now().first:
         return _train(args, cfg, device, rl_device, checkpoint, start)
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
@@ -115,11 +113,6 @@ def describe(cfg: TaskConfig, device: torch.device, folder: Path) -> str:
     share = f" on each of {ranks.count} processes" if ranks.several else ""
     robots = f"{cfg.env.num_envs} robots{share}"
     return f"{cfg.task}: {robots}, {cfg.train.runner.max_iterations} iterations, {where}; {relative(folder)}"
-
-
-def limit_threads() -> None:
-    """The C engine takes the cores; torch's small tensors are slower when its own threads compete for them."""
-    torch.set_num_threads(1)
 
 
 def _checkpoint(args: argparse.Namespace, cfg: TaskConfig) -> Path:

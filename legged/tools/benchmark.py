@@ -27,7 +27,7 @@ from legged.envs import LeggedRobot
 from legged.graph import StepGraph
 from legged.physics import resolve_physics
 from legged.registry import make_task, task_config
-from legged.rl.arguments import add_task_arguments, import_and_check, overrides, pick_device, run_main
+from legged.rl.arguments import add_task_arguments, import_and_check, overrides, pick_device, run_main, settle_on
 from legged.rl.captured import CapturedRunner
 from legged.rl.display import Progress
 from legged.rl.runner import Runner
@@ -70,8 +70,7 @@ def _main(argv: list[str] | None) -> int:
     import_and_check(args)
     device = pick_device(args.sim_device)
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
-    if device.type == "cpu":
-        torch.set_num_threads(1)
+    settle_on(device)
     if args.kernels is not None and device.type != "cuda":
         raise ConfigError(f"--kernels: needs a GPU, and the task is on {device}")
     if args.scale is not None:

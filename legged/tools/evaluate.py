@@ -28,6 +28,7 @@ from legged.rl.arguments import (
     overrides,
     pick_device,
     run_main,
+    settle_on,
 )
 from legged.rl.policy import find_policy
 from legged.rl.runs import write_text
@@ -69,8 +70,7 @@ def _main(argv: list[str] | None) -> int:
         raise ConfigError("--num_envs: the grid says how many robots there are; --robots sets those of a cell")
     grid = Grid(axis_values("--vx", args.vx), axis_values("--vy", args.vy), axis_values("--yaw", args.yaw), args.robots)
     device = torch.device("cpu") if args.physics == "mujoco" and args.sim_device is None else pick_device(args.sim_device)
-    if device.type == "cpu":
-        torch.set_num_threads(1)
+    settle_on(device)
     everywhere = args.physics == EVERYWHERE
     if everywhere:
         for flag in ("solver", "types", "robots_per_point"):

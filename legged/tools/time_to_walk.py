@@ -11,12 +11,18 @@ import json
 import sys
 from typing import Any
 
-import torch
-
 from legged.config import ConfigError
 from legged.paths import relative
 from legged.physics import engine_name
-from legged.rl.arguments import add_run_arguments, add_task_arguments, import_and_check, overrides, pick_device, run_main
+from legged.rl.arguments import (
+    add_run_arguments,
+    add_task_arguments,
+    import_and_check,
+    overrides,
+    pick_device,
+    run_main,
+    settle_on,
+)
 from legged.rl.checkpoint import read_checkpoint
 from legged.rl.policy import find_policy
 from legged.rl.runs import checkpoints, write_text
@@ -47,8 +53,7 @@ def _main(argv: list[str] | None) -> int:
     if args.num_envs is not None:
         raise ConfigError("--num_envs: the grid says how many robots there are; --robots sets those of a cell")
     device = pick_device(args.sim_device)
-    if device.type == "cpu":
-        torch.set_num_threads(1)
+    settle_on(device)
     policy = find_policy(args)
     grid = Grid(AXIS, AXIS, AXIS, args.robots)
     asked = [("sim.physics", "auto"), *(one for one in overrides(args) if one[0] != "train.runner.experiment_name")]
