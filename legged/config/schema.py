@@ -330,6 +330,8 @@ class AlgorithmConfig:
     lam: float = field(default=0.95, metadata=UNIT)
     desired_kl: float = field(default=0.01, metadata=POSITIVE)
     max_grad_norm: float = field(default=1.0, metadata=POSITIVE)
+    use_mixed_precision: bool = False
+    """Networks compute in bfloat16 while they learn; weights, losses and the optimiser stay float32."""
     symmetry: bool = False
     """Learn from every sample also as its mirror image, left for right (Mittal et al., arXiv 2403.04359)."""
 

@@ -55,8 +55,6 @@ class DevicePPO(PPO):
             return "random network distillation"
         if self.symmetry and (self.symmetry.use_mirror_loss or not self.symmetry.use_data_augmentation):
             return "a mirror loss"
-        if self.use_mixed_precision:
-            return "mixed precision"
         for name, model in (("actor", self.actor), ("critic", self.critic)):
             if type(model) is not MLPModel:
                 return f"the {name} is a {type(model).__name__}"
@@ -174,8 +172,8 @@ class DevicePPO(PPO):
         if self.normalize_advantage_per_mini_batch:
             own = advantages[:samples]
             advantages = (advantages - own.mean()) / (own.std() + FEW)
-        mean = self.actor.mlp(self.actor.obs_normalizer(actor_input))
-        values = self.critic.mlp(self.critic.obs_normalizer(critic_input)).squeeze(-1)
+        mean = self._output(self.actor, actor_input)
+        values = self._output(self.critic, critic_input).squeeze(-1)
         std = self.action_std()
         log_prob = gaussian_log_prob(actions, mean, std)
         entropy = std.log().sum() + actions.shape[1] * (0.5 + HALF_LOG_2PI)
@@ -208,6 +206,13 @@ class DevicePPO(PPO):
             torch.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
         self.optimizer.step()
         return torch.stack(losses).detach()
+
+    def _output(self, model: MLPModel, inputs: Tensor) -> Tensor:
+        """What a network makes of its inputs, float32; with mixed precision its layers compute in bfloat16."""
+        kind, enabled = inputs.device.type, self.use_mixed_precision
+        # A graph must cast the weights anew at every replay, so none may come from autocast's cache.
+        with torch.autocast(kind, torch.bfloat16, enabled, cache_enabled=False):
+            return model.mlp(model.obs_normalizer(inputs)).float()
 
     def action_std(self) -> Tensor:
         """(D,) standard deviation of the actions."""
