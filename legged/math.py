@@ -19,7 +19,7 @@ def quat_rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
 
 
 def quat_to_matrix(quat: Tensor) -> Tensor:
-    """Rotation matrices (N, 3, 3) from the body frame of `quat` (N, 4) to the world frame."""
+    """Rotation matrices (N, 3, 3) from the body frame of `quat` (N, 4), w first, to the world frame."""
     w, x, y, z = quat.t().contiguous()
     rows = (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),

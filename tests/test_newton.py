@@ -225,9 +225,13 @@ def test_lost_contacts_are_reported_until_the_next_refresh(make_physics, robot, 
 # ---- other grounds and shapes -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("solver", "near"), [("mujoco", 2e-3), ("steel", 0.01)])
-def test_it_stands_on_terrain_like_c_mujoco(robot, solver, near):
-    """On bumps and on a slope of 15 degrees; the ground is one height field here, and many in C MuJoCo."""
+@pytest.mark.parametrize(
+    ("solver", "collider", "near"), [("mujoco", "cells", 2e-3), ("mujoco", "convex", 2e-3), ("steel", "cells", 0.01)]
+)
+def test_it_stands_on_terrain_like_c_mujoco(robot, solver, collider, near):
+    """On bumps and on a slope of 15 degrees; but with our collider (mujoco, cells), the ground is one height field here, and
+    many in C MuJoCo.
+    """
     cfg = TerrainConfig(mesh_type="height_map", terrain_length=4.0, terrain_width=4.0, border_size=2.0)
     tiles = [[TileSpec("rough_slope_up", 0.0), TileSpec("slope_up", 15.0)]]
     terrain = Terrain.of_tiles(tiles, cfg, np.random.default_rng(1))
@@ -236,7 +240,8 @@ def test_it_stands_on_terrain_like_c_mujoco(robot, solver, near):
     ground = terrain.height_map.height_at(states.base_pos[:, 0].numpy(), states.base_pos[:, 1].numpy())
     states.base_pos[:, 2] = torch.tensor(ground, dtype=torch.float32) + 0.65
     found = []
-    for sim in (SimConfig(physics="mujoco", threads=1), SimConfig(physics="newton", solver=solver)):
+    other = SimConfig(physics="newton", solver=solver, terrain_collider=collider)
+    for sim in (SimConfig(physics="mujoco", threads=1), other):
         physics = make_physics(robot, sim, 2, torch.device("cpu"), terrain)
         states.write(physics)
         roll(physics, states.dof_pos, 200)

@@ -328,6 +328,26 @@ def test_robots_tumble_and_come_to_rest_alike_on_all_back_ends(robot, on_stairs)
     assert all(fallen.tolist() == [True, True, False, False] for fallen in tilted.values())
 
 
+def test_the_general_collider_carries_a_robot_too(robot):
+    """sim.terrain_collider=convex, across the rim of a platform on a slope: as C MuJoCo, which has a height field there too."""
+    ground = tiles(("slope_up", 15.0))
+    states = standing(robot, 1)
+    place = ground.origins[0, 0] - [1.2, 0.0, 0.0]
+    height = ground.height_map.height_at(place[:1], place[1:2])[0]
+    states.base_pos[0] = torch.tensor([place[0], place[1], height + 0.65])
+    found = []
+    for name, collider in (("mujoco", "cells"), ("mujoco_warp", "convex")):
+        sim = SimConfig(physics=name, threads=1, terrain_collider=collider, nconmax=64, njmax=256)
+        physics = make_physics(robot, sim, 1, torch.device("cpu"), ground)
+        states.write(physics)
+        roll(physics, states.dof_pos, 200)
+        found.append(physics.state)
+        assert not physics.overflowed.any()
+    assert (found[0].contact_forces[0, :, 2] > 50.0).sum() == 4
+    torch.testing.assert_close(found[1].base_pos, found[0].base_pos, atol=2e-4, rtol=0.0)
+    torch.testing.assert_close(found[1].base_quat, found[0].base_quat, atol=2e-4, rtol=0.0)
+
+
 def test_self_collisions_are_kept_if_asked(robot, on_stairs):
     """Knees turned inward until left and right thigh meet: they feel each other, on level ground far above it."""
     ground = tiles(("flat", 0.0))

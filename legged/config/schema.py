@@ -74,7 +74,7 @@ class SimConfig:
     """Let the robot's shapes touch each other, except those of neighbouring bodies."""
     terrain_collider: Literal["cells", "convex"] = "cells"
     """How mujoco_warp and Newton's MuJoCo solver meet a height map: `cells`, our own kernel with vertical faces; `convex`,
-    the general collider on one height field, three times slower and with ramps for steps, for shapes unknown to `cells`."""
+    the general collider on one height field, ten times slower and with ramps for steps, for shapes unknown to `cells`."""
     threads: int = field(default=0, metadata=AT_LEAST_0)
     """Threads of the C engine; 0 takes all cores."""
 

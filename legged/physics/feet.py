@@ -76,7 +76,7 @@ class FeetKinematics:
     """Forward kinematics of the feet in torch.
 
     Engines compute them at the start of a step; computed here from the live joint state they are never stale, and
-    cost no engine call. Worlds are the last dimension, along which memory runs: with vectors last it takes ten times as long.
+    cost no engine call. Worlds are the last dimension, along which memory runs: with vectors last it takes twice as long.
     """
 
     def __init__(self, model: mujoco.MjModel, robot: Robot) -> None:
@@ -85,7 +85,7 @@ class FeetKinematics:
         def tensor(values: np.ndarray) -> Tensor:
             return torch.tensor(values, dtype=torch.float32)
 
-        self._offset = tensor(chains.offset).unsqueeze(2)
+        self._offset = tensor(chains.offset).unsqueeze(2)  # (F, 3, 1)
         columns = np.eye(3)
         self._levels = [
             _Level(
@@ -102,10 +102,10 @@ class FeetKinematics:
         ]
 
     def write(self, state: RobotState) -> None:
-        """The live base and joint state -> state.feet_pos, state.feet_vel."""
+        """The live base and joint state -> state.feet_pos [m] and state.feet_vel [m/s], (N, F, 3), world frame."""
         feet, worlds = len(self._offset), len(state.base_pos)
         angles, rates = state.dof_pos.t().contiguous(), state.dof_vel.t().contiguous()
-        moved = torch.zeros(feet, 3, 2, worlds)  # points, and their velocities
+        moved = torch.zeros(feet, 3, 2, worlds)  # points and their velocities, in the base frame at the end
         moved[:, :, 0] = self._offset
         for level in self._levels:
             moved[:, :, 0] -= level.anchor

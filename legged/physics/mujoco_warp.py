@@ -114,18 +114,19 @@ class MujocoWarpPhysics(WarpPhysics):
 
     def _choose_torque_step(self, sim: SimConfig) -> TorqueStep | None:
         """What replaces mujoco-warp's stages around our solver, where the model allows it."""
+        why_none = why_stages = ""
         if self._solver is None:
-            why_not = "needs the fused sim.constraint_solver"
+            why_none = "needs the fused sim.constraint_solver"
         elif not TorqueStep.moved_by_torques(self.model):
-            why_not = "more than torques moves the robot: springs, dampers, geared or affine actuators, a fluid"
+            why_none = "more than torques moves the robot: springs, dampers, geared or affine actuators, a fluid"
         else:
-            why_not = SmoothDynamics.why_not(self.model)
-        if sim.smooth_dynamics == "fused" and why_not:
+            why_stages = SmoothDynamics.why_not(self.model)
+        if sim.smooth_dynamics == "fused" and (why_not := why_none or why_stages):
             raise ConfigError(f"sim.smooth_dynamics=fused: {why_not}; sim.smooth_dynamics=auto takes what fits")
-        if self._solver is None or not TorqueStep.moved_by_torques(self.model):
+        if why_none:
             return None
-        base, fused = self.model.body(self.robot.file.base).id, sim.smooth_dynamics != "stages" and why_not == ""
-        return TorqueStep(self.model, self._m, self._d, base, fused)
+        base = self.model.body(self.robot.file.base).id
+        return TorqueStep(self.model, self._m, self._d, base, fused=sim.smooth_dynamics != "stages" and not why_stages)
 
     def library_step(self) -> None:
         """A physics step as mujoco-warp makes it by itself, to compare with."""

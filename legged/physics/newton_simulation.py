@@ -60,8 +60,10 @@ class Simulation:
         solver = self.solver
         assert isinstance(solver, SolverMuJoCo)
         model = solver.mj_model
-        robot, (ground,) = np.flatnonzero(model.geom_bodyid), np.flatnonzero(model.geom_bodyid == 0)
-        TerrainContact(solver.mjw_model, solver.mjw_data, model, int(ground), terrain.height_map, robot)
+        ground = self.model.shape_count - 1  # the shape that was added last
+        (floor,) = np.flatnonzero(solver.mjc_geom_to_newton_shape.numpy()[0] == ground)
+        shapes = np.flatnonzero(model.geom_bodyid)
+        TerrainContact(solver.mjw_model, solver.mjw_data, model, int(floor), terrain.height_map, shapes)
 
     def _request(self) -> SolverBase.Observables | None:
         """What the solver is to report of a step beside the state."""

@@ -1,6 +1,6 @@
 """Contacts of spheres, capsules and boxes with a height map, as one Warp kernel behind mujoco-warp's own collisions.
 
-mujoco-warp meets a height field with a general convex solver (GJK) on triangular prisms: three times the cost of a plane,
+mujoco-warp meets a height field with a general convex solver (GJK) on triangular prisms: ten times the cost of this,
 and a riser becomes a ramp one cell wide. Here a contact is a few lookups (ground.py).
 
 Conventions: the normal points from the terrain (first geom) to the robot's shape; `dist` is negative in penetration; the
@@ -104,8 +104,8 @@ def probes_of(model: mujoco.MjModel, shapes: Iterable[int]) -> Iterator[Probe]:
         else:
             name, of = model.geom(i).name, kinds(kind).name.removeprefix("mjGEOM_").lower()
             raise ConfigError(
-                f"terrain: shape '{name}' is a {of}; a height map meets spheres, capsules and boxes (their corners) in"
-                " mujoco_warp. Use those, or sim.physics=mujoco"
+                f"terrain: shape '{name}' is a {of}; sim.terrain_collider=cells knows spheres, capsules and boxes (their"
+                " corners). Use those, sim.terrain_collider=convex, or sim.physics=mujoco"
             )
 
 

@@ -208,7 +208,9 @@ class DevicePPO(PPO):
         return torch.stack(losses).detach()
 
     def _output(self, model: MLPModel, inputs: Tensor) -> Tensor:
-        """What a network makes of its inputs, float32; with mixed precision its layers compute in bfloat16."""
+        """What a network makes of its inputs (n, width): (n, outputs), float32. With mixed precision its layers compute in
+        bfloat16.
+        """
         kind, enabled = inputs.device.type, self.use_mixed_precision
         # A graph must cast the weights anew at every replay, so none may come from autocast's cache.
         with torch.autocast(kind, torch.bfloat16, enabled, cache_enabled=False):

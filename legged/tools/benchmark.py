@@ -70,11 +70,11 @@ def _main(argv: list[str] | None) -> int:
     import_and_check(args)
     device = pick_device(args.sim_device)
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
-    settle_on(device)
     if args.kernels is not None and device.type != "cuda":
         raise ConfigError(f"--kernels: needs a GPU, and the task is on {device}")
     if args.scale is not None:
-        return scale(args, cfg, device)
+        return scale(args, cfg, device)  # in processes of their own: this one must not take memory
+    settle_on(device)
     if args.grounds and resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics")) != "mujoco_warp":
         raise ConfigError("--grounds: compares colliders of mujoco_warp; add sim.physics=mujoco_warp")
     if args.grounds and cfg.terrain.mesh_type == "plane":
