@@ -329,7 +329,7 @@ def test_robots_tumble_and_come_to_rest_alike_on_all_back_ends(robot, on_stairs)
 
 
 def test_the_general_collider_carries_a_robot_too(robot):
-    """sim.terrain_collider=convex, across the rim of a platform on a slope: as C MuJoCo, which has a height field there too."""
+    """sim.terrain_collider=convex, across the rim of a platform on a slope: as C MuJoCo, with a height field there too."""
     ground = tiles(("slope_up", 15.0))
     states = standing(robot, 1)
     place = ground.origins[0, 0] - [1.2, 0.0, 0.0]
