@@ -63,8 +63,9 @@ class SimConfig:
     has converged; `fused`, the same iteration as one launch in which every world ends by itself; `auto`, `fused` for a model
     that it knows (pyramidal cones, 32 degrees of freedom)."""
     smooth_dynamics: Literal["auto", "fused", "stages"] = "auto"
-    """How mujoco_warp computes poses, inertias and bias forces: `stages`, its own twenty launches; `fused`, one; `auto`,
-    `fused` for a robot that torques alone move, with `constraint_solver` fused too."""
+    """How mujoco_warp computes what is not of contacts: `stages`, its own launches, dozens of them; `fused`, one for poses,
+    inertias and bias forces, one for integration; `auto`, `fused` for a robot that torques alone move, where the constraint
+    solver is fused too."""
     nconmax: int = field(default=24, metadata=AT_LEAST_1)
     """Contacts (and candidate pairs) allocated per robot in mujoco_warp and newton, in a pool all robots share."""
     njmax: int = field(default=96, metadata=AT_LEAST_1)

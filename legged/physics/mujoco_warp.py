@@ -18,7 +18,6 @@ from legged.physics.constraint_solver import ConstraintSolver
 from legged.physics.exchange import Exchange
 from legged.physics.kernels import compile_ahead
 from legged.physics.scene import FLOOR, build_model
-from legged.physics.smooth_dynamics import SmoothDynamics
 from legged.physics.terrain_contact import TerrainContact
 from legged.physics.torque_step import TorqueStep
 from legged.physics.warp_physics import WarpPhysics
@@ -87,10 +86,9 @@ class MujocoWarpPhysics(WarpPhysics):
             mjw.step(m, d)
             return
         if self._torque_step is not None:
-            self._torque_step.place()
+            self._torque_step.begin()
             mjw.collision(m, d)
             mjw.make_constraint(m, d)
-            self._torque_step.sum_forces()
             self._solver.solve()
             self._torque_step.integrate()
             return
@@ -114,19 +112,12 @@ class MujocoWarpPhysics(WarpPhysics):
 
     def _choose_torque_step(self, sim: SimConfig) -> TorqueStep | None:
         """What replaces mujoco-warp's stages around our solver, where the model allows it."""
-        why_none = why_stages = ""
-        if self._solver is None:
-            why_none = "needs the fused sim.constraint_solver"
-        elif not TorqueStep.moved_by_torques(self.model):
-            why_none = "more than torques moves the robot: springs, dampers, geared or affine actuators, a fluid"
-        else:
-            why_stages = SmoothDynamics.why_not(self.model)
-        if sim.smooth_dynamics == "fused" and (why_not := why_none or why_stages):
+        why_not = TorqueStep.why_not(self.model) if self._solver else "needs the fused sim.constraint_solver"
+        if sim.smooth_dynamics == "fused" and why_not:
             raise ConfigError(f"sim.smooth_dynamics=fused: {why_not}; sim.smooth_dynamics=auto takes what fits")
-        if why_none:
+        if sim.smooth_dynamics == "stages" or why_not:
             return None
-        base = self.model.body(self.robot.file.base).id
-        return TorqueStep(self.model, self._m, self._d, base, fused=sim.smooth_dynamics != "stages" and not why_stages)
+        return TorqueStep(self.model, self._m, self._d, self.model.body(self.robot.file.base).id)
 
     def library_step(self) -> None:
         """A physics step as mujoco-warp makes it by itself, to compare with."""

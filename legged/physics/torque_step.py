@@ -2,7 +2,8 @@
 
 mujoco-warp launches a stage for everything that a model might have: springs, dampers, gravity compensation, external
 forces, muscles with lengths and activations. At 4096 worlds a launch costs microseconds whether it finds anything or not;
-together these are a fifth of a step. Where a model has none of them, forces are one launch and integration is another.
+together these are a fifth of a step. Where a model has none of them, what comes before contacts is one launch, and
+integration is another.
 """
 
 from typing import Any
@@ -27,22 +28,6 @@ def turned_by(quat: wp.vec4, rotation: wp.vec3) -> wp.vec4:
     old = wp.vec3(quat[1], quat[2], quat[3])
     new = quat[0] * xyz + w * old + wp.cross(old, xyz)
     return wp.normalize(wp.vec4(quat[0] * w - wp.dot(old, xyz), new[0], new[1], new[2]))
-
-
-@wp.kernel
-def sum_forces(
-    torques: wp.array2d[float],
-    lowest: wp.array[float],
-    highest: wp.array[float],
-    bias: wp.array2d[float],
-    qfrc_smooth: wp.array2d[float],
-):
-    """One thread a world and degree of freedom: the motor's torque within its limits, less Coriolis forces and weight."""
-    world, dof = wp.tid()
-    force = -bias[world, dof]
-    if dof >= 6:
-        force += wp.clamp(torques[world, dof - 6], lowest[dof - 6], highest[dof - 6])
-    qfrc_smooth[world, dof] = force
 
 
 @wp.kernel
@@ -86,23 +71,27 @@ def integrate(
 
 
 class TorqueStep:
-    """Launches on mujoco-warp's arrays what comes before contacts, between them and the solver, and after it."""
+    """Launches on mujoco-warp's arrays what comes before contacts and after the solver."""
 
-    def __init__(self, model: mujoco.MjModel, m: Any, d: Any, base: int, fused: bool) -> None:
-        """For a model that `moved_by_torques`, whose free body is `base`; with `fused`, poses, inertias and forces are one
-        launch. Call with the arrays' device as Warp's current one.
+    def __init__(self, model: mujoco.MjModel, m: Any, d: Any, base: int) -> None:
+        """For a model of which nothing is said by `why_not`, whose free body is `base`. Call with the arrays' device as
+        Warp's current one.
         """
         free = np.array([-np.inf, np.inf])
         controls = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, free)
         forces = np.where(model.actuator_forcelimited[:, None], model.actuator_forcerange, free)
         limits = np.stack([np.maximum(controls, forces)[:, 0], np.minimum(controls, forces)[:, 1]])
-        self._m, self._d = m, d
-        self._dynamics = SmoothDynamics(model, m, d, base, limits) if fused else None
-        lowest, highest = (wp.array(values, dtype=float) for values in limits)
-        self._forces = (d.nworld, m.nv), [d.ctrl, lowest, highest, d.qfrc_bias], [d.qfrc_smooth]
+        self._dynamics = SmoothDynamics(model, m, d, base, limits)
         state = [d.qpos, d.qvel, d.qacc_warmstart, d.overflow]
         counts = [d.nefc, d.nacon, d.ncollision, d.njmax, d.naconmax]
         self._integration = (d.nworld, m.njnt), [m.opt.timestep, d.qacc, *counts], state
+
+    @classmethod
+    def why_not(cls, model: mujoco.MjModel) -> str:
+        """What of a model this does not step; empty if nothing."""
+        if not cls.moved_by_torques(model):
+            return "more than torques moves the robot: springs, dampers, geared or affine actuators, a fluid"
+        return SmoothDynamics.why_not(model)
 
     @staticmethod
     def moved_by_torques(model: mujoco.MjModel) -> bool:
@@ -124,22 +113,9 @@ class TorqueStep:
             and (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE).all()
         )
 
-    def place(self) -> None:
-        """From qpos: where shapes are, and what contacts need to know of the robot."""
-        if self._dynamics is not None:
-            self._dynamics.launch()  # forces too
-            return
-        mjw.fwd_kinematics(self._m, self._d)
-        mjw.crb(self._m, self._d)
-
-    def sum_forces(self) -> None:
-        """From qvel and controls: qfrc_smooth."""
-        if self._dynamics is not None:
-            return
-        mjw.com_vel(self._m, self._d)
-        mjw.rne(self._m, self._d)
-        dim, inputs, outputs = self._forces
-        wp.launch(sum_forces, dim=dim, inputs=inputs, outputs=outputs)
+    def begin(self) -> None:
+        """From qpos, qvel and controls: where shapes are, what contacts need to know of the robot, and qfrc_smooth."""
+        self._dynamics.launch()
 
     def integrate(self) -> None:
         """From qacc: the next state, the next warm start, and the overflow flags."""

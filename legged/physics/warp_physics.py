@@ -1,5 +1,6 @@
 """What the back-ends on Warp share: states as views of the engine's arrays, streams, and capture on the CPU."""
 
+from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
@@ -44,9 +45,9 @@ class WarpPhysics(Physics):
         self._forces_read = False
         self._advance: Callable[[], Any] = self._step
 
+    @abstractmethod
     def _step(self) -> None:
         """One physics step, as launches."""
-        raise NotImplementedError
 
     def _allocate_state(self) -> RobotState:
         """RobotState with the fields that `_qpos` and `_qvel` hold already as views of them."""
