@@ -61,9 +61,10 @@ SOURCE = """
     float H[DOFS][NV];
     const float TINY = 1e-15f;
 
-    const int ne = equalities.data[world], nf = ne + frictions.data[world];
-    const int rows = nefc.data[world] < ROWS ? nefc.data[world] : ROWS;
-    const int width = jacobian.shape[2];  // padded
+    const int ne = arrays.equalities.data[world], nf = ne + arrays.frictions.data[world];
+    const int rows = arrays.nefc.data[world] < ROWS ? arrays.nefc.data[world] : ROWS;
+    const int width = arrays.jacobian.shape[2];  // padded
+    const float* jacobian = arrays.jacobian.data + (long long)world * arrays.jacobian.shape[1] * width;
 
     // Derivative of a row's cost at x. `side` tells the pieces of its cost apart: the curvature where it is quadratic.
     auto pull = [&](int r, int q, float at, float& side) {
@@ -79,25 +80,25 @@ SOURCE = """
     meet();  // of the world before
     for (int k = lane; k < NV * STEP; k += lanes) M[k] = 0.0f;
     for (int k = lane; k < rows * NV; k += lanes)
-        J[(k / NV) * STEP + k %% NV] = jacobian.data[((long long)world * jacobian.shape[1] + k / NV) * width + k %% NV];
+        J[(k / NV) * STEP + k %% NV] = jacobian[(k / NV) * width + k %% NV];
     EACH_ROW(r, q) {
-        const int at = world * stiffness.shape[1] + r;
-        D[q] = stiffness.data[at];
-        loss[q] = frictionloss.data[at];
+        const int at = world * arrays.stiffness.shape[1] + r;
+        D[q] = arrays.stiffness.data[at];
+        loss[q] = arrays.frictionloss.data[at];
         sides[q] = -3.0f;
     }
     EACH(i) {
-        OF(a, i) = warmstart.data[world * warmstart.shape[1] + i];
-        OF(smooth, i) = qfrc_smooth.data[world * qfrc_smooth.shape[1] + i];
+        OF(a, i) = arrays.warmstart.data[world * arrays.warmstart.shape[1] + i];
+        OF(smooth, i) = arrays.qfrc_smooth.data[world * arrays.qfrc_smooth.shape[1] + i];
         shown[i] = OF(a, i);
     }
     meet();
     float trace = 0.0f;
     EACH(i) {
-        const int from = row_start.data[i], count = row_count.data[i];
+        const int from = arrays.row_start.data[i], count = arrays.row_count.data[i];
         for (int k = from; k < from + count; ++k) {
-            const int j = column.data[k];
-            const float m = inertia.data[world * inertia.shape[1] + k];
+            const int j = arrays.column.data[k];
+            const float m = arrays.inertia.data[world * arrays.inertia.shape[1] + k];
             M[i * STEP + j] = m;
             M[j * STEP + i] = m;
             if (i == j) trace += m;
@@ -112,7 +113,7 @@ SOURCE = """
         OF(Ma, i) = total;
     }
     EACH_ROW(r, q) {
-        float total = -reference.data[world * reference.shape[1] + r];
+        float total = -arrays.reference.data[world * arrays.reference.shape[1] + r];
         #pragma unroll
         for (int j = 0; j < NV; ++j) total += J[r * STEP + j] * shown[j];
         x[q] = total;
@@ -136,7 +137,7 @@ SOURCE = """
             float pushed = 0.0f;
             #pragma unroll 4
             for (int r = 0; r < rows; ++r) pushed += J[r * STEP + i] * force[r];
-            qfrc_constraint.data[world * qfrc_constraint.shape[1] + i] = pushed;
+            arrays.qfrc_constraint.data[world * arrays.qfrc_constraint.shape[1] + i] = pushed;
             OF(grad, i) = OF(Ma, i) - OF(smooth, i) - pushed;
             squares += OF(grad, i) * OF(grad, i);
         }
@@ -236,11 +237,11 @@ SOURCE = """
     }
 
     EACH(i) {
-        qacc.data[world * qacc.shape[1] + i] = OF(a, i);
-        inertial.data[world * inertial.shape[1] + i] = OF(Ma, i);
+        arrays.qacc.data[world * arrays.qacc.shape[1] + i] = OF(a, i);
+        arrays.inertial.data[world * arrays.inertial.shape[1] + i] = OF(Ma, i);
     }
-    for (int r = lane; r < rows; r += lanes) efc_force.data[world * efc_force.shape[1] + r] = force[r];
-    if (lane == 0) rounds.data[world] = round;
+    for (int r = lane; r < rows; r += lanes) arrays.efc_force.data[world * arrays.efc_force.shape[1] + r] = force[r];
+    if (lane == 0) arrays.rounds.data[world] = round;
     #undef LEGGED_SHARED
     #undef EACH
     #undef EACH_FROM
@@ -259,87 +260,44 @@ def row_length(nv: int) -> int:
     return 4 * (-(-nv // 4) | 1)
 
 
+@wp.struct
+class SolverArrays:
+    """What the solver reads of mujoco-warp's model and data, and from `qacc` on what it writes."""
+
+    row_start: wp.array[int]
+    row_count: wp.array[int]
+    column: wp.array[int]
+    inertia: wp.array2d[float]
+    qfrc_smooth: wp.array2d[float]
+    warmstart: wp.array2d[float]
+    equalities: wp.array[int]
+    frictions: wp.array[int]
+    nefc: wp.array[int]
+    jacobian: wp.array3d[float]
+    stiffness: wp.array2d[float]
+    reference: wp.array2d[float]
+    frictionloss: wp.array2d[float]
+    qacc: wp.array2d[float]
+    inertial: wp.array2d[float]
+    qfrc_constraint: wp.array2d[float]
+    efc_force: wp.array2d[float]
+    rounds: wp.array[int]
+
+
 def solver_kernel(nv: int, rows: int) -> Any:
     """The kernel for models of `nv` degrees of freedom and at most `rows` constraint rows; launched for (worlds, lanes)."""
 
     @wp.func_native(SOURCE % {"nv": nv, "rows": rows, "step": row_length(nv)})
     def solve_world(
-        world: int,
-        most_rounds: int,
-        most_searches: int,
-        tolerance: float,
-        ls_tolerance: float,
-        row_start: wp.array[int],
-        row_count: wp.array[int],
-        column: wp.array[int],
-        inertia: wp.array2d[float],
-        qfrc_smooth: wp.array2d[float],
-        warmstart: wp.array2d[float],
-        equalities: wp.array[int],
-        frictions: wp.array[int],
-        nefc: wp.array[int],
-        jacobian: wp.array3d[float],
-        stiffness: wp.array2d[float],
-        reference: wp.array2d[float],
-        frictionloss: wp.array2d[float],
-        qacc: wp.array2d[float],
-        inertial: wp.array2d[float],
-        qfrc_constraint: wp.array2d[float],
-        efc_force: wp.array2d[float],
-        rounds: wp.array[int],
+        world: int, most_rounds: int, most_searches: int, tolerance: float, ls_tolerance: float, arrays: SolverArrays
     ) -> None: ...
 
     @wp.kernel(module="unique", enable_backward=False)
     def solve_constraints(
-        most_rounds: int,
-        most_searches: int,
-        tolerance: float,
-        ls_tolerance: float,
-        row_start: wp.array[int],
-        row_count: wp.array[int],
-        column: wp.array[int],
-        inertia: wp.array2d[float],
-        qfrc_smooth: wp.array2d[float],
-        warmstart: wp.array2d[float],
-        equalities: wp.array[int],
-        frictions: wp.array[int],
-        nefc: wp.array[int],
-        jacobian: wp.array3d[float],
-        stiffness: wp.array2d[float],
-        reference: wp.array2d[float],
-        frictionloss: wp.array2d[float],
-        qacc: wp.array2d[float],
-        inertial: wp.array2d[float],
-        qfrc_constraint: wp.array2d[float],
-        efc_force: wp.array2d[float],
-        rounds: wp.array[int],
+        most_rounds: int, most_searches: int, tolerance: float, ls_tolerance: float, arrays: SolverArrays
     ) -> None:
         world, _lane = wp.tid()  # type: ignore[misc]
-        solve_world(
-            world,
-            most_rounds,
-            most_searches,
-            tolerance,
-            ls_tolerance,
-            row_start,
-            row_count,
-            column,
-            inertia,
-            qfrc_smooth,
-            warmstart,
-            equalities,
-            frictions,
-            nefc,
-            jacobian,
-            stiffness,
-            reference,
-            frictionloss,
-            qacc,
-            inertial,
-            qfrc_constraint,
-            efc_force,
-            rounds,
-        )
+        solve_world(world, most_rounds, most_searches, tolerance, ls_tolerance, arrays)
 
     return solve_constraints
 
@@ -354,11 +312,20 @@ class ConstraintSolver:
         self._kernel = solver_kernel(m.nv, d.njmax)
         self._lanes = 1 if d.qacc.device.is_cpu else LANES
         efc, opt = d.efc, m.opt
-        settings = [opt.iterations, opt.ls_iterations, float(opt.tolerance.numpy()[0]), float(opt.ls_tolerance.numpy()[0])]
-        inertia = [m.M_rowadr, m.M_rownnz, m.M_colind, d.M]
-        rows = [d.ne, d.nf, d.nefc, efc.J, efc.D, efc.aref, efc.frictionloss]
-        self._inputs = [*settings, *inertia, d.qfrc_smooth, d.qacc_warmstart, *rows]
-        self._outputs = [d.qacc, efc.Ma, d.qfrc_constraint, efc.force, d.solver_niter]
+        self._settings = [
+            opt.iterations,
+            opt.ls_iterations,
+            float(opt.tolerance.numpy()[0]),
+            float(opt.ls_tolerance.numpy()[0]),
+        ]
+        arrays = self._arrays = SolverArrays()
+        arrays.row_start, arrays.row_count, arrays.column, arrays.inertia = m.M_rowadr, m.M_rownnz, m.M_colind, d.M
+        arrays.qfrc_smooth, arrays.warmstart = d.qfrc_smooth, d.qacc_warmstart
+        arrays.equalities, arrays.frictions, arrays.nefc = d.ne, d.nf, d.nefc
+        arrays.jacobian, arrays.stiffness, arrays.reference = efc.J, efc.D, efc.aref
+        arrays.frictionloss = efc.frictionloss
+        arrays.qacc, arrays.inertial, arrays.qfrc_constraint = d.qacc, efc.Ma, d.qfrc_constraint
+        arrays.efc_force, arrays.rounds = efc.force, d.solver_niter
         self._worlds = d.nworld
 
     @staticmethod
@@ -384,4 +351,5 @@ class ConstraintSolver:
     def solve(self) -> None:
         """From M, qfrc_smooth, the constraint rows and the last acceleration: qacc, qfrc_constraint and efc.force."""
         dim = (self._worlds, self._lanes)
-        wp.launch(self._kernel, dim=dim, inputs=self._inputs, outputs=self._outputs, block_dim=self._lanes)
+        inputs = [*self._settings, self._arrays]
+        wp.launch(self._kernel, dim=dim, inputs=inputs, block_dim=self._lanes)

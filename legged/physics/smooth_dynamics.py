@@ -18,12 +18,21 @@ from legged.physics.constraint_solver import LANES, SHARED_BYTES
 SOURCE = """
     const int NB = %(bodies)d, NV = %(dofs)d, NJ = %(joints)d, NG = %(geoms)d, DEPTH = %(depth)d, base = %(base)d;
     const float gravity[3] = {%(gravity)s};
+    // Tables that `SmoothDynamics` fills: of a body the numbers, then floats, in its parent's frame; of a hinge; of a shape.
+    enum { PARENT, LEVEL, FIRST_JOINT, END_JOINT, SUBTREE, NUMBERS };
+    enum { POSITION, ORIENTATION = 3, COM = 7, PRINCIPAL_AXES = 10, PRINCIPAL = 14, BODY = 17 };
+    enum { ANCHOR, AXIS = 3, REFERENCE = 6, LOWEST, HIGHEST, JOINT };
+    const int GEOM = 7;  // POSITION, ORIENTATION
+    const int* numbers = arrays.body_numbers.data;
+    const float *bodies = arrays.bodies.data, *joints = arrays.joints.data, *geoms = arrays.geoms.data;
 #if defined(__CUDA_ARCH__)
     #define LEGGED_SHARED __shared__
-    #define EACH(i, count) for (int i = threadIdx.x & 31; i < (count); i += 32)
+    const int lane = threadIdx.x & 31;
+    #define EACH(i, count) for (int i = lane; i < (count); i += 32)
     auto meet = []() { __syncwarp(); };
 #else
     #define LEGGED_SHARED
+    const int lane = 0;
     #define EACH(i, count) for (int i = 0; i < (count); ++i)
     auto meet = []() {};
 #endif
@@ -73,12 +82,12 @@ SOURCE = """
         for (int k = 0; k < 3; ++k) out[3 + k] = carried_along[k] + body[9] * v[3 + k];
     };
 
-    const float* q_in = qpos.data + (long long)world * qpos.shape[1];
-    const float* v_in = qvel.data + (long long)world * qvel.shape[1];
-    const float* masses = body_mass.data + (long long)(world %% body_mass.shape[0]) * NB;
+    const float* q_in = arrays.qpos.data + (long long)world * arrays.qpos.shape[1];
+    const float* v_in = arrays.qvel.data + (long long)world * arrays.qvel.shape[1];
+    const float* masses = arrays.body_mass.data + (long long)(world %% arrays.body_mass.shape[0]) * NB;
 
     meet();  // of the world before
-    EACH(b, NB) if (body_numbers.data[b * 5 + 1] == 0) {
+    EACH(b, NB) if (numbers[b * NUMBERS + LEVEL] == 0) {
         for (int k = 0; k < 3; ++k) pos[b * 3 + k] = 0.0f;
         for (int k = 0; k < 4; ++k) quat[b * 4 + k] = k == 0 ? 1.0f : 0.0f;
         for (int k = 0; k < 6; ++k) velocity[b * 6 + k] = 0.0f;
@@ -87,27 +96,27 @@ SOURCE = """
     meet();
     // Poses, level by level away from the world.
     for (int level = 1; level <= DEPTH; ++level) {
-        EACH(b, NB) if (body_numbers.data[b * 5 + 1] == level) {
-            const int parent = body_numbers.data[b * 5];
+        EACH(b, NB) if (numbers[b * NUMBERS + LEVEL] == level) {
+            const int parent = numbers[b * NUMBERS + PARENT];
             float p[3], q[4], moved[3];
             if (b == base) {
                 for (int k = 0; k < 3; ++k) p[k] = q_in[k];
                 for (int k = 0; k < 4; ++k) q[k] = q_in[3 + k];
             } else {
-                rotate(quat + parent * 4, bodies.data + b * 17, moved);
+                rotate(quat + parent * 4, bodies + b * BODY + POSITION, moved);
                 for (int k = 0; k < 3; ++k) p[k] = pos[parent * 3 + k] + moved[k];
-                multiply(quat + parent * 4, bodies.data + b * 17 + 3, q);
-                for (int j = body_numbers.data[b * 5 + 2]; j < body_numbers.data[b * 5 + 3]; ++j) {
+                multiply(quat + parent * 4, bodies + b * BODY + ORIENTATION, q);
+                for (int j = numbers[b * NUMBERS + FIRST_JOINT]; j < numbers[b * NUMBERS + END_JOINT]; ++j) {
                     float turn[4], before[4];
-                    rotate(q, joints.data + j * 9, moved);
+                    rotate(q, joints + j * JOINT + ANCHOR, moved);
                     for (int k = 0; k < 3; ++k) anchor[j * 3 + k] = p[k] + moved[k];
-                    rotate(q, joints.data + j * 9 + 3, axis + j * 3);
-                    const float half = 0.5f * (q_in[7 + j] - joints.data[j * 9 + 6]);
+                    rotate(q, joints + j * JOINT + AXIS, axis + j * 3);
+                    const float half = 0.5f * (q_in[7 + j] - joints[j * JOINT + REFERENCE]);
                     turn[0] = cosf(half);
-                    for (int k = 0; k < 3; ++k) turn[1 + k] = sinf(half) * joints.data[j * 9 + 3 + k];
+                    for (int k = 0; k < 3; ++k) turn[1 + k] = sinf(half) * joints[j * JOINT + AXIS + k];
                     for (int k = 0; k < 4; ++k) before[k] = q[k];
                     multiply(before, turn, q);
-                    rotate(q, joints.data + j * 9, moved);
+                    rotate(q, joints + j * JOINT + ANCHOR, moved);
                     for (int k = 0; k < 3; ++k) p[k] = anchor[j * 3 + k] - moved[k];
                 }
             }
@@ -118,23 +127,23 @@ SOURCE = """
         meet();
     }
     EACH(g, NG) {
-        const int b = geom_body.data[g];
+        const int b = arrays.geom_body.data[g];
         const long long at = (long long)world * NG + g;
-        float* out = reinterpret_cast<float*>(geom_xpos.data) + at * 3;
+        float* out = reinterpret_cast<float*>(arrays.geom_xpos.data) + at * 3;
         float moved[3], q[4];
-        rotate(quat + b * 4, geoms.data + g * 7, moved);
+        rotate(quat + b * 4, geoms + g * GEOM + POSITION, moved);
         for (int k = 0; k < 3; ++k) out[k] = pos[b * 3 + k] + moved[k];
-        multiply(quat + b * 4, geoms.data + g * 7 + 3, q);
-        to_matrix(q, reinterpret_cast<float*>(geom_xmat.data) + at * 9);
+        multiply(quat + b * 4, geoms + g * GEOM + ORIENTATION, q);
+        to_matrix(q, reinterpret_cast<float*>(arrays.geom_xmat.data) + at * 9);
     }
     // The robot's centre of mass: all threads add up the same.
     EACH(b, NB) {
         float moved[3];
-        rotate(quat + b * 4, bodies.data + b * 17 + 7, moved);
+        rotate(quat + b * 4, bodies + b * BODY + COM, moved);
         for (int k = 0; k < 3; ++k) centre[b * 3 + k] = pos[b * 3 + k] + moved[k];
     }
     meet();
-    const int last = base + body_numbers.data[base * 5 + 4];
+    const int last = base + numbers[base * NUMBERS + SUBTREE];
     float com[3] = {0.0f, 0.0f, 0.0f}, mass = 0.0f;
     for (int b = base; b < last; ++b) {
         mass += masses[b];
@@ -144,9 +153,9 @@ SOURCE = """
     // Inertias about it.
     EACH(b, NB) {
         float q[4], R[9], I[6];
-        multiply(quat + b * 4, bodies.data + b * 17 + 10, q);
+        multiply(quat + b * 4, bodies + b * BODY + PRINCIPAL_AXES, q);
         to_matrix(q, R);
-        const float* main = bodies.data + b * 17 + 14;
+        const float* main = bodies + b * BODY + PRINCIPAL;
         const int one[6] = {0, 1, 2, 0, 0, 1}, other[6] = {0, 1, 2, 1, 2, 2};
         for (int n = 0; n < 6; ++n) {
             I[n] = 0.0f;
@@ -176,25 +185,27 @@ SOURCE = """
             for (int k = 0; k < 3; ++k) offset[k] = com[k] - about[k];
             cross(out, offset, out + 3);
         }
-        float* shown = reinterpret_cast<float*>(cdof.data) + ((long long)world * NV + i) * 6;
+        float* shown = reinterpret_cast<float*>(arrays.cdof.data) + ((long long)world * NV + i) * 6;
         for (int k = 0; k < 6; ++k) shown[k] = out[k];
     }
-    EACH(b, NB) if (b == base)
-        for (int k = 0; k < 3; ++k) reinterpret_cast<float*>(subtree_com.data)[((long long)world * NB + b) * 3 + k] = com[k];
+    if (lane == 0) {
+        float* out = reinterpret_cast<float*>(arrays.subtree_com.data) + ((long long)world * NB + base) * 3;
+        for (int k = 0; k < 3; ++k) out[k] = com[k];
+    }
     meet();
     EACH(b, NB)
         for (int k = 0; k < 10; ++k) {
             float total = 0.0f;
-            for (int c = b; c < b + body_numbers.data[b * 5 + 4]; ++c) total += inertia[c * 10 + k];
+            for (int c = b; c < b + numbers[b * NUMBERS + SUBTREE]; ++c) total += inertia[c * 10 + k];
             carried[b * 10 + k] = total;
         }
     // Velocities, and accelerations as if no joint accelerated, level by level.
     for (int level = 1; level <= DEPTH; ++level) {
-        EACH(b, NB) if (body_numbers.data[b * 5 + 1] == level) {
-            const int parent = body_numbers.data[b * 5];
+        EACH(b, NB) if (numbers[b * NUMBERS + LEVEL] == level) {
+            const int parent = numbers[b * NUMBERS + PARENT];
             float v[6], a[6], now[6], c[3], d[3];
             for (int k = 0; k < 6; ++k) { v[k] = velocity[parent * 6 + k]; a[k] = acceleration[parent * 6 + k]; }
-            int from = 6 + body_numbers.data[b * 5 + 2], to = 6 + body_numbers.data[b * 5 + 3];
+            int from = 6 + numbers[b * NUMBERS + FIRST_JOINT], to = 6 + numbers[b * NUMBERS + END_JOINT];
             if (b == base) {
                 for (int k = 0; k < 3; ++k) v[3 + k] += v_in[k];
                 from = 3;
@@ -217,12 +228,12 @@ SOURCE = """
     }
     EACH(i, NV) {
         float f[6];
-        momentum(carried + dof_body.data[i] * 10, motion + i * 6, f);
-        for (int k = row_start.data[i]; k < row_start.data[i] + row_count.data[i]; ++k) {
-            const int j = column.data[k];
-            float total = i == j ? armature.data[i] : 0.0f;
+        momentum(carried + arrays.dof_body.data[i] * 10, motion + i * 6, f);
+        for (int k = arrays.row_start.data[i]; k < arrays.row_start.data[i] + arrays.row_count.data[i]; ++k) {
+            const int j = arrays.column.data[k];
+            float total = i == j ? arrays.armature.data[i] : 0.0f;
             for (int n = 0; n < 6; ++n) total += motion[j * 6 + n] * f[n];
-            mass_matrix.data[(long long)world * mass_matrix.shape[1] + k] = total;
+            arrays.mass_matrix.data[(long long)world * arrays.mass_matrix.shape[1] + k] = total;
         }
     }
     EACH(b, NB) {
@@ -237,102 +248,58 @@ SOURCE = """
     }
     meet();
     EACH(i, NV) {
-        const int b = dof_body.data[i];
+        const int b = arrays.dof_body.data[i];
         float total = 0.0f;
-        for (int c = b; c < b + body_numbers.data[b * 5 + 4]; ++c)
+        for (int c = b; c < b + numbers[b * NUMBERS + SUBTREE]; ++c)
             for (int k = 0; k < 6; ++k) total -= motion[i * 6 + k] * force[c * 6 + k];
         if (i >= 6) {
-            const float asked = torques.data[(long long)world * torques.shape[1] + i - 6];
-            const float lowest = joints.data[(i - 6) * 9 + 7], highest = joints.data[(i - 6) * 9 + 8];
+            const float asked = arrays.torques.data[(long long)world * arrays.torques.shape[1] + i - 6];
+            const float lowest = joints[(i - 6) * JOINT + LOWEST], highest = joints[(i - 6) * JOINT + HIGHEST];
             total += asked < lowest ? lowest : asked > highest ? highest : asked;
         }
-        qfrc_smooth.data[(long long)world * qfrc_smooth.shape[1] + i] = total;
+        arrays.qfrc_smooth.data[(long long)world * arrays.qfrc_smooth.shape[1] + i] = total;
     }
     #undef LEGGED_SHARED
     #undef EACH
 """
 
 
-BODY, JOINT, GEOM = 17, 9, 7
-"""Floats of a body (position, orientation, centre of mass, orientation and values of its principal inertias), a hinge
-(position, axis, reference angle, torque limits) and a shape (position, orientation), each in its parent's frame."""
+@wp.struct
+class DynamicsArrays:
+    """Tables of the robot, what the launch reads of mujoco-warp's model and data, and from `geom_xpos` on what it writes."""
+
+    bodies: wp.array[float]
+    body_numbers: wp.array[int]
+    joints: wp.array[float]
+    geoms: wp.array[float]
+    geom_body: wp.array[int]
+    dof_body: wp.array[int]
+    armature: wp.array[float]
+    row_start: wp.array[int]
+    row_count: wp.array[int]
+    column: wp.array[int]
+    body_mass: wp.array2d[float]
+    qpos: wp.array2d[float]
+    qvel: wp.array2d[float]
+    torques: wp.array2d[float]
+    geom_xpos: wp.array2d[wp.vec3]
+    geom_xmat: wp.array2d[wp.mat33]
+    subtree_com: wp.array2d[wp.vec3]
+    cdof: wp.array2d[wp.spatial_vector]
+    mass_matrix: wp.array2d[float]
+    qfrc_smooth: wp.array2d[float]
 
 
 def dynamics_kernel(numbers: dict[str, Any]) -> Any:
     """The kernel for the sizes and constants in `numbers`; launched for (worlds, lanes)."""
 
     @wp.func_native(SOURCE % numbers)
-    def move_world(
-        world: int,
-        bodies: wp.array[float],
-        body_numbers: wp.array[int],
-        joints: wp.array[float],
-        geoms: wp.array[float],
-        geom_body: wp.array[int],
-        dof_body: wp.array[int],
-        armature: wp.array[float],
-        row_start: wp.array[int],
-        row_count: wp.array[int],
-        column: wp.array[int],
-        body_mass: wp.array2d[float],
-        qpos: wp.array2d[float],
-        qvel: wp.array2d[float],
-        torques: wp.array2d[float],
-        geom_xpos: wp.array2d[wp.vec3],
-        geom_xmat: wp.array2d[wp.mat33],
-        subtree_com: wp.array2d[wp.vec3],
-        cdof: wp.array2d[wp.spatial_vector],
-        mass_matrix: wp.array2d[float],
-        qfrc_smooth: wp.array2d[float],
-    ) -> None: ...
+    def move_world(world: int, arrays: DynamicsArrays) -> None: ...
 
     @wp.kernel(module="unique", enable_backward=False)
-    def smooth_dynamics(
-        bodies: wp.array[float],
-        body_numbers: wp.array[int],
-        joints: wp.array[float],
-        geoms: wp.array[float],
-        geom_body: wp.array[int],
-        dof_body: wp.array[int],
-        armature: wp.array[float],
-        row_start: wp.array[int],
-        row_count: wp.array[int],
-        column: wp.array[int],
-        body_mass: wp.array2d[float],
-        qpos: wp.array2d[float],
-        qvel: wp.array2d[float],
-        torques: wp.array2d[float],
-        geom_xpos: wp.array2d[wp.vec3],
-        geom_xmat: wp.array2d[wp.mat33],
-        subtree_com: wp.array2d[wp.vec3],
-        cdof: wp.array2d[wp.spatial_vector],
-        mass_matrix: wp.array2d[float],
-        qfrc_smooth: wp.array2d[float],
-    ) -> None:
+    def smooth_dynamics(arrays: DynamicsArrays) -> None:
         world, _lane = wp.tid()  # type: ignore[misc]
-        move_world(
-            world,
-            bodies,
-            body_numbers,
-            joints,
-            geoms,
-            geom_body,
-            dof_body,
-            armature,
-            row_start,
-            row_count,
-            column,
-            body_mass,
-            qpos,
-            qvel,
-            torques,
-            geom_xpos,
-            geom_xmat,
-            subtree_com,
-            cdof,
-            mass_matrix,
-            qfrc_smooth,
-        )
+        move_world(world, arrays)
 
     return smooth_dynamics
 
@@ -357,17 +324,18 @@ class SmoothDynamics:
         numbers = np.stack([parent, depth, first[:-1], first[1:], subtree], axis=1)
         bodies = [model.body_pos, model.body_quat, model.body_ipos, model.body_iquat, model.body_inertia]
         joints = [model.jnt_pos[1:], model.jnt_axis[1:], model.qpos0[7:, None], limits.T]
-        tables = [
-            wp.array(np.concatenate(bodies, axis=1).ravel(), dtype=float),
-            wp.array(numbers.ravel(), dtype=int),
-            wp.array(np.concatenate(joints, axis=1).ravel(), dtype=float),
-            wp.array(np.concatenate([model.geom_pos, model.geom_quat], axis=1).ravel(), dtype=float),
-            wp.array(model.geom_bodyid, dtype=int),
-            wp.array(model.dof_bodyid, dtype=int),
-            wp.array(model.dof_armature, dtype=float),
-        ]
-        self._inputs = [*tables, m.M_rowadr, m.M_rownnz, m.M_colind, m.body_mass, d.qpos, d.qvel, d.ctrl]
-        self._outputs = [d.geom_xpos, d.geom_xmat, d.subtree_com, d.cdof, d.M, d.qfrc_smooth]
+        arrays = self._arrays = DynamicsArrays()
+        arrays.bodies = wp.array(np.concatenate(bodies, axis=1).ravel(), dtype=float)
+        arrays.body_numbers = wp.array(numbers.ravel(), dtype=int)
+        arrays.joints = wp.array(np.concatenate(joints, axis=1).ravel(), dtype=float)
+        arrays.geoms = wp.array(np.concatenate([model.geom_pos, model.geom_quat], axis=1).ravel(), dtype=float)
+        arrays.geom_body, arrays.dof_body = wp.array(model.geom_bodyid, dtype=int), wp.array(model.dof_bodyid, dtype=int)
+        arrays.armature, arrays.body_mass = wp.array(model.dof_armature, dtype=float), m.body_mass
+        arrays.row_start, arrays.row_count, arrays.column = m.M_rowadr, m.M_rownnz, m.M_colind
+        arrays.qpos, arrays.qvel, arrays.torques = d.qpos, d.qvel, d.ctrl
+        arrays.geom_xpos, arrays.geom_xmat = d.geom_xpos, d.geom_xmat
+        arrays.subtree_com, arrays.cdof = d.subtree_com, d.cdof
+        arrays.mass_matrix, arrays.qfrc_smooth = d.M, d.qfrc_smooth
         self._kernel = dynamics_kernel(
             {
                 "bodies": model.nbody,
@@ -394,4 +362,4 @@ class SmoothDynamics:
     def launch(self) -> None:
         """Once a step, before collisions."""
         dim = (self._worlds, self._lanes)
-        wp.launch(self._kernel, dim=dim, inputs=self._inputs, outputs=self._outputs, block_dim=self._lanes)
+        wp.launch(self._kernel, dim=dim, inputs=[self._arrays], block_dim=self._lanes)
