@@ -8,7 +8,7 @@ import numpy as np
 
 from legged.config.schema import SimConfig
 from legged.physics.newton_solvers import SolverSetup
-from legged.physics.scene import robot_spec
+from legged.physics.scene import FLOOR, robot_spec
 from legged.physics.terrain_geoms import DEPTH, lattice_heights
 from legged.robot import Robot
 from legged.terrain import Terrain
@@ -81,9 +81,9 @@ def build_newton_model(
     if setup.springs is not None:
         ground.ke, ground.kd, ground.kf = setup.springs
     if terrain is None:
-        scene.add_ground_plane(cfg=ground)
+        scene.add_ground_plane(cfg=ground, label=FLOOR)
     elif meets_cells(setup, sim):
-        scene.add_ground_plane(height=float(terrain.height_map.corners.min()) - DEPTH, cfg=ground)
+        scene.add_ground_plane(height=float(terrain.height_map.corners.min()) - DEPTH, cfg=ground, label=FLOOR)
     else:
         _add_height_field(scene, terrain, ground)
     model = scene.finalize(device)
@@ -112,4 +112,4 @@ def _add_height_field(scene: newton.ModelBuilder, terrain: Terrain, cfg: newton.
     half = [0.5 * (n - 1) * ground.cell for n in heights.shape]
     field = newton.Heightfield(heights, *heights.shape, hx=half[1], hy=half[0])
     middle = (ground.origin[0] + half[1], ground.origin[1] + half[0], 0.0)
-    scene.add_shape_heightfield(heightfield=field, xform=(*middle, 0.0, 0.0, 0.0, 1.0), cfg=cfg)
+    scene.add_shape_heightfield(heightfield=field, xform=(*middle, 0.0, 0.0, 0.0, 1.0), cfg=cfg, label=FLOOR)

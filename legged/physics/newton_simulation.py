@@ -13,6 +13,7 @@ from legged.physics.exchange import LOST
 from legged.physics.newton_model import build_newton_model, meets_cells
 from legged.physics.newton_solvers import SOLVERS
 from legged.physics.newton_springs import launch_spring_forces
+from legged.physics.scene import FLOOR
 from legged.physics.terrain_contact import TerrainContact
 from legged.robot import Robot
 from legged.terrain import Terrain
@@ -60,7 +61,7 @@ class Simulation:
         solver = self.solver
         assert isinstance(solver, SolverMuJoCo)
         model = solver.mj_model
-        ground = self.model.shape_count - 1  # the shape that was added last
+        ground = self.model.shape_label.index(FLOOR)
         (floor,) = np.flatnonzero(solver.mjc_geom_to_newton_shape.numpy()[0] == ground)
         shapes = np.flatnonzero(model.geom_bodyid)
         TerrainContact(solver.mjw_model, solver.mjw_data, model, int(floor), terrain.height_map, shapes)

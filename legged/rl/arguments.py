@@ -62,6 +62,15 @@ def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
     return found
 
 
+def policy_overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
+    """Those that change what a policy was trained with: all but the one that says which run it is of.
+
+    Raises:
+        ConfigError: as `overrides`.
+    """
+    return [change for change in overrides(args) if change[0] != "train.runner.experiment_name"]
+
+
 def pick_device(name: str | None, flag: str = "--sim_device") -> torch.device:
     """The device that was asked for, else the GPU if there is one; under torchrun the GPU of this process's number.
 

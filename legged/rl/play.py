@@ -20,8 +20,8 @@ from legged.rl.arguments import (
     add_run_arguments,
     add_task_arguments,
     import_and_check,
-    overrides,
     pick_device,
+    policy_overrides,
     run_main,
     settle_on,
 )
@@ -63,7 +63,7 @@ def _main(argv: list[str] | None) -> int:
     device = pick_device(args.sim_device)
     settle_on(device)
     policy = find_policy(args)
-    asked = [change for change in overrides(args) if change[0] != "train.runner.experiment_name"]
+    asked = policy_overrides(args)
     wanted = override(policy.cfg, asked)
     playground = Playground.of(wanted, args.terrain, args.difficulty)
     count = args.num_envs if args.num_envs is not None else 4 if playground is None else len(playground.order)

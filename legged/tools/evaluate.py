@@ -25,8 +25,8 @@ from legged.rl.arguments import (
     add_run_arguments,
     add_task_arguments,
     import_and_check,
-    overrides,
     pick_device,
+    policy_overrides,
     run_main,
     settle_on,
 )
@@ -79,11 +79,10 @@ def _main(argv: list[str] | None) -> int:
         args.physics = None
     policy = find_policy(args)
     if everywhere:
-        asked = [one for one in overrides(args) if one[0] != "train.runner.experiment_name"]
-        return cross(policy, grid, asked, device, not args.no_graph, args.out or policy.output("evaluate"))
+        return cross(policy, grid, policy_overrides(args), device, not args.no_graph, args.out or policy.output("evaluate"))
     types = chosen_types(policy.cfg, args.types)
     # The engine is that of the device, not that of the training.
-    asked = [("sim.physics", "auto"), *(one for one in overrides(args) if one[0] != "train.runner.experiment_name")]
+    asked = [("sim.physics", "auto"), *policy_overrides(args)]
     engine = engine_name(override(policy.cfg, asked).sim, device, "--physics" if args.physics else "sim.physics")
     start = time.perf_counter()
     task, runner = ready_to_track(policy, grid, asked, device, graph=not args.no_graph)

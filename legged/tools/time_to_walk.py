@@ -18,8 +18,8 @@ from legged.rl.arguments import (
     add_run_arguments,
     add_task_arguments,
     import_and_check,
-    overrides,
     pick_device,
+    policy_overrides,
     run_main,
     settle_on,
 )
@@ -56,7 +56,7 @@ def _main(argv: list[str] | None) -> int:
     settle_on(device)
     policy = find_policy(args)
     grid = Grid(AXIS, AXIS, AXIS, args.robots)
-    asked = [("sim.physics", "auto"), *(one for one in overrides(args) if one[0] != "train.runner.experiment_name")]
+    asked = [("sim.physics", "auto"), *policy_overrides(args)]
     task, runner = ready_to_track(policy, grid, asked, device, graph=not args.no_graph)
     act = runner.get_inference_policy(str(device))
     rows: list[dict[str, Any]] = []

@@ -10,7 +10,7 @@ import time
 
 from legged.physics import kernel_cache, resolve_physics
 from legged.registry import make_task, task_config
-from legged.rl.arguments import add_task_arguments, import_and_check, overrides, pick_device, run_main
+from legged.rl.arguments import add_task_arguments, import_and_check, overrides, pick_device, run_main, settle_on
 from legged.startup import STARTED_S
 
 
@@ -30,6 +30,7 @@ def _main(argv: list[str] | None) -> int:
     if resolve_physics(cfg.sim.physics, device) == "mujoco":
         print(f"{cfg.task}: nothing to do, C MuJoCo compiles no kernels")
         return 0
+    settle_on(device)
     make_task(cfg, device, graph=not args.no_graph)
     print(f"{cfg.task}: ready in {time.perf_counter() - start:.1f} s, its kernels are in {kernel_cache()}")
     return 0
