@@ -4,7 +4,8 @@ from legged.startup import importing  # first: it looks at the time
 
 with importing():
     from legged.headless import HEADLESS  # noqa: I001  before MuJoCo: it sets MUJOCO_GL
-    from legged.config import ConfigError, TaskConfig
+    from legged.config import TaskConfig
+    from legged.errors import ConfigError
     from legged.envs import LeggedRobot
     from legged.registry import make_task, register, task_config
 

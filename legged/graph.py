@@ -7,9 +7,7 @@ from typing import Any
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-
-class TermError(RuntimeError):
-    """A `_reward_*` or `_obs_*` method failed; the text names it."""
+from legged.errors import TermError
 
 
 @contextmanager

@@ -10,8 +10,9 @@ from typing import Any
 
 import torch
 
-from legged.config import ConfigError, TaskConfig, load_config, suggest
+from legged.config import TaskConfig, load_config
 from legged.envs import LeggedRobot
+from legged.errors import ConfigError, suggest
 from legged.paths import data_folder
 from legged.terrain import Terrain
 

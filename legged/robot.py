@@ -7,8 +7,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from legged.config.loader import ConfigError, build, read_yaml, suggest
+from legged.config.loader import build, read_yaml
 from legged.config.origins import Origins
+from legged.errors import ConfigError, suggest
 from legged.mirror import Mirror
 from legged.paths import data_folder
 

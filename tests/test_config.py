@@ -7,8 +7,9 @@ import yaml
 from helpers import TASK
 
 from legged import registry
-from legged.config import ConfigError, TaskConfig, from_dict, load_config, override, parse_override, to_dict, to_yaml
+from legged.config import TaskConfig, from_dict, load_config, override, parse_override, to_dict, to_yaml
 from legged.config.loader import read_yaml
+from legged.errors import ConfigError
 from legged.paths import data_folder
 
 SHIPPED = sorted(data_folder("cfg").glob("*.yaml"))

@@ -9,7 +9,7 @@ import warp as wp
 from helpers import call
 from reference import heaps, random_states, roll
 
-from legged.config import ConfigError
+from legged.errors import ConfigError
 from legged.physics.constraint_solver import ConstraintSolver
 from legged.rl.train import main
 

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from legged.envs import LeggedRobot
-from legged.graph import Branch, ForbidHostReads, HostReadError, StepGraph, TermError, calling
+from legged.errors import TermError
+from legged.graph import Branch, ForbidHostReads, HostReadError, StepGraph, calling
 from legged.registry import make_task, task_config
 
 CPU = torch.device("cpu")

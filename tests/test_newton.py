@@ -13,8 +13,8 @@ import pytest
 import torch
 from reference import TOUCHING, CWorlds, States, bits, pd, random_states, roll, snapshot, standing
 
-from legged.config import ConfigError
 from legged.config.schema import NewtonSolver, SimConfig, TerrainConfig
+from legged.errors import ConfigError
 from legged.physics import Physics, engine_name, make_physics, resolve_physics
 from legged.terrain import Terrain, TileSpec
 

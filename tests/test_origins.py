@@ -4,8 +4,9 @@ import pytest
 from helpers import TASK
 
 from legged import registry
-from legged.config import ConfigError, load_config, override, to_dict
+from legged.config import load_config, override, to_dict
 from legged.config.origins import Origins
+from legged.errors import ConfigError
 from legged.paths import data_folder
 from legged.rl.runs import run_config
 

@@ -10,7 +10,7 @@ from legged.config.schema import CommandCurriculumConfig, CommandRanges, Command
 from legged.contacts import FeetContacts
 from legged.control import Control
 from legged.curriculum import CommandCurriculum
-from legged.graph import TermError
+from legged.errors import TermError
 from legged.rewards import Rewards
 from legged.robot import load_robot
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from legged.config.schema import DomainRandConfig
-from legged.graph import TermError
+from legged.errors import TermError
 from legged.observations import ObservationGroup
 from legged.randomization import Randomization
 from legged.statistics import Statistics

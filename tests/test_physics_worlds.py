@@ -8,8 +8,8 @@ import pytest
 import torch
 from reference import FIELDS, TOUCHING, CWorlds, States, bits, heaps, random_states, roll, snapshot, standing
 
-from legged.config import ConfigError
 from legged.config.schema import SimConfig
+from legged.errors import ConfigError
 from legged.physics import resolve_physics
 from legged.physics.mujoco import MujocoPhysics
 from legged.physics.mujoco_warp import absent_stages

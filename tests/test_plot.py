@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 from torch.utils.tensorboard import SummaryWriter
 
-from legged.config import ConfigError
+from legged.errors import ConfigError
 from legged.tools import plot
 
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, small_task
 
-from legged.config import ConfigError
+from legged.errors import ConfigError
 from legged.ranks import Ranks
 from legged.registry import make_task, task_config
 from legged.rl import train

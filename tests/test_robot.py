@@ -9,9 +9,9 @@ import pytest
 import torch
 from reference import TOUCHING, roll, standing
 
-from legged.config import ConfigError
 from legged.config.schema import ControlConfig, SimConfig
 from legged.control import control_gains
+from legged.errors import ConfigError
 from legged.physics import make_physics
 from legged.physics.scene import build_model
 from legged.robot import Robot, load_robot, match_names, match_values

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from legged.config import ConfigError
 from legged.config.schema import SimConfig
+from legged.errors import ConfigError
 from legged.physics.kernels import launched
 from legged.physics.scene import build_model
 from legged.physics.smooth_dynamics import SmoothDynamics

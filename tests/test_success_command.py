@@ -8,7 +8,8 @@ import pytest
 from helpers import POLICY, TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
 
 from legged import make_task
-from legged.config import ConfigError, override
+from legged.config import override
+from legged.errors import ConfigError
 from legged.registry import task_config
 from legged.rl.policy import undisturbed
 from legged.terrain import Terrain, TileSpec

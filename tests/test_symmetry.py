@@ -9,8 +9,8 @@ from helpers import call, small_config, small_task, tiny_run
 from reference import random_states
 from tensordict import TensorDict
 
-from legged.config import ConfigError
 from legged.envs import LeggedRobot
+from legged.errors import ConfigError
 from legged.mirror import Mirror
 from legged.registry import make_task, task_config
 from legged.rl import train

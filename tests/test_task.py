@@ -8,9 +8,8 @@ import torch
 from helpers import small_config, small_task, zero_actions
 
 from legged import make_task, registry
-from legged.config import ConfigError
 from legged.envs import LeggedRobot
-from legged.graph import TermError
+from legged.errors import ConfigError, TermError
 from legged.math import quat_rotate_inverse
 
 BLOCKS = {  # name -> first column and scale, legged_gym's order

@@ -13,8 +13,8 @@ import torch
 import warp as wp
 from reference import roll, standing
 
-from legged.config import ConfigError
 from legged.config.schema import SimConfig, TerrainConfig
+from legged.errors import ConfigError
 from legged.physics import make_physics
 from legged.physics.terrain_contact import TerrainContact
 from legged.physics.terrain_geoms import add_terrain

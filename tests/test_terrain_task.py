@@ -8,9 +8,9 @@ import torch
 from helpers import CALM, ENGINE, tiny_run, zero_actions
 
 from legged.commands import Commands
-from legged.config import ConfigError
 from legged.config.schema import CommandsConfig, TerrainConfig
 from legged.envs import LeggedRobot
+from legged.errors import ConfigError
 from legged.observations import ObservationGroup
 from legged.registry import make_task, task_config
 from legged.rl.display import Progress

@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import difflib
 import re
 import types
 import typing
@@ -14,13 +13,10 @@ import yaml
 
 from legged.config.origins import Origins
 from legged.config.schema import TaskConfig
+from legged.errors import ConfigError, suggest
 from legged.paths import data_folder
 
 T = TypeVar("T")
-
-
-class ConfigError(ValueError):
-    """A wrong input by the user; its text says where, what was given and what is allowed."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -40,14 +36,6 @@ _Loader.add_implicit_resolver(
     re.compile(r"^[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+$"),
     list("-+.0123456789"),
 )
-
-
-def suggest(name: str, allowed: Iterable[str], what: str = "allowed") -> str:
-    """' did you mean ...?' with the nearest of `allowed`, followed by all of them."""
-    options = sorted(allowed)
-    near = difflib.get_close_matches(name, options, n=1, cutoff=0.5)
-    hint = f"; did you mean '{near[0]}'?" if near else ""
-    return f"{hint} ({what}: {', '.join(options) or 'none'})"
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

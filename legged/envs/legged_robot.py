@@ -8,13 +8,13 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.commands import Commands
-from legged.config.loader import ConfigError, suggest
 from legged.config.schema import TaskConfig
 from legged.contacts import FeetContacts
 from legged.control import Control, control_gains
 from legged.curriculum import CommandCurriculum
 from legged.envs.base_task import BaseTask
 from legged.envs.terms import Terms
+from legged.errors import ConfigError, suggest
 from legged.graph import Branch
 from legged.math import masked_set_
 from legged.observations import ObservationGroup

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import torch
 
-from legged.config.loader import ConfigError
 from legged.config.schema import SimConfig
+from legged.errors import ConfigError
 from legged.physics.base import Physics, RandomizedField, RobotState
 from legged.robot import Robot
 from legged.startup import importing

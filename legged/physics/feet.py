@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legged.config import ConfigError
+from legged.errors import ConfigError
 from legged.math import quat_to_matrix
 from legged.physics.base import RobotState
 from legged.robot import Robot

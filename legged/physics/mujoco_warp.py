@@ -10,8 +10,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from legged.config import ConfigError
 from legged.config.schema import SimConfig
+from legged.errors import ConfigError
 from legged.math import masked_set_
 from legged.physics.base import RandomizedField
 from legged.physics.constraint_solver import ConstraintSolver

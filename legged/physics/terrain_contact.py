@@ -20,7 +20,7 @@ from mujoco_warp._src.collision_core import contact_margin_gap, contact_material
 from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import vec5
 
-from legged.config.loader import ConfigError
+from legged.errors import ConfigError
 from legged.physics.ground import Ground, Hits, around_point, between_ends, ground_of
 from legged.terrain import HeightMap
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import mujoco
 
-from legged.config import ConfigError
+from legged.errors import ConfigError
 from legged.rendering.paint import add_horizon, add_painted_terrain
 from legged.robot import Robot
 from legged.terrain import Terrain

@@ -7,7 +7,8 @@ from typing import Any
 
 import torch
 
-from legged.config import ConfigError, parse_override
+from legged.config import parse_override
+from legged.errors import ConfigError
 from legged.ranks import Ranks
 from legged.registry import import_tasks
 from legged.startup import is_a_command

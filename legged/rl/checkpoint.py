@@ -5,8 +5,9 @@ from typing import Any
 
 import torch
 
-from legged.config import ConfigError, TaskConfig
+from legged.config import TaskConfig
 from legged.envs import BaseTask
+from legged.errors import ConfigError
 from legged.paths import relative, replacing
 
 

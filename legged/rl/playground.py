@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from legged.config import ConfigError, TaskConfig, suggest
+from legged.config import TaskConfig
 from legged.envs import LeggedRobot
+from legged.errors import ConfigError, suggest
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, check_terrain
 
 DIFFICULTIES = (0.5, 0.8)

@@ -8,8 +8,9 @@ from typing import Any
 
 import torch
 
-from legged.config import ConfigError, TaskConfig, override
+from legged.config import TaskConfig, override
 from legged.envs import LeggedRobot
+from legged.errors import ConfigError
 from legged.paths import relative
 from legged.registry import make_task, task_class, task_config
 from legged.rl.arguments import overrides

@@ -11,8 +11,9 @@ from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.utils.logger import Logger
 from torch.utils.tensorboard import SummaryWriter
 
-from legged.config import ConfigError, TaskConfig
+from legged.config import TaskConfig
 from legged.envs import BaseTask, LeggedRobot
+from legged.errors import ConfigError
 from legged.ranks import Ranks
 from legged.rl.checkpoint import describe_mismatch, observation_layout, read_checkpoint, write_checkpoint
 from legged.rl.display import Display, Progress

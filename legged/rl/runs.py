@@ -5,8 +5,9 @@ import subprocess
 from datetime import datetime
 from pathlib import Path
 
-from legged.config import ConfigError, TaskConfig, from_dict, suggest, to_yaml
+from legged.config import TaskConfig, from_dict, to_yaml
 from legged.config.loader import read_yaml
+from legged.errors import ConfigError, suggest
 from legged.paths import data_folder, relative, replacing
 
 LOGS = Path("logs")

@@ -11,8 +11,9 @@ from types import FrameType
 
 import torch
 
-from legged.config import ConfigError, TaskConfig, to_yaml
+from legged.config import TaskConfig, to_yaml
 from legged.envs import LeggedRobot
+from legged.errors import ConfigError
 from legged.paths import relative
 from legged.physics import engine_name, resolve_physics
 from legged.ranks import Ranks

@@ -7,8 +7,8 @@ import imageio.v3
 import numpy as np
 from PIL import Image
 
-from legged.config import ConfigError
 from legged.envs import LeggedRobot
+from legged.errors import ConfigError
 from legged.paths import relative, replacing
 from legged.rendering import Camera
 

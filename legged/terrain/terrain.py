@@ -6,9 +6,9 @@ from functools import cached_property
 
 import numpy as np
 
-from legged.config.loader import ConfigError, suggest
 from legged.config.origins import Origins
 from legged.config.schema import TerrainConfig
+from legged.errors import ConfigError, suggest
 from legged.terrain.generators import TERRAIN_TYPES, Tile
 from legged.terrain.height_map import HeightMap
 

@@ -22,8 +22,9 @@ from typing import Any
 
 import torch
 
-from legged.config import ConfigError, override
+from legged.config import override
 from legged.envs import LeggedRobot
+from legged.errors import ConfigError
 from legged.graph import StepGraph
 from legged.physics import resolve_physics
 from legged.registry import make_task, task_config

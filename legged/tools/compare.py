@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from legged.config import ConfigError, suggest
+from legged.errors import ConfigError, suggest
 from legged.paths import relative, replacing
 from legged.rl.arguments import run_main
 from legged.tools.success_report import ENGINES, TRAINED

@@ -18,7 +18,8 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from legged.config import ConfigError, override
+from legged.config import override
+from legged.errors import ConfigError
 from legged.paths import relative, replacing
 from legged.physics import engine_name
 from legged.rl.arguments import (

@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from legged.config import ConfigError
+from legged.errors import ConfigError
 from legged.paths import relative, replacing
 from legged.rl.arguments import run_main
 

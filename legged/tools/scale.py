@@ -12,7 +12,8 @@ from typing import Any
 
 import torch
 
-from legged.config import ConfigError, TaskConfig
+from legged.config import TaskConfig
+from legged.errors import ConfigError
 from legged.rl.arguments import EXIT_WRONG_INPUT
 from legged.rl.runs import write_text
 

@@ -13,9 +13,9 @@ import matplotlib
 import numpy as np
 from PIL import Image
 
-from legged.config import ConfigError, TaskConfig
-from legged.config.loader import suggest
+from legged.config import TaskConfig
 from legged.config.schema import TerrainConfig
+from legged.errors import ConfigError, suggest
 from legged.paths import relative, replacing
 from legged.registry import task_config
 from legged.rl.arguments import add_task_arguments, import_and_check, overrides, run_main

@@ -15,9 +15,10 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged.config import ConfigError, TaskConfig, override, suggest
+from legged.config import TaskConfig, override
 from legged.config.schema import TerrainConfig
 from legged.envs import LeggedRobot
+from legged.errors import ConfigError, suggest
 from legged.math import uniform, yaw_of
 from legged.rl.policy import TrainedPolicy, restore, undisturbed
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec

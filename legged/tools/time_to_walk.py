@@ -11,7 +11,7 @@ import json
 import sys
 from typing import Any
 
-from legged.config import ConfigError
+from legged.errors import ConfigError
 from legged.paths import relative
 from legged.physics import engine_name
 from legged.rl.arguments import (
