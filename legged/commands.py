@@ -15,6 +15,8 @@ HEADING_GAIN = 0.5
 class Commands:
     """What each robot is asked to do: (vx, vy) [m/s] and yaw rate [rad/s] in the base frame, and a heading [rad]."""
 
+    STATE = ("commands", "is_moving", "ranges", "time_left", "held", "steered", "standing")
+
     def __init__(self, cfg: CommandsConfig, num_envs: int, dt: float, device: torch.device) -> None:
         """All commands start at zero, due to be sampled at the first update; `dt` is the control step [s]."""
         self.cfg, self.dt = cfg, dt

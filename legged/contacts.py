@@ -14,6 +14,8 @@ class FeetContacts:
     a single missed sample does not split a stance.
     """
 
+    STATE = ("_flags", "_times")
+
     def __init__(self, num_envs: int, num_feet: int, dt: float, device: torch.device) -> None:
         """All feet start on the ground, at rest; `dt` is the control step [s]."""
         self.dt = dt

@@ -19,6 +19,8 @@ class Control:
     T: action_scale * action
     """
 
+    STATE = ("_last_dof_vel",)
+
     def __init__(self, robot: Robot, cfg: ControlConfig, torques: Tensor, sim_dt: float) -> None:
         """Torques are written to `torques` (N, D), the physics' own tensor, which takes their device along. Gains come
         from `cfg` if it names any, else from the robot.

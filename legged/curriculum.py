@@ -14,6 +14,8 @@ class CommandCurriculum:
     the sway of a gait or by exploration, and standing still scores 0 however narrow the range.
     """
 
+    STATE = ("share", "_sums", "_steps")
+
     def __init__(self, cfg: CommandCurriculumConfig, full_ranges: Tensor, dt: float) -> None:
         """`full_ranges` (3, 2); `dt` is the control step [s]."""
         self.cfg, self.full_ranges = cfg, full_ranges.clone()
@@ -58,11 +60,11 @@ class CommandCurriculum:
         names = ("command_vx", "command_vy", "command_yaw")
         return dict(zip(names, (self._full_limit * self.share).unbind(), strict=True))
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """What a resumed run needs."""
+    def progress(self) -> dict[str, Tensor]:
+        """How far it has got, whatever the number of robots."""
         return {"share": self.share.clone()}
 
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Go on from a saved state; a curriculum that is off keeps the full ranges."""
+    def load_progress(self, state: dict[str, Tensor]) -> None:
+        """Go on from there; a curriculum that is off keeps the full ranges."""
         if self.cfg.enabled:
             self.share.copy_(state["share"].to(self.share.device))

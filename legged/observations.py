@@ -1,4 +1,4 @@
-"""Observation groups: named terms, scaled, noised, clipped and laid side by side in one buffer."""
+"""Observation groups: named terms, each evaluated once a step, then scaled, noised, clipped and laid side by side."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,12 +10,44 @@ from legged.graph import calling
 from legged.math import masked_set_
 
 
+class ObservationTerms:
+    """The terms that a task's groups name, evaluated once a step for all of them and laid side by side."""
+
+    def __init__(self, functions: Mapping[str, Callable[[], Tensor]]) -> None:
+        """Functions by term, in order, each (N, width); each is called once to learn its width."""
+        self._functions = dict(functions)
+        self.columns: dict[str, slice] = {}
+        """Term -> where it lies in `values`."""
+        start = 0
+        sample = None
+        for name, function in self._functions.items():
+            with calling(f"_obs_{name}"):
+                sample = function()
+                if sample.dim() != 2:
+                    raise ValueError(f"must return a tensor (num_envs, width), got {tuple(sample.shape)}")
+            self.columns[name] = slice(start, start + sample.shape[1])
+            start += sample.shape[1]
+        if sample is None:
+            raise ValueError("observations need at least one term")
+        self.values = torch.zeros(sample.shape[0], start, device=sample.device)
+        """(N, width) the terms as groups read them, with 0 for what is no number."""
+
+    def evaluate(self) -> Tensor:
+        """Bring `values` up to date; returns them as the terms gave them, (N, width), numbers or not."""
+        found = []
+        for name, function in self._functions.items():
+            with calling(f"_obs_{name}"):
+                found.append(function())
+        raw = torch.cat(found, dim=1).float()
+        torch.nan_to_num(raw, nan=0.0, posinf=0.0, neginf=0.0, out=self.values)
+        return raw
+
+
 @dataclass(frozen=True)
 class ObservationTerm:
     """One term of a group and where it lies in the buffer."""
 
     name: str
-    function: Callable[[], Tensor]
     columns: slice
     scale: Tensor
     """(width,) factors."""
@@ -28,38 +60,42 @@ class ObservationGroup:
     (N, history * width).
     """
 
+    STATE = ("_steps",)
+
     def __init__(
         self,
-        functions: Mapping[str, Callable[[], Tensor]],
+        source: ObservationTerms,
+        names: Sequence[str],
         scales: Mapping[str, Sequence[float] | float],
         noise: Mapping[str, float],
         clip: float,
         history: int = 1,
     ) -> None:
-        """Functions by term, in order; each is called once to learn its width. No noise where none is named."""
+        """The group of the terms `names` of `source`, in that order. No noise where none is named."""
         self.clip, self.history = clip, history
         self.terms: list[ObservationTerm] = []
+        num_envs, device = source.values.shape[0], source.values.device
         start = 0
-        sample = None
-        for name, function in functions.items():
-            with calling(f"_obs_{name}"):
-                sample = function()
-                if sample.dim() != 2:
-                    raise ValueError(f"must return a tensor (num_envs, width), got {tuple(sample.shape)}")
-            width = sample.shape[1]
-            scale = torch.as_tensor(scales.get(name, 1.0), dtype=torch.float32, device=sample.device).expand(width)
-            self.terms.append(ObservationTerm(name, function, slice(start, start + width), scale, noise.get(name, 0.0)))
+        columns: list[int] = []
+        for name in names:
+            there = source.columns[name]
+            width = there.stop - there.start
+            columns += range(there.start, there.stop)
+            scale = torch.as_tensor(scales.get(name, 1.0), dtype=torch.float32, device=device).expand(width)
+            self.terms.append(ObservationTerm(name, slice(start, start + width), scale, noise.get(name, 0.0)))
             start += width
-        if sample is None:
-            raise ValueError("an observation group needs at least one term")
-        self._steps = torch.zeros(sample.shape[0], history, start, device=sample.device)
+        self._steps = torch.zeros(num_envs, history, start, device=device)
         self.buffer = self._steps.flatten(1)
         """(N, history * width) what the network is given."""
         self._now = self._steps[:, -1]
+        # Terms that lie side by side already are read where they are; others are picked column by column.
+        together = columns == list(range(columns[0], columns[0] + start))
+        self._values = source.values[:, columns[0] : columns[0] + start] if together else source.values
+        self._columns = None if together else torch.tensor(columns, device=device)
         self._scale = torch.cat([term.scale for term in self.terms])
         half = torch.cat([torch.full_like(term.scale, term.noise) for term in self.terms])
         self._noise_width = half * self._scale if bool(half.any()) else None
-        self._noise = torch.zeros(sample.shape[0], start, device=sample.device)
+        self._noise = torch.zeros(num_envs, start, device=device)
 
     def draw(self) -> None:
         """Draw the noise of the next `compute`."""
@@ -72,13 +108,9 @@ class ObservationGroup:
             self._steps[:, :-1].copy_(self._steps[:, 1:].clone())
 
     def compute(self) -> None:
-        """Evaluate all terms into the newest step."""
-        values = []
-        for term in self.terms:
-            with calling(f"_obs_{term.name}"):
-                values.append(term.function())
-        raw = torch.cat(values, dim=1)
-        torch.addcmul(self._noise, raw, self._scale, out=self._now)
+        """Take the terms' values into the newest step."""
+        values = self._values if self._columns is None else self._values.index_select(1, self._columns)
+        torch.addcmul(self._noise, values, self._scale, out=self._now)
         self._now.clamp_(-self.clip, self.clip)
 
     def restart(self, mask: Tensor) -> None:

@@ -11,6 +11,8 @@ from legged.physics import Physics, RandomizedField
 class Randomization:
     """Draws friction and mass once, and pushes each robot at its own moments."""
 
+    STATE = ("friction", "added_mass", "push_time_left")
+
     def __init__(self, cfg: DomainRandConfig, num_envs: int, dt: float, device: torch.device) -> None:
         """`dt` is the control step [s]. The first pushes are spread over a whole interval."""
         self.cfg, self.dt, self.device = cfg, dt, device

@@ -5,12 +5,15 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
+from legged.faults import LARGEST
 from legged.graph import calling
 from legged.math import masked_set_
 
 
 class Rewards:
     """The sum of scale * dt * term. `termination` is added after the clip at zero, as in legged_gym."""
+
+    STATE = ("sums",)
 
     def __init__(
         self,
@@ -35,11 +38,15 @@ class Rewards:
         """(N,) reward of the last step."""
         self.sums = torch.zeros(len(self.names), num_envs, device=device)
         """(terms, N) sum of each scaled term over the episode so far."""
+        self.fine = torch.ones(len(self.names), num_envs, dtype=torch.bool, device=device)
+        """(terms, N) whether each term was a number at the last step."""
         self.episode_sums = {name: self.sums[i] for i, name in enumerate(self.names)}
         """The rows of `sums` by name."""
 
     def compute(self, valid: Tensor) -> Tensor:
-        """Evaluate all terms; robots outside `valid` (N,), whose physics blew up, get zero."""
+        """Evaluate all terms; robots outside `valid` (N,), whose physics blew up, get zero, and so does a term that is no
+        number.
+        """
         if not self.functions:
             return self.total
         values = []
@@ -49,8 +56,10 @@ class Rewards:
                 if value.shape != (self.num_envs,):
                     raise ValueError(f"must return a tensor ({self.num_envs},), got {tuple(value.shape)}")
             values.append(value)
-        # Stacked, so that scaling, masking and summing cost four launches and not four a term.
-        scaled = torch.where(valid, torch.stack(values) * self._factors, 0.0)
+        # Stacked, so that scaling, masking and summing cost a launch each and not one a term.
+        scaled = torch.stack(values) * self._factors
+        torch.lt(scaled.abs(), LARGEST, out=self.fine)
+        scaled = torch.where(self.fine & valid, scaled, 0.0)
         self.sums.add_(scaled)
         if not self.only_positive:
             return torch.sum(scaled, dim=0, out=self.total)

@@ -168,7 +168,7 @@ def test_checkpoints_are_exchanged_between_the_loops(first, second):
     """A run begun with one loop goes on with the other: counts of optimiser steps and the learning rate continue."""
     begun = tiny_run("--runner", first, "train.algorithm.learning_rate=2e-4")
     resumed = tiny_run("--runner", second, "--resume", iterations=3)
-    before, after = (torch.load(run / f"model_{i}.pt", weights_only=False) for run, i in ((begun, 1), (resumed, 2)))
+    before, after = (torch.load(run / f"model_{i}.pt", weights_only=True) for run, i in ((begun, 1), (resumed, 2)))
     assert checkpoints(resumed) == [2]
     steps = [{int(s["step"]) for s in saved["optimizer_state_dict"]["state"].values()} for saved in (before, after)]
     assert steps == [{40}, {60}]

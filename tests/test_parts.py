@@ -215,12 +215,12 @@ def test_a_curriculum_that_is_off_uses_the_full_range():
     assert found.metrics() == {}
 
 
-def test_the_curriculum_s_state_survives_a_round_trip():
+def test_the_curriculum_s_progress_survives_a_round_trip():
     found, other = curriculum(), curriculum()
     run_window(found, ALL, ALL * torch.tensor([1.0, 0.0, 1.0]))
-    state = found.state_dict()
+    state = found.progress()
     run_window(found, ALL, ALL)  # a saved state is not changed by what comes after it
-    other.load_state_dict(state)
+    other.load_progress(state)
     assert other.share.tolist() == pytest.approx([0.5, 0.3, 0.5])
     widest = {name: float(value) for name, value in other.metrics().items()}
     assert widest == pytest.approx({"command_vx": 0.5, "command_vy": 0.15, "command_yaw": 1.0})
@@ -228,7 +228,7 @@ def test_the_curriculum_s_state_survives_a_round_trip():
 
 def test_a_curriculum_that_is_off_ignores_the_narrow_ranges_of_an_earlier_training():
     narrow, off = curriculum(), curriculum(enabled=False)
-    off.load_state_dict(narrow.state_dict())
+    off.load_progress(narrow.progress())
     assert off.share.tolist() == [1.0] * 3
 
 

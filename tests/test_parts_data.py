@@ -9,7 +9,7 @@ import torch
 
 from legged.config.schema import DomainRandConfig
 from legged.errors import TermError
-from legged.observations import ObservationGroup
+from legged.observations import ObservationGroup, ObservationTerms
 from legged.randomization import Randomization
 from legged.statistics import Statistics
 
@@ -29,13 +29,15 @@ def mask(*values) -> torch.Tensor:
 # ---- observations ----------------------------------------------------------------------------------------------------
 
 
-def group(noise=None, clip=100.0, num_envs=2) -> ObservationGroup:
+def group(noise=None, clip=100.0, num_envs=2, names=("a", "b", "c")) -> ObservationGroup:
     functions = {
         "a": lambda: torch.tensor([[1.0, 2.0]]).repeat(num_envs, 1),
         "b": lambda: torch.tensor([[-3.0]]).repeat(num_envs, 1),
         "c": lambda: torch.tensor([[10.0, 20.0, 30.0]]).repeat(num_envs, 1),
     }
-    return ObservationGroup(functions, {"a": 2.0, "c": [0.1, 0.2, 0.3]}, noise or {}, clip)
+    source = ObservationTerms(functions)
+    source.evaluate()
+    return ObservationGroup(source, names, {"a": 2.0, "c": [0.1, 0.2, 0.3]}, noise or {}, clip)
 
 
 def test_terms_lie_side_by_side_in_order_each_with_its_scale():
@@ -84,7 +86,7 @@ def test_a_group_without_noise_is_exact():
 
 def test_a_term_that_is_no_matrix_is_named():
     with pytest.raises(TermError, match=r"_obs_flat: must return a tensor \(num_envs, width\), got \(2,\)"):
-        ObservationGroup({"flat": lambda: torch.zeros(2)}, {}, {}, 1.0)
+        ObservationTerms({"flat": lambda: torch.zeros(2)})
 
 
 def test_a_term_that_fails_is_named():
@@ -92,7 +94,41 @@ def test_a_term_that_fails_is_named():
         raise IndexError("no such foot")
 
     with pytest.raises(TermError, match="_obs_broken: no such foot"):
-        ObservationGroup({"broken": fail}, {}, {}, 1.0)
+        ObservationTerms({"broken": fail})
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("b", "c"), [-3.0, 1.0, 4.0, 9.0]),
+        (("c", "a"), [1.0, 4.0, 9.0, 2.0, 4.0]),
+        (("a", "c"), [2.0, 4.0, 1.0, 4.0, 9.0]),
+        (("b",), [-3.0]),
+    ],
+)
+def test_a_group_picks_its_terms_in_its_own_order(names, expected):
+    found = group(names=names)
+    found.compute()
+    assert found.buffer.tolist() == [pytest.approx(expected)] * 2
+
+
+def test_a_term_is_evaluated_once_for_all_groups_that_name_it():
+    calls = []
+    source = ObservationTerms({"a": lambda: calls.append(1) or torch.ones(2, 1)})
+    groups = [ObservationGroup(source, ["a"], {"a": scale}, {}, 100.0) for scale in (2.0, 3.0)]
+    calls.clear()
+    source.evaluate()
+    for each in groups:
+        each.compute()
+    assert [each.buffer[0].tolist() for each in groups] == [[2.0], [3.0]]
+    assert len(calls) == 1
+
+
+def test_what_is_no_number_is_seen_as_zero():
+    source = ObservationTerms({"a": lambda: torch.tensor([[math.nan, math.inf, -math.inf, 1.0]])})
+    raw = source.evaluate()
+    assert source.values.tolist() == [[0.0, 0.0, 0.0, 1.0]]
+    assert raw.isnan().tolist() == [[True, False, False, False]]
 
 
 # ---- statistics ------------------------------------------------------------------------------------------------------

@@ -86,7 +86,7 @@ def test_two_processes_learn_one_policy_from_different_robots():
     Path("spy.py").write_text(SPY)
     with two_processes("spy.py", *TRAIN, "--max_iterations", "2", "train.policy.obs_normalization=true") as process:
         out = ended(process, 0)
-    first, second = (torch.load(f"rank{r}.pt", weights_only=False) for r in (0, 1))
+    first, second = (torch.load(f"rank{r}.pt", weights_only=True) for r in (0, 1))
     for network in ("actor", "critic"):
         for name, tensor in first[network].items():
             assert tensor.equal(second[network][name]), name
@@ -97,7 +97,7 @@ def test_two_processes_learn_one_policy_from_different_robots():
     assert int(first["actor"]["obs_normalizer.count"]) == 2 * 2 * 4 * 8  # processes, iterations, steps, robots
     (folder,) = run_folders()
     assert checkpoints(folder) == [0, 1]
-    saved = torch.load(folder / "model_1.pt", weights_only=False)["actor_state_dict"]
+    saved = torch.load(folder / "model_1.pt", weights_only=True)["actor_state_dict"]
     assert all(tensor.equal(first["actor"][name]) for name, tensor in saved.items())
     assert out.count("it 2/2") == out.count("finished after 2 iterations: 128 steps") == 1
     assert "8 robots on each of 2 processes" in out
@@ -136,7 +136,7 @@ def test_a_signal_stops_all_with_one_checkpoint():
     done = int(re.search(r"stopped after (\d+) iterations", out).group(1))
     (folder,) = run_folders()
     assert checkpoints(folder) == sorted({0, done - 1})
-    assert torch.load(folder / f"model_{done - 1}.pt", weights_only=False)["iter"] == done - 1
+    assert torch.load(folder / f"model_{done - 1}.pt", weights_only=True)["iter"] == done - 1
 
 
 def as_rank(monkeypatch, rank: int, count: int) -> None:

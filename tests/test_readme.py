@@ -164,14 +164,14 @@ def test_numbers_of_the_blind_policies_are_those_of_the_shipped_evaluations():
 
 @pytest.mark.parametrize("policy", sorted(ROUGH.parent.iterdir()), ids=lambda path: path.name)
 def test_shipped_checkpoint_is_finite_and_of_its_task(policy):
-    saved = torch.load(policy / "model.pt", weights_only=False, map_location="cpu")
+    saved = torch.load(policy / "model.pt", weights_only=True, map_location="cpu")
     assert saved["infos"]["task"] == policy.name
     assert all(torch.isfinite(tensor).all() for tensor in saved["actor_state_dict"].values())
 
 
 def test_a_policy_without_its_optimiser_is_exported(tmp_path):
     """As the one for rough terrain is shipped."""
-    assert "optimizer_state_dict" not in torch.load(ROUGH / "model.pt", weights_only=False, map_location="cpu")
+    assert "optimizer_state_dict" not in torch.load(ROUGH / "model.pt", weights_only=True, map_location="cpu")
     arguments = ["--task", "anymal_c", "--load_run", str(ROUGH), "--out", str(tmp_path), "--no-video", "--headless"]
     assert play.main([*arguments, "--terrain", "flat", "--num_envs", "1"]) == 0
     described = json.loads((tmp_path / "exported" / "policy.json").read_text())

@@ -141,9 +141,21 @@ class BaseTask(VecEnv):
         """What is logged of a rollout: fresh 0-dimensional tensors by their name in TensorBoard."""
         return self.statistics.flush()
 
-    def state_dict(self) -> dict[str, Any]:
-        """What a resumed training must know of the task, beside the networks."""
+    def progress(self) -> dict[str, Any]:
+        """How far the curricula have got: what every checkpoint holds, whatever the number of environments."""
         return {}
 
+    def load_progress(self, progress: dict[str, Any]) -> None:
+        """Go on from there; to be followed by `reset`."""
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """Copies of everything that the next step is a function of, beside the actions and torch's random numbers."""
+
+    @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
+        """Put the task back into a saved state; the next step is then the one that would have followed.
+
+        Raises:
+            StateError: it is of another number of environments, or of another task; nothing should be used then.
+        """

@@ -1,6 +1,5 @@
 """The legged robot's MDP, top to bottom: one step, terminations, resets. Observation and reward terms are in terms.py."""
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -15,14 +14,16 @@ from legged.curriculum import CommandCurriculum
 from legged.envs.base_task import BaseTask
 from legged.envs.terms import Terms
 from legged.errors import ConfigError, suggest
+from legged.faults import LARGEST_STATE, Faults
 from legged.graph import Branch
 from legged.math import masked_set_
-from legged.observations import ObservationGroup
+from legged.observations import ObservationGroup, ObservationTerms
 from legged.physics import make_physics
 from legged.randomization import Randomization
 from legged.ranks import Ranks
 from legged.rewards import Rewards
 from legged.robot import Robot, load_robot
+from legged.state import load_state, state_of, take
 from legged.statistics import Statistics
 from legged.terrain import Terrain, check_terrain
 from legged.terrain.curriculum import TerrainCurriculum
@@ -75,7 +76,11 @@ class LeggedRobot(Terms, BaseTask):
         full_ranges = self.command_sampler.full_ranges
         self.command_curriculum = CommandCurriculum(cfg.commands.curriculum, full_ranges, self.dt)
         self.valid = torch.ones(n, dtype=torch.bool, device=device)
-        """(N,) robots whose physics is finite; the others are terminated and reset."""
+        """(N,) robots whose numbers are numbers: physics now, rewards and observations a step before; the others are
+        terminated and reset.
+        """
+        self._in_bounds = torch.ones_like(self.valid)
+        self._clipped_actions = torch.zeros_like(self.actions)
 
         self.feet_indices = torch.tensor(robot.feet_indices, device=device)
         self.penalised_indices = torch.tensor(robot.penalised_indices, dtype=torch.long, device=device)
@@ -102,7 +107,9 @@ class LeggedRobot(Terms, BaseTask):
         terms = {name: getattr(self, f"_reward_{name}") for name in scales}
         self.rewards = Rewards(terms, scales, self.dt, cfg.rewards.only_positive_rewards, self.rew_buf)
         self.episode_sums = self.rewards.episode_sums
+        self.observation_terms = ObservationTerms({name: getattr(self, f"_obs_{name}") for name in self._term_order()})
         self.observation_groups = {"actor": self._group("actor"), "critic": self._group("critic")}
+        self.faults = Faults(self.rewards.names, self.observation_terms, n, device)
         self.statistics = Statistics(self.rewards.names, cfg.env.episode_length_s, device)
         # A back-end that no graph can hold runs eagerly on a GPU; on the CPU nothing is captured, only checked.
         self._build_graph(graph and (self.physics.capturable or device.type == "cpu"))
@@ -163,7 +170,8 @@ class LeggedRobot(Terms, BaseTask):
 
     def _step(self) -> None:
         clip = self.cfg.control.clip_actions
-        torch.clamp(self._action_input, -clip, clip, out=self.actions)
+        torch.clamp(self._action_input, -clip, clip, out=self._clipped_actions)
+        torch.nan_to_num(self._clipped_actions, nan=0.0, out=self.actions)
         self.control.set_actions(self.actions)
         for _ in range(self.cfg.control.decimation):
             self.control.compute(self.dof_pos, self.dof_vel)
@@ -179,10 +187,12 @@ class LeggedRobot(Terms, BaseTask):
         with self._beside.fork():
             self.track()
         self.compute_reward()
+        with self._beside.fork():
+            self.faults.check_rewards(self.rewards.fine, self.valid)
         self._beside.join()
         if self.terrain_curriculum is not None:
             asked = self.commands[:, :2].norm(dim=1) * self.cfg.env.episode_length_s
-            self.terrain_curriculum.update(self.reset_buf, self.base_pos, asked)
+            self.terrain_curriculum.update(self.reset_buf & self.valid, self.base_pos, asked)
         self.reset_idx(self.reset_buf)
         self.randomization.push(self.physics, ~self.reset_buf)
         self._observe()
@@ -190,8 +200,10 @@ class LeggedRobot(Terms, BaseTask):
     def check_termination(self) -> None:
         """Failures: a terminating shape feels a force, the base is too low or tilted, physics blew up. And time-outs."""
         cfg = self.cfg.terminations
-        numbers = (self.base_pos, self.base_quat, self.base_lin_vel, self.base_ang_vel, self.dof_pos, self.dof_vel)
-        self.valid.copy_(torch.isfinite(torch.cat(numbers, dim=1).sum(dim=1)))
+        state = (self.base_pos, self.base_quat, self.base_lin_vel, self.base_ang_vel, self.dof_pos, self.dof_vel)
+        largest = torch.linalg.vector_norm(torch.cat([*state, self._clipped_actions], dim=1), torch.inf, dim=1)
+        torch.lt(largest, LARGEST_STATE, out=self._in_bounds)  # so is NaN not
+        torch.logical_and(self._in_bounds, self.faults.sound, out=self.valid)
         force = self.contact_forces[:, self.termination_indices].norm(dim=2)
         failed = (force > TERMINATION_FORCE).any(dim=1) | ~self.valid
         if cfg.min_base_height > 0.0:
@@ -216,6 +228,7 @@ class LeggedRobot(Terms, BaseTask):
         velocity = torch.cat([self.base_lin_vel[:, :2], self.base_ang_vel[:, 2:]], dim=1)
         error = (self.commands[:, :3] - velocity).square()
         self.statistics.add_step(error[:, :2].sum(dim=1), error[:, 2], self.valid, self.physics.overflowed)
+        self.faults.check_state(self._in_bounds, self._clipped_actions)
         self.command_curriculum.update(self.commands[:, :3], velocity, self.valid)
         self.command_curriculum.write_ranges(self.command_sampler.ranges)
 
@@ -257,10 +270,14 @@ class LeggedRobot(Terms, BaseTask):
         self.physics.refresh()
         self.height_scan.update(self.base_pos, self.base_quat)
         self.command_sampler.update(self.reset_buf, self.base_quat)
+        raw = self.observation_terms.evaluate()
+        with self._beside.fork():
+            self.faults.check_observations(raw)
         for group in self.observation_groups.values():
             group.advance()
             group.compute()
             group.restart(self.reset_buf)
+        self._beside.join()
         self.last_actions.copy_(self.actions)
         self.last_dof_vel.copy_(self.dof_vel)
 
@@ -270,6 +287,7 @@ class LeggedRobot(Terms, BaseTask):
         `heading` (N,) [rad] and in heading mode, the yaw rate steers towards it instead.
         """
         self.command_sampler.hold(commands, heading)
+        self.observation_terms.evaluate()
         for group in self.observation_groups.values():
             group.compute()
             group.restart(self.episode_length_buf == 0)
@@ -286,9 +304,13 @@ class LeggedRobot(Terms, BaseTask):
         scales.setdefault("commands", [lin, lin, ang])
         noisy = name == "actor" and cfg.add_noise
         noise = {term: half * cfg.noise_level for term, half in cfg.noise.items()} if noisy else {}
-        functions: dict[str, Callable[[], Tensor]] = {term: getattr(self, f"_obs_{term}") for term in names}
         history = cfg.actor_history if name == "actor" else 1
-        return ObservationGroup(functions, scales, noise, cfg.clip, history)
+        return ObservationGroup(self.observation_terms, names, scales, noise, cfg.clip, history)
+
+    def _term_order(self) -> list[str]:
+        """The terms of all groups, each once; those of the largest group first, so that it finds them side by side."""
+        groups = sorted((self.cfg.observations.actor, self.cfg.observations.critic), key=len, reverse=True)
+        return list(dict.fromkeys(name for names in groups for name in names))
 
     def _soft_limits(self, robot: Robot) -> Tensor:
         """(D, 2) joint limits, shrunk about their middle by `soft_dof_pos_limit` [rad]."""
@@ -307,16 +329,60 @@ class LeggedRobot(Terms, BaseTask):
     def log_rollout(self) -> dict[str, Tensor]:
         ranges = {f"Metrics/{name}": value for name, value in self.command_curriculum.metrics().items()}
         levels = self.terrain_curriculum.metrics() if self.terrain_curriculum is not None else {}
-        return {**super().log_rollout(), **ranges, **levels}
+        return {**super().log_rollout(), **ranges, **levels, **self.faults.flush()}
+
+    def progress(self) -> dict[str, Any]:
+        progress = {"command_curriculum": self.command_curriculum.progress()}
+        if self.terrain_curriculum is not None:
+            progress["terrain_curriculum"] = self.terrain_curriculum.progress()
+        return progress
+
+    def load_progress(self, progress: dict[str, Any]) -> None:
+        self.command_curriculum.load_progress(progress["command_curriculum"])
+        self.command_curriculum.write_ranges(self.command_sampler.ranges)
+        if self.terrain_curriculum is not None and "terrain_curriculum" in progress:
+            self.terrain_curriculum.load_progress(progress["terrain_curriculum"])
+
+    def _parts(self) -> dict[str, Any]:
+        """What has a state of its own, by name."""
+        parts = {
+            "commands": self.command_sampler,
+            "command_curriculum": self.command_curriculum,
+            "contacts": self.contacts,
+            "control": self.control,
+            "faults": self.faults,
+            "randomization": self.randomization,
+            "rewards": self.rewards,
+            **{f"observations_{name}": group for name, group in self.observation_groups.items()},
+        }
+        if self.terrain_curriculum is not None:
+            parts["terrain_curriculum"] = self.terrain_curriculum
+        return parts
+
+    def _own_tensors(self) -> dict[str, Tensor]:
+        """The task's own tensors of a row per robot, a subclass' among them; not those that are parts' or the physics'."""
+        others = [*vars(self.physics.state).values(), *self.physics.state_tensors().values(), self.height_scan.heights]
+        others += [tensor for part in self._parts().values() for tensor in vars(part).values() if isinstance(tensor, Tensor)]
+        known = {tensor.untyped_storage().data_ptr() for tensor in others}
+        return {
+            name: tensor
+            for name, tensor in vars(self).items()
+            if isinstance(tensor, Tensor)
+            and tensor.shape[:1] == (self.num_envs,)
+            and tensor.untyped_storage().data_ptr() not in known
+        }
 
     def state_dict(self) -> dict[str, Any]:
-        state = {"command_curriculum": self.command_curriculum.state_dict()}
-        if self.terrain_curriculum is not None:
-            state["terrain_curriculum"] = self.terrain_curriculum.state_dict()
-        return state
+        return {
+            "physics": {name: tensor.clone() for name, tensor in self.physics.state_tensors().items()},
+            "task": {name: tensor.clone() for name, tensor in self._own_tensors().items()},
+            **{name: state_of(part) for name, part in self._parts().items()},
+        }
 
+    @torch.inference_mode()
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.command_curriculum.load_state_dict(state["command_curriculum"])
-        self.command_curriculum.write_ranges(self.command_sampler.ranges)
-        if self.terrain_curriculum is not None and "terrain_curriculum" in state:
-            self.terrain_curriculum.load_state_dict(state["terrain_curriculum"])
+        for name, part in self._parts().items():
+            load_state(part, state.get(name, {}))
+        take(self._own_tensors(), state.get("task", {}), type(self).__name__)
+        self.randomization.apply(self.physics)
+        self.physics.load_state(state.get("physics", {}))

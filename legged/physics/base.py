@@ -1,6 +1,7 @@
 """The interface every physics engine is put behind, and the state it keeps for the task."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor
 
 from legged.robot import Robot
+from legged.state import take
 
 RandomizedField = Literal["friction", "added_base_mass"]
 
@@ -91,6 +93,22 @@ class Physics(ABC):
     @abstractmethod
     def randomize(self, field: RandomizedField, values: Tensor) -> None:
         """Set a property per world, (N,), at start-up: `friction` of the robot's shapes [-], `added_base_mass` [kg]."""
+
+    @abstractmethod
+    def state_tensors(self) -> dict[str, Tensor]:
+        """The engine's own arrays of which a step is a function, (N, ...) each, beside `torques`, and the contact forces:
+        copies of them put back by `load_state` give the same steps again, bit by bit on a CPU.
+        """
+
+    def load_state(self, saved: Mapping[str, Tensor]) -> None:
+        """Put all worlds into a state that was copied from `state_tensors`, and refresh.
+
+        Raises:
+            StateError: it is of another engine, robot or number of worlds.
+        """
+        take(self.state_tensors(), saved, type(self).__name__)
+        self.refresh()
+        self.state.contact_forces.copy_(saved["contact_forces"])  # the engine still has those of its own last step
 
     @abstractmethod
     def copy_to(self, env_id: int, data: mujoco.MjData) -> None:

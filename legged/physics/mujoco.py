@@ -110,6 +110,15 @@ class MujocoPhysics(Physics):
             self.batch.expand("body_mass")[:, base] = self.model.body_mass[base] + array
             self.batch.set_const()
 
+    def state_tensors(self) -> dict[str, Tensor]:
+        return {
+            "qpos": self._qpos,
+            "qvel": self._qvel,
+            "warmstart": torch.from_numpy(self._warmstart),
+            "contact_forces": self.state.contact_forces,
+            "stepped": self._stepped,
+        }
+
     def copy_to(self, env_id: int, data: mujoco.MjData) -> None:
         data.qpos[:] = self._qpos[env_id].numpy()
         data.qvel[:] = self._qvel[env_id].numpy()

@@ -140,6 +140,9 @@ class MujocoWarpPhysics(WarpPhysics):
             array.zero_()
         return recorded
 
+    def state_tensors(self) -> dict[str, Tensor]:
+        return {**super().state_tensors(), "warmstart": wp.to_torch(self._d.qacc_warmstart)}
+
     def push(self, mask: Tensor, lin_vel_xy: Tensor) -> None:
         masked_set_(self._qvel[:, :2], mask, self._qvel[:, :2] + lin_vel_xy)
 

@@ -1,5 +1,7 @@
 """Newton's solvers behind the interface: on a GPU, or on Warp's CPU device."""
 
+from collections.abc import Mapping
+
 import newton
 import torch
 import warp as wp
@@ -88,6 +90,15 @@ class NewtonPhysics(WarpPhysics):
             self._forget()
             self._exchange.write(mask, base_pos, base_quat, base_lin_vel, base_ang_vel, dof_pos, dof_vel)
             self._put()
+
+    def load_state(self, saved: Mapping[str, Tensor]) -> None:
+        """As every engine, but a solver's own memory (warm starts, matched contacts) begins anew."""
+        super().load_state(saved)
+        with self._on_device():
+            self._mask[:-1].fill_(True)
+            self._forget()
+            self._put()
+        self.refresh()
 
     def push(self, mask: Tensor, lin_vel_xy: Tensor) -> None:
         masked_set_(self._qvel[:, :2], mask, self._qvel[:, :2] + lin_vel_xy)

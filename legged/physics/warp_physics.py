@@ -109,6 +109,9 @@ class WarpPhysics(Physics):
         with self._on_device():
             self._exchange.write(mask, base_pos, base_quat, base_lin_vel, base_ang_vel, dof_pos, dof_vel)
 
+    def state_tensors(self) -> dict[str, Tensor]:
+        return {"qpos": self._qpos, "qvel": self._qvel, "contact_forces": self.state.contact_forces}
+
     def copy_to(self, env_id: int, data: mujoco.MjData) -> None:
         data.qpos[:] = self._qpos[env_id].cpu().numpy().astype(np.float64)
         data.qvel[:] = self._qvel[env_id].cpu().numpy().astype(np.float64)

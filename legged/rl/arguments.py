@@ -8,12 +8,12 @@ from typing import Any
 import torch
 
 from legged.config import parse_override
-from legged.errors import ConfigError
+from legged.errors import ConfigError, RunError
 from legged.ranks import Ranks
 from legged.registry import import_tasks
 from legged.startup import is_a_command
 
-EXIT_WRONG_INPUT = 2
+EXIT_STOPPED, EXIT_WRONG_INPUT = 1, 2
 
 
 def add_task_arguments(parser: argparse.ArgumentParser) -> None:
@@ -127,6 +127,9 @@ def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = N
         ranks = Ranks.now()
         print(f"rank {ranks.rank}: error: {error}" if ranks.several else f"error: {error}", file=sys.stderr)
         return EXIT_WRONG_INPUT
+    except RunError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return EXIT_STOPPED
 
 
 def import_and_check(args: argparse.Namespace) -> None:

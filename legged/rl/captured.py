@@ -35,6 +35,7 @@ class CapturedRunner(Runner):
         self, env: BaseTask, log_dir: Path | None = None, device: str = "cpu", display: Display | None = None
     ) -> None:
         super().__init__(env, log_dir, device, display)
+        self._rollout: Rollout | None = None
         self.why_stock = self.alg.why_stock
         """What keeps training on rsl-rl's own loop; empty if nothing does."""
         if torch.device(device) != torch.device(env.device):  # type: ignore[arg-type]
@@ -49,9 +50,9 @@ class CapturedRunner(Runner):
         self.alg.train_mode()
         if self.is_distributed:
             self.alg.broadcast_parameters()
-        rollout = Rollout(self.env, self.alg)
+        self._rollout = rollout = Rollout(self.env, self.alg)
         collect, update = self._capture(rollout)
-        if init_at_random_ep_len:
+        if not self._go_on() and init_at_random_ep_len:
             length = self.env.episode_length_buf
             self.env.episode_length_buf = torch.randint_like(length, high=int(self.env.max_episode_length))
         self.logger.init_logging_writer()
@@ -76,7 +77,7 @@ class CapturedRunner(Runner):
         """Rollout and update as graphs, where the task's step is one; networks and task are as before afterwards."""
         device = torch.device(self.device)
         enabled = self.env.captured
-        task_state = self.env.state_dict()
+        progress = self.env.progress()
         collect = StepGraph(rollout.collect, device, enabled, ROLLOUTS_TO_WARM_UP, lambda: rollout.collect(1))
         before = list(zip(self.alg.tensors(), copies(self.alg.tensors()), strict=True))
         fresh = not self.alg.optimizer.state
@@ -91,9 +92,12 @@ class CapturedRunner(Runner):
         if enabled:
             rollout.forget()
             self.env.reset_curricula()
-            self.env.load_state_dict(task_state)
+            self.env.load_progress(progress)
             self.env.reset()
         return collect, update
+
+    def _episodes(self) -> dict[str, Tensor]:
+        return super()._episodes() if self._rollout is None else self._rollout.episodes
 
     def _log(self, iteration: int, first: int, total: int, rollout: Rollout, clock: "Clock") -> None:
         """Read what is logged, which waits for the iteration to end."""

@@ -1,80 +1,178 @@
-"""Checkpoint files: written whole or not at all, and checked before anything is built from them."""
+"""Checkpoint files: plain data, written whole or not at all, and checked before anything is built from them.
 
+The layout is rsl-rl's (actor_state_dict, critic_state_dict, optimizer_state_dict, iter, infos); what is ours is in `infos`.
+"""
+
+import pickle
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from legged.config import TaskConfig
 from legged.envs import BaseTask
 from legged.errors import ConfigError
 from legged.paths import relative, replacing
+from legged.robot import load_robot
+
+FORMAT = 2
+"""Version of `infos`. Files without one, of rsl-rl or from before there were versions, are read as 1."""
+NETWORKS = ("actor", "critic")
+Saved = dict[str, Any]
 
 
-def write_checkpoint(path: Path, saved: dict[str, Any]) -> None:
+def write_checkpoint(path: Path, saved: Saved) -> None:
     """Write a checkpoint that is whole or not there."""
     with replacing(path) as part:
         torch.save(saved, part)
 
 
-def read_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
-    """The content of a checkpoint.
+def load_plain(path: Path, device: str = "cpu") -> Any:
+    """What a file of torch holds, if that is plain data: numbers, text, tensors, lists and dictionaries. Runs nothing.
 
     Raises:
-        ConfigError: the file is missing, or is no checkpoint of rsl-rl.
+        ConfigError: the file can't be read, is none of torch, or holds something else.
     """
+    name = relative(path)
     try:
-        saved = torch.load(path, weights_only=False, map_location=device)
+        path.open("rb").close()
+    except OSError as error:
+        raise ConfigError(f"{name}: cannot be read ({error.strerror or error})") from error
+    try:
+        return torch.load(path, weights_only=True, map_location=device)
+    except pickle.UnpicklingError as error:
+        if "weights_only" in str(error):
+            raise ConfigError(f"{name}: not a checkpoint (it holds more than plain data, which could run code)") from error
+        raise ConfigError(f"{name}: not a checkpoint ({_first_line(error)})") from error
     except Exception as error:  # torch raises half a dozen kinds for files that are none of its own
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ConfigError(f"{relative(path)}: not a checkpoint ({reason})") from error
-    if not isinstance(saved, dict) or not {"actor_state_dict", "critic_state_dict", "iter"} <= saved.keys():
-        raise ConfigError(f"{relative(path)}: not a checkpoint of rsl-rl (no actor, critic and iteration in it)")
-    return saved
+        raise ConfigError(f"{name}: not a checkpoint ({_first_line(error)})") from error
 
 
-def layer_shapes(state: dict[str, Any]) -> list[tuple[int, ...]]:
-    """Shapes of a network's weight matrices, from input to output."""
-    return [tuple(tensor.shape) for tensor in state.values() if tensor.dim() == 2]
+def _first_line(error: Exception) -> str:
+    lines = str(error).splitlines()
+    return lines[0][:200] if lines else type(error).__name__
+
+
+def read_checkpoint(path: Path, device: str = "cpu") -> Saved:
+    """The content of a checkpoint, whose parts are of the right kind and whose weights are finite.
+
+    Raises:
+        ConfigError: the file is missing, no checkpoint, of a newer format, or damaged.
+    """
+    saved = load_plain(path, device)
+    name = relative(path)
+    wanted = {*(f"{network}_state_dict" for network in NETWORKS), "iter"}
+    if not isinstance(saved, dict) or not wanted <= saved.keys():
+        raise ConfigError(f"{name}: not a checkpoint of rsl-rl (no actor, critic and iteration in it)")
+    infos = saved.get("infos") or {}
+    kinds = {"infos": (infos, dict), "iter": (saved["iter"], int)}
+    kinds |= {key: (saved[key], dict) for key in saved if key.endswith("_state_dict")}
+    kinds |= {f"infos.{key}": (infos[key], dict) for key in INFOS if isinstance(infos, dict) and key in infos}
+    for key, (value, kind) in kinds.items():
+        if not isinstance(value, kind) or isinstance(value, bool):
+            raise ConfigError(f"{name}: not a checkpoint (its {key} is {type(value).__name__}, not {kind.__name__})")
+    if saved["iter"] < 0:
+        raise ConfigError(f"{name}: not a checkpoint (its iteration is {saved['iter']})")
+    version = infos.get("format", 1)
+    if not isinstance(version, int) or version > FORMAT:
+        raise ConfigError(
+            f"{name}: written in format {version!r} by a newer version of legged; this one reads up to {FORMAT}"
+        )
+    for network in NETWORKS:
+        check_weights(saved[f"{network}_state_dict"], f"{name}: its {network}")
+    return {**saved, "infos": infos}
+
+
+INFOS = ("task_state", "observations", "networks", "robot")
+"""Entries of `infos` that are dictionaries."""
+
+
+def check_weights(state: dict[str, Any], where: str) -> None:
+    """Raise ConfigError, which begins with `where`, if a network's state is not made of finite tensors."""
+    for name, tensor in state.items():
+        if not isinstance(name, str) or not isinstance(tensor, Tensor):
+            raise ConfigError(f"{where} is damaged ({name!r} is no tensor)")
+        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+            raise ConfigError(f"{where} is damaged ({name} holds NaN or infinite numbers)")
+
+
+def describe(task: BaseTask) -> dict[str, Any]:
+    """What a checkpoint says of where it fits: `infos` without what changes during a training."""
+    robot = getattr(task, "robot", None)
+    return {
+        "format": FORMAT,
+        "task": task.cfg.task,
+        "observations": observation_layout(task),
+        "networks": networks(task.cfg),
+        **({} if robot is None else {"robot": {"name": robot.name, "joints": list(robot.joint_names)}}),
+    }
 
 
 def observation_layout(task: BaseTask) -> dict[str, dict[str, int]]:
-    """Group -> term -> width, kept in checkpoints."""
+    """Group -> term -> width."""
     return {
         name: {term.name: term.columns.stop - term.columns.start for term in group.terms}
         for name, group in task.observation_groups.items()
     }
 
 
-def check_fits(path: Path, saved: dict[str, Any], cfg: TaskConfig) -> None:
+def networks(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
+    """Network -> what of `train.policy` decides which weights it has, and what they compute."""
+    policy = cfg.train.policy
+    shared = {"activation": policy.activation, "obs_normalization": policy.obs_normalization}
+    history = {"actor": cfg.observations.actor_history}
+    return {
+        name: {"hidden_dims": list(getattr(policy, f"{name}_hidden_dims")), "history": history.get(name, 1), **shared}
+        for name in NETWORKS
+    }
+
+
+def network_of(state: dict[str, Any]) -> dict[str, Any]:
+    """As far as weights tell, the same, of a checkpoint that does not say it."""
+    layers = [tensor for name, tensor in state.items() if name.startswith("mlp.") and name.endswith(".weight")]
+    hidden = [layer.shape[0] for layer in layers[:-1]]
+    return {"hidden_dims": hidden, "obs_normalization": any("obs_normalizer" in name for name in state)}
+
+
+def check_fits(path: Path, saved: Saved, cfg: TaskConfig) -> None:
     """Compare a checkpoint with a configuration, before the task is built.
 
     Raises:
-        ConfigError: it was made for other observations, or for networks of another size.
+        ConfigError: it was made for another robot, other observations, or other networks.
     """
-    layout: dict[str, dict[str, int]] = (saved.get("infos") or {}).get("observations", {})
-    for group, hidden in (("actor", cfg.train.policy.actor_hidden_dims), ("critic", cfg.train.policy.critic_hidden_dims)):
-        shapes = layer_shapes(saved[f"{group}_state_dict"])
-        wanted = tuple(getattr(cfg.observations, group))
-        if group in layout and tuple(layout[group]) != wanted:
-            known = {term: width for terms in layout.values() for term, width in terms.items()}
-            size = sum(known[term] for term in wanted) if set(wanted) <= set(known) else "other"
+    name, infos = relative(path), saved["infos"]
+    joints = infos.get("robot", {}).get("joints")
+    robot = load_robot(cfg.robot, cfg.origins.where("robot"))
+    if joints is not None and list(robot.joint_names) != joints:
+        theirs = f"'{infos['robot'].get('name')}' with {len(joints)} joints"
+        raise ConfigError(f"{name}: made for another robot: {theirs}, not '{robot.name}' with {robot.num_dof}: {joints}")
+    layout: dict[str, dict[str, int]] = infos.get("observations", {})
+    described: dict[str, Any] = infos.get("networks", {})
+    for network, wanted in networks(cfg).items():
+        terms = tuple(getattr(cfg.observations, network))
+        if network in layout and tuple(layout[network]) != terms:
+            known = {term: width for widths in layout.values() for term, width in widths.items()}
+            size = sum(known[term] for term in terms) if set(terms) <= set(known) else "other"
             raise ConfigError(
-                f"{relative(path)}: made for other observations: its {group} takes {shapes[0][1]} numbers"
-                f" ({', '.join(layout[group])}), '{cfg.task}' gives {size} ({', '.join(wanted)})"
+                f"{name}: made for other observations: its {network} takes {sum(layout[network].values())} numbers"
+                f" ({', '.join(layout[network])}), '{cfg.task}' gives {size} ({', '.join(terms)})"
             )
-        if tuple(shape[0] for shape in shapes[:-1]) != tuple(hidden):
-            found = [shape[0] for shape in shapes[:-1]]
-            raise ConfigError(
-                f"{relative(path)}: its {group} has hidden layers {found}, the configuration"
-                f" train.policy.{group}_hidden_dims {list(hidden)}"
-            )
+        found = described.get(network) or network_of(saved[f"{network}_state_dict"])
+        for key, value in wanted.items():
+            if key in found and found[key] != value:
+                field = f"train.policy.{network}_hidden_dims" if key == "hidden_dims" else f"train.policy.{key}"
+                field = "observations.actor_history" if key == "history" else field
+                what = "hidden layers" if key == "hidden_dims" else key
+                raise ConfigError(f"{name}: its {network} has {what} {found[key]}, the configuration has {field} {value}")
 
 
-def describe_mismatch(path: Path, saved: dict[str, Any], wanted: dict[str, Any], task: str) -> str:
+def describe_mismatch(path: Path, saved: Saved, wanted: dict[str, Any], task: str) -> str:
     """What differs between a checkpoint's policy and the one that the built task needs."""
-    found, needed = layer_shapes(saved["actor_state_dict"]), layer_shapes(wanted)
+    found = saved["actor_state_dict"]
     text = f"{relative(path)}: made for another task than '{task}'"
-    if found and needed and found[0][1] != needed[0][1]:
-        return f"{text}: its policy takes {found[0][1]} observations, the task gives {needed[0][1]}"
-    return f"{text}: its policy has layers {found}, the task's {needed}"
+    for name in dict.fromkeys([*wanted, *found]):
+        here, there = (tuple(state[name].shape) if name in state else None for state in (wanted, found))
+        if here != there:
+            return f"{text}: its policy's {name} has the shape {there}, the task's {here}"
+    return f"{text}: its critic or its optimiser has other shapes"

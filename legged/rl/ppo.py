@@ -39,9 +39,16 @@ class DevicePPO(PPO):
             parameters = [p for p in (*self.actor.parameters(), *self.critic.parameters()) if p.requires_grad]
             capturable = self._rate.is_cuda
             self.optimizer = torch.optim.Adam(parameters, lr=self._rate, fused=True, capturable=capturable)
+            # Where this is 1, a fused step changes nothing: neither parameters nor moments nor its count.
+            self.optimizer.found_inf = torch.zeros((), device=self.device)  # type: ignore[attr-defined]
             if self.is_multi_gpu:
                 self._shared = SharedGradients(parameters, self.gpu_world_size)
-        self._losses = torch.zeros(len(LOSSES) if self.symmetry else len(LOSSES) - 1, device=self.device)
+        count = len(LOSSES) if self.symmetry else len(LOSSES) - 1
+        self._losses = torch.zeros(count + 1, device=self.device)
+        """Means over the mini-batches of the last update, by `LOSSES`, and the share of them that were taken."""
+        self._one = torch.ones((), device=self.device)
+        self.left_out = 0.0
+        """Share of the last update's mini-batches that changed nothing, because a gradient was no number."""
 
     def tensors(self) -> list[Tensor]:
         """Everything that an update changes: parameters, normalisers, moments of the optimiser, learning rate."""
@@ -114,12 +121,15 @@ class DevicePPO(PPO):
         for _ in range(epochs or self.num_learning_epochs):
             for batch in batches:
                 self._losses += self._step(*batch)
-        self._losses /= self.num_learning_epochs * self.num_mini_batches
+        self._losses[:-1] /= self._losses[-1:].clone()
+        self._losses[-1:] /= self.num_learning_epochs * self.num_mini_batches
         self._update_normalizers()
 
     def losses(self) -> dict[str, float]:
-        """Mean losses of the last update, read from the device."""
-        return dict(zip(LOSSES, self._losses.tolist(), strict=False))
+        """Mean losses of the last update, read from the device, as is `left_out`; NaN if no mini-batch had any."""
+        *losses, taken = self._losses.tolist()
+        self.left_out = 1.0 - taken
+        return dict(zip(LOSSES, losses, strict=False))
 
     @torch.no_grad()
     def _mini_batches(self) -> list[tuple[Tensor, ...]]:
@@ -167,7 +177,9 @@ class DevicePPO(PPO):
         old_mean: Tensor,
         old_std: Tensor,
     ) -> Tensor:
-        """One mini-batch: adapt the learning rate, step down the gradient; returns its losses, as in `LOSSES`."""
+        """One mini-batch: adapt the learning rate, step down the gradient; returns its losses, as in `LOSSES`, and 1. If a
+        gradient is no number, nothing is changed, and all that is returned is 0.
+        """
         samples = len(old_mean)
         if self.normalize_advantage_per_mini_batch:
             own = advantages[:samples]
@@ -202,10 +214,14 @@ class DevicePPO(PPO):
             loss.backward()
         if self.desired_kl is not None and self.schedule == "adaptive":
             self._adapt_rate(kl)
-        for model in (self.actor, self.critic):
-            torch.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
+        norms = [
+            torch.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm) for model in (self.actor, self.critic)
+        ]
+        # The clipped value loss passes no gradient on for a value that is NaN, so it is looked at by itself.
+        fine = (norms[0] + norms[1] + value_loss.detach()) < torch.inf
+        torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
         self.optimizer.step()
-        return torch.stack(losses).detach()
+        return torch.where(fine, torch.stack([*losses, self._one]).detach(), 0.0)
 
     def _output(self, model: MLPModel, inputs: Tensor) -> Tensor:
         """What a network makes of its inputs (n, width): (n, outputs), float32. With mixed precision its layers compute in

@@ -28,6 +28,11 @@ class Rollout:
         self.ended = torch.zeros(3, device=env.device)
         """(3,) of the episodes that ended in the last rollout: number, sum of returns, sum of lengths [steps]."""
 
+    @property
+    def episodes(self) -> dict[str, Tensor]:
+        """Return and length so far of each robot's episode, (N,) each."""
+        return {"return": self._return, "length": self._length}
+
     def forget(self) -> None:
         """All episodes begin anew."""
         self._return.zero_()

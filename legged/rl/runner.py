@@ -5,25 +5,26 @@ import io
 import time
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import torch
 from rsl_rl.runners import OnPolicyRunner
-from rsl_rl.utils.logger import Logger
-from torch.utils.tensorboard import SummaryWriter
+from torch import Tensor
 
 from legged.config import TaskConfig
 from legged.envs import BaseTask, LeggedRobot
 from legged.errors import ConfigError
 from legged.ranks import Ranks
-from legged.rl.checkpoint import describe_mismatch, observation_layout, read_checkpoint, write_checkpoint
-from legged.rl.display import Display, Progress
-from legged.rl.distributed import RankLost, any_rank, join, leave
+from legged.rl.checkpoint import check_weights, describe, describe_mismatch, read_checkpoint, write_checkpoint
+from legged.rl.display import Display
+from legged.rl.distributed import RankLost, join, leave
+from legged.rl.logger import Interrupted, QuietLogger
+from legged.rl.run_state import generators, read_run_state, remove_older, set_generators, write_run_state
+from legged.rl.step_guard import StepGuard
 from legged.rl.symmetry import MirrorImages, augment
+from legged.rl.watch import Diverged
 from legged.startup import STARTED_S
-
-
-class Interrupted(Exception):
-    """Training was asked to stop; raised at the end of an iteration, when networks and optimiser agree."""
+from legged.state import StateError, take
 
 
 def runner_config(cfg: TaskConfig, algorithm_class: str) -> dict[str, Any]:
@@ -58,64 +59,6 @@ def runner_config(cfg: TaskConfig, algorithm_class: str) -> dict[str, Any]:
     }
 
 
-class QuietLogger(Logger):
-    """rsl-rl's logger, writing to TensorBoard as ever but handing the console to our display."""
-
-    def __init__(self, *args: Any, display: Display | None = None, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.display = display
-        self.stop_requested = False
-        self.loop_s = 0.0
-        """Time spent in iterations so far, this process [s]."""
-        self.latest: dict[str, float] = {}
-        """The last value of everything the task logs; an iteration in which no episode ended has no episode means."""
-
-    @property
-    def steps_per_iteration(self) -> int:
-        """Steps of all robots, on all GPUs."""
-        return self.cfg["num_steps_per_env"] * self.num_envs * self.gpu_world_size
-
-    def _store_code_state(self) -> list[str]:
-        """Nothing: the run folder holds the state of this code already, see runs.code_state."""
-        return []
-
-    def stop_logging_writer(self) -> None:
-        """Also end TensorBoard's writer and its thread, which rsl-rl leaves open."""
-        super().stop_logging_writer()
-        if isinstance(self.writer, SummaryWriter):
-            self.writer.close()
-
-    def log(self, it: int, start_it: int, total_it: int, collect_time: float, learn_time: float, **kwargs: Any) -> None:
-        """Write one iteration, show it, and stop if that was asked for, of any process."""
-        # An episode mean has no value (NaN) in a rollout in which none ended; leave it out rather than write NaN.
-        values: dict[str, float] = {}
-        for entry in self.ep_extras:
-            stacked = torch.stack([value.reshape(()) for value in entry.values()]).tolist()  # one transfer, not twenty
-            values.update({key: value for key, value in zip(entry, stacked, strict=True) if value == value})
-        self.ep_extras[:] = [dict(values)] if values else []  # a copy: rsl-rl puts tensors in
-        with contextlib.redirect_stdout(io.StringIO()):
-            super().log(it, start_it, total_it, collect_time, learn_time, **kwargs)
-        self.latest.update(values)
-        self.loop_s += collect_time + learn_time
-        if self.display is not None:
-            self.display.show(
-                Progress(
-                    iteration=it + 1,
-                    total=total_it,
-                    elapsed_s=self.loop_s,
-                    eta_s=self.loop_s / (it + 1 - start_it) * (total_it - it - 1),
-                    steps_per_s=self.steps_per_iteration / (collect_time + learn_time),
-                    collect_s=collect_time,
-                    learn_s=learn_time,
-                    reward=sum(self.rewbuffer) / len(self.rewbuffer) if self.rewbuffer else float("nan"),
-                    action_std=float(kwargs["action_std"].detach().mean()),
-                    values=dict(self.latest),
-                )
-            )
-        if any_rank(self.stop_requested, torch.device(self.device)) and it + 1 < total_it:
-            raise Interrupted
-
-
 class Runner(OnPolicyRunner):
     """Trains a task with rsl-rl's PPO."""
 
@@ -133,6 +76,9 @@ class Runner(OnPolicyRunner):
             env.mirror_images = MirrorImages(env)  # type: ignore[attr-defined]  # where `augment` finds them
         with contextlib.redirect_stdout(io.StringIO()):
             super().__init__(env, config, str(log_dir) if log_dir else None, device)
+        self._state: dict[str, Any] | None = None
+        self._last_saved = ""
+        self._guard = None if hasattr(self.alg.optimizer, "found_inf") else StepGuard(self.alg.optimizer)
         self.logger = QuietLogger(
             log_dir=str(log_dir) if log_dir else None,
             cfg=self.cfg,
@@ -143,7 +89,12 @@ class Runner(OnPolicyRunner):
             gpu_global_rank=self.gpu_global_rank,
             device=device,
             display=display,
+            left_out=self._left_out,
         )
+
+    def _left_out(self) -> float:
+        """The share of the last update's mini-batches that changed nothing, because their gradients were no numbers."""
+        return self.alg.left_out if self._guard is None else self._guard.flush()
 
     def stop(self) -> None:
         """Ask `learn` to stop after the iteration that is going on."""
@@ -155,6 +106,7 @@ class Runner(OnPolicyRunner):
 
         Raises:
             RankLost: one of those has died.
+            Diverged: numbers went on being NaN or infinite; the last checkpoint is from before they hit the weights.
         """
         finished = True
         try:
@@ -164,6 +116,12 @@ class Runner(OnPolicyRunner):
             if self.logger.writer is not None:
                 self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
                 self.logger.stop_logging_writer()
+        except Diverged as error:
+            if self.logger.writer is not None:
+                self.logger.stop_logging_writer()
+            leave()
+            good = f"; the last checkpoint is {self._last_saved}" if self._last_saved else ""
+            raise Diverged(f"stopped after iteration {self.current_learning_iteration + 1}: {error}{good}") from error
         except RuntimeError as error:
             if self.is_distributed and "by peer" in str(error):  # gloo notices; with NCCL torchrun ends who waits
                 raise RankLost(f"rank {self.gpu_global_rank}: another process has ended; torchrun says which") from error
@@ -185,24 +143,35 @@ class Runner(OnPolicyRunner):
             }
             join(ranks, torch.device(self.device))
 
+    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
+        """Train for a number of iterations; robots that go on where they stopped keep their episodes."""
+        super().learn(num_learning_iterations, init_at_random_ep_len and not self._go_on())
+
     def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
-        """Write a checkpoint with the task's state."""
+        """Write a checkpoint, and beside it the state of everything else, which the newest alone keeps."""
         saved = self.alg.save()
+        for network in ("actor", "critic"):
+            check_weights(saved[f"{network}_state_dict"], f"{path}: is not written: the {network}")
         saved["iter"] = self.current_learning_iteration
         saved["infos"] = {
             **(infos or {}),
-            "task": self.env.cfg.task,
-            "task_state": self.env.state_dict(),
-            "observations": observation_layout(self.env),
+            **describe(self.env),
+            "task_state": self.env.progress(),
             "learning_rate": self.alg.learning_rate,
             "wall_s": time.perf_counter() - STARTED_S,  # since this process began
         }
+        if not self.is_distributed:  # the other processes' robots are not here
+            saved["infos"]["id"] = uuid4().hex
+            state = {"generators": generators(), "task": self.env.state_dict(), "episodes": self._episodes()}
+            write_run_state(Path(path), {"id": saved["infos"]["id"], **state})
         write_checkpoint(Path(path), saved)
+        remove_older(Path(path))
+        self._last_saved = path
         self.logger.save_model(path, self.current_learning_iteration)
 
     def load(self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None) -> dict:
-        """Restore networks, optimiser (if the checkpoint holds it; shipped ones do not), iteration count and the task's
-        state from a checkpoint.
+        """Restore networks, optimiser (if the checkpoint holds it; shipped ones do not), iteration count and the progress of
+        the task's curricula from a checkpoint.
 
         Raises:
             ConfigError: the file is no checkpoint, or of a network of another size.
@@ -210,15 +179,50 @@ class Runner(OnPolicyRunner):
         saved = read_checkpoint(Path(path), map_location or self.device)
         parts = load_cfg or dict.fromkeys(("actor", "critic", "iteration"), True)
         parts = {"optimizer": "optimizer_state_dict" in saved, **parts}
+        infos = saved["infos"]
         try:
             self.alg.load(saved, parts, strict)
-        except (RuntimeError, ValueError) as error:
+            self.alg.learning_rate = float(infos.get("learning_rate", self.alg.learning_rate))
+        except (RuntimeError, ValueError, KeyError, TypeError) as error:
             policy = self.alg.get_policy().state_dict()
             raise ConfigError(describe_mismatch(Path(path), saved, policy, self.env.cfg.task)) from error
-        infos = saved.get("infos") or {}
         # rsl-rl saves the index of the last finished iteration; going on from it would repeat that one.
         self.current_learning_iteration = saved["iter"] + 1
-        self.alg.learning_rate = infos.get("learning_rate", self.alg.learning_rate)
-        if "task_state" in infos:
-            self.env.load_state_dict(infos["task_state"])
+        try:
+            if "task_state" in infos:
+                self.env.load_progress(infos["task_state"])
+        except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ConfigError(f"{path}: the progress of its curricula is damaged ({error})") from error
         return infos
+
+    def resume(self, path: str) -> str:
+        """Load a checkpoint to train on from. Robots, random numbers and episodes go on where they were, if their state lies
+        beside it; else all robots begin anew on the tiles that they had reached. Returns why they do, or nothing.
+        """
+        infos = self.load(path)
+        if self.is_distributed:
+            why = "there are several processes"
+        else:
+            try:
+                self._state = read_run_state(Path(path), infos.get("id", ""))
+                self._go_on()
+                return ""
+            except StateError as error:
+                why = str(error)
+        self._state = None
+        self.load(path)
+        self.env.reset()
+        return why
+
+    def _go_on(self) -> bool:
+        """Put task, episodes and random generators into the state that was resumed from, if there is one."""
+        if self._state is None:
+            return False
+        self.env.load_state_dict(self._state["task"])
+        take(self._episodes(), self._state.get("episodes", {}), "episodes")
+        set_generators(self._state.get("generators", {}))
+        return True
+
+    def _episodes(self) -> dict[str, Tensor]:
+        """Return and length so far of the episode of each environment, (N,) each, as they are counted for the log."""
+        return {"return": self.logger.cur_reward_sum, "length": self.logger.cur_episode_length}

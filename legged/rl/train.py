@@ -13,7 +13,6 @@ import torch
 
 from legged.config import TaskConfig, to_yaml
 from legged.envs import LeggedRobot
-from legged.errors import ConfigError
 from legged.paths import relative
 from legged.physics import engine_name, resolve_physics
 from legged.ranks import Ranks
@@ -28,11 +27,11 @@ from legged.rl.arguments import (
     settle_on,
 )
 from legged.rl.captured import CapturedRunner
-from legged.rl.checkpoint import check_fits, read_checkpoint
 from legged.rl.display import Display
 from legged.rl.distributed import RankLost
+from legged.rl.resume import resumed
 from legged.rl.runner import Runner
-from legged.rl.runs import create_run, find_checkpoint, find_run
+from legged.rl.runs import create_run
 from legged.startup import STARTED_S
 
 
@@ -58,12 +57,18 @@ def _main(argv: list[str] | None) -> int:
     import_and_check(args)
     device = pick_device(args.sim_device)
     rl_device = pick_device(args.rl_device, "--rl_device") if args.rl_device else device
-    cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
+    checkpoint: Path | None = None
+    changed: list[str] = []
+    if args.resume or args.load_run or args.checkpoint is not None:
+        cfg, checkpoint, changed = resumed(args)
+    else:
+        cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
     resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics"))
     if args.show:
         print(to_yaml(cfg), end="")
         return 0
-    checkpoint = _checkpoint(args, cfg) if args.resume or args.load_run or args.checkpoint is not None else None
+    if checkpoint:
+        print(f"going on with the settings of {relative(checkpoint.parent)}" + "".join(f"; {text}" for text in changed))
     settle_on(device)
     if Ranks.now().first:
         return _train(args, cfg, device, rl_device, checkpoint, start)
@@ -88,8 +93,9 @@ def _train(
         kind = CapturedRunner if cfg.train.runner.loop == "captured" else Runner
         runner = kind(task, folder, str(rl_device), display)
         if checkpoint:
-            runner.load(str(checkpoint))
-            print(f"resumed {relative(checkpoint)} after iteration {runner.current_learning_iteration}", flush=True)
+            why_anew = runner.resume(str(checkpoint))
+            how = f"all robots begin anew: {why_anew}" if why_anew else "robots and random numbers go on where they were"
+            print(f"resumed {relative(checkpoint)} after iteration {runner.current_learning_iteration}; {how}", flush=True)
         ready = time.perf_counter()
         stopped_by = stop_on_signals(runner)
         try:
@@ -114,21 +120,6 @@ def describe(cfg: TaskConfig, device: torch.device, folder: Path) -> str:
     share = f" on each of {ranks.count} processes" if ranks.several else ""
     robots = f"{cfg.env.num_envs} robots{share}"
     return f"{cfg.task}: {robots}, {cfg.train.runner.max_iterations} iterations, {where}; {relative(folder)}"
-
-
-def _checkpoint(args: argparse.Namespace, cfg: TaskConfig) -> Path:
-    """The checkpoint to go on from, checked against the configuration before anything is built."""
-    path = find_checkpoint(find_run(cfg, args.load_run), args.checkpoint)
-    saved = read_checkpoint(path)
-    check_fits(path, saved, cfg)
-    if "optimizer_state_dict" not in saved:
-        raise ConfigError(f"{relative(path)}: holds no optimiser; it can be played, not trained on")
-    done, until = saved["iter"] + 1, cfg.train.runner.max_iterations
-    if done >= until:
-        raise ConfigError(
-            f"--resume: {relative(path)} has finished {done} iterations of {until}; --max_iterations sets a larger total"
-        )
-    return path
 
 
 def stop_on_signals(runner: Runner) -> list[int]:

@@ -15,6 +15,8 @@ class TerrainCurriculum:
     promoted thus has a mean level of 6.0 over ten rows, not 9.
     """
 
+    STATE = ("levels", "columns", "origins", "_sums")
+
     def __init__(self, cfg: TerrainConfig, terrain: Terrain, num_envs: int, device: torch.device) -> None:
         """Robots are spread evenly over the columns, at levels up to cfg.max_init_terrain_level."""
         self.enabled = cfg.curriculum
@@ -86,12 +88,14 @@ class TerrainCurriculum:
             log |= {f"Terrain/{what}_{name}": value for name, value in zip(self.names, share.unbind(), strict=True)}
         return log
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """What a resumed run needs."""
+    def progress(self) -> dict[str, Tensor]:
+        """How far the robots have got."""
         return {"levels": self.levels.clone()}
 
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Go on from a saved state; with another number of robots, from levels drawn out of the saved ones."""
+    def load_progress(self, state: dict[str, Tensor]) -> None:
+        """Go on from there; with another number of robots, from levels drawn out of the saved ones. The robots must be reset
+        afterwards: they still stand on the tiles that they had.
+        """
         saved = state["levels"].to(self.levels.device).clamp(max=self.rows - 1)
         if len(saved) != len(self.levels):
             saved = saved[torch.randint(len(saved), self.levels.shape, device=saved.device)]

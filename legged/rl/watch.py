@@ -1,0 +1,68 @@
+"""What is said and done about a training whose numbers are none: warnings by term, and an end to what does not mend."""
+
+import sys
+from collections.abc import Mapping
+from math import isnan
+
+from legged.errors import RunError
+
+PATIENCE = 10
+"""Iterations in a row that may go wrong."""
+SHARE_OF_ROBOTS, SHARE_OF_BATCHES = 0.2, 0.5
+"""An iteration has gone wrong if robots were reset for it in this share of their steps, or with this share of mini-batches
+left out.
+"""
+FAULT = "Faults/"
+MINI_BATCHES = "Faults/mini_batches"
+"""Logged: the share of mini-batches that were left out, if any was."""
+
+
+class Diverged(RunError):
+    """Training went on being non-finite; the text says how."""
+
+
+class FaultWatch:
+    """Reads what an iteration has logged: warns once of every fault, and gives up on a training that does not recover."""
+
+    def __init__(self, steps_per_iteration: int) -> None:
+        """`steps_per_iteration` are the control steps of all robots of this process."""
+        self._steps = steps_per_iteration
+        self._said: set[str] = set()
+        self._in_a_row = 0
+        self.why_stop = ""
+        """Why training can't go on; empty while it can."""
+
+    def judge(self, values: Mapping[str, float], left_out: float) -> None:
+        """Take in an iteration: what it logged by name, and the share of mini-batches that were left out."""
+        found = {name.removeprefix(FAULT): count for name, count in values.items() if name.startswith(FAULT)}
+        for name, count in found.items():
+            if name not in self._said and not isnan(count):
+                self._said.add(name)
+                robots = f"{count:.0f} robot{'' if count == 1.0 else 's'}"
+                say(f"{term(name)} of {robots} {MEANING.get(name, 'was NaN or infinite')}; logged as {FAULT}{name}")
+        if left_out > 0.0 and MINI_BATCHES not in self._said:
+            self._said.add(MINI_BATCHES)
+            say(f"{100 * left_out:.0f} % of the mini-batches had gradients that were NaN or infinite, and were left out")
+        reset = values.get("Metrics/non_finite_worlds", 0.0) / self._steps
+        wrong = reset >= SHARE_OF_ROBOTS or left_out >= SHARE_OF_BATCHES
+        self._in_a_row = self._in_a_row + 1 if wrong else 0
+        if self._in_a_row >= PATIENCE:
+            what = [f"robots were reset in {100 * reset:.0f} % of their steps"] if reset >= SHARE_OF_ROBOTS else []
+            what += [f"{100 * left_out:.0f} % of the mini-batches were left out"] if left_out >= SHARE_OF_BATCHES else []
+            terms = ", ".join(term(name) for name in found)
+            culprits = f" ({terms})" if terms else ""
+            self.why_stop = f"numbers were NaN or infinite for {PATIENCE} iterations in a row{culprits}: {' and '.join(what)}"
+
+
+MEANING = {"physics": "left all bounds, and they were reset", "action": "was NaN, and they were reset"}
+"""Fault -> what happened, where it is not that a term was no number."""
+
+
+def term(name: str) -> str:
+    """'reward_torques' -> '_reward_torques', the name of the method; 'the physics', 'the action'."""
+    return f"the {name}" if name in MEANING else f"_{name}"
+
+
+def say(text: str) -> None:
+    """Print a warning."""
+    print(f"warning: {text}", file=sys.stderr, flush=True)

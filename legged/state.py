@@ -1,0 +1,41 @@
+"""What a resumed training needs of an object: the tensors that its class names in `STATE`, saved as copies."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from torch import Tensor
+
+
+class StateError(ValueError):
+    """A saved state does not fit the object that is to take it."""
+
+
+def state_of(owner: Any) -> dict[str, Tensor]:
+    """Copies of the tensors that `owner.STATE` names."""
+    return {name: getattr(owner, name).clone() for name in owner.STATE}
+
+
+def load_state(owner: Any, state: Mapping[str, Any]) -> None:
+    """Give the tensors of `owner.STATE` the values saved by `state_of`, on whatever device.
+
+    Raises:
+        StateError: one is missing, or of another shape or type.
+    """
+    take({name: getattr(owner, name) for name in owner.STATE}, state, type(owner).__name__)
+
+
+def take(tensors: Mapping[str, Tensor], saved: Mapping[str, Any], of: str) -> None:
+    """Copy `saved` values into `tensors` of the same names; `of` says whose they are.
+
+    Raises:
+        StateError: one is missing, or of another shape or type; nothing is copied then.
+    """
+    for name, tensor in tensors.items():
+        value = saved.get(name) if isinstance(saved, Mapping) else None
+        if not isinstance(value, Tensor):
+            raise StateError(f"{of}.{name} is missing")
+        if value.shape != tensor.shape or value.dtype != tensor.dtype:
+            found, wanted = (f"{tuple(t.shape)} {str(t.dtype).removeprefix('torch.')}" for t in (value, tensor))
+            raise StateError(f"{of}.{name} is {found}, not {wanted}")
+    for name, tensor in tensors.items():
+        tensor.copy_(saved[name])
