@@ -3,10 +3,11 @@
 from legged.startup import importing  # first: it looks at the time
 
 with importing():
-    from legged.headless import HEADLESS  # noqa: I001  before MuJoCo: it sets MUJOCO_GL
+    import legged.cores  # noqa: F401  before torch: it says how threads wait
     from legged.config import TaskConfig
-    from legged.errors import ConfigError
     from legged.envs import LeggedRobot
+    from legged.errors import ConfigError
+    from legged.headless import HEADLESS
     from legged.registry import make_task, register, task_config
 
 __all__ = ["HEADLESS", "ConfigError", "LeggedRobot", "TaskConfig", "make_task", "register", "task_config"]

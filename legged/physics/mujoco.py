@@ -7,10 +7,12 @@ from mujoco.batch import Batch
 from torch import Tensor
 
 from legged.config.schema import SimConfig
+from legged.cores import available_cores
 from legged.math import quat_rotate, quat_rotate_inverse
 from legged.physics.base import Physics, RandomizedField, allocate_state
 from legged.physics.feet import FeetKinematics
 from legged.physics.scene import build_model, contact_sensor_columns
+from legged.ranks import Ranks
 from legged.robot import Robot
 from legged.terrain import Terrain
 
@@ -38,7 +40,7 @@ class MujocoPhysics(Physics):
         self.state = allocate_state(num_envs, robot, device)
         self.torques = torch.zeros(num_envs, robot.num_dof)
         self.overflowed = torch.zeros(num_envs, dtype=torch.bool)
-        self.batch = Batch(self.model, num_envs, sim.threads)
+        self.batch = Batch(self.model, num_envs, sim.threads or max(1, available_cores() // Ranks.now().local_count))
         self._qpos = torch.from_numpy(self.batch.bind("qpos"))
         self._qvel = torch.from_numpy(self.batch.bind("qvel"))
         self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))

@@ -1,15 +1,14 @@
 """Training in which an iteration is two calls: a rollout and an update, on a GPU one CUDA graph each."""
 
-import os
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from legged.cores import available_cores
 from legged.envs import BaseTask
 from legged.graph import StepGraph
 from legged.ranks import Ranks
@@ -17,6 +16,7 @@ from legged.rl.display import Display
 from legged.rl.ppo import DevicePPO
 from legged.rl.rollout import Rollout
 from legged.rl.runner import Runner
+from legged.rl.update_threads import UpdateThreads
 
 ROLLOUTS_TO_WARM_UP = 1
 """Steps have been warmed up when the task was built."""
@@ -56,13 +56,14 @@ class CapturedRunner(Runner):
             length = self.env.episode_length_buf
             self.env.episode_length_buf = torch.randint_like(length, high=int(self.env.max_episode_length))
         self.logger.init_logging_writer()
+        threads = UpdateThreads(self.env.cfg.sim.threads or available_cores() // Ranks.now().local_count)
         first = self.current_learning_iteration
         total = first + num_learning_iterations
         for iteration in range(first, total):
             clock = Clock(torch.device(self.device))
             collect()
             clock.lap()
-            with cores(self.env.cfg.sim.threads or (os.cpu_count() or 1) // Ranks.now().local_count):
+            with threads.use():
                 update()
             clock.lap()
             self.current_learning_iteration = iteration
@@ -130,19 +131,6 @@ def copies(tensors: Iterable[Tensor]) -> list[Tensor]:
     and with it the stream the copy was made on, which no capture on another stream may wait for.
     """
     return [tensor.clone() for tensor in tensors]
-
-
-@contextmanager
-def cores(count: int) -> Iterator[None]:
-    """Let torch use `count` threads (at least one) on the CPU, where else it uses one and leaves the cores to physics: an
-    update's matrices are large enough for all, a control step's are not.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(max(count, 1))
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 class Clock:

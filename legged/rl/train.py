@@ -12,6 +12,7 @@ from types import FrameType
 import torch
 
 from legged.config import TaskConfig, to_yaml
+from legged.cores import available_cores
 from legged.envs import LeggedRobot
 from legged.paths import relative
 from legged.physics import engine_name, resolve_physics
@@ -111,7 +112,10 @@ def _train(
 def describe(cfg: TaskConfig, device: torch.device, folder: Path) -> str:
     """One line on what is about to run where."""
     if device.type == "cpu":
-        engines = {"mujoco_warp": "mujoco-warp on the CPU", "mujoco": f"C MuJoCo on {cfg.sim.threads or 'all'} cores"}
+        engines = {
+            "mujoco_warp": "mujoco-warp on the CPU",
+            "mujoco": f"C MuJoCo on {cfg.sim.threads or available_cores()} cores",
+        }
         engine = engines.get(engine_name(cfg.sim, device), f"Newton's {cfg.sim.solver} solver on the CPU")
         where = f"no GPU in use: {engine}, settings of the task's cpu section"
     else:
