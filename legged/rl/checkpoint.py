@@ -3,7 +3,9 @@
 The layout is rsl-rl's (actor_state_dict, critic_state_dict, optimizer_state_dict, iter, infos); what is ours is in `infos`.
 """
 
+import math
 import pickle
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -65,27 +67,67 @@ def read_checkpoint(path: Path, device: str = "cpu") -> Saved:
     wanted = {*(f"{network}_state_dict" for network in NETWORKS), "iter"}
     if not isinstance(saved, dict) or not wanted <= saved.keys():
         raise ConfigError(f"{name}: not a checkpoint of rsl-rl (no actor, critic and iteration in it)")
-    infos = saved.get("infos") or {}
-    kinds = {"infos": (infos, dict), "iter": (saved["iter"], int)}
-    kinds |= {key: (saved[key], dict) for key in saved if key.endswith("_state_dict")}
-    kinds |= {f"infos.{key}": (infos[key], dict) for key in INFOS if isinstance(infos, dict) and key in infos}
-    for key, (value, kind) in kinds.items():
-        if not isinstance(value, kind) or isinstance(value, bool):
-            raise ConfigError(f"{name}: not a checkpoint (its {key} is {type(value).__name__}, not {kind.__name__})")
+    infos = {} if saved.get("infos") is None else saved["infos"]
+    _check_kind(f"{name}: not a checkpoint: its", saved, PARTS)
+    _check_kind(f"{name}: not a checkpoint: its infos.", infos, INFOS)
     if saved["iter"] < 0:
-        raise ConfigError(f"{name}: not a checkpoint (its iteration is {saved['iter']})")
+        raise ConfigError(f"{name}: not a checkpoint: its iteration is {saved['iter']}")
     version = infos.get("format", 1)
-    if not isinstance(version, int) or version > FORMAT:
-        raise ConfigError(
-            f"{name}: written in format {version!r} by a newer version of legged; this one reads up to {FORMAT}"
-        )
+    if version > FORMAT:
+        raise ConfigError(f"{name}: written in format {version} by a newer legged; this one reads formats up to {FORMAT}")
     for network in NETWORKS:
         check_weights(saved[f"{network}_state_dict"], f"{name}: its {network}")
     return {**saved, "infos": infos}
 
 
-INFOS = ("task_state", "observations", "networks", "robot")
-"""Entries of `infos` that are dictionaries."""
+Kind = type | tuple[type, ...] | dict[Any, Any]
+PLAIN = (bool, int, float, str, type(None))
+PARTS: dict[str, Kind] = {
+    "iter": int,
+    "infos": (dict, type(None)),
+    **{f"{network}_state_dict": dict for network in NETWORKS},
+    "optimizer_state_dict": {str: (dict, list)},
+}
+INFOS: dict[str, Kind] = {
+    "format": int,
+    "id": str,
+    "task": str,
+    "task_state": {str: {str: Tensor}},
+    "observations": {str: {str: int}},
+    "networks": {str: {str: (*PLAIN, list)}},
+    "robot": {str: (str, list)},
+    "learning_rate": float,
+    "wall_s": float,
+}
+"""Entry -> what it is made of: a type, some types, or {type: kind of each value}."""
+
+
+def _check_kind(where: str, found: Mapping[str, Any], kinds: Mapping[str, Kind]) -> None:
+    """Raise ConfigError if an entry of `found` is not of its kind; one that is missing is looked for by others."""
+    for key, kind in kinds.items():
+        if key not in found:
+            continue
+        value, wanted = found[key], dict if isinstance(kind, dict) else kind
+        if not is_kind(value, wanted):
+            names = " or ".join(t.__name__ for t in wanted) if isinstance(wanted, tuple) else wanted.__name__
+            raise ConfigError(f"{where}{'' if where.endswith('.') else ' '}{key} is {type(value).__name__}, not {names}")
+        if not is_kind(value, kind):
+            raise ConfigError(f"{where}{'' if where.endswith('.') else ' '}{key} is damaged")
+
+
+def is_kind(value: Any, kind: Kind) -> bool:
+    """Whether a value is made of what `kind` says; numbers are finite, and lists hold plain values only."""
+    if isinstance(kind, dict):
+        ((of_keys, of_values),) = kind.items()
+        return isinstance(value, dict) and all(is_kind(k, of_keys) and is_kind(v, of_values) for k, v in value.items())
+    if isinstance(kind, tuple):
+        return any(is_kind(value, one) for one in kind)
+    if kind is list:
+        return isinstance(value, list) and all(isinstance(item, (*PLAIN, dict)) for item in value)
+    if kind in (int, float):
+        numbers = int if kind is int else (int, float)
+        return isinstance(value, numbers) and not isinstance(value, bool) and abs(value) < math.inf
+    return isinstance(value, kind)  # type: ignore[arg-type]
 
 
 def check_weights(state: dict[str, Any], where: str) -> None:
@@ -95,6 +137,30 @@ def check_weights(state: dict[str, Any], where: str) -> None:
             raise ConfigError(f"{where} is damaged ({name!r} is no tensor)")
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             raise ConfigError(f"{where} is damaged ({name} holds NaN or infinite numbers)")
+
+
+def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str) -> dict[str, Any]:
+    """The state of an optimiser from a checkpoint, with the moments checked and everything but the learning rate as it is
+    set up here.
+
+    Raises:
+        ConfigError: it is not that of an optimiser of these parameters; begins with `where`.
+    """
+    groups = optimizer.state_dict()["param_groups"]
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    rates = [group.get("lr") for group in saved["param_groups"]] if is_kind(saved.get("param_groups"), list) else []
+    state = saved.get("state")
+    fits = len(rates) == len(groups) and all(is_kind(rate, float) and rate > 0.0 for rate in rates)
+    if not fits or not is_kind(state, {int: {str: Tensor}}) or not {*state} <= {*range(len(parameters))}:
+        raise ConfigError(f"{where} is damaged")
+    for i, tensors in state.items():
+        for name, tensor in tensors.items():
+            shape = () if name == "step" else parameters[i].shape
+            if tensor.shape != shape or not bool(torch.isfinite(tensor).all()):
+                raise ConfigError(f"{where} is damaged ({name} of parameter {i})")
+    if state and any({*state[0]} != {*state.get(i, {})} for i in range(len(parameters))):
+        raise ConfigError(f"{where} is damaged (the moments of some parameters are missing)")
+    return {"state": state, "param_groups": [{**group, "lr": rate} for group, rate in zip(groups, rates, strict=True)]}
 
 
 def describe(task: BaseTask) -> dict[str, Any]:

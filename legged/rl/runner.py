@@ -14,8 +14,9 @@ from torch import Tensor
 from legged.config import TaskConfig
 from legged.envs import BaseTask, LeggedRobot
 from legged.errors import ConfigError
+from legged.paths import relative
 from legged.ranks import Ranks
-from legged.rl.checkpoint import check_weights, describe, describe_mismatch, read_checkpoint, write_checkpoint
+from legged.rl.checkpoint import check_weights, describe, describe_mismatch, fit_optimizer, read_checkpoint, write_checkpoint
 from legged.rl.display import Display
 from legged.rl.distributed import RankLost, join, leave
 from legged.rl.logger import Interrupted, QuietLogger
@@ -179,6 +180,9 @@ class Runner(OnPolicyRunner):
         saved = read_checkpoint(Path(path), map_location or self.device)
         parts = load_cfg or dict.fromkeys(("actor", "critic", "iteration"), True)
         parts = {"optimizer": "optimizer_state_dict" in saved, **parts}
+        if parts["optimizer"]:
+            wanted, where = saved["optimizer_state_dict"], f"{relative(Path(path))}: its optimiser"
+            saved["optimizer_state_dict"] = fit_optimizer(wanted, self.alg.optimizer, where)
         infos = saved["infos"]
         try:
             self.alg.load(saved, parts, strict)
