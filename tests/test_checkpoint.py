@@ -191,6 +191,24 @@ def test_policies_of_the_package_are_plain_data(task):
     assert saved["infos"]["task"] == task
 
 
+@pytest.mark.parametrize("parameter", [0, 3])
+def test_an_optimiser_without_the_moments_of_a_parameter_is_damaged(model, capsys, parameter):
+    optimizer = torch.load(model, weights_only=True)["optimizer_state_dict"]
+    del optimizer["state"][parameter]
+    change(model, optimizer_state_dict=optimizer)
+    assert call(train.main, ["--task", TASK, "--sim_device", "cpu", *COMMANDS["resume"][1]]) == 2
+    assert "model_0.pt: its optimiser is damaged (the moments of some parameters are missing)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("rate", [float("nan"), 0.0, -1.0, "fast", None])
+def test_a_learning_rate_that_is_none_is_refused(model, capsys, rate):
+    optimizer = torch.load(model, weights_only=True)["optimizer_state_dict"]
+    optimizer["param_groups"][0]["lr"] = rate
+    change(model, optimizer_state_dict=optimizer)
+    assert call(train.main, ["--task", TASK, "--sim_device", "cpu", *COMMANDS["resume"][1]]) == 2
+    assert "its optimiser is damaged" in capsys.readouterr().err
+
+
 # ---- normalised observations -----------------------------------------------------------------------------------------
 
 

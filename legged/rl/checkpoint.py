@@ -158,7 +158,8 @@ def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str) -> d
             shape = () if name == "step" else parameters[i].shape
             if tensor.shape != shape or not bool(torch.isfinite(tensor).all()):
                 raise ConfigError(f"{where} is damaged ({name} of parameter {i})")
-    if state and any({*state[0]} != {*state.get(i, {})} for i in range(len(parameters))):
+    names = [{*state.get(i, {})} for i in range(len(parameters))]
+    if any(each != names[0] for each in names):
         raise ConfigError(f"{where} is damaged (the moments of some parameters are missing)")
     return {"state": state, "param_groups": [{**group, "lr": rate} for group, rate in zip(groups, rates, strict=True)]}
 
