@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from legged.config import TaskConfig, load_config
-from legged.config.checks import PLAIN, is_plain_name, plain_path, shown
+from legged.config.checks import PLAIN, is_plain_name, shown
 from legged.config.loader import Registered, extended_tasks
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError, suggest
@@ -71,10 +71,10 @@ def register_file(path: str) -> str:
     """
     file = Path(path).absolute()
     if not exists(file) or file.is_dir():
-        raise ConfigError(f"--task: there is no file '{plain_path(path)}'")
+        raise ConfigError(f"--task: there is no file {shown(path)}")
     name = file.stem
     if not is_plain_name(name):
-        raise ConfigError(f"--task: '{plain_path(path)}': the name of the file, without ending, must be {PLAIN}")
+        raise ConfigError(f"--task: {shown(path)}: the name of the file, without ending, must be {PLAIN}")
     known = _REGISTERED.get(name)
     ours = data_folder("cfg") / f"{name}.yaml"
     other = known.config if known is not None else ours if ours.is_file() else None
@@ -96,7 +96,7 @@ def _entry(name: str) -> _Entry:
         return _REGISTERED[name]
     path = data_folder("cfg") / f"{name}.yaml"
     if not is_plain_name(name) or not path.is_file():
-        raise ConfigError(f"--task: there is no task '{plain_path(name)}'{suggest(name[:100], task_names(), 'tasks')}")
+        raise ConfigError(f"--task: there is no task {shown(name)}{suggest(name[:100], task_names(), 'tasks')}")
     return _Entry(path, path.parent, LeggedRobot)
 
 

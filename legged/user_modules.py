@@ -6,6 +6,7 @@ import sys
 import traceback
 from pathlib import Path
 
+from legged.config.checks import shown
 from legged.errors import ConfigError
 from legged.paths import exists
 
@@ -23,7 +24,7 @@ def import_tasks(name: str) -> None:
     path = Path(name)
     is_file = path.suffix == ".py"
     if is_file and not (exists(path) and path.is_file()):
-        raise ConfigError(f"--import: there is no file '{name}'")
+        raise ConfigError(f"--import: there is no file {shown(name)}")
     folder = str(path.resolve().parent if is_file else Path.cwd())
     if folder not in sys.path:
         sys.path.insert(0, folder)
@@ -34,7 +35,9 @@ def import_tasks(name: str) -> None:
         raise ConfigError(f"--import: {name}{_line(error, folder)}: {error}") from error
     except ModuleNotFoundError as error:
         if not is_file and error.name is not None and f"{name}.".startswith(f"{error.name}."):
-            raise ConfigError(f"--import: there is no module '{name}' (a module name, or a path that ends in .py)") from error
+            raise ConfigError(
+                f"--import: there is no module {shown(name)} (a module name, or a path that ends in .py)"
+            ) from error
         raise _failed(name, error, folder) from error
     except (Exception, SystemExit) as error:
         for module in set(sys.modules) - before:  # half of a module is none

@@ -17,11 +17,12 @@ from legged.physics.base import RandomizedField
 from legged.physics.constraint_solver import ConstraintSolver
 from legged.physics.exchange import Exchange
 from legged.physics.kernels import compile_ahead
-from legged.physics.scene import FLOOR, build_model
+from legged.physics.scene import build_model
 from legged.physics.terrain_contact import TerrainContact
 from legged.physics.torque_step import TorqueStep
 from legged.physics.warp_physics import WarpPhysics
 from legged.robot import Robot
+from legged.robot_model import FLOOR
 from legged.terrain import Terrain
 
 # Fields of the model that differ per world once friction or mass are drawn, and those that set_const derives from mass.

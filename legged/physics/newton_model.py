@@ -8,9 +8,10 @@ import numpy as np
 
 from legged.config.schema import SimConfig
 from legged.physics.newton_solvers import SolverSetup
-from legged.physics.scene import FLOOR, robot_spec
+from legged.physics.scene import robot_source
 from legged.physics.terrain_geoms import DEPTH, lattice_heights
 from legged.robot import Robot
+from legged.robot_model import FLOOR
 from legged.terrain import Terrain
 
 
@@ -67,7 +68,7 @@ def build_newton_model(
     """
     world = _builder(setup)
     # Which shapes may touch is written in the model, and Newton reads it when it reads the model.
-    source = robot_spec(robot, True).to_xml() if sim.self_collisions else str(robot.model_path)
+    source = robot_source(robot, sim.self_collisions)
     world.add_mjcf(source, enable_self_collisions=sim.self_collisions, parse_visuals=False, parse_sites=False)
     for shape in range(world.shape_count):
         world.shape_gap[shape] = setup.gap
