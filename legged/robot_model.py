@@ -1,7 +1,8 @@
 """A robot's MJCF: read, and held against what the back-ends rely on."""
 
+import contextlib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import mujoco
@@ -14,6 +15,8 @@ FLOOR = "floor"
 """Name of the ground's geom, where it is a plane or stands for a height map; no geom of a robot may have it."""
 TAKEN = {"geom": r"floor|terrain_\d+", "sensor": "contact_.*"}
 """Kind of element -> names that the scene gives to its own."""
+LARGEST_NUMBER = 1e12
+"""Largest number of a model: beyond it float32, in which GPUs compute, overflows."""
 NUMBERS = ("qpos0", "qpos_spring", "body_", "jnt_", "dof_", "geom_", "site_", "actuator_", "mesh_", "eq_", "tendon_")
 """How the names of a model's arrays of numbers begin."""
 
@@ -27,16 +30,38 @@ def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
     path = folder / file
     if not exists(path) or not path.is_file():
         raise ConfigError(f"{where}: model: there is no file '{file}' in {folder}")
+    at = f"{where}: model: {path}"
+    warnings: list[str] = []
     try:
-        model = mujoco.MjModel.from_xml_path(str(path))
+        with _warnings_to(warnings):
+            model = mujoco.MjModel.from_xml_path(str(path))
     except Exception as error:  # its errors have no class of their own
-        raise ConfigError(f"{where}: model: {path}: MuJoCo refuses it: {' '.join(str(error).split())}") from error
-    for name in dir(model):
-        if name.startswith(NUMBERS):
-            values = getattr(model, name)
-            if isinstance(values, np.ndarray) and values.dtype.kind == "f" and not np.isfinite(values).all():
-                raise ConfigError(f"{where}: model: {path}: not all numbers are finite ({name} once compiled)")
+        raise ConfigError(f"{at}: MuJoCo refuses it: {' '.join(str(error).split())}") from error
+    if warnings:
+        raise ConfigError(f"{at}: MuJoCo warns: {' '.join(warnings[0].split())}")
+    for owner in (model, model.opt):
+        for name in dir(owner):
+            if owner is model and not name.startswith(NUMBERS):
+                continue
+            values = getattr(owner, name)
+            numeric = isinstance(values, float) or (isinstance(values, np.ndarray) and values.dtype.kind == "f")
+            if numeric and not (np.abs(values) <= LARGEST_NUMBER).all():
+                raise ConfigError(f"{at}: numbers must be finite and below {LARGEST_NUMBER:g} ({name}, once compiled)")
+    for flag in ("CONTACT", "CONSTRAINT", "ACTUATION"):
+        if model.opt.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"):
+            raise ConfigError(f"{at}: option flag: {flag.lower()} is disabled; without it the robot could not walk")
     return model
+
+
+@contextlib.contextmanager
+def _warnings_to(warnings: list[str]) -> Iterator[None]:
+    """Collect MuJoCo's warnings, which it would print, and write to a file in the working directory."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(warnings.append)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def check_model(model: mujoco.MjModel, base: str, where: str) -> None:

@@ -1,6 +1,7 @@
 """The interface every physics engine is put behind, and the state it keeps for the task."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -8,6 +9,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from legged.errors import suggest
 from legged.robot import Robot
 
 RandomizedField = Literal["friction", "added_base_mass"]
@@ -90,11 +92,26 @@ class Physics(ABC):
 
     @abstractmethod
     def randomize(self, field: RandomizedField, values: Tensor) -> None:
-        """Set a property per world, (N,), at start-up: `friction` of the robot's shapes [-], `added_base_mass` [kg]."""
+        """Set a property per world, (N,), at start-up: `friction` of the robot's shapes [-], `added_base_mass` [kg].
+
+        Raises:
+            ValueError: no such field.
+        """
 
     @abstractmethod
     def copy_to(self, env_id: int, data: mujoco.MjData) -> None:
         """One world's positions and velocities into a C MjData, with kinematics computed, for rendering."""
+
+
+def setter_of(field: str, **setters: Callable[[Tensor], None]) -> Callable[[Tensor], None]:
+    """What sets the property `field`, out of a back-end's setters by name.
+
+    Raises:
+        ValueError: the back-end cannot randomise that.
+    """
+    if field not in setters:
+        raise ValueError(f"randomize: there is no property '{field}'{suggest(field, setters, 'properties')}")
+    return setters[field]
 
 
 def allocate_state(num_envs: int, robot: Robot, device: torch.device) -> RobotState:
