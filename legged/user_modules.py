@@ -6,7 +6,7 @@ import sys
 import traceback
 from pathlib import Path
 
-from legged.config.checks import shown
+from legged.config.checks import plain_path, shown
 from legged.errors import ConfigError
 from legged.paths import exists
 
@@ -31,19 +31,12 @@ def import_tasks(name: str) -> None:
     before = set(sys.modules)
     try:
         _run(path) if is_file else importlib.import_module(name)
-    except ConfigError as error:
-        raise ConfigError(f"--import: {name}{_line(error, folder)}: {error}") from error
-    except ModuleNotFoundError as error:
-        if not is_file and error.name is not None and f"{name}.".startswith(f"{error.name}."):
-            raise ConfigError(
-                f"--import: there is no module {shown(name)} (a module name, or a path that ends in .py)"
-            ) from error
-        raise _failed(name, error, folder) from error
     except (Exception, SystemExit) as error:
         for module in set(sys.modules) - before:  # half of a module is none
-            if str(getattr(sys.modules[module], "__file__", None) or "").startswith(folder):
+            file = getattr(sys.modules[module], "__file__", None)
+            if file and str(Path(file).parent) == folder:
                 del sys.modules[module]
-        raise _failed(name, error, folder) from error
+        raise _described(name, is_file, folder, error) from error
 
 
 def _run(path: Path) -> None:
@@ -62,16 +55,19 @@ def _run(path: Path) -> None:
     spec.loader.exec_module(module)
 
 
-def _failed(name: str, error: BaseException, folder: str) -> ConfigError:
+def _described(name: str, is_file: bool, folder: str, error: BaseException) -> ConfigError:
+    """What went wrong in the module `name`, or that there is none."""
+    if isinstance(error, ModuleNotFoundError) and not is_file and f"{name}.".startswith(f"{error.name}."):
+        return ConfigError(f"--import: there is no module {shown(name)} (a module name, or a path that ends in .py)")
     text = " ".join(str(error.msg if isinstance(error, SyntaxError) else error).split())
-    return ConfigError(f"--import: {name}{_line(error, folder)}: {type(error).__name__}: {text}")
+    kind = "" if isinstance(error, ConfigError) else f"{type(error).__name__}: "
+    return ConfigError(f"--import: {plain_path(name)}{_line(error, folder)}: {kind}{text}")
 
 
 def _line(error: BaseException, folder: str) -> str:
     """' (file, line n)' of a mistake: where a file cannot be parsed, else the innermost line of a file in `folder`."""
     if isinstance(error, SyntaxError) and error.filename:
         return f" ({error.filename}, line {error.lineno})"
-    frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if Path(frame.filename).is_relative_to(folder) and frame.filename != __file__]
-    last = [frame for frame in own if "importlib" not in frame.filename] or []
-    return f" ({last[-1].filename}, line {last[-1].lineno})" if last else ""
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename != __file__]
+    own = [frame for frame in frames if Path(frame.filename).is_relative_to(folder) and "importlib" not in frame.filename]
+    return f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""

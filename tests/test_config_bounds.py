@@ -187,6 +187,15 @@ def test_sizes_that_no_engine_numbers_are_refused(changes, words):
     assert words in str(error.value)
 
 
+@pytest.mark.parametrize("network", ["actor", "critic"])
+def test_weights_are_counted(network):
+    """Four times 16384^2 are 2^30, as many as there may be."""
+    path = f"train.policy.{network}_hidden_dims"
+    assert small_config((path, [16384] * 5))
+    with pytest.raises(ConfigError, match=rf"command line: {path}: these are 1,342,177,280 weights"):
+        small_config((path, [16384] * 6))
+
+
 def test_measuring_points_are_counted():
     grid = [("terrain.measured_points_x", [0.1] * 101), ("terrain.measured_points_y", [0.0] * 100)]
     with pytest.raises(ConfigError, match=r"measured_points_x: with measured_points_y they are 10,100 points"):

@@ -1,6 +1,7 @@
 """Settings that are right by themselves and do not fit each other, or not the robot."""
 
 from collections.abc import Iterable, Mapping
+from itertools import pairwise
 from typing import get_args
 
 from legged.config.schema import TaskConfig
@@ -12,6 +13,8 @@ MOST_IN_A_POOL = 2**31 - 1
 """Contacts or constraint rows of all robots, which engines count in 32 bits."""
 MOST_SAMPLES = 2**28
 """Samples of an iteration."""
+MOST_WEIGHTS = 2**30
+"""Weights of a network; with gradients and the optimiser's moments 16 GB."""
 MOST_POINTS = 10_000
 """Heights measured around a robot."""
 
@@ -50,6 +53,12 @@ def check_sizes(cfg: TaskConfig) -> None:
             f"{cfg.origins.where('train.runner.num_steps_per_env')}: {steps} steps of {robots} robots (env.num_envs:"
             f" {cfg.origins.of('env.num_envs')}) are {robots * steps:,} samples an iteration, more than {MOST_SAMPLES:,}"
         )
+    for network in ("actor", "critic"):
+        field = f"train.policy.{network}_hidden_dims"
+        widths = getattr(cfg.train.policy, f"{network}_hidden_dims")
+        weights = sum(a * b for a, b in pairwise(widths))
+        if weights > MOST_WEIGHTS:
+            raise ConfigError(f"{cfg.origins.where(field)}: these are {weights:,} weights, more than {MOST_WEIGHTS:,}")
     points = len(cfg.terrain.measured_points_x) * len(cfg.terrain.measured_points_y)
     if points > MOST_POINTS:
         raise ConfigError(
