@@ -13,6 +13,7 @@ from legged.config.loader import read_yaml
 from legged.errors import ConfigError
 from legged.rl import train
 from legged.robot import load_robot
+from legged.tools import evaluate
 
 pytestmark = pytest.mark.usefixtures("workplace", "own_registry")
 
@@ -87,6 +88,14 @@ def test_a_yaml_file_trains_and_its_run_lies_under_its_name():
     folder = tiny_run("--task", str(path))
     assert folder.parent == Path("logs/mine")
     assert from_dict(read_yaml(folder / "config.yaml")).robot == str(Path("robots/spotty").resolve())
+
+
+def test_a_policy_of_a_yaml_file_is_played_and_judged(capsys):
+    written("mine.yaml", f"extends: {TASK}\n")
+    tiny_run("--task", "mine.yaml")
+    arguments = ["--task", "mine.yaml", "--sim_device", "cpu", "sim.threads=1"]
+    assert call(evaluate.main, [*arguments, "--vx=0", "--vy=0", "--yaw=0", "--robots", "1"]) == 0
+    assert "logs/mine/" in capsys.readouterr().out
 
 
 def test_a_task_of_the_package_may_be_given_as_its_file(show):

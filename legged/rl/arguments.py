@@ -133,5 +133,6 @@ def import_and_check(args: argparse.Namespace) -> None:
     """Let the user's module register its tasks, if one was named; a file given as --task becomes a task."""
     if args.module:
         import_tasks(args.module)
+    args.given_task = args.task  # what another process would have to be given
     if args.task.endswith(YAML_ENDINGS):
         args.task = register_file(args.task)
