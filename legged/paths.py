@@ -28,6 +28,14 @@ def relative(path: Path) -> str:
         return str(path)
 
 
+def exists(path: Path) -> bool:
+    """Whether there is a file or folder; there is none under a name that no system takes."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A file beside `path` to write to, with the same ending; it takes the place of `path` if nothing fails, else it goes."""

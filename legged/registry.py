@@ -1,7 +1,5 @@
 """Task names -> task class and configuration. Every `cfg/*.yaml` is a task; outside code adds its own."""
 
-import importlib
-import importlib.util
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -11,27 +9,81 @@ from typing import Any
 import torch
 
 from legged.config import TaskConfig, load_config
+from legged.config.checks import PLAIN, is_plain_name, shown
+from legged.config.loader import Registered, extended_tasks
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError, suggest
-from legged.paths import data_folder
+from legged.paths import data_folder, exists
 from legged.terrain import Terrain
+from legged.user_modules import import_tasks
+
+__all__ = [
+    "import_tasks",
+    "make_task",
+    "register",
+    "register_file",
+    "task_class",
+    "task_config",
+    "task_names",
+]
+
+YAML_ENDINGS = (".yaml", ".yml")
 
 
 @dataclass(frozen=True)
-class _Entry:
-    task_class: type[LeggedRobot]
-    config: Path | Mapping[str, Any]
+class _Entry(Registered):
+    task_class: type[LeggedRobot] | None
+    """None takes that of the task it extends."""
 
 
 _REGISTERED: dict[str, _Entry] = {}
 
 
-def register(name: str, config: Path | str | Mapping[str, Any], task_class: type[LeggedRobot] = LeggedRobot) -> None:
-    """Make `name` a task: a YAML file, or a mapping with the same keys, and a subclass of LeggedRobot.
+def register(name: str, config: Path | str | Mapping[str, Any], task_class: type[LeggedRobot] | None = None) -> None:
+    """Make `name` a task: a YAML file, or a mapping with the same keys, and a subclass of LeggedRobot; without one, the class
+    of the registered task that it extends, else LeggedRobot.
 
-    `extends: anymal_c_flat` in it builds on a task of this package.
+    `extends: anymal_c_flat` in it builds on a task of this package or on a registered one. The path of the file, and paths
+    in a mapping, are relative to the folder of the module that calls this, else to the working directory.
+
+    Raises:
+        ConfigError: the name is none, or the class or the configuration is of the wrong type.
     """
-    _REGISTERED[name] = _Entry(task_class, Path(config).resolve() if isinstance(config, str | Path) else config)
+    if not isinstance(name, str) or not is_plain_name(name):
+        raise ConfigError(f"register: the name of a task must be {PLAIN}; got {shown(name)}")
+    if task_class is not None and not (isinstance(task_class, type) and issubclass(task_class, LeggedRobot)):
+        raise ConfigError(f"register('{name}'): expected a subclass of LeggedRobot, got {shown(task_class)}")
+    if not isinstance(config, str | Path | Mapping):
+        raise ConfigError(f"register('{name}'): expected a YAML file or a mapping of sections, got {shown(config)}")
+    file = sys._getframe(1).f_globals.get("__file__")
+    folder = Path(file).resolve().parent if isinstance(file, str) else Path.cwd()
+    if isinstance(config, str | Path):
+        beside = folder / config
+        config = (beside if exists(beside) else Path(config)).absolute()
+    _REGISTERED[name] = _Entry(config, folder, task_class)
+
+
+def register_file(path: str) -> str:
+    """Make the YAML file at `path` a task, which is called by the file's name without ending; returns that name.
+
+    Raises:
+        ConfigError: there is no such file, or another task is called so.
+    """
+    file = Path(path).absolute()
+    if not exists(file) or file.is_dir():
+        raise ConfigError(f"--task: there is no file {shown(path)}")
+    name = file.stem
+    if not is_plain_name(name):
+        raise ConfigError(f"--task: {shown(path)}: the name of the file, without ending, must be {PLAIN}")
+    known = _REGISTERED.get(name)
+    ours = data_folder("cfg") / f"{name}.yaml"
+    other = known.config if known is not None else ours if ours.is_file() else None
+    if other is None:
+        _REGISTERED[name] = _Entry(file, file.parent, None)
+    elif not isinstance(other, Path) or other.resolve() != file.resolve():
+        where = other if isinstance(other, Path) else "registered from code"
+        raise ConfigError(f"--task: '{path}': there is another task '{name}' ({where}); give the file another name")
+    return name
 
 
 def task_names() -> list[str]:
@@ -43,9 +95,9 @@ def _entry(name: str) -> _Entry:
     if name in _REGISTERED:
         return _REGISTERED[name]
     path = data_folder("cfg") / f"{name}.yaml"
-    if not path.is_file():
-        raise ConfigError(f"--task: there is no task '{name}'{suggest(name, task_names(), 'tasks')}")
-    return _Entry(LeggedRobot, path)
+    if not is_plain_name(name) or not path.is_file():
+        raise ConfigError(f"--task: there is no task {shown(name)}{suggest(name[:100], task_names(), 'tasks')}")
+    return _Entry(path, path.parent, LeggedRobot)
 
 
 def task_class(name: str) -> type[LeggedRobot]:
@@ -54,7 +106,11 @@ def task_class(name: str) -> type[LeggedRobot]:
     Raises:
         ConfigError: no such task.
     """
-    return _entry(name).task_class
+    entry = _entry(name)
+    if entry.task_class is not None:
+        return entry.task_class
+    classes = (_REGISTERED[parent].task_class for parent in extended_tasks(entry, name, _REGISTERED))
+    return next((found for found in classes if found is not None), LeggedRobot)
 
 
 def task_config(name: str, overrides: Iterable[tuple[str, Any]] = (), on_cpu: bool = False) -> TaskConfig:
@@ -63,9 +119,8 @@ def task_config(name: str, overrides: Iterable[tuple[str, Any]] = (), on_cpu: bo
     Raises:
         ConfigError: no such task, or a mistake in its configuration.
     """
-    entry = _entry(name)
-    cfg = load_config(entry.config, name, overrides, on_cpu)
-    entry.task_class.check(cfg)
+    cfg = load_config(_entry(name), name, overrides, on_cpu, _REGISTERED)
+    task_class(name).check(cfg)
     return cfg
 
 
@@ -75,27 +130,3 @@ def make_task(
     """Build the task that a configuration describes, on its own terrain or on the one given."""
     other_ground = {} if terrain is None else {"terrain": terrain}  # a user's constructor may not know the argument
     return task_class(cfg.task)(cfg, device, graph, **other_ground)
-
-
-def import_tasks(name: str) -> None:
-    """Run a user's module, 'my_tasks' or 'path/my_tasks.py', so that it registers its tasks.
-
-    Raises:
-        ConfigError: it can't be found.
-    """
-    path = Path(name)
-    if path.suffix == ".py":
-        spec = importlib.util.spec_from_file_location(path.stem, path)
-        if spec is None or spec.loader is None or not path.is_file():
-            raise ConfigError(f"--import: there is no file '{name}'")
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[path.stem] = module
-        spec.loader.exec_module(module)
-        return
-    sys.path.insert(0, str(Path.cwd()))
-    try:
-        importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        if error.name != name:
-            raise
-        raise ConfigError(f"--import: there is no module '{name}' (a module name, or a path that ends in .py)") from error

@@ -1,17 +1,19 @@
 """A robot folder (robot.yaml and MJCF) -> names, indices, limits and gains."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
-from legged.config.loader import build, read_yaml
+from legged.config.bounds import LARGEST, NAMES, between, positive
+from legged.config.checks import build, shown
 from legged.config.origins import Origins
+from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError, suggest
 from legged.mirror import Mirror
-from legged.paths import data_folder
+from legged.paths import data_folder, exists
+from legged.robot_model import base_mass, check_model, hinges, read_model
 
 
 @dataclass(frozen=True)
@@ -22,17 +24,17 @@ class RobotFile:
     """MJCF file in the same folder."""
     base: str
     """Name of the floating body."""
-    spawn_height: float
+    spawn_height: float = field(metadata=positive(100, low=1e-3))
     """Base height above the ground after a reset [m]."""
-    default_joint_angles: dict[str, float]
+    default_joint_angles: dict[str, float] = field(metadata=between(-100, 100))
     """Joint-name pattern -> angle at action 0 [rad]."""
-    stiffness: dict[str, float]
+    stiffness: dict[str, float] = field(metadata=between(0, LARGEST))
     """Joint-name pattern -> P gain [N m/rad]."""
-    damping: dict[str, float]
+    damping: dict[str, float] = field(metadata=between(0, LARGEST))
     """Joint-name pattern -> D gain [N m s/rad]."""
-    velocity_limit: dict[str, float]
+    velocity_limit: dict[str, float] = field(metadata=positive(LARGEST))
     """Joint-name pattern -> largest joint speed [rad/s]."""
-    feet: tuple[str, ...]
+    feet: tuple[str, ...] = field(metadata=NAMES)
     """Patterns of the shapes that are feet."""
     penalize_contacts_on: tuple[str, ...] = ()
     """Patterns of the shapes whose contact the `collision` reward counts."""
@@ -63,6 +65,8 @@ class Robot:
     termination_indices: tuple[int, ...]
     mass: float
     """Total mass [kg]."""
+    base_mass: float
+    """Mass of the floating body [kg]."""
     mirror: Mirror | None
     """Which joints and feet are each other's left and right; None if the robot is not symmetric."""
 
@@ -97,19 +101,11 @@ def load_robot(name: str, where: str = "robot") -> Robot:
     if missing:
         raise ConfigError(f"{path}: missing: {', '.join(missing)}")
     file = build(RobotFile, data, "", Origins(), str(path))
-    if not (folder / file.model).is_file():
-        raise ConfigError(f"{path}: model: there is no file '{file.model}' in {folder}")
-    try:
-        model = mujoco.MjModel.from_xml_path(str(folder / file.model))
-    except ValueError as error:
-        raise ConfigError(f"{folder / file.model}: MuJoCo refuses it: {error}") from error
-
-    joints = [model.joint(i) for i in range(model.njnt) if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE]
+    model = read_model(folder, file.model, str(path))
+    check_model(model, file.base, str(path))
+    joints = [model.joint(i) for i in hinges(model)]
     names = tuple(joint.name for joint in joints)
-    _check_layout(model, file, path, names)
     shapes = tuple(model.geom(i).name for i in range(model.ngeom) if model.geom_contype[i] or model.geom_conaffinity[i])
-    if "" in shapes:
-        raise ConfigError(f"{folder / file.model}: every collision geom needs a name")
     feet = match_names(file.feet, shapes, f"{path}: feet")
     return Robot(
         name=folder.name,
@@ -125,38 +121,27 @@ def load_robot(name: str, where: str = "robot") -> Robot:
         penalised_indices=match_names(file.penalize_contacts_on, shapes, f"{path}: penalize_contacts_on"),
         termination_indices=match_names(file.terminate_after_contacts_on, shapes, f"{path}: terminate_after_contacts_on"),
         mass=float(model.body_mass.sum()),
+        base_mass=base_mass(model, file.base),
         mirror=Mirror.of(model, [joint.id for joint in joints], [shapes[i] for i in feet]),
     )
 
 
 def _folder(name: str, where: str) -> Path:
     robots = data_folder("resources") / "robots"
+    known = suggest(name, [p.parent.name for p in robots.glob("*/robot.yaml")])
+    if not name:
+        raise ConfigError(f"{where}: no robot is named{known}")
     for folder in (robots / name, Path(name)):
-        if (folder / "robot.yaml").is_file():
+        if exists(folder / "robot.yaml"):
             return folder.resolve()
-    known = [p.parent.name for p in robots.glob("*/robot.yaml")]
-    raise ConfigError(f"{where}: there is no robot '{name}'{suggest(name, known)}")
-
-
-def _check_layout(model: mujoco.MjModel, file: RobotFile, path: Path, names: tuple[str, ...]) -> None:
-    """What the back-ends rely on: one free base, then the hinges; one motor a hinge, in the same order."""
-    bodies = [model.body(i).name for i in range(model.nbody)]
-    if file.base not in bodies:
-        raise ConfigError(f"{path}: base: the model has no body '{file.base}'{suggest(file.base, bodies)}")
-    if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE or model.njnt != len(names) + 1:
-        raise ConfigError(f"{path}: model: needs one free joint, on the base, followed by hinges only")
-    if model.jnt_bodyid[0] != bodies.index(file.base):
-        raise ConfigError(f"{path}: base: the free joint is on '{bodies[model.jnt_bodyid[0]]}', not on '{file.base}'")
-    driven = tuple(model.joint(model.actuator_trnid[i, 0]).name for i in range(model.nu))
-    if driven != names:
-        raise ConfigError(f"{path}: model: needs one motor per hinge in the same order; hinges {names}, motors {driven}")
-    if not model.actuator_forcelimited.all():
-        raise ConfigError(f"{path}: model: every motor needs a forcerange (the torque limit)")
+    raise ConfigError(f"{where}: there is no robot {shown(name)}{known}")
 
 
 def match_names(patterns: Sequence[str], names: Sequence[str], where: str) -> tuple[int, ...]:
     """Indices of the names that contain any of the patterns, in the order of `names`."""
     for pattern in patterns:
+        if not pattern:
+            raise ConfigError(f"{where}: an empty pattern would match everything{suggest(pattern, names, 'names')}")
         if not any(pattern in name for name in names):
             raise ConfigError(f"{where}: pattern '{pattern}' matches nothing{suggest(pattern, names, 'names')}")
     return tuple(i for i, name in enumerate(names) if any(pattern in name for pattern in patterns))

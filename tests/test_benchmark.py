@@ -68,26 +68,45 @@ def test_grounds_need_mujoco_warp_and_terrain(arguments, words, capsys):
     assert words in capsys.readouterr().err
 
 
-def test_sizes_are_compared_in_processes_of_their_own(tmp_path, capfd):
-    """The first size wants 480 TB for the actions alone, which no process can have; the next is none the worse for it."""
-    too_many = 10_000_000_000_000
+def test_sizes_are_compared_in_processes_of_their_own(tmp_path, capfd, monkeypatch):
+    """The first size wants 4 PB, which no process can have; the next is none the worse for it."""
+    too_many = 1_000_000
+    (tmp_path / "hungry.py").write_text(
+        "import torch\n"
+        "from legged import LeggedRobot, register\n"
+        "class Hungry(LeggedRobot):\n"
+        "    def __init__(self, cfg, *args, **kwargs):\n"
+        "        self.reserve = torch.empty(cfg.env.num_envs // 1000 * 10**12)\n"
+        "        super().__init__(cfg, *args, **kwargs)\n"
+        "register('hungry', {'extends': 'anymal_c_flat'}, Hungry)\n"
+    )
+    monkeypatch.chdir(tmp_path)
     small = [text for text in SMALL if text not in ("--num_envs", "8")]
     steps = ["--steps", "2", "--repeats", "1", "--iterations", "1", "--json", str(tmp_path / "s.json")]
-    assert benchmark.main(["--task", "anymal_c_flat", *small, *steps, "--scale", f"{too_many},4"]) == 0
+    assert benchmark.main(["--import", "hungry.py", "--task", "hungry", *small, *steps, "--scale", f"{too_many},4"]) == 0
     result = json.loads((tmp_path / "s.json").read_text())
-    assert (result["task"], result["device"], result["loop"]) == ("anymal_c_flat", "CPU", "captured")
+    assert (result["task"], result["device"], result["loop"]) == ("hungry", "CPU", "captured")
     first, second = result["sizes"]
     assert first == {"num_envs": too_many, "failed": "out of memory"}
     assert second["num_envs"] == 4
     assert second["env_steps_per_s"] == pytest.approx(4 / second["control_step_ms"] * 1e3)
     assert second["robot_steps_per_s"] == pytest.approx(4 * 4 / second["iteration_ms"] * 1e3)
     title, heading, *rows = capfd.readouterr().out.splitlines()
-    assert title == "anymal_c_flat, CPU, captured training"
+    assert title == "hungry, CPU, captured training"
     assert heading.split() == ["robots", "control", "step", "steps/s", "iteration", "training", "steps/s", "GPU", "memory"]
     assert [row.split()[0] for row in rows] == [f"{too_many:,}", "4"]
     assert rows[0].endswith("  out of memory")
     assert rows[1].endswith(" -")  # memory of a GPU
     assert not list(tmp_path.glob("logs*"))
+
+
+def test_sizes_of_a_task_that_is_a_file(tmp_path, capfd, monkeypatch):
+    (tmp_path / "mine.yaml").write_text("extends: anymal_c_flat\n")
+    monkeypatch.chdir(tmp_path)
+    small = [text for text in SMALL if text not in ("--num_envs", "8")]
+    steps = ["--steps", "2", "--repeats", "1", "--iterations", "1"]
+    assert benchmark.main(["--task", "mine.yaml", *small, *steps, "--scale", "4"]) == 0
+    assert capfd.readouterr().out.splitlines()[-1].split()[0] == "4"
 
 
 def test_a_size_that_fails_otherwise_is_told_too(tmp_path, capfd, monkeypatch):

@@ -189,3 +189,10 @@ def test_added_base_mass_replaces_the_one_before(make_physics, backend, robot):
     untouched = make_physics(backend)
     states.write(untouched)
     torch.testing.assert_close(once_changed, roll(untouched, states.dof_pos, 40)[-1], atol=1e-2, rtol=1e-3)
+
+
+def test_an_unknown_property_is_no_mass(make_physics, backend):
+    """Every back-end names what was asked for and what there is."""
+    physics = make_physics(backend, tag="randomized")
+    with pytest.raises(ValueError, match=r"no property 'added_mass'; did you mean 'added_base_mass'\? .*friction"):
+        physics.randomize("added_mass", torch.full((6,), 30.0))

@@ -195,6 +195,8 @@ def test_joint_without_a_gain_is_an_error_that_names_it(robot):
         control_gains(robot, ControlConfig(damping={"HAA": 2.0, "HFE": 2.0}))
 
 
+MOTOR = '<motor name="LF_HAA" joint="LF_HAA"/>'
+
 # ---- robot folders -------------------------------------------------------------------------------------------------------
 
 
@@ -241,6 +243,30 @@ def test_misspelt_robot_is_an_error_that_suggests_the_right_name():
         ("base: base", "base: LF_HIP", "base: the free joint is on 'base', not on 'LF_HIP'"),
         ("model: anymal_c.xml", "model: anymal.xml", "model: there is no file 'anymal.xml'"),
         ("spawn_height: 0.6", "", "missing: spawn_height"),
+        ("spawn_height: 0.6", "spawn_height: 0", "spawn_height: must be above 0, got 0.0"),
+        ("spawn_height: 0.6", "spawn_height: -0.6", "spawn_height: must be above 0, got -0.6"),
+        ("spawn_height: 0.6", "spawn_height: .inf", "spawn_height: expected a finite number"),
+        ("spawn_height: 0.6", "spawn_height: tall", "spawn_height: expected a number, got 'tall'"),
+        ("stiffness: {HAA: 90.0", "stiffness: {HAA: -90.0", "stiffness.HAA: must be at least 0, got -90.0"),
+        ("damping: {HAA: 4.0", "damping: {HAA: -4.0", "damping.HAA: must be at least 0, got -4.0"),
+        ("velocity_limit: {HAA: 20.0", "velocity_limit: {HAA: 0", "velocity_limit.HAA: must be above 0"),
+        ("velocity_limit: {HAA: 20.0", "velocity_limit: {HAA: .nan", "velocity_limit.HAA: expected a number"),
+        ("  HAA: 0.0", "  HAA: 1e300", "default_joint_angles.HAA: must be at most 100"),
+        ("  HAA: 0.0", "  HAA: 0.0\n  '': 0.0", "default_joint_angles: an empty pattern would match everything"),
+        ("  HAA: 0.0", "  HAA: 0.0\n  1: 0.0", "default_joint_angles: expected text for a key, not 1"),
+        ("feet: [FOOT]", "feet: []", "feet: must not be empty"),
+        ("feet: [FOOT]", "feet: ['']", "feet: an empty pattern would match everything"),
+        ("feet: [FOOT]", "feet: FOOT", "feet: expected a list, got 'FOOT'"),
+        ("feet: [FOOT]", "feet: [3]", "feet[0]: expected text, got 3"),
+        ("on: [base]", "on: ['']", "terminate_after_contacts_on: an empty pattern would match everything"),
+        ("on: [SHANK, THIGH]", "on:", "penalize_contacts_on: expected a list, got None"),
+        ("model: anymal_c.xml", "model: ''", "model: there is no file ''"),
+        ("model: anymal_c.xml", "model: [a]", "model: expected text"),
+        ("model: anymal_c.xml", f"model: {'x' * 5000}", "model: there is no file"),
+        ("model: anymal_c.xml", "model: robot.yaml", "MuJoCo refuses it"),
+        ("base: base", "base: world", "base: the free joint is on 'base', not on 'world'"),
+        ("base: base", "base: [base]", "base: expected text"),
+        ("base: base", "base: base\nbase: base", "key 'base' is given twice"),
     ],
 )
 def test_mistake_in_robot_yaml_is_an_error_that_names_file_and_field(folder, old, new, message):
@@ -258,13 +284,51 @@ def test_mistake_in_robot_yaml_is_an_error_that_names_file_and_field(folder, old
         ('forcerange="-80 80"', "", "every motor needs a forcerange"),
         ('<motor name="RH_KFE" joint="RH_KFE"/>', "", "needs one motor per hinge in the same order"),
         ('<freejoint name="root"/>', "", "needs one free joint"),
+        # A torque is written to the motor, and must arrive at the joint as it is.
+        (MOTOR, MOTOR.replace("motor", "position"), "the actuator of 'LF_HAA' is no torque motor"),
+        (MOTOR, MOTOR.replace("motor", "velocity"), "the actuator of 'LF_HAA' is no torque motor"),
+        (MOTOR, MOTOR.replace("motor", "general").replace("/>", ' gainprm="2"/>'), "is no torque motor"),
+        (MOTOR, MOTOR.replace("motor", "general").replace("/>", ' dyntype="filter" dynprm="1"/>'), "is no torque motor"),
+        (MOTOR, MOTOR.replace("/>", ' gear="6"/>'), "the actuator of 'LF_HAA' has a gear of 6"),
+        (MOTOR, MOTOR.replace("joint", "site").replace('"LF_HAA"/>', '"imu"/>'), "motors ('no joint', "),
+        ('forcerange="-80 80"', 'forcerange="80 -80"', "every motor needs a forcerange"),
+        ('forcerange="-80 80"', 'forcerange="-inf inf"', "numbers must be finite and below 1e+12 (actuator_forcerange"),
+        ('forcerange="-80 80"', 'forcerange="-80 90"', "the same both ways"),
+        ('ctrlrange="-80 80"', 'ctrlrange="-1 1"', "ctrlrange [-1, 1], which cuts off its forcerange [-80, 80]"),
+        # What the scene brings.
+        ('name="LF_FOOT"', 'name="floor"', "geom 'floor': the scene has one of that name"),
+        ('name="LF_FOOT"', 'name="terrain_3"', "geom 'terrain_3': the scene has one of that name"),
+        ("<worldbody>", '<worldbody><geom name="ground" type="plane" size="0 0 1"/>', "geom 'ground' is fixed to the world"),
+        ("<worldbody>", '<option><flag contact="disable"/></option><worldbody>', "contact is disabled"),
+        # Numbers.
+        ('mass="26.37317"', 'mass="inf"', "numbers must be finite"),
+        ('mass="26.37317"', 'mass="0"', "MuJoCo refuses it"),
+        ('name="imu" pos="0 0 0"', 'name="imu" pos="nan 0 0"', "MuJoCo warns: XML contains a 'NaN'"),
+        ("<worldbody>", '<option gravity="0 0 inf"/><worldbody>', "numbers must be finite and below 1e+12 (gravity"),
+        # Files.
+        ("<worldbody>", '<include file="nowhere.xml"/><worldbody>', "nowhere.xml"),
+        ("<asset>", '<asset><mesh name="m" file="nowhere.obj"/>', "nowhere.obj"),
+        ("<mujoco ", "<robot ", "MuJoCo refuses it"),
+        (' name="LF_HAA" class', " class", "MuJoCo refuses it"),  # the motor names it
     ],
 )
-def test_model_the_engines_cannot_drive_is_an_error_that_names_the_folder(folder, old, new, message):
+def test_model_the_engines_cannot_drive_is_an_error_that_names_the_folder(folder, old, new, message, capfd, monkeypatch):
+    monkeypatch.chdir(folder)
     edit(folder / "anymal_c.xml", old, new)
     text = refused(folder)
-    assert str(folder) in text
+    assert text.startswith(f"{folder / 'robot.yaml'}: ")
     assert message in text
+    assert "\n" not in text
+    assert capfd.readouterr() == ("", "")  # MuJoCo prints its warnings, and writes them to a file
+    assert not (folder / "MUJOCO_LOG.TXT").exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89PNG\x00\xff", b"<mujoco>", b"robot: go2\n"])
+def test_model_that_is_no_mjcf_is_refused_in_one_line(folder, content):
+    (folder / "anymal_c.xml").write_bytes(content)
+    text = refused(folder)
+    assert text.startswith(f"{folder / 'robot.yaml'}: model: {folder / 'anymal_c.xml'}: MuJoCo refuses it: ")
+    assert "\n" not in text
 
 
 def test_feet_at_different_depths_are_refused(folder):

@@ -177,3 +177,42 @@ def test_lopsided_measuring_points_are_refused(capsys):
     arguments = ["--task", "anymal_c", "train.algorithm.symmetry=true", "terrain.measured_points_y=[0.0, 0.5]", "--show"]
     assert call(train.main, arguments) == 2
     assert "not the same left and right" in capsys.readouterr().err
+
+
+class Misspelt(Looking):
+    MIRRORED = {**LeggedRobot.MIRRORED, "foot_contact": "foot"}
+
+
+class TooNarrow(Looking):
+    MIRRORED = {**LeggedRobot.MIRRORED, "foot_contact": "joints"}
+
+
+class Unequal(Looking):
+    MIRRORED = {**LeggedRobot.MIRRORED, "foot_contact": "vector"}
+
+
+def looking_config():
+    return small_config(SYMMETRIC, ("observations.critic", ["dof_pos", "foot_contact"]))
+
+
+@pytest.fixture
+def looking(monkeypatch):
+    """A configuration with one observation that only the classes of this file have."""
+    with monkeypatch.context() as patch:
+        patch.setattr(LeggedRobot, "_obs_foot_contact", Looking._obs_foot_contact, raising=False)
+        patch.setattr(LeggedRobot, "MIRRORED", Knowing.MIRRORED)
+        return looking_config()
+
+
+def test_a_misspelt_kind_of_mirror_is_refused_at_the_start(looking):
+    """It would be taken for `same`, and left and right would be learned from each other's feet."""
+    words = r"Misspelt\.MIRRORED: observation 'foot_contact' has the unknown kind 'foot'; did you mean 'feet'\?"
+    with pytest.raises(ConfigError, match=words):
+        Misspelt.check(looking)
+
+
+@pytest.mark.parametrize(("task", "words"), [(TooNarrow, "kind 'joints' is for 12"), (Unequal, "kind 'vector' is for 3")])
+def test_a_kind_of_mirror_of_another_width_is_refused(looking, task, words):
+    with pytest.raises(ConfigError, match=rf"{task.__name__}\.MIRRORED: observation 'foot_contact' has 4 numbers.*{words}"):
+        MirrorImages(task(looking))
+    assert MirrorImages(Knowing(looking)).groups["critic"][0].tolist()[12:] == [13, 12, 15, 14]

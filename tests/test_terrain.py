@@ -254,6 +254,17 @@ def test_corners_are_listed_with_x_first():
             {"horizontal_scale": 0.02},
             ["horizontal_scale", "86 x 166 m in cells of 0.02 m are 35,690,000", "16,777,216"],
         ),
+        ({"horizontal_scale": 0.32}, ["horizontal_scale: cells of 0.32 m", "tread of a step of 'stairs_up', 0.31 m"]),
+        ({"horizontal_scale": 1.1, "proportions": {"obstacles": 1.0}}, ["cells of 1.1 m", "side of a block", "1 m"]),
+        ({"horizontal_scale": 0.11, "proportions": {"stepping_stones": 1.0}}, ["cells of 0.11 m", "gap between two stones"]),
+        ({"horizontal_scale": 0.6, "proportions": {"gap": 1.0}}, ["cells of 0.6 m", "width of a ditch"]),
+        ({"horizontal_scale": 0.6, "proportions": {"waves": 1.0}}, ["cells of 0.6 m", "quarter of a wave"]),
+        ({"horizontal_scale": 2.5, "proportions": {"flat": 1.0}}, ["cells of 2.5 m", "2 m square in which robots start"]),
+        (
+            {"horizontal_scale": 1.5, "terrain_width": 1.2, "spawn_range": 0.1, "proportions": {"flat": 1.0}},
+            ["cells of 1.5 m are larger than a tile of 1.2 m"],
+        ),
+        ({"num_rows": 101, "num_cols": 100, "terrain_width": 3.5}, ["num_rows", "num_cols = 100", "10,100 tiles"]),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
 )
@@ -274,6 +285,8 @@ def test_wrong_terrain_is_named(changes, words):
         {"terrain_length": 3.1, "spawn_range": 1.5, "max_init_terrain_level": 9, "border_size": 2.0},
         {"terrain_length": 3.1, "proportions": {"flat": 1.0, "pit": 0.0}},  # the pit's platform does not count
         {"proportions": {"stairs_up": 0.95, "gap": 0.05}},  # one column
+        {"horizontal_scale": 0.31},  # a cell a step
+        {"horizontal_scale": 2.0, "proportions": {"flat": 1.0}},
         {"proportions": dict.fromkeys(TERRAIN_TYPES, 1.0 / 12.0), "num_cols": 12},
     ],
 )

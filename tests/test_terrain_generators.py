@@ -189,3 +189,24 @@ def test_sizes_by_difficulty(names, sizes):
         if kind.unit == "degrees":
             found = np.tan(np.radians(found)).tolist()
         assert found == pytest.approx(sizes)
+
+
+@pytest.mark.parametrize("name", TERRAIN_TYPES)
+@pytest.mark.parametrize("cell", [0.32, 0.5, 1.5, 5.0])
+def test_every_type_comes_to_an_end_on_coarse_cells(name, cell):
+    """Whoever makes tiles without the check of a configuration gets a coarse tile, not an endless loop."""
+    kind = TERRAIN_TYPES[name]
+    one = Tile(np.zeros((6, 6)), cell, np.random.default_rng(0))
+    kind.generate(one, kind.size(0.5))
+    assert np.isfinite(one.heights).all()
+
+
+@pytest.mark.parametrize("name", [name for name, kind in TERRAIN_TYPES.items() if kind.finest])
+def test_the_largest_cells_that_are_admitted_make_the_type(name):
+    """There is something on the tile, beside level ground, at every level of a training from the second to the hardest."""
+    kind = TERRAIN_TYPES[name]
+    count = round(8.0 / kind.finest[0])
+    for difficulty in (0.6, 0.9):
+        one = Tile(np.zeros((count, count)), kind.finest[0], np.random.default_rng(0))
+        kind.generate(one, kind.size(difficulty))
+        assert len(np.unique(one.heights.round(6))) > 1

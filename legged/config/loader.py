@@ -2,67 +2,46 @@
 
 import copy
 import dataclasses
-import re
-import types
-import typing
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union
+from typing import Any
 
 import yaml
 
+from legged.config.checks import DEEPEST, SHOWN, build, plain_path, shown
 from legged.config.origins import Origins
 from legged.config.schema import TaskConfig
+from legged.config.yaml_files import parse, read_yaml
 from legged.errors import ConfigError, suggest
-from legged.paths import data_folder
+from legged.paths import data_folder, exists
 
-T = TypeVar("T")
-
-
-class _Loader(yaml.SafeLoader):
-    """SafeLoader that reads `1e-4` as a number (YAML 1.1 wants a dot) and refuses a key given twice."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for key in keys:
-            if keys.count(key) > 1:
-                line = node.start_mark.line + 1
-                raise ConfigError(f"{self.name}: key '{key}' is given twice in the block from line {line}")
-        return super().construct_mapping(node, deep)
+LONGEST_CHAIN = 20
+"""Files that extend each other."""
 
 
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+$"),
-    list("-+.0123456789"),
-)
+@dataclass(frozen=True)
+class Registered:
+    """A configuration that outside code gave to the registry: a file, or a mapping with the same keys."""
+
+    config: Path | Mapping[str, Any]
+    folder: Path
+    """What the paths in a mapping are relative to: the folder of the code."""
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file; ConfigError when it is missing, malformed or no mapping."""
-    try:
-        with path.open(encoding="utf-8") as stream:
-            loader = _Loader(stream)
-            loader.name = str(path)
-            try:
-                data = loader.get_single_data()
-            finally:
-                loader.dispose()
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not valid YAML: {error}") from error
-    if data is None:
-        return {}
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path}: expected a mapping of sections, got {type(data).__name__}")
-    return data
+Source = Path | Mapping[str, Any] | Registered
 
 
 def merge(base: dict[str, Any], top: Mapping[str, Any], source: str, origins: Origins, prefix: str = "") -> None:
-    """Lays `top` over `base` in place: maps merge, lists and scalars replace. Notes in `origins` who set each path."""
+    """Lays `top` over `base` in place: maps merge, lists and scalars replace. Notes in `origins` who set each path.
+
+    Raises:
+        ConfigError: maps inside each other without end.
+    """
+    if prefix.count(".") > DEEPEST:
+        raise ConfigError(f"{source}: {shown(prefix)}: more than {DEEPEST} sections inside each other")
     for key, value in top.items():
-        path = f"{prefix}{key}"
+        path = f"{prefix}{plain_path(key)}"
         if isinstance(value, Mapping):
             if not isinstance(base.get(key), dict):
                 base[key] = {}
@@ -73,40 +52,140 @@ def merge(base: dict[str, Any], top: Mapping[str, Any], source: str, origins: Or
         origins.note(path, source)
 
 
-def _read_chain(source: Path | Mapping[str, Any], name: str, seen: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Origins]:
-    """A file (or a mapping in a user's code), called `name` in errors, laid over the files it extends."""
-    if isinstance(source, Path):
-        if source in seen:
-            raise ConfigError(f"{source}: extends itself: {' -> '.join(p.name for p in (*seen, source))}")
-        data, folders, seen = read_yaml(source), [source.parent, data_folder("cfg")], (*seen, source)
-    else:
-        data, folders = copy.deepcopy(dict(source)), [data_folder("cfg")]
-    parent = data.pop("extends", None)
+@dataclass(frozen=True)
+class _Layer:
+    """One of the configurations that are laid over each other."""
+
+    data: Mapping[str, Any]
+    """What it sets, without `extends`."""
+    name: str
+    """What errors call it."""
+    folder: Path
+    """What its paths are relative to."""
+    task: str | None
+    """The name of the registered task that it is; None for a file."""
+
+
+def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> list[_Layer]:
+    """The configuration of `task`, what it extends, what that extends, and so on.
+
+    Raises:
+        ConfigError: one of them cannot be read, is not there, or extends itself.
+    """
+    layers: list[_Layer] = []
+    seen: list[Any] = []
+    found, name = source, name_of(source, task)
+    while True:
+        given = found.config if isinstance(found, Registered) else found
+        if _mark(found) in seen:
+            chain = " -> ".join(Path(n).name for n in (*(layer.name for layer in layers), name))
+            raise ConfigError(f"{name}: extends itself: {chain}")
+        if len(layers) == LONGEST_CHAIN:
+            raise ConfigError(f"{name}: extends: more than {LONGEST_CHAIN} files extend each other")
+        seen.append(_mark(found))
+        data = read_yaml(given) if isinstance(given, Path) else dict(given)
+        parent = data.pop("extends", None)
+        beside = given.parent if isinstance(given, Path) else None
+        folder = beside or (found.folder if isinstance(found, Registered) else Path.cwd())
+        layers.append(_Layer(data, name, folder, task if isinstance(found, Registered) else None))
+        if parent is None:
+            return layers
+        others = {key: entry for key, entry in registered.items() if _mark(entry) not in seen}
+        found, task = _parent(parent, name, beside, others)
+        name = name_of(found, task)
+
+
+def _mark(source: Source) -> Any:
+    """What tells configurations apart."""
+    given = source.config if isinstance(source, Registered) else source
+    return given.resolve() if isinstance(given, Path) else id(given)
+
+
+def _parent(
+    parent: Any, name: str, beside: Path | None, registered: Mapping[str, Registered]
+) -> tuple[Path | Registered, str]:
+    """What `extends: parent` means: a file in the folder `beside`, a registered task, or one of ours; and its name."""
+    if not isinstance(parent, str) or not parent:
+        raise ConfigError(f"{name}: extends: expected the name of a task or of a file beside this one, got {shown(parent)}")
+    file = parent if parent.endswith((".yaml", ".yml")) else f"{parent}.yaml"
+    if beside is not None and exists(beside / file):
+        return beside / file, parent
+    if parent in registered:
+        return registered[parent], parent
+    if exists(data_folder("cfg") / file):
+        return data_folder("cfg") / file, parent
+    folders = [data_folder("cfg"), *([] if beside is None else [beside])]
+    names = {path.stem for folder in folders for path in folder.glob("*.yaml")} | set(registered)
+    raise ConfigError(f"{name}: extends: there is no {shown(parent)}{suggest(parent[:SHOWN], names)}")
+
+
+def extended_tasks(source: Source, task: str, registered: Mapping[str, Registered]) -> list[str]:
+    """Names of those tasks of `registered` that the configuration of `task` extends, the nearest first."""
+    return [layer.task for layer in _layers(source, task, registered)[1:] if layer.task is not None]
+
+
+def _merged(layers: Iterable[_Layer]) -> tuple[dict[str, Any], Origins]:
+    """Layers laid over those after them. Each is checked by itself: what another one sets over it must not hide a mistake.
+
+    Raises:
+        ConfigError: a layer does not fit the schema.
+    """
     merged: dict[str, Any] = {}
     origins = Origins()
-    if parent is not None:
-        found = [folder / f"{parent}.yaml" for folder in folders if (folder / f"{parent}.yaml").is_file()]
-        if not found:
-            names = {p.stem for folder in folders for p in folder.glob("*.yaml")}
-            raise ConfigError(f"{name}: extends: there is no '{parent}'{suggest(str(parent), names)}")
-        merged, origins = _read_chain(found[0], str(found[0]), seen)
-    merge(merged, data, name, origins)
+    for layer in reversed(list(layers)):
+        _check_layer(layer.data, layer.name)
+        data = copy.deepcopy(dict(layer.data))
+        for section in (data, data.get("cpu", {})):
+            if "robot" in section:
+                section["robot"] = robot_path(section["robot"], layer.folder)
+        merge(merged, data, layer.name, origins)
     return merged, origins
 
 
+def name_of(source: Source, task: str) -> str:
+    """What errors call the configuration of a task."""
+    given = source.config if isinstance(source, Registered) else source
+    return str(given) if isinstance(given, Path) else f"registered config of '{task}'"
+
+
+def _check_layer(data: Mapping[str, Any], name: str) -> None:
+    """What is set here, and in the `cpu:` section (found on a GPU machine too), fits the schema.
+
+    Raises:
+        ConfigError: it does not.
+    """
+    build(TaskConfig, {key: value for key, value in data.items() if key != "cpu"}, "", Origins(), name)
+    if "cpu" in data:
+        cpu = data["cpu"]
+        if not isinstance(cpu, Mapping):
+            raise ConfigError(f"{name}: cpu: expected a mapping of sections, got {shown(cpu)}")
+        if "task" in cpu:
+            raise ConfigError(f"{name}: cpu: task: a task has one name on every machine")
+        build(TaskConfig, cpu, "", Origins(), f"{name}: cpu")
+
+
+def robot_path(robot: Any, folder: Path) -> Any:
+    """A `robot` that was named by a file in `folder`, as an absolute path if it is one: a folder beside the file or in the
+    working directory, or what holds a slash or begins with a dot. Names of robots under resources/robots/ stay as they are.
+    """
+    if not isinstance(robot, str) or not robot or exists(data_folder("resources") / "robots" / robot / "robot.yaml"):
+        return robot
+    for path in (folder / robot, Path.cwd() / robot):
+        if exists(path / "robot.yaml"):
+            return str(path.resolve())
+    return str((folder / robot).absolute()) if robot.startswith(".") or "/" in robot else robot
+
+
 def parse_override(text: str) -> tuple[str, Any]:
-    """`a.b=1e-3` -> ("a.b", 0.001); the value is read as YAML."""
+    """`a.b=1e-3` -> ("a.b", 0.001); the value is read as YAML.
+
+    Raises:
+        ConfigError: it is not of that form.
+    """
     key, equals, value = text.partition("=")
     if not equals or not key:
-        raise ConfigError(f"command line: '{text}' is not of the form section.key=value")
-    try:
-        loader = _Loader(value)
-        try:
-            return key.strip(), loader.get_single_data()
-        finally:
-            loader.dispose()
-    except yaml.YAMLError as error:
-        raise ConfigError(f"command line: {key}: '{value}' is not a YAML value: {error}") from error
+        raise ConfigError(f"command line: '{plain_path(text)}' is not of the form section.key=value")
+    return key.strip(), parse(value, f"command line: {plain_path(key)}: {shown(value)}")
 
 
 def nest(path: str, value: Any) -> dict[str, Any]:
@@ -117,41 +196,42 @@ def nest(path: str, value: Any) -> dict[str, Any]:
 
 
 def load_config(
-    source: Path | Mapping[str, Any], task: str, overrides: Iterable[tuple[str, Any]] = (), on_cpu: bool = False
+    source: Source,
+    task: str,
+    overrides: Iterable[tuple[str, Any]] = (),
+    on_cpu: bool = False,
+    registered: Mapping[str, Registered] | None = None,
 ) -> TaskConfig:
-    """The task file or mapping `source`, over the files it extends, under its `cpu:` section (if asked) and overrides.
+    """The task file or mapping `source`, over what it extends (a file, or one of the tasks in `registered`), under its
+    `cpu:` section (if asked) and overrides.
 
     Raises:
         ConfigError: unknown key, wrong type or value, with file and dotted path.
     """
-    name = str(source) if isinstance(source, Path) else f"registered config of '{task}'"
-    data, origins = _read_chain(source, name)
+    name = name_of(source, task)
+    data, origins = _merged(_layers(source, task, registered or {}))
     cpu = data.pop("cpu", {})
-    if not isinstance(cpu, dict):
-        raise ConfigError(f"{origins.where('cpu')}: expected a mapping of sections, got {cpu!r}")
     data["task"] = task
+    where = Origins(origins)
+    if on_cpu:
+        set_here = Origins()
+        merge(data, copy.deepcopy(cpu), "", set_here)
+        for path in set_here:
+            where.note(path, origins.of(f"cpu.{path}") + ": cpu")
+    _merge_overrides(data, overrides, where)
+    return from_dict(data, where, source=name)
 
-    def with_cpu(apply: bool) -> tuple[dict[str, Any], Origins]:
-        merged = copy.deepcopy(data)
-        where = Origins(origins)
-        if apply:
-            set_here = Origins()
-            merge(merged, cpu, "", set_here)
-            for path in set_here:
-                where.note(path, origins.of(f"cpu.{path}") + ": cpu")
-        return merged, where
 
-    from_dict(*with_cpu(True), source=name)  # so that a mistake in `cpu:` is found on a GPU machine too
-    merged, where = with_cpu(on_cpu)
+def _merge_overrides(data: dict[str, Any], overrides: Iterable[tuple[str, Any]], origins: Origins) -> None:
+    """Lays overrides of the command line over `data`, each of them checked by itself: a later one must not hide it."""
     for key, value in overrides:
-        _refuse_task(key)
-        merge(merged, nest(key, value), "command line", where)
-    return from_dict(merged, where, source=name)
-
-
-def _refuse_task(key: str) -> None:
-    if key == "task":
-        raise ConfigError("command line: task: can't be overridden; choose the task with --task")
+        if key == "task":
+            raise ConfigError("command line: task: can't be overridden; choose the task with --task")
+        if key.count(".") > DEEPEST:
+            raise ConfigError(f"command line: {shown(key)}: more than {DEEPEST} sections inside each other")
+        layer = nest(key, robot_path(value, Path.cwd()) if key == "robot" else copy.deepcopy(value))
+        build(TaskConfig, layer, "", Origins(), "command line")
+        merge(data, layer, "command line", origins)
 
 
 def from_dict(data: Mapping[str, Any], origins: Origins | None = None, source: str = "config") -> TaskConfig:
@@ -168,106 +248,8 @@ def override(cfg: TaskConfig, overrides: Iterable[tuple[str, Any]]) -> TaskConfi
     """`cfg` with some dotted paths replaced, by the command line or by what it asks for, checked again."""
     data = to_dict(cfg)
     origins = Origins(cfg.origins)
-    for key, value in overrides:
-        _refuse_task(key)
-        merge(data, nest(key, value), "command line", origins)
+    _merge_overrides(data, overrides, origins)
     return from_dict(data, origins, source=cfg.task)
-
-
-def build(schema: type[T], data: Any, path: str, origins: Origins, source: str) -> T:
-    """An instance of the dataclass `schema` from a mapping, checked field by field."""
-    where = f"{_origin(path, origins, source)}: {path or 'top level'}"
-    if not isinstance(data, Mapping):
-        raise ConfigError(f"{where}: expected a mapping with keys of {schema.__name__}, got {data!r}")
-    fields = {f.name: f for f in dataclasses.fields(schema) if f.compare}  # type: ignore[arg-type]
-    hints = typing.get_type_hints(schema)
-    values: dict[str, Any] = {}
-    for key, value in data.items():
-        dotted = f"{path}.{key}" if path else str(key)
-        if key not in fields:
-            raise ConfigError(f"{_origin(dotted, origins, source)}: {dotted}: unknown key '{key}'{suggest(str(key), fields)}")
-        if dataclasses.is_dataclass(hints[key]):
-            values[key] = build(hints[key], value, dotted, origins, source)  # type: ignore[arg-type]
-            continue
-        checked = _check(hints[key], value, dotted, origins, source)
-        if fields[key].metadata:
-            _check_bounds(checked, fields[key].metadata, f"{_origin(dotted, origins, source)}: {dotted}")
-        if typing.get_origin(hints[key]) is dict:  # maps merge with the schema's default entries
-            factory = fields[key].default_factory
-            checked = {**(factory() if callable(factory) else {}), **checked}
-        values[key] = checked
-    return schema(**values)
-
-
-def _origin(path: str, origins: Origins, source: str) -> str:
-    """Who gave the value at `path`; `source` where nobody in particular did."""
-    return origins.of(path) if path and origins else source
-
-
-def _check(kind: Any, value: Any, path: str, origins: Origins, source: str) -> Any:
-    """`value` as `kind`, or ConfigError. Integers count as floats, lists as tuples; nothing else is converted."""
-    origin, args = typing.get_origin(kind), typing.get_args(kind)
-
-    def fail(expected: str) -> ConfigError:
-        return ConfigError(f"{_origin(path, origins, source)}: {path}: expected {expected}, got {value!r}")
-
-    if kind is Any:
-        return value
-    if origin is Literal:
-        if value not in args:
-            raise ConfigError(
-                f"{_origin(path, origins, source)}: {path}: unknown value {value!r}{suggest(str(value), map(str, args))}"
-            )
-        return value
-    if origin in (Union, types.UnionType):
-        if value is None and type(None) in args:
-            return None
-        return _check(next(a for a in args if a is not type(None)), value, path, origins, source)
-    if origin is tuple:
-        if not isinstance(value, list | tuple):
-            raise fail("a list")
-        if len(args) == 2 and args[1] is Ellipsis:
-            return tuple(_check(args[0], v, f"{path}[{i}]", origins, source) for i, v in enumerate(value))
-        if len(value) != len(args):
-            raise fail(f"a list of {len(args)} numbers")
-        checked = tuple(_check(args[i], v, f"{path}[{i}]", origins, source) for i, v in enumerate(value))
-        if args == (float, float) and checked[0] > checked[1]:
-            raise fail("[low, high] with low <= high")
-        return checked
-    if origin is dict:
-        if not isinstance(value, Mapping):
-            raise fail("a mapping")
-        return {str(k): _check(args[1], v, f"{path}.{k}", origins, source) for k, v in value.items()}
-    if kind is bool:
-        if not isinstance(value, bool):
-            raise fail("true or false")
-    elif kind is int:
-        if not isinstance(value, int) or isinstance(value, bool):
-            raise fail("a whole number")
-    elif kind is float:
-        if not isinstance(value, int | float) or isinstance(value, bool):
-            raise fail("a number")
-        value = float(value)
-        if value != value:
-            raise fail("a number")
-    elif kind is str and not isinstance(value, str):
-        raise fail("text")
-    return value
-
-
-def _check_bounds(value: Any, bounds: Mapping[str, float], where: str) -> None:
-    if isinstance(value, tuple):
-        if not value:
-            raise ConfigError(f"{where}: must not be empty")
-        for i, item in enumerate(value):
-            _check_bounds(item, bounds, f"{where}[{i}]")
-        return
-    if "min" in bounds and value < bounds["min"]:
-        raise ConfigError(f"{where}: must be at least {bounds['min']}, got {value}")
-    if "max" in bounds and value > bounds["max"]:
-        raise ConfigError(f"{where}: must be at most {bounds['max']}, got {value}")
-    if "above" in bounds and value <= bounds["above"]:
-        raise ConfigError(f"{where}: must be above {bounds['above']}, got {value}")
 
 
 def to_dict(config: Any) -> Any:

@@ -12,6 +12,7 @@ from legged.contacts import FeetContacts
 from legged.control import Control, control_gains
 from legged.curriculum import CommandCurriculum
 from legged.envs.base_task import BaseTask
+from legged.envs.checks import check_base_mass, check_mirror_kinds, check_sizes
 from legged.envs.terms import Terms
 from legged.errors import ConfigError, suggest
 from legged.faults import LARGEST_STATE, Faults
@@ -138,16 +139,16 @@ class LeggedRobot(Terms, BaseTask):
             where, otherwise = origins.where("train.algorithm.symmetry"), "false learns without mirror images"
             if robot.mirror is None:
                 raise ConfigError(f"{where}: '{robot.name}' is lopsided (joints and feet at zero angles); {otherwise}")
-            for name in (*cfg.observations.actor, *cfg.observations.critic):
-                if name not in cls.MIRRORED:
-                    missing = f"{cls.__name__}.MIRRORED does not say how observation '{name}' is mirrored"
-                    raise ConfigError(f"{where}: {missing}; {otherwise}")
+            used = (*cfg.observations.actor, *cfg.observations.critic)
+            check_mirror_kinds(cls.__name__, cls.MIRRORED, used, where)
             y = cfg.terrain.measured_points_y
             if sorted(y) != sorted(-value for value in y):
                 points = f"terrain.measured_points_y ({origins.of('terrain.measured_points_y')})"
                 raise ConfigError(f"{where}: {points} are not the same left and right: {list(y)}")
         control_gains(robot, cfg.control, origins.where)
         check_terrain(cfg.terrain, origins)
+        check_base_mass(cfg, robot)
+        check_sizes(cfg)
         if round(cfg.env.episode_length_s / cfg.dt) < 1:
             where, given = origins.where("env.episode_length_s"), cfg.env.episode_length_s
             raise ConfigError(

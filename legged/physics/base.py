@@ -1,7 +1,7 @@
 """The interface every physics engine is put behind, and the state it keeps for the task."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,6 +9,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from legged.errors import suggest
 from legged.robot import Robot
 from legged.state import take
 
@@ -92,7 +93,11 @@ class Physics(ABC):
 
     @abstractmethod
     def randomize(self, field: RandomizedField, values: Tensor) -> None:
-        """Set a property per world, (N,), at start-up: `friction` of the robot's shapes [-], `added_base_mass` [kg]."""
+        """Set a property per world, (N,), at start-up: `friction` of the robot's shapes [-], `added_base_mass` [kg].
+
+        Raises:
+            ValueError: no such field.
+        """
 
     @abstractmethod
     def state_tensors(self) -> dict[str, Tensor]:
@@ -113,6 +118,17 @@ class Physics(ABC):
     @abstractmethod
     def copy_to(self, env_id: int, data: mujoco.MjData) -> None:
         """One world's positions and velocities into a C MjData, with kinematics computed, for rendering."""
+
+
+def setter_of(field: str, **setters: Callable[[Tensor], None]) -> Callable[[Tensor], None]:
+    """What sets the property `field`, out of a back-end's setters by name.
+
+    Raises:
+        ValueError: the back-end cannot randomise that.
+    """
+    if field not in setters:
+        raise ValueError(f"randomize: there is no property '{field}'{suggest(field, setters, 'properties')}")
+    return setters[field]
 
 
 def allocate_state(num_envs: int, robot: Robot, device: torch.device) -> RobotState:

@@ -9,7 +9,7 @@ from torch import Tensor
 from legged.config.schema import SimConfig
 from legged.cores import available_cores
 from legged.math import quat_rotate, quat_rotate_inverse
-from legged.physics.base import Physics, RandomizedField, allocate_state
+from legged.physics.base import Physics, RandomizedField, allocate_state, setter_of
 from legged.physics.feet import FeetKinematics
 from legged.physics.scene import build_model, contact_sensor_columns
 from legged.ranks import Ranks
@@ -103,14 +103,16 @@ class MujocoPhysics(Physics):
         self._qvel[:, :2].add_(torch.where(mask.view(-1, 1), lin_vel_xy, 0.0))
 
     def randomize(self, field: RandomizedField, values: Tensor) -> None:
-        array = values.double().numpy()
-        if field == "friction":
-            geoms = [self.model.geom(name).id for name in self.robot.contact_names]
-            self.batch.expand("geom_friction")[:, geoms, 0] = array[:, None]
-        else:
-            base = self.model.body(self.robot.file.base).id
-            self.batch.expand("body_mass")[:, base] = self.model.body_mass[base] + array
-            self.batch.set_const()
+        setter_of(field, friction=self._set_friction, added_base_mass=self._add_base_mass)(values)
+
+    def _set_friction(self, values: Tensor) -> None:
+        geoms = [self.model.geom(name).id for name in self.robot.contact_names]
+        self.batch.expand("geom_friction")[:, geoms, 0] = values.double().numpy()[:, None]
+
+    def _add_base_mass(self, values: Tensor) -> None:
+        base = self.model.body(self.robot.file.base).id
+        self.batch.expand("body_mass")[:, base] = self.model.body_mass[base] + values.double().numpy()
+        self.batch.set_const()
 
     def state_tensors(self) -> dict[str, Tensor]:
         return {

@@ -13,15 +13,16 @@ from torch import Tensor
 from legged.config.schema import SimConfig
 from legged.errors import ConfigError
 from legged.math import masked_set_
-from legged.physics.base import RandomizedField
+from legged.physics.base import RandomizedField, setter_of
 from legged.physics.constraint_solver import ConstraintSolver
 from legged.physics.exchange import Exchange
 from legged.physics.kernels import compile_ahead
-from legged.physics.scene import FLOOR, build_model
+from legged.physics.scene import build_model
 from legged.physics.terrain_contact import TerrainContact
 from legged.physics.torque_step import TorqueStep
 from legged.physics.warp_physics import WarpPhysics
 from legged.robot import Robot
+from legged.robot_model import FLOOR
 from legged.terrain import Terrain
 
 # Fields of the model that differ per world once friction or mass are drawn, and those that set_const derives from mass.
@@ -147,11 +148,14 @@ class MujocoWarpPhysics(WarpPhysics):
         masked_set_(self._qvel[:, :2], mask, self._qvel[:, :2] + lin_vel_xy)
 
     def randomize(self, field: RandomizedField, values: Tensor) -> None:
-        if field == "friction":
-            geoms = [self.model.geom(name).id for name in self.robot.contact_names]
-            friction = wp.to_torch(self._m.geom_friction)
-            friction[:, geoms, 0] = values.to(self.device).unsqueeze(1).expand(-1, len(geoms))
-            return
+        setter_of(field, friction=self._set_friction, added_base_mass=self._add_base_mass)(values)
+
+    def _set_friction(self, values: Tensor) -> None:
+        geoms = [self.model.geom(name).id for name in self.robot.contact_names]
+        friction = wp.to_torch(self._m.geom_friction)
+        friction[:, geoms, 0] = values.to(self.device).unsqueeze(1).expand(-1, len(geoms))
+
+    def _add_base_mass(self, values: Tensor) -> None:
         base = self.model.body(self.robot.file.base).id
         mass = wp.to_torch(self._m.body_mass)
         mass[:, base] = float(self.model.body_mass[base]) + values.to(self.device)

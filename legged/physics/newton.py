@@ -9,7 +9,7 @@ from torch import Tensor
 
 from legged.config.schema import SimConfig
 from legged.math import masked_set_
-from legged.physics.base import RandomizedField
+from legged.physics.base import RandomizedField, setter_of
 from legged.physics.kernels import compile_ahead
 from legged.physics.newton_exchange import NewtonExchange
 from legged.physics.newton_simulation import Simulation
@@ -107,17 +107,23 @@ class NewtonPhysics(WarpPhysics):
             self._put()
 
     def randomize(self, field: RandomizedField, values: Tensor) -> None:
-        model, layout, setup = self._simulation.model, self._simulation.layout, self._simulation.setup
-        values = values.to(self.device)
-        if field == "friction":
-            shapes = len(layout.shapes)
-            friction = wp.to_torch(model.shape_material_mu)[: self.num_envs * layout.num_shapes].view(self.num_envs, -1)
-            friction[:, layout.shapes] = (values * setup.friction_factor).unsqueeze(1).expand(-1, shapes)
-            changed = newton.ModelFlags.SHAPE_PROPERTIES
-        else:
-            mass = float(self.model.body(self.robot.file.base).mass[0]) + values
-            wp.to_torch(model.body_mass).view(self.num_envs, -1)[:, layout.base] = mass
-            wp.to_torch(model.body_inv_mass).view(self.num_envs, -1)[:, layout.base] = 1.0 / mass
-            changed = newton.ModelFlags.BODY_INERTIAL_PROPERTIES
+        setter_of(field, friction=self._set_friction, added_base_mass=self._add_base_mass)(values.to(self.device))
+
+    def _set_friction(self, values: Tensor) -> None:
+        model, layout = self._simulation.model, self._simulation.layout
+        friction = wp.to_torch(model.shape_material_mu)[: self.num_envs * layout.num_shapes].view(self.num_envs, -1)
+        factor = self._simulation.setup.friction_factor
+        friction[:, layout.shapes] = (values * factor).unsqueeze(1).expand(-1, len(layout.shapes))
+        self._notify(newton.ModelFlags.SHAPE_PROPERTIES)
+
+    def _add_base_mass(self, values: Tensor) -> None:
+        model, base = self._simulation.model, self._simulation.layout.base
+        mass = float(self.model.body(self.robot.file.base).mass[0]) + values
+        wp.to_torch(model.body_mass).view(self.num_envs, -1)[:, base] = mass
+        wp.to_torch(model.body_inv_mass).view(self.num_envs, -1)[:, base] = 1.0 / mass
+        self._notify(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
+
+    def _notify(self, changed: newton.ModelFlags) -> None:
+        """Tell the solver what has changed."""
         with self._on_device():
             self._simulation.solver.notify_model_changed(changed)

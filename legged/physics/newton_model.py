@@ -7,10 +7,12 @@ import newton
 import numpy as np
 
 from legged.config.schema import SimConfig
+from legged.errors import ConfigError
 from legged.physics.newton_solvers import SolverSetup
-from legged.physics.scene import FLOOR, robot_spec
+from legged.physics.scene import robot_source
 from legged.physics.terrain_geoms import DEPTH, lattice_heights
 from legged.robot import Robot
+from legged.robot_model import FLOOR
 from legged.terrain import Terrain
 
 
@@ -64,11 +66,18 @@ def build_newton_model(
     """N robots from the robot's MJCF on one ground that all of them share: a plane, or the height map as one field of
     points, where steps are ramps one cell wide. Where our collider takes its place (`meets_cells`), a plane far below
     stands for it. `device` is Warp's.
+
+    Raises:
+        ConfigError: the robot has meshes, which Newton cannot read here.
     """
     world = _builder(setup)
     # Which shapes may touch is written in the model, and Newton reads it when it reads the model.
-    source = robot_spec(robot, True).to_xml() if sim.self_collisions else str(robot.model_path)
-    world.add_mjcf(source, enable_self_collisions=sim.self_collisions, parse_visuals=False, parse_sites=False)
+    source = robot_source(robot, sim.self_collisions)
+    try:
+        world.add_mjcf(source, enable_self_collisions=sim.self_collisions, parse_visuals=False, parse_sites=False)
+    except ModuleNotFoundError as error:
+        needs = f"to read its meshes newton needs the package {error.name}, which is not installed here"
+        raise ConfigError(f"{robot.model_path}: {needs}: pip install {error.name}") from error
     for shape in range(world.shape_count):
         world.shape_gap[shape] = setup.gap
         if setup.springs is not None:

@@ -7,23 +7,49 @@ import mujoco
 from legged.config.schema import SimConfig
 from legged.physics.terrain_geoms import add_height_field, add_terrain
 from legged.robot import Robot
+from legged.robot_model import FLOOR
 from legged.terrain import Terrain
 
-FLOOR = "floor"
-"""The ground's geom, where it is a plane or stands for a height map that mujoco-warp does not collide with itself."""
 UNTOUCHED = 1 << 30
 """A collision type that nothing collides with, of a shape that is no mere decoration."""
 GroundShapes = Literal["exact", "height_field", "none"]
 
 
+ROBOT, GROUND = 1, 2
+"""Collision types: a bit each of MuJoCo's contype and conaffinity."""
+
+
 def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
-    """The robot alone; with `self_collisions` its shapes touch each other, except those of neighbouring bodies."""
+    """The robot alone. Whatever its file says, its shapes meet the ground, and each other only with `self_collisions`, except
+    those of neighbouring bodies; and contacts take the friction of the robot, which is what randomisation changes.
+    """
     spec = mujoco.MjSpec.from_file(str(robot.model_path))
-    if self_collisions:
-        for geom in spec.geoms:
-            if geom.name in robot.contact_names:
-                geom.conaffinity |= geom.contype
+    for geom in spec.geoms:
+        if geom.name in robot.contact_names:
+            geom.contype, geom.conaffinity = ROBOT, GROUND | ROBOT if self_collisions else GROUND
+            if geom.priority < 1:  # else MuJoCo takes the larger friction of the two shapes
+                geom.priority, geom.condim = 1, max(geom.condim, 3)
+    if not self_collisions:
+        for pair in list(spec.pairs):  # they touch whatever their types are
+            spec.delete(pair)
+    spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
     return spec
+
+
+def robot_source(robot: Robot, self_collisions: bool) -> str:
+    """The robot as MJCF for an engine that reads it by itself: the file, or a text where `robot_spec` changes it."""
+    own = mujoco.MjSpec.from_file(str(robot.model_path))
+    before = {geom.name: _contact_settings(geom) for geom in own.geoms}
+    spec = robot_spec(robot, self_collisions)
+    if all(before[geom.name] == _contact_settings(geom) for geom in spec.geoms) and len(own.pairs) == len(spec.pairs):
+        return str(robot.model_path)
+    for folder in ("meshdir", "texturedir"):
+        setattr(spec, folder, str((robot.model_path.parent / getattr(spec, folder)).resolve()))
+    return str(spec.to_xml())
+
+
+def _contact_settings(geom: mujoco.MjsGeom) -> tuple[int, int, int, int]:
+    return geom.contype, geom.conaffinity, geom.priority, geom.condim
 
 
 def build_model(
@@ -59,8 +85,8 @@ def build_model(
             name=FLOOR,
             type=mujoco.mjtGeom.mjGEOM_PLANE,
             size=[0, 0, 1],
-            contype=2 if touches else UNTOUCHED,
-            conaffinity=1 if touches else 0,
+            contype=GROUND if touches else UNTOUCHED,
+            conaffinity=ROBOT if touches else 0,
             group=0,
         )
     elif ground == "height_field":

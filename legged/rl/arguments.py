@@ -10,7 +10,7 @@ import torch
 from legged.config import parse_override
 from legged.errors import ConfigError, RunError
 from legged.ranks import Ranks
-from legged.registry import import_tasks
+from legged.registry import YAML_ENDINGS, import_tasks, register_file
 from legged.startup import is_a_command
 
 EXIT_STOPPED, EXIT_WRONG_INPUT = 1, 2
@@ -18,7 +18,7 @@ EXIT_STOPPED, EXIT_WRONG_INPUT = 1, 2
 
 def add_task_arguments(parser: argparse.ArgumentParser) -> None:
     """--task, --import, engine and devices, and free `key=value` overrides."""
-    parser.add_argument("--task", required=True, help="name of the task, e.g. anymal_c_flat")
+    parser.add_argument("--task", required=True, help="name of the task, e.g. anymal_c_flat, or a YAML file")
     parser.add_argument("--import", dest="module", help="module or .py file that registers tasks of your own")
     parser.add_argument("--num_envs", type=int, help="number of robots (env.num_envs)")
     parser.add_argument("--seed", type=int, help="random seed (env.seed)")
@@ -133,6 +133,9 @@ def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = N
 
 
 def import_and_check(args: argparse.Namespace) -> None:
-    """Let the user's module register its tasks, if one was named."""
+    """Let the user's module register its tasks, if one was named; a file given as --task becomes a task."""
     if args.module:
         import_tasks(args.module)
+    args.given_task = args.task  # what another process would have to be given
+    if args.task.endswith(YAML_ENDINGS):
+        args.task = register_file(args.task)

@@ -5,6 +5,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.envs import LeggedRobot
+from legged.errors import ConfigError
 
 SIGNS = {"vector": (1.0, -1.0, 1.0), "rotation": (-1.0, 1.0, -1.0), "command": (1.0, -1.0, -1.0)}
 """Kind of term -> signs of its three numbers. A rotation is a pseudo-vector: it keeps its y."""
@@ -14,7 +15,11 @@ class MirrorImages:
     """Columns and signs under which observations and actions of a task turn into those of its mirrored robot."""
 
     def __init__(self, task: LeggedRobot) -> None:
-        """The configuration is checked already: the robot has a mirror, and so has every term."""
+        """The configuration is checked already: the robot has a mirror, and so has every term, of a known kind.
+
+        Raises:
+            ConfigError: a term is not as wide as its kind in `MIRRORED` says.
+        """
         assert task.robot.mirror is not None
         self._task, self._robot = task, task.robot.mirror
         self.groups = {name: self._group(name) for name in task.observation_groups}
@@ -34,18 +39,30 @@ class MirrorImages:
         """Of a term that lies at the columns from `start` on."""
         device = self._task.device
         kind = self._task.MIRRORED[name]
-        columns, signs = torch.arange(width), torch.ones(width)
+        columns, signs = self._images_of(kind, width)
+        if len(columns) != width:
+            task = type(self._task).__name__
+            raise ConfigError(
+                f"{task}.MIRRORED: observation '{name}' has {width} numbers, but its kind '{kind}' is for {len(columns)}"
+            )
+        return (columns + start).to(device), signs.to(device)
+
+    def _images_of(self, kind: str, width: int) -> tuple[Tensor, Tensor]:
+        """Columns and signs of a kind of term, of as many numbers as the kind has; `same` takes any `width`."""
         if kind in SIGNS:
-            signs = torch.tensor(SIGNS[kind])
-        elif kind == "joints":
-            columns, signs = torch.tensor(self._robot.joints), torch.tensor(self._robot.signs)
+            return torch.arange(len(SIGNS[kind])), torch.tensor(SIGNS[kind])
+        if kind == "joints":
+            return torch.tensor(self._robot.joints), torch.tensor(self._robot.signs)
+        if kind == "same":
+            columns = torch.arange(width)
         elif kind == "feet":
             columns = torch.tensor(self._robot.feet)
         elif kind == "heights":
             points = self._task.height_scan.points.cpu()
-            apart = torch.cdist(points, points * torch.tensor([1.0, -1.0]))
-            columns = apart.argmin(dim=1)
-        return (columns + start).to(device), signs.to(device)  # type: ignore[arg-type]
+            columns = torch.cdist(points, points * torch.tensor([1.0, -1.0])).argmin(dim=1)
+        else:
+            raise ValueError(f"there is no way to mirror '{kind}'")
+        return columns, torch.ones(len(columns))
 
 
 def augment(env: LeggedRobot, obs: TensorDict | None, actions: Tensor | None) -> tuple[TensorDict | None, Tensor | None]:

@@ -12,6 +12,16 @@ import numpy as np
 
 HOLE_DEPTH = 1.0
 """Depth of gaps and of the space between stepping stones: more than a leg's length [m]."""
+TREAD = 0.31
+"""Width of a step of stairs [m]."""
+SMALLEST_BLOCK = 1.0
+"""Shortest side of an obstacle [m]."""
+JOINT = 0.1
+"""Gap between two stepping stones [m]."""
+WAVE = 2.0
+"""Length of a wave [m]."""
+NARROWEST_DITCH = 0.5
+"""Cells must not be larger than this for a ditch whose width grows to 1 m [m]."""
 
 
 @dataclass(frozen=True)
@@ -66,9 +76,9 @@ def bumps(tile: Tile, amplitude: float, step: float = 0.005, spacing: float = 0.
     return np.array([np.interp(y, np.arange(counts[1]), row) for row in along])
 
 
-def stairs(tile: Tile, riser: float, platform: float = 3.0, tread: float = 0.31) -> None:
+def stairs(tile: Tile, riser: float, platform: float = 3.0, tread: float = TREAD) -> None:
     """Rings of steps up to a platform in the middle (down, for a negative riser). The tread is cut to whole cells."""
-    width, across = tile.cells(tread), tile.cells(platform)
+    width, across = max(1, tile.cells(tread)), tile.cells(platform)
     first = 0
     while min(tile.heights.shape) - 2 * first > across:
         first += width
@@ -78,7 +88,7 @@ def stairs(tile: Tile, riser: float, platform: float = 3.0, tread: float = 0.31)
 def obstacles(tile: Tile, height: float, platform: float = 3.0, count: int = 20) -> None:
     """Rectangular blocks and pits of 1 to 2 m, as high or deep as `height` or half of it, anywhere but in the middle."""
     rows, columns = tile.heights.shape
-    sides = [tile.cells(0.1 * tenths) for tenths in range(10, 20, 4)]
+    sides = [max(1, tile.cells(0.1 * tenths)) for tenths in range(10, 20, 4)]
     for _ in range(count):
         length, width = tile.rng.choice(sides, 2)
         x = tile.rng.integers(0, max(1, rows - length))
@@ -87,9 +97,9 @@ def obstacles(tile: Tile, height: float, platform: float = 3.0, count: int = 20)
     tile.heights[tile.middle(platform)] = 0.0
 
 
-def stepping_stones(tile: Tile, stone: float, platform: float = 4.0, gap: float = 0.1) -> None:
+def stepping_stones(tile: Tile, stone: float, platform: float = 4.0, gap: float = JOINT) -> None:
     """Square stones of side `stone`, in rows shifted against each other, with gaps around them."""
-    side, between = max(1, tile.cells(stone)), tile.cells(gap)
+    side, between = max(1, tile.cells(stone)), max(1, tile.cells(gap))
     rows, columns = tile.heights.shape
     tile.heights[:] = -HOLE_DEPTH
     for x in range(0, rows, side + between):
@@ -109,7 +119,7 @@ def pit(tile: Tile, depth: float, platform: float = 4.0) -> None:
     tile.heights[tile.middle(platform)] = -depth
 
 
-def waves(tile: Tile, amplitude: float, length: float = 2.0) -> None:
+def waves(tile: Tile, amplitude: float, length: float = WAVE) -> None:
     """Sine waves in both directions, level at the tile's edge: heights from -amplitude to amplitude."""
     x, y = ((np.arange(n) + 0.5) * tile.cell for n in tile.heights.shape)
     pattern = np.sin(2.0 * np.pi * x[:, None] / length) + np.sin(2.0 * np.pi * y[None, :] / length)
@@ -136,6 +146,8 @@ class TerrainType:
     """Made of steps with vertical faces, not of slopes."""
     platform: float = 3.0
     """Side of the level square in the middle [m]."""
+    finest: tuple[float, str] | None = None
+    """Length of the smallest part that a tile is made of [m], and its name; cells must not be larger."""
 
 
 def _angle(difficulty: float) -> float:
@@ -147,20 +159,30 @@ def _riser(difficulty: float) -> float:
     return 0.05 + 0.18 * difficulty
 
 
+OF_WAVES, OF_STAIRS = (WAVE / 4, "quarter of a wave"), (TREAD, "tread of a step")
+OF_BLOCKS, OF_STONES = (SMALLEST_BLOCK, "side of a block"), (JOINT, "gap between two stones")
+OF_DITCH = (NARROWEST_DITCH, "width of a ditch")
+
 TERRAIN_TYPES: dict[str, TerrainType] = {
     "flat": TerrainType(flat, lambda d: 0.0, "m", "height", stepped=False, platform=0.0),
     "slope_up": TerrainType(lambda t, s: slope(t, -s), _angle, "degrees", "angle", stepped=False),
     "slope_down": TerrainType(slope, _angle, "degrees", "angle", stepped=False),
     "rough_slope_up": TerrainType(lambda t, s: rough_slope(t, -s), _angle, "degrees", "angle", stepped=False),
     "rough_slope_down": TerrainType(rough_slope, _angle, "degrees", "angle", stepped=False),
-    "waves": TerrainType(waves, lambda d: 0.2 * d, "m", "amplitude", stepped=False, platform=0.0),
-    "stairs_up": TerrainType(lambda t, s: stairs(t, -s), _riser, "m", "step height", stepped=True),
-    "stairs_down": TerrainType(stairs, _riser, "m", "step height", stepped=True),
-    "obstacles": TerrainType(obstacles, lambda d: 0.05 + 0.2 * d, "m", "height", stepped=True),
+    "waves": TerrainType(waves, lambda d: 0.2 * d, "m", "amplitude", stepped=False, platform=0.0, finest=OF_WAVES),
+    "stairs_up": TerrainType(lambda t, s: stairs(t, -s), _riser, "m", "step height", stepped=True, finest=OF_STAIRS),
+    "stairs_down": TerrainType(stairs, _riser, "m", "step height", stepped=True, finest=OF_STAIRS),
+    "obstacles": TerrainType(obstacles, lambda d: 0.05 + 0.2 * d, "m", "height", stepped=True, finest=OF_BLOCKS),
     "stepping_stones": TerrainType(
-        stepping_stones, lambda d: 1.5 * (1.05 - d), "m", "stone size", stepped=True, platform=4.0
+        stepping_stones,
+        lambda d: 1.5 * (1.05 - d),
+        "m",
+        "stone size",
+        stepped=True,
+        platform=4.0,
+        finest=OF_STONES,
     ),
-    "gap": TerrainType(gap, lambda d: 1.0 * d, "m", "width", stepped=True),
+    "gap": TerrainType(gap, lambda d: 1.0 * d, "m", "width", stepped=True, finest=OF_DITCH),
     "pit": TerrainType(pit, lambda d: 1.0 * d, "m", "depth", stepped=True, platform=4.0),
 }
 """Every type, by the name under which `terrain.proportions` asks for it."""

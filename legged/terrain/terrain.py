@@ -16,6 +16,8 @@ SPAWN_SQUARE = 2.0
 """Robots start at the height of the highest point in a square of this side in the middle of their tile [m]."""
 EDGE = 1.0
 """Robots closer than this to the end of the map have left it [m]."""
+MOST_TILES = 10_000
+"""Each of them is made and laid out by itself."""
 MOST_CELLS = 2**24
 """As many as float32 can number, which the height scan does."""
 
@@ -141,6 +143,11 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
                 " ask for more columns or leave the type out"
             )
         kind = TERRAIN_TYPES[name]
+        if share > 0.0 and kind.finest is not None and cfg.horizontal_scale > kind.finest[0] * (1.0 + 1e-6):
+            raise ConfigError(
+                f"{where('horizontal_scale')}: cells of {cfg.horizontal_scale:g} m are larger than the {kind.finest[1]} of"
+                f" '{name}', {kind.finest[0]:g} m (proportions.{name}: {origins.of(f'terrain.proportions.{name}')})"
+            )
         side = min(cfg.terrain_length, cfg.terrain_width)
         if share > 0.0 and side <= kind.platform:
             short = "terrain_length" if cfg.terrain_length <= cfg.terrain_width else "terrain_width"
@@ -161,6 +168,14 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
         )
     if cfg.border_size < 2.0 * EDGE:
         raise ConfigError(f"{where('border_size')}: must be at least {2.0 * EDGE:g}, got {cfg.border_size:g}")
+    if cfg.horizontal_scale > min(side, SPAWN_SQUARE):
+        limit = f"a tile of {side:g} m" if side < SPAWN_SQUARE else f"the {SPAWN_SQUARE:g} m square in which robots start"
+        raise ConfigError(f"{where('horizontal_scale')}: cells of {cfg.horizontal_scale:g} m are larger than {limit}")
+    if cfg.num_rows * cfg.num_cols > MOST_TILES:
+        raise ConfigError(
+            f"{where('num_rows')}: {among('num_rows')} times {among('num_cols')} are {cfg.num_rows * cfg.num_cols:,} tiles,"
+            f" more than {MOST_TILES:,}"
+        )
     tiles = (cfg.num_rows * cfg.terrain_length, cfg.num_cols * cfg.terrain_width)
     x, y = (size + 2.0 * cfg.border_size for size in tiles)
     cells = x * y / cfg.horizontal_scale**2

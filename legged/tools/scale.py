@@ -96,8 +96,8 @@ def measure_apart(args: argparse.Namespace, size: int, loop: str) -> dict[str, A
 
 def arguments(args: argparse.Namespace) -> Sequence[str]:
     """The command line of `args`, without what is different for each size."""
-    named = ("task", "seed", "sim_device", "steps", "repeats", "iterations")
-    flags = [(f"--{name}", getattr(args, name)) for name in named] + [("--import", args.module)]
+    named = ("seed", "sim_device", "steps", "repeats", "iterations")
+    flags = [(f"--{name}", getattr(args, name)) for name in named] + [("--task", args.given_task), ("--import", args.module)]
     texts = [text for flag, value in flags if value is not None for text in (flag, str(value))]
     return [*texts, *(["--no-graph"] if args.no_graph else []), *args.overrides]
 

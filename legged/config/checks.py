@@ -1,0 +1,208 @@
+"""Plain values -> an instance of a schema, field by field; every mistake is an error that names who set it and its path."""
+
+import dataclasses
+import functools
+import math
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, TypeVar, Union
+
+from legged.config.bounds import FLOAT32_MAX
+from legged.config.origins import Origins
+from legged.errors import ConfigError, suggest
+
+T = TypeVar("T")
+
+LONGEST_NAME = 100
+"""Letters of a name that becomes a folder."""
+DEEPEST = 30
+"""Sections and lists inside each other, in the free space of a configuration."""
+SHOWN = 80
+"""Letters of a value that an error shows."""
+PLAIN = "a plain name: no path separators, not '..', no leading '.', no control characters, at most 100 letters"
+
+
+@functools.cache
+def hints_of(schema: type) -> dict[str, Any]:
+    """Field -> type of a dataclass."""
+    return typing.get_type_hints(schema)
+
+
+def shown(value: Any) -> str:
+    """A value as an error shows it: on one line, and not endless."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python writes no integer of more than 4300 digits
+        return f"a whole number of {value.bit_length()} bits" if isinstance(value, int) else type(value).__name__
+    text = " ".join(text.split())
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}... ({len(text)} letters)"
+
+
+def plain_path(key: Any) -> str:
+    """A key as part of a dotted path in an error: on one line, and not endless."""
+    return key if isinstance(key, str) and key and key.isprintable() and len(key) <= SHOWN else shown(key)
+
+
+def is_plain_name(name: str) -> bool:
+    """Whether `name` can be that of a folder inside another one, on every system."""
+    if not name or not name.isprintable() or name.startswith(".") or name != name.strip():
+        return False
+    return not any(mark in name for mark in "/\\") and len(name) <= LONGEST_NAME and len(name.encode()) <= 2 * LONGEST_NAME
+
+
+def build(schema: type[T], data: Any, path: str, origins: Origins, source: str) -> T:
+    """An instance of the dataclass `schema` from a mapping, checked field by field.
+
+    Raises:
+        ConfigError: an unknown key, a wrong type, or a value beyond its bounds.
+    """
+    where = f"{_origin(path, origins, source)}: {path or 'top level'}"
+    if not isinstance(data, Mapping):
+        raise ConfigError(f"{where}: expected a mapping with keys of {schema.__name__}, got {shown(data)}")
+    fields = {f.name: f for f in dataclasses.fields(schema) if f.compare}  # type: ignore[arg-type]
+    hints = hints_of(schema)  # type: ignore[arg-type]
+    values: dict[str, Any] = {}
+    for key, value in data.items():
+        shown_key = plain_path(key)
+        dotted = f"{path}.{shown_key}" if path else shown_key
+        if key not in fields:
+            known = suggest(shown_key, fields)
+            raise ConfigError(f"{_origin(dotted, origins, source)}: {dotted}: unknown key {shown(key)}{known}")
+        if dataclasses.is_dataclass(hints[key]):
+            values[key] = build(hints[key], value, dotted, origins, source)  # type: ignore[arg-type]
+            continue
+        checked = _check(hints[key], value, dotted, origins, source)
+        if fields[key].metadata:
+            _check_bounds(checked, fields[key].metadata, dotted, f"{_origin(dotted, origins, source)}: ")
+        if typing.get_origin(hints[key]) is dict:  # maps merge with the schema's default entries
+            factory = fields[key].default_factory
+            checked = {**(factory() if callable(factory) else {}), **checked}
+        values[key] = checked
+    return schema(**values)
+
+
+def _origin(path: str, origins: Origins, source: str) -> str:
+    """Who gave the value at `path`; `source` where nobody in particular did."""
+    return origins.of(path) if path and origins else source
+
+
+def _check(kind: Any, value: Any, path: str, origins: Origins, source: str) -> Any:
+    """`value` as `kind`, or ConfigError. Integers count as floats, lists as tuples; nothing else is converted."""
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+
+    def fail(expected: str) -> ConfigError:
+        return ConfigError(f"{_origin(path, origins, source)}: {path}: expected {expected}, got {shown(value)}")
+
+    if kind is Any:
+        return _check_free(value, fail)
+    if origin is Literal:
+        if not isinstance(value, str) or value not in args:
+            known = suggest(value if isinstance(value, str) else shown(value), args)
+            raise ConfigError(f"{_origin(path, origins, source)}: {path}: unknown value {shown(value)}{known}")
+        return value
+    if origin in (Union, types.UnionType):
+        if value is None and type(None) in args:
+            return None
+        return _check(next(a for a in args if a is not type(None)), value, path, origins, source)
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise fail("a list")
+        if len(args) == 2 and args[1] is Ellipsis:
+            return tuple(_check(args[0], v, f"{path}[{i}]", origins, source) for i, v in enumerate(value))
+        if len(value) != len(args):
+            raise fail(f"a list of {len(args)} numbers")
+        checked = tuple(_check(args[i], v, f"{path}[{i}]", origins, source) for i, v in enumerate(value))
+        if args == (float, float) and checked[0] > checked[1]:
+            raise fail("[low, high] with low <= high")
+        return checked
+    if origin is dict:
+        if not isinstance(value, Mapping):
+            raise fail("a mapping")
+        for key in value:
+            if not isinstance(key, str):
+                raise fail(f"text for a key, not {shown(key)}")
+        return {k: _check(args[1], v, f"{path}.{plain_path(k)}", origins, source) for k, v in value.items()}
+    if kind is bool:
+        if not isinstance(value, bool):
+            raise fail("true or false")
+    elif kind is int:
+        if not isinstance(value, int) or isinstance(value, bool):
+            raise fail("a whole number")
+    elif kind is float:
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            raise fail("a number")
+        return _number(value, fail)
+    elif kind is str:
+        if not isinstance(value, str):
+            raise fail("text")
+        return str.__str__(value)
+    return value
+
+
+def _number(value: float, fail: Any) -> float:
+    """A number that float32 holds."""
+    if value != value:
+        raise fail("a number")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if math.isinf(number):
+        raise fail(f"a finite number, at most {FLOAT32_MAX:g} in size")
+    return number  # the bounds of the field, which lie within float32, come next
+
+
+def _check_free(value: Any, fail: Any, depth: int = 0) -> Any:
+    """A value of the free space: whatever YAML can write and read, but no infinite number."""
+    if depth > DEEPEST:
+        raise fail(f"at most {DEEPEST} maps and lists inside each other")
+    if isinstance(value, Mapping):
+        for key in value:
+            if not isinstance(key, str | int):
+                raise fail(f"text for a key, not {shown(key)}")
+        return {key: _check_free(item, fail, depth + 1) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_check_free(item, fail, depth + 1) for item in value]
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        if value != value or not abs(value) <= FLOAT32_MAX:
+            raise fail(f"finite numbers, at most {FLOAT32_MAX:g} in size")
+        return int(value) if isinstance(value, int) else float(value)  # NumPy's are not written as YAML
+    elif value is not None and not isinstance(value, bool | str):
+        raise fail("numbers, texts, true, false, null, lists and maps of them")
+    return value
+
+
+def _check_bounds(value: Any, bounds: Mapping[str, Any], path: str, origin: str) -> None:
+    """Holds a checked value, and all items in it, against the bounds of its field."""
+    if isinstance(value, tuple):
+        _check_length(value, bounds, f"{origin}{path}")
+        for i, item in enumerate(value):
+            _check_bounds(item, bounds, f"{path}[{i}]", origin)
+        return
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            _check_bounds(item, bounds, f"{path}.{plain_path(key)}", origin)
+        return
+    where = f"{origin}{path}"
+    if isinstance(value, str):
+        if "name" in bounds and value and not is_plain_name(value):
+            raise ConfigError(f"{where}: expected {PLAIN}; got {shown(value)}")
+        return
+    if "above" in bounds and value <= bounds["above"]:
+        raise ConfigError(f"{where}: must be above {bounds['above']}, got {shown(value)}")
+    if "min" in bounds and value < bounds["min"]:
+        raise ConfigError(f"{where}: must be at least {bounds['min']}, got {shown(value)}")
+    if "max" in bounds and value > bounds["max"]:
+        raise ConfigError(f"{where}: must be at most {bounds['max']}, got {shown(value)}")
+
+
+def _check_length(value: Sequence[Any], bounds: Mapping[str, Any], where: str) -> None:
+    if not value:
+        raise ConfigError(f"{where}: must not be empty")
+    if len(value) > bounds.get("items", len(value)):
+        raise ConfigError(f"{where}: must have at most {bounds['items']} items, got {len(value)}")
+    if bounds.get("unique"):
+        twice = next((item for i, item in enumerate(value) if item in value[:i]), None)
+        if twice is not None:
+            raise ConfigError(f"{where}: {shown(twice)} is named twice; each may come once")

@@ -1,0 +1,91 @@
+"""How a policy is trained: networks, PPO, length of training."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from legged.config.bounds import NAME, UNIT, between, items, positive
+
+HIDDEN = items(64, between(1, 16384))
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """Networks of actor and critic."""
+
+    actor_hidden_dims: tuple[int, ...] = field(default=(512, 256, 128), metadata=HIDDEN)
+    """Widths of the policy's hidden layers."""
+    critic_hidden_dims: tuple[int, ...] = field(default=(512, 256, 128), metadata=HIDDEN)
+    """Widths of the value function's hidden layers."""
+    activation: Literal["elu", "selu", "relu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish"] = "elu"
+    """Activation function, by rsl-rl's names."""
+    init_noise_std: float = field(default=1.0, metadata=positive(1000, low=1e-6))
+    """Standard deviation of the actions before training."""
+    obs_normalization: bool = False
+    """Normalise observations by running mean and variance."""
+
+
+@dataclass(frozen=True)
+class AlgorithmConfig:
+    """PPO, by rsl-rl's names."""
+
+    value_loss_coef: float = field(default=1.0, metadata=between(0, 1000))
+    """Weight of the value function's error in the loss."""
+    use_clipped_value_loss: bool = True
+    """Clip the change of the value function by clip_param, as that of the policy."""
+    clip_param: float = field(default=0.2, metadata=positive(100, low=1e-6))
+    """How far the ratio of new to old probability may leave 1 before it is clipped."""
+    entropy_coef: float = field(default=0.01, metadata=between(0, 100))
+    """Weight of the entropy in the loss: a larger one keeps exploration up."""
+    num_learning_epochs: int = field(default=5, metadata=between(1, 1000))
+    """Passes over the samples of an iteration."""
+    num_mini_batches: int = field(default=4, metadata=between(1, 1_000_000))
+    """Parts into which the samples are split; each gives one step of the optimiser."""
+    learning_rate: float = field(default=1e-3, metadata=positive(1, low=1e-12))
+    """Step size of Adam; where `adaptive` starts from."""
+    schedule: Literal["adaptive", "fixed"] = "adaptive"
+    """`adaptive` changes the learning rate so that the policy changes by desired_kl; `fixed` leaves it."""
+    gamma: float = field(default=0.99, metadata=UNIT)
+    """Discount of rewards, per control step."""
+    lam: float = field(default=0.95, metadata=UNIT)
+    """Lambda of generalised advantage estimation."""
+    desired_kl: float = field(default=0.01, metadata=positive(100))
+    """KL divergence between two policies in a row that `adaptive` aims at."""
+    max_grad_norm: float = field(default=1.0, metadata=positive(1e9))
+    """Norm at which gradients are clipped."""
+    use_mixed_precision: bool = False
+    """Networks compute in bfloat16 while they learn; weights, losses and the optimiser stay float32."""
+    symmetry: bool = False
+    """Learn from every sample also as its mirror image, left for right (Mittal et al., arXiv 2403.04359)."""
+
+
+@dataclass(frozen=True)
+class RunnerConfig:
+    """Length of training and what it writes."""
+
+    num_steps_per_env: int = field(default=24, metadata=between(1, 100_000))
+    """Control steps per robot and iteration."""
+    max_iterations: int = field(default=1500, metadata=between(1, 1_000_000_000))
+    """Iterations of the whole training; a resumed run goes on up to this number."""
+    save_interval: int = field(default=50, metadata=between(1, 1_000_000_000))
+    """Iterations between two checkpoints."""
+    loop: Literal["stock", "captured"] = "captured"
+    """`captured`: rsl-rl's arithmetic without the host in between, on a GPU as CUDA graphs; it falls back to `stock` where
+    a feature needs that, and says why. `stock`: rsl-rl's own training loop."""
+    matmul: Literal["float32", "tf32"] = "tf32"
+    """Matrix products of the networks on a GPU while training; `tf32` keeps 10 of the factors' 23 bits and is faster."""
+    experiment_name: str = field(default="", metadata=NAME)
+    """Folder under logs/; the task's name when empty."""
+    run_name: str = field(default="", metadata=NAME)
+    """Appended to the run folder's date and time."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything the learner needs."""
+
+    policy: PolicyConfig = PolicyConfig()
+    """Networks."""
+    algorithm: AlgorithmConfig = AlgorithmConfig()
+    """Settings of PPO."""
+    runner: RunnerConfig = RunnerConfig()
+    """Length of training, checkpoints and names."""

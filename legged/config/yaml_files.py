@@ -1,0 +1,146 @@
+"""YAML texts -> plain values; whatever is wrong with a file is one line that names it, and the line in it."""
+
+import contextlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from legged.config.checks import shown
+from legged.errors import ConfigError
+
+MOST_BYTES = 250_000
+"""Size of the largest file that is read; a whole configuration has 6000, and PyYAML takes seconds for this one."""
+DEEPEST = 40
+"""Maps and lists inside each other."""
+MOST_VALUES = 100_000
+"""Values in a file once its aliases are written out; a few lines of aliases of aliases can stand for billions."""
+
+
+class _Loader(yaml.SafeLoader):
+    """SafeLoader that reads `1e-4` as a number (YAML 1.1 wants a dot), knows merge keys `<<`, and refuses a key given twice
+    and what would take forever to read.
+    """
+
+    def get_single_node(self) -> yaml.Node | None:
+        self._sizes: dict[int, tuple[int, int] | None] = {}
+        node: yaml.Node | None = super().get_single_node()
+        if node is not None:
+            self._measure(node)
+        return node
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """As the parser's own, which would recurse as deep as the text says."""
+        self._depth = getattr(self, "_depth", 0) + 1
+        if self._depth > DEEPEST:
+            raise yaml.MarkedYAMLError(problem=f"more than {DEEPEST} blocks inside each other", problem_mark=self.get_mark())
+        try:
+            return super().compose_node(parent, index)  # type: ignore[no-any-return]
+        finally:
+            self._depth -= 1
+
+    def _measure(self, node: yaml.Node) -> tuple[int, int]:
+        """How many values a node stands for, and how deep they lie, with aliases written out."""
+        if isinstance(node, yaml.ScalarNode):
+            return 1, 1
+        if id(node) in self._sizes:
+            known = self._sizes[id(node)]
+            if known is None:
+                self._refuse("an anchor refers to itself", node)
+            return known  # type: ignore[return-value]
+        self._sizes[id(node)] = None
+        inner = [part for pair in node.value for part in pair] if isinstance(node, yaml.MappingNode) else node.value
+        parts = [self._measure(part) for part in inner]
+        size, depth = 1 + sum(part[0] for part in parts), 1 + max((part[1] for part in parts), default=0)
+        if size > MOST_VALUES or depth > DEEPEST:
+            self._refuse(f"aliases stand for more than {MOST_VALUES} values, or {DEEPEST} blocks inside each other", node)
+        self._sizes[id(node)] = size, depth
+        if isinstance(node, yaml.MappingNode):
+            self._refuse_key_given_twice(node)
+        return size, depth
+
+    def _refuse_key_given_twice(self, node: yaml.MappingNode) -> None:
+        """Checked before merge keys are put in place, whose keys a block may give again."""
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if (key.tag, key.value) in seen:
+                    line = node.start_mark.line + 1
+                    raise ConfigError(f"{self.name}: key '{key.value}' is given twice in the block from line {line}")
+                seen.add((key.tag, key.value))
+
+    def _refuse(self, problem: str, node: yaml.Node) -> None:
+        raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
+
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """As the constructor's own; numbers and dates that are none are an error with a line."""
+        try:
+            return super().construct_object(node, deep)
+        except (ValueError, OverflowError) as error:
+            if isinstance(error, ConfigError):
+                raise
+            what = shown(node.value) if isinstance(node, yaml.ScalarNode) else "a value"
+            raise yaml.MarkedYAMLError(problem=f"{what} cannot be read ({error})", problem_mark=node.start_mark) from error
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+$"),
+    list("-+.0123456789"),
+)
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping in a YAML file.
+
+    Raises:
+        ConfigError: the file is missing, too large, malformed, or no mapping.
+    """
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(MOST_BYTES + 1)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+    if len(content) > MOST_BYTES:
+        raise ConfigError(f"{path}: is no configuration: it is larger than {MOST_BYTES:,} bytes")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise ConfigError(f"{path}: not valid YAML: line {line} is not text in UTF-8") from error
+    data = parse(text, str(path))
+    if data is None:
+        return {}
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: expected a mapping of sections, got {type(data).__name__}")
+    return data
+
+
+def parse(text: str, source: str) -> Any:
+    """The value that a YAML text stands for; `source` says whose it is.
+
+    Raises:
+        ConfigError: it is malformed, refers to itself, or is too large once its aliases are written out.
+    """
+    with _as_one_line(source):
+        loader = _Loader(text)
+        loader.name = source
+        try:
+            return loader.get_single_data()
+        finally:
+            loader.dispose()
+
+
+@contextlib.contextmanager
+def _as_one_line(source: str) -> Iterator[None]:
+    try:
+        yield
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        where = f" (line {mark.line + 1}, column {mark.column + 1})" if mark else ""
+        text = ", ".join(part for part in (error.context, error.problem) if part)
+        raise ConfigError(f"{source}: not valid YAML: {' '.join(text.split())}{where}") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{source}: not valid YAML: {' '.join(str(error).split())}") from error

@@ -1,0 +1,73 @@
+"""Modules of users, which register their tasks: how they are found and run, and how their mistakes are reported."""
+
+import importlib
+import importlib.util
+import sys
+import traceback
+from pathlib import Path
+
+from legged.config.checks import plain_path, shown
+from legged.errors import ConfigError
+from legged.paths import exists
+
+_IMPORTED: set[str] = set()
+"""Names of the modules that were run from files."""
+
+
+def import_tasks(name: str) -> None:
+    """Run a user's module, 'my_tasks' or 'path/my_tasks.py', so that it registers its tasks. What lies beside it can be
+    imported from it.
+
+    Raises:
+        ConfigError: it can't be found, or it fails.
+    """
+    path = Path(name)
+    is_file = path.suffix == ".py"
+    if is_file and not (exists(path) and path.is_file()):
+        raise ConfigError(f"--import: there is no file {shown(name)}")
+    folder = str(path.resolve().parent if is_file else Path.cwd())
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    before = set(sys.modules)
+    try:
+        _run(path) if is_file else importlib.import_module(name)
+    except (Exception, SystemExit) as error:
+        for module in set(sys.modules) - before:  # half of a module is none
+            file = getattr(sys.modules[module], "__file__", None)
+            if file and str(Path(file).parent) == folder:
+                del sys.modules[module]
+        raise _described(name, is_file, folder, error) from error
+
+
+def _run(path: Path) -> None:
+    """Run a file as the module of its name."""
+    loaded = sys.modules.get(path.stem)
+    if loaded is not None and path.stem not in _IMPORTED:
+        file = getattr(loaded, "__file__", None) or "built in"
+        if file != str(path.resolve()):
+            raise ConfigError(f"a module '{path.stem}' is loaded already ({file}); give the file another name")
+    spec = importlib.util.spec_from_file_location(path.stem, path.resolve())
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module
+    _IMPORTED.add(path.stem)
+    spec.loader.exec_module(module)
+
+
+def _described(name: str, is_file: bool, folder: str, error: BaseException) -> ConfigError:
+    """What went wrong in the module `name`, or that there is none."""
+    if isinstance(error, ModuleNotFoundError) and not is_file and f"{name}.".startswith(f"{error.name}."):
+        return ConfigError(f"--import: there is no module {shown(name)} (a module name, or a path that ends in .py)")
+    text = " ".join(str(error.msg if isinstance(error, SyntaxError) else error).split())
+    kind = "" if isinstance(error, ConfigError) else f"{type(error).__name__}: "
+    return ConfigError(f"--import: {plain_path(name)}{_line(error, folder)}: {kind}{text}")
+
+
+def _line(error: BaseException, folder: str) -> str:
+    """' (file, line n)' of a mistake: where a file cannot be parsed, else the innermost line of a file in `folder`."""
+    if isinstance(error, SyntaxError) and error.filename:
+        return f" ({error.filename}, line {error.lineno})"
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename != __file__]
+    own = [frame for frame in frames if Path(frame.filename).is_relative_to(folder) and "importlib" not in frame.filename]
+    return f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
