@@ -1,5 +1,6 @@
 """Checkpoint files: written whole or not at all, and checked before anything is built from them."""
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -8,13 +9,14 @@ import torch
 from legged.config import TaskConfig
 from legged.envs import BaseTask
 from legged.errors import ConfigError
-from legged.paths import relative, replacing
+from legged.paths import relative, write_bytes
 
 
 def write_checkpoint(path: Path, saved: dict[str, Any]) -> None:
     """Write a checkpoint that is whole or not there."""
-    with replacing(path) as part:
-        torch.save(saved, part)
+    buffer = io.BytesIO()  # onto a full disk torch.save fails with a message that says nothing of it
+    torch.save(saved, buffer)
+    write_bytes(path, buffer.getbuffer())
 
 
 def read_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:

@@ -11,8 +11,8 @@ import onnxruntime
 import torch
 
 from legged.envs import LeggedRobot
+from legged.paths import write_text
 from legged.rl.runner import Runner
-from legged.rl.runs import write_text
 
 CHECKED_OBSERVATIONS = 1000
 LARGEST_DIFFERENCE = 1e-4

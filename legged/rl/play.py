@@ -1,6 +1,7 @@
 """See a policy walk, and export it: `python play.py --task anymal_c_flat`."""
 
 import argparse
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -123,3 +124,7 @@ def record(task: LeggedRobot, act: Callable[[TensorDict], Tensor], folder: Path 
         )
     video.write(gif)
     return table
+
+
+if __name__ == "__main__":
+    sys.exit(main())

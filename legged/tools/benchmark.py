@@ -26,13 +26,13 @@ from legged.config import override
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
 from legged.graph import StepGraph
+from legged.paths import write_text
 from legged.physics import resolve_physics
 from legged.registry import make_task, task_config
 from legged.rl.arguments import add_task_arguments, import_and_check, overrides, pick_device, run_main, settle_on
 from legged.rl.captured import CapturedRunner
 from legged.rl.display import Progress
 from legged.rl.runner import Runner
-from legged.rl.runs import write_text
 from legged.tools.kernel_times import kernel_times, table
 from legged.tools.scale import scale
 

@@ -12,10 +12,9 @@ from rich.table import Table
 
 from legged.config import override
 from legged.config.schema import NewtonSolver
-from legged.paths import relative
+from legged.paths import relative, write_text
 from legged.physics import engine_name
 from legged.rl.policy import TrainedPolicy
-from legged.rl.runs import write_text
 from legged.tools.tracking import ready_to_track, tell
 from legged.tools.velocity_grid import Grid, measure
 

@@ -20,7 +20,7 @@ from rich.table import Table
 
 from legged.config import override
 from legged.errors import ConfigError
-from legged.paths import relative, replacing
+from legged.paths import relative, replacing, write_text
 from legged.physics import engine_name
 from legged.rl.arguments import (
     add_run_arguments,
@@ -32,7 +32,6 @@ from legged.rl.arguments import (
     settle_on,
 )
 from legged.rl.policy import find_policy
-from legged.rl.runs import write_text
 from legged.tools.crossing import EVERYWHERE, cross
 from legged.tools.success import chosen_types, sweep
 from legged.tools.success_report import plot_success, print_success, with_other_engine

@@ -12,7 +12,7 @@ import sys
 from typing import Any
 
 from legged.errors import ConfigError
-from legged.paths import relative
+from legged.paths import relative, write_text
 from legged.physics import engine_name
 from legged.rl.arguments import (
     add_run_arguments,
@@ -25,7 +25,7 @@ from legged.rl.arguments import (
 )
 from legged.rl.checkpoint import read_checkpoint
 from legged.rl.policy import find_policy
-from legged.rl.runs import checkpoints, write_text
+from legged.rl.runs import checkpoints
 from legged.tools.tracking import ready_to_track, tell
 from legged.tools.velocity_grid import Grid, measure
 
