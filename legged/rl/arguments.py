@@ -14,6 +14,7 @@ from legged.errors import ConfigError, RunError
 from legged.paths import full_disk_in, reason
 from legged.ranks import Ranks
 from legged.registry import import_tasks
+from legged.rl.engine_warnings import told_once
 from legged.rl.output import forgiving_output
 from legged.startup import INTERRUPTED, is_a_command, leave_at_interrupts, raise_at_interrupts
 
@@ -134,7 +135,7 @@ def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = N
     if argv is None:
         is_a_command()
         raise_at_interrupts()
-    with forgiving_output() as output:
+    with forgiving_output() as output, told_once():
         leaves = None
         try:
             code = _guarded(main, argv)
