@@ -148,3 +148,15 @@ def ready_to_write(folder: Path, megabytes: float = 1.0) -> None:
             probe.write(bytes(2**16))  # a quota says no only now
     except OSError as error:
         raise RunError(f"{relative(folder)}: cannot write there: {reason(error)}") from error
+
+
+def ready_to_write_file(flag: str, path: Path, megabytes: float = 1.0) -> None:
+    """Check as `ready_to_write` that the file `path`, which was asked for by `flag`, can be written.
+
+    Raises:
+        ConfigError: it is a folder, or can't lie where it should.
+        RunError: it can't be written there.
+    """
+    if path.is_dir() or not path.name:
+        raise ConfigError(f"{flag}: {path} is a folder; the name of a file is wanted")
+    ready_to_write(path.parent, megabytes)

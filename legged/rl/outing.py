@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import torch
+from rich.markup import escape
 from rich.table import Table
 from tensordict import TensorDict
 from torch import Tensor
@@ -77,5 +78,5 @@ def _table(tracking: Tracking, playground: Playground, num_envs: int, speed: flo
     for kind, label in playground.labels().items():
         robots = torch.tensor([own == kind for own in kinds], device=tracking.steps.device)
         if robots.any():
-            table.add_row(label, str(int(robots.sum())), *tracking.row(robots))
+            table.add_row(escape(label), str(int(robots.sum())), *tracking.row(robots))
     return table

@@ -6,6 +6,7 @@ from typing import Any, get_args
 
 import matplotlib
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from legged.config.schema import NewtonSolver
@@ -34,7 +35,7 @@ def print_success(success: dict[str, Any]) -> None:
     """One line a point; sizes beyond those of training are marked."""
     rule = success["definition"]
     head = f"success: {rule['distance_m']:g} m from the start within {rule['time_s']:g} s, asked for {rule['vx']:g} m/s"
-    table = Table(title=head, title_justify="left")
+    table = Table(title=escape(head), title_justify="left")
     for name in ("terrain", "size", "success", "95 % interval", "fell", "stuck", "time to success"):
         table.add_column(name, justify="left" if name == "terrain" else "right")
     beyond = False
@@ -44,7 +45,7 @@ def print_success(success: dict[str, Any]) -> None:
             beyond |= mark
             time_s = point["mean_time_s"]
             table.add_row(
-                name if i == 0 else "",
+                escape(name) if i == 0 else "",
                 f"{point['size']:g} {entry['unit']}{' *' if mark else '  '}",
                 f"{point['successes']}/{point['robots']} = {100 * point['share']:.0f} %",
                 f"{100 * point['low']:.0f} to {100 * point['high']:.0f} %",
