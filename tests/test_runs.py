@@ -216,3 +216,10 @@ def test_somebody_elses_repository_is_not(installed, place):
 def test_without_git_that_is_said(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     assert code_state().splitlines()[1:] == ["git is not on the PATH: the commit is not known"]
+
+
+@pytest.mark.parametrize("name", ["", " ", "long" * 100, "zero\0byte", "../..", "*"])
+def test_a_run_of_an_odd_name_is_not_there(name):
+    tiny_run(iterations=1)
+    with pytest.raises(ConfigError, match="there is no run") if name != "../.." else pytest.raises(ConfigError):
+        runs.run_config(runs.find_run(small_config(), name))

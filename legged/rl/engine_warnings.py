@@ -20,7 +20,7 @@ def told_once() -> Iterator[None]:
         kind = re.sub(r"\d+", "#", text)
         if kind not in told:
             told.add(kind)
-            print(f"warning: MuJoCo: {text}", file=sys.stderr, flush=True)
+            sys.stderr.write(f"warning: MuJoCo: {text}\n")  # at once: the engine warns from several threads
 
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(tell)

@@ -145,8 +145,9 @@ def find_run(cfg: TaskConfig, load_run: str | None) -> Path:
             raise ConfigError(f"--load_run: there is no run with a checkpoint in {relative(parent)}; train one first")
         return runs[-1]
     for folder in (parent / str(load_run), Path(str(load_run))):
-        if folder.is_dir():
-            return folder
+        with suppress(OSError, ValueError):  # no name of a folder
+            if str(load_run).strip() and folder.is_dir():
+                return folder
     raise ConfigError(f"--load_run: there is no run '{load_run}'{suggest(str(load_run), [p.name for p in runs], 'runs')}")
 
 

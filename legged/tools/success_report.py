@@ -12,6 +12,7 @@ from rich.table import Table
 from legged.config.schema import NewtonSolver
 from legged.paths import replacing
 from legged.terrain import TERRAIN_TYPES
+from legged.tools.evaluation_file import check
 
 PANELS = {
     "stairs": ("stairs_up", "stairs_down"),
@@ -79,9 +80,12 @@ def with_other_engine(result: dict[str, Any], path: Path) -> list[dict[str, Any]
             continue
         try:
             saved = json.loads(other.read_text(encoding="utf-8"))
-            if "success" in saved and all(saved[key] == result[key] for key in ("task", "checkpoint")):
+            check(saved, str(other))
+            points = [point for entry in saved["success"]["types"].values() for point in entry["points"]]
+            drawable = "robots_per_point" in saved["success"] and all({"low", "high"} <= point.keys() for point in points)
+            if drawable and all(saved[key] == result[key] for key in ("task", "checkpoint")):
                 found.append(saved)
-        except (ValueError, KeyError, TypeError):  # not a file of ours: nothing to show
+        except (OSError, ValueError, KeyError):  # not a file of ours: nothing to show
             continue
     return sorted(found, key=lambda one: list(ENGINES).index(one["physics"]))
 
