@@ -207,3 +207,13 @@ def test_a_rank_beyond_the_number_of_processes_is_named(monkeypatch):
     as_rank(monkeypatch, 2, 2)
     with pytest.raises(ConfigError, match="RANK: must be below 2, the number of processes, got 2"):
         Ranks.now()
+
+
+def test_a_number_of_processes_that_was_left_behind_is_named_before_anything_is_built(monkeypatch, capsys):
+    as_rank(monkeypatch, 0, 2)
+    monkeypatch.delenv("MASTER_ADDR", raising=False)
+    monkeypatch.setattr(train, "make_task", lambda *_, **__: pytest.fail("built"))
+    assert call(train.main, ["--task", "anymal_c_flat", "--sim_device", "cpu"]) == 2
+    err = capsys.readouterr().err
+    assert "error: WORLD_SIZE: the environment says that 2 processes train together" in err
+    assert "MASTER_ADDR" in err

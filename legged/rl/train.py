@@ -30,7 +30,7 @@ from legged.rl.arguments import (
 from legged.rl.captured import CapturedRunner
 from legged.rl.checkpoint import check_fits, read_checkpoint
 from legged.rl.display import Display
-from legged.rl.distributed import RankLost
+from legged.rl.distributed import RankLost, check_reachable
 from legged.rl.output import when_output_is_lost
 from legged.rl.runner import Runner
 from legged.rl.runs import create_run, discard_run, experiment_folder, find_checkpoint, find_run
@@ -86,6 +86,7 @@ def _train(
 ) -> int:
     """Build and train; returns the exit code. Of several processes the first one has a run folder and a display."""
     first = Ranks.now().first
+    check_reachable(Ranks.now())
     if first:
         ready_to_write(experiment_folder(cfg), ROOM_MB)
         print(describe(cfg, device), flush=True)
