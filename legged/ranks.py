@@ -3,6 +3,8 @@
 import os
 from dataclasses import dataclass
 
+from legged.errors import ConfigError
+
 
 @dataclass(frozen=True)
 class Ranks:
@@ -19,10 +21,19 @@ class Ranks:
 
     @classmethod
     def now(cls) -> "Ranks":
-        """As the environment says; one process, where it says nothing."""
-        names = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")
-        values = [int(os.environ.get(name, default)) for name, default in zip(names, (0, 0, 1, 1), strict=True)]
-        return cls(*values) if values[2] > 1 else cls()
+        """As the environment says; one process, where it says nothing.
+
+        Raises:
+            ConfigError: it says something that can't be.
+        """
+        rank, local_rank = _whole("RANK", 0, 0), _whole("LOCAL_RANK", 0, 0)
+        count, local_count = _whole("WORLD_SIZE", 1, 1), _whole("LOCAL_WORLD_SIZE", 1, 1)
+        if count == 1:
+            return cls()
+        for name, value, end in (("RANK", rank, count), ("LOCAL_RANK", local_rank, local_count)):
+            if value >= end:
+                raise ConfigError(f"{name}: must be below {end}, the number of processes, got {value}; torchrun sets it")
+        return cls(rank, local_rank, count, local_count)
 
     @property
     def several(self) -> bool:
@@ -33,3 +44,13 @@ class Ranks:
     def first(self) -> bool:
         """Whether this is the process that logs, prints and saves."""
         return self.rank == 0
+
+
+def _whole(name: str, default: int, least: int) -> int:
+    """A whole number in the environment; one that is empty says nothing."""
+    text = os.environ.get(name, "").strip()
+    if not text:
+        return default
+    if not (text.isdecimal() and int(text) >= least):
+        raise ConfigError(f"{name}: the environment says '{text}'; a whole number of at least {least} is allowed, or nothing")
+    return int(text)

@@ -9,6 +9,7 @@ from legged.registry import make_task
 from legged.rl.captured import CapturedRunner
 from legged.rl.runner import Runner
 from legged.tools import benchmark
+from legged.tools.scale import others
 
 SMALL = ["--sim_device", "cpu", "--num_envs", "8", "sim.physics=mujoco", "sim.threads=1", "train.runner.num_steps_per_env=4"]
 
@@ -137,3 +138,42 @@ def test_sizes_are_numbers(sizes, capsys):
 def test_scale_sets_the_number_of_robots_itself(other, capsys):
     assert call(benchmark.main, ["--task", "anymal_c", "--sim_device", "cpu", "--scale", "4", *other]) == 2
     assert f"leave out {other[0]}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ("--steps=0", "--steps: must be at least 1, got 0"),
+        ("--repeats=0", "--repeats: must be at least 1, got 0"),
+        ("--iterations=-1", "--iterations: must be at least 0, got -1"),
+        ("--kernels=0", "--kernels: must be at least 1, got 0"),
+        ("--json=.", "--json: . is a folder"),
+    ],
+)
+@pytest.mark.parametrize("more", [[], ["--scale", "4"]])
+def test_options_out_of_range_are_refused(option, words, more, capsys):
+    assert call(benchmark.main, ["--task", "anymal_c_flat", "--sim_device", "cpu", option, *more]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_each_size_is_measured_as_the_command_line_says():
+    kept = ["--task", "x", "--physics", "newton", "--solver", "kamino", "--kernels", "3", "--steps=5", "sim.dt=0.01"]
+    own = ["--scale", "4,8", "--json=out.json", "--runner", "stock", "--num_env", "3"]
+    assert others([*own[:2], *kept[:3], *own[2:], *kept[3:]]) == kept
+
+
+def test_the_engine_of_a_scale_is_the_one_asked_for(capsys, monkeypatch):
+    """The C engine is the default here, so that only its name in the row tells."""
+    seen = []
+
+    def run(command, **_):
+        seen.append(command)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("legged.tools.scale.subprocess.run", run)
+    arguments = ["--task", "anymal_c_flat", "--sim_device", "cpu", "--scale=4", "--physics", "newton", "--solver", "xpbd"]
+    assert benchmark.main(arguments) == 130
+    (command,) = seen
+    assert command[command.index("--physics") + 1] == "newton"
+    assert command[command.index("--solver") + 1] == "xpbd"
+    assert "--scale=4" not in command

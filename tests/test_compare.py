@@ -87,3 +87,75 @@ def test_wrong_input_is_named(arguments, message, tmp_path, monkeypatch, capsys)
     (tmp_path / "other.json").write_text("{}", encoding="utf-8")
     assert call(main, arguments) == 2
     assert message in capsys.readouterr().err
+
+
+def changed(result, path, value):
+    """The result with another value at a path of keys."""
+    inner = result = json.loads(json.dumps(result))  # its parts may be one object
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    return result
+
+
+POINT = ("success", "types", "pit", "points")
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        (("task",), 3, "task: expected a text, got int '3'"),
+        (("rough",), [], "rough: expected a mapping, got list"),
+        (("rough", "falls"), None, "rough.falls: expected a number, got nothing"),
+        (("rough", "falls"), float("nan"), "rough.falls: expected a number, got float 'nan'"),
+        (("rough", "rmse_lin", "mean"), "0.1", "rough.rmse_lin.mean: expected a number or null, got str '0.1'"),
+        (("success",), 1, "success: expected a mapping, got int"),
+        (("success", "types"), None, "success.types: expected a mapping, got nothing"),
+        (("success", "types", "pit"), [], "success.types.pit: expected a mapping"),
+        ((*POINT[:-1], "unit"), 1, "success.types.pit.unit: expected a text"),
+        (POINT, {}, "success.types.pit.points: expected a list"),
+        ((*POINT, 0, "share"), True, "success.types.pit.points[0].share: expected a number, got bool"),
+    ],
+)
+def test_a_field_of_another_type_is_named(path, value, words, tmp_path, capsys):
+    result = evaluation(tmp_path / "x.json", stairs={0.1: 1.0})
+    (tmp_path / "x.json").write_text(json.dumps(changed(result, path, value)))
+    assert main([str(tmp_path / "x.json")]) == 2
+    err = capsys.readouterr().err
+    assert f"x.json: is not the result of an evaluation: {words}" in err
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("text", ["[1, 2]", "3", "null", "[" * 100_000, "\udcff", "{"])
+def test_a_file_of_something_else_is_named(text, tmp_path, capsys):
+    (tmp_path / "x.json").write_bytes(text.encode("utf-8", errors="surrogateescape"))
+    assert main([str(tmp_path / "x.json")]) == 2
+    assert "x.json: is not the result of an evaluation" in capsys.readouterr().err
+
+
+def test_who_fell_before_anything_was_measured_has_no_error(tmp_path, capsys):
+    nothing = {"mean": None, "worst": None}
+    for name in ("1", "2"):
+        result = evaluation(tmp_path / f"{name}.json", rmse=0.3)
+        (tmp_path / f"{name}.json").write_text(json.dumps({**result, "rmse_lin": nothing, "falls": 1.0}))
+    assert main([str(tmp_path / "1.json"), str(tmp_path / "2.json")]) == 0
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in capsys.readouterr().out.split("\n") if "│" in line]
+    lines = {row[0]: row[1:] for row in rows}
+    assert lines["velocity RMSE, mean [m/s]"] == ["none"]
+    assert lines["yaw rate RMSE, mean [rad/s]"] == ["0.300 (0 %)"]
+    assert lines["falls [%]"] == ["100.00 (0 %)"]
+
+
+def test_an_engine_of_another_version_and_brackets_in_names_are_shown_as_they_are(tmp_path, capsys):
+    evaluation(tmp_path / "1.json", task="[/x]", physics="[red]physx", stairs={0.1: 1.0, 0.2: 0.5})
+    out = tmp_path / "new" / "x.png"
+    assert main([str(tmp_path / "1.json"), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "[/x]" in said
+    assert "[red]physx, 1 seed" in said
+    assert out.stat().st_size > 10_000
+
+
+def test_a_picture_over_a_folder_is_refused_before_anything_is_read(tmp_path, capsys):
+    assert main([str(tmp_path / "none"), "--out", str(tmp_path)]) == 2
+    assert "is a folder; the name of a file is wanted" in capsys.readouterr().err

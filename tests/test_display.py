@@ -1,5 +1,8 @@
 """What is seen of a training, on one line and as a table."""
 
+import io
+import sys
+
 from rich.console import Console
 
 from legged.rl.display import Display, Progress
@@ -42,3 +45,19 @@ def test_plain_lines_come_at_most_every_two_seconds_and_at_the_end(capsys):
             display.show(Progress(iteration, 10, elapsed, 0.0, 1.0, 0.1, 0.1, 0.0, 0.5, {}))
     shown = [line.split()[1] for line in capsys.readouterr().out.splitlines()]
     assert shown == ["1/10", "3/10", "10/10"]
+
+
+def test_a_terminal_that_cannot_be_controlled_gets_plain_lines(monkeypatch, capsys):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    monkeypatch.setenv("TERM", "dumb")
+    with Display("title") as display:
+        display.show(progress())
+    assert capsys.readouterr().out.startswith("it 3/10 ")
+
+
+def test_brackets_in_names_are_shown_as_they_are():
+    console = Console(width=120, record=True, file=io.StringIO())
+    console.print(Progress(1, 2, 1.0, 1.0, 1.0, 0.4, 0.1, 1.0, 0.3, {"rew_[/x]": 1.0}).table("run [/bold]"))
+    text = console.export_text()
+    assert "run [/bold]" in text
+    assert "[/x]" in text

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
+from helpers import POLICY, TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
 
 from legged import make_task
 from legged.config import override
+from legged.errors import RunError
 from legged.rl import play
 from legged.rl.policy import TrainedPolicy, undisturbed
 from legged.tools import evaluate
@@ -225,3 +226,42 @@ def test_evaluations_of_a_shipped_policy_do_not_touch_the_package(tmp_path):
     assert shipped.output("evaluate") == Path("logs") / "evaluate" / TASK
     own = TrainedPolicy(small_config(), tmp_path / "logs" / TASK / "run" / "model_1.pt")
     assert own.output("evaluate") == tmp_path / "logs" / TASK / "run"
+
+
+# ---- what can't be measured, or not written --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--vx=-1:1:1e-9"], "--vx: '-1:1:1e-9' makes 2,000,000,001 cells"),
+        (["--vx=1e30"], "--vx: '1e30' asks for more than 20"),
+        (["--robots", "100000000"], "125 cells x 100,000,000 robots are 12,500,000,000 robots"),
+        (["--robots-per-point", "99999999"], "--robots-per-point: at most 65,536"),
+    ],
+)
+def test_grids_that_no_machine_holds_are_refused_with_their_size(options, words, capsys):
+    assert call(evaluate.main, ["--task", TASK, "--sim_device", "cpu", *options]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_written_is_found_before_anything_is_measured(tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").write_text("mine")
+    monkeypatch.setattr(evaluate, "ready_to_track", lambda *_, **__: pytest.fail("measured"))
+    arguments = ["--task", TASK, "--sim_device", "cpu", "--load_run", str(POLICY), "--out", str(tmp_path / "file")]
+    for physics in ("mujoco", "all"):
+        assert call(evaluate.main, [*arguments, "--physics", physics]) == 2
+        assert "file: cannot make the folder" in capsys.readouterr().err
+
+
+def test_a_disk_that_fills_up_meanwhile_costs_the_files_and_not_the_table(tmp_path, monkeypatch, capsys):
+    def full(path, _text):
+        raise RunError(f"{path.name}: no space left on the disk")
+
+    monkeypatch.setattr(evaluate, "write_text", full)
+    grid = ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1", "--physics", "mujoco", "sim.threads=1"]
+    arguments = ["--task", TASK, "--load_run", str(POLICY), "--out", str(tmp_path), *grid]
+    assert call(evaluate.main, arguments) == 1
+    out, err = capsys.readouterr()
+    assert "velocity RMSE, mean" in out
+    assert err == "error: evaluation_mujoco.json: no space left on the disk\n"

@@ -156,7 +156,7 @@ def test_robots_are_asked_to_walk_along_x_and_are_counted_by_type(monkeypatch, h
         seen.append(task.commands.clone())
         return torch.zeros(8, 12)
 
-    table = outing.walk_out(task, act, ground, None, gif=False)
+    table = outing.walk_out(task, act, ground, video.Video(task, 1, None))
     assert len(seen) == 2 * 5
     commands = torch.stack(seen)
     torch.testing.assert_close(commands[..., 0], torch.full((10, 8), 0.5))  # what the task was trained on
@@ -189,7 +189,9 @@ def test_each_episode_shows_another_robot_and_says_what_is_below_it(monkeypatch,
     monkeypatch.setattr(FakeCamera, "shots", [])
     ground = playground(config(), difficulty=0.5)
     task = on(ground, config(), num_envs=2)
-    outing.walk_out(task, lambda _: torch.zeros(2, 12), ground, tmp_path, gif=False)
+    film = video.Video(task, 2, tmp_path)
+    outing.walk_out(task, lambda _: torch.zeros(2, 12), ground, film)
+    film.write()
     up, down = (0, "stairs_up, step height 0.14 m"), (1, "stairs_down, step height 0.14 m")
     assert FakeCamera.shots == [up, up, down, down, up, up]
     assert (tmp_path / "play.mp4").is_file()

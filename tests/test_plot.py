@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 from torch.utils.tensorboard import SummaryWriter
 
@@ -46,3 +47,81 @@ def test_levels_get_panels_of_their_own(tmp_path):
 def test_a_folder_without_events_is_named(tmp_path):
     with pytest.raises(ConfigError, match="holds no TensorBoard file"):
         plot.read_scalars(tmp_path)
+
+
+def write_config(folder, name=""):
+    config = {"task": "anymal_c", "env": {"seed": 3}, "terrain": {"num_rows": 5}, "train": {"runner": {"run_name": name}}}
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+
+
+def test_runs_are_called_what_they_are(tmp_path):
+    folders = [tmp_path / name for name in ("a", "b", "c", "d")]
+    for folder in folders:
+        folder.mkdir()
+    write_config(folders[0])
+    write_config(folders[1], name="[wide]")
+    write_config(folders[2])
+    configs = [plot.read_config(folder) for folder in folders]
+    assert plot.labels(folders, configs) == [
+        "anymal_c, seed 3 (a)",  # as the third
+        "anymal_c, [wide], seed 3",
+        "anymal_c, seed 3 (c)",
+        "d",  # no configuration
+    ]
+    assert plot.labels([folders[0]] * 2, [configs[0]] * 2) == ["anymal_c, seed 3 (a) [1]", "anymal_c, seed 3 (a) [2]"]
+
+
+@pytest.mark.parametrize("text", ["[1, 2]", "env: 3\ntask: x", "{", "train: {runner: [1]}"])
+def test_a_configuration_that_someone_broke_costs_the_label_only(text, tmp_path):
+    (tmp_path / "config.yaml").write_text(text)
+    config = plot.read_config(tmp_path)
+    assert plot.labels([tmp_path], [config]) == ["x" if "task" in text else tmp_path.name]
+    assert plot.always_promoted(config) is None
+
+
+def test_who_is_always_promoted_has_two_thirds_of_the_levels():
+    """By simulation: robots climb one row after the other, and from the top go to a random one."""
+    random = np.random.default_rng(1)
+    for rows in (1, 5, 10):
+        levels, seen = random.integers(0, rows, 500), []
+        for _ in range(400):
+            moved = levels + 1
+            levels = np.where(moved >= rows, random.integers(0, rows, 500), moved)
+            seen.append(levels.mean())
+        expected = plot.always_promoted({"terrain": {"num_rows": rows}})
+        assert np.mean(seen[50:]) == pytest.approx(expected, abs=0.05)
+    assert plot.always_promoted({"terrain": {"num_rows": 5}}) == pytest.approx(8 / 3)
+
+
+def test_the_line_is_that_of_the_runs_rows(tmp_path, monkeypatch):
+    write_run(tmp_path / "run", 1.0)
+    write_config(tmp_path / "run")
+    drawn = []
+    monkeypatch.setattr(plot, "draw", lambda runs, path, always: drawn.append((list(runs), set(always))))
+    assert plot.main([str(tmp_path / "run"), "--out", str(tmp_path / "x.png")]) == 0
+    assert drawn == [(["anymal_c, seed 3"], {8 / 3})]
+
+
+def test_one_iteration_is_drawn(tmp_path):
+    writer = SummaryWriter(str(tmp_path / "run"))
+    writer.add_scalar("Metrics/lin_vel_rmse", 1.0, 0)
+    writer.add_scalar("Perf/collection_time", 0.0, 0)
+    writer.add_scalar("Perf/learning_time", 0.0, 0)
+    writer.close()
+    assert plot.main([str(tmp_path / "run"), "--out", str(tmp_path / "new" / "x.png")]) == 0
+    assert (tmp_path / "new" / "x.png").stat().st_size > 1000
+
+
+def test_wrong_input_is_one_line(tmp_path, capsys):
+    write_run(tmp_path / "run", 1.0)
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "events.out.tfevents.1").write_text("garbage")
+    for arguments, words in (
+        ([tmp_path / "run", "--out", tmp_path], "is a folder; the name of a file is wanted"),
+        ([tmp_path / "none"], "none: holds no TensorBoard file"),
+        ([tmp_path / "bad"], "bad: its TensorBoard file holds no values"),
+    ):
+        assert plot.main([str(argument) for argument in arguments]) == 2
+        err = capsys.readouterr().err
+        assert words in err
+        assert len(err.splitlines()) == 1

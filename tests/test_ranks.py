@@ -187,3 +187,33 @@ def test_a_mistake_names_the_process(monkeypatch, capsys):
     as_rank(monkeypatch, 1, 2)
     assert call(train.main, ["--task", "anymal_z"]) == 2
     assert capsys.readouterr().err.startswith("rank 1: error: --task: there is no task 'anymal_z'")
+
+
+@pytest.mark.parametrize("name", ["RANK", "LOCAL_RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE"])
+@pytest.mark.parametrize("text", ["two", "-1", "1.5"])
+def test_an_environment_that_says_nonsense_is_named(monkeypatch, capsys, name, text):
+    monkeypatch.setenv(name, text)
+    assert call(train.main, ["--task", "anymal_c_flat", "--sim_device", "cpu"]) == 2
+    assert capsys.readouterr().err.startswith(f"error: {name}: the environment says '{text}'")
+
+
+def test_an_environment_that_says_nothing_is_one_process(monkeypatch):
+    for name in ("RANK", "LOCAL_RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE"):
+        monkeypatch.setenv(name, "")
+    assert Ranks.now() == Ranks()
+
+
+def test_a_rank_beyond_the_number_of_processes_is_named(monkeypatch):
+    as_rank(monkeypatch, 2, 2)
+    with pytest.raises(ConfigError, match="RANK: must be below 2, the number of processes, got 2"):
+        Ranks.now()
+
+
+def test_a_number_of_processes_that_was_left_behind_is_named_before_anything_is_built(monkeypatch, capsys):
+    as_rank(monkeypatch, 0, 2)
+    monkeypatch.delenv("MASTER_ADDR", raising=False)
+    monkeypatch.setattr(train, "make_task", lambda *_, **__: pytest.fail("built"))
+    assert call(train.main, ["--task", "anymal_c_flat", "--sim_device", "cpu"]) == 2
+    err = capsys.readouterr().err
+    assert "error: WORLD_SIZE: the environment says that 2 processes train together" in err
+    assert "MASTER_ADDR" in err

@@ -1,5 +1,7 @@
 """Pictures: the robots are in them, move in them, and carry their arrows and captions."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ import torch
 
 from legged.config import override
 from legged.registry import make_task, task_config
-from legged.rendering import Camera, display_model
+from legged.rendering import Camera, display_model, size_of
 from legged.rendering.follower import BEHIND, CUT, FLATTEST, FRONT, Follower
 from legged.rendering.paint import LOW, MIDDLE
 from legged.rl.playground import SETTING, Playground
@@ -260,3 +262,46 @@ def test_a_follower_sees_the_faces_of_steps():
     for x, azimuth in ((0.0, BEHIND), (-6.0, FRONT), (-3.0, BEHIND), (4.0, BEHIND)):
         follower.update(np.array([x, 0.0, 0.5]))
         assert follower.azimuth == azimuth
+
+
+# ---- robots of other sizes -------------------------------------------------------------------------------------------
+
+
+def scaled_robot(robot, tmp_path, factor: float):
+    """A robot of one box with legs of boxes, `factor` times as large as 1 m x 0.4 m x 0.5 m."""
+    xml = f"""<mujoco><worldbody><body name="base" pos="0 0 {factor}"><freejoint/>
+      <geom name="shell" type="box" size="{0.5 * factor} {0.2 * factor} {0.1 * factor}" mass="1"/>
+      <body pos="0 0 {-0.1 * factor}"><joint name="hip" axis="0 1 0"/>
+        <geom name="leg" type="box" pos="0 0 {-0.15 * factor}" size="0.01 0.01 {0.15 * factor}" mass="1"/></body>
+      </body></worldbody></mujoco>"""
+    (tmp_path / "small.xml").write_text(xml)
+    file = replace(robot.file, model="small.xml", base="base")
+    return replace(robot, folder=tmp_path, file=file, joint_names=("hip",), default_dof_pos=np.zeros(1))
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
+def test_a_robot_is_as_large_as_the_box_around_it(robot, tmp_path, factor):
+    size = size_of(scaled_robot(robot, tmp_path, factor))
+    assert size.longest == pytest.approx(factor)
+    assert size.height == pytest.approx(0.5 * factor)  # 0.2 of the shell, 0.3 of the leg
+    turned = replace(scaled_robot(robot, tmp_path, factor), default_dof_pos=np.array([np.pi / 2]))
+    assert size_of(turned).height == pytest.approx(factor * 0.2 + 0.01, abs=0.011)  # the leg points along x
+
+
+def test_the_camera_comes_nearer_to_smaller_robots(task, camera, monkeypatch):
+    assert camera.view.distance == pytest.approx(2.0 + 1.1 * 2**0.5, rel=0.01)  # ANYmal C's
+    assert camera.offsets[1, 1] - camera.offsets[0, 1] == pytest.approx(1.9, rel=0.01)
+    size = size_of(task.robot)
+    monkeypatch.setattr("legged.rendering.camera.size_of", lambda _: replace(size, longest=0.5 * size.longest))
+    near = Camera(task, count=2, width=WIDTH, height=HEIGHT)
+    near.close()
+    assert near.view.distance == pytest.approx(0.5 * camera.view.distance)
+    assert np.ptp(near.offsets[:, 1]) == pytest.approx(0.5 * np.ptp(camera.offsets[:, 1]))
+
+
+def test_feet_have_spots_on_a_plane(task, camera, monkeypatch):
+    with_spots = camera.picture().astype(int)
+    monkeypatch.setattr(camera, "_shade_feet", lambda _ground: None)
+    changed = differ(with_spots.astype(np.uint8), without := camera.picture())
+    assert 0.0005 < changed.mean() < 0.05
+    assert with_spots[changed].mean() < without[changed].mean() - 20  # they are darker than the floor

@@ -278,7 +278,7 @@ def test_a_training_that_is_finished_already(fails, run):
 
 def test_a_file_where_the_log_folder_should_be(fails, tmp_path):
     (tmp_path / "logs").write_text("mine\n")
-    fails(train.main, task(), "logs", "cannot make the log folder")
+    fails(train.main, task(), "logs", "cannot make the folder")
     assert (tmp_path / "logs").read_text() == "mine\n"
 
 

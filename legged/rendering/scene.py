@@ -1,11 +1,13 @@
 """What is drawn: robots on a floor or a terrain, under a sky."""
 
+import warnings
 from collections.abc import Sequence
 
 import mujoco
 
-from legged.errors import ConfigError
+from legged.errors import RunError
 from legged.rendering.paint import add_horizon, add_painted_terrain
+from legged.rendering.window import draw_without_window
 from legged.robot import Robot
 from legged.terrain import Terrain
 
@@ -49,12 +51,15 @@ def make_renderer(model: mujoco.MjModel, width: int, height: int, instead: str =
     """What draws a model.
 
     Raises:
-        ConfigError: nothing can be drawn on this machine; `instead` is what the user might do then.
+        RunError: nothing can be drawn on this machine; `instead` is what the user might do then.
     """
+    draw_without_window()
     try:
-        return mujoco.Renderer(model, height, width, max_geom=model.ngeom + 1000)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # glfw warns, and then fails
+            return mujoco.Renderer(model, height, width, max_geom=model.ngeom + 1000)
     except Exception as error:  # each GL back-end fails in its own way
-        raise ConfigError(
+        raise RunError(
             f"cannot render here ({error}); without a display MUJOCO_GL=egl or MUJOCO_GL=osmesa and their libraries are"
             f" needed{instead}"
         ) from error

@@ -3,6 +3,7 @@
 The layout is rsl-rl's (actor_state_dict, critic_state_dict, optimizer_state_dict, iter, infos); what is ours is in `infos`.
 """
 
+import io
 import math
 import pickle
 from collections.abc import Mapping
@@ -15,7 +16,7 @@ from torch import Tensor
 from legged.config import TaskConfig
 from legged.envs import BaseTask
 from legged.errors import ConfigError
-from legged.paths import relative, replacing
+from legged.paths import relative, write_bytes
 from legged.robot import load_robot
 
 FORMAT = 2
@@ -26,8 +27,9 @@ Saved = dict[str, Any]
 
 def write_checkpoint(path: Path, saved: Saved) -> None:
     """Write a checkpoint that is whole or not there."""
-    with replacing(path) as part:
-        torch.save(saved, part)
+    buffer = io.BytesIO()  # onto a full disk torch.save fails with a message that says nothing of it
+    torch.save(saved, buffer)
+    write_bytes(path, buffer.getbuffer())
 
 
 def load_plain(path: Path, device: str = "cpu") -> Any:

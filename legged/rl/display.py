@@ -6,6 +6,7 @@ from datetime import timedelta
 
 from rich.console import Console
 from rich.live import Live
+from rich.markup import escape
 from rich.table import Table
 
 PLAIN_LINES_EVERY_S = 2.0
@@ -91,14 +92,14 @@ class Progress:
             left["terrain level"] = f"{self.values['Terrain/level']:.2f}"
         right = {k.removeprefix("rew_"): f"{v:+.4f}" for k, v in self.values.items() if k.startswith("rew_")}
         right.update(self.levels())
-        table = Table(title=title, caption=self.warnings() or None, title_justify="left")
+        table = Table(title=escape(title), caption=escape(self.warnings()) or None, title_justify="left")
         for name, justify in (("training", "left"), ("", "right"), ("reward per second", "left"), (" ", "right")):
             table.add_column(name, justify=justify)  # type: ignore[arg-type]
         left_rows, right_rows = list(left.items()), list(right.items())
         for i in range(max(len(left_rows), len(right_rows))):
             a = left_rows[i] if i < len(left_rows) else ("", "")
             b = right_rows[i] if i < len(right_rows) else ("", "")
-            table.add_row(*a, *b)
+            table.add_row(*(escape(text) for text in (*a, *b)))
         return table
 
 
@@ -108,7 +109,9 @@ class Display:
     def __init__(self, title: str) -> None:
         """`title` heads the live table."""
         self.title = title
-        self._live = Live(console=Console(), refresh_per_second=4) if sys.stdout.isatty() else None
+        console = Console()
+        live = sys.stdout.isatty() and not console.is_dumb_terminal  # of a dumb one no line can be drawn anew
+        self._live = Live(console=console, refresh_per_second=4) if live else None
         self._last_line_s = -PLAIN_LINES_EVERY_S
 
     def __enter__(self) -> "Display":

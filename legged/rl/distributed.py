@@ -1,9 +1,12 @@
 """What the processes of a training on several GPUs do together: begin, add up, agree, end."""
 
+import os
+
 import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from legged.errors import ConfigError
 from legged.ranks import Ranks
 
 
@@ -11,10 +14,25 @@ class RankLost(Exception):
     """Another process of this training has ended."""
 
 
+def check_reachable(ranks: Ranks) -> None:
+    """Check that this process is told where it meets the others, if there are any.
+
+    Raises:
+        ConfigError: it is not; another program's WORLD_SIZE may be left in the environment.
+    """
+    missing = [name for name in ("MASTER_ADDR", "MASTER_PORT") if not os.environ.get(name)]
+    if ranks.several and missing:
+        raise ConfigError(
+            f"WORLD_SIZE: the environment says that {ranks.count} processes train together, but not where they meet"
+            f" ({', '.join(missing)}); torchrun sets both, and one process needs neither"
+        )
+
+
 def join(ranks: Ranks, device: torch.device) -> None:
     """Meet the other processes, once; with NCCL on GPUs, gloo without."""
     if dist.is_initialized():
         return
+    check_reachable(ranks)
     if device.type == "cuda":
         torch.cuda.set_device(device)
         dist.init_process_group("nccl", rank=ranks.rank, world_size=ranks.count, device_id=device)

@@ -1,7 +1,7 @@
 """Export of a policy as TorchScript and ONNX, with what a robot's controller needs to know, checked against torch."""
 
+import io
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,8 @@ import onnxruntime
 import torch
 
 from legged.envs import LeggedRobot
+from legged.paths import make_folder, write_bytes, write_text
 from legged.rl.runner import Runner
-from legged.rl.runs import write_text
 
 CHECKED_OBSERVATIONS = 1000
 LARGEST_DIFFERENCE = 1e-4
@@ -32,37 +32,34 @@ def export(runner: Runner, folder: Path) -> dict[str, float]:
 
     Raises:
         ExportError: a file computes something else.
+        RunError: a file can't be written.
     """
     task: LeggedRobot = runner.env  # type: ignore[assignment]
-    folder.mkdir(parents=True, exist_ok=True)
     metadata = describe(task)
     policy = runner.alg.get_policy()
     device = next(policy.parameters()).device
     observations = torch.randn(CHECKED_OBSERVATIONS, task.observation_groups["actor"].buffer.shape[1])
-    # Written beside their names and renamed once they have been read back and agree.
-    script, network = folder / "policy.pt.part", folder / "policy.onnx.part"
+    # In memory first, written once they have been read back and agree: onto a full disk torch would abort the process.
     try:
         policy.to("cpu").eval()
         with torch.inference_mode():
             wanted = policy.as_jit()(observations).numpy()
-        _write_torchscript(policy, script)
-        _write_onnx(policy, network, metadata)
+        script, network = _torchscript(policy), _onnx(policy, metadata)
     finally:
         policy.to(device)
     with torch.inference_mode():
-        from_script = torch.jit.load(str(script))(observations).numpy()
-    session = onnxruntime.InferenceSession(network.read_bytes(), providers=["CPUExecutionProvider"])
+        from_script = torch.jit.load(io.BytesIO(script))(observations).numpy()
+    session = onnxruntime.InferenceSession(network, providers=["CPUExecutionProvider"])
     (from_onnx,) = session.run(None, {"obs": observations.numpy()})
     differences = {}
-    for path, found in ((script, from_script), (network, np.asarray(from_onnx))):
+    for name, found in (("policy.pt", from_script), ("policy.onnx", np.asarray(from_onnx))):
         difference = float(np.abs(found - wanted).max())
         if not difference <= LARGEST_DIFFERENCE:
-            script.unlink()
-            network.unlink()
-            raise ExportError(f"{path.stem}: differs from the policy by {difference:.1e} (allowed: {LARGEST_DIFFERENCE})")
-        differences[path.stem] = difference
-    for path in (script, network):
-        os.replace(path, path.with_suffix(""))
+            raise ExportError(f"{name}: differs from the policy by {difference:.1e} (allowed: {LARGEST_DIFFERENCE})")
+        differences[name] = difference
+    make_folder(folder)
+    write_bytes(folder / "policy.pt", script)
+    write_bytes(folder / "policy.onnx", network)
     write_text(folder / "policy.json", json.dumps(metadata, indent=1))
     return differences
 
@@ -97,24 +94,28 @@ def describe(task: LeggedRobot) -> dict[str, Any]:
     }
 
 
-def _write_torchscript(policy: Any, path: Path) -> None:
-    torch.jit.script(policy.as_jit().to("cpu")).save(str(path))
+def _torchscript(policy: Any) -> bytes:
+    """The file of the TorchScript policy."""
+    buffer = io.BytesIO()
+    torch.jit.save(torch.jit.script(policy.as_jit().to("cpu")), buffer)
+    return buffer.getvalue()
 
 
-def _write_onnx(policy: Any, path: Path, metadata: dict[str, Any]) -> None:
-    """rsl-rl's ONNX model with a free batch size and the metadata as JSON strings, one property a key."""
+def _onnx(policy: Any, metadata: dict[str, Any]) -> bytes:
+    """The file of rsl-rl's ONNX model with a free batch size and the metadata as JSON strings, one property a key."""
     module = policy.as_onnx(verbose=False).to("cpu").eval()
+    buffer = io.BytesIO()
     torch.onnx.export(
         module,
         module.get_dummy_inputs(),
-        str(path),
+        buffer,  # type: ignore[arg-type]
         opset_version=18,
         input_names=["obs"],
         output_names=["actions"],
         dynamic_axes={"obs": {0: "batch"}, "actions": {0: "batch"}},
         dynamo=False,
     )
-    model = onnx.load(str(path))
+    model = onnx.load_from_string(buffer.getvalue())
     onnx.helper.set_model_props(model, {key: json.dumps(value) for key, value in metadata.items()})
     onnx.checker.check_model(model)
-    path.write_bytes(model.SerializeToString())
+    return model.SerializeToString()

@@ -1,9 +1,9 @@
 """Robots walk out of their tiles of terrain, one after the other in the middle of the picture."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import torch
+from rich.markup import escape
 from rich.table import Table
 from tensordict import TensorDict
 from torch import Tensor
@@ -45,15 +45,12 @@ class Tracking:
 
 
 @torch.inference_mode()
-def walk_out(
-    task: LeggedRobot, act: Callable[[TensorDict], Tensor], playground: Playground, folder: Path | None, gif: bool
-) -> Table:
-    """Let the robots walk along x from the middle of their tiles; write play.mp4 (and .gif) to `folder`; returns a table
-    of errors and falls for each type.
+def walk_out(task: LeggedRobot, act: Callable[[TensorDict], Tensor], playground: Playground, video: Video) -> Table:
+    """Let the robots walk along x from the middle of their tiles, filmed by `video`; returns a table of errors and falls for
+    each type.
     """
     assert task.terrain is not None, "the task stands on a plane"
     device = torch.device(task.device)
-    video = Video(task, min(task.num_envs, len(playground.order)), folder)
     tracking = Tracking(task.num_envs, device)
     low, high = task.command_sampler.full_ranges[0].tolist()
     command = torch.tensor([min(max(FORWARD, low), high), 0.0, 0.0], device=device)
@@ -63,13 +60,12 @@ def walk_out(
         observations = task.hold_commands(command, torch.zeros(task.num_envs, device=device))
         followed = episode % task.num_envs
         video.follow(followed)
-        for step in range(round(EPISODE_S / task.dt)):
+        for step in range(max(1, round(EPISODE_S / task.dt))):
             observations, _, _, _ = task.step(act(observations))
             tracking.add(task)
             if video.due(step):
                 where = playground.label(task.terrain, task.base_pos[followed].tolist())
                 video.take(slice(followed, followed + 1), where)
-    video.write(gif)
     return _table(tracking, playground, task.num_envs, float(command[0]))
 
 
@@ -82,5 +78,5 @@ def _table(tracking: Tracking, playground: Playground, num_envs: int, speed: flo
     for kind, label in playground.labels().items():
         robots = torch.tensor([own == kind for own in kinds], device=tracking.steps.device)
         if robots.any():
-            table.add_row(label, str(int(robots.sum())), *tracking.row(robots))
+            table.add_row(escape(label), str(int(robots.sum())), *tracking.row(robots))
     return table

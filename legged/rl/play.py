@@ -1,6 +1,8 @@
 """See a policy walk, and export it: `python play.py --task anymal_c_flat`."""
 
 import argparse
+import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,8 +16,10 @@ from torch import Tensor
 
 from legged.config import override
 from legged.envs import LeggedRobot
+from legged.errors import RunError
 from legged.headless import HEADLESS
-from legged.paths import relative
+from legged.paths import ready_to_write, relative
+from legged.rendering import window_opens
 from legged.rl.arguments import (
     add_run_arguments,
     add_task_arguments,
@@ -32,6 +36,10 @@ from legged.rl.policy import find_policy, restore, undisturbed
 from legged.rl.video import Video
 from legged.rl.viewer import view
 
+ROOM_MB = 24.0
+"""What the disk must have room for: the film and the exported policy [MiB]."""
+MOST_SHOWN = 9
+"""Robots in the picture on a plane."""
 SCHEDULE = (  # seconds; vx, vy [m/s], yaw rate [rad/s]
     (2.0, (0.5, 0.0, 0.0)),
     (2.5, (1.0, 0.0, 0.0)),
@@ -73,27 +81,44 @@ def _main(argv: list[str] | None) -> int:
     if playground:
         changes += playground.changes(wanted)
         terrain = playground.build(override(policy.cfg, changes))
+    folder = args.out or policy.output("play")
+    ready_to_write(folder, ROOM_MB)
     task, runner = restore(policy, changes, device, graph=not args.no_graph, terrain=terrain)
     print(f"{policy.cfg.task}: {relative(policy.checkpoint)}")
 
-    folder = args.out or policy.output("play")
     differences = export(runner, folder / "exported")
     for name, difference in differences.items():
         print(f"exported {relative(folder / 'exported' / name)}, largest difference to the policy {difference:.1e}")
 
     act = runner.get_inference_policy(str(device))
     if not (HEADLESS or args.headless or args.no_video):
-        view(task, act, playground)
-    film = None if args.no_video else folder
-    result = walk_out(task, act, playground, film, args.gif) if playground else record(task, act, film, args.gif)
+        if window_opens():
+            view(task, act, playground)
+        else:
+            print("no window opens on this display: recording only")
+    elif not (args.no_video or args.headless) and "DISPLAY" in os.environ:
+        print(f"the display {os.environ['DISPLAY']} (DISPLAY) does not answer: recording only")
+    shown = min(task.num_envs, len(playground.order) if playground else MOST_SHOWN)
+    video, failure = _video(task, shown, None if args.no_video else folder, args.gif)
+    result = walk_out(task, act, playground, video) if playground else record(task, act, video)
     Console(width=90).print(result)
-    return 0
+    if failure is None:
+        video.write()
+        return 0
+    raise failure
+
+
+def _video(task: LeggedRobot, count: int, folder: Path | None, gif: bool) -> tuple[Video, RunError | None]:
+    """What films the robots; where nothing can be rendered, what films nothing, and why: they are measured all the same."""
+    try:
+        return Video(task, count, folder, gif), None
+    except RunError as error:
+        return Video(task, count, None), error
 
 
 @torch.inference_mode()
-def record(task: LeggedRobot, act: Callable[[TensorDict], Tensor], folder: Path | None, gif: bool) -> Table:
-    """Let the robots follow the schedule; write play.mp4 (and .gif) to `folder`; returns a table of errors and falls."""
-    video = Video(task, min(task.num_envs, 9), folder)
+def record(task: LeggedRobot, act: Callable[[TensorDict], Tensor], video: Video) -> Table:
+    """Let the robots follow the schedule, filmed by `video`; returns a table of errors and falls."""
     table = Table(title="following commands", title_justify="left")
     for name in ("vx, vy [m/s], yaw [rad/s]", "velocity RMSE", "yaw rate RMSE", "falls"):
         table.add_column(escape(name), justify="left" if name.startswith("vx") else "right")
@@ -104,7 +129,7 @@ def record(task: LeggedRobot, act: Callable[[TensorDict], Tensor], folder: Path 
         held = torch.tensor(command, dtype=torch.float32, device=task.device)  # type: ignore[arg-type]
         observations = task.hold_commands(held)
         lin, ang, falls, measured = 0.0, 0.0, 0, 0
-        steps = round(seconds / task.dt)
+        steps = max(1, round(seconds / task.dt))
         for step in range(steps):
             observations, _, _, _ = task.step(act(observations))
             falls += int(task.terminated_buf.sum())
@@ -117,9 +142,13 @@ def record(task: LeggedRobot, act: Callable[[TensorDict], Tensor], folder: Path 
                 video.take(slice(None))
         table.add_row(
             ", ".join(f"{value:g}" for value in command),
-            f"{(lin / measured) ** 0.5:.3f} m/s",
-            f"{(ang / measured) ** 0.5:.3f} rad/s",
+            # With long control steps a command may be over before anything was measured.
+            f"{(lin / measured) ** 0.5:.3f} m/s" if measured else "-",
+            f"{(ang / measured) ** 0.5:.3f} rad/s" if measured else "-",
             str(falls),
         )
-    video.write(gif)
     return table
+
+
+if __name__ == "__main__":
+    sys.exit(main())

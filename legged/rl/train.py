@@ -3,22 +3,23 @@
 import argparse
 import contextlib
 import os
+import shlex
 import signal
 import sys
 import time
 from pathlib import Path
-from types import FrameType
 
 import torch
 
 from legged.config import TaskConfig, to_yaml
 from legged.cores import available_cores
-from legged.envs import LeggedRobot
-from legged.paths import relative
+from legged.errors import ConfigError, RunError
+from legged.paths import full_disk_in, ready_to_write, reason, relative
 from legged.physics import engine_name, resolve_physics
 from legged.ranks import Ranks
 from legged.registry import make_task, task_config
 from legged.rl.arguments import (
+    EXIT_FAILED,
     add_run_arguments,
     add_task_arguments,
     import_and_check,
@@ -29,11 +30,16 @@ from legged.rl.arguments import (
 )
 from legged.rl.captured import CapturedRunner
 from legged.rl.display import Display
-from legged.rl.distributed import RankLost
+from legged.rl.distributed import RankLost, check_reachable
+from legged.rl.output import when_output_is_lost
 from legged.rl.resume import resumed
 from legged.rl.runner import Runner
-from legged.rl.runs import create_run
-from legged.startup import STARTED_S
+from legged.rl.runs import create_run, discard_run, experiment_folder, find_run
+from legged.rl.stopping import quiet_writers, stopping_on_signals
+from legged.startup import STARTED_S, command_of_ours
+
+ROOM_MB = 16.0
+"""What the disk must have room for before a training begins: its first checkpoints [MiB]."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -86,30 +92,67 @@ def _train(
     start: float,
 ) -> int:
     """Build and train; returns the exit code. Of several processes the first one has a run folder and a display."""
-    folder = create_run(cfg) if Ranks.now().first else None
-    if folder:
-        print(describe(cfg, device, folder), flush=True)
+    first = Ranks.now().first
+    check_reachable(Ranks.now())
+    if first:
+        ready_to_write(experiment_folder(cfg), ROOM_MB)
+        print(describe(cfg, device), flush=True)
     task = make_task(cfg, device, graph=not args.no_graph)
-    with Display(f"{cfg.task}: {relative(folder)}") if folder else contextlib.nullcontext() as display:
+    with Display(cfg.task) if first else contextlib.nullcontext() as display:
         kind = CapturedRunner if cfg.train.runner.loop == "captured" else Runner
-        runner = kind(task, folder, str(rl_device), display)
+        runner = kind(task, None, str(rl_device), display)
         if checkpoint:
             why_anew = runner.resume(str(checkpoint))
             how = f"all robots begin anew: {why_anew}" if why_anew else "robots and random numbers go on where they were"
             print(f"resumed {relative(checkpoint)} after iteration {runner.current_learning_iteration}; {how}", flush=True)
         ready = time.perf_counter()
-        stopped_by = stop_on_signals(runner)
-        try:
-            finished = runner.train(cfg.train.runner.max_iterations)
-        except RankLost as lost:
-            print(lost, file=sys.stderr, flush=True)
-            return 1
+        with stopping_on_signals(runner.stop) as stopped_by, quiet_writers():
+            try:
+                folder, finished = _learn(runner, cfg, display)
+            except RankLost as lost:
+                print(lost, file=sys.stderr, flush=True)
+                return EXIT_FAILED
+            except KeyboardInterrupt:
+                if not stopped_by:
+                    raise
+                print("interrupted", file=sys.stderr, flush=True)
+                return 128 + stopped_by[-1]
     if folder:
-        _summary(runner, folder, ready - start, finished)
-    return 0 if finished else 128 + (stopped_by or [signal.SIGTERM])[0]
+        _summary(runner, folder, ready - start, finished, play_command(args, cfg, folder))
+    if finished:
+        return 0
+    # Without a signal of its own it is the output that went away, or another process that was asked to stop.
+    return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
 
 
-def describe(cfg: TaskConfig, device: torch.device, folder: Path) -> str:
+def _learn(runner: Runner, cfg: TaskConfig, display: Display | None) -> tuple[Path | None, bool]:
+    """Train into a new run folder; gives the folder, none where another process has it, and whether training got to its end.
+    A training that fails before its first checkpoint leaves no folder.
+
+    Raises:
+        RunError: the folder can't be written.
+    """
+    folder = create_run(cfg) if display else None
+    if folder is None or display is None:
+        return None, runner.train(cfg.train.runner.max_iterations)
+    print(f"run folder {relative(folder)}", flush=True)
+    display.title = f"{cfg.task}: {relative(folder)}"
+    runner.logger.log_dir = str(folder)
+    when_output_is_lost(runner.stop)
+    try:
+        return folder, runner.train(cfg.train.runner.max_iterations)
+    except BaseException as error:
+        if runner.logger.writer is not None:
+            with contextlib.suppress(OSError):
+                runner.logger.stop_logging_writer()
+        discard_run(folder)
+        full = full_disk_in(error)
+        if full is not None and not isinstance(error, RunError):  # TensorBoard's writer does not say which file
+            raise RunError(f"{relative(folder)}: {reason(full)}") from error
+        raise
+
+
+def describe(cfg: TaskConfig, device: torch.device) -> str:
     """One line on what is about to run where."""
     if device.type == "cpu":
         engines = {
@@ -123,40 +166,43 @@ def describe(cfg: TaskConfig, device: torch.device, folder: Path) -> str:
     ranks = Ranks.now()
     share = f" on each of {ranks.count} processes" if ranks.several else ""
     robots = f"{cfg.env.num_envs} robots{share}"
-    return f"{cfg.task}: {robots}, {cfg.train.runner.max_iterations} iterations, {where}; {relative(folder)}"
+    return f"{cfg.task}: {robots}, {cfg.train.runner.max_iterations} iterations, {where}"
 
 
-def stop_on_signals(runner: Runner) -> list[int]:
-    """Ctrl-C and SIGTERM stop at the end of an iteration, a second one at once. Returns a list that gets the signal.
-
-    Of several processes all stop as soon as one is asked to. There a second signal changes nothing: torchrun passes on what
-    the terminal has sent already, and kills who takes more than half a minute.
-    """
-    received: list[int] = []
-    ranks = Ranks.now()
-
-    def handler(number: int, frame: FrameType | None) -> None:
-        if received and not ranks.several:
-            raise KeyboardInterrupt
-        if not received and ranks.first:
-            once_more = "" if ranks.several else "; once more to stop at once"
-            print(f"stopping after this iteration, with a checkpoint{once_more}", file=sys.stderr, flush=True)
-        received.append(number)
-        runner.stop()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, handler)
-    return received
+def play_command(args: argparse.Namespace, cfg: TaskConfig, folder: Path) -> str:
+    """The command that shows the policy of a run, as it can be pasted into the shell that this training was started from."""
+    words = [*play_program(), "--task", args.given_task]
+    if args.module:
+        words += ["--import", args.module]
+    if cfg.train.runner.experiment_name:
+        words += ["--experiment_name", cfg.train.runner.experiment_name]
+    with contextlib.suppress(ConfigError, OSError):
+        if find_run(cfg, None) != folder:  # another training of this task goes on beside it
+            words += ["--load_run", folder.name]
+    return shlex.join(words)
 
 
-def _summary(runner: Runner, folder: Path, start_up_s: float, finished: bool) -> None:
-    task: LeggedRobot = runner.env  # type: ignore[assignment]
+def play_program() -> list[str]:
+    """How play is started by somebody who started this process as he did."""
+    how = command_of_ours()
+    if how == "installed":
+        return ["legged-play"]
+    if how == "module":
+        return ["python", "-m", "legged.rl.play"]
+    return ["python", str(Path(sys.argv[0]).with_name("play.py")) if how == "script" else "play.py"]
+
+
+def _summary(runner: Runner, folder: Path, start_up_s: float, finished: bool, play: str) -> None:
     steps = runner.logger.tot_timesteps
     loop = runner.logger.loop_s
     print(
         f"{'finished' if finished else 'stopped'} after {runner.current_learning_iteration + 1} iterations: "
         f"{steps:,} steps in {loop:.1f} s of training loop ({steps / max(loop, 1e-9):,.0f} steps/s), "
         f"{start_up_s:.1f} s of start-up, imports and kernel compilation included\n"
-        f"checkpoint in {relative(folder)}; see it walk: python play.py --task {task.cfg.task}",
+        f"checkpoint in {relative(folder)}; see it walk: {play}",
         flush=True,
     )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

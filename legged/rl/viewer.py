@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.envs import LeggedRobot
-from legged.rendering import display_model
+from legged.rendering import display_model, size_of
 from legged.rl.playground import Playground
 
 STEP = (0.1, 0.1, 0.2)
@@ -56,6 +56,7 @@ def view(task: LeggedRobot, act: Callable[[TensorDict], Tensor], playground: Pla
     keyboard = Keyboard(low, high)
     model = display_model(task.robot, 1, 640, 480, task.terrain)
     data = mujoco.MjData(model)
+    length = size_of(task.robot).longest
     simulated = mujoco.MjData(task.physics.model)  # type: ignore[attr-defined]
     print(HELP)
     if playground:
@@ -66,7 +67,7 @@ def view(task: LeggedRobot, act: Callable[[TensorDict], Tensor], playground: Pla
         window.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
         window.cam.trackbodyid = model.body(f"0/{task.robot.file.base}").id
         window.cam.distance, window.cam.azimuth, window.cam.elevation = (
-            (2.5, 130.0, -18.0) if task.terrain is None else (4.0, 62.0, -35.0)
+            (2.4 * length, 130.0, -18.0) if task.terrain is None else (3.83 * length, 62.0, -35.0)
         )
         window.opt.geomgroup[3] = 0  # collision shapes
         while window.is_running():

@@ -26,13 +26,13 @@ from legged.config import override
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
 from legged.graph import StepGraph
+from legged.paths import make_folder, ready_to_write_file, write_text
 from legged.physics import resolve_physics
 from legged.registry import make_task, task_config
 from legged.rl.arguments import add_task_arguments, import_and_check, overrides, pick_device, run_main, settle_on
 from legged.rl.captured import CapturedRunner
 from legged.rl.display import Progress
 from legged.rl.runner import Runner
-from legged.rl.runs import write_text
 from legged.tools.kernel_times import kernel_times, table
 from legged.tools.scale import scale
 
@@ -71,10 +71,17 @@ def _main(argv: list[str] | None) -> int:
     import_and_check(args)
     device = pick_device(args.sim_device)
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
+    for name, least in (("steps", 1), ("repeats", 1), ("iterations", 0), ("kernels", 1)):
+        value = getattr(args, name)
+        if value is not None and value < least:
+            raise ConfigError(f"--{name}: must be at least {least}, got {value}")
+    if args.json:
+        ready_to_write_file("--json", args.json)
     if args.kernels is not None and device.type != "cuda":
         raise ConfigError(f"--kernels: needs a GPU, and the task is on {device}")
     if args.scale is not None:
-        return scale(args, cfg, device)  # in processes of their own: this one must not take memory
+        # In processes of their own: this one must not take memory.
+        return scale(args, sys.argv[1:] if argv is None else argv, cfg, device)
     settle_on(device)
     if args.grounds and resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics")) != "mujoco_warp":
         raise ConfigError("--grounds: compares colliders of mujoco_warp; add sim.physics=mujoco_warp")
@@ -101,6 +108,7 @@ def _main(argv: list[str] | None) -> int:
         print((f"{name}: " if name else "") + report(task, result), flush=True)
         results[name] = result
     if args.json:
+        make_folder(args.json.parent)
         write_text(args.json, json.dumps(results if args.grounds else results[""], indent=1))
     return 0
 

@@ -18,8 +18,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from legged.errors import ConfigError, suggest
-from legged.paths import relative, replacing
+from legged.paths import make_folder, ready_to_write_file, relative, replacing
 from legged.rl.arguments import run_main
+from legged.tools.evaluation_file import check, tracking_of
 from legged.tools.success_report import ENGINES, TRAINED
 
 Evaluations = dict[tuple[str, str], list[dict[str, Any]]]
@@ -46,13 +47,17 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("--types", help="terrain types to show, e.g. stairs_up,slope_up; all by default")
     parser.add_argument("--out", type=Path, help="also draw success against difficulty into this PNG file")
     args = parser.parse_args(argv)
+    if args.out:
+        ready_to_write_file("--out", args.out)
     results = read(args.paths)
     if args.types:
-        keep_types(results, args.types.split(","))
+        keep_types(results, [name.strip() for name in args.types.split(",")])
     groups = grouped(results)
     console = Console(width=130)
     console.print(tracking_table(groups))
     with_success = {key: results for key, results in groups.items() if all("success" in result for result in results)}
+    if not types_of(with_success):
+        with_success = {}
     if with_success:
         console.print(success_table(with_success))
     if args.out:
@@ -77,9 +82,9 @@ def read(paths: Iterable[Path]) -> list[dict[str, Any]]:
         for file in files:
             try:
                 result = json.loads(file.read_text(encoding="utf-8"))
-                tracking_of(result)["falls"], result["task"], result["physics"]
-            except (ValueError, KeyError, TypeError) as error:
+            except (OSError, ValueError, RecursionError) as error:
                 raise ConfigError(f"{file}: is not the result of an evaluation ({error})") from error
+            check(result, str(file))
             results.append(result)
     return results
 
@@ -98,11 +103,6 @@ def keep_types(results: Sequence[dict[str, Any]], types: Sequence[str]) -> None:
         if "success" in result:
             found = result["success"]["types"]
             result["success"]["types"] = {name: found[name] for name in types if name in found}
-
-
-def tracking_of(result: dict[str, Any]) -> dict[str, Any]:
-    """The part of a result that says how commands were followed."""
-    return result.get("rough", result)
 
 
 def grouped(results: Sequence[dict[str, Any]]) -> Evaluations:
@@ -124,12 +124,16 @@ def tracking_table(groups: Evaluations) -> Table:
     table = Table(title="following commands: mean of seeds (farthest from it)", title_justify="left")
     table.add_column("measure")
     for key, results in groups.items():
-        table.add_column(heading(key, len(results)), justify="right")
+        table.add_column(escape(heading(key, len(results))), justify="right")
     for label, name, part, factor, decimals in FIGURES:
         cells = []
         for results in groups.values():
             found = [tracking_of(result)[name] for result in results]
-            values = [factor * (value if part is None else value[part]) for value in found]
+            every = [value if part is None else value[part] for value in found]
+            values = [factor * value for value in every if value is not None]
+            if not values:  # every robot fell before it was measured
+                cells.append("none")
+                continue
             text = f"{mean(values):.{decimals}f}"
             cells.append(f"{text} ({100 * spread(values):.0f} %)" if len(values) > 1 else text)
         table.add_row(escape(label), *cells)
@@ -139,8 +143,12 @@ def tracking_table(groups: Evaluations) -> Table:
 def heading(key: tuple[str, str], seeds: int) -> str:
     """A group in words."""
     task, physics = key
-    engine = ENGINES[physics][0] if physics in ENGINES else physics
-    return f"{task}\n{engine}, {seeds} seed{'s' if seeds > 1 else ''}"
+    return f"{task}\n{drawn(physics)[0]}, {seeds} seed{'s' if seeds > 1 else ''}"
+
+
+def drawn(physics: str) -> tuple[str, str, str]:
+    """Label, line and marker of an engine; one of which this version knows nothing has its own name."""
+    return ENGINES.get(physics, (physics, ":", "x"))
 
 
 def shares(results: Sequence[dict[str, Any]], terrain: str) -> dict[float, list[float]]:
@@ -166,12 +174,12 @@ def success_table(groups: Evaluations) -> Table:
     table.add_column("terrain")
     table.add_column("size", justify="right")
     for key, results in groups.items():
-        table.add_column(heading(key, len(results)), justify="right")
+        table.add_column(escape(heading(key, len(results))), justify="right")
     for name, entry in types_of(groups).items():
         columns = [shares(results, name) for results in groups.values()]
         for i, size in enumerate(sorted(set().union(*columns))):
             cells = [_share(column.get(size, [])) for column in columns]
-            table.add_row(name if i == 0 else "", f"{size:g} {entry['unit']}", *cells)
+            table.add_row(escape(name if i == 0 else ""), escape(f"{size:g} {entry['unit']}"), *cells)
         table.add_section()
     return table
 
@@ -200,7 +208,7 @@ def draw(groups: Evaluations, path: Path) -> None:
     for axis, (name, entry) in zip(axes.flat, names.items(), strict=False):
         for (task, physics), results in groups.items():
             found = shares(results, name)
-            color, (_, line, marker) = COLORS[tasks.index(task) % len(COLORS)], ENGINES[physics]
+            color, (_, line, marker) = COLORS[tasks.index(task) % len(COLORS)], drawn(physics)
             axis.plot(list(found), [mean(v) for v in found.values()], line, marker=marker, ms=3, color=color, clip_on=False)
             low, high = ([pick(values) for values in found.values()] for pick in (min, max))
             axis.fill_between(list(found), low, high, color=color, alpha=0.15, lw=0)
@@ -217,11 +225,12 @@ def draw(groups: Evaluations, path: Path) -> None:
         axis.spines[["top", "right"]].set_visible(False)
     keys = []
     for (task, physics), results in groups.items():
-        color, (label, line, marker) = COLORS[tasks.index(task) % len(COLORS)], ENGINES[physics]
+        color, (label, line, marker) = COLORS[tasks.index(task) % len(COLORS)], drawn(physics)
         text = f"{task}, {label}" + (f", {len(results)} seeds" if len(results) > 1 else "")
         keys.append(plt.Line2D([], [], color=color, ls=line, marker=marker, ms=4, label=text))
     keys.append(plt.Line2D([], [], **TRAINED, label="hardest of training"))
     figure.legend(handles=keys, loc="outside lower center", ncols=2, frameon=False)
+    make_folder(path.parent)
     with replacing(path) as part:
         figure.savefig(part, dpi=110, format="png")
     plt.close(figure)

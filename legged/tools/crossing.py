@@ -8,14 +8,15 @@ from typing import Any, get_args
 import matplotlib
 import torch
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from legged.config import override
 from legged.config.schema import NewtonSolver
-from legged.paths import relative
+from legged.errors import RunError
+from legged.paths import make_folder, relative, replacing, write_text
 from legged.physics import engine_name
 from legged.rl.policy import TrainedPolicy
-from legged.rl.runs import write_text
 from legged.tools.tracking import ready_to_track, tell
 from legged.tools.velocity_grid import Grid, measure
 
@@ -35,8 +36,9 @@ def cross(
 
     Engines run on `device`, the C engine on the CPU. `asked` is what the command line changes beside the engine.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     path = folder / "crossing.json"
+    failure: RunError | None = None
     result: dict[str, Any] = {
         "task": policy.cfg.task,
         "checkpoint": policy.checkpoint.name,
@@ -47,8 +49,14 @@ def cross(
     for choice in ENGINES:
         where = torch.device("cpu") if choice == [("sim.physics", "mujoco")] else device
         result["engines"].append(_measured(policy, grid, [*asked, *choice], where, graph))
-        write_text(path, json.dumps(result, indent=1, allow_nan=False))
+        try:
+            write_text(path, json.dumps(result, indent=1, allow_nan=False))
+            failure = None
+        except RunError as error:  # what is measured is shown all the same, and the disk may have room again by then
+            failure = error
     Console(width=110).print(report(result))
+    if failure is not None:
+        raise failure
     plot(result, path.with_suffix(".png"))
     print(f"written: {relative(path)}, {relative(path.with_suffix('.png'))}")
     return 0
@@ -82,7 +90,7 @@ def report(result: dict[str, Any]) -> Table:
     """A line an engine; an engine in which every robot fell before it was measured has no errors."""
     cells = len(result["grid"]["vx"]) * len(result["grid"]["vy"]) * len(result["grid"]["yaw"])
     title = f"{result['task']} ({result['checkpoint']}): {cells} commands x {result['robots_per_cell']} robots"
-    table = Table(title=title, title_justify="left")
+    table = Table(title=escape(title), title_justify="left")
     table.add_column("engine", no_wrap=True)
     for head in ("velocity RMSE", "yaw rate RMSE", "falls", "cost of\ntransport", "base height", "lost\ncontacts", "steps/s"):
         table.add_column(head, justify="right")
@@ -129,7 +137,6 @@ def plot(result: dict[str, Any], path: Path) -> None:
     axes[3].set_xscale("log")
     axes[3].set_xlim(1.0, None)
     figure.suptitle(f"{result['task']} in every engine")
-    part = path.with_name(f".{path.name}")
-    figure.savefig(part, dpi=110, format="png")
+    with replacing(path) as part:
+        figure.savefig(part, dpi=110, format="png")
     plt.close(figure)
-    part.replace(path)

@@ -16,11 +16,12 @@ import matplotlib
 import numpy as np
 import torch
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from legged.config import override
 from legged.errors import ConfigError
-from legged.paths import relative, replacing
+from legged.paths import make_folder, ready_to_write, relative, replacing, write_text
 from legged.physics import engine_name
 from legged.rl.arguments import (
     add_run_arguments,
@@ -32,12 +33,20 @@ from legged.rl.arguments import (
     settle_on,
 )
 from legged.rl.policy import find_policy
-from legged.rl.runs import write_text
 from legged.tools.crossing import EVERYWHERE, cross
 from legged.tools.success import chosen_types, sweep
 from legged.tools.success_report import plot_success, print_success, with_other_engine
 from legged.tools.tracking import ready_to_track, tell
 from legged.tools.velocity_grid import Grid, measure
+
+MOST_ROBOTS = 2**20
+"""More are not simulated at once."""
+MOST_SIZES = 16
+"""Sizes of a terrain type, at most, that are measured at once."""
+MOST_VALUES = 10_000
+"""Commands on an axis, at most."""
+FASTEST = 20.0
+"""A command, at most [m/s, rad/s]: the ground that fast robots need grows with the square of it."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -70,6 +79,9 @@ def _main(argv: list[str] | None) -> int:
     if args.num_envs is not None:
         raise ConfigError("--num_envs: the grid says how many robots there are; --robots sets those of a cell")
     grid = Grid(axis_values("--vx", args.vx), axis_values("--vy", args.vy), axis_values("--yaw", args.yaw), args.robots)
+    check_number(grid)
+    if a_point > MOST_ROBOTS // MOST_SIZES:
+        raise ConfigError(f"--robots-per-point: at most {MOST_ROBOTS // MOST_SIZES:,}, got {a_point:,}")
     device = torch.device("cpu") if args.physics == "mujoco" and args.sim_device is None else pick_device(args.sim_device)
     settle_on(device)
     everywhere = args.physics == EVERYWHERE
@@ -79,8 +91,10 @@ def _main(argv: list[str] | None) -> int:
                 raise ConfigError(f"--{flag.replace('_', '-')}: --physics {EVERYWHERE} tracks commands in every solver, only")
         args.physics = None
     policy = find_policy(args)
+    folder = args.out or policy.output("evaluate")
+    ready_to_write(folder)
     if everywhere:
-        return cross(policy, grid, policy_overrides(args), device, not args.no_graph, args.out or policy.output("evaluate"))
+        return cross(policy, grid, policy_overrides(args), device, not args.no_graph, folder)
     types = chosen_types(policy.cfg, args.types)
     # The engine is that of the device, not that of the training.
     asked = [("sim.physics", "auto"), *policy_overrides(args)]
@@ -105,20 +119,21 @@ def _main(argv: list[str] | None) -> int:
         **({"rough": {"bumps": 0.05, **figures, "contact_overflows": lost}} if rough else figures),
         **({} if success is None else {"success": success}),
     }
-    folder = args.out or policy.output("evaluate")
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"evaluation_{engine}.json"
-    write_text(path, json.dumps(result, indent=1, allow_nan=False))
-    written = [path, path.with_suffix(".png")]
+    # First what is on the screen: no disk can take it away any more.
     tracking = {**header, **figures, "ground": "on rough ground, " if rough else ""}
-    plot(tracking, written[1])
     print_report(tracking)
     warn_of_overflows("tracking", lost)
     if success is not None:
-        written.append(folder / f"success_{engine}.png")
-        plot_success(with_other_engine(result, path), written[2])
         print_success(success)
         warn_of_overflows("success", success["contact_overflows"])
+    make_folder(folder)
+    path = folder / f"evaluation_{engine}.json"
+    write_text(path, json.dumps(result, indent=1, allow_nan=False))
+    written = [path, path.with_suffix(".png")]
+    plot(tracking, written[1])
+    if success is not None:
+        written.append(folder / f"success_{engine}.png")
+        plot_success(with_other_engine(result, path), written[2])
     print(f"written: {', '.join(relative(one) for one in written)}")
     return 0
 
@@ -144,12 +159,33 @@ def axis_values(flag: str, text: str) -> list[float]:
     except ValueError:
         parts = []
     finite = all(np.isfinite(part) for part in parts)
+    if finite and any(abs(part) > FASTEST for part in parts[:2]):
+        raise ConfigError(f"{flag}: '{text}' asks for more than {FASTEST:g}; commands are in m/s and rad/s")
     if len(parts) == 1 and finite:
         return parts
     if len(parts) != 3 or not finite or parts[2] <= 0 or parts[1] < parts[0]:
         raise ConfigError(f"{flag}: '{text}' is not of the form low:high:step, e.g. {flag}=-1:1:0.5")
     low, high, step = parts
+    count = (high - low) / step + 1.0
+    if count > MOST_VALUES:
+        raise ConfigError(
+            f"{flag}: '{text}' makes {count:,.0f} cells of this axis alone; at most {MOST_VALUES:,} are possible"
+        )
     return [round(float(value), 6) for value in np.arange(low, high + 0.5 * step, step)]
+
+
+def check_number(grid: Grid) -> None:
+    """Check that the robots of a grid can be simulated at once.
+
+    Raises:
+        ConfigError: there are more than any machine holds.
+    """
+    cells = len(grid.vx) * len(grid.vy) * len(grid.yaw)
+    if grid.num_envs > MOST_ROBOTS:
+        raise ConfigError(
+            f"--vx, --vy, --yaw, --robots: {cells:,} cells x {grid.robots:,} robots are {grid.num_envs:,} robots; at most"
+            f" {MOST_ROBOTS:,} are possible"
+        )
 
 
 def print_report(result: dict[str, Any]) -> None:
@@ -158,7 +194,7 @@ def print_report(result: dict[str, Any]) -> None:
     title = f"{result['task']} ({result['checkpoint']}) in {result['physics']}"
     if result["ground"]:
         title += ", on level ground with bumps of up to 5 cm"
-    table = Table(title=title, title_justify="left")
+    table = Table(title=escape(title), title_justify="left")
     for name, justify in (("measure", "left"), ("value", "right"), ("where", "left")):
         table.add_column(name, justify=justify)  # type: ignore[arg-type]
     cells = f"{len(result['cells'])} cells x {result['robots_per_cell']} robots x {result['measured_s']:.0f} s"

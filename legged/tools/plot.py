@@ -7,16 +7,20 @@ which robots moved up and down, as means over the runs.
 
 import argparse
 import sys
+from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from legged.config.loader import read_yaml
 from legged.errors import ConfigError
-from legged.paths import relative, replacing
+from legged.paths import make_folder, ready_to_write_file, relative, replacing
 from legged.rl.arguments import run_main
+from legged.rl.runs import CONFIG_FILE
 
 CURVES = (
     ("Metrics/lin_vel_rmse", "velocity error in training [m/s]", 1.0),
@@ -27,8 +31,6 @@ CURVES = (
 
 
 LEVEL = "Terrain/level_"
-ALWAYS_PROMOTED = 6.0
-"""Mean level over ten rows of robots that are always promoted: from the top they go to a random row."""
 Scalars = dict[str, tuple[np.ndarray, np.ndarray]]
 """Tag -> (iterations, values)."""
 
@@ -43,16 +45,20 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("runs", nargs="+", type=Path, help="run folders")
     parser.add_argument("--out", type=Path, default=Path("learning_curve.png"), help="PNG file")
     args = parser.parse_args(argv)
-    draw({run.name: read_scalars(run) for run in args.runs}, args.out)
+    ready_to_write_file("--out", args.out)
+    runs = [read_scalars(run) for run in args.runs]
+    configs = [read_config(run) for run in args.runs]
+    named = dict(zip(labels(args.runs, configs), runs, strict=True))
+    draw(named, args.out, {level for config in configs if (level := always_promoted(config)) is not None})
     print(f"written: {relative(args.out)}")
     return 0
 
 
 def read_scalars(run: Path) -> Scalars:
-    """All scalars of a run folder.
+    """Read all scalars of a run folder.
 
     Raises:
-        ConfigError: it holds no TensorBoard file.
+        ConfigError: it holds no TensorBoard file, or one without values.
     """
     if not list(run.glob("events.out.tfevents.*")):
         raise ConfigError(f"{run}: holds no TensorBoard file")
@@ -62,7 +68,52 @@ def read_scalars(run: Path) -> Scalars:
     for tag in events.Tags()["scalars"]:
         entries = events.Scalars(tag)
         found[tag] = (np.array([e.step for e in entries]), np.array([e.value for e in entries]))
+    if not found:
+        raise ConfigError(f"{run}: its TensorBoard file holds no values; the training ended before its first iteration did")
     return found
+
+
+def read_config(run: Path) -> dict[str, Any]:
+    """Read the configuration in a run folder as it stands there: what an older version wrote need not fit this one's schema.
+    Empty where there is none that can be read.
+    """
+    try:
+        return read_yaml(run / CONFIG_FILE)
+    except ConfigError:
+        return {}
+
+
+def labels(folders: Sequence[Path], configs: Sequence[dict[str, Any]]) -> list[str]:
+    """What each run is: its task, its own name and its seed; the name of its folder where no configuration says that, and
+    beside it where two would be called the same.
+    """
+    found = []
+    for folder, config in zip(folders, configs, strict=True):
+        name, seed = _at(config, "train", "runner", "run_name"), _at(config, "env", "seed")
+        parts = [str(config["task"])] if config.get("task") else []
+        parts += [str(name)] if name else []
+        parts += [f"seed {seed}"] if seed is not None else []
+        found.append(", ".join(parts) if config.get("task") else folder.resolve().name)
+    twice = {label for label in found if found.count(label) > 1}
+    names = [folder.resolve().name for folder in folders]
+    named = [f"{text} ({name})" if text in twice else text for text, name in zip(found, names, strict=True)]
+    return [f"{text} [{i}]" if named.count(text) > 1 else text for i, text in enumerate(named, start=1)]
+
+
+def always_promoted(config: dict[str, Any]) -> float | None:
+    """Give the mean level of robots that are always promoted, over the R rows of a run's terrain: 2 (R - 1) / 3. From the top
+    they go to a random row, so that they are on row r in proportion to r + 1. None where no configuration says how many rows
+    there are.
+    """
+    rows = _at(config, "terrain", "num_rows")
+    return 2.0 * (rows - 1) / 3.0 if isinstance(rows, int) else None
+
+
+def _at(config: Any, *keys: str) -> Any:
+    """The value in a nested mapping; None where there is none."""
+    for key in keys:
+        config = config.get(key) if isinstance(config, dict) else None
+    return config
 
 
 def smooth(values: np.ndarray, width: int = 9) -> np.ndarray:
@@ -72,8 +123,10 @@ def smooth(values: np.ndarray, width: int = 9) -> np.ndarray:
     return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
 
 
-def draw(runs: dict[str, Scalars], path: Path) -> None:
-    """One panel a curve, one line a run; and, on terrain, one panel for levels and one for moves, one line a type."""
+def draw(runs: dict[str, Scalars], path: Path, always: Collection[float] = ()) -> None:
+    """Draw one panel a curve, one line a run; and, on terrain, one panel for levels and one for moves, one line a type.
+    `always` are mean levels of robots that are always promoted.
+    """
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
@@ -90,18 +143,20 @@ def draw(runs: dict[str, Scalars], path: Path) -> None:
         axis.set_ylim(bottom=min(0.0, axis.get_ylim()[0]))
     axes[0, 0].legend(fontsize="small")
     if types:
-        _draw_levels(axes[2, 0], axes[2, 1], list(runs.values()), types)
+        _draw_levels(axes[2, 0], axes[2, 1], list(runs.values()), types, always)
     for axis in axes.flat:
         axis.set_xlabel("iteration")
+        if axis.get_xlim()[0] >= axis.get_xlim()[1] or max(len(steps) for steps, _ in first.values()) < 2:
+            axis.set_xlim(0.0, 2.0)  # one iteration has no extent
         axis.grid(alpha=0.3)
         _time_axis(axis, first)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     with replacing(path) as part:
         figure.savefig(part, dpi=110, format="png")
     plt.close(figure)
 
 
-def _draw_levels(levels: Axes, moves: Axes, runs: list[Scalars], types: list[str]) -> None:
+def _draw_levels(levels: Axes, moves: Axes, runs: list[Scalars], types: list[str], always: Collection[float]) -> None:
     """Mean level, and shares of episodes after which robots moved up (solid) and down (dashed), of each type."""
     for i, name in enumerate(types):
         colour = f"C{i}"
@@ -109,8 +164,9 @@ def _draw_levels(levels: Axes, moves: Axes, runs: list[Scalars], types: list[str
         for what, line in (("promoted", "-"), ("demoted", "--")):
             steps, share = mean_of(runs, f"Terrain/{what}_{name}")
             moves.plot(steps, smooth(100.0 * share, 25), line, color=colour, linewidth=1.2)
-    levels.axhline(ALWAYS_PROMOTED, color="0.3", linestyle=":", linewidth=1.4)
-    levels.set_ylabel("mean terrain level (dotted: always up)")
+    for level in always:
+        levels.axhline(level, color="0.3", linestyle=":", linewidth=1.4)
+    levels.set_ylabel("mean terrain level" + (" (dotted: always up)" if always else ""))
     levels.set_ylim(bottom=0.0)
     levels.legend(fontsize="small", ncols=2)
     moves.set_ylabel("moved up, dashed: down [% of episodes]")
@@ -129,6 +185,9 @@ def _time_axis(axis: Axes, scalars: Scalars) -> None:
     if "Perf/collection_time" not in scalars:
         return
     per_iteration = float(np.mean(scalars["Perf/collection_time"][1]) + np.mean(scalars["Perf/learning_time"][1]))
+
+    if not per_iteration > 0.0:
+        return
 
     def seconds(iterations: np.ndarray) -> np.ndarray:
         return iterations * per_iteration

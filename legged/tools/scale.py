@@ -14,8 +14,8 @@ import torch
 
 from legged.config import TaskConfig
 from legged.errors import ConfigError
+from legged.paths import make_folder, write_text
 from legged.rl.arguments import EXIT_WRONG_INPUT
-from legged.rl.runs import write_text
 
 NO_MEMORY = re.compile(r"out of memory|can't allocate memory|Failed to allocate|MemoryError|bad_?alloc")
 """What torch, Warp and Python say of it."""
@@ -34,8 +34,9 @@ COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], str]], ...] = (
 """Of the table: heading, width, text."""
 
 
-def scale(args: argparse.Namespace, cfg: TaskConfig, device: torch.device) -> int:
-    """Print a row for each number of robots in `args.scale`, write all to `args.json`; returns the exit code. A size that
+def scale(args: argparse.Namespace, given: Sequence[str], cfg: TaskConfig, device: torch.device) -> int:
+    """Print a row for each number of robots in `args.scale`, write all to `args.json`; returns the exit code. `given` is the
+    command line that `args` were read from: each size is measured as it says. A size that
     needs more memory than there is has a row that says so; one that fails for another reason too, and makes the code 1.
 
     Raises:
@@ -51,9 +52,10 @@ def scale(args: argparse.Namespace, cfg: TaskConfig, device: torch.device) -> in
     print("".join(f"{name:>{width}}" for name, width, _ in COLUMNS), flush=True)
     rows = []
     for size in sizes:
-        rows.append(measure_apart(args, size, loop))
+        rows.append(measure_apart(others(given), size, loop))
         print(line(rows[-1]), flush=True)
     if args.json:
+        make_folder(args.json.parent)
         write_text(args.json, json.dumps({"task": cfg.task, "device": where, "loop": loop, "sizes": rows}, indent=1))
     return int(any(row.get("failed", NO_ROOM) != NO_ROOM for row in rows))
 
@@ -70,19 +72,20 @@ def numbers(text: str) -> list[int]:
     return [int(part) for part in parts]
 
 
-def measure_apart(args: argparse.Namespace, size: int, loop: str) -> dict[str, Any]:
-    """The benchmark's numbers with `size` robots, or why there are none as `failed`.
+def measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, Any]:
+    """The benchmark's numbers under these arguments with `size` robots, or why there are none as `failed`.
 
     Raises:
         ConfigError: the configuration does not allow that many.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "result.json"
-        command = [sys.executable, "-m", "legged.tools.benchmark", *arguments(args)]
+        command = [sys.executable, "-m", "legged.tools.benchmark", *arguments]
         command += ["--num_envs", str(size), "--runner", loop, "--json", str(path)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode == EXIT_WRONG_INPUT:
-            raise ConfigError(done.stderr.strip().removeprefix("error: "))
+            said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+            raise ConfigError(said[-1].removeprefix("error: "))
         if done.returncode == KILLED or (done.returncode and NO_MEMORY.search(done.stderr)):
             return {"num_envs": size, "failed": NO_ROOM}
         if done.returncode:
@@ -94,12 +97,12 @@ def measure_apart(args: argparse.Namespace, size: int, loop: str) -> dict[str, A
     return {**result, **iterations}
 
 
-def arguments(args: argparse.Namespace) -> Sequence[str]:
-    """The command line of `args`, without what is different for each size."""
-    named = ("seed", "sim_device", "steps", "repeats", "iterations")
-    flags = [(f"--{name}", getattr(args, name)) for name in named] + [("--task", args.given_task), ("--import", args.module)]
-    texts = [text for flag, value in flags if value is not None for text in (flag, str(value))]
-    return [*texts, *(["--no-graph"] if args.no_graph else []), *args.overrides]
+def others(given: Sequence[str]) -> list[str]:
+    """A command line without what is different for each size, abbreviated or not."""
+    own = argparse.ArgumentParser(add_help=False)
+    for flag in ("--scale", "--json", "--num_envs", "--runner"):
+        own.add_argument(flag)
+    return own.parse_known_args(list(given))[1]
 
 
 def line(row: dict[str, Any]) -> str:

@@ -16,7 +16,7 @@ from PIL import Image
 from legged.config import TaskConfig
 from legged.config.schema import TerrainConfig
 from legged.errors import ConfigError, suggest
-from legged.paths import relative, replacing
+from legged.paths import make_folder, ready_to_write, relative, replacing
 from legged.registry import task_config
 from legged.rl.arguments import add_task_arguments, import_and_check, overrides, run_main
 from legged.robot import load_robot
@@ -43,6 +43,7 @@ def _main(argv: list[str] | None) -> int:
     if not 0.0 <= args.difficulty <= 1.0:
         raise ConfigError(f"--difficulty: must be between 0 and 1, got {args.difficulty:g}")
     cfg = task_config(args.task, overrides(args), on_cpu=True)
+    ready_to_write(args.out)
     if args.types is None:
         if cfg.terrain.mesh_type == "plane":
             raise ConfigError(
@@ -59,7 +60,7 @@ def _main(argv: list[str] | None) -> int:
         check_terrain(replace(sizes, proportions=dict.fromkeys(types, 1.0 / len(types))), cfg.origins)
         terrain = tiles(cfg.terrain, [types[::-1]], args.difficulty, cfg.env.seed)  # the map's first column is the rightmost
         levels = [f"{args.difficulty:g}"]
-    args.out.mkdir(parents=True, exist_ok=True)
+    make_folder(args.out)
     map_path, picture_path = args.out / "terrain_map.png", args.out / "terrain.png"
     with replacing(map_path) as part:
         draw_map(terrain, levels, part)

@@ -6,11 +6,13 @@ from typing import Any, get_args
 
 import matplotlib
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from legged.config.schema import NewtonSolver
 from legged.paths import replacing
 from legged.terrain import TERRAIN_TYPES
+from legged.tools.evaluation_file import check
 
 PANELS = {
     "stairs": ("stairs_up", "stairs_down"),
@@ -34,7 +36,7 @@ def print_success(success: dict[str, Any]) -> None:
     """One line a point; sizes beyond those of training are marked."""
     rule = success["definition"]
     head = f"success: {rule['distance_m']:g} m from the start within {rule['time_s']:g} s, asked for {rule['vx']:g} m/s"
-    table = Table(title=head, title_justify="left")
+    table = Table(title=escape(head), title_justify="left")
     for name in ("terrain", "size", "success", "95 % interval", "fell", "stuck", "time to success"):
         table.add_column(name, justify="left" if name == "terrain" else "right")
     beyond = False
@@ -44,7 +46,7 @@ def print_success(success: dict[str, Any]) -> None:
             beyond |= mark
             time_s = point["mean_time_s"]
             table.add_row(
-                name if i == 0 else "",
+                escape(name) if i == 0 else "",
                 f"{point['size']:g} {entry['unit']}{' *' if mark else '  '}",
                 f"{point['successes']}/{point['robots']} = {100 * point['share']:.0f} %",
                 f"{100 * point['low']:.0f} to {100 * point['high']:.0f} %",
@@ -78,9 +80,12 @@ def with_other_engine(result: dict[str, Any], path: Path) -> list[dict[str, Any]
             continue
         try:
             saved = json.loads(other.read_text(encoding="utf-8"))
-            if "success" in saved and all(saved[key] == result[key] for key in ("task", "checkpoint")):
+            check(saved, str(other))
+            points = [point for entry in saved["success"]["types"].values() for point in entry["points"]]
+            drawable = "robots_per_point" in saved["success"] and all({"low", "high"} <= point.keys() for point in points)
+            if drawable and all(saved[key] == result[key] for key in ("task", "checkpoint")):
                 found.append(saved)
-        except (ValueError, KeyError, TypeError):  # not a file of ours: nothing to show
+        except (OSError, ValueError, KeyError):  # not a file of ours: nothing to show
             continue
     return sorted(found, key=lambda one: list(ENGINES).index(one["physics"]))
 

@@ -33,7 +33,7 @@ def render(terrain: Terrain, places: Sequence[Place], robot: Robot, width: int =
     The height of the picture is what the terrain fills.
 
     Raises:
-        ConfigError: nothing can be rendered here.
+        RunError: nothing can be rendered here.
     """
     outline = _outline(terrain)
     seen = np.ptp(Camera.on(outline, width, width).pixels(outline), axis=0)

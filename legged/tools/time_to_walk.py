@@ -9,10 +9,11 @@ time_to_walk.json into the run folder.
 import argparse
 import json
 import sys
+from pathlib import Path
 from typing import Any
 
 from legged.errors import ConfigError
-from legged.paths import relative
+from legged.paths import make_folder, ready_to_write, relative, write_text
 from legged.physics import engine_name
 from legged.rl.arguments import (
     add_run_arguments,
@@ -25,12 +26,15 @@ from legged.rl.arguments import (
 )
 from legged.rl.checkpoint import read_checkpoint
 from legged.rl.policy import find_policy
-from legged.rl.runs import checkpoints, write_text
+from legged.rl.runs import checkpoints
 from legged.tools.tracking import ready_to_track, tell
 from legged.tools.velocity_grid import Grid, measure
 
 AXIS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 """Commands of the grid, in m/s and rad/s."""
+
+MOST_A_CELL = 8192
+"""Robots; on the grid of 125 cells a million."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -47,24 +51,30 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("--falls", type=float, default=0.01, help="and a smaller share of falls")
     args = parser.parse_intermixed_args(argv)
     import_and_check(args)
-    for flag, value in (("--robots", args.robots), ("--rmse", args.rmse), ("--falls", args.falls)):
-        if value <= 0:
+    for flag, value, most in (
+        ("--robots", args.robots, MOST_A_CELL),
+        ("--rmse", args.rmse, 100.0),
+        ("--falls", args.falls, 1.0),
+    ):
+        if not value > 0:
             raise ConfigError(f"{flag}: must be above 0, got {value}")
+        if value > most:
+            raise ConfigError(f"{flag}: must be at most {most:,}, got {value}")
     if args.num_envs is not None:
         raise ConfigError("--num_envs: the grid says how many robots there are; --robots sets those of a cell")
     device = pick_device(args.sim_device)
     settle_on(device)
     policy = find_policy(args)
+    folder = policy.output("evaluate")
+    ready_to_write(folder)
+    there = {path: _written_at(path) for path in checkpoints(policy.folder).values()}  # all of them, before minutes of work
     grid = Grid(AXIS, AXIS, AXIS, args.robots)
     asked = [("sim.physics", "auto"), *policy_overrides(args)]
     task, runner = ready_to_track(policy, grid, asked, device, graph=not args.no_graph)
     act = runner.get_inference_policy(str(device))
     rows: list[dict[str, Any]] = []
     tell(f"{'iteration':>9} {'seconds':>8} {'velocity RMSE [m/s]':>20} {'yaw rate RMSE [rad/s]':>22} {'falls [%]':>10}")
-    for path in checkpoints(policy.folder).values():
-        seconds = (read_checkpoint(path).get("infos") or {}).get("wall_s")
-        if seconds is None:
-            raise ConfigError(f"{relative(path)}: says nothing of the time it was written at")
+    for path, seconds in there.items():
         runner.load(str(path))
         figures = measure(task, act, grid)
         row = {
@@ -80,13 +90,25 @@ def _main(argv: list[str] | None) -> int:
     first = next((row for row in rows if walks(row, args.rmse, args.falls)), None)
     limits = f"velocity RMSE < {args.rmse:g} m/s, falls < {100 * args.falls:g} %"
     tell(f"{limits}: " + (f"after {first['wall_s']:.1f} s, {first['iteration']} iterations" if first else "never"))
-    path = policy.output("evaluate") / "time_to_walk.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
+    path = folder / "time_to_walk.json"
     engine = engine_name(task.cfg.sim, device)
     result = {"task": task.cfg.task, "physics": engine, "rmse": args.rmse, "share_of_falls": args.falls, "first": first}
     write_text(path, json.dumps({**result, "checkpoints": rows}, indent=1))
     print(f"written: {relative(path)}")
     return 0
+
+
+def _written_at(path: Path) -> float:
+    """When a checkpoint was written, since its process began [s].
+
+    Raises:
+        ConfigError: it does not say.
+    """
+    seconds = (read_checkpoint(path).get("infos") or {}).get("wall_s")
+    if not isinstance(seconds, int | float):
+        raise ConfigError(f"{relative(path)}: says nothing of the time it was written at")
+    return float(seconds)
 
 
 def walks(row: dict[str, Any], rmse: float, falls: float) -> bool:

@@ -1,0 +1,35 @@
+"""How large a robot is, which says from how far it is looked at."""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from legged.robot import Robot
+
+
+@dataclass(frozen=True)
+class RobotSize:
+    """Of the upright box around a robot in its default pose: ANYmal C's is 1.04 m long and 0.77 m high."""
+
+    longest: float
+    """Its longest side [m]."""
+    height: float
+    """[m]."""
+
+
+def size_of(robot: Robot) -> RobotSize:
+    """Measure the shapes of a robot, seen or touched."""
+    model = mujoco.MjModel.from_xml_path(str(robot.model_path))
+    data = mujoco.MjData(model)
+    data.qpos[3:7] = [1.0, 0.0, 0.0, 0.0]
+    data.qpos[7 : 7 + robot.num_dof] = robot.default_dof_pos
+    mujoco.mj_kinematics(model, data)
+    own = [i for i in range(model.ngeom) if model.geom_bodyid[i] > 0 and model.geom_type[i] != mujoco.mjtGeom.mjGEOM_PLANE]
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    points = [
+        data.geom_xpos[i] + (model.geom_aabb[i, :3] + corners * model.geom_aabb[i, 3:]) @ data.geom_xmat[i].reshape(3, 3).T
+        for i in own
+    ]
+    sides = np.ptp(np.concatenate(points), axis=0)
+    return RobotSize(float(sides.max()), float(sides[2]))

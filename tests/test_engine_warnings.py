@@ -1,0 +1,28 @@
+"""MuJoCo's warnings: told once, and in no file."""
+
+import re
+from pathlib import Path
+
+import mujoco
+import pytest
+import torch
+from helpers import small_task
+
+from legged.rl.engine_warnings import told_once
+
+pytestmark = pytest.mark.usefixtures("workplace")
+
+
+def test_many_broken_worlds_are_one_line_and_no_file(capfd):
+    task = small_task(num_envs=6)
+    before = mujoco.get_mju_user_warning()
+    with told_once():
+        for value in (float("nan"), 1e30):
+            task.physics._qpos[:, 2] = value
+            task.step(torch.zeros(6, 12))
+    assert mujoco.get_mju_user_warning() is before
+    err = capfd.readouterr().err
+    assert err.count("warning: MuJoCo: Nan, Inf or huge value in QPOS") == 1
+    kinds = [re.sub(r"\d+", "#", line) for line in err.splitlines()]
+    assert len(kinds) == len(set(kinds)) < 6  # each once, and not one a world
+    assert not Path("MUJOCO_LOG.TXT").exists()
