@@ -264,7 +264,7 @@ class LeggedRobot(Terms, BaseTask):
         self.last_actions.copy_(self.actions)
         self.last_dof_vel.copy_(self.dof_vel)
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def hold_commands(self, commands: Tensor, heading: Tensor | None = None) -> TensorDict:
         """Ask for fixed vx, vy [m/s], yaw rate [rad/s], (N, 3) or (3,), until told otherwise; returns observations. With
         `heading` (N,) [rad] and in heading mode, the yaw rate steers towards it instead.
