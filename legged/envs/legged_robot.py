@@ -13,6 +13,7 @@ from legged.contacts import FeetContacts
 from legged.control import Control, control_gains
 from legged.curriculum import CommandCurriculum
 from legged.envs.base_task import BaseTask
+from legged.envs.overrides import check_overrides, check_terms
 from legged.envs.terms import Terms
 from legged.errors import ConfigError, suggest
 from legged.graph import Branch
@@ -116,6 +117,7 @@ class LeggedRobot(Terms, BaseTask):
     def check(cls, cfg: TaskConfig) -> Robot:
         """Everything that can be wrong with a configuration, before anything is built; returns the robot."""
         origins = cfg.origins
+        check_overrides(cls, LeggedRobot)
         robot = load_robot(cfg.robot, origins.where("robot"))
         rewards, terms = cls.terms("_reward_"), cls.terms("_obs_")
         for name in cfg.rewards.scales:
@@ -127,6 +129,7 @@ class LeggedRobot(Terms, BaseTask):
                 if name not in terms:
                     where = origins.where(f"observations.{part}" + (f".{name}" if part in ("scales", "noise") else ""))
                     raise ConfigError(f"{where}: {cls.__name__} has no observation '{name}'{suggest(name, terms)}")
+        check_terms(cls, cfg)
         if cfg.train.algorithm.symmetry:
             where, otherwise = origins.where("train.algorithm.symmetry"), "false learns without mirror images"
             if robot.mirror is None:

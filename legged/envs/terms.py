@@ -36,6 +36,9 @@ class Terms:
         "heights": "heights",
     }
     """Observation term -> how its numbers change when left and right are exchanged; a subclass adds its own terms'."""
+    OWN_HELPERS: tuple[str, ...] = ()
+    """Methods of a subclass that are named like a hook of another framework, which nothing here calls, but which the subclass
+    calls itself. Without this they are an error (legged/envs/overrides.py)."""
     cfg: TaskConfig
     dt: float
     """Control step [s]."""
