@@ -28,7 +28,8 @@ def plain_state(value: Any, depth: int = 3) -> Any:
     if isinstance(value, np.random.Generator):
         return repr(value.bit_generator.state)
     if isinstance(value, np.random.RandomState):
-        return repr(value.get_state())
+        kind, keys, *rest = value.get_state()
+        return kind, np.asarray(keys).tobytes(), *rest
     if isinstance(value, random.Random):
         return value.getstate()
     if depth == 0:

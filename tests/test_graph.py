@@ -5,6 +5,7 @@ import torch
 from torch.overrides import _get_current_function_mode
 from torch.utils._python_dispatch import _get_current_dispatch_mode
 
+from legged.config import TaskConfig
 from legged.envs import LeggedRobot
 from legged.errors import TermError
 from legged.graph import Branch, ForbidHostReads, HostReadError, StepGraph, calling
@@ -88,7 +89,7 @@ def test_branch_lets_errors_through():
 # ---- the real step -------------------------------------------------------------------------------------------------------
 
 
-def config(backend: str):
+def config(backend: str) -> TaskConfig:
     changes = {
         "env.num_envs": 4,
         "sim.physics": backend,
@@ -113,16 +114,75 @@ def test_the_whole_step_of_the_task_can_be_captured(backend):
     assert (resets >= 2).all()
 
 
+def with_reward() -> TaskConfig:
+    cfg = config("mujoco")
+    cfg.rewards.scales["mine"] = 1.0
+    return cfg
+
+
 class ReadsOnTheHost(LeggedRobot):
     def _reward_mine(self) -> torch.Tensor:
         return self.base_pos[:, 2] * (1.0 if self.base_pos[0, 2] > 0.0 else 2.0)
 
 
 def test_a_users_reward_with_a_host_read_is_named():
-    cfg = config("mujoco")
-    cfg.rewards.scales["mine"] = 1.0
+    cfg = with_reward()
     with pytest.raises(TermError, match="_reward_mine: reads a value on the host"):
         ReadsOnTheHost(cfg)
     task = ReadsOnTheHost(cfg, graph=False)
     _, rewards, _, _ = task.step(torch.zeros(4, 12))
     assert torch.isfinite(rewards).all()
+
+
+class Forked(LeggedRobot):
+    """Terms as forks write them: joints by lists of numbers, constants beside the term."""
+
+    def _reward_mine(self) -> torch.Tensor:
+        weights = torch.tensor([1.0, 0.5], device=self.device)
+        hips = self.dof_pos[:, [0, 3, 6, 9]] - self.default_dof_pos[[0, 3, 6, 9]]
+        return hips.abs().sum(dim=1) + (self.dof_vel[:, [1, 2]] * weights).square().sum(dim=1)
+
+
+class ForkedCounts(LeggedRobot):
+    def __init__(self, *args, **kwargs):
+        self.calls = 0
+        super().__init__(*args, **kwargs)
+
+    def _reward_mine(self) -> torch.Tensor:
+        self.calls += 1
+        return self.base_pos[:, 2]
+
+
+def test_joints_by_lists_of_numbers_give_the_same_reward_checked_and_not():
+    rewards = []
+    for graph in (True, False):
+        task = Forked(with_reward(), graph=graph)
+        torch.manual_seed(0)
+        task.reset()
+        task.step(torch.zeros(4, 12))
+        hips = task.dof_pos[:, ::3] - task.default_dof_pos[::3]
+        rewards.append(task.rewards.functions["mine"]())
+        by_hand = hips.abs().sum(dim=1) + task.dof_vel[:, 1].square() + 0.25 * task.dof_vel[:, 2].square()
+        torch.testing.assert_close(rewards[-1], by_hand)
+
+
+def test_a_count_in_a_term_is_refused_and_runs_without_a_graph():
+    with pytest.raises(TermError, match=r"_reward_mine: self\.calls changed from \d+ to \d+: a CUDA graph repeats"):
+        ForkedCounts(with_reward())
+    task = ForkedCounts(with_reward(), graph=False)
+    task.step(torch.zeros(4, 12))
+    assert task.calls >= 1
+
+
+class Filters(LeggedRobot):
+    """Keeps the last velocities the way that eager code does."""
+
+    def _reward_mine(self) -> torch.Tensor:
+        change = self.base_lin_vel - getattr(self, "last_lin_vel", self.base_lin_vel)
+        self.last_lin_vel = self.base_lin_vel.clone()
+        return change.square().sum(dim=1)
+
+
+def test_a_tensor_made_anew_in_every_step_and_read_in_the_next_is_refused():
+    with pytest.raises(TermError, match=r"_reward_mine: reads self\.last_lin_vel, .* self\.last_lin_vel\.copy_"):
+        Filters(with_reward())

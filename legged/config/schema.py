@@ -302,7 +302,7 @@ class ObservationsConfig:
 
 @dataclass(frozen=True)
 class PolicyConfig:
-    """Networks of actor and critic."""
+    """Networks of actor and critic: layers, before them `rnn_num_layers` recurrent ones if `rnn_type` says which kind."""
 
     actor_hidden_dims: tuple[int, ...] = field(default=(512, 256, 128), metadata=AT_LEAST_1)
     critic_hidden_dims: tuple[int, ...] = field(default=(512, 256, 128), metadata=AT_LEAST_1)
@@ -312,6 +312,9 @@ class PolicyConfig:
     """Standard deviation of the actions before training."""
     obs_normalization: bool = False
     """Normalise observations by running mean and variance."""
+    rnn_type: Literal["none", "lstm", "gru"] = "none"
+    rnn_hidden_dim: int = field(default=256, metadata=AT_LEAST_1)
+    rnn_num_layers: int = field(default=1, metadata=AT_LEAST_1)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from legged.control import Control, control_gains
 from legged.curriculum import CommandCurriculum
 from legged.envs.base_task import BaseTask
 from legged.envs.overrides import check_overrides, check_terms
+from legged.envs.recurrent import check_recurrent
 from legged.envs.terms import Terms
 from legged.errors import ConfigError, suggest
 from legged.graph import Branch
@@ -130,6 +131,7 @@ class LeggedRobot(Terms, BaseTask):
                     where = origins.where(f"observations.{part}" + (f".{name}" if part in ("scales", "noise") else ""))
                     raise ConfigError(f"{where}: {cls.__name__} has no observation '{name}'{suggest(name, terms)}")
         check_terms(cls, cfg)
+        check_recurrent(cfg)
         if cfg.train.algorithm.symmetry:
             where, otherwise = origins.where("train.algorithm.symmetry"), "false learns without mirror images"
             if robot.mirror is None:

@@ -9,6 +9,7 @@ from legged.config import TaskConfig
 from legged.envs import BaseTask
 from legged.errors import ConfigError
 from legged.paths import relative, replacing
+from legged.rl.recurrent import check_rnn
 
 
 def write_checkpoint(path: Path, saved: dict[str, Any]) -> None:
@@ -34,8 +35,8 @@ def read_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
 
 
 def layer_shapes(state: dict[str, Any]) -> list[tuple[int, ...]]:
-    """Shapes of a network's weight matrices, from input to output."""
-    return [tuple(tensor.shape) for tensor in state.values() if tensor.dim() == 2]
+    """Shapes of a network's weight matrices, from input to output; recurrent layers aside."""
+    return [tuple(tensor.shape) for name, tensor in state.items() if tensor.dim() == 2 and not name.startswith("rnn.")]
 
 
 def observation_layout(task: BaseTask) -> dict[str, dict[str, int]]:
@@ -52,6 +53,7 @@ def check_fits(path: Path, saved: dict[str, Any], cfg: TaskConfig) -> None:
     Raises:
         ConfigError: it was made for other observations, or for networks of another size.
     """
+    check_rnn(path, saved, cfg)
     layout: dict[str, dict[str, int]] = (saved.get("infos") or {}).get("observations", {})
     for group, hidden in (("actor", cfg.train.policy.actor_hidden_dims), ("critic", cfg.train.policy.critic_hidden_dims)):
         shapes = layer_shapes(saved[f"{group}_state_dict"])

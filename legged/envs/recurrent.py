@@ -1,0 +1,25 @@
+"""What a recurrent policy asks of the rest of a configuration."""
+
+from legged.config.schema import TaskConfig
+from legged.errors import ConfigError
+
+
+def check_recurrent(cfg: TaskConfig) -> None:
+    """Compare a recurrent policy with the learner's settings.
+
+    Raises:
+        ConfigError: it can't learn from mirror images, in mixed precision, or from fewer robots than mini-batches.
+    """
+    kind, algorithm, origins = cfg.train.policy.rnn_type, cfg.train.algorithm, cfg.origins
+    if kind == "none":
+        return
+    recurrent = f"a recurrent policy (train.policy.rnn_type={kind}, {origins.of('train.policy.rnn_type')})"
+    for name, what in (("symmetry", "mirror images"), ("use_mixed_precision", "mixed precision")):
+        if getattr(algorithm, name):
+            where = origins.where(f"train.algorithm.{name}")
+            raise ConfigError(f"{where}: {recurrent} can't be trained with {what}; train.algorithm.{name}=false")
+    if algorithm.num_mini_batches > cfg.env.num_envs:
+        where, given = origins.where("train.algorithm.num_mini_batches"), algorithm.num_mini_batches
+        raise ConfigError(
+            f"{where}: {recurrent} learns from whole robots: must be at most env.num_envs={cfg.env.num_envs}, got {given}"
+        )
