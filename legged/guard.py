@@ -150,20 +150,23 @@ class ForbidHostReads:
     def run(self, func: Any, args: Any, kwargs: Any) -> Any:
         """Run one operator, and compare it with that of the step before."""
         inputs = [value for value in tree_leaves((args, kwargs)) if value is not None]
+        over = overwritten(func, args, kwargs)
+        read = [value for value in inputs if all(value is not other for other in over)]
         from_host = func is aten.lift_fresh.default
         if not self.constants.making and not caller().startswith("legged.physics"):
             numbers = [repr(value) for value in inputs if not isinstance(value, Tensor)]
             if from_host and inputs[0].dim() == 0:
                 numbers.append(repr(inputs[0].item()))
-            kept = {} if from_host else {m: v for v in inputs if (m := memory_of(v)) is not None and m not in self._made}
+            kept = {m: v for v in (() if from_host else read) if (m := memory_of(v)) is not None and m not in self._made}
             name = str(func).removeprefix("aten.").rpartition(".")[0]
             seen = Seen(f"{name}({', '.join(numbers)})", {m: StorageWeakRef(v.untyped_storage()) for m, v in kept.items()})
             if self.compares:
                 self._judge(seen, kept)
             self._record.append(seen)
         result = func(*args, **kwargs)
-        read = set() if from_host else {memory_of(value) for value in inputs}
-        self._made |= {m for value in tree_leaves(result) if (m := memory_of(value)) is not None} - read
+        given = set() if from_host else {memory_of(value) for value in inputs}
+        self._made |= {m for value in tree_leaves(result) if (m := memory_of(value)) is not None} - given
+        self._made |= {m for value in over if (m := memory_of(value)) is not None and fills(value)}
         return result
 
     def _judge(self, seen: "Seen", kept: dict[int, Tensor]) -> None:
@@ -204,6 +207,21 @@ class Seen:
 def memory_of(value: Any) -> int | None:
     """What tells the memory of a tensor from all other memory that is known."""
     return value.untyped_storage()._cdata if isinstance(value, Tensor) and value.layout is torch.strided else None
+
+
+OVERWRITING = ("copy_", "fill_", "zero_", "uniform_", "normal_", "random_", "bernoulli_", "exponential_")
+"""Methods that do not look at what was in the tensor."""
+
+
+def overwritten(func: Any, args: Any, kwargs: Any) -> list[Tensor]:
+    """The tensors that an operator writes without reading them."""
+    found = [kwargs[a.name] for a in func._schema.arguments if a.is_out and a.name in kwargs]
+    return tree_leaves(found) + ([args[0]] if func._schema.name.removeprefix("aten::") in OVERWRITING else [])
+
+
+def fills(tensor: Tensor) -> bool:
+    """Whether a tensor is all of its memory."""
+    return tensor.numel() * tensor.element_size() == tensor.untyped_storage().nbytes()
 
 
 def caller() -> str:

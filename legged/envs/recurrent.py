@@ -8,16 +8,15 @@ def check_recurrent(cfg: TaskConfig) -> None:
     """Compare a recurrent policy with the learner's settings.
 
     Raises:
-        ConfigError: it can't learn from mirror images, in mixed precision, or from fewer robots than mini-batches.
+        ConfigError: it can't learn from mirror images, nor from fewer robots than mini-batches.
     """
     kind, algorithm, origins = cfg.train.policy.rnn_type, cfg.train.algorithm, cfg.origins
     if kind == "none":
         return
     recurrent = f"a recurrent policy (train.policy.rnn_type={kind}, {origins.of('train.policy.rnn_type')})"
-    for name, what in (("symmetry", "mirror images"), ("use_mixed_precision", "mixed precision")):
-        if getattr(algorithm, name):
-            where = origins.where(f"train.algorithm.{name}")
-            raise ConfigError(f"{where}: {recurrent} can't be trained with {what}; train.algorithm.{name}=false")
+    if algorithm.symmetry:
+        where = origins.where("train.algorithm.symmetry")
+        raise ConfigError(f"{where}: {recurrent} can't learn from mirror images; train.algorithm.symmetry=false")
     if algorithm.num_mini_batches > cfg.env.num_envs:
         where, given = origins.where("train.algorithm.num_mini_batches"), algorithm.num_mini_batches
         raise ConfigError(
