@@ -81,7 +81,7 @@ class StepGraph:
     def _check(self) -> None:
         """Run under the guard, which says what is wrong, where a failed capture only says that something is."""
         for step in range(self._checks):
-            # One step uses up random numbers, as every rehearsal does; those it is compared with leave the host's stream alone.
+            # One step uses up random numbers, as any rehearsal does; those it is compared with leave the host's alone.
             with torch.random.fork_rng(devices=[], enabled=step > 0), self._guard:
                 self._rehearse()
 

@@ -46,6 +46,15 @@ def test_step_graph_checks_first_and_then_runs_plainly_on_the_cpu():
     assert not step.captured
 
 
+def test_the_compared_steps_use_up_the_random_numbers_of_one():
+    torch.manual_seed(0)
+    StepGraph(lambda: torch.rand(3, device=CPU), CPU, enabled=True)
+    after = torch.rand(1)
+    torch.manual_seed(0)
+    torch.rand(3)
+    assert torch.equal(after, torch.rand(1))
+
+
 def test_a_rehearsal_stands_in_where_the_graph_is_checked():
     calls = []
     step = StepGraph(lambda: calls.append("all"), CPU, enabled=True, rehearse=lambda: calls.append("one"))
