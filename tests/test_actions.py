@@ -124,7 +124,7 @@ def test_numbers_of_another_type_are_taken_as_they_are(task, dtype):
         (torch.zeros(4, 12, dtype=torch.complex64), "complex64"),
         (torch.zeros(4, 12, dtype=torch.bool), "bool"),
     ],
-    ids=str,
+    ids=lambda value: value if isinstance(value, str) else type(value).__name__,
 )
 def test_other_shapes_are_refused_by_the_one_that_is_expected(task, actions, got):
     task.step(ACTIONS)
