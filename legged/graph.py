@@ -2,57 +2,12 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
 
-from legged.errors import TermError
+from legged.guard import ForbidHostReads, HostReadError, calling
 
-
-@contextmanager
-def calling(term: str) -> Iterator[None]:
-    """Name `term` in the error if the block fails, also while a graph is being captured."""
-    try:
-        yield
-    except TermError:
-        raise
-    except Exception as error:
-        text = str(error).splitlines()
-        raise TermError(f"{term}: {text[0] if text else type(error).__name__}") from error
-
-
-class HostReadError(RuntimeError):
-    """Code of the step wants a tensor's value on the host."""
-
-
-class ForbidHostReads(TorchDispatchMode):
-    """Refuses what would make a GPU wait for the host, or what no graph can hold: `.item()`, `if tensor`, `nonzero`,
-    indexing by a mask.
-    """
-
-    READS = {
-        torch.ops.aten._local_scalar_dense.default: "reads a value on the host (.item(), float(tensor), if tensor)",
-        torch.ops.aten.nonzero.default: "has a result of unknown size (nonzero, where with one argument)",
-        torch.ops.aten.masked_select.default: "has a result of unknown size (masked_select)",
-        torch.ops.aten._unique2.default: "has a result of unknown size (unique)",
-        torch.ops.aten.bincount.default: "has a result of unknown size (bincount)",
-        torch.ops.aten.repeat_interleave.Tensor: "has a result of unknown size (repeat_interleave by a tensor)",
-        torch.ops.aten.equal.default: "reads a value on the host (torch.equal)",
-    }
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        with self:  # in inference mode composite operators (item, one-argument where) arrive whole: take them apart
-            result = func.decompose(*args, **(kwargs or {}))
-        if result is not NotImplemented:
-            return result
-        reason = self.READS.get(func)
-        indexing = func in (torch.ops.aten.index.Tensor, torch.ops.aten.index_put_.default, torch.ops.aten.index_put.default)
-        if indexing and any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
-            reason = "indexes by a mask, whose size is unknown; use torch.where or masked_fill"
-        if reason:
-            raise HostReadError(f"{reason}, which a CUDA graph cannot hold")
-        return func(*args, **(kwargs or {}))
+__all__ = ["Branch", "ForbidHostReads", "HostReadError", "StepGraph", "calling"]
 
 
 class Branch:
@@ -109,17 +64,26 @@ class StepGraph:
         """
         self._function, self._rehearse, self._warm_up_steps = function, rehearse or function, warm_up_steps
         self._graph: torch.cuda.CUDAGraph | None = None
+        # What does the same many times shows in one time all that it does; of a step, several are compared.
+        self._checks = ForbidHostReads.STEPS if rehearse is None else 1
+        self._guard = ForbidHostReads(device, getattr(function, "__self__", None))
         if not enabled:
             return
         try:
             if device.type != "cuda":
-                with ForbidHostReads():
-                    self._rehearse()
+                self._check()
                 return
             self._graph = self._capture(device)
         except Exception as error:
             error.add_note("The step must fit one CUDA graph; --no-graph (graph=False) runs it eagerly instead.")
             raise
+
+    def _check(self) -> None:
+        """Run under the guard, which says what is wrong, where a failed capture only says that something is."""
+        for step in range(self._checks):
+            # One step uses up random numbers, as any rehearsal does; those it is compared with leave the host's alone.
+            with torch.random.fork_rng(devices=[], enabled=step > 0), self._guard:
+                self._rehearse()
 
     def _capture(self, device: torch.device) -> "torch.cuda.CUDAGraph":
         import warp as wp
@@ -129,8 +93,7 @@ class StepGraph:
         with torch.cuda.stream(stream):
             for _ in range(self._warm_up_steps):
                 self._rehearse()
-            with ForbidHostReads():  # says what is wrong, where a failed capture only says that something is
-                self._rehearse()
+            self._check()
         torch.cuda.current_stream(device).wait_stream(stream)
         torch.cuda.synchronize(device)
         graph = torch.cuda.CUDAGraph()
@@ -143,7 +106,8 @@ class StepGraph:
                 warp_stream = wp.stream_from_torch(torch.cuda.current_stream(device))
                 with wp.ScopedStream(warp_stream, sync_enter=False), wp.ScopedCapture(stream=warp_stream, external=True):
                     try:
-                        self._function()
+                        with self._guard.recording():
+                            self._function()
                     except Exception as error:
                         failure = error
                         raise

@@ -231,7 +231,8 @@ def test_a_checkpoint_that_does_not_say_its_sizes_is_read_by_its_weights(model):
     from legged.rl.checkpoint import network_of
 
     saved = torch.load(model, weights_only=True)
-    assert network_of(saved["actor_state_dict"]) == {"hidden_dims": [8], "obs_normalization": False}
+    plain = {"rnn_type": "none", "rnn_hidden_dim": 0, "rnn_num_layers": 0}
+    assert network_of(saved["actor_state_dict"]) == {"hidden_dims": [8], "obs_normalization": False, **plain}
     layers = {f"mlp.{i}.weight": torch.zeros(shape) for i, shape in ((0, (16, 5)), (2, (4, 16)), (4, (2, 4)))}
     normalised = {"obs_normalizer._mean": torch.zeros(1, 5), **layers}
-    assert network_of(normalised) == {"hidden_dims": [16, 4], "obs_normalization": True}
+    assert network_of(normalised) == {"hidden_dims": [16, 4], "obs_normalization": True, **plain}

@@ -221,7 +221,8 @@ def test_a_reset_in_the_middle_leaves_the_others_alone_and_gives_a_new_command()
 
 def test_an_episode_does_not_depend_on_what_was_before_it():
     """Neither on the task's memory nor on the engine's, whose solver starts from the last solution."""
-    used, fresh = small_task(), small_task()
+    whole_ranges = ("commands.curriculum.enabled", False)  # a curriculum is to remember
+    used, fresh = small_task(whole_ranges), small_task(whole_ranges)
     for step in range(60):
         used.step(torch.full((4, 12), 0.3 * (-1.0) ** (step // 10)))
     for task in (used, fresh):

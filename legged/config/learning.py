@@ -10,7 +10,7 @@ HIDDEN = items(64, between(1, 16384))
 
 @dataclass(frozen=True)
 class PolicyConfig:
-    """Networks of actor and critic."""
+    """Networks of actor and critic: layers, before them `rnn_num_layers` recurrent ones if `rnn_type` says which kind."""
 
     actor_hidden_dims: tuple[int, ...] = field(default=(512, 256, 128), metadata=HIDDEN)
     """Widths of the policy's hidden layers."""
@@ -22,6 +22,12 @@ class PolicyConfig:
     """Standard deviation of the actions before training."""
     obs_normalization: bool = False
     """Normalise observations by running mean and variance."""
+    rnn_type: Literal["none", "lstm", "gru"] = "none"
+    """Kind of recurrent layers, whose memory lasts an episode; `none` for a policy that sees the present only."""
+    rnn_hidden_dim: int = field(default=256, metadata=between(1, 16384))
+    """Width of a recurrent layer."""
+    rnn_num_layers: int = field(default=1, metadata=between(1, 64))
+    """Recurrent layers, one on top of the other."""
 
 
 @dataclass(frozen=True)

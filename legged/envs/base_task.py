@@ -1,6 +1,8 @@
 """The boundary to rsl-rl: a vectorised environment whose step is one function, captured where there is a GPU."""
 
 from abc import abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -12,6 +14,33 @@ from legged.config.schema import TaskConfig
 from legged.graph import StepGraph
 from legged.observations import ObservationGroup
 from legged.statistics import Statistics
+
+
+@contextmanager
+def ordinary_tensors() -> Iterator[None]:
+    """Record no gradients, but make no inference tensors either, even if the caller does: what a term keeps of one step must
+    be writable in the next, whoever makes that.
+    """
+    with torch.inference_mode(False), torch.no_grad():
+        yield
+
+
+def as_actions(actions: Any, num_envs: int, num_actions: int) -> Tensor:
+    """The actions that a caller gave, as a tensor (N, D) of real numbers.
+
+    Raises:
+        ValueError: they are none.
+    """
+    wanted = f"actions: expected real numbers of shape (N, D) = ({num_envs}, {num_actions})"
+    try:
+        tensor = actions if isinstance(actions, Tensor) else torch.tensor(actions)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{wanted}, got {type(actions).__name__}: {error}") from error
+    if tensor.shape != (num_envs, num_actions):
+        raise ValueError(f"{wanted}, got {tuple(tensor.shape)}")
+    if tensor.is_complex() or tensor.dtype == torch.bool:
+        raise ValueError(f"{wanted}, got {tensor.dtype}")
+    return tensor
 
 
 class BaseTask(VecEnv):
@@ -93,14 +122,16 @@ class BaseTask(VecEnv):
 
     def _build_graph(self, enabled: bool) -> None:
         """Capture the step (on a GPU) or check that it could be (on the CPU), then start all episodes anew."""
-        with torch.inference_mode():
+        with ordinary_tensors():
+            before = self.state_dict()
             self._graph = StepGraph(self._step, self.device, enabled)  # type: ignore[arg-type]
-            self.reset_curricula()  # the trial steps are no training
+            self.load_state_dict(before)  # the trial steps leave no trace
+            self.reset_curricula()
         self.reset()
 
     def reset(self) -> TensorDict:
         """Begin a new episode in every environment; returns the observations."""
-        with torch.inference_mode():
+        with ordinary_tensors():
             self.reset_buf.fill_(True)
             self._draw()
             self.reset_idx(self.reset_buf)
@@ -115,14 +146,19 @@ class BaseTask(VecEnv):
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)  # type: ignore[arg-type]
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
-        """One control step of all environments under `actions` (N, D), on any device.
+        """One control step of all environments under `actions` (N, D): a tensor on any device, an array or a list, of any
+        real numbers. Nothing of it is differentiated, whether or not the caller records gradients.
 
         Returns observations, rewards (N,), dones (N,) bool, and extras with `time_outs` (N,) bool and, once per
         rollout, `log`: means over the rollout as 0-dimensional tensors.
+
+        Raises:
+            ValueError: the actions have another shape, or are no real numbers; nothing is stepped then.
         """
-        self._action_input.copy_(actions)
         assert self._graph is not None, "the subclass must call _build_graph"
-        self._graph()
+        with ordinary_tensors():
+            self._action_input.copy_(as_actions(actions, self.num_envs, self.num_actions))
+            self._graph()
         extras: dict[str, Any] = {"time_outs": self.time_out_buf.clone()}
         self._steps_since_log += 1
         if self._steps_since_log == self.cfg.train.runner.num_steps_per_env:

@@ -13,6 +13,8 @@ from legged.control import Control, control_gains
 from legged.curriculum import CommandCurriculum
 from legged.envs.base_task import BaseTask
 from legged.envs.checks import check_base_mass, check_mirror_kinds, check_sizes
+from legged.envs.overrides import check_overrides, check_terms
+from legged.envs.recurrent import check_recurrent
 from legged.envs.terms import Terms
 from legged.errors import ConfigError, suggest
 from legged.faults import LARGEST_STATE, Faults
@@ -124,6 +126,7 @@ class LeggedRobot(Terms, BaseTask):
     def check(cls, cfg: TaskConfig) -> Robot:
         """Everything that can be wrong with a configuration, before anything is built; returns the robot."""
         origins = cfg.origins
+        check_overrides(cls, LeggedRobot)
         robot = load_robot(cfg.robot, origins.where("robot"))
         rewards, terms = cls.terms("_reward_"), cls.terms("_obs_")
         for name in cfg.rewards.scales:
@@ -135,6 +138,8 @@ class LeggedRobot(Terms, BaseTask):
                 if name not in terms:
                     where = origins.where(f"observations.{part}" + (f".{name}" if part in ("scales", "noise") else ""))
                     raise ConfigError(f"{where}: {cls.__name__} has no observation '{name}'{suggest(name, terms)}")
+        check_terms(cls, cfg)
+        check_recurrent(cfg)
         if cfg.train.algorithm.symmetry:
             where, otherwise = origins.where("train.algorithm.symmetry"), "false learns without mirror images"
             if robot.mirror is None:
@@ -282,7 +287,7 @@ class LeggedRobot(Terms, BaseTask):
         self.last_actions.copy_(self.actions)
         self.last_dof_vel.copy_(self.dof_vel)
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def hold_commands(self, commands: Tensor, heading: Tensor | None = None) -> TensorDict:
         """Ask for fixed vx, vy [m/s], yaw rate [rad/s], (N, 3) or (3,), until told otherwise; returns observations. With
         `heading` (N,) [rad] and in heading mode, the yaw rate steers towards it instead.
@@ -380,7 +385,7 @@ class LeggedRobot(Terms, BaseTask):
             **{name: state_of(part) for name, part in self._parts().items()},
         }
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def load_state_dict(self, state: dict[str, Any]) -> None:
         for name, part in self._parts().items():
             load_state(part, state.get(name, {}))

@@ -19,6 +19,9 @@ MirrorKind = Literal["same", "vector", "rotation", "command", "joints", "feet", 
 PENALISED_FORCE = 0.1
 """Contact force on a penalised shape that counts as a collision [N]."""
 
+HEIGHTS_OFFSET, HEIGHTS_LIMIT = 0.5, 1.0
+"""Observed heights are relative to this far below the base [m], and at most this large [m]."""
+
 
 class Terms:
     """The methods `_obs_<name>` and `_reward_<name>` that a configuration can name. N robots, D joints, F feet, B tracked
@@ -36,6 +39,9 @@ class Terms:
         "heights": "heights",
     }
     """Observation term -> how its numbers change when left and right are exchanged; a subclass adds its own terms'."""
+    OWN_HELPERS: tuple[str, ...] = ()
+    """Methods of a subclass that are named like a hook of another framework, which nothing here calls, but which the subclass
+    calls itself. Without this they are an error (legged/envs/overrides.py)."""
     cfg: TaskConfig
     dt: float
     """Control step [s]."""
@@ -80,32 +86,42 @@ class Terms:
     terminated_buf: Tensor
     """(N,) the episode ends now in a failure."""
 
-    # ---- observations: (N, width) each -------------------------------------------------------------------------------
+    # ---- observations: (N, width) each; the docstrings go into policy.json, the last brackets as the unit -----------------
 
     def _obs_base_lin_vel(self) -> Tensor:
+        """Linear velocity (x, y, z) of the base, in the base frame [m/s]."""
         return self.base_lin_vel
 
     def _obs_base_ang_vel(self) -> Tensor:
+        """Angular velocity (x, y, z) of the base, in the base frame [rad/s]."""
         return self.base_ang_vel
 
     def _obs_projected_gravity(self) -> Tensor:
+        """Unit vector along gravity, in the base frame: (0, 0, -1) when the base is level [1]."""
         return self.projected_gravity
 
     def _obs_commands(self) -> Tensor:
+        """Commanded vx (forward), vy (leftward) and yaw rate (left positive), in the base frame [m/s, m/s, rad/s]."""
         return self.commands[:, :3]
 
     def _obs_dof_pos(self) -> Tensor:
+        """Joint angle minus default_joint_angles, by joint [rad]."""
         return self.dof_pos - self.default_dof_pos
 
     def _obs_dof_vel(self) -> Tensor:
+        """Joint velocity, by joint [rad/s]."""
         return self.dof_vel
 
     def _obs_actions(self) -> Tensor:
+        """The policy's last output within plus and minus action_clip, by joint; 0 at the start of an episode [1]."""
         return self.actions
 
     def _obs_heights(self) -> Tensor:
-        """The ground around the robot, relative to half a metre below its base and within 1 m of that [m]."""
-        return (self.base_pos[:, 2:3] - 0.5 - self.measured_heights).clamp(-1.0, 1.0)
+        """Base above ground, less an offset: clip(base_z - offset - ground_z, -limit, limit) at each of the points, which lie
+        in the yaw frame; base_z and ground_z in the world frame [m].
+        """
+        below = self.base_pos[:, 2:3] - HEIGHTS_OFFSET - self.measured_heights
+        return below.clamp(-HEIGHTS_LIMIT, HEIGHTS_LIMIT)
 
     # ---- rewards: (N,) each, times scale and control step ------------------------------------------------------------
 

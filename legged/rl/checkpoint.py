@@ -17,6 +17,7 @@ from legged.config import TaskConfig
 from legged.envs import BaseTask
 from legged.errors import ConfigError
 from legged.paths import relative, write_bytes
+from legged.rl.recurrent import rnn_of
 from legged.robot import load_robot
 
 FORMAT = 2
@@ -189,7 +190,14 @@ def observation_layout(task: BaseTask) -> dict[str, dict[str, int]]:
 def networks(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
     """Network -> what of `train.policy` decides which weights it has, and what they compute."""
     policy = cfg.train.policy
-    shared = {"activation": policy.activation, "obs_normalization": policy.obs_normalization}
+    recurrent = policy.rnn_type != "none"
+    shared = {
+        "activation": policy.activation,
+        "obs_normalization": policy.obs_normalization,
+        "rnn_type": policy.rnn_type,
+        "rnn_hidden_dim": policy.rnn_hidden_dim if recurrent else 0,
+        "rnn_num_layers": policy.rnn_num_layers if recurrent else 0,
+    }
     history = {"actor": cfg.observations.actor_history}
     return {
         name: {"hidden_dims": list(getattr(policy, f"{name}_hidden_dims")), "history": history.get(name, 1), **shared}
@@ -201,7 +209,8 @@ def network_of(state: dict[str, Any]) -> dict[str, Any]:
     """As far as weights tell, the same, of a checkpoint that does not say it."""
     layers = [tensor for name, tensor in state.items() if name.startswith("mlp.") and name.endswith(".weight")]
     hidden = [layer.shape[0] for layer in layers[:-1]]
-    return {"hidden_dims": hidden, "obs_normalization": any("obs_normalizer" in name for name in state)}
+    rnn = dict(zip(("rnn_type", "rnn_hidden_dim", "rnn_num_layers"), rnn_of(state), strict=True))
+    return {"hidden_dims": hidden, "obs_normalization": any("obs_normalizer" in name for name in state), **rnn}
 
 
 def check_fits(path: Path, saved: Saved, cfg: TaskConfig) -> None:

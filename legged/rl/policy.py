@@ -1,12 +1,14 @@
 """Finding a trained policy and putting it back into its task."""
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDict
+from torch import Tensor
 
 from legged.config import TaskConfig, override
 from legged.envs import LeggedRobot
@@ -15,6 +17,7 @@ from legged.paths import relative
 from legged.registry import make_task, task_class, task_config
 from legged.rl.arguments import overrides
 from legged.rl.checkpoint import check_fits, read_checkpoint
+from legged.rl.recurrent import Remembering
 from legged.rl.runner import Runner
 from legged.rl.runs import find_checkpoint, find_run, run_config, shipped_policy
 from legged.terrain import Terrain
@@ -76,6 +79,15 @@ def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:
     ]
 
 
+class RestoredRunner(Runner):
+    """A runner that trains no more, whose policy forgets the episodes that have ended."""
+
+    def get_inference_policy(self, device: str | None = None) -> Callable[[TensorDict], Tensor]:  # type: ignore[override]
+        """Observations -> actions (N, D), without noise; one call a step, if the policy is recurrent."""
+        policy = super().get_inference_policy(device)
+        return Remembering(policy, self.env) if policy.is_recurrent else policy
+
+
 def restore(
     policy: TrainedPolicy,
     changes: Iterable[tuple[str, Any]],
@@ -89,10 +101,11 @@ def restore(
     Raises:
         ConfigError: the checkpoint does not fit the task.
     """
-    cfg = override(policy.cfg, changes)
+    few_robots_do = ("train.algorithm.num_mini_batches", 1)  # nothing is trained
+    cfg = override(policy.cfg, [*changes, few_robots_do])
     task_class(cfg.task).check(cfg)
     check_fits(policy.checkpoint, read_checkpoint(policy.checkpoint), cfg)
     task = make_task(cfg, device, graph, terrain)
-    runner = Runner(task, None, str(device))
+    runner = RestoredRunner(task, None, str(device))
     runner.load(str(policy.checkpoint))
     return task, runner

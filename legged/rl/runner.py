@@ -39,6 +39,9 @@ def runner_config(cfg: TaskConfig, algorithm_class: str) -> dict[str, Any]:
         "activation": policy.activation,
         "obs_normalization": policy.obs_normalization,
     }
+    if policy.rnn_type != "none":
+        shared["class_name"] = "RNNModel"
+        shared |= {name: getattr(policy, name) for name in ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")}
     return {
         "num_steps_per_env": runner.num_steps_per_env,
         "save_interval": runner.save_interval,

@@ -1,0 +1,101 @@
+"""The numbers of Python in a step, as tensors that lie on the device before a CUDA graph is recorded."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+class HostReadError(RuntimeError):
+    """Code of the step wants a tensor's value on the host, or hands it something of the host's that a graph can't hold."""
+
+
+class Constants:
+    """Tensors of the Python numbers in a step, made once each on the device: a graph can't copy from the host.
+
+    Lists in an index, numpy arrays among them, become tensors of positions; of a list of bools, whose size is known, the
+    positions of its Trues. `torch.tensor` and its kin become copies of such a constant.
+    """
+
+    def __init__(self) -> None:
+        self._made: dict[Any, Tensor] = {}
+        self.complete = False
+        """Whether the step has been run, so that another number would be one that changes from step to step."""
+        self.making = False
+        """Whether a constant is being made just now."""
+
+    def __len__(self) -> int:
+        return len(self._made)
+
+    def get(self, key: Any, make: Callable[[], Tensor]) -> Tensor:
+        """The constant of that key, made if there is none yet.
+
+        Raises:
+            HostReadError: the step asks for one that the step before it did not.
+        """
+        if key not in self._made:
+            if self.complete:
+                raise HostReadError(
+                    "makes a tensor of other numbers than the step before; a CUDA graph repeats the first ones"
+                )
+            with self._free(), torch.inference_mode(False):  # an ordinary tensor, so that autograd may keep it too
+                self._made[key] = make()
+        return self._made[key]
+
+    @contextmanager
+    def _free(self) -> Iterator[None]:
+        """The block may do what the step may not."""
+        self.making = True
+        try:
+            yield
+        finally:
+            self.making = False
+
+    def index(self, tensor: Tensor, index: Any) -> Any:
+        """An index of `tensor` that says the same without lists, arrays, or tensors of another device."""
+        parts = index if isinstance(index, tuple) else (index,)
+        if any(isinstance(part, list | tuple) and holds_tensors(part) for part in parts):
+            raise HostReadError("indexes by a list of tensors, whose values a CUDA graph cannot hold; torch.stack them")
+        if isinstance(index, list) and any(not isinstance(value, int | np.integer | np.bool_) for value in index):
+            return index  # torch takes most of these for tuples, and warns
+        pieces = tuple(piece for part in parts for piece in self._positions(tensor, index, part))
+        return pieces if isinstance(index, tuple) or len(pieces) != 1 else pieces[0]
+
+    def _positions(self, tensor: Tensor, index: Any, part: Any) -> tuple[Any, ...]:
+        """What takes the place of one part of an index."""
+        elsewhere = isinstance(part, Tensor) and part.device != tensor.device
+        if not elsewhere and not isinstance(part, list | tuple | range | np.ndarray):
+            return (part,)
+        with self._free():
+            array = np.asarray(part)
+        if array.dtype == bool:
+            if not self.complete:  # torch's own error where the mask has another shape
+                with self._free():
+                    torch.empty(1, device="cpu").expand(tensor.shape).__getitem__(index)
+            return tuple(self._constant(rows, tensor.device) for rows in np.nonzero(array))
+        if array.size and (array.dtype.kind not in "iu" or array.dtype == np.uint8):  # torch takes bytes for bools
+            return (part,)
+        return (int(array),) if array.ndim == 0 else (self._constant(array, tensor.device),)
+
+    def _constant(self, positions: np.ndarray, device: torch.device) -> Tensor:
+        positions = positions.astype(np.int64)
+        key = ("index", positions.shape, positions.tobytes(), device)
+        return self.get(key, lambda: torch.tensor(positions, device=device))
+
+
+def holds_tensors(data: Any) -> bool:
+    """Whether there are tensors in nested lists."""
+    return isinstance(data, Tensor) or (isinstance(data, list | tuple) and any(holds_tensors(value) for value in data))
+
+
+def key_of(data: Any) -> Any:
+    """What tells numbers, nested lists and arrays of them apart; None for anything else."""
+    if isinstance(data, np.ndarray):
+        return data.dtype.str, data.shape, data.tobytes()
+    if isinstance(data, list | tuple | range):
+        keys = tuple(key_of(value) for value in data)
+        return None if None in keys else keys
+    return (type(data), repr(data)) if isinstance(data, bool | int | float | complex | np.generic) else None

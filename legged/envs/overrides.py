@@ -1,0 +1,125 @@
+"""Methods of a user's class that nothing here would call: hooks of other frameworks, and terms that are none."""
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+from legged.config.origins import Origins
+from legged.config.schema import TaskConfig
+from legged.errors import ConfigError
+from legged.paths import relative
+
+_OBSERVE = "write a method _obs_<name> for each part and list the names in observations.actor and observations.critic"
+_STEP = "override _step and call super()._step() in it, or one of what it calls: check_termination, compute_reward, reset_idx"
+_START = (
+    "init_state.dof_pos_factor, init_state.yaw and init_state.base_velocity say how an episode begins; for more, override"
+    " reset_idx(mask) and call self.physics.write_state(mask, ...) after super().reset_idx(mask)"
+)
+_BUILD = "the robot is its MJCF (robot: in the task's YAML), the ground is terrain: or what make_terrain() returns"
+_DRAWING = "nothing is drawn while training; play.py makes pictures (legged/rendering)"
+_TORQUES = "control.control_type, control.stiffness and control.damping choose the law; others go into legged/control.py"
+_BUFFERS = "allocate tensors in __init__(), before super().__init__(...), which calls every term"
+
+HOOKS = {
+    # legged_gym and its forks
+    "_parse_cfg": "the configuration is complete when __init__() gets it; numbers of your own go under custom: in the YAML",
+    "_init_buffers": _BUFFERS,
+    "_prepare_reward_function": "rewards.scales in the YAML names the _reward_<name> methods that run; self.rewards has them",
+    "post_physics_step": _STEP,
+    "_post_physics_step_callback": _STEP,
+    "compute_observations": _OBSERVE,
+    "get_privileged_observations": "observations.critic lists the _obs_<name> methods that the critic sees",
+    "_get_noise_scale_vec": "observations.noise in the YAML gives each term's noise; observations.add_noise, noise_level",
+    "_resample_commands": "commands.ranges, commands.resampling_time_s, standing_share and single_axis_share say what is"
+    " sampled; another way of sampling goes into legged/commands.py",
+    "_compute_torques": _TORQUES,
+    "_reset_dofs": _START,
+    "_reset_root_states": _START,
+    "_push_robots": "domain_rand.push_robots, push_interval_s and max_push_vel_xy say how robots are pushed",
+    "_update_terrain_curriculum": "terrain.curriculum switches it; another one goes into legged/terrain/curriculum.py",
+    "update_command_curriculum": "commands.curriculum has its settings; another one goes into legged/curriculum.py",
+    "_get_heights": "self.measured_heights (N, P) has them after every step; terrain.measured_points_x and _y say where",
+    "_init_height_points": "terrain.measured_points_x and terrain.measured_points_y say where heights are measured",
+    "_process_rigid_shape_props": "domain_rand.randomize_friction and friction_range randomise; the MJCF says the rest",
+    "_process_dof_props": "joint limits and efforts are the MJCF's, velocity limits robot.yaml's; rewards.soft_* shrink them",
+    "_process_rigid_body_props": "domain_rand.randomize_base_mass and added_mass_range randomise; the MJCF says the rest",
+    "_create_envs": _BUILD,
+    "_create_ground_plane": _BUILD,
+    "_create_heightfield": _BUILD,
+    "_create_trimesh": _BUILD,
+    "_get_env_origins": "self.env_origins (N, 3) are the terrain's; terrain.spawn_range scatters robots around them",
+    "create_sim": _BUILD,
+    "_draw_debug_vis": _DRAWING,
+    "render": _DRAWING,
+    "set_camera": _DRAWING,
+    # Isaac Lab
+    "_setup_scene": _BUILD,
+    "_pre_physics_step": _TORQUES,
+    "_apply_action": _TORQUES,
+    "_get_observations": _OBSERVE,
+    "_get_rewards": "write a method _reward_<name> for each part and name its scale in rewards.scales",
+    "_get_dones": "override check_termination(): call super().check_termination(), then write self.terminated_buf, reset_buf",
+    "_reset_idx": "override reset_idx(mask), with a bool a robot",
+}
+"""Hook of another framework -> what takes its place here."""
+
+
+def check_overrides(cls: type, base: type) -> None:
+    """Look for hooks that `cls`, a subclass of `base`, or a class between them defines in vain.
+
+    Raises:
+        ConfigError: there is one which `base` does not have and no OWN_HELPERS names.
+    """
+    between = [part for part in cls.__mro__ if part not in base.__mro__]
+    helpers: set[str] = set()
+    for part in between:
+        own = vars(part).get("OWN_HELPERS", ())
+        helpers |= {own} if isinstance(own, str) else set(own)
+    for part in between:
+        for name in vars(part):
+            if name in HOOKS and name not in helpers and not hasattr(base, name):
+                raise ConfigError(
+                    f"{place(part, vars(part)[name])}: {part.__name__}.{name} would never be called: {HOOKS[name]}"
+                    f" (if your own code calls it: OWN_HELPERS = ('{name}',) in the class)"
+                )
+
+
+def check_terms(cls: type, cfg: TaskConfig) -> None:
+    """Look whether the terms that a configuration names, which are there, can be called.
+
+    Raises:
+        ConfigError: one is no method, or wants arguments.
+    """
+    used = [("_reward_", name, f"rewards.scales.{name}") for name in cfg.rewards.scales]
+    for group in ("actor", "critic"):
+        used += [("_obs_", name, f"observations.{group}") for name in getattr(cfg.observations, group)]
+    for prefix, name, path in used:
+        _check_term(cls, prefix + name, path, cfg.origins)
+
+
+def _check_term(cls: type, name: str, path: str, origins: Origins) -> None:
+    """One term that the setting at `path` asks for."""
+    found = inspect.getattr_static(cls, name)
+    where = f"{origins.where(path)}: {cls.__name__}.{name}"
+    if isinstance(found, property) or not callable(getattr(cls, name)):
+        raise ConfigError(f"{where} is no method but a {type(found).__name__}; a term is a method without arguments")
+    # A method of the class has `self` still to come, one bound to it (classmethod, staticmethod) has not.
+    bound = isinstance(found, classmethod | staticmethod)
+    parameters = list(inspect.signature(getattr(cls, name)).parameters.values())
+    needed = [p.name for p in parameters if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    takes_self = bool(parameters) and parameters[0].kind is not parameters[0].KEYWORD_ONLY
+    if not bound and not takes_self:
+        raise ConfigError(f"{where} takes no self; a term is a method without other arguments")
+    if needed[0 if bound else 1 :]:
+        listed = ", ".join(needed[0 if bound else 1 :])
+        raise ConfigError(f"{where} takes arguments ({listed}); a term has none but self, and reads the task's tensors")
+
+
+def place(cls: type, attribute: Any) -> str:
+    """File and line of something a class defines, as far as Python knows them."""
+    function = inspect.unwrap(getattr(attribute, "fget", None) or getattr(attribute, "__func__", attribute))
+    code = getattr(function, "__code__", None)
+    if code is not None:
+        return f"{relative(Path(code.co_filename))}:{code.co_firstlineno}"
+    module = inspect.getmodule(cls)
+    return relative(Path(module.__file__)) if module is not None and module.__file__ else cls.__module__

@@ -1,0 +1,55 @@
+"""State that Python keeps and a CUDA graph does not: attributes that are no tensors, random generators of the host."""
+
+import random
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+LIBRARIES = ("builtins", "legged", "mujoco", "newton", "numpy", "tensordict", "torch", "warp")
+"""Whose objects are no state of the user's."""
+
+
+def random_states() -> dict[str, Any]:
+    """States of the host's two global random generators."""
+    kind, keys, *rest = np.random.get_state()
+    return {"np.random": (kind, np.asarray(keys).tobytes(), *rest), "Python's random": random.getstate()}
+
+
+def plain_state(value: Any, depth: int = 3) -> Any:
+    """What a Python value is now, comparable: numbers, text, containers of them, arrays, random generators, and objects of
+    the user's own classes. Tensors and the parts of a task count for nothing: they are judged by what is read of them.
+    """
+    if value is None or isinstance(value, bool | int | float | complex | str | bytes | np.generic):
+        return repr(value)
+    if isinstance(value, np.ndarray):
+        return value.shape, value.tobytes()
+    if isinstance(value, np.random.Generator):
+        return repr(value.bit_generator.state)
+    if isinstance(value, np.random.RandomState):
+        kind, keys, *rest = value.get_state()
+        return kind, np.asarray(keys).tobytes(), *rest
+    if isinstance(value, random.Random):
+        return value.getstate()
+    if depth == 0:
+        return None
+    if isinstance(value, list | tuple | deque):
+        return [plain_state(part, depth - 1) for part in value]
+    if isinstance(value, set | frozenset):
+        return sorted(map(repr, value))
+    if isinstance(value, Mapping):
+        return {repr(key): plain_state(part, depth - 1) for key, part in value.items()}
+    own = type(value).__module__.partition(".")[0] not in LIBRARIES
+    return attributes(value, depth - 1) if own and hasattr(value, "__dict__") and not callable(value) else None
+
+
+def attributes(owner: Any, depth: int = 3) -> dict[str, Any]:
+    """The plain state of an object's attributes."""
+    return {name: plain_state(value, depth) for name, value in vars(owner).items()} if hasattr(owner, "__dict__") else {}
+
+
+def shown(state: Any) -> str:
+    """Its text, cut where it is long."""
+    text = str(state)
+    return text if len(text) <= 40 else f"{text[:37]}..."
