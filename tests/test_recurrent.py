@@ -124,9 +124,9 @@ def test_a_checkpoint_of_another_width_or_depth_is_refused(tmp_path):
     path = tmp_path / "model_0.pt"
     Runner(small_task(*recurrent("gru"))).save(str(path))
     check_fits(path, read_checkpoint(path), small_config(*recurrent("gru")))
-    with pytest.raises(ConfigError, match="rnn_num_layers 2, the configuration has train.policy.rnn_num_layers 3"):
+    with pytest.raises(ConfigError, match=r"rnn_num_layers 2, the configuration has train\.policy.rnn_num_layers 3"):
         check_fits(path, read_checkpoint(path), small_config(*recurrent("gru", layers=3)))
-    with pytest.raises(ConfigError, match="rnn_hidden_dim 6, the configuration has train.policy.rnn_hidden_dim 7"):
+    with pytest.raises(ConfigError, match=r"rnn_hidden_dim 6, the configuration has train\.policy.rnn_hidden_dim 7"):
         check_fits(path, read_checkpoint(path), small_config(*recurrent("gru"), ("train.policy.rnn_hidden_dim", 7)))
 
 
