@@ -26,13 +26,12 @@ class Faults:
         """`rewards` are the names of the reward terms, in the order of their rows."""
         self.sound = torch.ones(num_envs, dtype=torch.bool, device=device)
         """(N,) robots whose rewards and observations of the last step were numbers; the others end at the next one."""
+        self._terms = observations
         self._names = ("physics", "action", *(f"reward_{n}" for n in rewards), *(f"obs_{n}" for n in observations.columns))
-        self._seen = torch.zeros(len(self._names), num_envs, dtype=torch.bool, device=device)
-        self._physics, self._action = self._seen[:2]
-        self._rewards, self._observations = self._seen[2:].split([len(rewards), len(observations.columns)])
-        self._column_of_term = torch.zeros(len(observations.columns), observations.values.shape[1], device=device)
-        for i, columns in enumerate(observations.columns.values()):
-            self._column_of_term[i, columns] = 1.0
+        self._seen = torch.zeros(2 + len(rewards), num_envs, dtype=torch.bool, device=device)
+        self._physics, self._action, self._rewards = self._seen[0], self._seen[1], self._seen[2:]
+        # Of observations the largest number is kept, by column, which costs two launches a step; robots are counted later.
+        self._largest = torch.zeros_like(observations.values)
 
     def check_state(self, in_bounds: Tensor, clipped_actions: Tensor) -> None:
         """Take in which robots' states and actions are numbers, (N,), and the actions (N, D), which are finite or NaN."""
@@ -46,17 +45,19 @@ class Faults:
         torch.logical_not(broken.any(dim=0), out=self.sound)
         self._rewards.logical_or_(broken)
 
-    def check_observations(self, raw: Tensor) -> None:
-        """Take in the terms' values (N, width), before they are scaled and clipped; after `check_rewards`."""
-        broken = ~(raw.abs() < LARGEST)
-        self.sound.logical_and_(~broken.any(dim=1))
-        self._observations.logical_or_(self._column_of_term @ broken.t().float() > 0.0)
+    def check_observations(self) -> None:
+        """Look at the terms' values, before they are scaled and clipped; after `check_rewards`."""
+        size = self._terms.raw.abs()
+        self.sound.logical_and_(size.amax(dim=1) < LARGEST)  # NaN is the largest of all, and not below
+        torch.maximum(self._largest, size, out=self._largest)
 
     def flush(self) -> dict[str, Tensor]:
         """Return the number of robots by fault, as fresh 0-dimensional tensors by their name in TensorBoard, NaN where there
         were none; then start anew.
         """
-        counts = self._seen.sum(dim=1).float()
+        broken = [~(self._largest[:, columns].amax(dim=1) < LARGEST) for columns in self._terms.columns.values()]
+        counts = torch.cat([self._seen, torch.stack(broken)]).sum(dim=1).float()
         self._seen.zero_()
+        self._largest.zero_()
         counts = torch.where(counts > 0.0, counts, torch.nan)  # NaN says "no value", and is not logged
         return {f"Faults/{name}": count for name, count in zip(self._names, counts.unbind(), strict=True)}

@@ -31,16 +31,17 @@ class ObservationTerms:
             raise ValueError("observations need at least one term")
         self.values = torch.zeros(sample.shape[0], start, device=sample.device)
         """(N, width) the terms as groups read them, with 0 for what is no number."""
+        self.raw = self.values
+        """(N, width) the terms as they gave them, numbers or not."""
 
-    def evaluate(self) -> Tensor:
-        """Bring `values` up to date; returns them as the terms gave them, (N, width), numbers or not."""
+    def evaluate(self) -> None:
+        """Bring `raw` and `values` up to date."""
         found = []
         for name, function in self._functions.items():
             with calling(f"_obs_{name}"):
                 found.append(function())
-        raw = torch.cat(found, dim=1).float()
-        torch.nan_to_num(raw, nan=0.0, posinf=0.0, neginf=0.0, out=self.values)
-        return raw
+        self.raw = torch.cat(found, dim=1).float()
+        torch.nan_to_num(self.raw, nan=0.0, posinf=0.0, neginf=0.0, out=self.values)
 
 
 @dataclass(frozen=True)

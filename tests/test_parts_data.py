@@ -126,9 +126,9 @@ def test_a_term_is_evaluated_once_for_all_groups_that_name_it():
 
 def test_what_is_no_number_is_seen_as_zero():
     source = ObservationTerms({"a": lambda: torch.tensor([[math.nan, math.inf, -math.inf, 1.0]])})
-    raw = source.evaluate()
+    source.evaluate()
     assert source.values.tolist() == [[0.0, 0.0, 0.0, 1.0]]
-    assert raw.isnan().tolist() == [[True, False, False, False]]
+    assert source.raw.isnan().tolist() == [[True, False, False, False]]
 
 
 # ---- statistics ------------------------------------------------------------------------------------------------------

@@ -193,9 +193,9 @@ class LeggedRobot(Terms, BaseTask):
         with self._beside.fork():
             self.track()
         self.compute_reward()
+        self._beside.join()
         with self._beside.fork():
             self.faults.check_rewards(self.rewards.fine, self.valid)
-        self._beside.join()
         if self.terrain_curriculum is not None:
             asked = self.commands[:, :2].norm(dim=1) * self.cfg.env.episode_length_s
             self.terrain_curriculum.update(self.reset_buf & self.valid, self.base_pos, asked)
@@ -276,9 +276,9 @@ class LeggedRobot(Terms, BaseTask):
         self.physics.refresh()
         self.height_scan.update(self.base_pos, self.base_quat)
         self.command_sampler.update(self.reset_buf, self.base_quat)
-        raw = self.observation_terms.evaluate()
+        self.observation_terms.evaluate()
         with self._beside.fork():
-            self.faults.check_observations(raw)
+            self.faults.check_observations()
         for group in self.observation_groups.values():
             group.advance()
             group.compute()

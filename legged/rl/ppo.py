@@ -214,14 +214,26 @@ class DevicePPO(PPO):
             loss.backward()
         if self.desired_kl is not None and self.schedule == "adaptive":
             self._adapt_rate(kl)
-        norms = [
-            torch.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm) for model in (self.actor, self.critic)
-        ]
         # The clipped value loss passes no gradient on for a value that is NaN, so it is looked at by itself.
-        fine = (norms[0] + norms[1] + value_loss.detach()) < torch.inf
+        fine = (self._clip_gradients() + value_loss.detach()) < torch.inf
         torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
         self.optimizer.step()
         return torch.where(fine, torch.stack([*losses, self._one]).detach(), 0.0)
+
+    def _clip_gradients(self) -> Tensor:
+        """Clip the gradients of actor and critic, each to the norm `max_grad_norm`, as torch's clip_grad_norm_ does one after
+        the other; returns the sum () of both norms before.
+        """
+        gradients = [
+            [parameter.grad for parameter in model.parameters() if parameter.grad is not None]
+            for model in (self.actor, self.critic)
+        ]
+        of_each = torch.stack(torch._foreach_norm([*gradients[0], *gradients[1]]))
+        norms = torch.stack([torch.linalg.vector_norm(n) for n in of_each.split([len(some) for some in gradients])])
+        factors = (self.max_grad_norm / (norms + 1e-6)).clamp(max=1.0)
+        for some, factor in zip(gradients, factors.unbind(), strict=True):
+            torch._foreach_mul_(some, factor)
+        return norms.sum()
 
     def _output(self, model: MLPModel, inputs: Tensor) -> Tensor:
         """What a network makes of its inputs (n, width): (n, outputs), float32. With mixed precision its layers compute in
