@@ -83,7 +83,7 @@ def with_other_engine(result: dict[str, Any], path: Path) -> list[dict[str, Any]
             check_success(saved, str(other))
             points = [point for entry in saved["success"]["types"].values() for point in entry["points"]]
             drawable = "robots_per_point" in saved["success"] and all({"low", "high"} <= point.keys() for point in points)
-            if drawable and all(saved[key] == result[key] for key in ("task", "checkpoint")):
+            if drawable and saved["physics"] == engine and all(saved[key] == result[key] for key in ("task", "checkpoint")):
                 found.append(saved)
         except (OSError, ValueError, KeyError):  # not a file of ours: nothing to show
             continue
