@@ -166,10 +166,14 @@ def test_evaluate_measures_success_and_tracking_on_rough_ground(run, tmp_path, c
 
 def test_the_other_engine_is_drawn_too_if_it_is_of_the_same_checkpoint(tmp_path):
     entry = {"unit": "m", "what": "step height", "trained_to": None, "points": []}
-    mine = {"task": "t", "checkpoint": "model_1.pt", "physics": "mujoco", "success": {"types": {"stairs_up": entry}}}
+    success = {"types": {"stairs_up": entry}, "robots_per_point": 2}
+    mine = {"task": "t", "checkpoint": "model_1.pt", "physics": "mujoco", "success": success}
+    bare = {"types": {"stairs_up": {**entry, "points": [{"size": 0.1, "share": 1.0}]}}, "robots_per_point": 2}  # no interval
+    others = ("physics", "physx"), ("checkpoint", "model_2.pt")
+    foreign = [{"success": bare}, {"success": {"types": {}}}, {"success": 3}, *({name: value} for name, value in others)]
     path, other = tmp_path / "evaluation_mujoco.json", tmp_path / "evaluation_mujoco_warp.json"
     assert with_other_engine(mine, path) == [mine]
-    for text in ("{}", "[]", "nonsense", json.dumps({**mine, "physics": "mujoco_warp", "checkpoint": "model_2.pt"})):
+    for text in ("{}", "[]", "nonsense", *(json.dumps({**mine, "physics": "mujoco_warp", **change}) for change in foreign)):
         other.write_text(text)
         assert with_other_engine(mine, path) == [mine]
     other.write_text(json.dumps({**mine, "physics": "mujoco_warp"}))

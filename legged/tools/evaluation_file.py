@@ -21,9 +21,14 @@ def check(result: Any, where: str) -> None:
     for name in ("rmse_lin", "rmse_ang"):
         for part in ("mean", "worst"):
             _number(_mapping(tracking.get(name), where, f"{path}{name}"), part, where, f"{path}{name}.", or_null=True)
-    if "success" not in fields:
-        return
-    types = _mapping(_mapping(fields["success"], where, "success").get("types"), where, "success.types")
+    if "success" in fields:
+        check_success(fields, where)
+
+
+def check_success(result: Any, where: str) -> None:
+    """Check the part that says how hard a terrain was crossed. Raises as `check`."""
+    success = _mapping(_mapping(result, where, "the whole file").get("success"), where, "success")
+    types = _mapping(success.get("types"), where, "success.types")
     for name, entry in types.items():
         path = f"success.types.{name}."
         _mapping(entry, where, path.rstrip("."))

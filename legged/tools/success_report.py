@@ -12,7 +12,7 @@ from rich.table import Table
 from legged.config.schema import NewtonSolver
 from legged.paths import replacing
 from legged.terrain import TERRAIN_TYPES
-from legged.tools.evaluation_file import check
+from legged.tools.evaluation_file import check_success
 
 PANELS = {
     "stairs": ("stairs_up", "stairs_down"),
@@ -80,10 +80,10 @@ def with_other_engine(result: dict[str, Any], path: Path) -> list[dict[str, Any]
             continue
         try:
             saved = json.loads(other.read_text(encoding="utf-8"))
-            check(saved, str(other))
+            check_success(saved, str(other))
             points = [point for entry in saved["success"]["types"].values() for point in entry["points"]]
             drawable = "robots_per_point" in saved["success"] and all({"low", "high"} <= point.keys() for point in points)
-            if drawable and all(saved[key] == result[key] for key in ("task", "checkpoint")):
+            if drawable and saved["physics"] == engine and all(saved[key] == result[key] for key in ("task", "checkpoint")):
                 found.append(saved)
         except (OSError, ValueError, KeyError):  # not a file of ours: nothing to show
             continue
