@@ -3,11 +3,10 @@
 from legged.startup import importing  # first: it looks at the time
 
 with importing():
-    import legged.cores  # noqa: F401  before torch: it says how threads wait
+    from legged.headless import HEADLESS  # before MuJoCo: it sets MUJOCO_GL
     from legged.config import TaskConfig
-    from legged.envs import LeggedRobot
     from legged.errors import ConfigError
-    from legged.headless import HEADLESS
+    from legged.envs import LeggedRobot
     from legged.registry import make_task, register, task_config
 
 __all__ = ["HEADLESS", "ConfigError", "LeggedRobot", "TaskConfig", "make_task", "register", "task_config"]

@@ -1,12 +1,8 @@
-"""How many cores this process may use, and how its threads wait for each other. Imported before torch, which asks once."""
+"""How many cores this process may use."""
 
 import math
 import os
 from pathlib import Path
-
-# A thread of torch's that waits for the others spins by default, which takes the core from the very thread that it waits for
-# as soon as something else runs on the machine: updates then take ten to a hundred times as long.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 CGROUPS = Path("/sys/fs/cgroup")
 """Where Linux says what a group of processes may use."""

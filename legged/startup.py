@@ -17,6 +17,11 @@ STARTED_S = time.perf_counter()
 INTERRUPTED = 128 + signal.SIGINT
 """Exit code of a command that Ctrl-C ended."""
 
+# A thread of torch's that waits for the others spins by default, which takes the core from the very thread that it waits for
+# as soon as something else runs on the machine: updates then take ten to a hundred times as long. It is asked once, by the
+# first import of torch.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 # rsl-rl imports GitPython, which complains at length where there is no git; this package asks git by itself.
 os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
 

@@ -57,7 +57,7 @@ def test_without_groups_nothing_is_limited(tmp_path):
 def test_threads_wait_without_spinning_unless_the_user_says_otherwise(given, found):
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
     environment |= {"OMP_WAIT_POLICY": given} if given else {}
-    code = "import sys, legged.cores, os; assert 'torch' in sys.modules; print(os.environ['OMP_WAIT_POLICY'])"
+    code = "import legged, os; print(os.environ['OMP_WAIT_POLICY'])"
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == found
 

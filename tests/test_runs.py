@@ -35,11 +35,11 @@ def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(monkeypatc
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("train.runner.experiment_name=../elsewhere", "experiment_name: '../elsewhere' would not lie below logs/"),
-        ("train.runner.experiment_name=/tmp/elsewhere", "'/tmp/elsewhere' would not lie below logs/"),
-        ("train.runner.experiment_name=a/../../b", "'a/../../b' would not lie below logs/"),
-        ("train.runner.run_name=a/b", "command line: train.runner.run_name: 'a/b' becomes part of a folder's name"),
-        (f"train.runner.run_name={'long' * 70}", "200 bytes at most"),
+        ("train.runner.experiment_name=../elsewhere", "experiment_name: expected a plain name"),
+        ("train.runner.experiment_name=/tmp/elsewhere", "got '/tmp/elsewhere'"),
+        ("train.runner.experiment_name=a/../../b", "got 'a/../../b'"),
+        ("train.runner.run_name=a/b", "command line: train.runner.run_name: expected a plain name"),
+        (f"train.runner.run_name={'long' * 70}", "at most 100 letters"),
     ],
 )
 def test_names_that_are_paths_are_refused_before_anything_is_built(override, words, monkeypatch, capsys):

@@ -125,7 +125,9 @@ class BaseTask(VecEnv):
         with ordinary_tensors():
             before = self.state_dict()
             self._graph = StepGraph(self._step, self.device, enabled)  # type: ignore[arg-type]
-            self.load_state_dict(before)  # the trial steps leave no trace
+            # The trial steps leave no trace, but for buffers that a term makes at its first call.
+            now = self.state_dict()
+            self.load_state_dict({part: {**state, **before[part]} for part, state in now.items()})
             self.reset_curricula()
         self.reset()
 

@@ -19,33 +19,13 @@ LOGS = Path("logs")
 CONFIG_FILE = "config.yaml"
 CODE_FILE = "code.diff"
 SHIPPED_MODEL = "model.pt"
-LONGEST_RUN_NAME = 200
-"""Bytes of a run's own name: with date, time and number it becomes a folder's."""
 GIT_S = 30.0
 """Git has so long to answer; on a slow network disk it may take its time [s]."""
 
 
 def experiment_folder(cfg: TaskConfig) -> Path:
-    """Where the runs of a task lie.
-
-    Raises:
-        ConfigError: the experiment's name leads out of the folder of logs, or a run's name is a path.
-    """
-    runner = cfg.train.runner
-    name = runner.experiment_name or cfg.task
-    parts = Path(name).parts
-    if Path(name).is_absolute() or ".." in parts or not parts or not name.isprintable():
-        raise ConfigError(
-            f"{cfg.origins.where('train.runner.experiment_name')}: '{name}' would not lie below {LOGS}/;"
-            " a name, or several with / between them, is allowed"
-        )
-    own = runner.run_name
-    if "/" in own or "\\" in own or not own.isprintable() or len(os.fsencode(own)) > LONGEST_RUN_NAME:
-        raise ConfigError(
-            f"{cfg.origins.where('train.runner.run_name')}: '{own}' becomes part of a folder's name: it can hold no /, no"
-            f" control characters, and {LONGEST_RUN_NAME} bytes at most"
-        )
-    return LOGS / name
+    """Say where the runs of a task lie; the configuration has plain names only."""
+    return LOGS / (cfg.train.runner.experiment_name or cfg.task)
 
 
 def create_run(cfg: TaskConfig) -> Path:
