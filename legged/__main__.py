@@ -5,7 +5,7 @@ from pathlib import Path
 
 import legged.tools
 from legged.errors import ConfigError
-from legged.rl.arguments import run_main
+from legged.rl.command import run_main
 
 
 def commands() -> dict[str, str]:

@@ -11,7 +11,7 @@ from helpers import TASK, TINY_TRAINING, checkpoints, run_folders
 
 from legged.errors import ConfigError, RunError
 from legged.rl import train
-from legged.rl.arguments import run_main
+from legged.rl.command import run_main
 from legged.rl.output import Output, forgiving_output, when_output_is_lost
 
 pytestmark = pytest.mark.usefixtures("workplace")

@@ -289,3 +289,31 @@ def test_a_grid_that_is_none(fails, run, spec):
 
 def test_a_number_of_robots_a_cell_that_cannot_be(fails, run):
     fails(evaluate.main, task("--robots", "0"), "--robots", "at least 1")
+
+
+# ---- a user's own code -----------------------------------------------------------------------------------------------
+
+MISTAKES = {
+    "reads on the host": ("self.base_pos[:, 2] * float(self.base_pos[0, 2])", "_reward_mine: reads a value on the host"),
+    "fails": ("self.no_such_thing", "_reward_mine: 'Mine' object has no attribute 'no_such_thing'"),
+    "wrong shape": ("self.base_pos", "_reward_mine: must return a tensor (4,), got (4, 3)"),
+}
+
+
+@pytest.mark.parametrize("kind", MISTAKES)
+def test_a_mistake_in_a_term_is_one_line_with_file_and_line(capsys, tmp_path, kind):
+    expression, words = MISTAKES[kind]
+    (tmp_path / "mine.py").write_text(
+        "from legged import LeggedRobot, register\n"
+        "class Mine(LeggedRobot):\n"
+        "    def _reward_mine(self):\n"
+        f"        return {expression}\n"
+        f"register('mine', {{'extends': '{TASK}', 'rewards': {{'scales': {{'mine': 1.0}}}}}}, Mine)\n"
+    )
+    code = call(train.main, ["--import", "mine.py", "--task", "mine", "--sim_device", "cpu", "--num_envs", "4"])
+    err = capsys.readouterr().err
+    assert (code, err.count("\n")) == (2, 1), err
+    assert err.startswith(f"error: {words}")
+    if kind != "wrong shape":  # which is found behind the method's return
+        assert f"({tmp_path / 'mine.py'}, line 4)" in err
+    assert not Path("logs").exists()

@@ -10,6 +10,7 @@ from legged.config.schema import SimConfig
 from legged.cores import available_cores
 from legged.math import quat_rotate, quat_rotate_inverse
 from legged.physics.base import Physics, RandomizedField, allocate_state, setter_of
+from legged.physics.engine_warnings import keep_out_of_files
 from legged.physics.feet import FeetKinematics
 from legged.physics.scene import build_model, contact_sensor_columns
 from legged.ranks import Ranks
@@ -30,6 +31,7 @@ class MujocoPhysics(Physics):
         """Build the scene and place all robots at the model's initial state; `device` must be the CPU."""
         if device.type != "cpu":
             raise ValueError(f"the mujoco back-end runs on the CPU, not on {device}")
+        keep_out_of_files()
         self.num_envs, self.dt, self.device = num_envs, sim.dt, device
         self.model = build_model(robot, sim, terrain, contact_sensors=True)
         # A world that blows up must stay non-finite until the task sees it; the engine would put it back silently.

@@ -14,6 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.envs import LeggedRobot
+from legged.errors import RunError
 from legged.paths import make_folder, write_bytes, write_text
 from legged.rl.description import describe
 from legged.rl.runner import Runner
@@ -25,7 +26,7 @@ LARGEST_DIFFERENCE = 1e-4
 """Exports that differ from the policy by more than this, in actions, are refused."""
 
 
-class ExportError(RuntimeError):
+class ExportError(RunError):
     """An exported policy does not compute what the policy does."""
 
 

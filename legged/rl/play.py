@@ -26,9 +26,9 @@ from legged.rl.arguments import (
     import_and_check,
     pick_device,
     policy_overrides,
-    run_main,
     settle_on,
 )
+from legged.rl.command import run_main
 from legged.rl.export import export
 from legged.rl.outing import EPISODE_S, walk_out
 from legged.rl.playground import SETTING, Playground

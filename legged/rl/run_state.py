@@ -84,5 +84,5 @@ def set_generators(state: dict[str, Any]) -> None:
         torch.set_rng_state(state["torch"])
         if isinstance(state["cuda"], Tensor) and torch.cuda.is_available():
             torch.cuda.set_rng_state(state["cuda"])
-    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+    except Exception as error:  # every generator refuses in a way of its own what is none of its states
         raise StateError(f"its random generators are damaged ({error})") from error

@@ -18,17 +18,9 @@ from legged.paths import full_disk_in, ready_to_write, reason, relative
 from legged.physics import engine_name, resolve_physics
 from legged.ranks import Ranks
 from legged.registry import make_task, task_config
-from legged.rl.arguments import (
-    EXIT_FAILED,
-    add_run_arguments,
-    add_task_arguments,
-    import_and_check,
-    overrides,
-    pick_device,
-    run_main,
-    settle_on,
-)
+from legged.rl.arguments import add_run_arguments, add_task_arguments, import_and_check, overrides, pick_device, settle_on
 from legged.rl.captured import CapturedRunner
+from legged.rl.command import EXIT_FAILED, run_main
 from legged.rl.display import Display
 from legged.rl.distributed import RankLost, check_reachable
 from legged.rl.output import when_output_is_lost

@@ -29,8 +29,9 @@ from legged.graph import StepGraph
 from legged.paths import make_folder, ready_to_write_file, write_text
 from legged.physics import resolve_physics
 from legged.registry import make_task, task_config
-from legged.rl.arguments import add_task_arguments, import_and_check, overrides, pick_device, run_main, settle_on
+from legged.rl.arguments import add_task_arguments, import_and_check, overrides, pick_device, settle_on
 from legged.rl.captured import CapturedRunner
+from legged.rl.command import run_main
 from legged.rl.display import Progress
 from legged.rl.runner import Runner
 from legged.tools.kernel_times import kernel_times, table

@@ -19,7 +19,7 @@ from rich.table import Table
 
 from legged.errors import ConfigError, suggest
 from legged.paths import make_folder, ready_to_write_file, relative, replacing
-from legged.rl.arguments import run_main
+from legged.rl.command import run_main
 from legged.tools.evaluation_file import check, tracking_of
 from legged.tools.success_report import ENGINES, TRAINED
 

@@ -29,9 +29,9 @@ from legged.rl.arguments import (
     import_and_check,
     pick_device,
     policy_overrides,
-    run_main,
     settle_on,
 )
+from legged.rl.command import run_main
 from legged.rl.policy import find_policy
 from legged.tools.crossing import EVERYWHERE, cross
 from legged.tools.success import chosen_types, sweep

@@ -19,7 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from legged.config.loader import read_yaml
 from legged.errors import ConfigError
 from legged.paths import make_folder, ready_to_write_file, relative, replacing
-from legged.rl.arguments import run_main
+from legged.rl.command import run_main
 from legged.rl.runs import CONFIG_FILE
 
 CURVES = (

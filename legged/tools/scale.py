@@ -15,7 +15,7 @@ import torch
 from legged.config import TaskConfig
 from legged.errors import ConfigError
 from legged.paths import make_folder, write_text
-from legged.rl.arguments import EXIT_WRONG_INPUT
+from legged.rl.command import EXIT_WRONG_INPUT
 
 NO_MEMORY = re.compile(r"out of memory|can't allocate memory|Failed to allocate|MemoryError|bad_?alloc")
 """What torch, Warp and Python say of it."""

@@ -18,7 +18,8 @@ from legged.config.schema import TerrainConfig
 from legged.errors import ConfigError, suggest
 from legged.paths import make_folder, ready_to_write, relative, replacing
 from legged.registry import task_config
-from legged.rl.arguments import add_task_arguments, import_and_check, overrides, run_main
+from legged.rl.arguments import add_task_arguments, import_and_check, overrides
+from legged.rl.command import run_main
 from legged.robot import load_robot
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, check_terrain
 from legged.tools.terrain_picture import Place, render

@@ -21,10 +21,10 @@ from legged.rl.arguments import (
     import_and_check,
     pick_device,
     policy_overrides,
-    run_main,
     settle_on,
 )
 from legged.rl.checkpoint import read_checkpoint
+from legged.rl.command import run_main
 from legged.rl.policy import find_policy
 from legged.rl.runs import checkpoints
 from legged.tools.tracking import ready_to_track, tell

@@ -10,7 +10,8 @@ import time
 
 from legged.physics import kernel_cache, resolve_physics
 from legged.registry import make_task, task_config
-from legged.rl.arguments import add_task_arguments, import_and_check, overrides, pick_device, run_main, settle_on
+from legged.rl.arguments import add_task_arguments, import_and_check, overrides, pick_device, settle_on
+from legged.rl.command import run_main
 from legged.startup import STARTED_S
 
 
