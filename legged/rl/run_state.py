@@ -50,9 +50,12 @@ def read_run_state(checkpoint: Path, checkpoint_id: str) -> dict[str, Any]:
         state = load_plain(path)
     except ConfigError as error:
         raise StateError(str(error)) from error
-    if not isinstance(state, dict) or state.get("format") != FORMAT or not isinstance(state.get("task"), dict):
-        raise StateError(f"{relative(path)} is of another format")
-    if state.get("id") != checkpoint_id:
+    kinds = {"format": int, "id": str, "task": dict, "episodes": dict, "generators": dict}
+    if not isinstance(state, dict) or not all(isinstance(state.get(name), kind) for name, kind in kinds.items()):
+        raise StateError(f"{relative(path)} is damaged")
+    if state["format"] != FORMAT:
+        raise StateError(f"{relative(path)} is of format {state['format']}, this version reads {FORMAT}")
+    if state["id"] != checkpoint_id:
         raise StateError(f"{relative(path)} belongs to another checkpoint")
     return state
 
