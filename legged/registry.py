@@ -129,4 +129,8 @@ def make_task(
 ) -> LeggedRobot:
     """Build the task that a configuration describes, on its own terrain or on the one given."""
     other_ground = {} if terrain is None else {"terrain": terrain}  # a user's constructor may not know the argument
-    return task_class(cfg.task)(cfg, device, graph, **other_ground)
+    kind = task_class(cfg.task)
+    task = kind(cfg, device, graph, **other_ground)
+    if not hasattr(task, "observation_groups"):
+        raise ConfigError(f"{kind.__module__}.{kind.__name__}: its constructor must call super().__init__ with its arguments")
+    return task

@@ -12,6 +12,8 @@ from legged.paths import exists
 
 _IMPORTED: set[str] = set()
 """Names of the modules that were run from files."""
+_FOLDERS: set[str] = set()
+"""Folders that modules of users were found in."""
 
 
 def import_tasks(name: str) -> None:
@@ -26,6 +28,7 @@ def import_tasks(name: str) -> None:
     if is_file and not (exists(path) and path.is_file()):
         raise ConfigError(f"--import: there is no file {shown(name)}")
     folder = str(path.resolve().parent if is_file else Path.cwd())
+    _FOLDERS.add(folder)
     if folder not in sys.path:
         sys.path.insert(0, folder)
     before = set(sys.modules)
@@ -37,6 +40,12 @@ def import_tasks(name: str) -> None:
             if file and str(Path(file).parent) == folder:
                 del sys.modules[module]
         raise _described(name, is_file, folder, error) from error
+
+
+def is_of_a_module(file: str) -> bool:
+    """Whether a file of code lies beside a module that a user let run, or below."""
+    path = Path(file)
+    return any(path.is_relative_to(folder) for folder in _FOLDERS) and "site-packages" not in path.parts
 
 
 def _run(path: Path) -> None:

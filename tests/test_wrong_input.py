@@ -1,6 +1,7 @@
 """Wrong input ends with exit code 2 and one message that helps, without a traceback and before anything is built."""
 
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -293,6 +294,19 @@ def test_a_number_of_robots_a_cell_that_cannot_be(fails, run):
 
 # ---- a user's own code -----------------------------------------------------------------------------------------------
 
+
+@pytest.fixture(autouse=True)
+def forgotten():
+    """Modules and tasks of users are forgotten after a test."""
+    registered, path = dict(legged.registry._REGISTERED), list(sys.path)
+    yield
+    legged.registry._REGISTERED.clear()
+    legged.registry._REGISTERED.update(registered)
+    sys.path[:] = path
+    for name in ("mine", "my_tasks"):
+        sys.modules.pop(name, None)
+
+
 MISTAKES = {
     "reads on the host": ("self.base_pos[:, 2] * float(self.base_pos[0, 2])", "_reward_mine: reads a value on the host"),
     "fails": ("self.no_such_thing", "_reward_mine: 'Mine' object has no attribute 'no_such_thing'"),
@@ -317,3 +331,26 @@ def test_a_mistake_in_a_term_is_one_line_with_file_and_line(capsys, tmp_path, ki
     if kind != "wrong shape":  # which is found behind the method's return
         assert f"({tmp_path / 'mine.py'}, line 4)" in err
     assert not Path("logs").exists()
+
+
+CONSTRUCTORS = {
+    "fails": ("self.nothing_of_that", "AttributeError: 'Mine' object has no attribute 'nothing_of_that' ("),
+    "calls nobody": ("pass", "mine.Mine: its constructor must call super().__init__ with its arguments"),
+}
+
+
+@pytest.mark.parametrize("kind", CONSTRUCTORS)
+def test_a_mistake_in_a_constructor_is_one_line(capsys, tmp_path, kind):
+    statement, words = CONSTRUCTORS[kind]
+    (tmp_path / "mine.py").write_text(
+        "from legged import LeggedRobot, register\n"
+        "class Mine(LeggedRobot):\n"
+        "    def __init__(self, *args, **kwargs):\n"
+        f"        {statement}\n"
+        f"register('mine', {{'extends': '{TASK}'}}, Mine)\n"
+    )
+    code = call(train.main, ["--import", "mine.py", "--task", "mine", "--sim_device", "cpu", "--num_envs", "4"])
+    err = capsys.readouterr().err
+    assert (code, err.count("\n")) == (2, 1), err
+    assert err.startswith(f"error: {words}")
+    assert ("line 4)" in err) == (kind == "fails")

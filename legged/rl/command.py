@@ -3,6 +3,7 @@
 import errno
 import re
 import sys
+import sysconfig
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ from legged.physics.engine_warnings import told_once
 from legged.ranks import Ranks
 from legged.rl.output import forgiving_output
 from legged.startup import INTERRUPTED, is_a_command, leave_at_interrupts, raise_at_interrupts
+from legged.user_modules import is_of_a_module
 
 EXIT_FAILED = 1
 EXIT_WRONG_INPUT = 2
@@ -71,6 +73,9 @@ def _guarded(main: Callable[[list[str] | None], int], argv: list[str] | None) ->
             print("interrupted", file=sys.stderr, flush=True)
             return INTERRUPTED
         text = known_failure(error)
+        if text is None and is_of_a_module(traceback.extract_tb(error.__traceback__)[-1].filename):
+            _say(f"{type(error).__name__}: {' '.join(str(error).split())}{line_of_user(error)}")
+            return EXIT_WRONG_INPUT
         if text is None:
             raise
         _say(text)
@@ -79,16 +84,21 @@ def _guarded(main: Callable[[list[str] | None], int], argv: list[str] | None) ->
 
 def line_of_user(error: BaseException) -> str:
     """Say ' (file, line n)' of the innermost line behind `error` that is neither ours nor a library's."""
-    ours = Path(legged.errors.__file__).parent
     found = ""
     behind: BaseException | None = error
     while behind is not None:
         for frame in traceback.extract_tb(behind.__traceback__):
-            file = Path(frame.filename)
-            if not file.is_relative_to(ours) and not {"site-packages", "dist-packages"} & {*file.parts} and file.is_file():
+            if _is_of_user(frame):
                 found = f" ({frame.filename}, line {frame.lineno})"
         behind = behind.__cause__
     return found
+
+
+def _is_of_user(frame: traceback.FrameSummary) -> bool:
+    """Whether a line is neither ours, nor a library's, nor Python's."""
+    file = Path(frame.filename)
+    libraries = {"site-packages", "dist-packages"} & {*file.parts} or file.is_relative_to(sysconfig.get_path("stdlib"))
+    return not libraries and not file.is_relative_to(Path(legged.errors.__file__).parent) and file.is_file()
 
 
 def known_failure(error: BaseException) -> str | None:
