@@ -308,49 +308,41 @@ def forgotten():
 
 
 MISTAKES = {
-    "reads on the host": ("self.base_pos[:, 2] * float(self.base_pos[0, 2])", "_reward_mine: reads a value on the host"),
-    "fails": ("self.no_such_thing", "_reward_mine: 'Mine' object has no attribute 'no_such_thing'"),
-    "wrong shape": ("self.base_pos", "_reward_mine: must return a tensor (4,), got (4, 3)"),
+    "reads on the host": (
+        "def _reward_mine(self): return self.base_pos[:, 2] * float(self.base_pos[0, 2])",
+        "_reward_mine: reads a value on the host",
+    ),
+    "fails": (
+        "def _reward_mine(self): return self.no_such_thing",
+        "_reward_mine: 'Mine' object has no attribute 'no_such_thing' (",
+    ),
+    "wrong shape": ("def _reward_mine(self): return self.base_pos", "_reward_mine: must return a tensor (4,), got (4, 3)"),
+    "constructor fails": (
+        "def __init__(self, *args, **kwargs): self.nothing_of_that",
+        "AttributeError: 'Mine' object has no attribute 'nothing_of_that' (",
+    ),
+    "constructor calls nobody": (
+        "def __init__(self, *args, **kwargs): pass",
+        "mine.Mine: its constructor must call super().__init__ with its arguments",
+    ),
 }
+FOUND_LATER = {"wrong shape", "constructor calls nobody"}
+"""Mistakes that show when the line has been left."""
 
 
 @pytest.mark.parametrize("kind", MISTAKES)
-def test_a_mistake_in_a_term_is_one_line_with_file_and_line(capsys, tmp_path, kind):
-    expression, words = MISTAKES[kind]
+def test_a_mistake_in_a_user_s_class_is_one_line_with_file_and_line(capsys, tmp_path, kind):
+    method, words = MISTAKES[kind]
+    scales = "{'mine': 1.0}" if "_reward_mine" in method else "{}"
     (tmp_path / "mine.py").write_text(
         "from legged import LeggedRobot, register\n"
         "class Mine(LeggedRobot):\n"
-        "    def _reward_mine(self):\n"
-        f"        return {expression}\n"
-        f"register('mine', {{'extends': '{TASK}', 'rewards': {{'scales': {{'mine': 1.0}}}}}}, Mine)\n"
+        f"    {method}\n"
+        f"register('mine', {{'extends': '{TASK}', 'rewards': {{'scales': {scales}}}}}, Mine)\n"
     )
     code = call(train.main, ["--import", "mine.py", "--task", "mine", "--sim_device", "cpu", "--num_envs", "4"])
     err = capsys.readouterr().err
     assert (code, err.count("\n")) == (2, 1), err
     assert err.startswith(f"error: {words}")
-    if kind != "wrong shape":  # which is found behind the method's return
-        assert f"({tmp_path / 'mine.py'}, line 4)" in err
+    assert (f"({tmp_path / 'mine.py'}, line 3)" in err) == (kind not in FOUND_LATER)
     assert not Path("logs").exists()
-
-
-CONSTRUCTORS = {
-    "fails": ("self.nothing_of_that", "AttributeError: 'Mine' object has no attribute 'nothing_of_that' ("),
-    "calls nobody": ("pass", "mine.Mine: its constructor must call super().__init__ with its arguments"),
-}
-
-
-@pytest.mark.parametrize("kind", CONSTRUCTORS)
-def test_a_mistake_in_a_constructor_is_one_line(capsys, tmp_path, kind):
-    statement, words = CONSTRUCTORS[kind]
-    (tmp_path / "mine.py").write_text(
-        "from legged import LeggedRobot, register\n"
-        "class Mine(LeggedRobot):\n"
-        "    def __init__(self, *args, **kwargs):\n"
-        f"        {statement}\n"
-        f"register('mine', {{'extends': '{TASK}'}}, Mine)\n"
-    )
-    code = call(train.main, ["--import", "mine.py", "--task", "mine", "--sim_device", "cpu", "--num_envs", "4"])
-    err = capsys.readouterr().err
-    assert (code, err.count("\n")) == (2, 1), err
-    assert err.startswith(f"error: {words}")
-    assert ("line 4)" in err) == (kind == "fails")
