@@ -54,6 +54,36 @@ def test_a_model_in_a_fluid_is_seen(robot):
     assert not TorqueStep.moved_by_torques(model)
 
 
+TREES = {
+    "hinges after a free joint": ("<freejoint/>", "hinge", ("a", "b"), ""),
+    "no free joint": (
+        "<joint type='slide' name='x'/>",
+        "hinge",
+        ("a", "b"),
+        "its joints are not a free one followed by hinges",
+    ),
+    "a slide": ("<freejoint/>", "slide", ("a", "b"), "its joints are not a free one followed by hinges"),
+    "motors the other way round": ("<freejoint/>", "hinge", ("b", "a"), "its motors are not one for each hinge"),
+    "a joint without motor": ("<freejoint/>", "hinge", ("a",), "its motors are not one for each hinge"),
+}
+
+
+@pytest.mark.parametrize("name", TREES)
+def test_only_a_free_base_with_driven_hinges_is_stepped(name):
+    """The launch numbers degrees of freedom as such a robot has them; others it would simulate wrongly without a word."""
+    root, kind, driven, why_not = TREES[name]
+    link = "<geom size='0.1' mass='1'/>"
+    motors = "".join(f"<motor joint='{joint}'/>" for joint in driven)
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody><body>{root}{link}<body><joint name='a' type='{kind}'/>{link}"
+        f"<body><joint name='b' type='hinge'/>{link}</body></body></body></worldbody><actuator>{motors}</actuator></mujoco>"
+    )
+    assert TorqueStep.moved_by_torques(model)
+    found = TorqueStep.why_not(model)
+    assert found.startswith(why_not)
+    assert bool(found) == bool(why_not)
+
+
 @pytest.mark.parametrize("damping", ["", ' damping="1.5"'])
 def test_torques_beyond_the_limits_move_as_in_c_mujoco(robot, tmp_path, damping):
     """With dampers in the knees too, which need mujoco-warp's own stages: on 20 steps, through contacts."""

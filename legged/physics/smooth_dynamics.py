@@ -352,7 +352,13 @@ class SmoothDynamics:
 
     @staticmethod
     def why_not(model: mujoco.MjModel) -> str:
-        """What of a model this does not compute; empty if nothing."""
+        """Say what of a model this does not compute; empty if nothing."""
+        free, hinge = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE
+        if not model.njnt or model.jnt_type[0] != free or (model.jnt_type[1:] != hinge).any():
+            return "its joints are not a free one followed by hinges"
+        on_joints = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT).all()
+        if not on_joints or model.actuator_trnid[:, 0].tolist() != list(range(1, model.njnt)):
+            return "its motors are not one for each hinge, in their order"
         if 4 * (48 * model.nbody + 6 * model.njnt + 6 * model.nv) > SHARED_BYTES:
             return f"{model.nbody} bodies do not fit a GPU's shared memory"
         if model.neq:
