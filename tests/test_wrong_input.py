@@ -1,5 +1,6 @@
 """Wrong input ends with exit code 2 and one message that helps, without a traceback and before anything is built."""
 
+import json
 import shutil
 import sys
 from pathlib import Path
@@ -160,6 +161,14 @@ def test_a_number_of_robots_is_not_evaluate_s_to_choose(fails, run):
 
 def test_a_number_of_iterations_that_cannot_be(fails):
     fails(train.main, task("--max_iterations", "0"), "train.runner.max_iterations: must be at least 1")
+
+
+@pytest.mark.parametrize("name", ["a\nb", "x" * 5000, "\x1b[31m"])
+def test_an_odd_name_is_still_one_line(fails, name):
+    err = fails(train.main, task(f"observations.actor=[{json.dumps(name)}]"), "observations.actor", "no observation")
+    assert err.count("\n") == 1
+    assert len(err) < 2100
+    assert "\x1b" not in err
 
 
 # ---- devices ---------------------------------------------------------------------------------------------------------
