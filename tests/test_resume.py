@@ -184,3 +184,21 @@ def test_a_user_s_own_buffers_go_on_too():
     first.distance += torch.tensor([1.0, 2.0, 3.0])
     second.load_state_dict(first.state_dict())
     assert second.distance.tolist() == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize("loop", ["captured", "stock"])
+def test_a_state_is_taken_once(loop):
+    """Whoever goes on learning in a notebook, call after call, goes on from where the last call ended."""
+    from legged.registry import make_task
+    from legged.rl.captured import CapturedRunner
+    from legged.rl.runner import Runner
+
+    folder = tiny_run(*EVENTFUL, num_envs=6)
+    parts, whole = ((CapturedRunner if loop == "captured" else Runner)(make_task(run_config(folder))) for _ in range(2))
+    for runner, calls in ((parts, (1, 2)), (whole, (3,))):
+        assert runner.resume(str(folder / "model_1.pt")) == ""
+        for count in calls:
+            runner.learn(count)
+            runner.current_learning_iteration += 1
+    assert same(parts.alg.actor.state_dict(), whole.alg.actor.state_dict())
+    assert same(parts.env.state_dict(), whole.env.state_dict())

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from legged.config import TaskConfig
 from legged.envs import BaseTask, LeggedRobot
-from legged.errors import ConfigError
+from legged.errors import ConfigError, RunError
 from legged.paths import relative
 from legged.ranks import Ranks
 from legged.rl.checkpoint import check_weights, describe, describe_mismatch, fit_optimizer, read_checkpoint, write_checkpoint
@@ -110,7 +110,7 @@ class Runner(OnPolicyRunner):
 
         Raises:
             RankLost: one of those has died.
-            Diverged: numbers went on being NaN or infinite; the last checkpoint is from before they hit the weights.
+            Diverged: numbers went on being NaN or infinite; the last checkpoint is good.
         """
         finished = True
         try:
@@ -149,13 +149,21 @@ class Runner(OnPolicyRunner):
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train for a number of iterations; robots that go on where they stopped keep their episodes."""
-        super().learn(num_learning_iterations, init_at_random_ep_len and not self._go_on())
+        goes_on = self._go_on()
+        super().learn(num_learning_iterations, init_at_random_ep_len and not goes_on)
 
     def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
-        """Write a checkpoint, and beside it the state of everything else, which the newest alone keeps."""
+        """Write a checkpoint, and beside it the state of everything else, which the newest alone keeps.
+
+        Raises:
+            RunError: weights are NaN or infinite, or a file can't be written.
+        """
         saved = self.alg.save()
-        for network in ("actor", "critic"):
-            check_weights(saved[f"{network}_state_dict"], f"{path}: is not written: the {network}")
+        try:
+            for network in ("actor", "critic"):
+                check_weights(saved[f"{network}_state_dict"], f"{path}: is not written: the {network}")
+        except ConfigError as error:
+            raise RunError(str(error)) from error
         saved["iter"] = self.current_learning_iteration
         saved["infos"] = {
             **(infos or {}),
@@ -211,24 +219,29 @@ class Runner(OnPolicyRunner):
             why = "there are several processes"
         else:
             try:
-                self._state = read_run_state(Path(path), infos.get("id", ""))
-                self._go_on()
+                state = read_run_state(Path(path), infos.get("id", ""))
+                self._take(state)
+                self._state = state  # taken once more when training begins, after the trial steps of a capture
                 return ""
             except StateError as error:
                 why = str(error)
-        self._state = None
         self.load(path)
         self.env.reset()
         return why
 
     def _go_on(self) -> bool:
-        """Put task, episodes and random generators into the state that was resumed from, if there is one."""
+        """Take the state that was resumed from, if there is one and training has not begun yet."""
         if self._state is None:
             return False
-        self.env.load_state_dict(self._state["task"])
-        take(self._episodes(), self._state.get("episodes", {}), "episodes")
-        set_generators(self._state.get("generators", {}))
+        self._take(self._state)
+        self._state = None
         return True
+
+    def _take(self, state: dict[str, Any]) -> None:
+        """Put task, episodes and random generators into a state; StateError if it does not fit."""
+        self.env.load_state_dict(state["task"])
+        take(self._episodes(), state["episodes"], "episodes")
+        set_generators(state["generators"])
 
     def _episodes(self) -> dict[str, Tensor]:
         """Return and length so far of the episode of each environment, (N,) each, as they are counted for the log."""
