@@ -125,3 +125,13 @@ def test_wrong_input_is_one_line(tmp_path, capsys):
         err = capsys.readouterr().err
         assert words in err
         assert len(err.splitlines()) == 1
+
+
+def test_a_run_that_was_killed_while_it_logged_is_drawn(tmp_path):
+    """Between the two times of an iteration: there is no axis of time then."""
+    writer = SummaryWriter(str(tmp_path / "run"))
+    writer.add_scalar("Metrics/lin_vel_rmse", 0.5, 0)
+    writer.add_scalar("Perf/collection_time", 1.0, 0)
+    writer.close()
+    assert plot.main([str(tmp_path / "run"), "--out", str(tmp_path / "curve.png")]) == 0
+    assert Image.open(tmp_path / "curve.png").size[0] > 100

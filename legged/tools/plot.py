@@ -182,7 +182,7 @@ def mean_of(runs: list[Scalars], tag: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _time_axis(axis: Axes, scalars: Scalars) -> None:
     """A second axis on top: seconds of training loop at the mean time of an iteration."""
-    if "Perf/collection_time" not in scalars:
+    if not {"Perf/collection_time", "Perf/learning_time"} <= scalars.keys():  # of a run that was killed in between
         return
     per_iteration = float(np.mean(scalars["Perf/collection_time"][1]) + np.mean(scalars["Perf/learning_time"][1]))
 
