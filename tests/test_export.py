@@ -138,3 +138,13 @@ def test_an_export_that_gives_nan_is_refused(runner, tmp_path, monkeypatch):
     with pytest.raises(ExportError, match=r"policy\.onnx"):
         export(runner, tmp_path)
     assert not (tmp_path / "policy.json").exists()
+
+
+def test_a_policy_of_large_actions_may_differ_by_their_share(tmp_path):
+    """float32 has seven digits: of actions of 1e6 the last one is 0.06, which is no fault of an export."""
+    runner = Runner(small_task(("train.policy.actor_hidden_dims", [64]), ("train.policy.critic_hidden_dims", [8])))
+    with torch.no_grad():
+        for parameter in runner.alg.get_policy().mlp.parameters():
+            parameter.mul_(1000.0)
+        assert runner.alg.get_policy()(runner.env.get_observations()).abs().max() > 1e3
+    assert max(export(runner, tmp_path / "exported").values()) < 1e-4

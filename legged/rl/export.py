@@ -23,7 +23,7 @@ CHECKED_OBSERVATIONS = 1000
 CHECKED_SEQUENCE = (100, 3)
 """Steps and robots on which a recurrent policy is checked."""
 LARGEST_DIFFERENCE = 1e-4
-"""Exports that differ from the policy by more than this, in actions, are refused."""
+"""Exports that differ from the policy by more than this, in actions or as a share of the largest, are refused."""
 
 
 class ExportError(RunError):
@@ -66,7 +66,7 @@ def export(runner: Runner, folder: Path) -> dict[str, float]:
     by_onnx = [(_run_onnx(network, observations, metadata["recurrent"]), wanted)]
     differences = {}
     for name, pairs in (("policy.pt", by_script), ("policy.onnx", by_onnx)):
-        difference = float(np.max([np.abs(found - right).max() for found, right in pairs]))
+        difference = float(np.max([np.abs(found - right).max() / max(1.0, np.abs(right).max()) for found, right in pairs]))
         if not difference <= LARGEST_DIFFERENCE:
             raise ExportError(f"{name}: differs from the policy by {difference:.1e} (allowed: {LARGEST_DIFFERENCE})")
         differences[name] = difference
