@@ -141,10 +141,11 @@ def test_an_export_that_gives_nan_is_refused(runner, tmp_path, monkeypatch):
 
 
 def test_a_policy_of_large_actions_may_differ_by_their_share(tmp_path):
-    """float32 has seven digits: of actions of 1e6 the last one is 0.06, which is no fault of an export."""
-    runner = Runner(small_task(("train.policy.actor_hidden_dims", [64]), ("train.policy.critic_hidden_dims", [8])))
+    """float32 has seven digits: of actions of 2e6 the last one is 0.1, which is no fault of an export."""
+    sizes = [("train.policy.actor_hidden_dims", [128, 64, 32]), ("train.policy.critic_hidden_dims", [8])]
+    runner = Runner(small_task(*sizes))
     with torch.no_grad():
         for parameter in runner.alg.get_policy().mlp.parameters():
-            parameter.mul_(30000.0)
-        assert runner.alg.get_policy()(runner.env.get_observations()).abs().max() > 1e6
+            parameter.mul_(100.0)
+        assert runner.alg.get_policy()(runner.env.get_observations()).abs().max() > 1e5
     assert max(export(runner, tmp_path / "exported").values()) < 1e-4
