@@ -110,22 +110,32 @@ def test_sizes_of_a_task_that_is_a_file(tmp_path, capfd, monkeypatch):
     assert capfd.readouterr().out.splitlines()[-1].split()[0] == "4"
 
 
-def test_a_size_that_fails_otherwise_is_told_too(tmp_path, capfd, monkeypatch):
-    (tmp_path / "broken.py").write_text(
+def broken_task(folder, statement: str) -> list[str]:
+    """Arguments for a task in `folder` whose observation ends in a statement."""
+    (folder / "broken.py").write_text(
+        "import os\n"
         "from legged import LeggedRobot, register\n"
         "class Broken(LeggedRobot):\n"
-        "    def _obs_broken(self):\n"
-        "        raise ValueError('no such thing')\n"
+        f"    def _obs_broken(self): {statement}\n"
         "cfg = {'extends': 'anymal_c_flat', 'observations': {'actor': ['broken']}}\n"
         "register('broken', {**cfg, 'train': {'algorithm': {'symmetry': False}}}, Broken)\n"
     )
+    return ["--task", "broken", "--import", "broken.py", "--sim_device", "cpu", "--scale", "4,5"]
+
+
+def test_a_size_that_fails_otherwise_is_told_too(tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    arguments = ["--task", "broken", "--import", "broken.py", "--sim_device", "cpu", "--scale", "4"]
-    assert benchmark.main(arguments) == 1
-    out, err = capfd.readouterr()
-    assert out.splitlines()[-1].split()[0] == "4"
-    assert "no such thing" in out
-    assert "Traceback" in err
+    assert benchmark.main(broken_task(tmp_path, "os._exit(3)")) == 1
+    rows = capfd.readouterr().out.splitlines()[-2:]
+    assert [row.split() for row in rows] == [[size, "exit", "code", "3"] for size in ("4", "5")]
+
+
+def test_a_mistake_that_is_the_same_for_all_sizes_is_told_once(tmp_path, capfd, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert benchmark.main(broken_task(tmp_path, "raise ValueError('no such thing')")) == 2
+    err = capfd.readouterr().err
+    assert err.startswith("error: _obs_broken: no such thing (")
+    assert err.count("\n") == 1
 
 
 @pytest.mark.parametrize("sizes", ["", "4,", "0", "many", "-4", "1e3"])
