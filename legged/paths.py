@@ -165,6 +165,8 @@ def ready_to_write_file(flag: str, path: Path, megabytes: float = 1.0) -> None:
         ConfigError: it is a folder, or can't lie where it should.
         RunError: it can't be written there.
     """
+    if "\0" in path.name or len(os.fsencode(path.name)) > LONGEST_NAME:
+        raise ConfigError(f"{flag}: no file can be called {path.name}")
     if path.is_dir() or not path.name:
         raise ConfigError(f"{flag}: {path} is a folder; the name of a file is wanted")
     ready_to_write(path.parent, megabytes)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from legged.errors import ConfigError, RunError
-from legged.paths import ABANDONED_S, make_folder, ready_to_write, replacing, write_bytes, write_text
+from legged.paths import ABANDONED_S, make_folder, ready_to_write, ready_to_write_file, replacing, write_bytes, write_text
 
 
 def names(folder: Path) -> list[str]:
@@ -131,3 +131,9 @@ def test_a_folder_that_cannot_be_is_the_users_mistake(check, name, tmp_path):
     with pytest.raises(ConfigError, match="cannot make the folder"):
         check(tmp_path / name)
     assert names(tmp_path) == ["dangling", "file"]
+
+
+@pytest.mark.parametrize("name", ["\0", "a\0b.png", "x" * 256])
+def test_a_name_that_no_file_can_have_is_refused_before_the_work(tmp_path, name):
+    with pytest.raises(ConfigError, match="--out: no file can be called"):
+        ready_to_write_file("--out", tmp_path / name)
