@@ -3,7 +3,9 @@
 import contextlib
 import io
 import re
-from collections.abc import Iterator, Sequence
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -104,3 +106,13 @@ def kept_global_state() -> Iterator[None]:
         torch.set_num_threads(threads)
         for number, handler in handlers.items():
             signal.signal(number, handler)
+
+
+def wait_for(condition: Callable[[], object], process: subprocess.Popen, seconds: float = 60.0) -> None:
+    """Wait until something holds while a process runs whose output goes to out.txt, and maybe to err.txt."""
+    end = time.monotonic() + seconds
+    while not condition():
+        said = "".join(path.read_text() for path in (Path("out.txt"), Path("err.txt")) if path.is_file())
+        assert process.poll() is None, said
+        assert time.monotonic() < end, said
+        time.sleep(0.01)

@@ -6,11 +6,10 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import pytest
-from helpers import TASK, TINY_TRAINING, checkpoints, run_folders
+from helpers import TASK, TINY_TRAINING, checkpoints, run_folders, wait_for
 
 from legged import startup
 from legged.rl import train
@@ -78,14 +77,6 @@ def running(*command: str):
     finally:
         process.kill()
         process.wait()
-
-
-def wait_for(condition, process, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert process.poll() is None, Path("err.txt").read_text()
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 TRAIN = [str(REPOSITORY / "train.py"), "--task", TASK, "--sim_device", "cpu", "--num_envs", "8", "--max_iterations", "100000"]

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, tiny_run
+from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, tiny_run, wait_for
 
 from legged.config import from_dict
 from legged.config.loader import read_yaml
@@ -233,14 +233,6 @@ def training(*arguments: str):
     finally:
         process.kill()
         process.wait()
-
-
-def wait_for(condition, process, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert process.poll() is None, Path("out.txt").read_text()
-        assert time.monotonic() < end, Path("out.txt").read_text()
-        time.sleep(0.05)
 
 
 def loads(folder: Path, iteration: int) -> None:

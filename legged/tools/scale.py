@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import re
 import subprocess
 import sys
 import tempfile
@@ -15,10 +14,8 @@ import torch
 from legged.config import TaskConfig
 from legged.errors import ConfigError
 from legged.paths import make_folder, write_text
-from legged.rl.command import EXIT_WRONG_INPUT
+from legged.rl.command import EXIT_WRONG_INPUT, LACKS_MEMORY
 
-NO_MEMORY = re.compile(r"out of memory|can't allocate memory|Failed to allocate|MemoryError|bad_?alloc")
-"""What torch, Warp and Python say of it."""
 KILLED = -9
 """What a process ends with that Linux ends for want of memory."""
 NO_ROOM = "out of memory"
@@ -86,7 +83,7 @@ def measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, A
         if done.returncode == EXIT_WRONG_INPUT:
             said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
             raise ConfigError(said[-1].removeprefix("error: "))
-        if done.returncode == KILLED or (done.returncode and NO_MEMORY.search(done.stderr)):
+        if done.returncode == KILLED or (done.returncode and LACKS_MEMORY.search(done.stderr)):
             return {"num_envs": size, "failed": NO_ROOM}
         if done.returncode:
             print(done.stderr, file=sys.stderr)

@@ -44,7 +44,7 @@ def test_compare_of_a_damaged_evaluation(data, how, value, flags, run, in_new_fo
     path = data.draw(st.sampled_from(places(content)))
     with in_new_folder():
         Path("evaluation_mujoco.json").write_text(json.dumps(mutated(content, path, how, value)), encoding="utf-8")
-        run(compare.main, ["evaluation_mujoco.json", str(source), *flags])
+        assert run(compare.main, ["evaluation_mujoco.json", str(source), *flags]).code in (0, 1, 2)
 
 
 @given(data=st.data(), out=st.sampled_from(["a.png", "b/c.png", ".", "x.nonsense", "/proc/a.png"]))
@@ -56,7 +56,7 @@ def test_plot_of_damaged_events(data, out, trained, run, in_new_folder):
         for place in data.draw(st.lists(st.integers(0, len(content) - 1), max_size=4)):
             content[place] ^= data.draw(st.integers(1, 255))
         events.write_bytes(bytes(content[: data.draw(st.one_of(st.just(len(content)), st.integers(0, len(content))))]))
-        run(plot.main, ["run", "--out", out])
+        assert run(plot.main, ["run", "--out", out]).code in (0, 1, 2)
 
 
 COMMON = {"--num_envs": SMALL_NUMBERS, "--seed": SMALL_NUMBERS, "--load_run": WORDS, "--checkpoint": SMALL_NUMBERS}
@@ -92,7 +92,7 @@ def test_any_command_line(data, name, trained, run, in_new_folder):
         return
     with in_new_folder() as folder:
         shutil.copytree(trained, folder / "logs" / TASK / "run")
-        run(main, ["--task", TASK, "--sim_device", "cpu", "sim.threads=1", *small, *flags])
+        assert run(main, ["--task", TASK, "--sim_device", "cpu", "sim.threads=1", *small, *flags]).code in (0, 1, 2)
 
 
 MODULE = f'''import torch
@@ -133,7 +133,7 @@ def test_a_damaged_module_of_a_user(text, run, in_new_folder):
         with in_new_folder():
             Path("mine.py").write_text(text, encoding="utf-8", errors="replace")
             arguments = ["--import", "mine.py", "--task", "mine", "--sim_device", "cpu", "--num_envs", "4"]
-            run(train.main, [*arguments, "--max_iterations", "1", *TINY_TRAINING])
+            assert run(train.main, [*arguments, "--max_iterations", "1", *TINY_TRAINING]).code in (0, 1, 2)
     finally:
         _REGISTERED.clear()
         _REGISTERED.update(before)
