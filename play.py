@@ -2,7 +2,7 @@
 
 import sys
 
-from legged.rl.play import main
+from legged.tools.play import main
 
 if __name__ == "__main__":
     sys.exit(main())

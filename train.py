@@ -2,7 +2,7 @@
 
 import sys
 
-from legged.rl.train import main
+from legged.tools.train import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,9 +1,9 @@
 """Legged robots learn to walk: legged_gym's task on batched MuJoCo, trained by rsl-rl."""
 
-from legged.startup import importing  # first: it looks at the time
+from legged.process.startup import importing  # first: it looks at the time
 
 with importing():
-    from legged.headless import HEADLESS  # before MuJoCo: it sets MUJOCO_GL
+    from legged.process.headless import HEADLESS  # before MuJoCo: it sets MUJOCO_GL
     from legged.config import TaskConfig
     from legged.errors import ConfigError
     from legged.envs import LeggedRobot

@@ -4,19 +4,18 @@ import sys
 from pathlib import Path
 
 import legged.tools
+from legged.commandline.command import run_main
 from legged.errors import ConfigError
-from legged.rl.command import run_main
 
 
 def commands() -> dict[str, str]:
     """Module -> the first line of what it says about itself, of all modules that can be run as `python -m`."""
-    folders = [Path(__file__).parent / "rl", Path(next(iter(legged.tools.__path__)))]
     found = {}
-    for path in sorted(path for folder in folders for path in folder.glob("*.py")):
+    for path in sorted(Path(next(iter(legged.tools.__path__))).glob("*.py")):
         text = path.read_text(encoding="utf-8")
         if '__name__ == "__main__"' in text:
             summary = text.split('"""')[1].strip().splitlines()[0]
-            found[f"legged.{path.parent.name}.{path.stem}"] = summary.partition(": `")[0].rstrip(".:")
+            found[f"legged.tools.{path.stem}"] = summary.partition(": `")[0].rstrip(".:")
     return found
 
 

@@ -13,7 +13,7 @@ from legged.config.checks import PLAIN, is_plain_name, shown
 from legged.config.loader import Registered, extended_tasks
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError, suggest
-from legged.paths import data_folder, exists
+from legged.process.paths import data_folder, exists
 from legged.terrain import Terrain
 from legged.user_modules import import_tasks
 

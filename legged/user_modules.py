@@ -8,7 +8,7 @@ from pathlib import Path
 
 from legged.config.checks import plain_path, shown
 from legged.errors import ConfigError
-from legged.paths import exists
+from legged.process.paths import exists
 
 _IMPORTED: set[str] = set()
 """Names of the modules that were run from files."""

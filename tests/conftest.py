@@ -1,6 +1,6 @@
 """Fixtures: a working directory, the robot, and physics engines that are built once and shared."""
 
-import legged.headless  # noqa: F401, I001  (chooses how to render, before MuJoCo is imported)
+import legged.process.headless  # noqa: F401, I001  (chooses how to render, before MuJoCo is imported)
 
 import functools
 from collections.abc import Callable, Iterator
@@ -13,7 +13,7 @@ from helpers import kept_global_state
 from legged.config.schema import SimConfig
 from legged.physics import Physics
 from legged.physics import make_physics as build_physics
-from legged.robot import Robot, load_robot
+from legged.robots.robot import Robot, load_robot
 
 torch.set_num_threads(1)  # tensors are small here; a second thread only costs
 

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from legged.config import TaskConfig
 from legged.envs import LeggedRobot
 from legged.registry import make_task, task_config
-from legged.rl import train
+from legged.tools import train
 
 TASK = "anymal_c_flat"
 JOINTS = 12

@@ -9,10 +9,10 @@ import torch
 from learners import MIRROR, SAMPLES, fill, learner
 from rsl_rl.algorithms import PPO
 
-from legged.graph import ForbidHostReads
-from legged.ranks import Ranks
-from legged.rl.distributed import any_rank, join, leave
-from legged.rl.ppo import DevicePPO
+from legged.graph.step_graph import ForbidHostReads
+from legged.learning.distributed import any_rank, join, leave
+from legged.learning.ppo import DevicePPO
+from legged.process.ranks import Ranks
 
 CASES = {
     "plain": {},

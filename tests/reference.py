@@ -9,8 +9,8 @@ from torch import Tensor
 
 from legged.config.schema import SimConfig
 from legged.physics import Physics, RobotState
-from legged.physics.scene import build_model
-from legged.robot import Robot
+from legged.physics.scene.robot_scene import build_model
+from legged.robots.robot import Robot
 
 TOUCHING = 0.54982
 """Base height at which the feet of the default pose end 1 mm above the ground [m]."""

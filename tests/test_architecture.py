@@ -14,7 +14,7 @@ LONGEST = 400
 
 
 def name_of(path: Path) -> str:
-    """legged/rl/train.py -> legged.rl.train."""
+    """legged/tools/train.py -> legged.tools.train."""
     parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
@@ -38,10 +38,10 @@ def uses(path: Path, *modules: str) -> set[str]:
 
 def test_the_rules_are_applied_to_all_of_the_package():
     names = {name_of(path) for path in FILES}
-    assert {"legged.physics.mujoco_warp", "legged.rl.train", "legged.envs.legged_robot", "legged"} <= names
+    assert {"legged.physics.warp.mujoco_warp", "legged.tools.train", "legged.envs.legged_robot", "legged"} <= names
     # The parser of imports sees what it should: a lazy import, and a plain one.
-    assert uses(PACKAGE / "graph.py", "warp") == {"warp"}
-    assert uses(PACKAGE / "rl" / "train.py", "legged.rl", "torch", "warp") == {"legged.rl", "torch"}
+    assert uses(PACKAGE / "graph" / "step_graph.py", "warp") == {"warp"}
+    assert uses(PACKAGE / "tools" / "train.py", "legged.learning", "torch", "warp") == {"legged.learning", "torch"}
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
@@ -54,55 +54,72 @@ def test_warp_is_known_to_the_physics_and_to_the_graph_only(path):
     name = name_of(path)
     if not name.startswith("legged.physics"):
         assert not uses(path, "mujoco_warp")
-        if name != "legged.graph":
+        if name != "legged.graph.step_graph":
             assert not uses(path, "warp")
 
 
-PARTS = sorted({".".join(name_of(path).split(".")[:2]) for path in FILES} - {"legged"})
-ABOVE = ["legged.envs", "legged.registry", "legged.rl", "legged.tools"]
-GUARD = ("legged.errors", "legged.constants", "legged.python_state")
-LAYERS = {  # what a part of the package must not know
-    "legged.config": ["legged.robot", "legged.physics", *ABOVE, "torch"],
-    "legged.math": ["legged"],
-    "legged.errors": ["legged"],
-    "legged.constants": ["legged"],
-    "legged.python_state": ["legged", "torch"],
-    "legged.guard": [part for part in PARTS if part not in GUARD],
-    "legged.graph": [part for part in PARTS if part not in (*GUARD, "legged.guard")],
-    "legged.robot": ["legged.physics", *ABOVE, "torch"],
-    "legged.terrain": ["legged.robot", "legged.physics", *ABOVE, "mujoco"],
-    **{f"legged.terrain.{part}": ["torch"] for part in ("generators", "height_map", "terrain")},
-    "legged.physics": [*ABOVE, "legged.rewards", "legged.commands"],
-    **{
-        f"legged.{part}": [*ABOVE, "mujoco"]
-        for part in (
-            "control",
-            "commands",
-            "contacts",
-            "curriculum",
-            "observations",
-            "rewards",
-            "statistics",
-            "randomization",
-        )
-    },
-    "legged.envs": ["legged.registry", "legged.rl", "legged.tools", "mujoco"],
-    "legged.registry": ["legged.rl", "legged.tools"],
-    "legged.rl": ["legged.tools"],
+FLOORS = [  # from the ground up; each part imports from the floors below it only
+    {"errors", "math", "state"},
+    {"process"},
+    {"graph", "config"},
+    {"robots", "terrain"},
+    {"physics"},
+    {"mdp"},
+    {"envs"},
+    {"user_modules"},
+    {"registry"},
+    {"commandline"},
+    {"learning", "rendering"},
+    {"policies", "play", "benchmarks"},
+    {"evaluation"},
+    {"tools"},
+]
+PARTS = sorted({name_of(path).split(".")[1] for path in FILES if name_of(path) not in ("legged", "legged.__main__")})
+WITHOUT = {  # what else a part does without
+    "errors": ["torch"],
+    "process": ["torch"],
+    "config": ["torch"],
+    "robots": ["torch"],
+    "terrain": ["torch", "mujoco"],
+    "graph.python_state": ["torch"],
+    "mdp": ["mujoco"],
+    "envs": ["mujoco"],
 }
 
 
-@pytest.mark.parametrize("part", LAYERS)
+def floor_of(part: str) -> int:
+    return next(i for i, parts in enumerate(FLOORS) if part in parts)
+
+
+def test_every_part_has_its_floor():
+    assert sorted(part for parts in FLOORS for part in parts) == PARTS
+
+
+@pytest.mark.parametrize("part", PARTS)
 def test_imports_point_one_way(part):
-    files = [path for path in FILES if name_of(path) == part or name_of(path).startswith(f"{part}.")]
+    above = [other for other in PARTS if other != part and floor_of(other) >= floor_of(part)]
+    files = [path for path in FILES if name_of(path).split(".")[1:2] == [part]]
+    found = {name_of(path): uses(path, *(f"legged.{other}" for other in above)) for path in files}
+    assert not {name: modules for name, modules in found.items() if modules}
+
+
+@pytest.mark.parametrize("part", WITHOUT)
+def test_a_part_does_without(part):
+    files = [path for path in FILES if f"{name_of(path)}.".startswith(f"legged.{part}.")]
     assert files, f"there is no {part}"
-    found = {name_of(path): uses(path, *LAYERS[part]) for path in files}
+    found = {name_of(path): uses(path, *WITHOUT[part]) for path in files}
     assert not {name: modules for name, modules in found.items() if modules}
 
 
 def test_rsl_rl_is_known_to_its_boundary_only():
     users = {name_of(path) for path in FILES if uses(path, "rsl_rl")}
-    assert users <= {"legged.envs.base_task", "legged.rl.logger", "legged.rl.runner", "legged.rl.ppo", "legged.rl.rollout"}
+    assert users <= {
+        "legged.envs.base_task",
+        "legged.learning.logger",
+        "legged.learning.runner",
+        "legged.learning.ppo",
+        "legged.learning.rollout",
+    }
 
 
 def test_a_machine_without_a_gpu_imports_no_gpu_engine():

@@ -10,8 +10,7 @@ import torch
 from helpers import POLICY
 
 from legged.registry import import_tasks, make_task, task_config
-from legged.rl import play, train
-from legged.tools import benchmark, compare, evaluate, plot, show_terrain, time_to_walk, warmup
+from legged.tools import benchmark, compare, evaluate, play, plot, show_terrain, time_to_walk, train, warmup
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -14,7 +14,7 @@ from legged.config.origins import Origins
 from legged.config.schema import TaskConfig
 from legged.config.yaml_files import parse, read_yaml
 from legged.errors import ConfigError, suggest
-from legged.paths import data_folder, exists
+from legged.process.paths import data_folder, exists
 
 LONGEST_CHAIN = 20
 """Files that extend each other."""

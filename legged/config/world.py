@@ -32,7 +32,7 @@ class SimConfig:
     device), `auto` by device."""
     solver: NewtonSolver = "mujoco"
     """Solver of `newton`; the other engines have their own. Each comes with settings under which a quadruped stands:
-    legged/physics/newton_solvers.py."""
+    legged/physics/newton/solvers.py."""
     dt: float = field(default=0.005, metadata=positive(0.1, low=1e-5))
     """Physics step [s]; the control step is `dt * control.decimation`."""
     cone: Literal["pyramidal", "elliptic"] = "pyramidal"

@@ -11,9 +11,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.config.schema import TaskConfig
-from legged.graph import StepGraph
-from legged.observations import ObservationGroup
-from legged.statistics import Statistics
+from legged.graph.step_graph import StepGraph
+from legged.mdp.observations import ObservationGroup
+from legged.mdp.statistics import Statistics
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from typing import get_args
 from legged.config.schema import TaskConfig
 from legged.envs.terms import MirrorKind
 from legged.errors import ConfigError, suggest
-from legged.robot import Robot
+from legged.robots.robot import Robot
 
 MOST_IN_A_POOL = 2**31 - 1
 """Contacts or constraint rows of all robots, which engines count in 32 bits."""

@@ -6,31 +6,31 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged.commands import Commands
 from legged.config.schema import TaskConfig
-from legged.contacts import FeetContacts
-from legged.control import Control, control_gains
-from legged.curriculum import CommandCurriculum
 from legged.envs.base_task import BaseTask
 from legged.envs.checks import check_base_mass, check_mirror_kinds, check_sizes
 from legged.envs.overrides import check_overrides, check_terms
 from legged.envs.recurrent import check_recurrent
 from legged.envs.terms import Terms
 from legged.errors import ConfigError, suggest
-from legged.faults import LARGEST_STATE, Faults
-from legged.graph import Branch
+from legged.graph.step_graph import Branch
 from legged.math import masked_set_
-from legged.observations import ObservationGroup, ObservationTerms
+from legged.mdp.command_curriculum import CommandCurriculum
+from legged.mdp.commands import Commands
+from legged.mdp.contacts import FeetContacts
+from legged.mdp.control import Control, control_gains
+from legged.mdp.faults import LARGEST_STATE, Faults
+from legged.mdp.height_scan import HeightScan
+from legged.mdp.observations import ObservationGroup, ObservationTerms
+from legged.mdp.randomization import Randomization
+from legged.mdp.rewards import Rewards
+from legged.mdp.statistics import Statistics
+from legged.mdp.terrain_curriculum import TerrainCurriculum
 from legged.physics import make_physics
-from legged.randomization import Randomization
-from legged.ranks import Ranks
-from legged.rewards import Rewards
-from legged.robot import Robot, load_robot
+from legged.process.ranks import Ranks
+from legged.robots.robot import Robot, load_robot
 from legged.state import load_state, state_of, take
-from legged.statistics import Statistics
 from legged.terrain import Terrain, check_terrain
-from legged.terrain.curriculum import TerrainCurriculum
-from legged.terrain.scan import HeightScan
 
 TERMINATION_FORCE = 1.0
 """Contact force on a terminating shape that ends the episode [N]."""

@@ -7,7 +7,7 @@ from typing import Any
 from legged.config.origins import Origins
 from legged.config.schema import TaskConfig
 from legged.errors import ConfigError
-from legged.paths import relative
+from legged.process.paths import relative
 
 _OBSERVE = "write a method _obs_<name> for each part and list the names in observations.actor and observations.critic"
 _STEP = "override _step and call super()._step() in it, or one of what it calls: check_termination, compute_reward, reset_idx"
@@ -17,7 +17,7 @@ _START = (
 )
 _BUILD = "the robot is its MJCF (robot: in the task's YAML), the ground is terrain: or what make_terrain() returns"
 _DRAWING = "nothing is drawn while training; play.py makes pictures (legged/rendering)"
-_TORQUES = "control.control_type, control.stiffness and control.damping choose the law; others go into legged/control.py"
+_TORQUES = "control.control_type, control.stiffness and control.damping choose the law; others go into legged/mdp/control.py"
 _BUFFERS = "allocate tensors in __init__(), before super().__init__(...), which calls every term"
 
 HOOKS = {
@@ -31,13 +31,13 @@ HOOKS = {
     "get_privileged_observations": "observations.critic lists the _obs_<name> methods that the critic sees",
     "_get_noise_scale_vec": "observations.noise in the YAML gives each term's noise; observations.add_noise, noise_level",
     "_resample_commands": "commands.ranges, commands.resampling_time_s, standing_share and single_axis_share say what is"
-    " sampled; another way of sampling goes into legged/commands.py",
+    " sampled; another way of sampling goes into legged/mdp/commands.py",
     "_compute_torques": _TORQUES,
     "_reset_dofs": _START,
     "_reset_root_states": _START,
     "_push_robots": "domain_rand.push_robots, push_interval_s and max_push_vel_xy say how robots are pushed",
-    "_update_terrain_curriculum": "terrain.curriculum switches it; another one goes into legged/terrain/curriculum.py",
-    "update_command_curriculum": "commands.curriculum has its settings; another one goes into legged/curriculum.py",
+    "_update_terrain_curriculum": "terrain.curriculum switches it; another one goes into legged/mdp/terrain_curriculum.py",
+    "update_command_curriculum": "commands.curriculum sets it; another one goes into legged/mdp/command_curriculum.py",
     "_get_heights": "self.measured_heights (N, P) has them after every step; terrain.measured_points_x and _y say where",
     "_init_height_points": "terrain.measured_points_x and terrain.measured_points_y say where heights are measured",
     "_process_rigid_shape_props": "domain_rand.randomize_friction and friction_range randomise; the MJCF says the rest",

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from legged.config.schema import TaskConfig
-from legged.contacts import FeetContacts
-from legged.control import Control
-from legged.terrain.scan import HeightScan
+from legged.mdp.contacts import FeetContacts
+from legged.mdp.control import Control
+from legged.mdp.height_scan import HeightScan
 
 MirrorKind = Literal["same", "vector", "rotation", "command", "joints", "feet", "heights"]
 """`vector`: (x, y, z) of a velocity or direction; `rotation`: of an angular velocity; `command`: (vx, vy, yaw rate);

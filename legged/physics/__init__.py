@@ -9,8 +9,8 @@ import torch
 from legged.config.schema import SimConfig
 from legged.errors import ConfigError
 from legged.physics.base import Physics, RandomizedField, RobotState
-from legged.robot import Robot
-from legged.startup import importing
+from legged.process.startup import importing
+from legged.robots.robot import Robot
 from legged.terrain import Terrain
 
 __all__ = ["Physics", "RandomizedField", "RobotState", "engine_name", "kernel_cache", "make_physics", "resolve_physics"]
@@ -51,13 +51,13 @@ def make_physics(
     engine = resolve_physics(sim.physics, device)
     if engine == "newton":
         with importing():
-            import legged.physics.warp_physics  # noqa: F401  (settings of Warp, before Newton declares its kernels)
-            from legged.physics.newton import NewtonPhysics
+            import legged.physics.warp.physics  # noqa: F401  (settings of Warp, before Newton declares its kernels)
+            from legged.physics.newton.physics import NewtonPhysics
 
         return NewtonPhysics(robot, sim, num_envs, device, terrain)
     if engine == "mujoco_warp":
         with importing():
-            from legged.physics.mujoco_warp import MujocoWarpPhysics
+            from legged.physics.warp.mujoco_warp import MujocoWarpPhysics
 
         return MujocoWarpPhysics(robot, sim, num_envs, device, terrain, randomized)
     from legged.physics.mujoco import MujocoPhysics
@@ -67,6 +67,6 @@ def make_physics(
 
 def kernel_cache() -> Path:
     """The folder in which Warp keeps compiled kernels."""
-    from legged.physics.kernels import cache_folder
+    from legged.physics.warp.compile import cache_folder
 
     return cache_folder()

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from legged.errors import suggest
-from legged.robot import Robot
+from legged.robots.robot import Robot
 from legged.state import take
 
 RandomizedField = Literal["friction", "added_base_mass"]

@@ -10,7 +10,7 @@ from torch import Tensor
 from legged.errors import ConfigError
 from legged.math import quat_to_matrix
 from legged.physics.base import RobotState
-from legged.robot import Robot
+from legged.robots.robot import Robot
 
 
 @dataclass(frozen=True)

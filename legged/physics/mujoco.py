@@ -7,14 +7,14 @@ from mujoco.batch import Batch
 from torch import Tensor
 
 from legged.config.schema import SimConfig
-from legged.cores import available_cores
 from legged.math import quat_rotate, quat_rotate_inverse
 from legged.physics.base import Physics, RandomizedField, allocate_state, setter_of
 from legged.physics.engine_warnings import keep_out_of_files
 from legged.physics.feet import FeetKinematics
-from legged.physics.scene import build_model, contact_sensor_columns
-from legged.ranks import Ranks
-from legged.robot import Robot
+from legged.physics.scene.robot_scene import build_model, contact_sensor_columns
+from legged.process.cores import available_cores
+from legged.process.ranks import Ranks
+from legged.robots.robot import Robot
 from legged.terrain import Terrain
 
 OVERFLOW = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]

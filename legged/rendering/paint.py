@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from legged.physics.terrain_geoms import SAME, add_terrain
+from legged.physics.scene.terrain_geoms import SAME, add_terrain
 from legged.terrain import Terrain
 
 DEPTH = 0.6

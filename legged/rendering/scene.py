@@ -8,7 +8,7 @@ import mujoco
 from legged.errors import RunError
 from legged.rendering.paint import add_horizon, add_painted_terrain
 from legged.rendering.window import draw_without_window
-from legged.robot import Robot
+from legged.robots.robot import Robot
 from legged.terrain import Terrain
 
 

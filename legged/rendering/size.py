@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from legged.robot import Robot
+from legged.robots.robot import Robot
 
 
 @dataclass(frozen=True)

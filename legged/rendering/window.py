@@ -8,7 +8,7 @@ from importlib import import_module
 
 from mujoco.rendering.classic import gl_context
 
-from legged.headless import HEADLESS, off_screen_library
+from legged.process.headless import HEADLESS, off_screen_library
 
 
 @functools.cache

@@ -1,1 +1,1 @@
-"""Commands beside train and play: `python -m legged.tools.<name>`."""
+"""Commands: `python -m legged.tools.<name>`, and nothing else."""

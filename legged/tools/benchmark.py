@@ -22,20 +22,20 @@ from typing import Any
 
 import torch
 
+from legged.benchmarks.kernel_times import kernel_times, table
+from legged.benchmarks.scale import scale
+from legged.commandline.arguments import add_task_arguments, import_and_check, overrides, pick_device, settle_on
+from legged.commandline.command import run_main
 from legged.config import override
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
-from legged.graph import StepGraph
-from legged.paths import make_folder, ready_to_write_file, write_text
+from legged.graph.step_graph import StepGraph
+from legged.learning.captured import CapturedRunner
+from legged.learning.display import Progress
+from legged.learning.runner import Runner
 from legged.physics import resolve_physics
+from legged.process.paths import make_folder, ready_to_write_file, write_text
 from legged.registry import make_task, task_config
-from legged.rl.arguments import add_task_arguments, import_and_check, overrides, pick_device, settle_on
-from legged.rl.captured import CapturedRunner
-from legged.rl.command import run_main
-from legged.rl.display import Progress
-from legged.rl.runner import Runner
-from legged.tools.kernel_times import kernel_times, table
-from legged.tools.scale import scale
 
 GROUNDS: dict[str, list[tuple[str, Any]]] = {
     "plane": [("terrain.mesh_type", "plane")],

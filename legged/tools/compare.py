@@ -17,11 +17,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from legged.commandline.command import run_main
 from legged.errors import ConfigError, suggest
-from legged.paths import make_folder, ready_to_write_file, relative, replacing
-from legged.rl.command import run_main
-from legged.tools.evaluation_file import check, tracking_of
-from legged.tools.success_report import ENGINES, TRAINED
+from legged.evaluation.evaluation_file import check, tracking_of
+from legged.evaluation.success_report import ENGINES, TRAINED
+from legged.process.paths import make_folder, ready_to_write_file, relative, replacing
 
 Evaluations = dict[tuple[str, str], list[dict[str, Any]]]
 """(task, physics) -> results, one a seed."""

@@ -19,11 +19,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from legged.config import override
-from legged.errors import ConfigError
-from legged.paths import make_folder, ready_to_write, relative, replacing, write_text
-from legged.physics import engine_name
-from legged.rl.arguments import (
+from legged.commandline.arguments import (
     add_run_arguments,
     add_task_arguments,
     import_and_check,
@@ -31,13 +27,17 @@ from legged.rl.arguments import (
     policy_overrides,
     settle_on,
 )
-from legged.rl.command import run_main
-from legged.rl.policy import find_policy
-from legged.tools.crossing import EVERYWHERE, cross
-from legged.tools.success import chosen_types, sweep
-from legged.tools.success_report import plot_success, print_success, with_other_engine
-from legged.tools.tracking import ready_to_track, tell
-from legged.tools.velocity_grid import Grid, measure
+from legged.commandline.command import run_main
+from legged.config import override
+from legged.errors import ConfigError
+from legged.evaluation.crossing import EVERYWHERE, cross
+from legged.evaluation.success import chosen_types, sweep
+from legged.evaluation.success_report import plot_success, print_success, with_other_engine
+from legged.evaluation.tracking import ready_to_track, tell
+from legged.evaluation.velocity_grid import Grid, measure
+from legged.physics import engine_name
+from legged.policies.restore import find_policy
+from legged.process.paths import make_folder, ready_to_write, relative, replacing, write_text
 
 MOST_ROBOTS = 2**20
 """More are not simulated at once."""

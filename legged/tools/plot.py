@@ -16,11 +16,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from legged.commandline.command import run_main
 from legged.config.loader import read_yaml
 from legged.errors import ConfigError
-from legged.paths import make_folder, ready_to_write_file, relative, replacing
-from legged.rl.command import run_main
-from legged.rl.runs import CONFIG_FILE
+from legged.learning.run_folder import CONFIG_FILE
+from legged.process.paths import make_folder, ready_to_write_file, relative, replacing
 
 CURVES = (
     ("Metrics/lin_vel_rmse", "velocity error in training [m/s]", 1.0),

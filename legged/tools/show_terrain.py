@@ -13,16 +13,16 @@ import matplotlib
 import numpy as np
 from PIL import Image
 
+from legged.commandline.arguments import add_task_arguments, import_and_check, overrides
+from legged.commandline.command import run_main
 from legged.config import TaskConfig
 from legged.config.schema import TerrainConfig
 from legged.errors import ConfigError, suggest
-from legged.paths import make_folder, ready_to_write, relative, replacing
+from legged.process.paths import make_folder, ready_to_write, relative, replacing
 from legged.registry import task_config
-from legged.rl.arguments import add_task_arguments, import_and_check, overrides
-from legged.rl.command import run_main
-from legged.robot import load_robot
+from legged.rendering.terrain_picture import Place, render
+from legged.robots.robot import load_robot
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, check_terrain
-from legged.tools.terrain_picture import Place, render
 
 MARGIN = 2.0
 """Border that is shown around the tiles [m]."""

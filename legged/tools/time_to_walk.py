@@ -12,10 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from legged.errors import ConfigError
-from legged.paths import make_folder, ready_to_write, relative, write_text
-from legged.physics import engine_name
-from legged.rl.arguments import (
+from legged.commandline.arguments import (
     add_run_arguments,
     add_task_arguments,
     import_and_check,
@@ -23,12 +20,15 @@ from legged.rl.arguments import (
     policy_overrides,
     settle_on,
 )
-from legged.rl.checkpoint import read_checkpoint
-from legged.rl.command import run_main
-from legged.rl.policy import find_policy
-from legged.rl.runs import checkpoints
-from legged.tools.tracking import ready_to_track, tell
-from legged.tools.velocity_grid import Grid, measure
+from legged.commandline.command import run_main
+from legged.errors import ConfigError
+from legged.evaluation.tracking import ready_to_track, tell
+from legged.evaluation.velocity_grid import Grid, measure
+from legged.learning.checkpoint import read_checkpoint
+from legged.learning.run_folder import checkpoints
+from legged.physics import engine_name
+from legged.policies.restore import find_policy
+from legged.process.paths import make_folder, ready_to_write, relative, write_text
 
 AXIS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 """Commands of the grid, in m/s and rad/s."""

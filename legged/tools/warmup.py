@@ -8,11 +8,11 @@ import argparse
 import sys
 import time
 
+from legged.commandline.arguments import add_task_arguments, import_and_check, overrides, pick_device, settle_on
+from legged.commandline.command import run_main
 from legged.physics import kernel_cache, resolve_physics
+from legged.process.startup import STARTED_S
 from legged.registry import make_task, task_config
-from legged.rl.arguments import add_task_arguments, import_and_check, overrides, pick_device, settle_on
-from legged.rl.command import run_main
-from legged.startup import STARTED_S
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from outcomes import refused_in_a_line
 
+from legged.learning.checkpoint import check_fits, read_checkpoint
+from legged.learning.run_folder import run_config
+from legged.learning.runner import Runner
 from legged.registry import make_task
-from legged.rl import play, train
-from legged.rl.checkpoint import check_fits, read_checkpoint
-from legged.rl.runner import Runner
-from legged.rl.runs import run_config
+from legged.tools import play, train
 
 TENSORS = st.sampled_from(
     [

@@ -13,10 +13,10 @@ from outcomes import refused_in_a_line
 
 from legged.config import from_dict, load_config, to_yaml
 from legged.config.loader import parse_override
-from legged.paths import data_folder
+from legged.learning.runner import Runner
+from legged.process.paths import data_folder
 from legged.registry import make_task, task_config
-from legged.rl import train
-from legged.rl.runner import Runner
+from legged.tools import train
 
 TASKS = ["anymal_c_flat", "anymal_c", "anymal_c_proprio"]
 CHEAP = [("sim.physics", "mujoco"), ("sim.threads", 1), ("env.num_envs", 4), ("train.runner.num_steps_per_env", 2)]

@@ -13,10 +13,10 @@ import pytest
 import torch
 from helpers import TASK, TINY_TRAINING, checkpoints, run_folders
 
+from legged.learning.captured import CapturedRunner
+from legged.learning.run_folder import run_config
+from legged.learning.run_state import state_path
 from legged.registry import make_task
-from legged.rl.captured import CapturedRunner
-from legged.rl.run_state import state_path
-from legged.rl.runs import run_config
 
 CASES = int(os.environ.get("FUZZ_KILLS", "2"))
 """Moments for each signal; FUZZ_KILLS=50 for a night."""

@@ -6,10 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from legged.envs import LeggedRobot
+from legged.learning.captured import CapturedRunner
+from legged.learning.rollout import Rollout
+from legged.learning.runner import Runner
 from legged.registry import _REGISTERED, make_task, register, task_config
-from legged.rl.captured import CapturedRunner
-from legged.rl.rollout import Rollout
-from legged.rl.runner import Runner
 
 N, STEPS = 6, 4
 BAD = st.sampled_from([float("nan"), float("inf"), float("-inf"), 1e30, -1e30, 3e38, 1e15, 1e5])

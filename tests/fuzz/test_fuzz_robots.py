@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from outcomes import refused_in_a_line
 
-from legged.paths import data_folder
+from legged.process.paths import data_folder
 from legged.registry import make_task, task_config
 
 SOURCE = data_folder("resources") / "robots" / "anymal_c"

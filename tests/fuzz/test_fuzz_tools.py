@@ -10,10 +10,9 @@ from helpers import TASK, TINY_TRAINING
 from hypothesis import given
 from hypothesis import strategies as st
 
-from legged.paths import data_folder
+from legged.process.paths import data_folder
 from legged.registry import _REGISTERED
-from legged.rl import play, train
-from legged.tools import benchmark, compare, evaluate, plot, show_terrain, time_to_walk
+from legged.tools import benchmark, compare, evaluate, play, plot, show_terrain, time_to_walk, train
 
 POLICIES = data_folder("resources") / "policies"
 EVALUATIONS = [POLICIES / "anymal_c" / "evaluation_mujoco.json", POLICIES / TASK / "evaluation_mujoco.json"]

@@ -1,0 +1,110 @@
+"""Speed and memory by number of robots: the benchmark once for each, in a process of its own, so that memory is its own."""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from legged.commandline.command import EXIT_WRONG_INPUT, LACKS_MEMORY
+from legged.config import TaskConfig
+from legged.errors import ConfigError
+from legged.process.paths import make_folder, write_text
+
+KILLED = -9
+"""What a process ends with that Linux ends for want of memory."""
+NO_ROOM = "out of memory"
+"""What is said of a size that does not fit."""
+COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], str]], ...] = (
+    ("robots", 12, lambda row: f"{row['num_envs']:,}"),
+    ("control step", 14, lambda row: f"{row['control_step_ms']:.2f} ms"),
+    ("steps/s", 13, lambda row: f"{row['env_steps_per_s']:,.0f}"),
+    ("iteration", 13, lambda row: f"{row['iteration_ms']:.1f} ms" if "iteration_ms" in row else "-"),
+    ("training steps/s", 18, lambda row: f"{row['robot_steps_per_s']:,.0f}" if "robot_steps_per_s" in row else "-"),
+    ("GPU memory", 12, lambda row: f"{row['gpu_memory_gib']:.1f} GiB" if "gpu_memory_gib" in row else "-"),
+)
+"""Of the table: heading, width, text."""
+
+
+def scale(args: argparse.Namespace, given: Sequence[str], cfg: TaskConfig, device: torch.device) -> int:
+    """Print a row for each number of robots in `args.scale`, write all to `args.json`; returns the exit code. `given` is the
+    command line that `args` were read from: each size is measured as it says. A size that
+    needs more memory than there is has a row that says so; one that fails for another reason too, and makes the code 1.
+
+    Raises:
+        ConfigError: the numbers are none, or another option asks for one number or compares something else.
+    """
+    sizes = numbers(args.scale)
+    for flag, value in (("--num_envs", args.num_envs), ("--grounds", args.grounds)):
+        if value:
+            raise ConfigError(f"--scale: compares numbers of robots by itself; leave out {flag}")
+    loop = args.runner or cfg.train.runner.loop
+    where = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
+    print(f"{cfg.task}, {where}, {loop} training", flush=True)
+    print("".join(f"{name:>{width}}" for name, width, _ in COLUMNS), flush=True)
+    rows = []
+    for size in sizes:
+        rows.append(measure_apart(others(given), size, loop))
+        print(line(rows[-1]), flush=True)
+    if args.json:
+        make_folder(args.json.parent)
+        write_text(args.json, json.dumps({"task": cfg.task, "device": where, "loop": loop, "sizes": rows}, indent=1))
+    return int(any(row.get("failed", NO_ROOM) != NO_ROOM for row in rows))
+
+
+def numbers(text: str) -> list[int]:
+    """'1024,4096' -> [1024, 4096].
+
+    Raises:
+        ConfigError: not a list of numbers above 0.
+    """
+    parts = [part.strip().replace("_", "") for part in text.split(",")]
+    if not all(part.isdecimal() and int(part) > 0 for part in parts):
+        raise ConfigError(f"--scale: '{text}' is not a list of numbers of robots, like 1024,4096,16384")
+    return [int(part) for part in parts]
+
+
+def measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, Any]:
+    """The benchmark's numbers under these arguments with `size` robots, or why there are none as `failed`.
+
+    Raises:
+        ConfigError: the configuration does not allow that many.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "result.json"
+        command = [sys.executable, "-m", "legged.tools.benchmark", *arguments]
+        command += ["--num_envs", str(size), "--runner", loop, "--json", str(path)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode == EXIT_WRONG_INPUT:
+            said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+            raise ConfigError(said[-1].removeprefix("error: "))
+        if done.returncode == KILLED or (done.returncode and LACKS_MEMORY.search(done.stderr)):
+            return {"num_envs": size, "failed": NO_ROOM}
+        if done.returncode:
+            print(done.stderr, file=sys.stderr)
+            said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+            return {"num_envs": size, "failed": said[-1]}
+        result = json.loads(path.read_text(encoding="utf-8"))
+    iterations = result.pop("iterations", {}).get(loop, {})
+    return {**result, **iterations}
+
+
+def others(given: Sequence[str]) -> list[str]:
+    """A command line without what is different for each size, abbreviated or not."""
+    own = argparse.ArgumentParser(add_help=False)
+    for flag in ("--scale", "--json", "--num_envs", "--runner"):
+        own.add_argument(flag)
+    return own.parse_known_args(list(given))[1]
+
+
+def line(row: dict[str, Any]) -> str:
+    """A row of the table."""
+    if "failed" in row:
+        _, width, robots = COLUMNS[0]
+        return f"{robots(row):>{width}}  {row['failed']}"
+    return "".join(f"{text(row):>{width}}" for _, width, text in COLUMNS)

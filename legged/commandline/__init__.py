@@ -1,0 +1,1 @@
+"""Commands as processes: flags, output, stopping, exit codes."""

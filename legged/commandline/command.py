@@ -1,0 +1,124 @@
+"""A command as a process: how it ends, with which exit code, and with which one line."""
+
+import errno
+import re
+import sys
+import sysconfig
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+
+import legged.errors
+from legged.commandline.output import forgiving_output
+from legged.errors import ConfigError, RunError, TermError
+from legged.graph.step_graph import HostReadError
+from legged.physics.engine_warnings import told_once
+from legged.process.paths import full_disk_in, reason
+from legged.process.ranks import Ranks
+from legged.process.startup import INTERRUPTED, is_a_command, leave_at_interrupts, raise_at_interrupts
+from legged.user_modules import is_of_a_module
+
+EXIT_FAILED = 1
+EXIT_WRONG_INPUT = 2
+NO_MEMORY = "out of memory; fewer robots (--num_envs) need less"
+LACKS_MEMORY = re.compile(r"(?i)out of memory|can't allocate memory|failed to allocate|bad_?alloc|unable to allocate")
+"""What torch, Warp, NumPy and C++ say of it."""
+
+
+def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = None) -> int:
+    """Run a command, of this process if it has no `argv` of its own; returns its exit code: 0 done, 1 it could not go on, 2
+    wrong input, 130 interrupted. What ends it says so in one line; only a fault of the program leaves a traceback.
+
+    A standard output that goes away ends nothing: what is measured is written to files all the same. The code is 1 then.
+    """
+    if argv is None:
+        is_a_command()
+        raise_at_interrupts()
+    with forgiving_output() as output, told_once():
+        leaves = None
+        try:
+            code = _guarded(main, argv)
+        except SystemExit as stop:  # argparse, after --help or a wrong flag
+            leaves, code = stop, stop.code if isinstance(stop.code, int) else 0
+        output.flush()
+        if output.lost is not None:
+            _say(output.lost)
+            code = code or EXIT_FAILED
+        elif leaves is not None:
+            raise leaves
+    if argv is None:
+        leave_at_interrupts()  # Python still has to end
+    return code
+
+
+def _guarded(main: Callable[[list[str] | None], int], argv: list[str] | None) -> int:
+    """Run a command; its exit code, whichever way it ends."""
+    try:
+        return main(argv)
+    except ConfigError as error:
+        _say(str(error))
+        return EXIT_WRONG_INPUT
+    except (TermError, HostReadError) as error:
+        _say("; ".join([f"{error}{line_of_user(error)}", *getattr(error, "__notes__", ())]))
+        return EXIT_WRONG_INPUT
+    except RunError as error:
+        _say(str(error))
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr, flush=True)
+        return INTERRUPTED
+    except MemoryError as error:
+        _say(f"out of memory: {error}" if str(error) else NO_MEMORY)
+    except Exception as error:  # what libraries make of a full disk, of too little memory and of Ctrl-C
+        if isinstance(error.__context__, KeyboardInterrupt):
+            print("interrupted", file=sys.stderr, flush=True)
+            return INTERRUPTED
+        text = known_failure(error)
+        if text is None and is_of_a_module(traceback.extract_tb(error.__traceback__)[-1].filename):
+            _say(f"{type(error).__name__}: {' '.join(str(error).split())}{line_of_user(error)}")
+            return EXIT_WRONG_INPUT
+        if text is None:
+            raise
+        _say(text)
+    return EXIT_FAILED
+
+
+def line_of_user(error: BaseException) -> str:
+    """Say ' (file, line n)' of the innermost line behind `error` that is neither ours nor a library's."""
+    found = ""
+    behind: BaseException | None = error
+    while behind is not None:
+        for frame in traceback.extract_tb(behind.__traceback__):
+            if _is_of_user(frame):
+                found = f" ({frame.filename}, line {frame.lineno})"
+        behind = behind.__cause__
+    return found
+
+
+def _is_of_user(frame: traceback.FrameSummary) -> bool:
+    """Whether a line is neither ours, nor a library's, nor Python's."""
+    file = Path(frame.filename)
+    libraries = {"site-packages", "dist-packages"} & {*file.parts} or file.is_relative_to(sysconfig.get_path("stdlib"))
+    return not libraries and not file.is_relative_to(Path(legged.errors.__file__).parent) and file.is_file()
+
+
+def known_failure(error: BaseException) -> str | None:
+    """One line on a full disk, a file that can't be written or too little memory, whichever library met it; None for all
+    other errors.
+    """
+    full = full_disk_in(error)
+    if full is not None:
+        return f"{full.filename}: {reason(full)}" if full.filename else reason(full)
+    if isinstance(error, PermissionError) or (isinstance(error, OSError) and error.errno in (errno.EROFS, errno.EMFILE)):
+        return f"{error.filename}: {reason(error)}" if error.filename else reason(error)
+    if isinstance(error, RuntimeError) and LACKS_MEMORY.search(str(error)):
+        return f"out of memory ({str(error).splitlines()[0][:160]}); fewer robots (--num_envs) need less"
+    return None
+
+
+def _say(text: str) -> None:
+    """Tell why the command ends."""
+    try:
+        rank = f"rank {Ranks.now().rank}: " if Ranks.now().several else ""
+    except ConfigError:  # that is the error
+        rank = ""
+    print(f"{rank}error: {text}", file=sys.stderr, flush=True)

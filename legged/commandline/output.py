@@ -1,0 +1,92 @@
+"""Standard output that may go away: a closed pipe, a full disk, a terminal that was hung up. A command goes on without it."""
+
+import errno
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, TextIO
+
+from legged.process.paths import DISK_FULL, reason
+
+
+class Output:
+    """A text stream that takes what is written to it and, once it can't be written any more, drops it."""
+
+    def __init__(self, stream: TextIO | None) -> None:
+        """`stream` is None in a process that was started without one."""
+        self._stream = open(os.devnull, "w") if stream is None else stream  # noqa: SIM115  (as long as the process)
+        self.lost: str | None = None
+        """Why nothing more can be written; None while it can."""
+        self._when_lost: list[Callable[[], object]] = []
+
+    def write(self, text: str) -> int:
+        """Write, or drop what can't be written; the number of characters."""
+        if self.lost is None:
+            with self._watched():
+                self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush what was written."""
+        if self.lost is None:
+            with self._watched():
+                self._stream.flush()
+
+    def when_lost(self, do: Callable[[], object]) -> None:
+        """Call `do` as soon as nothing can be written any more; at once, if that is so."""
+        if self.lost is not None:
+            do()
+        self._when_lost.append(do)
+
+    @contextmanager
+    def _watched(self) -> Iterator[None]:
+        try:
+            yield
+        except UnicodeError:  # a name that this terminal's encoding does not have
+            raise
+        except (OSError, ValueError) as error:  # ValueError: somebody has closed it
+            self.lost = _why(error)
+            if self._stream in (sys.__stdout__, sys.__stderr__):  # what Python still holds must not fail at exit
+                with suppress(OSError, ValueError):
+                    nowhere = os.open(os.devnull, os.O_WRONLY)
+                    os.dup2(nowhere, self._stream.fileno())
+                    os.close(nowhere)
+            for do in self._when_lost:
+                do()
+
+    def __getattr__(self, name: str) -> Any:
+        """Whatever else a text stream has."""
+        return getattr(self._stream, name)
+
+
+def _why(error: OSError | ValueError) -> str:
+    if isinstance(error, ValueError) or error.errno in (errno.EPIPE, errno.EBADF, errno.EIO):
+        return "the output was closed"
+    return f"the output can't be written: {DISK_FULL if error.errno == errno.ENOSPC else reason(error)}"
+
+
+_OUTPUTS: list[Output] = []
+"""Of the commands that run in this process, the innermost last."""
+
+
+def when_output_is_lost(do: Callable[[], object]) -> None:
+    """Call `do` once nothing can be written to standard output any more. Outside of a command it never is."""
+    if _OUTPUTS:
+        _OUTPUTS[-1].when_lost(do)
+
+
+@contextmanager
+def forgiving_output() -> Iterator[Output]:
+    """Let standard output and standard error of this process go away without an exception; gives the first."""
+    streams = sys.stdout, sys.stderr
+    output = Output(sys.stdout)
+    sys.stdout, sys.stderr = output, Output(sys.stderr)  # type: ignore[assignment]
+    _OUTPUTS.append(output)
+    try:
+        yield output
+    finally:
+        output.flush()
+        sys.stderr.flush()
+        _OUTPUTS.remove(output)
+        sys.stdout, sys.stderr = streams

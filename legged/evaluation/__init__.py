@@ -1,0 +1,1 @@
+"""How well a policy does: tracking errors, success on terrain, crossings."""

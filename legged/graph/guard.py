@@ -1,0 +1,359 @@
+"""What no CUDA graph can hold, found on any machine: host reads, host data, Python state that a replay would freeze."""
+
+import sys
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.multiprocessing.reductions import StorageWeakRef
+from torch.overrides import TorchFunctionMode, _get_current_function_mode_stack
+from torch.utils._device import DeviceContext, _device_constructors
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from legged.errors import TermError
+from legged.graph.constants import Constants, HostReadError, holds_tensors, key_of
+from legged.graph.python_state import attributes, random_states, shown
+
+__all__ = ["ForbidHostReads", "HostReadError", "calling"]
+
+aten = torch.ops.aten
+ON_THE_DEVICE = "say device=self.device"
+NEXT_TO = ("torch", "numpy", "warp", "contextlib")
+"""Modules whose own frames say nothing of who called them."""
+
+
+_active: "ForbidHostReads | None" = None
+
+
+@contextmanager
+def calling(term: str) -> Iterator[None]:
+    """Name `term` in the error if the block fails, also while a graph is being captured; under the guard, look what it does
+    to Python's state.
+    """
+    try:
+        with _active.inside(term) if _active is not None else nullcontext():
+            yield
+    except TermError:
+        raise
+    except Exception as error:
+        text = str(error).splitlines()
+        raise TermError(f"{term}: {text[0] if text else type(error).__name__}") from error
+
+
+class ForbidHostReads:
+    """Refuses, in its block, what would make a GPU wait for the host or what no graph can hold: `.item()`, `if tensor`,
+    `nonzero`, indexing by a mask, copies to and from the host, tensors made without a device, random numbers of the host.
+
+    Used again and again on one step, it also compares the steps, from the third on: the attributes of `owner` that are no
+    tensors must stay, the numbers handed to torch must be the same, and nothing may be read that the step before allocated,
+    for a graph goes on reading what was there when it was captured. (To allocate a tensor, keep it as an attribute and read
+    it outside the step, or later in the same step, is harmless.) The first steps may set up whatever they keep.
+
+    Physics engines of this package are left alone: those on the host work on numpy's arrays, and are never captured.
+    """
+
+    STEPS = 3
+    """Steps after which all has been judged."""
+
+    def __init__(self, device: torch.device | None = None, owner: Any = None) -> None:
+        """For a step on `device`, the CPU by default, of a task `owner`."""
+        self.device = device or torch.device("cpu")
+        self.owner = owner
+        self.constants = Constants()
+        self._operators, self._calls = _Operators(self), _Calls(self)
+        self._steps = 0
+        self._place = ""
+        self._made: set[int] = set()
+        self._record: list[Seen] = []
+        self._record_before: list[Seen] = []
+        self._state: dict[str, Any] = {}
+
+    @property
+    def compares(self) -> bool:
+        """Whether this step is judged by the one before."""
+        return self._steps >= self.STEPS
+
+    def __enter__(self) -> "ForbidHostReads":
+        global _active
+        self._steps += 1
+        self.constants.complete = self.compares
+        self._made = set()
+        self._record_before, self._record = self._record, []
+        self._state = self._python_state()
+        self._operators.__enter__()
+        self._calls.__enter__()
+        _active = self
+        return self
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        global _active
+        _active = None
+        self._calls.__exit__(kind, error, trace)
+        self._operators.__exit__(kind, error, trace)
+        if kind is None:
+            self._judge_state(self._state)
+            if self.compares and len(self._record) != len(self._record_before):
+                raise HostReadError("the step makes fewer calls than the one before; a CUDA graph repeats the same ones")
+
+    @contextmanager
+    def recording(self) -> Iterator[None]:
+        """While a graph is recorded: the constants are there, and others are refused."""
+        self.constants.complete = True
+        with self._calls:
+            yield
+
+    @contextmanager
+    def inside(self, term: str) -> Iterator[None]:
+        """The block is a term of the task."""
+        before, self._place = self._python_state(), term
+        try:
+            yield
+            self._judge_state(before)
+        finally:
+            self._place = ""
+
+    def refuse(self, reason: str) -> None:
+        """Raise, unless it is a physics engine that asks.
+
+        Raises:
+            HostReadError: with that reason.
+        """
+        if not self.constants.making and not caller().startswith("legged.physics"):
+            raise HostReadError(f"{reason}; a CUDA graph cannot hold that")
+
+    def _python_state(self) -> dict[str, Any]:
+        return {"random": random_states(), "attributes": attributes(self.owner) if self.compares else {}}
+
+    def _judge_state(self, before: dict[str, Any]) -> None:
+        now = self._python_state()
+        for name, state in before["random"].items():
+            if now["random"][name] != state:
+                raise HostReadError(
+                    f"draws from {name}: a CUDA graph would repeat that number for ever; draw on the device,"
+                    " torch.rand(..., device=self.device)"
+                )
+        for name, state in before["attributes"].items():
+            found = now["attributes"].get(name)
+            if found != state:
+                raise HostReadError(
+                    f"self.{name} changed from {shown(state)} to {shown(found)}: a CUDA graph repeats what was recorded;"
+                    " keep it in a tensor and write that in place"
+                )
+
+    # ---- what the modes see ----------------------------------------------------------------------------------------------
+
+    def run(self, func: Any, args: Any, kwargs: Any) -> Any:
+        """Run one operator, and compare it with that of the step before."""
+        inputs = [value for value in tree_leaves((args, kwargs)) if value is not None]
+        over = overwritten(func, args, kwargs)
+        read = [value for value in inputs if all(value is not other for other in over)]
+        from_host = func is aten.lift_fresh.default
+        if not self.constants.making and not caller().startswith("legged.physics"):
+            numbers = [repr(value) for value in inputs if not isinstance(value, Tensor)]
+            if from_host and inputs[0].dim() == 0:
+                numbers.append(repr(inputs[0].item()))
+            kept = {m: v for v in (() if from_host else read) if (m := memory_of(v)) is not None and m not in self._made}
+            name = str(func).removeprefix("aten.").rpartition(".")[0]
+            seen = Seen(f"{name}({', '.join(numbers)})", {m: StorageWeakRef(v.untyped_storage()) for m, v in kept.items()})
+            if self.compares:
+                self._judge(seen, kept)
+            self._record.append(seen)
+        result = func(*args, **kwargs)
+        given = set() if from_host else {memory_of(value) for value in inputs}
+        self._made |= {m for value in tree_leaves(result) if (m := memory_of(value)) is not None} - given
+        self._made |= {m for value in over if (m := memory_of(value)) is not None and fills(value)}
+        return result
+
+    def _judge(self, seen: "Seen", kept: dict[int, Tensor]) -> None:
+        """Compare an operator with the one at its place in the step before."""
+        place = len(self._record)
+        before = self._record_before[place] if place < len(self._record_before) else Seen("nothing", {})
+        if seen.call != before.call:
+            raise HostReadError(
+                f"calls {shown(seen.call)} where the step before called {shown(before.call)}: a CUDA graph repeats what was"
+                " recorded; keep what changes in a tensor"
+            )
+        for memory in seen.memory.keys() - before.memory.keys():
+            name = next((f"self.{name}" for name, own in self._tensors() if memory_of(own) == memory), "")
+            raise HostReadError(
+                f"reads {name or 'a tensor'}, which was another tensor in the step before: a CUDA graph goes on reading the"
+                f" one of its recording; allocate it once and write in place, {name or 'tensor'}.copy_(...)"
+            )
+
+    def _tensors(self) -> Iterator[tuple[str, Tensor]]:
+        """The owner's attributes that are tensors, or lists or tables of them."""
+        for name, value in getattr(self.owner, "__dict__", {}).items():
+            parts = (
+                value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple | deque) else (value,)
+            )
+            yield from ((name, part) for part in parts if isinstance(part, Tensor))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """An operator that a step ran."""
+
+    call: str
+    """Its name and what it was given that is no tensor."""
+    memory: dict[int, StorageWeakRef]
+    """That of the tensors it was given which the step did not make; kept, so that none is mistaken for a later one."""
+
+
+def memory_of(value: Any) -> int | None:
+    """What tells the memory of a tensor from all other memory that is known."""
+    return value.untyped_storage()._cdata if isinstance(value, Tensor) and value.layout is torch.strided else None
+
+
+OVERWRITING = ("copy_", "fill_", "zero_", "uniform_", "normal_", "random_", "bernoulli_", "exponential_")
+"""Methods that do not look at what was in the tensor."""
+
+
+def overwritten(func: Any, args: Any, kwargs: Any) -> list[Tensor]:
+    """The tensors that an operator writes without reading them."""
+    found = [kwargs[a.name] for a in func._schema.arguments if a.is_out and a.name in kwargs]
+    return tree_leaves(found) + ([args[0]] if func._schema.name.removeprefix("aten::") in OVERWRITING else [])
+
+
+def fills(tensor: Tensor) -> bool:
+    """Whether a tensor is all of its memory."""
+    return tensor.numel() * tensor.element_size() == tensor.untyped_storage().nbytes()
+
+
+def caller() -> str:
+    """The module whose code asks torch for something."""
+    frame = sys._getframe(1)
+    while frame is not None:
+        name = frame.f_globals.get("__name__", "")
+        if name != __name__ and name.partition(".")[0] not in NEXT_TO:
+            return name
+        frame = frame.f_back  # type: ignore[assignment]
+    return ""
+
+
+def default_device() -> torch.device | None:
+    """What `torch.set_default_device` or `with torch.device(...)` asked for."""
+    asked = [mode.device for mode in _get_current_function_mode_stack() if isinstance(mode, DeviceContext)]
+    return asked[-1] if asked else None
+
+
+UNCHECKED = "looks on the host whether it succeeded (inv, solve); torch.linalg.inv_ex and the like do not"
+
+
+class _Operators(TorchDispatchMode):
+    """Sees every operator that runs, whoever calls it."""
+
+    REASONS = {
+        aten._local_scalar_dense.default: "reads a value on the host (.item(), float(tensor), if tensor)",
+        aten.equal.default: "reads a value on the host (torch.equal)",
+        aten._linalg_check_errors.default: UNCHECKED,
+        aten.inverse.default: UNCHECKED,
+        aten.normal.Tensor_Tensor: "looks at its deviations on the host; mean + std * torch.randn_like(mean) does not",
+        aten.normal.float_Tensor: "looks at its deviations on the host; mean + std * torch.randn_like(std) does not",
+        aten.multinomial.default: "looks at its weights on the host (multinomial)",
+        aten.nonzero.default: "has a result of unknown size (nonzero, where with one argument)",
+    }
+
+    def __init__(self, guard: ForbidHostReads) -> None:
+        super().__init__()
+        self._guard = guard
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        with self:  # in inference mode composite operators (item, one-argument where) arrive whole: take them apart
+            result = func.decompose(*args, **kwargs)
+        if result is not NotImplemented:
+            return result
+        reason = self._reason(func, args, kwargs)
+        if reason:
+            self._guard.refuse(reason)
+        return self._guard.run(func, args, kwargs)
+
+    def _reason(self, func: Any, args: Any, kwargs: Any) -> str:
+        """Why the operator is refused; empty if it is not."""
+        if func in (aten.index.Tensor, aten.index_put_.default, aten.index_put.default):
+            if any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
+                return "indexes by a mask, whose size is unknown; use torch.where or masked_fill"
+            return ""
+        if func is aten.lift_fresh.default and args[0].dim() > 0:
+            return "makes a tensor of the host's numbers; torch.tensor(..., device=self.device) makes it on the device"
+        if func in self.REASONS:
+            return self.REASONS[func]
+        name = str(func).split(".")[1]
+        if torch.Tag.data_dependent_output in func.tags:
+            return f"reads a value on the host ({name})"
+        if torch.Tag.dynamic_output_shape in func.tags and kwargs.get("output_size") is None:
+            return f"has a result of unknown size ({name})"
+        return ""
+
+
+class _Calls(TorchFunctionMode):
+    """Sees what Python calls of torch, and puts constants in the place of the host's numbers."""
+
+    REASONS = {
+        Tensor.cpu: "copies to the host (.cpu())",
+        Tensor.numpy: "copies to the host (.numpy())",
+        Tensor.tolist: "copies to the host (.tolist())",
+        Tensor.__array__: "copies to the host (a numpy function of a tensor)",
+        Tensor.__dlpack__: "copies to the host (a tensor handed to another library)",
+        Tensor.__repr__: "prints a tensor, which copies it to the host",
+    }
+    OF_DATA = (torch.tensor, torch.as_tensor, torch.asarray)
+
+    def __init__(self, guard: ForbidHostReads) -> None:
+        super().__init__()
+        self._guard = guard
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs, guard = kwargs or {}, self._guard
+        if func in (Tensor.__getitem__, Tensor.__setitem__):
+            return func(args[0], guard.constants.index(args[0], args[1]), *args[2:])
+        if func in self.REASONS:
+            guard.refuse(self.REASONS[func])
+        elif func is Tensor.to and self._is_host(*args[1:], *kwargs.values()):
+            guard.refuse('copies to the host (.to("cpu"))')
+        elif func is Tensor.type and args[1:] and not isinstance(args[1], torch.dtype):
+            guard.refuse("copies to the host (.type of a CPU tensor's type); .to(torch.int64) and the like do not")
+        elif func is Tensor.new_tensor:
+            return self._constant(func, args[1], args, kwargs, (args[0].dtype, args[0].device))
+        elif func in _device_constructors() or func is torch.normal:
+            return self._factory(func, args, kwargs)
+        elif func is torch.nn.functional.one_hot and len(args) > 1 and args[1] > 0:  # on the CPU alone it looks at the values
+            return (args[0].unsqueeze(-1) == torch.arange(args[1], device=args[0].device)).long()
+        return func(*args, **kwargs)
+
+    def _is_host(self, *values: Any) -> bool:
+        """Whether one of the values means the CPU. On a machine without a GPU the task's own device is one, too: there,
+        only its name as text.
+        """
+        kinds = str if self._guard.device.type == "cpu" else str | torch.device
+        return any(isinstance(value, kinds) and torch.device(value).type == "cpu" for value in values)
+
+    def _factory(self, func: Any, args: Any, kwargs: Any) -> Any:
+        """A function that makes a tensor out of nothing, or of the host's data."""
+        given = [*args, *kwargs.values()]
+        of_tensor = bool(given) and isinstance(given[0], Tensor) and (func in self.OF_DATA or func is torch.normal)
+        device = kwargs.get("device") or default_device()
+        if of_tensor or kwargs.get("out") is not None or sys._getframe(2).f_globals.get("__name__", "").startswith("torch."):
+            return func(*args, **kwargs)
+        if device is None:
+            self._guard.refuse(f"torch.{func.__name__} without a device makes a tensor on the CPU: {ON_THE_DEVICE}")
+        elif self._is_host(device) and not caller().startswith("legged."):  # a learner has its device as text
+            self._guard.refuse(f"torch.{func.__name__} makes a tensor on the CPU: {ON_THE_DEVICE}")
+        elif func in self.OF_DATA:
+            return self._constant(func, given[0], args, kwargs, (device,))
+        return func(*args, **kwargs)
+
+    def _constant(self, func: Any, data: Any, args: Any, kwargs: Any, kind: Any) -> Any:
+        """A copy of the constant that the call makes."""
+        if holds_tensors(data) and not isinstance(data, Tensor):
+            self._guard.refuse(f"{func.__name__} of a list of tensors reads their values on the host; torch.stack them")
+        key = key_of(data)
+        if key is None:
+            return func(*args, **kwargs)
+        settings = tuple((name, str(value)) for name, value in kwargs.items() if value is not data)
+        return self._guard.constants.get((func.__name__, key, settings, kind), lambda: func(*args, **kwargs)).clone()

@@ -1,0 +1,1 @@
+"""rsl-rl's PPO, its runner, and the same without the host in the loop."""

@@ -1,0 +1,160 @@
+"""Training in which an iteration is two calls: a rollout and an update, on a GPU one CUDA graph each."""
+
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from legged.envs import BaseTask
+from legged.graph.step_graph import StepGraph
+from legged.learning.display import Display
+from legged.learning.ppo import DevicePPO
+from legged.learning.rollout import Rollout
+from legged.learning.runner import Runner
+from legged.learning.update_threads import UpdateThreads
+from legged.process.cores import available_cores
+from legged.process.ranks import Ranks
+
+ROLLOUTS_TO_WARM_UP = 1
+"""Steps have been warmed up when the task was built."""
+
+
+class CapturedRunner(Runner):
+    """As Runner, with the host out of the loop: it launches, and reads what is logged once an iteration.
+
+    Checkpoints, configuration and logs are those of Runner, and so is `learn` where a feature needs it (`why_stock`).
+    """
+
+    alg: DevicePPO
+    ALGORITHM = "legged.learning.ppo:DevicePPO"
+
+    def __init__(
+        self, env: BaseTask, log_dir: Path | None = None, device: str = "cpu", display: Display | None = None
+    ) -> None:
+        super().__init__(env, log_dir, device, display)
+        self._rollout: Rollout | None = None
+        self.why_stock = self.alg.why_stock
+        """What keeps training on rsl-rl's own loop; empty if nothing does."""
+        if torch.device(device) != torch.device(env.device):  # type: ignore[arg-type]
+            self.why_stock = f"the task is on {env.device}, the networks are on {device}"
+
+    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
+        """Train for a number of iterations."""
+        if self.why_stock:
+            print(f"rsl-rl's own training loop: {self.why_stock}", flush=True)
+            super().learn(num_learning_iterations, init_at_random_ep_len)
+            return
+        self.alg.train_mode()
+        if self.is_distributed:
+            self.alg.broadcast_parameters()
+        self._rollout = rollout = Rollout(self.env, self.alg)
+        collect, update = self._capture(rollout)
+        if not self._go_on() and init_at_random_ep_len:
+            length = self.env.episode_length_buf
+            self.env.episode_length_buf = torch.randint_like(length, high=int(self.env.max_episode_length))
+        self.logger.init_logging_writer()
+        threads = UpdateThreads(self.env.cfg.sim.threads or available_cores() // Ranks.now().local_count)
+        first = self.current_learning_iteration
+        total = first + num_learning_iterations
+        for iteration in range(first, total):
+            clock = Clock(torch.device(self.device))
+            collect()
+            clock.lap()
+            with threads.use():
+                update()
+            clock.lap()
+            self.current_learning_iteration = iteration
+            self._log(iteration, first, total, rollout, clock)
+            if self.logger.writer is not None and iteration % self.cfg["save_interval"] == 0:
+                self.save(str(Path(self.logger.log_dir) / f"model_{iteration}.pt"))
+        if self.logger.writer is not None:
+            self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
+            self.logger.stop_logging_writer()
+
+    def _capture(self, rollout: Rollout) -> tuple[Callable[[], None], Callable[[], None]]:
+        """Rollout and update as graphs, where the task's step is one; networks and task are as before afterwards."""
+        device = torch.device(self.device)
+        enabled = self.env.captured
+        progress = self.env.progress()
+        collect = StepGraph(rollout.collect, device, enabled, ROLLOUTS_TO_WARM_UP, lambda: rollout.collect(1))
+        before = list(zip(self.alg.tensors(), copies(self.alg.tensors()), strict=True))
+        fresh = not self.alg.optimizer.state
+        update = StepGraph(self.alg.learn, device, enabled, rehearse=lambda: self.alg.learn(1))
+        with torch.no_grad():
+            for tensor, value in before:
+                tensor.copy_(value)
+            if fresh:  # the optimiser's moments came to be while warming up
+                for state in self.alg.optimizer.state.values():
+                    for tensor in state.values():
+                        tensor.zero_()
+        if enabled:
+            rollout.forget()
+            self.env.reset_curricula()
+            self.env.load_progress(progress)
+            self.env.reset()
+        return collect, update
+
+    def _episodes(self) -> dict[str, Tensor]:
+        return super()._episodes() if self._rollout is None else self._rollout.episodes
+
+    def _log(self, iteration: int, first: int, total: int, rollout: Rollout, clock: "Clock") -> None:
+        """Read what is logged, which waits for the iteration to end."""
+        logger = self.logger
+        ended, returns, lengths = rollout.ended.tolist()
+        if ended:
+            logger.rewbuffer.clear()
+            logger.rewbuffer.append(returns / ended)
+            logger.lenbuffer.clear()
+            logger.lenbuffer.append(lengths / ended)
+        if logger.writer is not None:
+            logger.ep_extras.append(self.env.log_rollout())
+        collect_s, learn_s = clock.seconds()
+        logger.log(
+            it=iteration,
+            start_it=first,
+            total_it=total,
+            collect_time=collect_s,
+            learn_time=learn_s,
+            loss_dict=self.alg.losses(),
+            learning_rate=self.alg.learning_rate,
+            action_std=self.alg.action_std().detach(),
+            rnd_weight=None,
+        )
+
+
+@torch.no_grad()
+def copies(tensors: Iterable[Tensor]) -> list[Tensor]:
+    """Copies outside autograd: one that knew its parameter would keep the node that accumulates the parameter's gradient,
+    and with it the stream the copy was made on, which no capture on another stream may wait for.
+    """
+    return [tensor.clone() for tensor in tensors]
+
+
+class Clock:
+    """Times of laps on a device; on a GPU measured there, without making anything wait."""
+
+    def __init__(self, device: torch.device) -> None:
+        """Starts at once."""
+        self._cuda = device.type == "cuda"
+        self._marks: list[Any] = []
+        self.lap()
+
+    def lap(self) -> None:
+        """End a lap."""
+        if self._cuda:
+            mark = torch.cuda.Event(enable_timing=True)
+            mark.record()
+            self._marks.append(mark)
+        else:
+            self._marks.append(time.perf_counter())
+
+    def seconds(self) -> list[float]:
+        """Each lap's time [s]; waits for the last one to end."""
+        pairs = list(zip(self._marks, self._marks[1:], strict=False))
+        if not self._cuda:
+            return [end - start for start, end in pairs]
+        self._marks[-1].synchronize()
+        return [1e-3 * start.elapsed_time(end) for start, end in pairs]

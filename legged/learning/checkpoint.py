@@ -1,0 +1,256 @@
+"""Checkpoint files: plain data, written whole or not at all, and checked before anything is built from them.
+
+The layout is rsl-rl's (actor_state_dict, critic_state_dict, optimizer_state_dict, iter, infos); what is ours is in `infos`.
+"""
+
+import io
+import math
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from legged.config import TaskConfig
+from legged.envs import BaseTask
+from legged.errors import ConfigError
+from legged.learning.recurrent import rnn_of
+from legged.process.paths import relative, write_bytes
+from legged.robots.robot import load_robot
+
+FORMAT = 2
+"""Version of `infos`. Files without one, of rsl-rl or from before there were versions, are read as 1."""
+NETWORKS = ("actor", "critic")
+Saved = dict[str, Any]
+
+
+def write_checkpoint(path: Path, saved: Saved) -> None:
+    """Write a checkpoint that is whole or not there."""
+    buffer = io.BytesIO()  # onto a full disk torch.save fails with a message that says nothing of it
+    torch.save(saved, buffer)
+    write_bytes(path, buffer.getbuffer())
+
+
+def load_plain(path: Path, device: str = "cpu") -> Any:
+    """What a file of torch holds, if that is plain data: numbers, text, tensors, lists and dictionaries. Runs nothing.
+
+    Raises:
+        ConfigError: the file can't be read, is none of torch, or holds something else.
+    """
+    name = relative(path)
+    try:
+        path.open("rb").close()
+    except OSError as error:
+        raise ConfigError(f"{name}: cannot be read ({error.strerror or error})") from error
+    try:
+        return torch.load(path, weights_only=True, map_location=device)
+    except pickle.UnpicklingError as error:
+        if "weights_only" in str(error):
+            raise ConfigError(f"{name}: not a checkpoint (it holds more than plain data, which could run code)") from error
+        raise ConfigError(f"{name}: not a checkpoint ({_first_line(error)})") from error
+    except Exception as error:  # torch raises half a dozen kinds for files that are none of its own
+        raise ConfigError(f"{name}: not a checkpoint ({_first_line(error)})") from error
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).splitlines()
+    return lines[0][:200] if lines else type(error).__name__
+
+
+def read_checkpoint(path: Path, device: str = "cpu") -> Saved:
+    """The content of a checkpoint, whose parts are of the right kind and whose weights are finite.
+
+    Raises:
+        ConfigError: the file is missing, no checkpoint, of a newer format, or damaged.
+    """
+    saved = load_plain(path, device)
+    name = relative(path)
+    wanted = {*(f"{network}_state_dict" for network in NETWORKS), "iter"}
+    if not isinstance(saved, dict) or not wanted <= saved.keys():
+        raise ConfigError(f"{name}: not a checkpoint of rsl-rl (no actor, critic and iteration in it)")
+    infos = {} if saved.get("infos") is None else saved["infos"]
+    _check_kind(f"{name}: not a checkpoint: its", saved, PARTS)
+    _check_kind(f"{name}: not a checkpoint: its infos.", infos, INFOS)
+    if saved["iter"] < 0:
+        raise ConfigError(f"{name}: not a checkpoint: its iteration is {saved['iter']}")
+    version = infos.get("format", 1)
+    if version > FORMAT:
+        raise ConfigError(f"{name}: written in format {version} by a newer legged; this one reads formats up to {FORMAT}")
+    for network in NETWORKS:
+        check_weights(saved[f"{network}_state_dict"], f"{name}: its {network}")
+    return {**saved, "infos": infos}
+
+
+Kind = type | tuple[type, ...] | dict[Any, Any]
+PLAIN = (bool, int, float, str, type(None))
+PARTS: dict[str, Kind] = {
+    "iter": int,
+    "infos": (dict, type(None)),
+    **{f"{network}_state_dict": dict for network in NETWORKS},
+    "optimizer_state_dict": {str: (dict, list)},
+}
+INFOS: dict[str, Kind] = {
+    "format": int,
+    "id": str,
+    "task": str,
+    "task_state": {str: {str: Tensor}},
+    "observations": {str: {str: int}},
+    "networks": {str: {str: (*PLAIN, list)}},
+    "robot": {str: (str, list)},
+    "learning_rate": float,
+    "wall_s": float,
+}
+"""Entry -> what it is made of: a type, some types, or {type: kind of each value}."""
+
+
+def _check_kind(where: str, found: Mapping[str, Any], kinds: Mapping[str, Kind]) -> None:
+    """Raise ConfigError if an entry of `found` is not of its kind; one that is missing is looked for by others."""
+    for key, kind in kinds.items():
+        if key not in found:
+            continue
+        value, wanted = found[key], dict if isinstance(kind, dict) else kind
+        if not is_kind(value, wanted):
+            names = " or ".join(t.__name__ for t in wanted) if isinstance(wanted, tuple) else wanted.__name__
+            raise ConfigError(f"{where}{'' if where.endswith('.') else ' '}{key} is {type(value).__name__}, not {names}")
+        if not is_kind(value, kind):
+            raise ConfigError(f"{where}{'' if where.endswith('.') else ' '}{key} is damaged")
+
+
+def is_kind(value: Any, kind: Kind) -> bool:
+    """Whether a value is made of what `kind` says; numbers are finite, and lists hold plain values only."""
+    if isinstance(kind, dict):
+        ((of_keys, of_values),) = kind.items()
+        return isinstance(value, dict) and all(is_kind(k, of_keys) and is_kind(v, of_values) for k, v in value.items())
+    if isinstance(kind, tuple):
+        return any(is_kind(value, one) for one in kind)
+    if kind is list:
+        return isinstance(value, list) and all(isinstance(item, (*PLAIN, dict)) for item in value)
+    if kind in (int, float):
+        numbers = int if kind is int else (int, float)
+        return isinstance(value, numbers) and not isinstance(value, bool) and abs(value) < math.inf
+    return isinstance(value, kind)  # type: ignore[arg-type]
+
+
+def check_weights(state: dict[str, Any], where: str) -> None:
+    """Raise ConfigError, which begins with `where`, if a network's state is not made of finite tensors."""
+    for name, tensor in state.items():
+        if not isinstance(name, str) or not isinstance(tensor, Tensor):
+            raise ConfigError(f"{where} is damaged ({name!r} is no tensor)")
+        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+            raise ConfigError(f"{where} is damaged ({name} holds NaN or infinite numbers)")
+
+
+def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str) -> dict[str, Any]:
+    """The state of an optimiser from a checkpoint, with the moments checked and everything but the learning rate as it is
+    set up here.
+
+    Raises:
+        ConfigError: it is not that of an optimiser of these parameters; begins with `where`.
+    """
+    groups = optimizer.state_dict()["param_groups"]
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    rates = [group.get("lr") for group in saved["param_groups"]] if is_kind(saved.get("param_groups"), list) else []
+    state = saved.get("state")
+    fits = len(rates) == len(groups) and all(is_kind(rate, float) and rate > 0.0 for rate in rates)
+    if not fits or not is_kind(state, {int: {str: Tensor}}) or not {*state} <= {*range(len(parameters))}:
+        raise ConfigError(f"{where} is damaged")
+    for i, tensors in state.items():
+        for name, tensor in tensors.items():
+            shape = () if name == "step" else parameters[i].shape
+            if tensor.shape != shape or not bool(torch.isfinite(tensor).all()):
+                raise ConfigError(f"{where} is damaged ({name} of parameter {i})")
+    names = [{*state.get(i, {})} for i in range(len(parameters))]
+    if any(each != names[0] for each in names):
+        raise ConfigError(f"{where} is damaged (the moments of some parameters are missing)")
+    return {"state": state, "param_groups": [{**group, "lr": rate} for group, rate in zip(groups, rates, strict=True)]}
+
+
+def describe(task: BaseTask) -> dict[str, Any]:
+    """What a checkpoint says of where it fits: `infos` without what changes during a training."""
+    robot = getattr(task, "robot", None)
+    return {
+        "format": FORMAT,
+        "task": task.cfg.task,
+        "observations": observation_layout(task),
+        "networks": networks(task.cfg),
+        **({} if robot is None else {"robot": {"name": robot.name, "joints": list(robot.joint_names)}}),
+    }
+
+
+def observation_layout(task: BaseTask) -> dict[str, dict[str, int]]:
+    """Group -> term -> width."""
+    return {
+        name: {term.name: term.columns.stop - term.columns.start for term in group.terms}
+        for name, group in task.observation_groups.items()
+    }
+
+
+def networks(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
+    """Network -> what of `train.policy` decides which weights it has, and what they compute."""
+    policy = cfg.train.policy
+    recurrent = policy.rnn_type != "none"
+    shared = {
+        "activation": policy.activation,
+        "obs_normalization": policy.obs_normalization,
+        "rnn_type": policy.rnn_type,
+        "rnn_hidden_dim": policy.rnn_hidden_dim if recurrent else 0,
+        "rnn_num_layers": policy.rnn_num_layers if recurrent else 0,
+    }
+    history = {"actor": cfg.observations.actor_history}
+    return {
+        name: {"hidden_dims": list(getattr(policy, f"{name}_hidden_dims")), "history": history.get(name, 1), **shared}
+        for name in NETWORKS
+    }
+
+
+def network_of(state: dict[str, Any]) -> dict[str, Any]:
+    """As far as weights tell, the same, of a checkpoint that does not say it."""
+    layers = [tensor for name, tensor in state.items() if name.startswith("mlp.") and name.endswith(".weight")]
+    hidden = [layer.shape[0] for layer in layers[:-1]]
+    rnn = dict(zip(("rnn_type", "rnn_hidden_dim", "rnn_num_layers"), rnn_of(state), strict=True))
+    return {"hidden_dims": hidden, "obs_normalization": any("obs_normalizer" in name for name in state), **rnn}
+
+
+def check_fits(path: Path, saved: Saved, cfg: TaskConfig) -> None:
+    """Compare a checkpoint with a configuration, before the task is built.
+
+    Raises:
+        ConfigError: it was made for another robot, other observations, or other networks.
+    """
+    name, infos = relative(path), saved["infos"]
+    joints = infos.get("robot", {}).get("joints")
+    robot = load_robot(cfg.robot, cfg.origins.where("robot"))
+    if joints is not None and list(robot.joint_names) != joints:
+        theirs = f"'{infos['robot'].get('name')}' with {len(joints)} joints"
+        raise ConfigError(f"{name}: made for another robot: {theirs}, not '{robot.name}' with {robot.num_dof}: {joints}")
+    layout: dict[str, dict[str, int]] = infos.get("observations", {})
+    described: dict[str, Any] = infos.get("networks", {})
+    for network, wanted in networks(cfg).items():
+        terms = tuple(getattr(cfg.observations, network))
+        if network in layout and tuple(layout[network]) != terms:
+            known = {term: width for widths in layout.values() for term, width in widths.items()}
+            size = sum(known[term] for term in terms) if set(terms) <= set(known) else "other"
+            raise ConfigError(
+                f"{name}: made for other observations: its {network} takes {sum(layout[network].values())} numbers"
+                f" ({', '.join(layout[network])}), '{cfg.task}' gives {size} ({', '.join(terms)})"
+            )
+        found = described.get(network) or network_of(saved[f"{network}_state_dict"])
+        for key, value in wanted.items():
+            if key in found and found[key] != value:
+                field = f"train.policy.{network}_hidden_dims" if key == "hidden_dims" else f"train.policy.{key}"
+                field = "observations.actor_history" if key == "history" else field
+                what = "hidden layers" if key == "hidden_dims" else key
+                raise ConfigError(f"{name}: its {network} has {what} {found[key]}, the configuration has {field} {value}")
+
+
+def describe_mismatch(path: Path, saved: Saved, wanted: dict[str, Any], task: str) -> str:
+    """What differs between a checkpoint's policy and the one that the built task needs."""
+    found = saved["actor_state_dict"]
+    text = f"{relative(path)}: made for another task than '{task}'"
+    for name in dict.fromkeys([*wanted, *found]):
+        here, there = (tuple(state[name].shape) if name in state else None for state in (wanted, found))
+        if here != there:
+            return f"{text}: its policy's {name} has the shape {there}, the task's {here}"
+    return f"{text}: its critic or its optimiser has other shapes"

@@ -1,0 +1,61 @@
+"""What the processes of a training on several GPUs do together: begin, add up, agree, end."""
+
+import os
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from legged.errors import ConfigError
+from legged.process.ranks import Ranks
+
+
+class RankLost(Exception):
+    """Another process of this training has ended."""
+
+
+def check_reachable(ranks: Ranks) -> None:
+    """Check that this process is told where it meets the others, if there are any.
+
+    Raises:
+        ConfigError: it is not; another program's WORLD_SIZE may be left in the environment.
+    """
+    missing = [name for name in ("MASTER_ADDR", "MASTER_PORT") if not os.environ.get(name)]
+    if ranks.several and missing:
+        raise ConfigError(
+            f"WORLD_SIZE: the environment says that {ranks.count} processes train together, but not where they meet"
+            f" ({', '.join(missing)}); torchrun sets both, and one process needs neither"
+        )
+
+
+def join(ranks: Ranks, device: torch.device) -> None:
+    """Meet the other processes, once; with NCCL on GPUs, gloo without."""
+    if dist.is_initialized():
+        return
+    check_reachable(ranks)
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+        dist.init_process_group("nccl", rank=ranks.rank, world_size=ranks.count, device_id=device)
+    else:
+        dist.init_process_group("gloo", rank=ranks.rank, world_size=ranks.count)
+
+
+def leave() -> None:
+    """Wait until all are done, so that none is ended while another still saves."""
+    if dist.is_initialized():
+        dist.barrier()
+        dist.destroy_process_group()
+
+
+def sum_over_ranks_(tensor: Tensor) -> Tensor:
+    """Add up `tensor` over all processes, in place; by itself it is its sum."""
+    if dist.is_initialized():
+        dist.all_reduce(tensor)
+    return tensor
+
+
+def any_rank(asked: bool, device: torch.device) -> bool:
+    """Whether any process asks for something. All must call it; it waits for all of them."""
+    if not dist.is_initialized():
+        return asked
+    return bool(sum_over_ranks_(torch.tensor(float(asked), device=device)).item())

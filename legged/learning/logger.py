@@ -1,0 +1,91 @@
+"""rsl-rl's logger, which writes to TensorBoard as ever but hands the console to our display; it also ends a training."""
+
+import contextlib
+import io
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from rsl_rl.utils.logger import Logger
+from torch.utils.tensorboard import SummaryWriter
+
+from legged.learning.display import Display, Progress
+from legged.learning.distributed import any_rank
+from legged.learning.watch import FAULT, MINI_BATCHES, Diverged, FaultWatch
+
+
+class Interrupted(Exception):
+    """Training was asked to stop; raised at the end of an iteration, when networks and optimiser agree."""
+
+
+class QuietLogger(Logger):
+    """Logs iterations; at the end of one, training stops here if that was asked for, or if it can't go on."""
+
+    def __init__(self, *args: Any, display: Display | None = None, left_out: Callable[[], float], **kwargs: Any) -> None:
+        """`left_out` gives the share of the last update's mini-batches that changed nothing."""
+        super().__init__(*args, **kwargs)
+        self.display, self._left_out = display, left_out
+        self.watch = FaultWatch(self.cfg["num_steps_per_env"] * self.num_envs)
+        self.stop_requested = False
+        self.loop_s = 0.0
+        """Time spent in iterations so far, this process [s]."""
+        self.latest: dict[str, float] = {}
+        """The last value of everything the task logs; an iteration in which no episode ended has no episode means."""
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Steps of all robots, on all GPUs."""
+        return self.cfg["num_steps_per_env"] * self.num_envs * self.gpu_world_size
+
+    def _store_code_state(self) -> list[str]:
+        """Nothing: the run folder holds the state of this code already, see runs.code_state."""
+        return []
+
+    def stop_logging_writer(self) -> None:
+        """Also end TensorBoard's writer and its thread, which rsl-rl leaves open."""
+        super().stop_logging_writer()
+        if isinstance(self.writer, SummaryWriter):
+            self.writer.close()
+
+    def log(self, it: int, start_it: int, total_it: int, collect_time: float, learn_time: float, **kwargs: Any) -> None:
+        """Write one iteration, show it, and stop if that was asked for, of any process.
+
+        Raises:
+            Interrupted: it was asked for.
+            Diverged: numbers have been NaN or infinite for too long.
+        """
+        # An episode mean has no value (NaN) in a rollout in which none ended; leave it out rather than write NaN.
+        values: dict[str, float] = {}
+        for entry in self.ep_extras:
+            stacked = torch.stack([value.reshape(()) for value in entry.values()]).tolist()  # one transfer, not twenty
+            values.update({key: value for key, value in zip(entry, stacked, strict=True) if value == value})
+        left_out = self._left_out()
+        if left_out > 0.0:
+            values[MINI_BATCHES] = left_out
+        self.ep_extras[:] = [dict(values)] if values else []  # a copy: rsl-rl puts tensors in
+        losses = {name: loss for name, loss in kwargs.pop("loss_dict").items() if math.isfinite(loss)}
+        with contextlib.redirect_stdout(io.StringIO()):
+            super().log(it, start_it, total_it, collect_time, learn_time, loss_dict=losses, **kwargs)
+        self.watch.judge(values, left_out)
+        self.latest = {name: value for name, value in self.latest.items() if not name.startswith(FAULT)} | values
+        self.loop_s += collect_time + learn_time
+        if self.display is not None:
+            self.display.show(
+                Progress(
+                    iteration=it + 1,
+                    total=total_it,
+                    elapsed_s=self.loop_s,
+                    eta_s=self.loop_s / (it + 1 - start_it) * (total_it - it - 1),
+                    steps_per_s=self.steps_per_iteration / (collect_time + learn_time),
+                    collect_s=collect_time,
+                    learn_s=learn_time,
+                    reward=sum(self.rewbuffer) / len(self.rewbuffer) if self.rewbuffer else float("nan"),
+                    action_std=float(kwargs["action_std"].detach().mean()),
+                    values=dict(self.latest),
+                )
+            )
+        if any_rank(bool(self.watch.why_stop), torch.device(self.device)):
+            raise Diverged(self.watch.why_stop or "numbers of another process were NaN or infinite")
+        if any_rank(self.stop_requested, torch.device(self.device)) and it + 1 < total_it:
+            raise Interrupted

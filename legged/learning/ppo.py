@@ -1,0 +1,324 @@
+"""rsl-rl's PPO, updated without a host read: the same losses and steps, in closed form, on data shuffled once."""
+
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.modules.distribution import GaussianDistribution
+from rsl_rl.modules.normalization import EmpiricalNormalization
+from torch import Tensor
+
+from legged.learning.distributed import sum_over_ranks_
+
+LOWEST_RATE, HIGHEST_RATE, RATE_STEP = 1e-5, 1e-2, 1.5
+"""Bounds of the adaptive learning rate and the factor by which it moves, as in rsl-rl."""
+FEW = 1e-8
+LOSSES = ("value", "surrogate", "entropy", "symmetry")
+"""What is logged of an update, by rsl-rl's names; the last, how far the policy is from its mirror image, with symmetry."""
+HALF_LOG_2PI = 0.9189385332046727
+"""0.5 * log(2 pi)."""
+
+
+class DevicePPO(PPO):
+    """PPO (Schulman et al., arXiv 1707.06347) as rsl-rl computes it, for Gaussian MLP policies.
+
+    What differs is where and how often: the learning rate is a tensor on the device; samples are shuffled into contiguous
+    memory once an update, not gathered for every mini-batch; log-probability, entropy and divergence of the Gaussian are
+    written out; the optimiser is fused; and losses are summed on the device and read once. Where a feature needs rsl-rl's
+    own update (`why_stock`), that runs.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self._rate: Tensor | None = None
+        super().__init__(*args, **kwargs)
+        self.why_stock = self._why_stock()
+        """What keeps the update on rsl-rl's own path; empty if nothing does."""
+        if not self.why_stock:
+            self._rate = torch.tensor(self._initial_rate, device=self.device)
+            parameters = [p for p in (*self.actor.parameters(), *self.critic.parameters()) if p.requires_grad]
+            capturable = self._rate.is_cuda
+            self.optimizer = torch.optim.Adam(parameters, lr=self._rate, fused=True, capturable=capturable)
+            # Where this is 1, a fused step changes nothing: neither parameters nor moments nor its count.
+            self.optimizer.found_inf = torch.zeros((), device=self.device)  # type: ignore[attr-defined]
+            if self.is_multi_gpu:
+                self._shared = SharedGradients(parameters, self.gpu_world_size)
+        count = len(LOSSES) if self.symmetry else len(LOSSES) - 1
+        self._losses = torch.zeros(count + 1, device=self.device)
+        """Means over the mini-batches of the last update, by `LOSSES`, and the share of them that were taken."""
+        self._one = torch.ones((), device=self.device)
+        self.left_out = 0.0
+        """Share of the last update's mini-batches that changed nothing, because a gradient was no number."""
+
+    def tensors(self) -> list[Tensor]:
+        """Everything that an update changes: parameters, normalisers, moments of the optimiser, learning rate."""
+        models = [tensor for model in (self.actor, self.critic) for tensor in model.state_dict(keep_vars=True).values()]
+        moments = [tensor for state in self.optimizer.state.values() for tensor in state.values()]
+        assert self._rate is not None
+        return [*models, *moments, self._rate]
+
+    def _why_stock(self) -> str:
+        if self.rnd:
+            return "random network distillation"
+        if self.symmetry and (self.symmetry.use_mirror_loss or not self.symmetry.use_data_augmentation):
+            return "a mirror loss"
+        for name, model in (("actor", self.actor), ("critic", self.critic)):
+            if type(model) is not MLPModel:
+                return f"the {name} is a {type(model).__name__}"
+        if type(self.actor.distribution) is not GaussianDistribution:
+            return f"actions are {type(self.actor.distribution).__name__}"
+        if type(self.optimizer) is not torch.optim.Adam:
+            return f"the optimiser is {type(self.optimizer).__name__}"
+        return ""
+
+    @property
+    def learning_rate(self) -> float:  # type: ignore[override]
+        """The learning rate now; reading it waits for the device."""
+        return self._initial_rate if self._rate is None else float(self._rate)
+
+    @learning_rate.setter
+    def learning_rate(self, value: float | Tensor) -> None:
+        if self._rate is None:
+            self._initial_rate = float(value)
+        else:
+            self._rate.fill_(value)
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
+        """As rsl-rl, of a checkpoint of either class."""
+        iteration = super().load(loaded_dict, load_cfg, strict)
+        if self._rate is not None:  # loading puts the saved number in place of the tensor
+            for group in self.optimizer.param_groups:
+                self._rate.fill_(group["lr"])
+                group.update(lr=self._rate, fused=True, capturable=self._rate.is_cuda)
+            for state in self.optimizer.state.values():
+                state["step"] = state["step"].to(self.device, torch.float32)
+        return iteration
+
+    def save(self) -> dict:
+        """As rsl-rl, whose optimiser is not fused and has its learning rate and step counts on the host."""
+        saved = super().save()
+        if self._rate is not None:
+            optimizer = saved["optimizer_state_dict"]
+            plain = {"lr": self.learning_rate, "fused": None, "capturable": False}
+            saved["optimizer_state_dict"] = {
+                "state": {key: {**state, "step": state["step"].cpu()} for key, state in optimizer["state"].items()},
+                "param_groups": [{**group, **plain} for group in optimizer["param_groups"]],
+            }
+        return saved
+
+    def update(self) -> dict[str, float]:
+        """All epochs over the stored rollout; returns the mean losses."""
+        if self.why_stock:
+            return super().update()
+        self.learn()
+        self.storage.clear()
+        return self.losses()
+
+    def learn(self, epochs: int | None = None) -> None:
+        """All epochs over the stored rollout, or the first `epochs`: no host read, so that one graph can hold it."""
+        self._losses.zero_()
+        batches = self._mini_batches()
+        for _ in range(epochs or self.num_learning_epochs):
+            for batch in batches:
+                self._losses += self._step(*batch)
+        self._losses[:-1] /= self._losses[-1:].clone()
+        self._losses[-1:] /= self.num_learning_epochs * self.num_mini_batches
+        self._update_normalizers()
+
+    def losses(self) -> dict[str, float]:
+        """Mean losses of the last update, read from the device, as is `left_out`; NaN if no mini-batch had any."""
+        *losses, taken = self._losses.tolist()
+        self.left_out = 1.0 - taken
+        return dict(zip(LOSSES, losses, strict=False))
+
+    @torch.no_grad()
+    def _mini_batches(self) -> list[tuple[Tensor, ...]]:
+        """The rollout, shuffled: for each mini-batch of n samples the networks' inputs, actions (n, D), old
+        log-probabilities, advantages, old values, returns (n,) each, and the old Gaussian's mean (n, D) and std (n, D).
+
+        With symmetry, each but the last two also holds the mirror images, after the samples: 2 n.
+        """
+        st = self.storage
+        observations, actions = st.observations.flatten(0, 1), st.actions.flatten(0, 1)
+        samples = len(actions)
+        if self.symmetry:
+            observations, actions = self.symmetry.data_augmentation_func(
+                env=self.symmetry.env, obs=observations, actions=actions
+            )
+        images = len(actions) // samples
+        count = samples // self.num_mini_batches
+        order = self._order(count * self.num_mini_batches).view(self.num_mini_batches, count)
+        imaged = torch.cat([order + i * samples for i in range(images)], dim=1)
+        repeated = order.repeat(1, images)
+        inputs = [torch.cat([observations[name] for name in m.obs_groups], dim=-1) for m in (self.actor, self.critic)]
+        single = (st.actions_log_prob, st.advantages, st.values, st.returns)
+        assert st.distribution_params is not None
+        columns = [
+            *((column, imaged) for column in (*inputs, actions)),
+            *((column.flatten(), repeated) for column in single),
+            *((column.flatten(0, 1), order) for column in st.distribution_params),
+        ]
+        shuffled = [column.index_select(0, index.flatten()).split(index.shape[1]) for column, index in columns]
+        return list(zip(*shuffled, strict=True))
+
+    def _order(self, count: int) -> Tensor:
+        """A random permutation of `count` samples; by sorting, which a graph can hold."""
+        return torch.rand(count, device=self.device).argsort()
+
+    def _step(
+        self,
+        actor_input: Tensor,
+        critic_input: Tensor,
+        actions: Tensor,
+        old_log_prob: Tensor,
+        advantages: Tensor,
+        old_values: Tensor,
+        returns: Tensor,
+        old_mean: Tensor,
+        old_std: Tensor,
+    ) -> Tensor:
+        """One mini-batch: adapt the learning rate, step down the gradient; returns its losses, as in `LOSSES`, and 1. If a
+        gradient is no number, nothing is changed, and all that is returned is 0.
+        """
+        samples = len(old_mean)
+        if self.normalize_advantage_per_mini_batch:
+            own = advantages[:samples]
+            advantages = (advantages - own.mean()) / (own.std() + FEW)
+        mean = self._output(self.actor, actor_input)
+        values = self._output(self.critic, critic_input).squeeze(-1)
+        std = self.action_std()
+        log_prob = gaussian_log_prob(actions, mean, std)
+        entropy = std.log().sum() + actions.shape[1] * (0.5 + HALF_LOG_2PI)
+        ratio = torch.exp(log_prob - old_log_prob)
+        clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
+        surrogate = torch.max(-advantages * ratio, -advantages * clipped).mean()
+        value_loss = (values - returns).square()
+        if self.use_clipped_value_loss:
+            near = old_values + (values - old_values).clamp(-self.clip_param, self.clip_param)
+            value_loss = torch.max(value_loss, (near - returns).square())
+        value_loss = value_loss.mean()
+        loss = surrogate + self.value_loss_coef * value_loss - self.entropy_coef * entropy
+
+        losses = [value_loss, surrogate, entropy]
+        if self.symmetry:
+            images = self.symmetry.data_augmentation_func(env=self.symmetry.env, obs=None, actions=mean[:samples])[1]
+            losses.append((mean[samples:] - images[samples:]).square().mean())
+
+        kl = divergence(old_mean, old_std, mean[:samples].detach(), std.detach())
+        if self.is_multi_gpu:
+            self._shared.zero_()
+            loss.backward()
+            self._shared.average_(kl)
+        else:
+            self.optimizer.zero_grad()
+            loss.backward()
+        if self.desired_kl is not None and self.schedule == "adaptive":
+            self._adapt_rate(kl)
+        # The clipped value loss passes no gradient on for a value that is NaN, so it is looked at by itself.
+        fine = (self._clip_gradients() + value_loss.detach()) < torch.inf
+        torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
+        self.optimizer.step()
+        return torch.where(fine, torch.stack([*losses, self._one]).detach(), 0.0)
+
+    def _clip_gradients(self) -> Tensor:
+        """Clip the gradients of actor and critic, each to the norm `max_grad_norm`, as torch's clip_grad_norm_ does one after
+        the other; returns the sum () of both norms before.
+        """
+        gradients = [
+            [parameter.grad for parameter in model.parameters() if parameter.grad is not None]
+            for model in (self.actor, self.critic)
+        ]
+        of_each = torch.stack(torch._foreach_norm([*gradients[0], *gradients[1]]))
+        norms = torch.stack([torch.linalg.vector_norm(n) for n in of_each.split([len(some) for some in gradients])])
+        factors = (self.max_grad_norm / (norms + 1e-6)).clamp(max=1.0)
+        for some, factor in zip(gradients, factors.unbind(), strict=True):
+            torch._foreach_mul_(some, factor)
+        return norms.sum()
+
+    def _output(self, model: MLPModel, inputs: Tensor) -> Tensor:
+        """What a network makes of its inputs (n, width): (n, outputs), float32. With mixed precision its layers compute in
+        bfloat16.
+        """
+        kind, enabled = inputs.device.type, self.use_mixed_precision
+        # A graph must cast the weights anew at every replay, so none may come from autocast's cache.
+        with torch.autocast(kind, torch.bfloat16, enabled, cache_enabled=False):
+            return model.mlp(model.obs_normalizer(inputs)).float()
+
+    def action_std(self) -> Tensor:
+        """(D,) standard deviation of the actions."""
+        distribution = self.actor.distribution
+        if distribution.std_type == "scalar":
+            return distribution.std_param.clamp(*distribution.std_range)
+        return distribution.log_std_param.clamp(*distribution.log_std_range).exp()
+
+    @torch.no_grad()
+    def _adapt_rate(self, kl: Tensor) -> None:
+        """Move the learning rate so that the mean divergence `kl` () becomes the wanted one."""
+        assert self._rate is not None
+        slower = (self._rate / RATE_STEP).clamp(min=LOWEST_RATE)
+        faster = (self._rate * RATE_STEP).clamp(max=HIGHEST_RATE)
+        rate = torch.where((kl < 0.5 * self.desired_kl) & (kl > 0.0), faster, self._rate)
+        self._rate.copy_(torch.where(kl > 2.0 * self.desired_kl, slower, rate))
+
+    def _update_normalizers(self) -> None:
+        for model in (self.actor, self.critic):
+            if isinstance(model.obs_normalizer, EmpiricalNormalization):
+                inputs = torch.cat([self.storage.observations[name] for name in model.obs_groups], dim=-1)
+                update_normalizer(model.obs_normalizer, inputs.flatten(0, 1))
+
+
+@torch.no_grad()
+def update_normalizer(normalizer: EmpiricalNormalization, x: Tensor) -> None:
+    """Take samples (n, width) of all processes into the running mean and variance, as rsl-rl does, but in place: a graph
+    knows addresses.
+    """
+    mean, variance = x.mean(dim=0, keepdim=True), x.var(dim=0, unbiased=False, keepdim=True)
+    count = len(x)
+    if torch.distributed.is_initialized():
+        count *= torch.distributed.get_world_size()
+        own_mean = mean
+        mean = sum_over_ranks_(own_mean * len(x)) / count
+        variance = sum_over_ranks_((variance + (own_mean - mean).square()) * len(x)) / count
+    normalizer.count += count
+    rate = count / normalizer.count
+    moved = mean - normalizer._mean
+    normalizer._mean += rate * moved
+    normalizer._var += rate * (variance - normalizer._var + moved * (mean - normalizer._mean))
+    torch.sqrt(normalizer._var, out=normalizer._std)
+
+
+@torch.no_grad()
+def divergence(old_mean: Tensor, old_std: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """Mean () of KL(old || new) over Gaussians of means (n, D) and standard deviations (n, D), new ones (D,)."""
+    moved = (old_std.square() + (old_mean - mean).square()) / (2.0 * std.square())
+    return (torch.log(std / old_std) + moved - 0.5).sum(dim=1).mean()
+
+
+class SharedGradients:
+    """The gradients of all parameters side by side in one buffer, which is averaged over processes in one go, and at the
+    end of it the divergence from which the learning rate follows: so all processes take the same step.
+    """
+
+    def __init__(self, parameters: list[torch.nn.Parameter], count: int) -> None:
+        """Makes the parameters' gradients views of the buffer; there are `count` processes."""
+        self._count = count
+        self._buffer = torch.zeros(sum(p.numel() for p in parameters) + 1, device=parameters[0].device)
+        pieces = self._buffer[:-1].split([p.numel() for p in parameters])
+        for parameter, piece in zip(parameters, pieces, strict=True):
+            parameter.grad = piece.view_as(parameter)
+
+    def zero_(self) -> None:
+        """Begin a mini-batch; what follows adds to the gradients in place."""
+        self._buffer.zero_()
+
+    def average_(self, kl: Tensor) -> None:
+        """Gradients and `kl` () of this process become those of all."""
+        self._buffer[-1] = kl
+        sum_over_ranks_(self._buffer)
+        self._buffer /= self._count
+        kl.copy_(self._buffer[-1])
+
+
+def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """Log-density (...,) of `x` (..., D) under a Gaussian of mean (..., D) and standard deviation (D,)."""
+    return -0.5 * ((x - mean) / std).square().sum(dim=-1) - std.log().sum() - x.shape[-1] * HALF_LOG_2PI

@@ -1,0 +1,66 @@
+"""What `train.py --resume` goes on from: the run's own settings, changes on the command line, and the checkpoint."""
+
+import argparse
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from legged.commandline.arguments import overrides
+from legged.config import TaskConfig, override, to_dict
+from legged.errors import ConfigError
+from legged.learning.checkpoint import check_fits, read_checkpoint
+from legged.learning.run_folder import find_checkpoint, find_run, run_config
+from legged.process.paths import relative
+from legged.registry import task_class, task_config
+
+OF_A_RUN = ("train.runner.run_name", "train.runner.max_iterations", "train.runner.experiment_name")
+"""Settings that say nothing of how is trained."""
+
+
+def resumed(args: argparse.Namespace) -> tuple[TaskConfig, Path, list[str]]:
+    """Find the configuration to go on with, the checkpoint to go on from, and a line for each setting that the command line
+    changes. All that can be wrong is found here, before anything is built.
+
+    Raises:
+        ConfigError: there is no such run, it is of another task, robot, observation or network, or it has finished.
+    """
+    asked = overrides(args)
+    folders = [(key, value) for key, value in asked if key == "train.runner.experiment_name"]
+    folder = find_run(task_config(args.task, folders), args.load_run)
+    before = run_config(folder)
+    if before.task != args.task:
+        raise ConfigError(f"--load_run: {relative(folder)} was trained on '{before.task}', not on '{args.task}'")
+    cfg = override(before, asked)
+    if cfg.robot != before.robot:
+        raise ConfigError(
+            f"{cfg.origins.where('robot')}: a resumed training keeps its robot, '{before.robot}'; got '{cfg.robot}'"
+        )
+    task_class(cfg.task).check(cfg)
+    path = find_checkpoint(folder, args.checkpoint)
+    saved = read_checkpoint(path)
+    check_fits(path, saved, cfg)
+    if "optimizer_state_dict" not in saved:
+        raise ConfigError(f"{relative(path)}: holds no optimiser; it can be played, not trained on")
+    done, until = saved["iter"] + 1, cfg.train.runner.max_iterations
+    if done >= until:
+        raise ConfigError(
+            f"--resume: {relative(path)} has finished {done} iterations of {until}; --max_iterations sets a larger total"
+        )
+    return cfg, path, changes(before, cfg, (key for key, _ in asked))
+
+
+def changes(before: TaskConfig, after: TaskConfig, asked: Iterable[str]) -> list[str]:
+    """Say 'env.seed 7 -> 3' for those of the dotted paths `asked` whose value is another one now."""
+    found = []
+    for path in dict.fromkeys(asked):
+        old, new = (value_at(to_dict(cfg), path) for cfg in (before, after))
+        if old != new and path not in OF_A_RUN:
+            found.append(f"{path} {old} -> {new}")
+    return found
+
+
+def value_at(values: Any, path: str) -> Any:
+    """Look up a dotted path in nested mappings; None where there is nothing."""
+    for key in path.split("."):
+        values = values.get(key) if isinstance(values, dict) else None
+    return values

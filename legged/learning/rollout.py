@@ -1,0 +1,106 @@
+"""A rollout without a host read: policy, sampling, task and returns, written straight into rsl-rl's storage."""
+
+from collections.abc import Mapping
+
+import torch
+from rsl_rl.models import MLPModel
+from tensordict import TensorDict
+from torch import Tensor
+
+from legged.envs import BaseTask
+from legged.learning.ppo import DevicePPO, gaussian_log_prob
+
+
+class Rollout:
+    """The T control steps of an iteration, as rsl-rl's runner and PPO make them, in one function that a graph can hold."""
+
+    def __init__(self, env: BaseTask, alg: DevicePPO) -> None:
+        """For a task and a learner on the same device."""
+        self.env, self.alg = env, alg
+        st = alg.storage
+        if st.distribution_params is None:
+            st.distribution_params = (torch.zeros_like(st.actions), torch.zeros_like(st.actions))
+        self._observations = {name: group.buffer for name, group in env.observation_groups.items()}
+        self._cut_off = torch.zeros_like(st.rewards)
+        """(T, N, 1) whether the step ended its episode by time."""
+        self._return = torch.zeros(env.num_envs, device=env.device)
+        self._length = torch.zeros(env.num_envs, device=env.device)
+        self.ended = torch.zeros(3, device=env.device)
+        """(3,) of the episodes that ended in the last rollout: number, sum of returns, sum of lengths [steps]."""
+
+    @property
+    def episodes(self) -> dict[str, Tensor]:
+        """Return and length so far of each robot's episode, (N,) each."""
+        return {"return": self._return, "length": self._length}
+
+    def forget(self) -> None:
+        """All episodes begin anew."""
+        self._return.zero_()
+        self._length.zero_()
+
+    @torch.no_grad()
+    def collect(self, steps: int | None = None) -> None:
+        """T steps into the storage, with returns and advantages; `steps`, to rehearse, takes fewer of them."""
+        self.ended.zero_()
+        for t in range(steps or self.alg.storage.num_transitions_per_env):
+            self._step(t)
+        self._judge()
+        self._returns()
+
+    def _step(self, t: int) -> None:
+        env, alg, st = self.env, self.alg, self.alg.storage
+        for name, now in self._observations.items():
+            st.observations[name][t].copy_(now)
+        mean = alg.actor.mlp(self._input(alg.actor, self._observations))
+        actions = torch.addcmul(mean, alg.action_std(), torch.randn_like(mean))
+        st.actions[t].copy_(actions)
+        st.distribution_params[0][t].copy_(mean)
+
+        env.step_in_place(actions.to(env.device))
+
+        st.rewards[t].copy_(env.rew_buf.unsqueeze(1))
+        st.dones[t].copy_(env.reset_buf.unsqueeze(1))
+        self._cut_off[t].copy_(env.time_out_buf.unsqueeze(1))
+        self._count()
+
+    def _judge(self) -> None:
+        """What acting did not need, for all steps at once: log-probabilities, values, and what they add to rewards."""
+        alg, st = self.alg, self.alg.storage
+        std = alg.action_std()
+        st.distribution_params[1].copy_(std.expand_as(st.actions))
+        st.actions_log_prob.copy_(gaussian_log_prob(st.actions, st.distribution_params[0], std).unsqueeze(-1))
+        st.values.copy_(alg.critic.mlp(self._input(alg.critic, st.observations)))
+        # The value of the state that was acted on stands for the one that a time-out cut off, as in rsl-rl.
+        st.rewards.add_(alg.gamma * self._cut_off * st.values)
+
+    def _count(self) -> None:
+        """Returns and lengths of episodes, for the log."""
+        env = self.env
+        self._return.add_(env.rew_buf)
+        self._length.add_(1.0)
+        done = env.reset_buf
+        counts = torch.stack([torch.ones_like(self._return), self._return, self._length])
+        self.ended.add_(torch.where(done, counts, 0.0).sum(dim=1))
+        self._return.masked_fill_(done, 0.0)
+        self._length.masked_fill_(done, 0.0)
+
+    @staticmethod
+    def _input(model: MLPModel, observations: Mapping[str, Tensor] | TensorDict) -> Tensor:
+        """What a network is given of `observations` by group (..., width): its groups side by side, normalised."""
+        return model.obs_normalizer(torch.cat([observations[name] for name in model.obs_groups], dim=-1))
+
+    def _returns(self) -> None:
+        """Generalised advantage estimation (Schulman et al., arXiv 1506.02438), backwards over the storage."""
+        alg, st = self.alg, self.alg.storage
+        following = alg.critic.mlp(self._input(alg.critic, self._observations))
+        advantage = torch.zeros_like(following)
+        for t in reversed(range(st.num_transitions_per_env)):
+            alive = 1.0 - st.dones[t].float()
+            delta = st.rewards[t] + alive * alg.gamma * following - st.values[t]
+            advantage = delta + alive * (alg.gamma * alg.lam) * advantage
+            torch.add(advantage, st.values[t], out=st.returns[t])
+            following = st.values[t]
+        advantages = st.returns - st.values
+        if not alg.normalize_advantage_per_mini_batch:
+            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        st.advantages.copy_(advantages)

@@ -1,0 +1,185 @@
+"""Run folders: logs/<experiment>/<date_time>_<run>/ with configuration, code state, TensorBoard and checkpoints."""
+
+import itertools
+import os
+import re
+import subprocess
+import tomllib
+from contextlib import suppress
+from datetime import datetime
+from importlib import metadata
+from pathlib import Path
+
+from legged.config import TaskConfig, from_dict, to_yaml
+from legged.config.loader import read_yaml
+from legged.errors import ConfigError, suggest
+from legged.process.paths import data_folder, make_folder, not_made, relative, write_text
+
+LOGS = Path("logs")
+CONFIG_FILE = "config.yaml"
+CODE_FILE = "code.diff"
+SHIPPED_MODEL = "model.pt"
+GIT_S = 30.0
+"""Git has so long to answer; on a slow network disk it may take its time [s]."""
+
+
+def experiment_folder(cfg: TaskConfig) -> Path:
+    """Say where the runs of a task lie; the configuration has plain names only."""
+    return LOGS / (cfg.train.runner.experiment_name or cfg.task)
+
+
+def create_run(cfg: TaskConfig) -> Path:
+    """A new run folder with the resolved configuration and the state of the code. It is nobody else's, also where several
+    processes make theirs in the same second.
+
+    Raises:
+        ConfigError: the folder's name can't be one.
+        RunError: it can't be made or written.
+    """
+    parent = experiment_folder(cfg)
+    folder = parent / stamped(cfg)
+    make_folder(parent)
+    for number in itertools.count(2):
+        try:
+            folder.mkdir()
+            break
+        except FileExistsError:  # two runs in one second
+            folder = parent / f"{stamped(cfg)}-{number}"
+        except (OSError, ValueError) as error:
+            raise not_made(folder, error) from error
+    write_text(folder / CONFIG_FILE, to_yaml(cfg))
+    write_text(folder / CODE_FILE, code_state())
+    return folder
+
+
+def stamped(cfg: TaskConfig) -> str:
+    """The name of a run that begins now: date, time and, if it has one, its own name."""
+    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    return f"{stamp}_{cfg.train.runner.run_name}" if cfg.train.runner.run_name else stamp
+
+
+def discard_run(folder: Path) -> None:
+    """Remove the folder of a run that failed before its first checkpoint, and the folders above it that are empty then; a
+    folder that holds anything else stays.
+    """
+    if checkpoints(folder):
+        return
+    ours = [folder / CONFIG_FILE, folder / CODE_FILE, *folder.glob("events.out.tfevents.*")]
+    with suppress(OSError):
+        for path in ours:
+            path.unlink(missing_ok=True)
+        for empty in (folder, *folder.parents[: len(folder.parts) - 1]):
+            empty.rmdir()
+
+
+def code_state() -> str:
+    """Version, commit, status and difference of the code that runs. The last three only if it lies in the git repository of
+    this project: one in which it is installed belongs to somebody else. Of files that git does not track, only the names.
+    """
+    package = Path(__file__).resolve().parents[1]
+    version = f"legged {_version()}\n"
+    try:
+        if Path(_git(package.parent, "rev-parse", "--show-toplevel").strip()).resolve() != package.parent:
+            return f"{version}not in a git repository of its own\n"
+        _git(package.parent, "ls-files", "--error-unmatch", f"{package.name}/__init__.py", "pyproject.toml")
+        project = tomllib.loads((package.parent / "pyproject.toml").read_text(encoding="utf-8"))
+        if project.get("project", {}).get("name") != package.name:
+            return f"{version}not in a git repository of its own\n"
+        commit = _git(package.parent, "rev-parse", "HEAD").strip()
+        status = _git(package.parent, "status", "--short")
+        return f"{version}commit {commit}\n{status}\n{_git(package.parent, 'diff', '--no-ext-diff', '--no-color', 'HEAD')}"
+    except FileNotFoundError:
+        return f"{version}git is not on the PATH: the commit is not known\n"
+    except subprocess.CalledProcessError:
+        return f"{version}not in a git repository of its own\n"
+    except (OSError, subprocess.TimeoutExpired, ValueError) as error:
+        return f"{version}git could not be asked: {error}\n"
+
+
+def _git(folder: Path, *args: str) -> str:
+    """What git says about the repository that a folder lies in, whatever the environment names."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    command = ["git", "-C", str(folder), *args]
+    result = subprocess.run(command, capture_output=True, check=True, timeout=GIT_S, env=environment)
+    return result.stdout.decode("utf-8", errors="replace")
+
+
+def _version() -> str:
+    """The version of this package as it is installed."""
+    try:
+        return metadata.version("legged")
+    except metadata.PackageNotFoundError:
+        return "(not installed)"
+
+
+def find_run(cfg: TaskConfig, load_run: str | None) -> Path:
+    """The run folder that `load_run` names (a name in the task's experiment, a path, or nothing for the newest).
+
+    Raises:
+        ConfigError: there is none.
+    """
+    parent = experiment_folder(cfg)
+    runs = sorted((p for p in parent.glob("*") if checkpoints(p)), key=_last_saved)
+    if load_run in (None, "-1"):
+        if not runs:
+            raise ConfigError(f"--load_run: there is no run with a checkpoint in {relative(parent)}; train one first")
+        return runs[-1]
+    for folder in (parent / str(load_run), Path(str(load_run))):
+        with suppress(OSError, ValueError):  # no name of a folder
+            if str(load_run).strip() and folder.is_dir():
+                return folder
+    raise ConfigError(f"--load_run: there is no run '{load_run}'{suggest(str(load_run), [p.name for p in runs], 'runs')}")
+
+
+def find_checkpoint(folder: Path, checkpoint: int | None) -> Path:
+    """The checkpoint of that iteration in a run folder, or the latest.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    found = checkpoints(folder)
+    if not found:
+        raise ConfigError(f"--load_run: {relative(folder)} holds no checkpoint (model_<iteration>.pt)")
+    if checkpoint is None or checkpoint == -1:
+        return found[max(found)]
+    if checkpoint not in found:
+        have = ", ".join(str(i) for i in sorted(found))
+        raise ConfigError(f"--checkpoint: {relative(folder)} has no checkpoint {checkpoint} (it has: {have})")
+    return found[checkpoint]
+
+
+def shipped_policy(task: str) -> Path | None:
+    """The folder of the policy that comes with this package for a task, if there is one."""
+    folder = data_folder("resources") / "policies" / task
+    return folder if (folder / SHIPPED_MODEL).is_file() else None
+
+
+def run_config(folder: Path) -> TaskConfig:
+    """The configuration that a run was trained with.
+
+    Raises:
+        ConfigError: the folder has none, or it no longer fits the schema.
+    """
+    path = folder / CONFIG_FILE
+    if not path.is_file():
+        raise ConfigError(f"--load_run: {relative(folder)} is no run folder (it has no {CONFIG_FILE})")
+    return from_dict(read_yaml(path), source=str(path))
+
+
+def _last_saved(folder: Path) -> float:
+    """When the latest checkpoint of a run was written; evaluations and videos in its folder do not count."""
+    return max(path.stat().st_mtime for path in checkpoints(folder).values())
+
+
+def checkpoints(folder: Path) -> dict[int, Path]:
+    """Checkpoints of a folder by iteration, in that order; the one of a shipped policy counts as 0."""
+    found: dict[int, Path] = {}
+    for path in folder.glob("model*.pt"):
+        match = re.fullmatch(r"model_(\d+)\.pt", path.name, re.ASCII)
+        if not path.is_file():  # a folder of that name, or a link to a file that has gone
+            continue
+        if match:
+            found[int(match.group(1))] = path
+        elif path.name == SHIPPED_MODEL:
+            found[0] = path
+    return dict(sorted(found.items()))

@@ -1,0 +1,91 @@
+"""The rest of a training beside its checkpoint: random generators, robots, episodes. With it a resumed training goes on as if
+it had never stopped; without it robots start anew.
+
+It is as large as the robots are many, so only the newest is kept: state_<iteration>.pt beside model_<iteration>.pt.
+"""
+
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from legged.errors import ConfigError
+from legged.learning.checkpoint import load_plain, write_checkpoint
+from legged.process.paths import relative
+from legged.state import StateError
+
+FORMAT = 1
+
+
+def state_path(checkpoint: Path) -> Path:
+    """Say where the state that belongs to a checkpoint lies, if there is one."""
+    return checkpoint.with_name(checkpoint.name.replace("model", "state", 1))
+
+
+def write_run_state(checkpoint: Path, state: dict[str, Any]) -> None:
+    """Write the state that belongs to a checkpoint: before the checkpoint, so that the newest always has one."""
+    write_checkpoint(state_path(checkpoint), {"format": FORMAT, **state})
+
+
+def remove_older(checkpoint: Path) -> None:
+    """Remove the states of other checkpoints in the folder."""
+    for path in checkpoint.parent.glob("state_*.pt"):
+        if path != state_path(checkpoint):
+            path.unlink(missing_ok=True)
+
+
+def read_run_state(checkpoint: Path, checkpoint_id: str) -> dict[str, Any]:
+    """Read the state that belongs to a checkpoint, which says the same `id`.
+
+    Raises:
+        StateError: there is none, or it can't be used.
+    """
+    path = state_path(checkpoint)
+    if not path.is_file():
+        raise StateError(f"there is no {path.name} beside it")
+    try:
+        state = load_plain(path)
+    except ConfigError as error:
+        raise StateError(str(error)) from error
+    kinds = {"format": int, "id": str, "task": dict, "episodes": dict, "generators": dict}
+    if not isinstance(state, dict) or not all(isinstance(state.get(name), kind) for name, kind in kinds.items()):
+        raise StateError(f"{relative(path)} is damaged")
+    if state["format"] != FORMAT:
+        raise StateError(f"{relative(path)} is of format {state['format']}, this version reads {FORMAT}")
+    if state["id"] != checkpoint_id:
+        raise StateError(f"{relative(path)} belongs to another checkpoint")
+    return state
+
+
+def generators() -> dict[str, Any]:
+    """Read the state of every random generator of this process, as plain data."""
+    version, numbers, gauss = random.getstate()
+    name, keys, position, has_gauss, cached = np.random.get_state(legacy=True)
+    assert isinstance(keys, np.ndarray)
+    return {
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state() if torch.cuda.is_available() else None,
+        "python": [version, list(numbers), gauss],
+        "numpy": [name, torch.from_numpy(keys.astype(np.int64)), int(position), int(has_gauss), float(cached)],
+    }
+
+
+def set_generators(state: dict[str, Any]) -> None:
+    """Go on from saved states; a GPU's that is not here is left out.
+
+    Raises:
+        StateError: they are damaged.
+    """
+    try:
+        version, numbers, gauss = state["python"]
+        name, keys, position, has_gauss, cached = state["numpy"]
+        random.setstate((version, tuple(numbers), gauss))
+        np.random.set_state((name, keys.numpy().astype(np.uint32), position, has_gauss, cached))
+        torch.set_rng_state(state["torch"])
+        if isinstance(state["cuda"], Tensor) and torch.cuda.is_available():
+            torch.cuda.set_rng_state(state["cuda"])
+    except Exception as error:  # every generator refuses in a way of its own what is none of its states
+        raise StateError(f"its random generators are damaged ({error})") from error

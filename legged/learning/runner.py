@@ -1,0 +1,255 @@
+"""rsl-rl's OnPolicyRunner with what it leaves out: task state in checkpoints, safe files, a clean stop."""
+
+import contextlib
+import io
+import time
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import torch
+from rsl_rl.runners import OnPolicyRunner
+from torch import Tensor
+
+from legged.config import TaskConfig
+from legged.envs import BaseTask, LeggedRobot
+from legged.errors import ConfigError, RunError
+from legged.learning.checkpoint import (
+    check_weights,
+    describe,
+    describe_mismatch,
+    fit_optimizer,
+    read_checkpoint,
+    write_checkpoint,
+)
+from legged.learning.display import Display
+from legged.learning.distributed import RankLost, join, leave
+from legged.learning.logger import Interrupted, QuietLogger
+from legged.learning.run_state import generators, read_run_state, remove_older, set_generators, write_run_state
+from legged.learning.step_guard import StepGuard
+from legged.learning.symmetry import MirrorImages, augment
+from legged.learning.watch import Diverged
+from legged.process.paths import relative
+from legged.process.ranks import Ranks
+from legged.process.startup import STARTED_S
+from legged.state import StateError, take
+
+
+def runner_config(cfg: TaskConfig, algorithm_class: str) -> dict[str, Any]:
+    """The dictionary rsl-rl wants."""
+    policy, runner = cfg.train.policy, cfg.train.runner
+    settings = dict(vars(cfg.train.algorithm))
+    if settings.pop("symmetry"):
+        settings["symmetry_cfg"] = {"data_augmentation_func": augment, "use_data_augmentation": True}
+    shared = {
+        "class_name": "MLPModel",
+        "activation": policy.activation,
+        "obs_normalization": policy.obs_normalization,
+    }
+    if policy.rnn_type != "none":
+        shared["class_name"] = "RNNModel"
+        shared |= {name: getattr(policy, name) for name in ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")}
+    return {
+        "num_steps_per_env": runner.num_steps_per_env,
+        "save_interval": runner.save_interval,
+        "run_name": runner.run_name,
+        "logger": "tensorboard",
+        "check_for_nan": False,  # it would wait for the GPU at every step; the task terminates and counts such robots
+        "obs_groups": {"actor": ["actor"], "critic": ["critic"]},
+        "actor": {
+            **shared,
+            "hidden_dims": list(policy.actor_hidden_dims),
+            "distribution_cfg": {
+                "class_name": "GaussianDistribution",
+                "init_std": policy.init_noise_std,
+                "std_type": "scalar",
+            },
+        },
+        "critic": {**shared, "hidden_dims": list(policy.critic_hidden_dims)},
+        "algorithm": {"class_name": algorithm_class, **settings},
+    }
+
+
+class Runner(OnPolicyRunner):
+    """Trains a task with rsl-rl's PPO."""
+
+    env: BaseTask
+    ALGORITHM = "PPO"
+    """Class of the learner, by rsl-rl's names or as module:class."""
+
+    def __init__(
+        self, env: BaseTask, log_dir: Path | None = None, device: str = "cpu", display: Display | None = None
+    ) -> None:
+        """`log_dir` is where checkpoints and TensorBoard files go; without one nothing is written."""
+        config = runner_config(env.cfg, self.ALGORITHM)
+        torch.backends.cuda.matmul.allow_tf32 = env.cfg.train.runner.matmul == "tf32"  # of this process
+        if env.cfg.train.algorithm.symmetry and isinstance(env, LeggedRobot):
+            env.mirror_images = MirrorImages(env)  # type: ignore[attr-defined]  # where `augment` finds them
+        with contextlib.redirect_stdout(io.StringIO()):
+            super().__init__(env, config, str(log_dir) if log_dir else None, device)
+        self._state: dict[str, Any] | None = None
+        self._last_saved = ""
+        self._guard = None if hasattr(self.alg.optimizer, "found_inf") else StepGuard(self.alg.optimizer)
+        self.logger = QuietLogger(
+            log_dir=str(log_dir) if log_dir else None,
+            cfg=self.cfg,
+            env_cfg=env.cfg,
+            num_envs=env.num_envs,
+            is_distributed=self.is_distributed,
+            gpu_world_size=self.gpu_world_size,
+            gpu_global_rank=self.gpu_global_rank,
+            device=device,
+            display=display,
+            left_out=self._left_out,
+        )
+
+    def _left_out(self) -> float:
+        """The share of the last update's mini-batches that changed nothing, because their gradients were no numbers."""
+        return self.alg.left_out if self._guard is None else self._guard.flush()
+
+    def stop(self) -> None:
+        """Ask `learn` to stop after the iteration that is going on."""
+        self.logger.stop_requested = True
+
+    def train(self, until_iteration: int) -> bool:
+        """Learn up to iteration `until_iteration`; false if stopped before. Leaves a checkpoint either way, and the other
+        processes, if there are any.
+
+        Raises:
+            RankLost: one of those has died.
+            Diverged: numbers went on being NaN or infinite; the last checkpoint is good.
+        """
+        finished = True
+        try:
+            self.learn(until_iteration - self.current_learning_iteration, init_at_random_ep_len=True)
+        except Interrupted:
+            finished = False
+            if self.logger.writer is not None:
+                self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
+                self.logger.stop_logging_writer()
+        except Diverged as error:
+            if self.logger.writer is not None:
+                self.logger.stop_logging_writer()
+            leave()
+            good = f"; the last checkpoint is {self._last_saved}" if self._last_saved else ""
+            raise Diverged(f"stopped after iteration {self.current_learning_iteration + 1}: {error}{good}") from error
+        except RuntimeError as error:
+            if self.is_distributed and "by peer" in str(error):  # gloo notices; with NCCL torchrun ends who waits
+                raise RankLost(f"rank {self.gpu_global_rank}: another process has ended; torchrun says which") from error
+            raise
+        leave()
+        return finished
+
+    def _configure_multi_gpu(self) -> None:
+        """As rsl-rl, and on the CPU too: each process of torchrun has the device it was given, and meets the others."""
+        ranks = Ranks.now()
+        self.is_distributed = ranks.several
+        self.gpu_world_size, self.gpu_global_rank, self.gpu_local_rank = ranks.count, ranks.rank, ranks.local_rank
+        self.cfg["multi_gpu"] = None
+        if ranks.several:
+            self.cfg["multi_gpu"] = {
+                "global_rank": ranks.rank,
+                "local_rank": ranks.local_rank,
+                "world_size": ranks.count,
+            }
+            join(ranks, torch.device(self.device))
+
+    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
+        """Train for a number of iterations; robots that go on where they stopped keep their episodes."""
+        goes_on = self._go_on()
+        super().learn(num_learning_iterations, init_at_random_ep_len and not goes_on)
+
+    def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
+        """Write a checkpoint, and beside it the state of everything else, which the newest alone keeps.
+
+        Raises:
+            RunError: weights are NaN or infinite, or a file can't be written.
+        """
+        saved = self.alg.save()
+        try:
+            for network in ("actor", "critic"):
+                check_weights(saved[f"{network}_state_dict"], f"{path}: is not written: the {network}")
+        except ConfigError as error:
+            raise RunError(str(error)) from error
+        saved["iter"] = self.current_learning_iteration
+        saved["infos"] = {
+            **(infos or {}),
+            **describe(self.env),
+            "task_state": self.env.progress(),
+            "learning_rate": self.alg.learning_rate,
+            "wall_s": time.perf_counter() - STARTED_S,  # since this process began
+        }
+        if not self.is_distributed:  # the other processes' robots are not here
+            saved["infos"]["id"] = uuid4().hex
+            state = {"generators": generators(), "task": self.env.state_dict(), "episodes": self._episodes()}
+            write_run_state(Path(path), {"id": saved["infos"]["id"], **state})
+        write_checkpoint(Path(path), saved)
+        remove_older(Path(path))
+        self._last_saved = path
+        self.logger.save_model(path, self.current_learning_iteration)
+
+    def load(self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None) -> dict:
+        """Restore networks, optimiser (if the checkpoint holds it; shipped ones do not), iteration count and the progress of
+        the task's curricula from a checkpoint.
+
+        Raises:
+            ConfigError: the file is no checkpoint, or of a network of another size.
+        """
+        saved = read_checkpoint(Path(path), map_location or self.device)
+        parts = load_cfg or dict.fromkeys(("actor", "critic", "iteration"), True)
+        parts = {"optimizer": "optimizer_state_dict" in saved, **parts}
+        if parts["optimizer"]:
+            wanted, where = saved["optimizer_state_dict"], f"{relative(Path(path))}: its optimiser"
+            saved["optimizer_state_dict"] = fit_optimizer(wanted, self.alg.optimizer, where)
+        infos = saved["infos"]
+        try:
+            self.alg.load(saved, parts, strict)
+            self.alg.learning_rate = float(infos.get("learning_rate", self.alg.learning_rate))
+        except (RuntimeError, ValueError, KeyError, TypeError) as error:
+            policy = self.alg.get_policy().state_dict()
+            raise ConfigError(describe_mismatch(Path(path), saved, policy, self.env.cfg.task)) from error
+        # rsl-rl saves the index of the last finished iteration; going on from it would repeat that one.
+        self.current_learning_iteration = saved["iter"] + 1
+        try:
+            if "task_state" in infos:
+                self.env.load_progress(infos["task_state"])
+        except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ConfigError(f"{path}: the progress of its curricula is damaged ({error})") from error
+        return infos
+
+    def resume(self, path: str) -> str:
+        """Load a checkpoint to train on from. Robots, random numbers and episodes go on where they were, if their state lies
+        beside it; else all robots begin anew on the tiles that they had reached. Returns why they do, or nothing.
+        """
+        infos = self.load(path)
+        if self.is_distributed:
+            why = "there are several processes"
+        else:
+            try:
+                state = read_run_state(Path(path), infos.get("id", ""))
+                self._take(state)
+                self._state = state  # taken once more when training begins, after the trial steps of a capture
+                return ""
+            except StateError as error:
+                why = str(error)
+        self.load(path)
+        self.env.reset()
+        return why
+
+    def _go_on(self) -> bool:
+        """Take the state that was resumed from, if there is one and training has not begun yet."""
+        if self._state is None:
+            return False
+        self._take(self._state)
+        self._state = None
+        return True
+
+    def _take(self, state: dict[str, Any]) -> None:
+        """Put task, episodes and random generators into a state; StateError if it does not fit."""
+        self.env.load_state_dict(state["task"])
+        take(self._episodes(), state["episodes"], "episodes")
+        set_generators(state["generators"])
+
+    def _episodes(self) -> dict[str, Tensor]:
+        """Return and length so far of the episode of each environment, (N,) each, as they are counted for the log."""
+        return {"return": self.logger.cur_reward_sum, "length": self.logger.cur_episode_length}

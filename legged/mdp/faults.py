@@ -1,0 +1,63 @@
+"""What is done about numbers that are none: NaN, infinite, or beyond anything a robot's could be.
+
+One such number in a sample would reach every weight of the networks. So a reward or an observation counts as 0 there, the
+robot's episode ends at the next step, and robots are counted by the term at fault; nothing of this waits for the host.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from legged.mdp.observations import ObservationTerms
+
+LARGEST = 1e10
+"""Rewards and observations beyond this count as infinite: the squares of sums of them must fit a float32."""
+LARGEST_STATE = 1e4
+"""Positions [m], velocities [m/s], angles [rad] and rates [rad/s] beyond this are no robot's: its physics has diverged."""
+
+
+class Faults:
+    """Which of N robots had a number that is none since the last `flush`, and what it was a number of."""
+
+    STATE = ("sound",)
+
+    def __init__(self, rewards: Sequence[str], observations: ObservationTerms, num_envs: int, device: torch.device) -> None:
+        """`rewards` are the names of the reward terms, in the order of their rows."""
+        self.sound = torch.ones(num_envs, dtype=torch.bool, device=device)
+        """(N,) robots whose rewards and observations of the last step were numbers; the others end at the next one."""
+        self._terms = observations
+        self._names = ("physics", "action", *(f"reward_{n}" for n in rewards), *(f"obs_{n}" for n in observations.columns))
+        self._seen = torch.zeros(2 + len(rewards), num_envs, dtype=torch.bool, device=device)
+        self._physics, self._action, self._rewards = self._seen[0], self._seen[1], self._seen[2:]
+        # Of observations the largest number is kept, by column, which costs two launches a step; robots are counted later.
+        self._largest = torch.zeros_like(observations.values)
+
+    def check_state(self, in_bounds: Tensor, clipped_actions: Tensor) -> None:
+        """Take in which robots' states and actions are numbers, (N,), and the actions (N, D), which are finite or NaN."""
+        broken = (clipped_actions != clipped_actions).any(dim=1)
+        self._action.logical_or_(broken)
+        self._physics.logical_or_(~(in_bounds | broken))
+
+    def check_rewards(self, fine: Tensor, valid: Tensor) -> None:
+        """Take in which rewards are numbers, (terms, N), of the robots that were sound before, (N,); the others end now."""
+        broken = valid & ~fine
+        torch.logical_not(broken.any(dim=0), out=self.sound)
+        self._rewards.logical_or_(broken)
+
+    def check_observations(self) -> None:
+        """Look at the terms' values, before they are scaled and clipped; after `check_rewards`."""
+        size = self._terms.raw.abs()
+        self.sound.logical_and_(size.amax(dim=1) < LARGEST)  # NaN is the largest of all, and not below
+        torch.maximum(self._largest, size, out=self._largest)
+
+    def flush(self) -> dict[str, Tensor]:
+        """Return the number of robots by fault, as fresh 0-dimensional tensors by their name in TensorBoard, NaN where there
+        were none; then start anew.
+        """
+        broken = [~(self._largest[:, columns].amax(dim=1) < LARGEST) for columns in self._terms.columns.values()]
+        counts = torch.cat([self._seen, torch.stack(broken)]).sum(dim=1).float()
+        self._seen.zero_()
+        self._largest.zero_()
+        counts = torch.where(counts > 0.0, counts, torch.nan)  # NaN says "no value", and is not logged
+        return {f"Faults/{name}": count for name, count in zip(self._names, counts.unbind(), strict=True)}

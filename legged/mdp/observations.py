@@ -1,0 +1,120 @@
+"""Observation groups: named terms, each evaluated once a step, then scaled, noised, clipped and laid side by side."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from legged.graph.step_graph import calling
+from legged.math import masked_set_
+
+
+class ObservationTerms:
+    """The terms that a task's groups name, evaluated once a step for all of them and laid side by side."""
+
+    def __init__(self, functions: Mapping[str, Callable[[], Tensor]]) -> None:
+        """Functions by term, in order, each (N, width); each is called once to learn its width."""
+        self._functions = dict(functions)
+        self.columns: dict[str, slice] = {}
+        """Term -> where it lies in `values`."""
+        start = 0
+        sample = None
+        for name, function in self._functions.items():
+            with calling(f"_obs_{name}"):
+                sample = function()
+                if sample.dim() != 2:
+                    raise ValueError(f"must return a tensor (num_envs, width), got {tuple(sample.shape)}")
+            self.columns[name] = slice(start, start + sample.shape[1])
+            start += sample.shape[1]
+        if sample is None:
+            raise ValueError("observations need at least one term")
+        self.values = torch.zeros(sample.shape[0], start, device=sample.device)
+        """(N, width) the terms as groups read them, with 0 for what is no number."""
+        self.raw = self.values
+        """(N, width) the terms as they gave them, numbers or not."""
+
+    def evaluate(self) -> None:
+        """Bring `raw` and `values` up to date."""
+        found = []
+        for name, function in self._functions.items():
+            with calling(f"_obs_{name}"):
+                found.append(function())
+        self.raw = torch.cat(found, dim=1).float()
+        torch.nan_to_num(self.raw, nan=0.0, posinf=0.0, neginf=0.0, out=self.values)
+
+
+@dataclass(frozen=True)
+class ObservationTerm:
+    """One term of a group and where it lies in the buffer."""
+
+    name: str
+    columns: slice
+    scale: Tensor
+    """(width,) factors."""
+    noise: float
+    """Half width of the uniform noise, in the term's unit before scaling."""
+
+
+class ObservationGroup:
+    """What one network sees: (N, width), rewritten in place; or with a history, the last steps side by side, oldest first:
+    (N, history * width).
+    """
+
+    STATE = ("_steps",)
+
+    def __init__(
+        self,
+        source: ObservationTerms,
+        names: Sequence[str],
+        scales: Mapping[str, Sequence[float] | float],
+        noise: Mapping[str, float],
+        clip: float,
+        history: int = 1,
+    ) -> None:
+        """The group of the terms `names` of `source`, in that order. No noise where none is named."""
+        self.clip, self.history = clip, history
+        self.terms: list[ObservationTerm] = []
+        num_envs, device = source.values.shape[0], source.values.device
+        start = 0
+        columns: list[int] = []
+        for name in names:
+            there = source.columns[name]
+            width = there.stop - there.start
+            columns += range(there.start, there.stop)
+            scale = torch.as_tensor(scales.get(name, 1.0), dtype=torch.float32, device=device).expand(width)
+            self.terms.append(ObservationTerm(name, slice(start, start + width), scale, noise.get(name, 0.0)))
+            start += width
+        self._steps = torch.zeros(num_envs, history, start, device=device)
+        self.buffer = self._steps.flatten(1)
+        """(N, history * width) what the network is given."""
+        self._now = self._steps[:, -1]
+        # Terms that lie side by side already are read where they are; others are picked column by column.
+        together = columns == list(range(columns[0], columns[0] + start))
+        self._values = source.values[:, columns[0] : columns[0] + start] if together else source.values
+        self._columns = None if together else torch.tensor(columns, device=device)
+        self._scale = torch.cat([term.scale for term in self.terms])
+        half = torch.cat([torch.full_like(term.scale, term.noise) for term in self.terms])
+        self._noise_width = half * self._scale if bool(half.any()) else None
+        self._noise = torch.zeros(num_envs, start, device=device)
+
+    def draw(self) -> None:
+        """Draw the noise of the next `compute`."""
+        if self._noise_width is not None:
+            self._noise.uniform_(-1.0, 1.0).mul_(self._noise_width)
+
+    def advance(self) -> None:
+        """Make room for a new step, forgetting the oldest."""
+        if self.history > 1:
+            self._steps[:, :-1].copy_(self._steps[:, 1:].clone())
+
+    def compute(self) -> None:
+        """Take the terms' values into the newest step."""
+        values = self._values if self._columns is None else self._values.index_select(1, self._columns)
+        torch.addcmul(self._noise, values, self._scale, out=self._now)
+        self._now.clamp_(-self.clip, self.clip)
+
+    def restart(self, mask: Tensor) -> None:
+        """Fill the history of the robots in `mask` (N,) with the newest step."""
+        if self.history > 1:
+            masked_set_(self._steps, mask, self._now.unsqueeze(1).expand_as(self._steps))

@@ -1,0 +1,71 @@
+"""Reward terms: scaled, summed, clipped and recorded per episode."""
+
+from collections.abc import Callable, Mapping
+
+import torch
+from torch import Tensor
+
+from legged.graph.step_graph import calling
+from legged.math import masked_set_
+from legged.mdp.faults import LARGEST
+
+
+class Rewards:
+    """The sum of scale * dt * term. `termination` is added after the clip at zero, as in legged_gym."""
+
+    STATE = ("sums",)
+
+    def __init__(
+        self,
+        functions: Mapping[str, Callable[[], Tensor]],
+        scales: Mapping[str, float],
+        dt: float,
+        only_positive: bool,
+        total: Tensor,
+    ) -> None:
+        """Functions and scales by term; `dt` is the control step [s]; sums are written to `total` (N,)."""
+        num_envs, device = len(total), total.device
+        self.functions = dict(functions)
+        self.names = tuple(functions)
+        self.scales = {name: scales[name] * dt for name in self.names}
+        factors = [self.scales[name] for name in self.names]
+        self._factors = torch.tensor(factors, device=device).view(len(factors), 1)
+        before_clip = [float(name != "termination") for name in self.names]
+        self._before_clip = torch.tensor(before_clip, device=device).view(len(factors), 1)
+        self.only_positive = only_positive
+        self.num_envs = num_envs
+        self.total = total
+        """(N,) reward of the last step."""
+        self.sums = torch.zeros(len(self.names), num_envs, device=device)
+        """(terms, N) sum of each scaled term over the episode so far."""
+        self.fine = torch.ones(len(self.names), num_envs, dtype=torch.bool, device=device)
+        """(terms, N) whether each term was a number at the last step."""
+        self.episode_sums = {name: self.sums[i] for i, name in enumerate(self.names)}
+        """The rows of `sums` by name."""
+
+    def compute(self, valid: Tensor) -> Tensor:
+        """Evaluate all terms; robots outside `valid` (N,), whose physics blew up, get zero, and so does a term that is no
+        number.
+        """
+        if not self.functions:
+            return self.total
+        values = []
+        for name, function in self.functions.items():
+            with calling(f"_reward_{name}"):
+                value = function()
+                if value.shape != (self.num_envs,):
+                    raise ValueError(f"must return a tensor ({self.num_envs},), got {tuple(value.shape)}")
+            values.append(value)
+        # Stacked, so that scaling, masking and summing cost a launch each and not one a term.
+        scaled = torch.stack(values) * self._factors
+        torch.lt(scaled.abs(), LARGEST, out=self.fine)
+        scaled = torch.where(self.fine & valid, scaled, 0.0)
+        self.sums.add_(scaled)
+        if not self.only_positive:
+            return torch.sum(scaled, dim=0, out=self.total)
+        total = (scaled * self._before_clip).sum(dim=0).clamp(min=0.0)
+        return self.total.copy_(total + (scaled * (1.0 - self._before_clip)).sum(dim=0))
+
+    def reset(self, mask: Tensor) -> None:
+        """Begin new sums for the robots in `mask`."""
+        masked_set_(self.sums.t(), mask, 0.0)

@@ -1,0 +1,1 @@
+"""The collider for height maps."""

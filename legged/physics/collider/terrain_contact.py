@@ -1,0 +1,266 @@
+"""Contacts of spheres, capsules and boxes with a height map, as one Warp kernel behind mujoco-warp's own collisions.
+
+mujoco-warp meets a height field with a general convex solver (GJK) on triangular prisms: ten times the cost of this,
+and a riser becomes a ramp one cell wide. Here a contact is a few lookups (ground.py).
+
+Conventions: the normal points from the terrain (first geom) to the robot's shape; `dist` is negative in penetration; the
+contact point lies halfway between the two surfaces, as in MuJoCo. Friction directions follow from the normal alone,
+where MuJoCo turns them along a capsule on a plane; the friction cone is the same.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+from mujoco_warp._src.collision_core import contact_margin_gap, contact_material_params, write_contact
+from mujoco_warp._src.math import make_frame
+from mujoco_warp._src.types import vec5
+
+from legged.errors import ConfigError
+from legged.physics.collider.ground import Ground, Hits, around_point, between_ends, ground_of
+from legged.terrain import HeightMap
+
+wp.set_module_options({"enable_backward": False})
+
+MODEL_FIELDS = (
+    "geom_condim",
+    "geom_priority",
+    "geom_solmix",
+    "geom_solref",
+    "geom_solimp",
+    "geom_friction",
+    "geom_margin",
+    "geom_gap",
+    "geom_adhesion",
+    "pair_dim",
+    "pair_solref",
+    "pair_solreffriction",
+    "pair_solimp",
+    "pair_margin",
+    "pair_gap",
+    "pair_adhesion",
+    "pair_friction",
+)
+"""Of mujoco-warp's model, in the kernel's order."""
+CONTACT_FIELDS = (
+    "dist",
+    "pos",
+    "frame",
+    "includemargin",
+    "friction",
+    "solref",
+    "solreffriction",
+    "solimp",
+    "dim",
+    "geom",
+    "efc_address",
+    "worldid",
+    "type",
+    "geomcollisionid",
+    "adhesion",
+)
+"""Of its contacts, in the kernel's order."""
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A sphere, or with `start` and `end` apart what lies between the ends of a capsule; in its geom's frame [m]."""
+
+    geom: int
+    start: np.ndarray
+    end: np.ndarray
+    radius: float
+
+    @property
+    def long(self) -> bool:
+        """Whether it is the inside of a capsule."""
+        return bool((self.start != self.end).any())
+
+
+def probes_of(model: mujoco.MjModel, shapes: Iterable[int]) -> Iterator[Probe]:
+    """The probes of those geoms.
+
+    Raises:
+        ConfigError: a shape that is neither sphere, capsule nor box.
+    """
+    kinds = mujoco.mjtGeom
+    for i in shapes:
+        kind, size = model.geom_type[i], model.geom_size[i]
+        centre = np.zeros(3)
+        if kind == kinds.mjGEOM_SPHERE:
+            yield Probe(i, centre, centre, size[0])
+        elif kind == kinds.mjGEOM_CAPSULE:
+            end = np.array([0.0, 0.0, size[1]])
+            yield Probe(i, -end, -end, size[0])
+            yield Probe(i, end, end, size[0])
+            yield Probe(i, -end, end, size[0])
+        elif kind == kinds.mjGEOM_BOX:
+            for signs in product((-1.0, 1.0), repeat=3):
+                yield Probe(i, size * signs, size * signs, 0.0)
+        else:
+            name, of = model.geom(i).name, kinds(kind).name.removeprefix("mjGEOM_").lower()
+            raise ConfigError(
+                f"terrain: shape '{name}' is a {of}; sim.terrain_collider=cells knows spheres, capsules and boxes (their"
+                " corners). Use those, sim.terrain_collider=convex, or sim.physics=mujoco"
+            )
+
+
+@wp.kernel
+def touch_ground(
+    ground: Ground,
+    terrain: int,
+    probe_geom: wp.array[int],
+    probe_start: wp.array[wp.vec3],
+    probe_end: wp.array[wp.vec3],
+    probe_radius: wp.array[float],
+    probe_long: wp.array[wp.bool],
+    geom_condim: wp.array[int],
+    geom_priority: wp.array[int],
+    geom_solmix: wp.array2d[float],
+    geom_solref: wp.array2d[wp.vec2],
+    geom_solimp: wp.array2d[vec5],
+    geom_friction: wp.array2d[wp.vec3],
+    geom_margin: wp.array2d[float],
+    geom_gap: wp.array2d[float],
+    geom_adhesion: wp.array2d[float],
+    pair_dim: wp.array[int],
+    pair_solref: wp.array2d[wp.vec2],
+    pair_solreffriction: wp.array2d[wp.vec2],
+    pair_solimp: wp.array2d[vec5],
+    pair_margin: wp.array2d[float],
+    pair_gap: wp.array2d[float],
+    pair_adhesion: wp.array2d[float],
+    pair_friction: wp.array2d[vec5],
+    geom_xpos: wp.array2d[wp.vec3],
+    geom_xmat: wp.array2d[wp.mat33],
+    naconmax: int,
+    contact_dist: wp.array[float],
+    contact_pos: wp.array[wp.vec3],
+    contact_frame: wp.array[wp.mat33],
+    contact_includemargin: wp.array[float],
+    contact_friction: wp.array[vec5],
+    contact_solref: wp.array[wp.vec2],
+    contact_solreffriction: wp.array[wp.vec2],
+    contact_solimp: wp.array[vec5],
+    contact_dim: wp.array[int],
+    contact_geom: wp.array[wp.vec2i],
+    contact_efc_address: wp.array2d[int],
+    contact_worldid: wp.array[int],
+    contact_type: wp.array[int],
+    contact_geomcollisionid: wp.array[int],
+    contact_adhesion: wp.array[float],
+    nacon: wp.array[int],
+):
+    """One thread a world and probe: finds up to MOST hits, then appends them to the contacts."""
+    world, probe = wp.tid()
+    geom = probe_geom[probe]
+    radius = probe_radius[probe]
+    geoms = wp.vec2i(terrain, geom)
+    margin, gap = contact_margin_gap(geom_margin, geom_gap, pair_margin, pair_gap, geoms, -1, world)
+    near = radius + margin + gap
+    position, turn = geom_xpos[world, geom], geom_xmat[world, geom]
+    a = position + turn * probe_start[probe]
+
+    hits = Hits()
+    if probe_long[probe]:
+        hits = between_ends(ground, a, position + turn * probe_end[probe], near)
+    else:
+        hits = around_point(ground, a, near)
+    if hits.count == 0:
+        return
+    condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
+        geom_condim,
+        geom_priority,
+        geom_solmix,
+        geom_solref,
+        geom_solimp,
+        geom_friction,
+        geom_adhesion,
+        pair_dim,
+        pair_solref,
+        pair_solreffriction,
+        pair_solimp,
+        pair_adhesion,
+        pair_friction,
+        geoms,
+        -1,
+        world,
+    )
+    for k in range(hits.count):
+        normal = wp.vec3(hits.normal[k, 0], hits.normal[k, 1], hits.normal[k, 2])
+        point = wp.vec3(hits.point[k, 0], hits.point[k, 1], hits.point[k, 2])
+        dist = hits.dist[k] - radius
+        write_contact(
+            naconmax,
+            k,
+            dist,
+            point - normal * (radius + 0.5 * dist),
+            make_frame(normal),
+            margin,
+            gap,
+            condim,
+            friction,
+            solref,
+            solreffriction,
+            solimp,
+            adhesion,
+            geoms,
+            wp.vec2i(-1, -1),
+            world,
+            contact_dist,
+            contact_pos,
+            contact_frame,
+            contact_includemargin,
+            contact_friction,
+            contact_solref,
+            contact_solreffriction,
+            contact_solimp,
+            contact_dim,
+            contact_geom,
+            contact_efc_address,
+            contact_worldid,
+            contact_type,
+            contact_geomcollisionid,
+            contact_adhesion,
+            nacon,
+        )
+
+
+class TerrainContact:
+    """Appends the contacts with a height map to mujoco-warp's, at the end of its collision stage."""
+
+    def __init__(
+        self, m: Any, d: Any, model: mujoco.MjModel, terrain: int, height_map: HeightMap, shapes: Iterable[int]
+    ) -> None:
+        """`m`, `d` are mujoco-warp's model and data; `terrain` is the static geom that stands for the map, `shapes` are
+        the geoms that meet it. Call with their device as Warp's current one.
+
+        Raises:
+            ConfigError: a colliding shape that is neither sphere, capsule nor box.
+        """
+        probes = list(probes_of(model, shapes))
+        largest = max(probe.radius for probe in probes) + float((model.geom_margin + model.geom_gap).max())
+        longest = max(float(np.linalg.norm(probe.end - probe.start)) for probe in probes)
+        self._inputs = [
+            ground_of(height_map, largest, longest),
+            terrain,
+            wp.array([probe.geom for probe in probes], dtype=int),
+            wp.array([probe.start for probe in probes], dtype=wp.vec3),
+            wp.array([probe.end for probe in probes], dtype=wp.vec3),
+            wp.array([probe.radius for probe in probes], dtype=float),
+            wp.array([probe.long for probe in probes], dtype=wp.bool),
+            *(getattr(m, name) for name in MODEL_FIELDS),
+            d.geom_xpos,
+            d.geom_xmat,
+            d.naconmax,
+        ]
+        self._outputs = [*(getattr(d.contact, name) for name in CONTACT_FIELDS), d.nacon]
+        self._dim = (d.nworld, len(probes))
+        m.callback.contactfilter = self._append
+
+    def _append(self, m: Any, d: Any) -> None:
+        wp.launch(touch_ground, dim=self._dim, inputs=self._inputs, outputs=self._outputs)

@@ -1,0 +1,1 @@
+"""Newton's solvers behind the interface."""

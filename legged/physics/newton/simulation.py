@@ -1,0 +1,110 @@
+"""One of Newton's solvers with all that a step of it needs: states, contacts, substeps."""
+
+import warnings
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+from newton.solvers import SolverBase, SolverMuJoCo, SolverSteel
+
+from legged.config.schema import SimConfig
+from legged.physics.collider.terrain_contact import TerrainContact
+from legged.physics.newton.model import build_newton_model, meets_cells
+from legged.physics.newton.solvers import SOLVERS
+from legged.physics.newton.springs import launch_spring_forces
+from legged.physics.scene.robot_scene import FLOOR
+from legged.physics.warp.exchange import LOST
+from legged.robots.robot import Robot
+from legged.terrain import Terrain
+
+
+class Simulation:
+    """N worlds, in Newton's own conventions. A step is Warp launches on fixed arrays only, so that a capture can hold it."""
+
+    def __init__(self, robot: Robot, sim: SimConfig, num_envs: int, terrain: Terrain | None, device: Any) -> None:
+        """Build the scene and its solver; `device` is Warp's, and must be its current one."""
+        self.setup = setup = SOLVERS[sim.solver]
+        self.model, self.layout = build_newton_model(robot, setup, sim, num_envs, terrain, device)
+        self.state, self._next = self.model.state(), self.model.state()
+        self.control = self.model.control()
+        capacity = sim.nconmax * num_envs
+        self._pipeline: newton.CollisionPipeline | None = None
+        if not setup.own_contacts:
+            self._pipeline = newton.CollisionPipeline(
+                self.model, broad_phase="explicit", rigid_contact_max=capacity, **setup.pipeline
+            )
+        with warnings.catch_warnings():
+            # Newton names MuJoCo 3.17; the contract is tested with the one that we use.
+            warnings.filterwarnings("ignore", "MuJoCo dependency version mismatch", newton.NewtonWarning)
+            self.solver = setup.make(self.model, sim)
+        if terrain is not None and meets_cells(setup, sim):
+            self._meet_cells(terrain)
+        if self._pipeline is None:
+            capacity = self.solver.get_max_contact_count()
+            self.contacts = newton.Contacts(capacity, 0, device=device)
+        else:
+            self.contacts = self._pipeline.contacts()
+        self.lost: wp.array | None = None
+        """(N,) or longer: the solver's flags of contacts or constraint rows that were dropped, if it has any."""
+        self.lost_bits = 1
+        """Those bits of `lost` that mean this."""
+        self._observables = self._request()
+        if self._observables is None or setup.springs is not None:
+            self.force = wp.zeros(capacity, dtype=wp.spatial_vector)
+        else:
+            self.force = self._observables.contact_f
+        """Force on the first shape of each contact in the last substep, world frame [N]."""
+
+    def _meet_cells(self, terrain: Terrain) -> None:
+        """Give Newton's MuJoCo solver the collider that mujoco_warp has, with vertical faces."""
+        solver = self.solver
+        assert isinstance(solver, SolverMuJoCo)
+        model = solver.mj_model
+        ground = self.model.shape_label.index(FLOOR)
+        (floor,) = np.flatnonzero(solver.mjc_geom_to_newton_shape.numpy()[0] == ground)
+        shapes = np.flatnonzero(model.geom_bodyid)
+        TerrainContact(solver.mjw_model, solver.mjw_data, model, int(floor), terrain.height_map, shapes)
+
+    def _request(self) -> SolverBase.Observables | None:
+        """What the solver is to report of a step beside the state."""
+        solver, kinds = self.solver, set()
+        if self.setup.springs is None:
+            kinds.add(solver.ObservableKind.CONTACT_F)
+        if isinstance(solver, SolverMuJoCo):
+            kinds.add(solver.ObservableKind.OVERFLOW)
+        observables = solver.observables(kinds, contacts=self.contacts) if kinds else None
+        if isinstance(solver, SolverMuJoCo) and observables is not None:
+            bits = solver.OverflowBits
+            self.lost, self.lost_bits = observables.overflow, int(LOST | bits.SOLVER_NCONMAX | bits.CONTACT_PIPELINE)
+        elif isinstance(solver, SolverSteel):
+            self.lost = solver.constraint_overflow
+        return observables
+
+    def step(self, dt: float) -> None:
+        """Advance `state` by dt [s] under `control`."""
+        setup, before, after = self.setup, self.state, self._next
+        extra = {} if self._observables is None else {"observables": self._observables}
+        for substep in range(setup.substeps):
+            before.clear_forces()
+            if self._pipeline is not None:
+                self._pipeline.collide(before, self.contacts)
+            if setup.springs is not None and substep == setup.substeps - 1:
+                launch_spring_forces(self.model, before, self.contacts, setup.springs, self.force)
+            self.solver.step(before, after, self.control, self.contacts, dt / setup.substeps, **extra)
+            before, after = after, before
+        if before is not self.state:  # whose addresses others know
+            self.state.assign(before)
+        if setup.maximal:
+            newton.eval_ik(self.model, self.state, self.state.joint_q, self.state.joint_qd)
+
+    def forget(self, mask: wp.array) -> None:
+        """Clear what the worlds of `mask` (N + 1,) would carry over a step; their state becomes the model's default."""
+        self.solver.reset(self.state, mask)
+        if self._pipeline is not None:
+            self._pipeline.reset_contact_matching(mask)
+
+    def place_bodies(self, mask: wp.array) -> None:
+        """Bodies of the worlds of `mask` (N + 1,) to where their joints say."""
+        worlds = mask[: self.model.world_count]
+        newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state, mask=worlds)

@@ -1,0 +1,1 @@
+"""Robot and ground as one MuJoCo model."""

@@ -1,0 +1,110 @@
+"""Robot, ground, sensors and solver options -> one MjModel that every MuJoCo back-end runs."""
+
+from typing import Literal
+
+import mujoco
+
+from legged.config.schema import SimConfig
+from legged.physics.scene.terrain_geoms import add_height_field, add_terrain
+from legged.robots.robot import Robot
+from legged.robots.robot_model import FLOOR
+from legged.terrain import Terrain
+
+UNTOUCHED = 1 << 30
+"""A collision type that nothing collides with, of a shape that is no mere decoration."""
+GroundShapes = Literal["exact", "height_field", "none"]
+
+
+ROBOT, GROUND = 1, 2
+"""Collision types: a bit each of MuJoCo's contype and conaffinity."""
+
+
+def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
+    """The robot alone. Whatever its file says, its shapes meet the ground, and each other only with `self_collisions`, except
+    those of neighbouring bodies; and contacts take the friction of the robot, which is what randomisation changes.
+    """
+    spec = mujoco.MjSpec.from_file(str(robot.model_path))
+    for geom in spec.geoms:
+        if geom.name in robot.contact_names:
+            geom.contype, geom.conaffinity = ROBOT, GROUND | ROBOT if self_collisions else GROUND
+            if geom.priority < 1:  # else MuJoCo takes the larger friction of the two shapes
+                geom.priority, geom.condim = 1, max(geom.condim, 3)
+    if not self_collisions:
+        for pair in list(spec.pairs):  # they touch whatever their types are
+            spec.delete(pair)
+    spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
+    return spec
+
+
+def robot_source(robot: Robot, self_collisions: bool) -> str:
+    """The robot as MJCF for an engine that reads it by itself: the file, or a text where `robot_spec` changes it."""
+    own = mujoco.MjSpec.from_file(str(robot.model_path))
+    before = {geom.name: _contact_settings(geom) for geom in own.geoms}
+    spec = robot_spec(robot, self_collisions)
+    if all(before[geom.name] == _contact_settings(geom) for geom in spec.geoms) and len(own.pairs) == len(spec.pairs):
+        return str(robot.model_path)
+    for folder in ("meshdir", "texturedir"):
+        setattr(spec, folder, str((robot.model_path.parent / getattr(spec, folder)).resolve()))
+    return str(spec.to_xml())
+
+
+def _contact_settings(geom: mujoco.MjsGeom) -> tuple[int, int, int, int]:
+    return geom.contype, geom.conaffinity, geom.priority, geom.condim
+
+
+def build_model(
+    robot: Robot,
+    sim: SimConfig,
+    terrain: Terrain | None = None,
+    ground: GroundShapes = "exact",
+    contact_sensors: bool = False,
+) -> mujoco.MjModel:
+    """The scene of one world, on a plane or on `terrain`.
+
+    A terrain is made of height fields and boxes that are exactly its height map (`exact`), of one height field whose
+    steps are ramps (`height_field`), or of a placeholder for a collider of our own (`none`).
+
+    The integrator is semi-implicit Euler: with torques from an explicit PD law it needs nothing better, and it is what
+    makes a step split exactly into torque and dynamics. With `contact_sensors`, every tracked shape gets a sensor
+    `contact_<shape>`, the net force that the shape exerts, world frame [N].
+    """
+    spec = robot_spec(robot, sim.self_collisions)
+    spec.compiler.discardvisual = True  # pictures have a model of their own
+    option = spec.option
+    option.timestep = sim.dt
+    option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    option.cone = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}[sim.cone]
+    option.impratio = sim.impratio
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.iterations = sim.iterations
+    option.ls_iterations = sim.ls_iterations
+    # Contacts with the ground need no condim above the robot's own 3; friction is the robot's (its shapes have priority).
+    if terrain is None or ground == "none":
+        touches = terrain is None
+        spec.worldbody.add_geom(
+            name=FLOOR,
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            size=[0, 0, 1],
+            contype=GROUND if touches else UNTOUCHED,
+            conaffinity=ROBOT if touches else 0,
+            group=0,
+        )
+    elif ground == "height_field":
+        add_height_field(spec, terrain.height_map)
+    else:
+        add_terrain(spec, terrain)
+    for name in robot.contact_names if contact_sensors else ():
+        spec.add_sensor(
+            name=f"contact_{name}",
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=mujoco.mjtObj.mjOBJ_GEOM,
+            objname=name,
+            intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1],  # data: force, reduce: netforce, num: 1
+        )
+    return spec.compile()
+
+
+def contact_sensor_columns(model: mujoco.MjModel, robot: Robot) -> tuple[int, int]:
+    """First and past-the-last column of the contact sensors in sensordata; they lie side by side, 3 a shape."""
+    start = int(model.sensor(f"contact_{robot.contact_names[0]}").adr[0])
+    return start, start + 3 * len(robot.contact_names)

@@ -1,0 +1,1 @@
+"""mujoco-warp behind the interface, and what all engines on Warp share."""

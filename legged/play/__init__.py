@@ -1,0 +1,1 @@
+"""A policy on show: its ground, its outing, films and the window."""

@@ -1,0 +1,106 @@
+"""The film of a play: frames from the camera, written as play.mp4 and play.gif."""
+
+import errno
+import subprocess
+import time
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+from PIL import Image
+
+from legged.envs import LeggedRobot
+from legged.errors import RunError
+from legged.process.paths import DISK_FULL, make_folder, relative, replacing
+from legged.rendering import Camera
+
+FPS = 25
+"""Frames a second; fewer where control steps are longer."""
+GIF_FPS = 8
+GIF_S = 12.0
+"""Length of a GIF; as many seconds of the film as a page can take [s]."""
+
+
+class Video:
+    """Collects pictures of a task's first robots while it is stepped; without a folder it does nothing."""
+
+    def __init__(self, task: LeggedRobot, count: int, folder: Path | None, gif: bool = False) -> None:
+        """Raises RunError where nothing can be rendered, or the folder can't be made."""
+        self.task, self.folder, self.gif = task, folder, gif
+        self.camera = Camera(task, count) if folder else None
+        if folder:
+            make_folder(folder)
+        self.every = max(1, round(1.0 / (FPS * task.dt)))
+        """Control steps from one frame to the next."""
+        self.fps = 1.0 / (self.every * task.dt)
+        """Frames a second of the film, which shows real time."""
+        self.frames: list[np.ndarray] = []
+        self._start = time.perf_counter()
+
+    def follow(self, robot: int) -> None:
+        """On terrain, the robot that is in the middle of the picture from now on."""
+        if self.camera:
+            self.camera.followed = robot
+
+    def due(self, step: int) -> bool:
+        """Whether a frame is to be taken after this control step."""
+        return self.camera is not None and step % self.every == 0
+
+    def take(self, robots: slice, *lines: str) -> None:
+        """A frame, with the velocities of `robots` and `lines` written on it."""
+        if self.camera:
+            self.frames.append(self.camera.picture([*velocities(self.task, robots), *lines]))
+
+    def write(self) -> None:
+        """Write play.mp4 and, if asked for, a smaller play.gif.
+
+        Raises:
+            RunError: one of them can't be written.
+        """
+        if not (self.camera and self.folder):
+            return
+        self.camera.close()
+        _write_mp4(self.frames, self.folder / "play.mp4", self.fps)
+        if self.gif:
+            _write_gif(self.frames, self.folder / "play.gif", self.fps)
+        print(f"recorded {len(self.frames)} frames in {time.perf_counter() - self._start:.1f} s")
+
+
+def velocities(task: LeggedRobot, robots: slice) -> list[str]:
+    """Commanded velocity of the first of `robots`, and the mean of their actual ones."""
+    wanted = task.commands[robots][0, :3].tolist()
+    actual = [*task.base_lin_vel[robots, :2].mean(dim=0).tolist(), float(task.base_ang_vel[robots, 2].mean())]
+    return [
+        f"{name}  {v[0]:+.2f}  {v[1]:+.2f} m/s  {v[2]:+.2f} rad/s" for name, v in (("commanded", wanted), ("actual", actual))
+    ]
+
+
+def _write_mp4(frames: list[np.ndarray], path: Path, fps: float) -> None:
+    try:
+        program = imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError as error:
+        raise RunError(f"{relative(path)}: videos need ffmpeg: pip install 'imageio[ffmpeg]' ({error})") from error
+    height, width, _ = frames[0].shape
+    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
+    wanted = ["-an", "-codec:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2"]
+    with replacing(path) as part:
+        command = [program, "-y", "-loglevel", "error", *given, *wanted, str(part)]
+        # It says with its exit code that a disk is full, which a pipe to it would not.
+        done = subprocess.run(command, input=np.stack(frames).tobytes(), capture_output=True, check=False)
+        if done.returncode:
+            said = done.stderr.decode("utf-8", errors="replace").strip().splitlines() or [f"exit code {done.returncode}"]
+            if any("No space left" in line or "quota" in line for line in said):
+                raise OSError(errno.ENOSPC, DISK_FULL)
+            raise RunError(f"{relative(path)}: ffmpeg could not write the video: {said[0]}")
+    print(f"video {relative(path)}")
+
+
+def _write_gif(frames: list[np.ndarray], path: Path, fps: float) -> None:
+    every = max(1, round(fps / GIF_FPS))
+    shown = frames[: max(1, round(GIF_S * fps)) : every]
+    pictures = [Image.fromarray(frame).resize((416, 234), Image.Resampling.LANCZOS) for frame in shown]
+    pictures = [picture.quantize(64, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE) for picture in pictures]
+    first, *rest = pictures
+    with replacing(path) as part:
+        first.save(part, save_all=True, append_images=rest, duration=round(1000 * every / fps), loop=0)
+    print(f"video {relative(path)}")

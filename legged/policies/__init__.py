@@ -1,0 +1,1 @@
+"""Trained policies: restored from checkpoints, exported, described."""

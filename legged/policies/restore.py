@@ -1,0 +1,111 @@
+"""Finding a trained policy and putting it back into its task."""
+
+import argparse
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from legged.commandline.arguments import overrides
+from legged.config import TaskConfig, override
+from legged.envs import LeggedRobot
+from legged.errors import ConfigError
+from legged.learning.checkpoint import check_fits, read_checkpoint
+from legged.learning.recurrent import Remembering
+from legged.learning.run_folder import find_checkpoint, find_run, run_config, shipped_policy
+from legged.learning.runner import Runner
+from legged.process.paths import relative
+from legged.registry import make_task, task_class, task_config
+from legged.terrain import Terrain
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """A checkpoint and the configuration it was trained with."""
+
+    cfg: TaskConfig
+    checkpoint: Path
+
+    @property
+    def folder(self) -> Path:
+        """The run folder, or the shipped policy's."""
+        return self.checkpoint.parent
+
+    def output(self, what: str) -> Path:
+        """Where files about it go by default: the run folder; logs/<what>/<task> for a policy that is shipped, whose folder
+        belongs to the package and may not be writable.
+        """
+        return Path("logs") / what / self.folder.name if self.folder.parent.name == "policies" else self.folder
+
+
+def find_policy(args: argparse.Namespace) -> TrainedPolicy:
+    """What --task, --load_run and --checkpoint name: the newest run of the task, else the policy that is shipped.
+
+    Raises:
+        ConfigError: there is none, or it is of another task.
+    """
+    flags = [(key, value) for key, value in overrides(args) if key == "train.runner.experiment_name"]
+    task = task_config(args.task, flags)
+    folder: Path | None = None
+    if args.load_run is None and args.checkpoint is None:
+        try:
+            folder = find_run(task, None)
+        except ConfigError:
+            folder = shipped_policy(args.task)
+            if folder is None:
+                raise
+    else:
+        folder = find_run(task, args.load_run)
+    cfg = run_config(folder)
+    if cfg.task != args.task:
+        raise ConfigError(f"--load_run: {relative(folder)} was trained on '{cfg.task}', not on '{args.task}'")
+    return TrainedPolicy(cfg, find_checkpoint(folder, args.checkpoint))
+
+
+def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:
+    """Overrides for measuring: no noise, no pushes, friction 1, nominal mass, no curriculum, episodes that don't end."""
+    return [
+        ("env.num_envs", num_envs),
+        ("env.episode_length_s", seconds + 10.0),
+        ("observations.add_noise", False),
+        ("domain_rand.randomize_friction", False),
+        ("domain_rand.randomize_base_mass", False),
+        ("domain_rand.push_robots", False),
+        ("commands.curriculum.enabled", False),
+    ]
+
+
+class RestoredRunner(Runner):
+    """A runner that trains no more, whose policy forgets the episodes that have ended."""
+
+    def get_inference_policy(self, device: str | None = None) -> Callable[[TensorDict], Tensor]:  # type: ignore[override]
+        """Observations -> actions (N, D), without noise; one call a step, if the policy is recurrent."""
+        policy = super().get_inference_policy(device)
+        return Remembering(policy, self.env) if policy.is_recurrent else policy
+
+
+def restore(
+    policy: TrainedPolicy,
+    changes: Iterable[tuple[str, Any]],
+    device: torch.device,
+    graph: bool = True,
+    terrain: Terrain | None = None,
+) -> tuple[LeggedRobot, Runner]:
+    """The task with some settings changed, on its own terrain or on the one given, and a runner that holds the policy;
+    nothing is written.
+
+    Raises:
+        ConfigError: the checkpoint does not fit the task.
+    """
+    few_robots_do = ("train.algorithm.num_mini_batches", 1)  # nothing is trained
+    cfg = override(policy.cfg, [*changes, few_robots_do])
+    task_class(cfg.task).check(cfg)
+    check_fits(policy.checkpoint, read_checkpoint(policy.checkpoint), cfg)
+    task = make_task(cfg, device, graph, terrain)
+    runner = RestoredRunner(task, None, str(device))
+    runner.load(str(policy.checkpoint))
+    return task, runner

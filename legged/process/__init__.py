@@ -1,0 +1,1 @@
+"""What a process is before any task: imports, display, paths, cores, ranks."""

@@ -1,0 +1,172 @@
+"""Where the files beside the code lie: in a clone at the top level, in an installed wheel inside the package; and how files
+are written: whole or not at all, after a look whether they can be.
+"""
+
+import errno
+import itertools
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from legged.errors import ConfigError, RunError
+
+DISK_FULL = "no space left on the disk"
+ABANDONED_S = 3600.0
+"""An unfinished file that nobody has written to for so long was left by a process that was killed [s]."""
+LONGEST_NAME = 255
+"""Of a file or folder, on the file systems there are [bytes]."""
+_REASONS = {errno.ENOSPC: DISK_FULL, errno.EDQUOT: f"{DISK_FULL} (the quota is used up)"}
+_COUNTER = itertools.count()
+
+
+def data_folder(name: str) -> Path:
+    """The folder `name` ('cfg' or 'resources') of this installation.
+
+    Raises:
+        FileNotFoundError: the installation lacks it.
+    """
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / name, package.parent / name):
+        if folder.is_dir():
+            return folder
+    raise FileNotFoundError(f"legged: the folder '{name}' is missing beside {package}; install the package again")
+
+
+def relative(path: Path) -> str:
+    """`path` as it is shortest to read: below the working directory if it lies there."""
+    try:
+        return str(path.resolve().relative_to(Path.cwd()))
+    except (OSError, ValueError):
+        return str(path)
+
+
+def exists(path: Path) -> bool:
+    """Whether there is a file or folder; there is none under a name that no system takes."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
+def reason(error: OSError) -> str:
+    """Say why an operation on a file failed, in a few words."""
+    return _REASONS.get(error.errno or 0) or error.strerror or str(error) or type(error).__name__
+
+
+def full_disk_in(error: BaseException) -> OSError | None:
+    """Find the error of a full disk behind `error`: a library may raise one of its own because of it."""
+    found: BaseException | None = error
+    while found is not None:
+        if isinstance(found, OSError) and found.errno in _REASONS:
+            return found
+        found = found.__cause__ or found.__context__
+    return None
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a file beside `path` to write to, with the same ending and a name of this process alone; it takes the place of
+    `path` if nothing fails, else it goes.
+
+    Raises:
+        RunError: it can't be written: the disk is full, read-only, or not this user's.
+    """
+    part = path.with_name(f".{path.stem}.{os.getpid()}-{next(_COUNTER)}{path.suffix}")
+    try:
+        _remove_abandoned(path)
+        yield part
+        part.replace(path)
+    except OSError as error:
+        raise RunError(f"{relative(path)}: {reason(error)}") from error
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def _remove_abandoned(path: Path) -> None:
+    """Remove unfinished files of the same name that killed processes have left."""
+    prefix = f".{path.stem}."
+    for other in path.parent.iterdir():
+        if not (other.name.startswith(prefix) and other.suffix == path.suffix):
+            continue
+        middle = other.name.removeprefix(prefix).removesuffix(path.suffix)
+        with suppress(OSError):
+            if middle.replace("-", "").isdecimal() and time.time() - other.stat().st_mtime > ABANDONED_S:
+                other.unlink()
+
+
+def write_bytes(path: Path, data: bytes | memoryview) -> None:
+    """Write a file that is whole or not there. Raises as `replacing`."""
+    with replacing(path) as part:
+        part.write_bytes(data)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file that is whole or not there, in UTF-8. Raises as `replacing`."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, and those above it, where they are missing.
+
+    Raises:
+        ConfigError: there is a file in its place, or its name can't be one of a folder.
+        RunError: it can't be made: the disk is full, read-only, or not this user's.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise not_made(folder, error) from error
+
+
+def not_made(folder: Path, error: OSError | ValueError) -> ConfigError | RunError:
+    """Name the folder that could not be made, and why: a wrong name is the user's mistake, a full disk is not."""
+    try:
+        blocking = next((str(p) for p in (folder, *folder.parents) if os.path.lexists(p) and not p.is_dir()), None)
+    except (OSError, ValueError):
+        blocking = None
+    if blocking is not None:
+        return ConfigError(f"{folder}: cannot make the folder: {blocking} is a file")
+    if isinstance(error, ValueError) or error.errno in (errno.ENAMETOOLONG, errno.EINVAL, errno.ELOOP):
+        return ConfigError(f"{folder}: cannot make the folder ({error})")
+    return RunError(f"{folder}: cannot make the folder: {reason(error)}")
+
+
+def ready_to_write(folder: Path, megabytes: float = 1.0) -> None:
+    """Check before long work that its results will find a place: that `folder` is there or can be made, that files can be
+    written to it, and that its disk has room for so many `megabytes`. Nothing is left behind.
+
+    Raises:
+        ConfigError: there is a file in its place, or its name can't be one of a folder.
+        RunError: it can't be written: the disk is full, read-only, or not this user's.
+    """
+    if any("\0" in part or len(os.fsencode(part)) > LONGEST_NAME for part in folder.parts):
+        raise not_made(folder, OSError(errno.ENAMETOOLONG, "no folder can have such a name"))
+    here = next(parent for parent in (folder, *folder.absolute().parents) if os.path.lexists(parent))
+    if not here.is_dir():
+        raise not_made(folder, NotADirectoryError(errno.ENOTDIR, "not a folder"))
+    try:
+        with tempfile.TemporaryFile(dir=here, buffering=0) as probe:
+            if shutil.disk_usage(here).free < megabytes * 2**20:
+                raise OSError(errno.ENOSPC, DISK_FULL)
+            probe.write(bytes(2**16))  # a quota says no only now
+    except OSError as error:
+        raise RunError(f"{relative(folder)}: cannot write there: {reason(error)}") from error
+
+
+def ready_to_write_file(flag: str, path: Path, megabytes: float = 1.0) -> None:
+    """Check as `ready_to_write` that the file `path`, which was asked for by `flag`, can be written.
+
+    Raises:
+        ConfigError: it is a folder, or can't lie where it should.
+        RunError: it can't be written there.
+    """
+    if "\0" in path.name or len(os.fsencode(path.name)) > LONGEST_NAME:
+        raise ConfigError(f"{flag}: no file can be called {path.name}")
+    if path.is_dir() or not path.name:
+        raise ConfigError(f"{flag}: {path} is a folder; the name of a file is wanted")
+    ready_to_write(path.parent, megabytes)

@@ -1,0 +1,91 @@
+"""Imported before anything heavy: imports are most of a start."""
+
+import atexit
+import gc
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+
+STARTED_S = time.perf_counter()
+"""When this package was first imported, on the clock of `time.perf_counter` [s]."""
+INTERRUPTED = 128 + signal.SIGINT
+"""Exit code of a command that Ctrl-C ended."""
+
+# A thread of torch's that waits for the others spins by default, which takes the core from the very thread that it waits for
+# as soon as something else runs on the machine: updates then take ten to a hundred times as long. It is asked once, by the
+# first import of torch.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+# rsl-rl imports GitPython, which complains at length where there is no git; this package asks git by itself.
+os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
+
+
+@contextmanager
+def importing() -> Iterator[None]:
+    """Imports without garbage collection: they make a million objects that stay, and looking through them time and again
+    takes a quarter of a start.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def is_a_command() -> None:
+    """This process is one of our commands: what it has imported is never garbage, nor is anything when it ends."""
+    gc.freeze()
+    atexit.register(gc.freeze)
+
+
+def command_of_ours() -> str | None:
+    """How this process was started, if as one of our commands: 'script' (train.py, play.py), 'module' (python -m legged...)
+    or 'installed' (legged-train, legged-play).
+    """
+    given = sys.orig_argv
+    if "-m" in given[:-1]:
+        name = given[given.index("-m") + 1]
+        return "module" if name == "legged" or name.startswith("legged.") else None
+    script = Path(sys.argv[0]) if sys.argv and sys.argv[0] else Path("-")
+    if script.stem in ("legged-train", "legged-play"):
+        return "installed"
+    top = Path(__file__).resolve().parents[2]
+    return "script" if script.name in ("train.py", "play.py") and script.resolve().parent == top else None
+
+
+def in_main_thread() -> bool:
+    """Whether this is the thread in which signal handlers can be set."""
+    return threading.current_thread() is threading.main_thread()
+
+
+def leave_at_once(_number: int, _frame: FrameType | None) -> None:
+    """End the process at Ctrl-C where there is nothing to save and Python would print a traceback: during imports, and when a
+    command has done its work.
+    """
+    with suppress(OSError):
+        os.write(2, b"interrupted\n")
+    os._exit(INTERRUPTED)
+
+
+def leave_at_interrupts() -> None:
+    """Let Ctrl-C end the process at once, without a traceback; a handler that somebody else has set stays."""
+    if in_main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, leave_at_once)
+
+
+def raise_at_interrupts() -> None:
+    """Undo `leave_at_interrupts`: Ctrl-C raises KeyboardInterrupt again, so that what was begun is cleaned up."""
+    if in_main_thread() and signal.getsignal(signal.SIGINT) is leave_at_once:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+if command_of_ours():
+    leave_at_interrupts()

@@ -1,1 +1,0 @@
-"""Training and playing: what rsl-rl does not do."""

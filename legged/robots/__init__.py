@@ -1,0 +1,1 @@
+"""Robots as data: a folder with robot.yaml and MJCF."""

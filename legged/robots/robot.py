@@ -1,0 +1,163 @@
+"""A robot folder (robot.yaml and MJCF) -> names, indices, limits and gains."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from legged.config.bounds import LARGEST, NAMES, between, positive
+from legged.config.checks import build, shown
+from legged.config.origins import Origins
+from legged.config.yaml_files import read_yaml
+from legged.errors import ConfigError, suggest
+from legged.process.paths import data_folder, exists
+from legged.robots.mirror import Mirror
+from legged.robots.robot_model import base_mass, check_model, hinges, read_model
+
+
+@dataclass(frozen=True)
+class RobotFile:
+    """The schema of robot.yaml."""
+
+    model: str
+    """MJCF file in the same folder."""
+    base: str
+    """Name of the floating body."""
+    spawn_height: float = field(metadata=positive(100, low=1e-3))
+    """Base height above the ground after a reset [m]."""
+    default_joint_angles: dict[str, float] = field(metadata=between(-100, 100))
+    """Joint-name pattern -> angle at action 0 [rad]."""
+    stiffness: dict[str, float] = field(metadata=between(0, LARGEST))
+    """Joint-name pattern -> P gain [N m/rad]."""
+    damping: dict[str, float] = field(metadata=between(0, LARGEST))
+    """Joint-name pattern -> D gain [N m s/rad]."""
+    velocity_limit: dict[str, float] = field(metadata=positive(LARGEST))
+    """Joint-name pattern -> largest joint speed [rad/s]."""
+    feet: tuple[str, ...] = field(metadata=NAMES)
+    """Patterns of the shapes that are feet."""
+    penalize_contacts_on: tuple[str, ...] = ()
+    """Patterns of the shapes whose contact the `collision` reward counts."""
+    terminate_after_contacts_on: tuple[str, ...] = ()
+    """Patterns of the shapes whose contact ends the episode."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """What the task needs to know of a robot. D joints in the order of the model, B collision shapes, F feet."""
+
+    name: str
+    folder: Path
+    file: RobotFile
+    joint_names: tuple[str, ...]
+    default_dof_pos: np.ndarray
+    """(D,) joint angles at action 0 [rad]."""
+    dof_pos_limits: np.ndarray
+    """(D, 2) lower and upper limit [rad]; infinite where the model has none."""
+    dof_vel_limits: np.ndarray
+    """(D,) [rad/s]."""
+    torque_limits: np.ndarray
+    """(D,) [N m]."""
+    contact_names: tuple[str, ...]
+    """Names of the B collision shapes, whose contact forces are tracked."""
+    feet_indices: tuple[int, ...]
+    penalised_indices: tuple[int, ...]
+    termination_indices: tuple[int, ...]
+    mass: float
+    """Total mass [kg]."""
+    base_mass: float
+    """Mass of the floating body [kg]."""
+    mirror: Mirror | None
+    """Which joints and feet are each other's left and right; None if the robot is not symmetric."""
+
+    @property
+    def num_dof(self) -> int:
+        return len(self.joint_names)
+
+    @property
+    def feet_names(self) -> tuple[str, ...]:
+        return tuple(self.contact_names[i] for i in self.feet_indices)
+
+    @property
+    def model_path(self) -> Path:
+        return self.folder / self.file.model
+
+    def gains(self, table: Mapping[str, float], where: str) -> np.ndarray:
+        """(D,) values of a pattern table; ConfigError for a pattern without joint or a joint without pattern."""
+        return match_values(table, self.joint_names, where)
+
+
+def load_robot(name: str, where: str = "robot") -> Robot:
+    """The robot of that name under resources/robots/, or in the folder `name`; `where` says who asks for it.
+
+    Raises:
+        ConfigError: no such robot, or robot.yaml and model do not fit together.
+    """
+    folder = _folder(name, where)
+    path = folder / "robot.yaml"
+    data = read_yaml(path)
+    missing = [k for k in ("model", "base", "spawn_height", "default_joint_angles", "feet") if k not in data]
+    missing += [k for k in ("stiffness", "damping", "velocity_limit") if k not in data]
+    if missing:
+        raise ConfigError(f"{path}: missing: {', '.join(missing)}")
+    file = build(RobotFile, data, "", Origins(), str(path))
+    model = read_model(folder, file.model, str(path))
+    check_model(model, file.base, str(path))
+    joints = [model.joint(i) for i in hinges(model)]
+    names = tuple(joint.name for joint in joints)
+    shapes = tuple(model.geom(i).name for i in range(model.ngeom) if model.geom_contype[i] or model.geom_conaffinity[i])
+    feet = match_names(file.feet, shapes, f"{path}: feet")
+    return Robot(
+        name=folder.name,
+        folder=folder,
+        file=file,
+        joint_names=names,
+        default_dof_pos=match_values(file.default_joint_angles, names, f"{path}: default_joint_angles"),
+        dof_pos_limits=np.array([j.range if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in joints], dtype=float),
+        dof_vel_limits=match_values(file.velocity_limit, names, f"{path}: velocity_limit"),
+        torque_limits=model.actuator_forcerange[:, 1].copy(),
+        contact_names=shapes,
+        feet_indices=feet,
+        penalised_indices=match_names(file.penalize_contacts_on, shapes, f"{path}: penalize_contacts_on"),
+        termination_indices=match_names(file.terminate_after_contacts_on, shapes, f"{path}: terminate_after_contacts_on"),
+        mass=float(model.body_mass.sum()),
+        base_mass=base_mass(model, file.base),
+        mirror=Mirror.of(model, [joint.id for joint in joints], [shapes[i] for i in feet]),
+    )
+
+
+def _folder(name: str, where: str) -> Path:
+    robots = data_folder("resources") / "robots"
+    known = suggest(name, [p.parent.name for p in robots.glob("*/robot.yaml")])
+    if not name:
+        raise ConfigError(f"{where}: no robot is named{known}")
+    for folder in (robots / name, Path(name)):
+        if exists(folder / "robot.yaml"):
+            return folder.resolve()
+    raise ConfigError(f"{where}: there is no robot {shown(name)}{known}")
+
+
+def match_names(patterns: Sequence[str], names: Sequence[str], where: str) -> tuple[int, ...]:
+    """Indices of the names that contain any of the patterns, in the order of `names`."""
+    for pattern in patterns:
+        if not pattern:
+            raise ConfigError(f"{where}: an empty pattern would match everything{suggest(pattern, names, 'names')}")
+        if not any(pattern in name for name in names):
+            raise ConfigError(f"{where}: pattern '{pattern}' matches nothing{suggest(pattern, names, 'names')}")
+    return tuple(i for i, name in enumerate(names) if any(pattern in name for pattern in patterns))
+
+
+def match_values(table: Mapping[str, float], names: Sequence[str], where: str) -> np.ndarray:
+    """(len(names),) the value of the longest pattern that each name contains.
+
+    Raises:
+        ConfigError: a pattern that no name contains, or a name without pattern.
+    """
+    match_names(tuple(table), names, where)
+    values = np.zeros(len(names))
+    for i, name in enumerate(names):
+        matching = [pattern for pattern in table if pattern in name]
+        if not matching:
+            raise ConfigError(f"{where}: no pattern matches joint '{name}' (patterns: {', '.join(table) or 'none'})")
+        values[i] = table[max(matching, key=len)]
+    return values

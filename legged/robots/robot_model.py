@@ -1,0 +1,162 @@
+"""A robot's MJCF: read, and held against what the back-ends rely on."""
+
+import contextlib
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from legged.errors import ConfigError, suggest
+from legged.process.paths import exists
+
+FLOOR = "floor"
+"""Name of the ground's geom, where it is a plane or stands for a height map; no geom of a robot may have it."""
+TAKEN = {"geom": r"floor|terrain_\d+", "sensor": "contact_.*"}
+"""Kind of element -> names that the scene gives to its own."""
+LARGEST_NUMBER = 1e12
+"""Largest number of a model: beyond it float32, in which GPUs compute, overflows."""
+NUMBERS = ("qpos0", "qpos_spring", "body_", "jnt_", "dof_", "geom_", "site_", "actuator_", "mesh_", "eq_", "tendon_")
+"""How the names of a model's arrays of numbers begin."""
+
+
+def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
+    """The model in `file` in `folder`; `where` says who names it.
+
+    Raises:
+        ConfigError: there is no such file, MuJoCo refuses it, or it holds numbers that are not finite.
+    """
+    path = folder / file
+    if not exists(path) or not path.is_file():
+        raise ConfigError(f"{where}: model: there is no file '{file}' in {folder}")
+    at = f"{where}: model: {path}"
+    warnings: list[str] = []
+    try:
+        with _warnings_to(warnings):
+            model = mujoco.MjModel.from_xml_path(str(path))
+    except Exception as error:  # its errors have no class of their own
+        raise ConfigError(f"{at}: MuJoCo refuses it: {' '.join(str(error).split())}") from error
+    if warnings:
+        raise ConfigError(f"{at}: MuJoCo warns: {' '.join(warnings[0].split())}")
+    for owner in (model, model.opt):
+        for name in dir(owner):
+            if owner is model and not name.startswith(NUMBERS):
+                continue
+            values = getattr(owner, name)
+            numeric = isinstance(values, float) or (isinstance(values, np.ndarray) and values.dtype.kind == "f")
+            if numeric and not (np.abs(values) <= LARGEST_NUMBER).all():
+                raise ConfigError(f"{at}: numbers must be finite and below {LARGEST_NUMBER:g} ({name}, once compiled)")
+    for flag in ("CONTACT", "CONSTRAINT", "ACTUATION"):
+        if model.opt.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"):
+            raise ConfigError(f"{at}: option flag: {flag.lower()} is disabled; without it the robot could not walk")
+    return model
+
+
+@contextlib.contextmanager
+def _warnings_to(warnings: list[str]) -> Iterator[None]:
+    """Collect MuJoCo's warnings, which it would print, and write to a file in the working directory."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(warnings.append)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def check_model(model: mujoco.MjModel, base: str, where: str) -> None:
+    """What the back-ends rely on: one free base, then the hinges; one motor a hinge, in the same order; named shapes.
+
+    Raises:
+        ConfigError: `where` and what is not so.
+    """
+    _check_tree(model, base, where)
+    _check_motors(model, where)
+    for i in range(model.ngeom):
+        if not (model.geom_contype[i] or model.geom_conaffinity[i]):
+            continue
+        name, body = model.geom(i).name, model.body(model.geom_bodyid[i])
+        if body.weldid[0] == 0:
+            alone = "the model is the robot alone, the task brings the ground"
+            raise ConfigError(f"{where}: model: geom '{name}' is fixed to the world; {alone}")
+        if not name:
+            raise ConfigError(f"{where}: model: every collision geom needs a name; one of body '{body.name}' has none")
+    for kind, count in (("geom", model.ngeom), ("sensor", model.nsensor)):
+        for name in (getattr(model, kind)(i).name for i in range(count)):
+            if re.fullmatch(TAKEN[kind], name):
+                raise ConfigError(f"{where}: model: {kind} '{name}': the scene has one of that name; choose another")
+    if base_mass(model, base) <= 0.0:
+        raise ConfigError(f"{where}: base: body '{base}' has no mass")
+
+
+def base_mass(model: mujoco.MjModel, base: str) -> float:
+    """Mass of the floating body [kg]."""
+    return float(model.body(base).mass[0])
+
+
+def hinges(model: mujoco.MjModel) -> list[int]:
+    """Ids of the hinge joints."""
+    return [i for i in range(model.njnt) if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE]
+
+
+def _check_tree(model: mujoco.MjModel, base: str, where: str) -> None:
+    bodies = [model.body(i).name for i in range(model.nbody)]
+    if base not in bodies:
+        raise ConfigError(f"{where}: base: the model has no body '{base}'{suggest(base, bodies)}")
+    joints = hinges(model)
+    if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE or model.njnt != len(joints) + 1:
+        raise ConfigError(f"{where}: model: needs one free joint, on the base, followed by hinges only")
+    if not joints:
+        raise ConfigError(f"{where}: model: has no hinge, so nothing could move the robot")
+    if model.jnt_bodyid[0] != bodies.index(base):
+        raise ConfigError(f"{where}: base: the free joint is on '{bodies[model.jnt_bodyid[0]]}', not on '{base}'")
+    for i in joints:
+        if not model.joint(i).name:
+            raise ConfigError(f"{where}: model: every hinge needs a name; one of '{bodies[model.jnt_bodyid[i]]}' has none")
+
+
+def _check_motors(model: mujoco.MjModel, where: str) -> None:
+    """The task computes torques of the joints, so actuators must pass them on as they are."""
+    names = tuple(model.joint(i).name for i in hinges(model))
+    on_joints = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    driven = tuple(model.joint(model.actuator_trnid[i, 0]).name if on_joints[i] else "no joint" for i in range(model.nu))
+    if driven != names:
+        raise ConfigError(f"{where}: model: needs one motor per hinge in the same order; hinges {names}, motors {driven}")
+    for i, joint in enumerate(names):
+        problem = _why_no_torque_motor(model, i) or _why_no_torque_limit(model, i)
+        if problem:
+            raise ConfigError(f"{where}: model: the actuator of '{joint}' {problem}")
+
+
+def _why_no_torque_motor(model: mujoco.MjModel, i: int) -> str:
+    """Why an actuator does not pass on a torque as it is; '' if it does."""
+    gain, bias, dynamics = model.actuator_gaintype[i], model.actuator_biastype[i], model.actuator_dyntype[i]
+    if (
+        gain != mujoco.mjtGain.mjGAIN_FIXED
+        or model.actuator_gainprm[i, 0] != 1.0
+        or bias != mujoco.mjtBias.mjBIAS_NONE
+        or dynamics != mujoco.mjtDyn.mjDYN_NONE
+    ):
+        return "is no torque motor: the task computes torques and needs <motor>, not <position>, <velocity> or the like"
+    if _first(model.actuator_gear[i]) != 1.0:
+        return f"has a gear of {model.actuator_gear[i, 0]:g}; torques are those of the joints, so it must be 1"
+    return ""
+
+
+def _first(values: Sequence[float]) -> float:
+    """The first of some numbers, if the others are 0; else NaN."""
+    return float(values[0]) if not np.any(values[1:]) else float("nan")
+
+
+def _why_no_torque_limit(model: mujoco.MjModel, i: int) -> str:
+    """Why an actuator's range of forces is no torque limit; '' if it is one."""
+    low, high = model.actuator_forcerange[i]
+    if not model.actuator_forcelimited[i]:
+        return "has no limit: every motor needs a forcerange (the torque limit)"
+    if not (0.0 < high < 1e6) or low != -high:
+        return f"has forcerange [{low:g}, {high:g}]: the torque limit must be above 0, finite, and the same both ways"
+    if model.actuator_ctrllimited[i] and (model.actuator_ctrlrange[i] != (low, high)).any():
+        lowest, highest = model.actuator_ctrlrange[i]
+        if lowest > low or highest < high:
+            return f"has ctrlrange [{lowest:g}, {highest:g}], which cuts off its forcerange [{low:g}, {high:g}]"
+    return ""

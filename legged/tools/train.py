@@ -1,0 +1,207 @@
+"""Train a policy: `python train.py --task anymal_c_flat`."""
+
+import argparse
+import contextlib
+import os
+import shlex
+import signal
+import sys
+import time
+from pathlib import Path
+
+import torch
+
+from legged.commandline.arguments import (
+    add_run_arguments,
+    add_task_arguments,
+    import_and_check,
+    overrides,
+    pick_device,
+    settle_on,
+)
+from legged.commandline.command import EXIT_FAILED, run_main
+from legged.commandline.output import when_output_is_lost
+from legged.commandline.stopping import quiet_writers, stopping_on_signals
+from legged.config import TaskConfig, to_yaml
+from legged.errors import ConfigError, RunError
+from legged.learning.captured import CapturedRunner
+from legged.learning.display import Display
+from legged.learning.distributed import RankLost, check_reachable
+from legged.learning.resume import resumed
+from legged.learning.run_folder import create_run, discard_run, experiment_folder, find_run
+from legged.learning.runner import Runner
+from legged.physics import engine_name, resolve_physics
+from legged.process.cores import available_cores
+from legged.process.paths import full_disk_in, ready_to_write, reason, relative
+from legged.process.ranks import Ranks
+from legged.process.startup import STARTED_S, command_of_ours
+from legged.registry import make_task, task_config
+
+ROOM_MB = 16.0
+"""What the disk must have room for before a training begins: its first checkpoints [MiB]."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The command; returns its exit code."""
+    return run_main(_main, argv)
+
+
+def _main(argv: list[str] | None) -> int:
+    start = STARTED_S if argv is None else time.perf_counter()  # as a command, imports are part of it
+    parser = argparse.ArgumentParser(prog="train.py", description="Train a legged robot.")
+    add_task_arguments(parser)
+    add_run_arguments(parser)
+    parser.add_argument("--resume", action="store_true", help="go on from a checkpoint, in a new run folder")
+    parser.add_argument("--run_name", help="appended to the run folder's name")
+    parser.add_argument("--max_iterations", type=int, help="length of the whole training")
+    parser.add_argument("--rl_device", help="device of the networks; that of the simulation by default")
+    parser.add_argument("--runner", choices=["stock", "captured"], help="training loop (train.runner.loop)")
+    parser.add_argument("--headless", action="store_true", help="accepted for legged_gym's sake: training draws nothing")
+    parser.add_argument("--show", action="store_true", help="print the full configuration and stop")
+    args = parser.parse_intermixed_args(argv)
+
+    import_and_check(args)
+    device = pick_device(args.sim_device)
+    rl_device = pick_device(args.rl_device, "--rl_device") if args.rl_device else device
+    checkpoint: Path | None = None
+    changed: list[str] = []
+    if args.resume or args.load_run or args.checkpoint is not None:
+        cfg, checkpoint, changed = resumed(args)
+    else:
+        cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
+    resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics"))
+    if args.show:
+        print(to_yaml(cfg), end="")
+        return 0
+    if checkpoint:
+        print(f"going on with the settings of {relative(checkpoint.parent)}" + "".join(f"; {text}" for text in changed))
+    settle_on(device)
+    if Ranks.now().first:
+        return _train(args, cfg, device, rl_device, checkpoint, start)
+    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        return _train(args, cfg, device, rl_device, checkpoint, start)
+
+
+def _train(
+    args: argparse.Namespace,
+    cfg: TaskConfig,
+    device: torch.device,
+    rl_device: torch.device,
+    checkpoint: Path | None,
+    start: float,
+) -> int:
+    """Build and train; returns the exit code. Of several processes the first one has a run folder and a display."""
+    first = Ranks.now().first
+    check_reachable(Ranks.now())
+    if first:
+        ready_to_write(experiment_folder(cfg), ROOM_MB)
+        print(describe(cfg, device), flush=True)
+    task = make_task(cfg, device, graph=not args.no_graph)
+    with Display(cfg.task) if first else contextlib.nullcontext() as display:
+        kind = CapturedRunner if cfg.train.runner.loop == "captured" else Runner
+        runner = kind(task, None, str(rl_device), display)
+        if checkpoint:
+            why_anew = runner.resume(str(checkpoint))
+            how = f"all robots begin anew: {why_anew}" if why_anew else "robots and random numbers go on where they were"
+            print(f"resumed {relative(checkpoint)} after iteration {runner.current_learning_iteration}; {how}", flush=True)
+        ready = time.perf_counter()
+        with stopping_on_signals(runner.stop) as stopped_by, quiet_writers():
+            try:
+                folder, finished = _learn(runner, cfg, display)
+            except RankLost as lost:
+                print(lost, file=sys.stderr, flush=True)
+                return EXIT_FAILED
+            except KeyboardInterrupt:
+                if not stopped_by:
+                    raise
+                print("interrupted", file=sys.stderr, flush=True)
+                return 128 + stopped_by[-1]
+    if folder:
+        _summary(runner, folder, ready - start, finished, play_command(args, cfg, folder))
+    if finished:
+        return 0
+    # Without a signal of its own it is the output that went away, or another process that was asked to stop.
+    return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
+
+
+def _learn(runner: Runner, cfg: TaskConfig, display: Display | None) -> tuple[Path | None, bool]:
+    """Train into a new run folder; gives the folder, none where another process has it, and whether training got to its end.
+    A training that fails before its first checkpoint leaves no folder.
+
+    Raises:
+        RunError: the folder can't be written.
+    """
+    folder = create_run(cfg) if display else None
+    if folder is None or display is None:
+        return None, runner.train(cfg.train.runner.max_iterations)
+    print(f"run folder {relative(folder)}", flush=True)
+    display.title = f"{cfg.task}: {relative(folder)}"
+    runner.logger.log_dir = str(folder)
+    when_output_is_lost(runner.stop)
+    try:
+        return folder, runner.train(cfg.train.runner.max_iterations)
+    except BaseException as error:
+        if runner.logger.writer is not None:
+            with contextlib.suppress(OSError):
+                runner.logger.stop_logging_writer()
+        discard_run(folder)
+        full = full_disk_in(error)
+        if full is not None and not isinstance(error, RunError):  # TensorBoard's writer does not say which file
+            raise RunError(f"{relative(folder)}: {reason(full)}") from error
+        raise
+
+
+def describe(cfg: TaskConfig, device: torch.device) -> str:
+    """One line on what is about to run where."""
+    if device.type == "cpu":
+        engines = {
+            "mujoco_warp": "mujoco-warp on the CPU",
+            "mujoco": f"C MuJoCo on {cfg.sim.threads or available_cores()} cores",
+        }
+        engine = engines.get(engine_name(cfg.sim, device), f"Newton's {cfg.sim.solver} solver on the CPU")
+        where = f"no GPU in use: {engine}, settings of the task's cpu section"
+    else:
+        where = torch.cuda.get_device_name(device)
+    ranks = Ranks.now()
+    share = f" on each of {ranks.count} processes" if ranks.several else ""
+    robots = f"{cfg.env.num_envs} robots{share}"
+    return f"{cfg.task}: {robots}, {cfg.train.runner.max_iterations} iterations, {where}"
+
+
+def play_command(args: argparse.Namespace, cfg: TaskConfig, folder: Path) -> str:
+    """The command that shows the policy of a run, as it can be pasted into the shell that this training was started from."""
+    words = [*play_program(), "--task", args.given_task]
+    if args.module:
+        words += ["--import", args.module]
+    if cfg.train.runner.experiment_name:
+        words += ["--experiment_name", cfg.train.runner.experiment_name]
+    with contextlib.suppress(ConfigError, OSError):
+        if find_run(cfg, None) != folder:  # another training of this task goes on beside it
+            words += ["--load_run", folder.name]
+    return shlex.join(words)
+
+
+def play_program() -> list[str]:
+    """How play is started by somebody who started this process as he did."""
+    how = command_of_ours()
+    if how == "installed":
+        return ["legged-play"]
+    if how == "module":
+        return ["python", "-m", "legged.tools.play"]
+    return ["python", str(Path(sys.argv[0]).with_name("play.py")) if how == "script" else "play.py"]
+
+
+def _summary(runner: Runner, folder: Path, start_up_s: float, finished: bool, play: str) -> None:
+    steps = runner.logger.tot_timesteps
+    loop = runner.logger.loop_s
+    print(
+        f"{'finished' if finished else 'stopped'} after {runner.current_learning_iteration + 1} iterations: "
+        f"{steps:,} steps in {loop:.1f} s of training loop ({steps / max(loop, 1e-9):,.0f} steps/s), "
+        f"{start_up_s:.1f} s of start-up, imports and kernel compilation included\n"
+        f"checkpoint in {relative(folder)}; see it walk: {play}",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

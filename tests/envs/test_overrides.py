@@ -1,0 +1,227 @@
+"""A method that nothing would call is an error which says what takes its place."""
+
+import functools
+
+import pytest
+from helpers import call, small_config
+
+from legged.envs import LeggedRobot
+from legged.envs.overrides import HOOKS
+from legged.errors import ConfigError
+from legged.tools import train
+
+pytestmark = pytest.mark.usefixtures("workplace")
+
+LEGGED_GYM = [
+    "_parse_cfg",
+    "_init_buffers",
+    "_prepare_reward_function",
+    "post_physics_step",
+    "_post_physics_step_callback",
+    "compute_observations",
+    "_get_noise_scale_vec",
+    "_resample_commands",
+    "_compute_torques",
+    "_reset_dofs",
+    "_reset_root_states",
+    "_push_robots",
+    "_update_terrain_curriculum",
+    "update_command_curriculum",
+    "_get_heights",
+    "_process_rigid_shape_props",
+    "_process_dof_props",
+    "_process_rigid_body_props",
+    "_create_envs",
+    "_draw_debug_vis",
+    "create_sim",
+    "render",
+    "set_camera",
+    "get_privileged_observations",
+    "_init_height_points",
+    "_create_ground_plane",
+    "_create_heightfield",
+    "_create_trimesh",
+    "_get_env_origins",
+]
+ISAAC_LAB = [
+    "_setup_scene",
+    "_pre_physics_step",
+    "_apply_action",
+    "_get_observations",
+    "_get_rewards",
+    "_get_dones",
+    "_reset_idx",
+]
+
+
+def subclass(name: str = "Mine", bases=(LeggedRobot,), **members) -> type[LeggedRobot]:
+    return type(name, bases, members)
+
+
+def hook(self, *args) -> None:
+    """Something of a fork."""
+
+
+@pytest.mark.parametrize("name", [*LEGGED_GYM, *ISAAC_LAB])
+def test_a_hook_that_nobody_calls_is_refused_by_class_file_and_line(name):
+    line = hook.__code__.co_firstlineno
+    with pytest.raises(ConfigError) as error:
+        subclass(**{name: hook}).check(small_config())
+    text = str(error.value)
+    assert text.splitlines() == [text]
+    assert f"test_overrides.py:{line}: Mine.{name} would never be called: {HOOKS[name]}" in text
+    assert f"OWN_HELPERS = ('{name}',)" in text
+
+
+def test_no_hook_of_the_table_is_one_of_this_package():
+    """Whoever makes one of these names mean something takes it out of the table."""
+    assert [name for name in HOOKS if hasattr(LeggedRobot, name)] == []
+
+
+def test_what_the_table_names_is_there():
+    """The methods, settings and files that take the place of a hook."""
+    text = " ".join(HOOKS.values())
+    for method in ("_step", "check_termination", "compute_reward", "reset_idx", "make_terrain"):
+        assert method in text
+        assert callable(getattr(LeggedRobot, method))
+    cfg = small_config()
+    for path in (
+        "init_state.dof_pos_factor",
+        "init_state.yaw",
+        "init_state.base_velocity",
+        "control.control_type",
+        "rewards.scales",
+        "observations.actor",
+        "observations.critic",
+        "observations.noise",
+        "observations.add_noise",
+        "commands.ranges",
+        "commands.resampling_time_s",
+        "commands.curriculum",
+        "domain_rand.push_robots",
+        "domain_rand.randomize_friction",
+        "domain_rand.randomize_base_mass",
+        "terrain.curriculum",
+        "terrain.measured_points_x",
+        "terrain.spawn_range",
+    ):
+        assert path in text
+        functools.reduce(getattr, path.split("."), cfg)
+
+
+def test_hooks_of_a_class_between_and_of_a_mixin_are_found():
+    between = subclass("Between", compute_observations=hook)
+    with pytest.raises(ConfigError, match=r"Between\.compute_observations"):
+        subclass("Last", (between,)).check(small_config())
+    mixin = type("Mixin", (), {"_init_buffers": hook})
+    with pytest.raises(ConfigError, match=r"Mixin\._init_buffers"):
+        subclass("Last", (mixin, LeggedRobot)).check(small_config())
+
+
+@pytest.mark.parametrize("kind", [property, staticmethod, classmethod, lambda function: 3], ids=str)
+def test_a_hook_of_another_kind_is_found_too(kind):
+    with pytest.raises(ConfigError, match=r"^\S+: Mine\._get_heights would never be called"):
+        subclass(_get_heights=kind(hook)).check(small_config())
+
+
+@pytest.mark.parametrize("own", [("_get_heights",), ["_get_heights"], "_get_heights"])
+def test_a_helper_of_that_name_which_the_class_calls_itself_is_allowed(own):
+    class Mine(LeggedRobot):
+        OWN_HELPERS = own
+
+        def _get_heights(self):
+            return self.measured_heights
+
+        def _reward_lin_vel_z(self):
+            return self._get_heights().mean(dim=1)
+
+    Mine(small_config())
+    with pytest.raises(ConfigError, match="_push_robots"):
+        subclass("Last", (Mine,), _push_robots=hook).check(small_config())
+
+
+def test_methods_that_are_called_here_and_those_of_another_name_are_allowed():
+    class Mine(LeggedRobot):
+        def check_termination(self):
+            super().check_termination()
+
+        def compute_reward(self):
+            super().compute_reward()
+
+        def reset_idx(self, mask):
+            super().reset_idx(mask)
+
+        def _step(self):
+            super()._step()
+
+        def my_helper(self):
+            return 1
+
+        def _reward_unused(self):
+            return self.rew_buf
+
+    Mine.check(small_config())
+
+
+# ---- terms ---------------------------------------------------------------------------------------------------------------
+
+
+def with_term(member: object, prefix: str = "_reward_") -> None:
+    cfg = small_config()
+    if prefix == "_reward_":
+        cfg.rewards.scales["mine"] = 1.0
+    else:
+        object.__setattr__(cfg.observations, "actor", (*cfg.observations.actor, "mine"))
+    mirrored = {**LeggedRobot.MIRRORED, "mine": "same"}
+    subclass(**{f"{prefix}mine": member}, MIRRORED=mirrored).check(cfg)
+
+
+@pytest.mark.parametrize(
+    ("member", "text"),
+    [
+        (3.0, "is no method but a float"),
+        ("text", "is no method but a str"),
+        (property(lambda self: self.rew_buf), "is no method but a property"),
+        (lambda self, env_ids: None, r"takes arguments \(env_ids\)"),
+        (lambda self, scale, *, power: None, r"takes arguments \(scale, power\)"),
+        (staticmethod(lambda task: None), r"takes arguments \(task\)"),
+        (lambda: None, "takes no self"),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize(("prefix", "path"), [("_reward_", r"rewards\.scales\.mine"), ("_obs_", r"observations\.actor")])
+def test_a_term_that_cannot_be_called_is_refused(member, text, prefix, path):
+    with pytest.raises(ConfigError, match=rf"{path}: Mine\.{prefix}mine {text}"):
+        with_term(member, prefix)
+
+
+@pytest.mark.parametrize(
+    "member",
+    [
+        lambda self: None,
+        lambda self, power=2: None,
+        lambda self, *args, **kwargs: None,
+        staticmethod(lambda: None),
+        classmethod(lambda cls: None),
+    ],
+    ids=str,
+)
+def test_a_term_that_can_be_called_is_allowed(member):
+    with_term(member)
+    with_term(member, "_obs_")
+
+
+def test_a_command_ends_with_one_line(tmp_path, capsys):
+    (tmp_path / "mine.py").write_text(
+        "from legged import LeggedRobot, register\n\n\n"
+        "class Fork(LeggedRobot):\n"
+        "    def compute_observations(self):\n"
+        "        self.obs_buf = None\n\n\n"
+        "register('forked', {'extends': 'anymal_c_flat'}, Fork)\n"
+    )
+    flags = ["--import", "mine.py", "--task", "forked", "--sim_device", "cpu"]
+    assert call(train.main, flags) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: mine.py:5: Fork.compute_observations would never be called: write a method _obs_<name>")
+    assert error.count("\n") == 1
+    assert not (tmp_path / "logs").exists()

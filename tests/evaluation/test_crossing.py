@@ -1,0 +1,79 @@
+"""One policy in every engine: the command, its table and its files."""
+
+import json
+from typing import get_args
+
+import pytest
+from helpers import TASK, call, kept_global_state, tiny_run
+from rich.console import Console
+
+from legged.config.schema import NewtonSolver
+from legged.evaluation import crossing
+from legged.tools import evaluate
+
+GRID = ["--vx=0:0.5:0.5", "--vy=0", "--yaw=0", "--robots", "1"]
+ENGINES = ["mujoco_warp", "mujoco", *(f"newton_{name}" for name in get_args(NewtonSolver))]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The folder of one short run, trained in one of Newton's solvers."""
+    folder = tmp_path_factory.mktemp("crossing")
+    with pytest.MonkeyPatch.context() as patch, kept_global_state():
+        patch.chdir(folder)
+        path = tiny_run("--physics", "newton", "--solver", "steel", num_envs=4, iterations=1)
+        assert "solver: steel" in (path / "config.yaml").read_text()
+        yield folder / path
+
+
+@pytest.fixture(autouse=True)
+def beside(run, monkeypatch):
+    monkeypatch.chdir(run.parents[2])
+
+
+def result(engine: str, **changes: float | None) -> dict:
+    """An engine's figures."""
+    same = {"rmse_lin": 0.1, "rmse_ang": 0.2, "falls": 0.0, "cost_of_transport": 0.5, "base_height": 0.5}
+    return {"physics": engine, "device": "cpu", "contact_overflows": 0, "steps_per_s": 1234.5, **same, **changes}
+
+
+def test_all_engines_there_are_take_part():
+    names = [dict(choice) for choice in crossing.ENGINES]
+    assert [f"newton_{name['sim.solver']}" if "sim.solver" in name else name["sim.physics"] for name in names] == ENGINES
+
+
+def test_the_command_measures_each_engine_and_writes_beside_the_checkpoint(run, capsys, monkeypatch):
+    chosen = [choice for choice in crossing.ENGINES if choice[-1] in (("sim.physics", "mujoco"), ("sim.solver", "mujoco"))]
+    assert len(chosen) == 2
+    monkeypatch.setattr(crossing, "ENGINES", chosen)
+    assert call(evaluate.main, ["--task", TASK, "--physics", "all", "--sim_device", "cpu", *GRID, "sim.threads=1"]) == 0
+    out = capsys.readouterr().out
+    found = json.loads((run / "crossing.json").read_text())
+    assert [row["physics"] for row in found["engines"]] == ["mujoco", "newton_mujoco"]
+    assert (run / "crossing.png").read_bytes().startswith(b"\x89PNG")
+    assert not list(run.glob(".crossing*"))
+    one, other = found["engines"]
+    # An untrained policy hardly moves; the same equations answer it the same.
+    assert other["rmse_lin"] == pytest.approx(one["rmse_lin"], rel=0.1)
+    assert other["base_height"] == pytest.approx(one["base_height"], abs=0.01)
+    assert one["steps_per_s"] > 0
+    for words in ("newton_mujoco", f"{one['rmse_lin']:.3f} m/s", "crossing.json", "2 commands x 1 robots"):
+        assert words in out
+
+
+def test_an_engine_in_which_everybody_fell_is_shown_without_numbers(tmp_path, capsys):
+    rows = [result("mujoco"), result("newton_xpbd", rmse_lin=None, rmse_ang=None, cost_of_transport=None, falls=1.0)]
+    summary = {"task": TASK, "checkpoint": "m.pt", "grid": {"vx": [0], "vy": [0], "yaw": [0]}, "robots_per_cell": 2}
+    summary["engines"] = rows
+    Console(width=110).print(crossing.report(summary))
+    line = next(line for line in capsys.readouterr().out.splitlines() if "newton_xpbd" in line)
+    assert line.count("none") == 3
+    assert "100.0 %" in line
+    crossing.plot(summary, tmp_path / "p.png")
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("flag", [["--types", "pit"], ["--solver", "xpbd"], ["--robots-per-point", "3"]])
+def test_flags_of_a_single_engine_are_refused(flag, capsys):
+    assert call(evaluate.main, ["--task", TASK, "--physics", "all", "--sim_device", "cpu", *GRID, *flag]) == 2
+    assert f"error: {flag[0]}: --physics all" in capsys.readouterr().err

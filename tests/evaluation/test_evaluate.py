@@ -1,0 +1,266 @@
+"""Measuring a policy over a grid of commands, with policies whose result is known beforehand; and play's table."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import POLICY, TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
+
+from legged import make_task
+from legged.config import override
+from legged.errors import RunError
+from legged.evaluation.velocity_grid import Grid, measure
+from legged.policies.restore import TrainedPolicy, undisturbed
+from legged.tools import evaluate, play
+from legged.tools.evaluate import axis_values
+
+pytestmark = pytest.mark.usefixtures("workplace")
+
+
+def on_grid(grid: Grid, act=stand, *settings):
+    changes = [*undisturbed(grid.num_envs, grid.hold_s), ("init_state.base_velocity", [0.0, 0.0]), *settings]
+    return measure(make_task(override(small_config(), changes)), act, grid)
+
+
+# ---- the grid --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("-1:1:0.5", [-1.0, -0.5, 0.0, 0.5, 1.0]),
+        ("0:0.3:0.1", [0.0, 0.1, 0.2, 0.3]),  # the end belongs to it, in spite of rounding
+        ("0:1:0.3", [0.0, 0.3, 0.6, 0.9]),
+        ("0.25", [0.25]),
+        ("-2", [-2.0]),
+        ("1:1:0.5", [1.0]),
+    ],
+)
+def test_axis_values(text, values):
+    assert axis_values("--vx", text) == values
+
+
+def test_a_grid_is_all_combinations_with_the_same_number_of_robots():
+    grid = Grid([0.0, 1.0], [0.0], [-1.0, 0.0, 1.0], robots=5)
+    assert grid.num_envs == 30
+    assert grid.cells.tolist()[:4] == [[0, 0, -1], [0, 0, 0], [0, 0, 1], [1, 0, -1]]
+
+
+def test_robots_that_stand_have_the_error_of_what_they_are_asked_for():
+    result = on_grid(Grid([0.0, 0.5], [0.0, -0.3], [0.0, 0.4], robots=2, hold_s=2.0))
+    cells = {tuple(cell["command"]): cell for cell in result["cells"]}
+    assert len(cells) == 8
+    for (vx, vy, yaw), cell in cells.items():
+        assert cell["rmse_lin"] == pytest.approx((vx**2 + vy**2) ** 0.5, abs=0.05)
+        assert cell["rmse_ang"] == pytest.approx(yaw, abs=0.05)
+        assert cell["falls"] == 0.0
+        assert cell["duty_factor"] == pytest.approx(1.0, abs=0.05)
+        assert cell["thigh_contact"] == 0.0
+        assert 0.45 < cell["base_height"] < 0.6
+        assert cell["cost_of_transport"] is None  # nobody gets anywhere
+    assert result["falls"] == 0.0
+    assert result["measured_s"] == pytest.approx(1.0)
+    assert result["rmse_lin"]["worst"] == pytest.approx(0.34**0.5, abs=0.05)
+    assert result["rmse_lin"]["worst_cell"][:2] == [0.5, -0.3]
+    # Mean of 0, 0.3, 0.5 and 0.583 over the cells.
+    assert result["rmse_lin"]["mean"] == pytest.approx(0.346, abs=0.03)
+    assert result["gait"]["command"] == [0.5, 0.0, 0.0]
+    json.dumps(result, allow_nan=False)
+
+
+def test_robots_that_are_made_to_fall_are_counted_and_measured_up_to_their_fall():
+    grid = Grid([0.0, 0.5], [0.0], [0.0], robots=4, hold_s=1.0, settle_s=0.2)
+    config = override(small_config(), [*undisturbed(grid.num_envs, grid.hold_s), ("init_state.base_velocity", [0.0, 0.0])])
+    task = make_task(config)
+    steps = 0
+
+    def topple(observations):
+        """Lays three of the four robots of the second command on their backs after half a second."""
+        nonlocal steps
+        steps += 1
+        if steps == 25:
+            task.physics._qpos[5:, 2] = 0.1
+            task.physics._qpos[5:, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64)
+        return stand(observations)
+
+    result = measure(task, topple, grid)
+    assert [cell["falls"] for cell in result["cells"]] == [0.0, 0.75]
+    assert result["falls"] == 0.375
+    assert result["cells"][1]["rmse_lin"] == pytest.approx(0.5, abs=0.15)
+    json.dumps(result, allow_nan=False)
+
+
+def test_a_cell_in_which_nobody_stands_long_enough_to_be_measured_does_not_count_as_perfect():
+    grid = Grid([0.5, 1.0], [0.0], [0.0], robots=2, hold_s=0.6, settle_s=0.3)
+    result = on_grid(grid, stand, ("terminations.min_base_height", 5.0))
+    assert result["falls"] == 1.0
+    for cell in result["cells"]:
+        assert cell["rmse_lin"] is None or cell["rmse_lin"] > 0.3
+    assert not result["rmse_lin"]["mean"] or result["rmse_lin"]["mean"] > 0.3
+    json.dumps(result, allow_nan=False)
+
+
+# ---- the commands ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A folder with one short run."""
+    folder = tmp_path_factory.mktemp("trained")
+    with pytest.MonkeyPatch.context() as patch, kept_global_state():
+        patch.chdir(folder)
+        tiny_run("--run_name", "short", num_envs=4, iterations=1)
+    return folder
+
+
+@pytest.fixture
+def run(trained, monkeypatch) -> Path:
+    monkeypatch.chdir(trained)
+    (folder,) = run_folders()
+    return folder
+
+
+def test_evaluate_writes_json_and_picture_beside_the_checkpoint(run, capsys):
+    arguments = ["--task", TASK, "--physics", "mujoco", "--vx=0:0.5:0.5", "--vy=0", "--yaw=-0.5:0.5:1", "--robots", "2"]
+    assert call(evaluate.main, [*arguments, "sim.threads=1"]) == 0
+    out = capsys.readouterr().out
+    result = json.loads((run / "evaluation_mujoco.json").read_text())
+    assert result["grid"] == {"vx": [0.0, 0.5], "vy": [0.0], "yaw": [-0.5, 0.5]}
+    assert len(result["cells"]) == 4
+    assert (result["task"], result["checkpoint"], result["physics"], result["device"]) == (
+        TASK,
+        "model_0.pt",
+        "mujoco",
+        "cpu",
+    )
+    assert (run / "evaluation_mujoco.png").read_bytes().startswith(b"\x89PNG")
+    assert not list(run.glob(".*"))  # nothing half written
+    for words in ("velocity RMSE, mean", f"{result['rmse_lin']['mean']:.3f} m/s", "falls", "evaluation_mujoco.json"):
+        assert words in out
+
+
+def test_evaluate_writes_elsewhere_if_asked(run, tmp_path):
+    before = sorted(run.iterdir())
+    arguments = [
+        "--task",
+        TASK,
+        "--physics",
+        "mujoco",
+        "--vx=0",
+        "--vy=0",
+        "--yaw=0",
+        "--robots",
+        "1",
+        "--out",
+        str(tmp_path / "o"),
+    ]
+    assert call(evaluate.main, [*arguments, "sim.threads=1"]) == 0
+    assert {path.name for path in (tmp_path / "o").iterdir()} == {"evaluation_mujoco.json", "evaluation_mujoco.png"}
+    assert sorted(run.iterdir()) == before
+
+
+SHORT = ((1.1, (0.5, 0.0, 0.0)), (1.1, (9.0, 0.0, 0.0)))  # the second is outside what the task was trained on
+
+
+def test_play_without_video_exports_and_prints_a_table(run, capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(play, "SCHEDULE", SHORT)
+    arguments = [
+        "--task",
+        TASK,
+        "--sim_device",
+        "cpu",
+        "--no-video",
+        "--num_envs",
+        "2",
+        "--out",
+        str(tmp_path),
+        "sim.threads=1",
+    ]
+    assert call(play.main, arguments) == 0
+    out = capsys.readouterr().out
+    for name in ("policy.pt", "policy.onnx"):
+        assert (tmp_path / "exported" / name).is_file()
+        assert f"exported/{name}, largest difference to the policy" in out
+    assert (tmp_path / "exported" / "policy.json").is_file()
+    assert not list(tmp_path.rglob("play*"))
+    # The column heads with their units, which rich would take for markup.
+    assert "vx, vy [m/s], yaw [rad/s]" in out
+    highest = small_config().commands.ranges.lin_vel_x[1]
+    assert "0.5, 0, 0" in out
+    assert f"{highest:g}, 0, 0" in out
+    assert out.count(" m/s ") >= 2
+    assert out.count("rad/s ") >= 2
+
+
+def test_play_records_a_short_video_where_something_can_be_drawn(run, capsys, monkeypatch, tmp_path):
+    import mujoco
+
+    try:
+        mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
+    except Exception as error:
+        pytest.skip(f"nothing can be rendered here: {error}")
+    monkeypatch.setattr(play, "SCHEDULE", SHORT[:1])
+    arguments = [
+        "--task",
+        TASK,
+        "--sim_device",
+        "cpu",
+        "--headless",
+        "--num_envs",
+        "1",
+        "--out",
+        str(tmp_path),
+        "sim.threads=1",
+    ]
+    assert call(play.main, arguments) == 0
+    assert os.path.getsize(tmp_path / "play.mp4") > 1000
+    assert not list(tmp_path.glob(".*"))  # nothing half written
+    assert "recorded 28 frames" in capsys.readouterr().out  # 1.1 s at 25 frames a second: steps 0, 2, ... 54
+
+
+def test_evaluations_of_a_shipped_policy_do_not_touch_the_package(tmp_path):
+    shipped = TrainedPolicy(small_config(), tmp_path / "resources" / "policies" / TASK / "model.pt")
+    assert shipped.output("evaluate") == Path("logs") / "evaluate" / TASK
+    own = TrainedPolicy(small_config(), tmp_path / "logs" / TASK / "run" / "model_1.pt")
+    assert own.output("evaluate") == tmp_path / "logs" / TASK / "run"
+
+
+# ---- what can't be measured, or not written --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--vx=-1:1:1e-9"], "--vx: '-1:1:1e-9' makes 2,000,000,001 cells"),
+        (["--vx=1e30"], "--vx: '1e30' asks for more than 20"),
+        (["--robots", "100000000"], "125 cells x 100,000,000 robots are 12,500,000,000 robots"),
+        (["--robots-per-point", "99999999"], "--robots-per-point: at most 65,536"),
+    ],
+)
+def test_grids_that_no_machine_holds_are_refused_with_their_size(options, words, capsys):
+    assert call(evaluate.main, ["--task", TASK, "--sim_device", "cpu", *options]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_written_is_found_before_anything_is_measured(tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").write_text("mine")
+    monkeypatch.setattr(evaluate, "ready_to_track", lambda *_, **__: pytest.fail("measured"))
+    arguments = ["--task", TASK, "--sim_device", "cpu", "--load_run", str(POLICY), "--out", str(tmp_path / "file")]
+    for physics in ("mujoco", "all"):
+        assert call(evaluate.main, [*arguments, "--physics", physics]) == 2
+        assert "file: cannot make the folder" in capsys.readouterr().err
+
+
+def test_a_disk_that_fills_up_meanwhile_costs_the_files_and_not_the_table(tmp_path, monkeypatch, capsys):
+    def full(path, _text):
+        raise RunError(f"{path.name}: no space left on the disk")
+
+    monkeypatch.setattr(evaluate, "write_text", full)
+    grid = ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1", "--physics", "mujoco", "sim.threads=1"]
+    arguments = ["--task", TASK, "--load_run", str(POLICY), "--out", str(tmp_path), *grid]
+    assert call(evaluate.main, arguments) == 1
+    out, err = capsys.readouterr()
+    assert "velocity RMSE, mean" in out
+    assert err == "error: evaluation_mujoco.json: no space left on the disk\n"

@@ -1,0 +1,220 @@
+"""Evaluating policies of tasks with terrain: types and sizes, rough ground, and the command with its files and errors."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+from helpers import POLICY, TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
+
+from legged import make_task
+from legged.config import override
+from legged.errors import ConfigError
+from legged.evaluation import success
+from legged.evaluation.success import (
+    chosen_types,
+    on_terrain,
+    sizes_of,
+    trained_to,
+)
+from legged.evaluation.success_report import is_beyond, panels_of, with_other_engine
+from legged.evaluation.velocity_grid import Grid, measure, rough_ground, rough_side
+from legged.policies.restore import undisturbed
+from legged.registry import task_config
+from legged.terrain import Terrain, TileSpec
+from legged.tools import evaluate
+
+pytestmark = pytest.mark.usefixtures("workplace")
+
+
+# ---- types and sizes -------------------------------------------------------------------------------------------------
+
+
+def test_where_training_ended():
+    cfg = task_config("anymal_c", [("terrain.num_rows", 10), ("terrain.proportions.waves", 0.0)], on_cpu=True)
+    ends = trained_to(cfg)
+    assert ends.keys() == {name for name, share in cfg.terrain.proportions.items() if share > 0.0}
+    assert ends["stairs_up"] == pytest.approx(0.05 + 0.18 * 0.9)  # the hardest of ten rows has difficulty 0.9
+    assert ends["obstacles"] == pytest.approx(0.05 + 0.2 * 0.9)
+    assert ends["slope_down"] == pytest.approx(math.degrees(math.atan(0.36)))
+    assert trained_to(small_config()) == {}
+    two_rows = task_config("anymal_c", [("terrain.num_rows", 2), ("terrain.max_init_terrain_level", 1)], on_cpu=True)
+    assert trained_to(two_rows)["stairs_up"] == pytest.approx(0.14)
+
+
+def test_sweeps_go_beyond_training_and_stones_get_harder_as_they_shrink():
+    for name, end in trained_to(task_config("anymal_c", on_cpu=True)).items():
+        for full in (False, True):
+            sizes = sizes_of(name, full)
+            assert list(sizes) == sorted(sizes)
+            assert sizes[0] < end < sizes[-1]
+        assert set(sizes_of(name, False)) <= set(sizes_of(name, True))
+    assert is_beyond("stairs_up", 0.25, 0.212)
+    assert not is_beyond("stairs_up", 0.2, 0.212)
+    assert not is_beyond("stairs_up", 0.25, None)
+    assert is_beyond("stepping_stones", 0.2, 0.225)
+    assert not is_beyond("stepping_stones", 0.3, 0.225)
+
+
+def test_panels():
+    assert panels_of(["pit", "stairs_down", "slope_up", "stairs_up", "pit"]) == {
+        "stairs": ("stairs_up", "stairs_down"),
+        "slopes": ("slope_up",),
+        "pit": ("pit",),
+    }
+
+
+def test_types_that_are_asked_for():
+    rough, flat = task_config("anymal_c", on_cpu=True), small_config()
+    assert chosen_types(rough, None) == [name for name, share in rough.terrain.proportions.items() if share > 0.0]
+    assert chosen_types(rough, "pit, gap,pit") == ["pit", "gap"]
+    assert chosen_types(flat, None) == []
+    assert chosen_types(flat, "pit") == ["pit"]
+    with pytest.raises(ConfigError, match=r"--types: there is no terrain type 'stair_up'; did you mean 'stairs_up'"):
+        chosen_types(rough, "stair_up")
+    blind_ground = task_config("anymal_c", [("terrain.mesh_type", "plane")], on_cpu=True)
+    with pytest.raises(ConfigError, match=r"--types: .*'heights'"):
+        chosen_types(blind_ground, "pit")
+
+
+# ---- rough ground ----------------------------------------------------------------------------------------------------
+
+
+def test_rough_ground_is_large_enough_and_has_bumps_of_5_cm():
+    assert rough_side(Grid([-1.0, 1.0], [-1.0, 1.0], [0.0])) == 20.0  # 2 + 4 * 1.414 + 1.5 = 9.2 m to each side
+    assert rough_side(Grid([3.0], [0.0], [0.0])) == 32.0  # 2 + 12 + 1.5
+    cfg = override(small_config(), on_terrain(small_config(), 20.0, 2.0)).terrain
+    terrain = rough_ground(cfg, seed=1)
+    assert terrain.tile_size == (20.0, 20.0)
+    tile = terrain.height_map.heights[30:-30, 30:-30]
+    assert tile.shape == (200, 200)
+    assert (tile.min(), tile.max()) == pytest.approx((-0.05, 0.05))
+    assert abs(tile.mean()) < 0.002
+    blocks = tile.reshape(4, 50, 4, 50).std(axis=(1, 3))
+    assert blocks.min() > 0.01  # everywhere, and no slope
+    assert abs(tile.reshape(4, 50, 4, 50).mean(axis=(1, 3))).max() < 0.01
+
+
+def test_height_of_the_gait_is_above_the_ground():
+    grid = Grid([0.0], [0.0], [0.0], robots=2, hold_s=1.0, settle_s=0.5)
+    cfg = override(small_config(), [*undisturbed(2, 1.0), *on_terrain(small_config(), 8.0, 0.1)])
+    pit = Terrain.of_tiles([[TileSpec("pit", 0.8)]], cfg.terrain, None)
+    result = measure(make_task(cfg, terrain=pit), stand, grid)
+    assert 0.45 < result["gait"]["base_height"] < 0.6
+    assert result["contact_overflows"] == 0
+
+
+def test_lost_contacts_are_counted_over_all_rollouts(monkeypatch):
+    grid = Grid([0.0], [0.0], [0.0], robots=3, hold_s=0.6, settle_s=0.2)
+    changes = [*undisturbed(3, 0.6), ("train.runner.num_steps_per_env", 24)]  # so that 30 steps are a rollout and a part
+    task = make_task(override(small_config(), changes))
+    refresh = task.physics.refresh
+
+    def lose():
+        refresh()
+        task.physics.overflowed.fill_(True)
+
+    monkeypatch.setattr(task.physics, "refresh", lose)
+    assert measure(task, stand, grid)["contact_overflows"] == 90
+
+
+# ---- the command -----------------------------------------------------------------------------------------------------
+
+CELL = ["--physics", "mujoco", "--vx=0", "--vy=0", "--yaw=0", "--robots", "1", "sim.threads=1"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A folder with one short run on a small terrain."""
+    folder = tmp_path_factory.mktemp("trained")
+    small = ["terrain.num_rows=2", "terrain.max_init_terrain_level=1", "terrain.border_size=3"]
+    with pytest.MonkeyPatch.context() as patch, kept_global_state():
+        patch.chdir(folder)
+        tiny_run("--task", "anymal_c", *small, num_envs=20, iterations=1)
+    return folder
+
+
+@pytest.fixture
+def run(trained, monkeypatch) -> Path:
+    monkeypatch.chdir(trained)
+    monkeypatch.setattr(success, "TIME_S", 0.1)
+    monkeypatch.setattr(success, "FEWER", dict.fromkeys(("stairs_up", "slope_down"), (0.1, 0.2)))
+    (folder,) = run_folders()
+    return folder
+
+
+def test_evaluate_measures_success_and_tracking_on_rough_ground(run, tmp_path, capsys):
+    arguments = ["--task", "anymal_c", *CELL, "--types", "stairs_up,slope_down", "--robots-per-point", "2"]
+    assert call(evaluate.main, [*arguments, "--out", str(tmp_path / "o")]) == 0
+    out = capsys.readouterr().out
+    files = {path.name for path in (tmp_path / "o").iterdir()}
+    assert files == {"evaluation_mujoco.json", "evaluation_mujoco.png", "success_mujoco.png"}
+    assert (tmp_path / "o" / "success_mujoco.png").read_bytes().startswith(b"\x89PNG")
+    result = json.loads((tmp_path / "o" / "evaluation_mujoco.json").read_text())
+    assert {"rough", "success"} <= result.keys()
+    assert "rmse_lin" not in result  # figures of a plane and of rough ground must not be taken for each other
+    assert len(result["rough"]["cells"]) == 1
+    assert result["rough"]["contact_overflows"] == 0
+    found = result["success"]
+    assert (found["robots_per_point"], found["contact_overflows"]) == (2, 0)
+    stairs = found["types"]["stairs_up"]
+    assert (stairs["unit"], stairs["what"], stairs["trained_to"]) == ("m", "step height", pytest.approx(0.14))
+    assert [(entry["size"], entry["robots"], entry["stuck"]) for entry in stairs["points"]] == [(0.1, 2, 2), (0.2, 2, 2)]
+    for words in ("tracking on rough ground: 1 commands", "stairs_up: 2 sizes x 2 robots", "0.2 m *", "0/2 = 0 %"):
+        assert words in out
+    assert "success_mujoco.png" in out
+
+
+def test_the_other_engine_is_drawn_too_if_it_is_of_the_same_checkpoint(tmp_path):
+    entry = {"unit": "m", "what": "step height", "trained_to": None, "points": []}
+    success = {"types": {"stairs_up": entry}, "robots_per_point": 2}
+    mine = {"task": "t", "checkpoint": "model_1.pt", "physics": "mujoco", "success": success}
+    bare = {"types": {"stairs_up": {**entry, "points": [{"size": 0.1, "share": 1.0}]}}, "robots_per_point": 2}  # no interval
+    others = ("physics", "physx"), ("checkpoint", "model_2.pt")
+    foreign = [{"success": bare}, {"success": {"types": {}}}, {"success": 3}, *({name: value} for name, value in others)]
+    path, other = tmp_path / "evaluation_mujoco.json", tmp_path / "evaluation_mujoco_warp.json"
+    assert with_other_engine(mine, path) == [mine]
+    for text in ("{}", "[]", "nonsense", *(json.dumps({**mine, "physics": "mujoco_warp", **change}) for change in foreign)):
+        other.write_text(text)
+        assert with_other_engine(mine, path) == [mine]
+    other.write_text(json.dumps({**mine, "physics": "mujoco_warp"}))
+    assert [one["physics"] for one in with_other_engine(mine, path)] == ["mujoco_warp", "mujoco"]
+
+
+def test_a_plane_task_is_evaluated_as_ever_and_crosses_terrain_only_if_asked(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(success, "TIME_S", 0.1)
+    arguments = ["--task", TASK, "--load_run", str(POLICY), *CELL, "--robots-per-point", "1"]
+    shipped = json.loads((POLICY / "evaluation_mujoco.json").read_text())
+    assert call(evaluate.main, [*arguments, "--out", str(tmp_path / "plane")]) == 0
+    plane = json.loads((tmp_path / "plane" / "evaluation_mujoco.json").read_text())
+    assert plane.keys() == shipped.keys()
+    assert plane["cells"][0].keys() == shipped["cells"][0].keys()
+    assert not (tmp_path / "plane" / "success_mujoco.png").exists()
+    assert "success" not in capsys.readouterr().out
+    assert call(evaluate.main, [*arguments, "--out", str(tmp_path / "both"), "--types", "waves"]) == 0
+    both = json.loads((tmp_path / "both" / "evaluation_mujoco.json").read_text())
+    assert both.keys() == shipped.keys() | {"success"}
+    assert both["success"]["types"]["waves"]["trained_to"] is None
+    assert both["rmse_lin"] == plane["rmse_lin"]
+
+
+def test_lost_contacts_are_warned_of(capsys):
+    evaluate.warn_of_overflows("success", 0)
+    assert capsys.readouterr().err == ""
+    evaluate.warn_of_overflows("success", 7)
+    assert "7 times" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--types", "stairsup"], ["--types", "did you mean 'stairs_up'?"]),
+        (["--types", ""], ["--types", "no terrain type ''"]),
+        (["--robots-per-point", "0"], ["--robots-per-point", "at least 1, got 0"]),
+    ],
+)
+def test_wrong_input(arguments, words, capsys):
+    assert call(evaluate.main, ["--task", TASK, "--load_run", str(POLICY), *CELL, *arguments]) == 2
+    error = capsys.readouterr().err
+    for word in words:
+        assert word in error

@@ -1,0 +1,57 @@
+"""When a training's checkpoints first walk."""
+
+import json
+
+import pytest
+import torch
+from helpers import TASK, call, run_folders, tiny_run
+
+from legged.learning.checkpoint import read_checkpoint, write_checkpoint
+from legged.tools import time_to_walk
+
+pytestmark = pytest.mark.usefixtures("workplace")
+
+HERE = ["--task", TASK, "--sim_device", "cpu", "--robots", "1", "sim.threads=1"]
+
+
+def test_checkpoints_are_judged_in_order_and_the_first_good_one_is_named(capsys):
+    """Networks of zeros stand still whatever they are asked for, so their error is sqrt(vx^2 + vy^2), averaged over the
+    grid's 25 pairs, and the limit decides who walks.
+    """
+    tiny_run("train.runner.save_interval=1", iterations=3)
+    (folder,) = run_folders()
+    for number, seconds in ((0, 4.0), (1, 5.0), (2, 6.5)):
+        path = folder / f"model_{number}.pt"
+        saved = read_checkpoint(path)
+        assert 0.0 < saved["infos"]["wall_s"] < 3600.0
+        saved["infos"]["wall_s"] = seconds
+        for name, tensor in saved["actor_state_dict"].items():
+            if number and "mlp" in name:
+                saved["actor_state_dict"][name] = torch.zeros_like(tensor)
+        write_checkpoint(path, saved)
+    stands = sum((x * x + y * y) ** 0.5 for x in time_to_walk.AXIS for y in time_to_walk.AXIS) / 25
+    assert time_to_walk.main([*HERE, "--rmse", "0.1"]) == 0
+    assert "never" in capsys.readouterr().out
+    result = json.loads((folder / "time_to_walk.json").read_text())
+    assert result["first"] is None
+    assert [row["iteration"] for row in result["checkpoints"]] == [1, 2, 3]
+    assert result["checkpoints"][1]["rmse_lin"] == pytest.approx(stands, abs=0.05)
+    assert [row["wall_s"] for row in result["checkpoints"]] == [4.0, 5.0, 6.5]
+    limit = result["checkpoints"][1]["rmse_lin"] + 0.02  # resets are random
+    assert time_to_walk.main([*HERE, "--rmse", str(limit), "--falls", "0.5"]) == 0
+    first = json.loads((folder / "time_to_walk.json").read_text())["first"]
+    wanted = 4.0 if result["checkpoints"][0]["rmse_lin"] < limit else 5.0
+    assert first["wall_s"] == wanted
+    assert f"after {wanted:.1f} s" in capsys.readouterr().out
+
+
+def test_a_robot_that_always_falls_does_not_walk():
+    row = {"rmse_lin": None, "falls": 1.0}
+    assert not time_to_walk.walks(row, 10.0, 2.0)
+    assert time_to_walk.walks({"rmse_lin": 0.14, "falls": 0.005}, 0.15, 0.01)
+    assert not time_to_walk.walks({"rmse_lin": 0.14, "falls": 0.02}, 0.15, 0.01)
+
+
+def test_wrong_limits_are_refused(capsys):
+    assert call(time_to_walk.main, [*HERE, "--rmse", "-1"]) == 2
+    assert "--rmse: must be above 0" in capsys.readouterr().err

@@ -1,0 +1,237 @@
+"""Checkpoints are plain data: they run nothing, fit what they say, and what is wrong with one is said in one line."""
+
+import pickle
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import TASK, call, checkpoints, kept_global_state, tiny_run
+
+from legged.errors import ConfigError
+from legged.learning.checkpoint import FORMAT, read_checkpoint
+from legged.learning.run_folder import shipped_policy
+from legged.tools import evaluate, play, time_to_walk, train
+
+pytestmark = pytest.mark.usefixtures("workplace")
+COMMANDS = {
+    "resume": (train.main, ["--resume", "--max_iterations", "9"]),
+    "play": (play.main, ["--no-video"]),
+    "evaluate": (evaluate.main, ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1"]),
+    "time_to_walk": (time_to_walk.main, ["--robots", "1"]),
+}
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory) -> bytes:
+    """The bytes of a checkpoint, beside the configuration of its run."""
+    with pytest.MonkeyPatch.context() as patch, kept_global_state():
+        patch.chdir(tmp_path_factory.mktemp("trained"))
+        folder = tiny_run(num_envs=4, iterations=1)
+        return (folder / "model_0.pt").read_bytes(), (folder / "config.yaml").read_text()
+
+
+@pytest.fixture
+def model(good) -> Path:
+    """A checkpoint in a run folder of its own."""
+    folder = Path("logs") / TASK / "run"
+    folder.mkdir(parents=True)
+    (folder / "model_0.pt").write_bytes(good[0])
+    (folder / "config.yaml").write_text(good[1])
+    return folder / "model_0.pt"
+
+
+def change(model: Path, **parts: object) -> None:
+    saved = torch.load(model, weights_only=True)
+    for name, value in parts.items():
+        saved[name] = value
+    torch.save(saved, model)
+
+
+class RunsCode:
+    """What a foreign file may hold."""
+
+    def __reduce__(self):
+        return (Path.touch, (Path("it_ran"),))
+
+
+def in_infos(model: Path) -> None:
+    change(model, infos={"note": RunsCode()})
+
+
+def as_the_whole_file(model: Path) -> None:
+    torch.save(RunsCode(), model)
+
+
+def as_a_bare_pickle(model: Path) -> None:
+    model.write_bytes(pickle.dumps(RunsCode()))
+
+
+def as_an_old_torch_file(model: Path) -> None:
+    torch.save({"actor_state_dict": RunsCode()}, model, _use_new_zipfile_serialization=False)
+
+
+def in_a_state_file(model: Path) -> None:
+    torch.save({"format": 1, "task": RunsCode()}, model.with_name("state_0.pt"))
+
+
+CODE = [in_infos, as_the_whole_file, as_a_bare_pickle, as_an_old_torch_file]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("place", CODE)
+def test_a_checkpoint_runs_no_code(model, capsys, place, command):
+    place(model)
+    main, arguments = COMMANDS[command]
+    assert call(main, ["--task", TASK, "--sim_device", "cpu", *arguments]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert "model_0.pt: not a checkpoint" in err
+    assert not Path("it_ran").exists()
+
+
+def test_a_state_of_robots_runs_no_code(model, capsys):
+    in_a_state_file(model)
+    arguments = ["--resume", "--max_iterations", "2", "--num_envs", "4"]
+    assert call(train.main, ["--task", TASK, "--sim_device", "cpu", *arguments]) == 0
+    assert (
+        "begin anew: logs/anymal_c_flat/run/state_0.pt: not a checkpoint (it holds more than plain data"
+        in capsys.readouterr().out
+    )
+    assert not Path("it_ran").exists()
+
+
+WRONG = {
+    "iter": ("three", "its iter is str, not int"),
+    "infos": ([1, 2], "its infos is list, not dict"),
+    "actor_state_dict": ([], "its actor_state_dict is list, not dict"),
+    "critic_state_dict": ({"mlp.0.weight": 3}, "its critic is damaged ('mlp.0.weight' is no tensor)"),
+    "optimizer_state_dict": (7, "its optimizer_state_dict is int, not dict"),
+}
+
+
+@pytest.mark.parametrize("part", WRONG)
+def test_a_part_of_the_wrong_kind_is_named(model, part):
+    value, words = WRONG[part]
+    change(model, **{part: value})
+    with pytest.raises(ConfigError, match=r"model_0\.pt") as error:
+        read_checkpoint(model)
+    assert words in str(error.value)
+
+
+def test_an_iteration_below_zero_is_refused(model):
+    change(model, iter=-1)
+    with pytest.raises(ConfigError, match="its iteration is -1"):
+        read_checkpoint(model)
+
+
+@pytest.mark.parametrize("key", ["task_state", "observations", "networks", "robot"])
+@pytest.mark.parametrize("value", [3, "text", [1]])
+def test_infos_of_the_wrong_kind_are_named(model, key, value):
+    infos = torch.load(model, weights_only=True)["infos"]
+    change(model, infos={**infos, key: value})
+    with pytest.raises(ConfigError, match=rf"its infos\.{key} is {type(value).__name__}, not dict"):
+        read_checkpoint(model)
+
+
+def test_a_newer_format_is_refused(model):
+    infos = torch.load(model, weights_only=True)["infos"]
+    assert infos["format"] == FORMAT
+    change(model, infos={**infos, "format": FORMAT + 1})
+    with pytest.raises(ConfigError, match=rf"format {FORMAT + 1} by a newer"):
+        read_checkpoint(model)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_that_are_no_numbers_are_refused(model, value):
+    saved = torch.load(model, weights_only=True)
+    saved["actor_state_dict"]["mlp.0.weight"][1, 1] = value
+    torch.save(saved, model)
+    with pytest.raises(ConfigError, match=r"its actor is damaged \(mlp\.0\.weight holds NaN or infinite numbers\)"):
+        read_checkpoint(model)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_progress_of_curricula_that_is_damaged_is_said(model, capsys, command):
+    infos = torch.load(model, weights_only=True)["infos"]
+    change(model, infos={**infos, "task_state": {"command_curriculum": {"share": torch.ones(7)}}})
+    if command == "evaluate":  # it switches the curriculum off, and reads nothing of it
+        return
+    main, arguments = COMMANDS[command]
+    code = call(main, ["--task", TASK, "--sim_device", "cpu", *arguments, "commands.curriculum.enabled=true"])
+    assert (code, capsys.readouterr().err.count("curricula is damaged")) == (2, 1)
+
+
+def test_every_byte_cut_off_is_noticed(model):
+    """Wherever a copy broke off."""
+    whole = model.read_bytes()
+    for share in (0.0, 0.01, 0.3, 0.6, 0.9, 0.999):
+        model.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(ConfigError, match=r"model_0\.pt: not a checkpoint"):
+            read_checkpoint(model)
+
+
+def test_an_archive_of_something_else_is_refused(model):
+    with zipfile.ZipFile(model, "w") as archive:
+        archive.writestr("readme.txt", "hello")
+    with pytest.raises(ConfigError, match=r"model_0\.pt: not a checkpoint"):
+        read_checkpoint(model)
+
+
+def test_a_folder_of_that_name_is_said(tmp_path):
+    (tmp_path / "model_3.pt").mkdir()
+    with pytest.raises(ConfigError, match=r"model_3\.pt: cannot be read \(Is a directory\)"):
+        read_checkpoint(tmp_path / "model_3.pt")
+
+
+@pytest.mark.parametrize("task", ["anymal_c", "anymal_c_flat", "anymal_c_blind", "anymal_c_proprio"])
+def test_policies_of_the_package_are_plain_data(task):
+    saved = read_checkpoint(shipped_policy(task) / "model.pt")
+    assert saved["infos"]["task"] == task
+
+
+@pytest.mark.parametrize("parameter", [0, 3])
+def test_an_optimiser_without_the_moments_of_a_parameter_is_damaged(model, capsys, parameter):
+    optimizer = torch.load(model, weights_only=True)["optimizer_state_dict"]
+    del optimizer["state"][parameter]
+    change(model, optimizer_state_dict=optimizer)
+    assert call(train.main, ["--task", TASK, "--sim_device", "cpu", *COMMANDS["resume"][1]]) == 2
+    assert "model_0.pt: its optimiser is damaged (the moments of some parameters are missing)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("rate", [float("nan"), 0.0, -1.0, "fast", None])
+def test_a_learning_rate_that_is_none_is_refused(model, capsys, rate):
+    optimizer = torch.load(model, weights_only=True)["optimizer_state_dict"]
+    optimizer["param_groups"][0]["lr"] = rate
+    change(model, optimizer_state_dict=optimizer)
+    assert call(train.main, ["--task", TASK, "--sim_device", "cpu", *COMMANDS["resume"][1]]) == 2
+    assert "its optimiser is damaged" in capsys.readouterr().err
+
+
+# ---- normalised observations -----------------------------------------------------------------------------------------
+
+
+def test_a_policy_with_normalised_observations_is_played_evaluated_and_resumed(capsys):
+    """The normaliser's moments are matrices too, and no layers."""
+    normalise = ["train.policy.obs_normalization=true"]
+    folder = tiny_run(*normalise, "train.policy.actor_hidden_dims=[16, 8]", num_envs=4)
+    base = ["--task", TASK, "--sim_device", "cpu"]
+    assert play.main([*base, "--no-video", "--num_envs", "1"]) == 0
+    assert evaluate.main([*base, *COMMANDS["evaluate"][1]]) == 0
+    assert train.main([*base, "--resume", "--max_iterations", "3"]) == 0
+    (resumed,) = [run for run in folder.parent.iterdir() if run != folder]
+    assert checkpoints(resumed) == [2]
+    saved = read_checkpoint(folder / "model_1.pt")
+    assert saved["infos"]["networks"]["actor"]["hidden_dims"] == [16, 8]
+    assert int(saved["actor_state_dict"]["obs_normalizer.count"]) == 2 * 4 * 4
+
+
+def test_a_checkpoint_that_does_not_say_its_sizes_is_read_by_its_weights(model):
+    from legged.learning.checkpoint import network_of
+
+    saved = torch.load(model, weights_only=True)
+    plain = {"rnn_type": "none", "rnn_hidden_dim": 0, "rnn_num_layers": 0}
+    assert network_of(saved["actor_state_dict"]) == {"hidden_dims": [8], "obs_normalization": False, **plain}
+    layers = {f"mlp.{i}.weight": torch.zeros(shape) for i, shape in ((0, (16, 5)), (2, (4, 16)), (4, (2, 4)))}
+    normalised = {"obs_normalizer._mean": torch.zeros(1, 5), **layers}
+    assert network_of(normalised) == {"hidden_dims": [16, 4], "obs_normalization": True, **plain}

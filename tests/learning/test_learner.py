@@ -1,0 +1,224 @@
+"""The captured training loop computes what rsl-rl's does: rollouts bit by bit, updates to float tolerance."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import checkpoints, small_config, small_task, tiny_run
+from learners import MIRROR, SAMPLES, STEPS, fill, learner
+from rsl_rl.algorithms import PPO
+
+from legged.graph.step_graph import ForbidHostReads
+from legged.learning.captured import CapturedRunner, Clock, copies
+from legged.learning.ppo import DevicePPO
+from legged.learning.rollout import Rollout
+from legged.learning.runner import Runner
+from legged.registry import task_config
+from legged.tools.plot import read_scalars
+
+pytestmark = pytest.mark.usefixtures("workplace")
+
+
+VARIANTS = {
+    "plain": {},
+    "normalised": {"normalized": True},
+    "log std": {"std_type": "log"},
+    "fixed rate": {"schedule": "fixed"},
+    "free values": {"use_clipped_value_loss": False, "value_loss_coef": 0.5},
+    "advantages per batch": {"normalize_advantage_per_mini_batch": True},
+    "symmetry": {"symmetry_cfg": MIRROR, "normalize_advantage_per_mini_batch": True},
+    "symmetry, normalised": {"symmetry_cfg": MIRROR, "normalized": True},
+    "mixed precision": {"use_mixed_precision": True},
+    "mixed precision, symmetry": {"use_mixed_precision": True, "symmetry_cfg": MIRROR},
+    "tight clips": {"clip_param": 0.05, "max_grad_norm": 0.1},
+}
+
+
+@pytest.mark.parametrize("options", VARIANTS.values(), ids=VARIANTS)
+def test_an_update_is_that_of_rsl_rl(options, monkeypatch):
+    """Losses, learning rate, parameters and moments over three updates on the same data in the same order."""
+    stock, ours = learner(PPO, **options), learner(DevicePPO, **options)
+    assert ours.why_stock == ""
+    order = torch.Generator().manual_seed(1)
+    rates = []
+    for seed in range(3):
+        fill(stock, seed)
+        fill(ours, seed)
+        permutation = torch.randperm(SAMPLES, generator=order)
+        monkeypatch.setattr(torch, "randperm", lambda *_, p=permutation, **__: p)
+        monkeypatch.setattr(ours, "_order", lambda _, p=permutation: p)
+        wanted = stock.update()
+        monkeypatch.undo()
+        monkeypatch.setattr(ours, "_order", lambda _, p=permutation: p)
+        assert ours.update() == pytest.approx(wanted, rel=1e-4, abs=1e-6)
+        assert ours.learning_rate == pytest.approx(stock.learning_rate, rel=1e-5)
+        rates.append(ours.learning_rate)
+    assert len(set(rates)) > 1 or options.get("schedule") == "fixed"
+    for model in ("actor", "critic"):
+        mine, theirs = (getattr(alg, model).state_dict() for alg in (ours, stock))
+        for name, tensor in theirs.items():
+            torch.testing.assert_close(mine[name], tensor, rtol=1e-3, atol=2e-5, msg=name)
+    moments = [alg.optimizer.state_dict()["state"] for alg in (ours, stock)]
+    assert len(moments[0]) == len(moments[1]) == 13
+    for key, theirs in moments[1].items():
+        torch.testing.assert_close(moments[0][key]["exp_avg"], theirs["exp_avg"], rtol=1e-2, atol=1e-5)
+        assert float(moments[0][key]["step"]) == float(theirs["step"])
+
+
+def task_and_runner(kind=Runner, *overrides, num_envs=12):
+    task = small_task(*overrides, ("train.runner.num_steps_per_env", STEPS), num_envs=num_envs)
+    torch.manual_seed(3)
+    return task, kind(task, None, "cpu")
+
+
+def test_a_rollout_is_that_of_rsl_rl():
+    """Observations, actions and ends of episodes bit by bit, with noise, commands and resets drawn alike; values, rewards
+    with bootstrapped time-outs and returns to float tolerance, because all steps are judged at once. The observation
+    stored at t is the one that was acted on.
+    """
+    first, runner = task_and_runner()
+    stock = runner.alg
+    torch.manual_seed(7)
+    first.reset()
+    first.episode_length_buf = torch.arange(12) + first.max_episode_length - 6  # some end by time, at different steps
+    with torch.inference_mode():
+        observations = first.get_observations()
+        for _ in range(STEPS):
+            observations, rewards, dones, extras = first.step(stock.act(observations))
+            stock.process_env_step(observations, rewards, dones, extras)
+        stock.compute_returns(observations)
+
+    second, captured = task_and_runner(CapturedRunner)
+    torch.manual_seed(7)
+    second.reset()
+    second.episode_length_buf = torch.arange(12) + second.max_episode_length - 6
+    rollout = Rollout(second, captured.alg)
+    rollout.collect()
+    ours = captured.alg.storage
+    assert stock.storage.dones.sum() > 3
+    for name in ("actions", "dones"):
+        torch.testing.assert_close(getattr(ours, name), getattr(stock.storage, name), rtol=0, atol=0, msg=name)
+    for name in ("values", "rewards", "returns", "advantages"):
+        torch.testing.assert_close(getattr(ours, name), getattr(stock.storage, name), rtol=1e-5, atol=1e-5, msg=name)
+    for name in ("actor", "critic"):
+        torch.testing.assert_close(ours.observations[name], stock.storage.observations[name], rtol=0, atol=0)
+    torch.testing.assert_close(ours.actions_log_prob, stock.storage.actions_log_prob, rtol=1e-5, atol=1e-5)
+    for mine, theirs in zip(ours.distribution_params, stock.storage.distribution_params, strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=0, atol=0)
+
+
+def test_ended_episodes_are_counted_over_rollouts():
+    """Two episodes end in the second rollout, after 8 + 3 and 8 + 5 steps of it."""
+    task, runner = task_and_runner(CapturedRunner, num_envs=2)
+    task.reset()
+    rollout = Rollout(task, runner.alg)
+    rollout.collect()
+    assert rollout.ended.tolist() == [0.0, 0.0, 0.0]
+    task.episode_length_buf = task.max_episode_length - torch.tensor([3, 5])
+    rewards = runner.alg.storage.rewards.sum()
+    rollout.collect()
+    ended, returns, lengths = rollout.ended.tolist()
+    assert (ended, lengths) == (2.0, 24.0)
+    assert returns == returns
+    assert returns != rewards
+
+
+def test_nothing_in_an_iteration_reads_on_the_host():
+    task, runner = task_and_runner(CapturedRunner)
+    rollout = Rollout(task, runner.alg)
+    with ForbidHostReads():
+        rollout.collect()
+        runner.alg.learn()
+
+
+def test_the_learning_rate_is_changed_in_place():
+    alg = learner(DevicePPO)
+    address = alg.optimizer.param_groups[0]["lr"].data_ptr()
+    fill(alg, 0)
+    alg.update()
+    assert alg.learning_rate != pytest.approx(1e-3)
+    assert alg.optimizer.param_groups[0]["lr"].data_ptr() == address
+    alg.learning_rate = 3e-4
+    assert alg.learning_rate == pytest.approx(3e-4)
+    assert float(alg.optimizer.param_groups[0]["lr"]) == pytest.approx(3e-4)
+
+
+def test_normalisers_are_updated_in_place():
+    """A captured rollout reads them where they were when it was captured."""
+    alg = learner(DevicePPO, normalized=True)
+    before = {name: tensor.data_ptr() for name, tensor in alg.actor.obs_normalizer.state_dict().items()}
+    fill(alg, 0)
+    alg.update()
+    after = alg.actor.obs_normalizer.state_dict()
+    assert {name: tensor.data_ptr() for name, tensor in after.items()} == before
+    assert int(after["count"]) == SAMPLES
+    assert after["_mean"].abs().max() > 0.0
+
+
+def test_features_that_need_rsl_rls_update_are_named():
+    alg = learner(DevicePPO, symmetry_cfg={**MIRROR, "use_mirror_loss": True})
+    assert alg.why_stock == "a mirror loss"
+    assert learner(DevicePPO, optimizer="sgd").why_stock == "the optimiser is SGD"
+    fill(alg, 0)
+    assert set(alg.update()) == {"value", "surrogate", "entropy", "symmetry"}  # by rsl-rl's own
+
+
+@pytest.mark.parametrize(("first", "second"), [("stock", "captured"), ("captured", "stock"), ("captured", "captured")])
+def test_checkpoints_are_exchanged_between_the_loops(first, second):
+    """A run begun with one loop goes on with the other: counts of optimiser steps and the learning rate continue."""
+    begun = tiny_run("--runner", first, "train.algorithm.learning_rate=2e-4")
+    resumed = tiny_run("--runner", second, "--resume", iterations=3)
+    before, after = (torch.load(run / f"model_{i}.pt", weights_only=True) for run, i in ((begun, 1), (resumed, 2)))
+    assert checkpoints(resumed) == [2]
+    steps = [{int(s["step"]) for s in saved["optimizer_state_dict"]["state"].values()} for saved in (before, after)]
+    assert steps == [{40}, {60}]
+    for saved in (before, after):
+        (group,) = saved["optimizer_state_dict"]["param_groups"]
+        assert isinstance(group["lr"], float)
+        assert group["lr"] == pytest.approx(saved["infos"]["learning_rate"])
+        assert not group["capturable"]
+
+
+def test_both_loops_log_the_same_things():
+    tags = {}
+    for loop in ("stock", "captured"):
+        folder: Path = tiny_run("--runner", loop, "env.episode_length_s=0.1")
+        tags[loop] = set(read_scalars(folder))
+    assert tags["stock"] == tags["captured"]
+    assert {"Train/mean_reward", "Loss/value", "Metrics/falls", "Perf/learning_time"} <= tags["captured"]
+
+
+def test_the_captured_loop_stops_when_asked():
+    task = small_task(num_envs=4)
+    runner = CapturedRunner(task, Path("run"), "cpu")
+    Path("run").mkdir()
+    runner.stop()
+    assert not runner.train(5)
+    assert checkpoints(Path("run")) == [0]
+
+
+def test_the_loop_is_a_setting():
+    assert small_config(("train.runner.loop", "stock")).train.runner.loop == "stock"
+    assert task_config("anymal_c").train.runner.loop == "captured"
+
+
+def test_laps_are_timed():
+    import time
+
+    clock = Clock(torch.device("cpu"))
+    time.sleep(0.02)
+    clock.lap()
+    clock.lap()
+    first, second = clock.seconds()
+    assert 0.02 <= first < 0.5
+    assert 0.0 <= second < 0.01
+
+
+def test_a_snapshot_leaves_no_gradient_node_alive():
+    # It is taken on one CUDA stream and the update captured on another; see captured.copies.
+    parameter = torch.nn.Parameter(torch.ones(3))
+    (snapshot,) = copies([parameter])
+    assert snapshot.grad_fn is None
+    with torch.no_grad():
+        parameter += 1.0
+    assert snapshot.tolist() == [1.0, 1.0, 1.0]

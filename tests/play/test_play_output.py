@@ -1,0 +1,106 @@
+"""What play shows and writes where something is in its way: long control steps, full disks, displays that refuse."""
+
+import errno
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import POLICY, TASK, call, small_task, stand
+
+import legged.policies.restore
+from legged.errors import RunError
+from legged.learning.runner import Runner
+from legged.play import video
+from legged.policies.export import export
+from legged.process.paths import DISK_FULL
+from legged.tools import play
+
+pytestmark = pytest.mark.usefixtures("workplace")
+
+HERE = ["--task", TASK, "--load_run", str(POLICY), "--sim_device", "cpu", "sim.threads=1", "sim.physics=mujoco"]
+
+
+class FakeCamera:
+    """Takes black pictures."""
+
+    def __init__(self, task, count):
+        self.followed = 0
+
+    def picture(self, _caption):
+        return np.zeros((18, 32, 3), dtype=np.uint8)
+
+    def close(self): ...
+
+
+@pytest.fixture
+def short(monkeypatch):
+    monkeypatch.setattr(play, "SCHEDULE", ((0.2, (0.5, 0.0, 0.0)),))
+    monkeypatch.setattr(video, "Camera", FakeCamera)
+
+
+def test_a_command_that_is_over_before_it_is_measured_has_no_error(short):
+    """One control step lasts 1.25 s, the command 0.2 s: one step, in whose first second nothing is measured."""
+    task = small_task(("control.decimation", 250), num_envs=2)
+    film = video.Video(task, 1, Path("film"))
+    table = play.record(task, stand, film)
+    assert list(table.columns[1].cells) == ["-"]
+    assert film.fps == pytest.approx(1 / task.dt)
+    film.write()
+    assert Path("film/play.mp4").stat().st_size > 0
+
+
+def test_a_film_that_does_not_fit_costs_no_table(short, monkeypatch, capsys):
+    real = subprocess.run
+
+    def run(command, **options):
+        if "libx264" in command:
+            return subprocess.CompletedProcess(command, 228, b"", b"Error writing trailer: No space left on device\n")
+        return real(command, **options)
+
+    monkeypatch.setattr(video.subprocess, "run", run)
+    assert call(play.main, [*HERE, "--headless", "--num_envs", "1", "--out", "out"]) == 1
+    out, err = capsys.readouterr()
+    assert "following commands" in out
+    assert err == f"error: out/play.mp4: {DISK_FULL}\n"
+    assert [path.name for path in Path("out").iterdir()] == ["exported"]
+
+
+def test_where_nothing_can_be_drawn_commands_are_followed_all_the_same(short, monkeypatch, capsys):
+    def fail(*_):
+        raise RunError("cannot render here")
+
+    monkeypatch.setattr(video, "Camera", fail)
+    assert call(play.main, [*HERE, "--headless", "--num_envs", "1", "--out", "out"]) == 1
+    out, err = capsys.readouterr()
+    assert "following commands" in out
+    assert err == "error: cannot render here\n"
+
+
+def test_a_window_that_does_not_open_is_told_and_a_film_is_made(short, monkeypatch, capsys):
+    monkeypatch.setattr(play, "HEADLESS", False)
+    monkeypatch.setattr(play, "window_opens", lambda: False)
+    monkeypatch.setattr(play, "view", lambda *_: pytest.fail("opened"))
+    assert call(play.main, [*HERE, "--num_envs", "1", "--out", "out"]) == 0
+    assert "no window opens on this display: recording only" in capsys.readouterr().out
+    assert Path("out/play.mp4").is_file()
+
+
+def test_a_folder_that_cannot_be_written_is_found_before_anything_is_built(monkeypatch, capsys):
+    Path("file").write_text("mine")
+    monkeypatch.setattr(legged.policies.restore, "make_task", lambda *_: pytest.fail("built"))
+    assert call(play.main, [*HERE, "--out", "file/below"]) == 2
+    assert "file/below: cannot make the folder: file is a file" in capsys.readouterr().err
+
+
+def test_an_export_onto_a_full_disk_is_one_line(monkeypatch):
+    """Torch would abort the process; so it never writes to the disk itself."""
+    runner = Runner(small_task(num_envs=2))
+
+    def full(self, _data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(RunError, match=r"out/policy\.pt: no space left on the disk"):
+        export(runner, Path("out"))
+    assert not list(Path("out").iterdir())

@@ -1,0 +1,105 @@
+"""The pictures of a terrain: both are written and show what was asked for; wrong input is named."""
+
+import mujoco
+import numpy as np
+import pytest
+from helpers import TASK, call
+from PIL import Image
+
+from legged.rendering.paint import HIGH, LOW, MIDDLE, colour
+from legged.rendering.terrain_picture import Camera
+from legged.tools import show_terrain
+
+
+@pytest.fixture(scope="module")
+def can_render():
+    try:
+        mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
+    except Exception as error:  # each GL back-end fails in its own way
+        pytest.skip(f"nothing can be rendered here: {error}")
+
+
+def shown(folder, *arguments) -> tuple[np.ndarray, np.ndarray]:
+    """The map and the picture of a call."""
+    assert call(show_terrain.main, ["--task", TASK, "--out", str(folder), *arguments]) == 0
+    assert {path.name for path in folder.iterdir()} == {"terrain.png", "terrain_map.png"}  # and nothing half written
+    return tuple(np.asarray(Image.open(folder / name).convert("RGB")) for name in ("terrain_map.png", "terrain.png"))
+
+
+def red(picture: np.ndarray) -> np.ndarray:
+    """(h, w) pixels of the robots' shells."""
+    r, g, b = (picture[:, :, i].astype(int) for i in range(3))
+    return (r > 90) & (r > 3 * g) & (r > 3 * b)
+
+
+def test_chosen_types_side_by_side(tmp_path, can_render):
+    """A pit on the left, a pyramid on the right: in the map blue and red, in the picture a robot on either."""
+    chart, picture = shown(tmp_path / "new" / "folder", "--types", "stairs_up,stairs_down", "--difficulty", "0.9")
+    r, b = chart[:, :, 0].astype(int), chart[:, :, 2].astype(int)
+    blue, warm = (np.flatnonzero((difference > 60).sum(axis=0) > 20) for difference in (b - r, r - b))
+    assert np.median(blue) < np.median(warm)
+    assert picture.shape[1] == 1600
+    columns = np.flatnonzero(red(picture).any(axis=0))
+    assert columns.min() < 800 < columns.max()
+    assert 500 < red(picture).sum() < 0.1 * picture[:, :, 0].size
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 500
+
+
+def test_the_grid_of_a_task(tmp_path, can_render):
+    grid = ["terrain.mesh_type=height_map", "terrain.num_cols=2", "terrain.num_rows=3", "terrain.max_init_terrain_level=1"]
+    chart, picture = shown(tmp_path, *grid, "terrain.proportions={rough_slope_up: 0.5, obstacles: 0.5}")
+    assert chart.std() > 20
+    assert red(picture).sum() > 500
+
+
+def test_pixels_are_where_mujoco_draws(can_render):
+    """A small red ball at a place that the camera says to be off its middle."""
+    place = np.array([1.0, -2.0, 0.5])
+    camera = Camera.on(np.array([[-4.0, -4.0, 0.0], [4.0, 4.0, 0.0], [4.0, -4.0, 1.0], [-4.0, 4.0, 1.0]]), 400, 300)
+    spec = mujoco.MjSpec()
+    spec.visual.global_.fovy = 30.0
+    spec.worldbody.add_geom(size=[0.1, 0, 0], pos=place, rgba=[1, 0, 0, 1])
+    spec.worldbody.add_light(pos=[0, 0, 9])
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with mujoco.Renderer(model, 300, 400) as renderer:
+        renderer.update_scene(data, camera.view())
+        row, column = np.argwhere(renderer.render()[:, :, 0] > 20).mean(axis=0)
+    expected = camera.pixels(place[None])[0]
+    assert np.abs(expected - [200, 150]).max() > 30
+    np.testing.assert_allclose([column + 0.5, row + 0.5], expected, atol=1.5)
+
+
+def test_camera_sees_all_points_and_not_much_more():
+    points = np.array([[x, y, z] for x in (-20.0, 20.0) for y in (-5.0, 7.0) for z in (-1.0, 0.5)])
+    at = Camera.on(points, 640, 360, fill=0.9).pixels(points)
+    low, high = at.min(axis=0), at.max(axis=0)
+    np.testing.assert_allclose(0.5 * (low + high), [320, 180], atol=3)
+    assert max((high - low) / [640, 360]) == pytest.approx(0.9, abs=0.01)
+
+
+def test_colours_by_height():
+    """Level ground in the middle, ends at 0.9 m up and down and beyond."""
+    np.testing.assert_allclose(colour(np.array([-3.0, 0.0, 0.45, 0.9])), [LOW, MIDDLE, 0.5 * (MIDDLE + HIGH), HIGH])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], ["anymal_c_flat", "plane", "--types"]),
+        (["--types", "gap", "--difficulty", "1.5"], ["--difficulty", "between 0 and 1", "1.5"]),
+        (["--types", "gap", "--difficulty", "nan"], ["--difficulty", "between 0 and 1"]),
+        (["--types", "gap,stair_up"], ["--types", "'stair_up'", "did you mean 'stairs_up'?"]),
+        (["--types", "gap,gap"], ["--types", "twice"]),
+        (["--types", ""], ["--types", "''"]),
+        (["--types", "pit", "terrain.terrain_length=3"], ["3 x 8 m", "platform of 'pit'"]),
+        (["terrain.mesh_type=height_map", "terrain.proportions={gap: 0.5}"], ["terrain.proportions", "sum to 1"]),
+    ],
+)
+def test_wrong_input_is_named_and_writes_nothing(tmp_path, capsys, arguments, words):
+    assert call(show_terrain.main, ["--task", TASK, "--out", str(tmp_path / "out"), *arguments]) == 2
+    message = capsys.readouterr().err
+    for word in words:
+        assert word in message
+    assert not (tmp_path / "out").exists()
