@@ -7,6 +7,9 @@ with importing():
     from legged.config import TaskConfig
     from legged.errors import ConfigError
     from legged.envs import LeggedRobot
-    from legged.registry import make_task, register, task_config
+    from legged.registry import make_task, register, task_config, task_names
+    from legged.gymnasium_ids import announce
+
+announce(task_names)
 
 __all__ = ["HEADLESS", "ConfigError", "LeggedRobot", "TaskConfig", "make_task", "register", "task_config"]

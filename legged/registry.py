@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,10 @@ import torch
 
 from legged.config import TaskConfig, load_config
 from legged.config.checks import PLAIN, is_plain_name, shown
-from legged.config.loader import Registered, extended_tasks
-from legged.envs import LeggedRobot
+from legged.config.loader import Registered, class_hints
+from legged.envs import BaseTask, LeggedRobot
 from legged.errors import ConfigError, suggest
+from legged.gymnasium_ids import add_ids
 from legged.process.paths import data_folder, exists
 from legged.terrain import Terrain
 from legged.user_modules import import_tasks
@@ -25,23 +27,30 @@ __all__ = [
     "task_class",
     "task_config",
     "task_names",
+    "task_schema",
 ]
 
 YAML_ENDINGS = (".yaml", ".yml")
+CLASSES = {
+    "LeggedRobot": "legged.envs.legged_robot",
+    "HalfCheetah": "legged.envs.half_cheetah",
+    "Humanoid": "legged.envs.humanoid",
+}
+"""Task classes of this package that `class:` in a task's YAML can name -> the module of each."""
 
 
 @dataclass(frozen=True)
 class _Entry(Registered):
-    task_class: type[LeggedRobot] | None
+    task_class: type[BaseTask] | None
     """None takes that of the task it extends."""
 
 
 _REGISTERED: dict[str, _Entry] = {}
 
 
-def register(name: str, config: Path | str | Mapping[str, Any], task_class: type[LeggedRobot] | None = None) -> None:
-    """Make `name` a task: a YAML file, or a mapping with the same keys, and a subclass of LeggedRobot; without one, the class
-    of the registered task that it extends, else LeggedRobot.
+def register(name: str, config: Path | str | Mapping[str, Any], task_class: type[BaseTask] | None = None) -> None:
+    """Make `name` a task: a YAML file, or a mapping with the same keys, and a subclass of LeggedRobot or BaseTask; without
+    one, the class that the configuration names (`class:`), or what it extends has, else LeggedRobot.
 
     `extends: anymal_c_flat` in it builds on a task of this package or on a registered one. The path of the file, and paths
     in a mapping, are relative to the folder of the module that calls this, else to the working directory.
@@ -51,8 +60,8 @@ def register(name: str, config: Path | str | Mapping[str, Any], task_class: type
     """
     if not isinstance(name, str) or not is_plain_name(name):
         raise ConfigError(f"register: the name of a task must be {PLAIN}; got {shown(name)}")
-    if task_class is not None and not (isinstance(task_class, type) and issubclass(task_class, LeggedRobot)):
-        raise ConfigError(f"register('{name}'): expected a subclass of LeggedRobot, got {shown(task_class)}")
+    if task_class is not None and not (isinstance(task_class, type) and issubclass(task_class, BaseTask)):
+        raise ConfigError(f"register('{name}'): expected a subclass of LeggedRobot or BaseTask, got {shown(task_class)}")
     if not isinstance(config, str | Path | Mapping):
         raise ConfigError(f"register('{name}'): expected a YAML file or a mapping of sections, got {shown(config)}")
     file = sys._getframe(1).f_globals.get("__file__")
@@ -61,6 +70,7 @@ def register(name: str, config: Path | str | Mapping[str, Any], task_class: type
         beside = folder / config
         config = (beside if exists(beside) else Path(config)).absolute()
     _REGISTERED[name] = _Entry(config, folder, task_class)
+    add_ids([name])
 
 
 def register_file(path: str) -> str:
@@ -80,6 +90,7 @@ def register_file(path: str) -> str:
     other = known.config if known is not None else ours if ours.is_file() else None
     if other is None:
         _REGISTERED[name] = _Entry(file, file.parent, None)
+        add_ids([name])
     elif not isinstance(other, Path) or other.resolve() != file.resolve():
         where = other if isinstance(other, Path) else "registered from code"
         raise ConfigError(f"--task: '{path}': there is another task '{name}' ({where}); give the file another name")
@@ -97,39 +108,58 @@ def _entry(name: str) -> _Entry:
     path = data_folder("cfg") / f"{name}.yaml"
     if not is_plain_name(name) or not path.is_file():
         raise ConfigError(f"--task: there is no task {shown(name)}{suggest(name[:100], task_names(), 'tasks')}")
-    return _Entry(path, path.parent, LeggedRobot)
+    return _Entry(path, path.parent, None)
 
 
-def task_class(name: str) -> type[LeggedRobot]:
-    """The class of a task.
+def task_class(name: str) -> type[BaseTask]:
+    """Return the class of a task.
 
     Raises:
-        ConfigError: no such task.
+        ConfigError: no such task, or its configuration names a class that is not there.
     """
-    entry = _entry(name)
-    if entry.task_class is not None:
-        return entry.task_class
-    classes = (_REGISTERED[parent].task_class for parent in extended_tasks(entry, name, _REGISTERED))
-    return next((found for found in classes if found is not None), LeggedRobot)
+    for hint in class_hints(_entry(name), name, _REGISTERED):
+        entry = _REGISTERED.get(hint.task or "")
+        if entry is not None and entry.task_class is not None:
+            return entry.task_class
+        if hint.kind is not None:
+            return _class_named(hint.kind, hint.where)
+    return LeggedRobot
+
+
+def _class_named(kind: Any, where: str) -> type[BaseTask]:
+    """Return the task class of that name: one of ours, or one that a registered task has."""
+    registered = {entry.task_class.__name__: entry.task_class for entry in _REGISTERED.values() if entry.task_class}
+    if isinstance(kind, str) and kind in registered:
+        return registered[kind]
+    if not isinstance(kind, str) or kind not in CLASSES:
+        raise ConfigError(f"{where}: there is no task class {shown(kind)}{suggest(str(kind)[:100], {*CLASSES, *registered})}")
+    return getattr(import_module(CLASSES[kind]), kind)  # type: ignore[no-any-return]
+
+
+def task_schema(name: str) -> type[TaskConfig]:
+    """Return the schema of a task's configuration, or that of a legged robot for a task which is not there any more."""
+    try:
+        return task_class(name).Config
+    except ConfigError:
+        return LeggedRobot.Config
 
 
 def task_config(name: str, overrides: Iterable[tuple[str, Any]] = (), on_cpu: bool = False) -> TaskConfig:
-    """The configuration of a task, checked down to its reward names and gains, but with nothing built.
+    """Return the configuration of a task, checked down to its reward names and gains, but with nothing built.
 
     Raises:
         ConfigError: no such task, or a mistake in its configuration.
     """
-    cfg = load_config(_entry(name), name, overrides, on_cpu, _REGISTERED)
-    task_class(name).check(cfg)
+    kind = task_class(name)
+    cfg = load_config(_entry(name), name, overrides, on_cpu, _REGISTERED, kind.Config)
+    kind.check(cfg)
     return cfg
 
 
-def make_task(
-    cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None
-) -> LeggedRobot:
-    """Build the task that a configuration describes, on its own terrain or on the one given."""
+def make_task(cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None) -> Any:
+    """Build the task that a configuration describes, on its own terrain or on the one given: an instance of `task_class`."""
     other_ground = {} if terrain is None else {"terrain": terrain}  # a user's constructor may not know the argument
-    kind = task_class(cfg.task)
+    kind: Any = task_class(cfg.task)
     task = kind(cfg, device, graph, **other_ground)
     if not hasattr(task, "observation_groups"):
         raise ConfigError(f"{kind.__module__}.{kind.__name__}: its constructor must call super().__init__ with its arguments")

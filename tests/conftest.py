@@ -4,18 +4,32 @@ import legged.process.headless  # noqa: F401, I001  (chooses how to render, befo
 
 import functools
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from importlib.util import find_spec
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import torch
+from devices import CUDA, ON_A_GPU, build, on_gpu
 from helpers import kept_global_state
 
-from legged.config.schema import SimConfig
-from legged.physics import Physics
-from legged.physics import make_physics as build_physics
+from legged.physics import Physics, RobotScene
+from legged.physics.fused.torque_step import TorqueStep
 from legged.robots.robot import Robot, load_robot
 
 torch.set_num_threads(1)  # tensors are small here; a second thread only costs
+
+collect_ignore = [] if find_spec("hypothesis") else ["fuzz"]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip the tests marked `gpu` where there is none."""
+    if torch.cuda.is_available():
+        return
+    for item in items:
+        if item.get_closest_marker("gpu"):
+            item.add_marker(pytest.mark.skip(reason="torch finds no CUDA device"))
 
 
 @pytest.fixture
@@ -28,6 +42,15 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
         yield
 
 
+@pytest.fixture
+def full_precision() -> Iterator[None]:
+    """A GPU multiplies float32 matrices as they are, whatever a training before has asked of it."""
+    matmul = torch.backends.cuda.matmul
+    before, matmul.allow_tf32 = matmul.allow_tf32, False
+    yield
+    matmul.allow_tf32 = before
+
+
 @pytest.fixture(scope="session")
 def robot() -> Robot:
     return load_robot("anymal_c")
@@ -35,34 +58,50 @@ def robot() -> Robot:
 
 @pytest.fixture(scope="session")
 def make_physics(robot: Robot) -> Callable[..., Physics]:
-    """make_physics(name, num_envs=6, tag="", **sim): an engine on the CPU, the same one for the same arguments.
+    """make_physics(name, num_envs=6, tag="", **sim): an engine, the same one for the same arguments; on the CPU, or by a name
+    like "newton, cuda" on a GPU, but seen from the host.
 
     Engines are dear (mujoco_warp compiles for 25 s on a fresh machine and takes 1 to 3 s later), so tests share them
     and put every world into a state before use. A test that changes the model (`randomize`) takes a `tag` of its own.
+    With the tag "stages", mujoco_warp has our constraint solver within its own launches.
     """
 
     @functools.cache
-    def make(name: str, num_envs: int = 6, tag: str = "", **sim: float) -> Physics:
-        return build_physics(robot, SimConfig(physics=name, threads=2, **sim), num_envs, torch.device("cpu"))
+    def make(name: str, num_envs: int = 6, tag: str = "", **sim: float | str) -> Physics:
+        scene, randomized = RobotScene(robot), ("friction", "added_base_mass") if tag and tag != "stages" else ()
+        with stages_kept() if tag == "stages" else nullcontext():
+            return build(scene, name, num_envs, randomized, threads=2, **sim)
 
     return make
 
 
-@pytest.fixture(params=["mujoco", "mujoco_warp", "newton"])
+@pytest.fixture(params=["cpu", on_gpu(CUDA)])
+def device(request: pytest.FixtureRequest) -> str:
+    """Return Warp's name of a device on which the fused launches are tested."""
+    return request.param
+
+
+def stages_kept() -> AbstractContextManager:
+    """Return a context in which a mujoco_warp that is built has our constraint solver among its own launches for all else."""
+    return mock.patch.object(TorqueStep, "why_not", return_value="the test wants stages")
+
+
+@pytest.fixture(params=["mujoco", "mujoco_warp", "newton", *map(on_gpu, ("mujoco_warp, cuda", "newton, cuda"))])
 def backend(request: pytest.FixtureRequest) -> str:
-    """Every back-end; a test that asks for this holds for all of them."""
+    """Every back-end, by a name for make_physics; a test that asks for this holds for all of them."""
     return request.param
 
 
 STEPS = {
-    "mujoco_warp, rounds": {"constraint_solver": "rounds"},
-    "mujoco_warp, stages": {"smooth_dynamics": "stages"},
+    "mujoco_warp, library": {"step": "library"},
+    "mujoco_warp, stages": {"tag": "stages"},
 }
 """Other ways of mujoco_warp to make a step."""
 
 
-@pytest.fixture(params=["mujoco", "mujoco_warp", *STEPS])
+@pytest.fixture(params=["mujoco", "mujoco_warp", *STEPS, *map(on_gpu, ("mujoco_warp, cuda", "mujoco_warp, stages, cuda"))])
 def physics(request: pytest.FixtureRequest, make_physics: Callable[..., Physics]) -> Physics:
     """Six worlds with the shipped solver options, in whatever state the last test left them."""
-    name, _, _ = request.param.partition(", ")
-    return make_physics(name, **STEPS.get(request.param, {}))
+    way = request.param.removesuffix(ON_A_GPU)
+    where = request.param.removeprefix(way)
+    return make_physics(way.partition(", ")[0] + where, **STEPS.get(way, {}))

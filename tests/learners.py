@@ -10,18 +10,20 @@ SAMPLES = ROBOTS * STEPS
 LEARNING = {"num_mini_batches": 4, "num_learning_epochs": 3, "entropy_coef": 0.01, "learning_rate": 1e-3}
 
 
-def observe() -> TensorDict:
-    return TensorDict({"actor": torch.randn(ROBOTS, 7), "critic": torch.randn(ROBOTS, 9)}, batch_size=[ROBOTS])
+def observe(device="cpu") -> TensorDict:
+    groups = {"actor": torch.randn(ROBOTS, 7), "critic": torch.randn(ROBOTS, 9)}
+    return TensorDict(groups, batch_size=[ROBOTS]).to(device)
 
 
-def learner(kind, normalized=False, std_type="scalar", **options):
-    """A learner on made-up data with weights that depend on nothing else."""
+def learner(kind, normalized=False, std_type="scalar", device="cpu", **options):
+    """A learner on made-up data with weights that depend on nothing else; all of it is drawn on the CPU."""
     torch.manual_seed(0)
     groups = {"actor": ["actor"], "critic": ["critic"]}
     gaussian = {"class_name": "GaussianDistribution", "init_std": 0.5, "std_type": std_type}
     actor = MLPModel(observe(), groups, "actor", 3, [16, 16], "elu", normalized, gaussian)
     critic = MLPModel(observe(), groups, "critic", 1, [16, 16], "elu", normalized)
-    return kind(actor, critic, RolloutStorage("rl", ROBOTS, STEPS, observe(), [3]), **{**LEARNING, **options})
+    storage = RolloutStorage("rl", ROBOTS, STEPS, observe(device), [3], device)
+    return kind(actor.to(device), critic.to(device), storage, device=device, **{**LEARNING, **options})
 
 
 def fill(alg, seed):
@@ -29,10 +31,11 @@ def fill(alg, seed):
     torch.manual_seed(seed)
     with torch.inference_mode():
         for _ in range(STEPS):
-            alg.act(observe())
-            ends = torch.rand(ROBOTS)
-            alg.process_env_step(observe(), torch.randn(ROBOTS), ends < 0.1, {"time_outs": ends < 0.04})
-        alg.compute_returns(observe())
+            alg.act(observe(alg.device))
+            ends, following, rewards = torch.rand(ROBOTS), observe(), torch.randn(ROBOTS)
+            ends, following, rewards = (each.to(alg.device) for each in (ends, following, rewards))
+            alg.process_env_step(following, rewards, ends < 0.1, {"time_outs": ends < 0.04})
+        alg.compute_returns(observe(alg.device))
 
 
 def mirrored(env, obs, actions):

@@ -5,11 +5,13 @@ from dataclasses import dataclass, fields, replace
 import mujoco
 import numpy as np
 import torch
+from devices import engine_of
 from torch import Tensor
 
 from legged.config.schema import SimConfig
+from legged.math import quat_rotate
 from legged.physics import Physics, RobotState
-from legged.physics.scene.robot_scene import build_model
+from legged.physics.scene import RobotScene
 from legged.robots.robot import Robot
 
 TOUCHING = 0.54982
@@ -19,7 +21,7 @@ FIELDS = tuple(field.name for field in fields(RobotState))
 
 @dataclass(frozen=True)
 class States:
-    """The arguments of `Physics.write_state`, one row a world."""
+    """States of robots in the frames of RobotState, one row a world."""
 
     base_pos: Tensor
     base_quat: Tensor
@@ -31,12 +33,22 @@ class States:
     @classmethod
     def of(cls, physics: Physics) -> "States":
         """Where the worlds are now."""
-        return cls(*(getattr(physics.state, field.name).clone() for field in fields(cls)))
+        return cls(*(getattr(physics.robot_state, field.name).clone() for field in fields(cls)))
+
+    @property
+    def qpos(self) -> Tensor:
+        """(N, 7 + D) as MuJoCo has it."""
+        return torch.cat([self.base_pos, self.base_quat, self.dof_pos], dim=1)
+
+    @property
+    def qvel(self) -> Tensor:
+        """(N, 6 + D) as MuJoCo has it: the linear velocity in the world frame."""
+        return torch.cat([quat_rotate(self.base_quat, self.base_lin_vel), self.base_ang_vel, self.dof_vel], dim=1)
 
     def write(self, physics: Physics, mask: Tensor | None = None) -> None:
         """Into the worlds of `mask`, by default all; refreshed."""
         every = torch.ones(physics.num_envs, dtype=torch.bool)
-        physics.write_state(every if mask is None else mask, *(getattr(self, field.name) for field in fields(self)))
+        physics.write(every if mask is None else mask, self.qpos, self.qvel)
         physics.refresh()
 
 
@@ -92,7 +104,7 @@ def pd(angles: Tensor, rates: Tensor, targets: Tensor, stiffness: float = 90.0, 
 
 def snapshot(physics: Physics) -> Tensor:
     """(N, K) a copy of all of `state`."""
-    return torch.cat([getattr(physics.state, name).reshape(physics.num_envs, -1) for name in FIELDS], dim=1)
+    return torch.cat([getattr(physics.robot_state, name).reshape(physics.num_envs, -1) for name in FIELDS], dim=1)
 
 
 def bits(tensor: Tensor) -> Tensor:
@@ -100,11 +112,35 @@ def bits(tensor: Tensor) -> Tensor:
     return tensor.contiguous().view(torch.int32)
 
 
+REORDERED = {"base_lin_vel": 4e-3, "base_lin_vel_w": 4e-3, "base_ang_vel": 4e-3, "feet_vel": 4e-3, "dof_vel": 2e-2}
+"""What the order of contacts may make of velocities in a hundred steps [m/s], [rad/s]; of positions it may be 2e-4, of forces
+2 N: twice what a float32 engine may be from C MuJoCo, for here are two of them.
+"""
+
+
+def assert_same(physics: Physics, found: Tensor, expected: Tensor) -> None:
+    """Check that snapshots or rollouts (..., K) are the same, bit by bit on the CPU. On a GPU contacts come in another order
+    each time, and with them what is summed over rows of constraints.
+    """
+    if engine_of(physics).device.type == "cpu":
+        assert torch.equal(bits(found), bits(expected))
+        return
+    limits = [
+        torch.full((value[0].numel(),), {**REORDERED, "contact_forces": 2.0}.get(name, 2e-4))
+        for name, value in ((name, getattr(physics.robot_state, name)) for name in FIELDS)
+    ]
+    bad = (found - expected).abs() > torch.cat(limits)
+    bad |= found.isfinite() != expected.isfinite()
+    columns = bad.flatten(0, -2).any(dim=0).split([len(limit) for limit in limits])
+    wrong = [name for name, column in zip(FIELDS, columns, strict=True) if column.any()]
+    assert not wrong, f"{wrong} differ by up to {(found - expected).nan_to_num().abs().max():.1e}"
+
+
 def roll(physics: Physics, targets: Tensor, steps: int, stiffness: float = 90.0, damping: float = 4.0) -> Tensor:
     """(steps, N, K) `state` after each of `steps` steps under PD towards the angles `targets` (N, D)."""
     states = []
     for _ in range(steps):
-        physics.torques.copy_(pd(physics.state.dof_pos, physics.state.dof_vel, targets, stiffness, damping))
+        physics.ctrl.copy_(pd(physics.robot_state.dof_pos, physics.robot_state.dof_vel, targets, stiffness, damping))
         physics.step()
         physics.refresh()
         states.append(snapshot(physics))
@@ -115,7 +151,7 @@ class CWorlds:
     """One MjData a world, stepped by mj_step: float64, no batching, no code of ours but the model."""
 
     def __init__(self, robot: Robot, sim: SimConfig, states: States) -> None:
-        self.robot, self.model = robot, build_model(robot, sim)
+        self.robot, self.model = robot, RobotScene(robot).model(sim)
         self.shapes = {self.model.geom(name).id: i for i, name in enumerate(robot.contact_names)}
         self.feet = [self.model.geom(name).id for name in robot.feet_names]
         self._live = mujoco.MjData(self.model)

@@ -1,4 +1,4 @@
-"""What the README shows works: its example task, its commands, its numbers, and the policy that is shipped."""
+"""What the README and the pages of docs/ show works: the example task, commands, links, numbers, and the shipped policies."""
 
 import json
 import re
@@ -9,31 +9,44 @@ import pytest
 import torch
 from helpers import POLICY
 
+from legged import registry
 from legged.registry import import_tasks, make_task, task_config
-from legged.tools import benchmark, compare, evaluate, play, plot, show_terrain, time_to_walk, train, warmup
+from legged.tools import benchmark, compare, evaluate, play, plot, show_terrain, train, warmup
 
 ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-SPEED = (ROOT / "SPEED.md").read_text(encoding="utf-8")
-ONE_LINE = re.sub(r"(?<!`)`[^`]+`(?!`)", lambda code: code[0].replace("\n", " "), README + SPEED)
-"""Both, without line ends in commands that are part of a sentence."""
+PAGES = {path: path.read_text(encoding="utf-8") for path in (*ROOT.glob("*.md"), *sorted((ROOT / "docs").glob("*.md")))}
+README, RESULTS = PAGES[ROOT / "README.md"], PAGES[ROOT / "docs" / "results.md"]
+ONE_LINE = re.sub(r"(?<!`)`[^`]+`(?!`)", lambda code: code[0].replace("\n", " "), "\n".join(PAGES.values()))
+"""All pages, without line ends in commands that are part of a sentence."""
+TASKS = sorted(path.stem for path in (ROOT / "cfg").glob("*.yaml"))
 ROUGH = ROOT / "resources" / "policies" / "anymal_c"
 
 
 def test_the_example_task_trains_without_touching_the_package(tmp_path, monkeypatch):
-    (code,) = re.findall(r"```python\n# my_tasks.py\n(.*?)```", README, flags=re.DOTALL)
+    (code,) = re.findall(r"```python\n# slip.py\n(.*?)```", README, flags=re.DOTALL)
     path = tmp_path / "readme_tasks.py"
     path.write_text(code, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "_REGISTERED", {})
     options = ["env.num_envs=4", "train.runner.num_steps_per_env=4", "--max_iterations", "1", "--sim_device", "cpu"]
-    assert train.main(["--import", str(path), "--task", "anymal_c_careful", *options]) == 0
-    assert list(tmp_path.glob("logs/anymal_c_careful/*/model_0.pt"))
+    assert train.main(["--import", str(path), "--task", "careful", *options]) == 0
+    assert list(tmp_path.glob("logs/careful/*/model_0.pt"))
 
     import_tasks(str(path))
-    task_config("anymal_c_careful")  # with a GPU's settings
-    task = make_task(task_config("anymal_c_careful", [("env.num_envs", 2), ("sim.physics", "mujoco")], on_cpu=True))
-    assert task.observation_groups["critic"].buffer.shape == (2, 52)  # 48 and four feet
+    task_config("careful")  # with a GPU's settings
+    task = make_task(task_config("careful", [("env.num_envs", 2), ("sim.physics", "mujoco")], on_cpu=True))
     assert "foot_slip" in task.rewards.names
+
+
+def test_the_readme_is_short_and_its_tree_names_every_folder():
+    assert len(README.splitlines()) <= 150
+    (tree,) = re.findall(r"```text\n(train\.py .*?)```", README, flags=re.DOTALL)
+    folders = {path.name for path in (ROOT / "legged").iterdir() if (path / "__init__.py").is_file()}
+    assert set(re.findall(r"^  (\w+)/ +\w", tree, flags=re.MULTILINE)) == folders
+
+
+def test_the_readme_names_every_task():
+    assert set(re.findall(r"^\| `(\w+)` \| ", README, flags=re.MULTILINE)) == set(TASKS)
 
 
 @pytest.mark.parametrize(
@@ -45,7 +58,6 @@ def test_the_example_task_trains_without_touching_the_package(tmp_path, monkeypa
         ("python -m legged.tools.benchmark", benchmark.main),
         ("python -m legged.tools.compare", compare.main),
         ("python -m legged.tools.plot", plot.main),
-        ("python -m legged.tools.time_to_walk", time_to_walk.main),
         ("python -m legged.tools.warmup", warmup.main),
         ("python -m legged.tools.show_terrain", show_terrain.main),
     ],
@@ -63,8 +75,18 @@ def test_every_flag_that_is_shown_exists(name, main, capsys):
 
 
 def test_links_and_pictures_are_there():
-    for target in re.findall(r"\]\((?!http)([^)]+)\)", README + SPEED):
-        assert (ROOT / target).is_file(), target
+    for page, text in PAGES.items():
+        for target in re.findall(r"\]\((?!http)([^)]+)\)", text):
+            path = (page.parent / target).resolve()
+            assert path.is_file(), f"{page.name}: {target}"
+
+
+def test_paths_in_the_text_are_there():
+    """Whatever is written as code and begins with a folder of the repository is one of its files, or a task in Gymnasium."""
+    for page, text in PAGES.items():
+        for path in re.findall(r"`((?:legged|tests|docs|cfg|resources)/[\w./-]+)`", text):
+            of_gymnasium = path.removeprefix("legged/") in TASKS
+            assert (ROOT / path).exists() or of_gymnasium, f"{page.name}: {path}"
 
 
 def test_shipped_policy_follows_commands_in_c_mujoco(tmp_path, capsys):
@@ -83,7 +105,7 @@ def test_numbers_of_the_results_table_are_those_of_the_shipped_evaluation():
     for seed, engine, label in columns:
         folder = POLICY if seed == 1 else POLICY / f"seed_{seed}"
         result = json.loads((folder / f"evaluation_{engine}.json").read_text())
-        (row,) = re.findall(rf"\| {seed}, {label} \|(.*)\n", README)
+        (row,) = re.findall(rf"\| {seed}, {label} \|(.*)\n", RESULTS)
         lin, ang, gait = result["rmse_lin"], result["rmse_ang"], result["gait"]
         assert f"{lin['mean']:.3f} ({lin['worst']:.3f})" in row
         assert f"{ang['mean']:.3f} ({ang['worst']:.3f})" in row
@@ -111,7 +133,7 @@ def seeds(physics: str) -> list[dict]:
 
 
 def of_seeds(values: list[float], decimals: int, unit: str = "") -> str:
-    """As the README writes them: mean (lowest to highest)."""
+    """As the page of results writes them: mean (lowest to highest)."""
     middle = sum(values) / len(values)
     edges = 0 if unit else decimals
     return f"{middle:.{decimals}f}{unit} ({min(values):.{edges}f} to {max(values):.{edges}f})"
@@ -135,13 +157,13 @@ def test_numbers_of_the_rough_results_are_those_of_the_shipped_evaluations():
         ("slope up, 30 degrees", "slope_up", 30.0),
     ):
         cells = [of_seeds([share(result, terrain, size) for result in results], 1, " %") for results in both]
-        assert f"| {label} | {' | '.join(cells)} |" in README
+        assert f"| {label} | {' | '.join(cells)} |" in RESULTS
     for key in ("rmse_lin", "rmse_ang"):
         for part in ("mean", "worst"):
             cells = [of_seeds([result["rough"][key][part] for result in results], 3) for results in both]
-            assert f"| {' | '.join(cells)} |" in README
+            assert f"| {' | '.join(cells)} |" in RESULTS
     cells = [of_seeds([100.0 * result["rough"]["falls"] for result in results], 2) for results in both]
-    assert f"| falls [%] | {' | '.join(cells)} |" in README
+    assert f"| falls [%] | {' | '.join(cells)} |" in RESULTS
 
 
 def test_numbers_of_the_blind_policies_are_those_of_the_shipped_evaluations():
@@ -155,10 +177,29 @@ def test_numbers_of_the_blind_policies_are_those_of_the_shipped_evaluations():
         ("slope up, 22 degrees", "slope_up", 22.0),
     ):
         cells = [f"{share(result, terrain, size):.0f} %" for result in results]
-        assert f"| {label} | {' | '.join(cells)} |" in README
+        assert f"| {label} | {' | '.join(cells)} |" in RESULTS
     errors = [result["rough"] for result in results]
     cells = [f"{error['rmse_lin']['mean']:.3f}, {error['rmse_ang']['mean']:.3f}" for error in errors]
-    assert f"RMSE on rough ground | {' | '.join(cells)} |" in README
+    assert f"RMSE on rough ground | {' | '.join(cells)} |" in RESULTS
+
+
+@pytest.mark.parametrize(("row", "folder"), [("1", "seed_1"), ("2, shipped", ""), ("3", "seed_3")])
+def test_numbers_of_the_humanoid_are_those_of_the_shipped_evaluations(row, folder):
+    files = [ROUGH.parent / "humanoid" / folder / f"evaluation_{engine}.json" for engine in ("mujoco_warp", "mujoco")]
+    results = [json.loads(file.read_text())["episodes"] for file in files]
+    assert all(result["count"] == 256 for result in results)
+    cells = [f"{result['metrics']['x_velocity']:.2f}, {100.0 * result['failures']:.1f} %" for result in results]
+    (shown,) = re.findall(rf"\n\| {row} \| [^|]* \| (\d\.\d+, .*) \|\n", RESULTS)
+    assert shown == " | ".join(cells)
+    assert folder or f"| {results[0]['metrics']['x_velocity']:.1f} m/s, no falls |" in README
+
+
+def test_numbers_of_the_step_are_those_of_the_shipped_evaluation():
+    result = json.loads((ROUGH.parent / "anymal_c_step" / "evaluation_mujoco_warp.json").read_text())
+    points = {point["size"]: point for point in result["success"]["types"]["step"]["points"]}
+    crossed = f"{points[0.15]['successes']} of {points[0.15]['robots']} tries"
+    assert f"crosses the step of 15 cm in {crossed}, and one of 20 cm in {points[0.2]['successes']}." in RESULTS
+    assert f"| crosses in {crossed} |" in README
 
 
 @pytest.mark.parametrize("policy", sorted(ROUGH.parent.iterdir()), ids=lambda path: path.name)
@@ -188,7 +229,7 @@ def test_a_policy_without_its_optimiser_is_exported(tmp_path):
     ],
 )
 def test_numbers_of_the_table_of_engines_are_those_of_the_crossings(label, folder):
-    shown = re.findall(rf"\n\| {re.escape(label)} \|(.*)\|\n", README)[0].split("|")
+    shown = re.findall(rf"\n\| {re.escape(label)} \|(.*)\|\n", RESULTS)[0].split("|")
     rows = {row["physics"]: row for row in json.loads((folder / "crossing.json").read_text())["engines"]}
     columns = ("mujoco", "steel", "kamino", "featherstone", "xpbd", "semi_implicit")
     for cell, solver in zip(shown, columns, strict=True):
@@ -204,7 +245,7 @@ def test_numbers_of_the_table_of_engines_are_those_of_the_crossings(label, folde
 @pytest.mark.parametrize("engine", ["mujoco_warp", "newton_mujoco", "newton_steel", "newton_xpbd"])
 def test_numbers_of_the_table_of_trainings_are_those_of_the_evaluations(engine):
     result = json.loads((POLICY / engine / f"evaluation_{engine}.json").read_text())
-    shown = [row for row in README.splitlines() if re.match(rf"\| (50 iterations in )?{engine} \| [\d.]+ s ", row)]
+    shown = [row for row in RESULTS.splitlines() if re.match(rf"\| (50 iterations in )?{engine} \| [\d.]+ s ", row)]
     errors = [f"{result[key]['mean']:.3f} ({result[key]['worst']:.3f})" for key in ("rmse_lin", "rmse_ang")]
     cells = [f"{errors[0]} m/s", f"{errors[1]} rad/s", f"{100.0 * result['falls']:.2f} %"]
     assert [row.strip("| ").split(" | ")[3:] for row in shown] == [cells]

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 
-from legged.envs import LeggedRobot
+from legged.envs import BaseTask
 
 
 @dataclass(frozen=True)
@@ -18,8 +18,8 @@ class KernelTime:
     """On the GPU, of all its launches in a control step [us]."""
 
 
-def kernel_times(task: LeggedRobot, steps: int) -> list[KernelTime]:
-    """The kernels of a control step, longest first: means over `steps` steps under small random actions."""
+def kernel_times(task: BaseTask, steps: int) -> list[KernelTime]:
+    """Return the kernels of a control step, longest first: means over `steps` steps under small random actions."""
     actions = 0.3 * torch.randn(task.num_envs, task.num_actions, device=torch.device(task.device))
     task.step(actions)
     torch.cuda.synchronize()
@@ -33,7 +33,7 @@ def kernel_times(task: LeggedRobot, steps: int) -> list[KernelTime]:
 
 
 def table(times: list[KernelTime], longest: int) -> str:
-    """The `longest` kernels in lines, and the sum of all."""
+    """Return the `longest` kernels in lines, and the sum of all."""
     lines = [f"{'us':>9} {'launches':>9}  kernel"]
     lines += [f"{time.total_us:9.1f} {time.launches:9.1f}  {time.name[:90]}" for time in times[:longest]]
     launches, total = sum(time.launches for time in times), sum(time.total_us for time in times)

@@ -58,7 +58,7 @@ def scale(args: argparse.Namespace, given: Sequence[str], cfg: TaskConfig, devic
 
 
 def numbers(text: str) -> list[int]:
-    """'1024,4096' -> [1024, 4096].
+    """Read '1024,4096' as [1024, 4096].
 
     Raises:
         ConfigError: not a list of numbers above 0.
@@ -70,7 +70,7 @@ def numbers(text: str) -> list[int]:
 
 
 def measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, Any]:
-    """The benchmark's numbers under these arguments with `size` robots, or why there are none as `failed`.
+    """Return the benchmark's numbers under these arguments with `size` robots, or why there are none as `failed`.
 
     Raises:
         ConfigError: the configuration does not allow that many.
@@ -95,7 +95,7 @@ def measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, A
 
 
 def others(given: Sequence[str]) -> list[str]:
-    """A command line without what is different for each size, abbreviated or not."""
+    """Return a command line without what is different for each size, abbreviated or not."""
     own = argparse.ArgumentParser(add_help=False)
     for flag in ("--scale", "--json", "--num_envs", "--runner"):
         own.add_argument(flag)
@@ -103,7 +103,7 @@ def others(given: Sequence[str]) -> list[str]:
 
 
 def line(row: dict[str, Any]) -> str:
-    """A row of the table."""
+    """Return a row of the table."""
     if "failed" in row:
         _, width, robots = COLUMNS[0]
         return f"{robots(row):>{width}}  {row['failed']}"

@@ -12,7 +12,7 @@ from legged.registry import YAML_ENDINGS, import_tasks, register_file
 
 
 def add_task_arguments(parser: argparse.ArgumentParser) -> None:
-    """--task, --import, engine and devices, and free `key=value` overrides."""
+    """Add --task, --import, engine and devices, and free `key=value` overrides."""
     parser.add_argument("--task", required=True, help="name of the task, e.g. anymal_c_flat, or a YAML file")
     parser.add_argument("--import", dest="module", help="module or .py file that registers tasks of your own")
     parser.add_argument("--num_envs", type=int, help="number of robots (env.num_envs)")
@@ -25,14 +25,14 @@ def add_task_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
-    """Which policy to load."""
+    """Add the flags that say which policy to load."""
     parser.add_argument("--experiment_name", help="folder under logs/; the task's name by default")
     parser.add_argument("--load_run", help="run folder, by name or path; the newest by default")
     parser.add_argument("--checkpoint", type=int, help="iteration of the checkpoint; the latest by default")
 
 
 def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
-    """All overrides of a command line; flags come after `key=value`s.
+    """Return all overrides of a command line; flags come after `key=value`s.
 
     Raises:
         ConfigError: not of the form `key=value`, or --solver without the engine whose it is.
@@ -59,7 +59,7 @@ def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
 
 
 def policy_overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
-    """Those that change what a policy was trained with: all but the one that says which run it is of.
+    """Return all overrides but the experiment name, which says what run a policy is of.
 
     Raises:
         ConfigError: as `overrides`.
@@ -68,7 +68,7 @@ def policy_overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
 
 
 def pick_device(name: str | None, flag: str = "--sim_device") -> torch.device:
-    """The device that was asked for, else the GPU if there is one; under torchrun the GPU of this process's number.
+    """Return the device that was asked for, else the GPU if there is one; under torchrun the GPU of this process's number.
 
     Raises:
         ConfigError: no such device, no GPU here, or under torchrun another one than its own.
@@ -112,7 +112,7 @@ def settle_on(device: torch.device) -> None:
         torch.cuda.set_device(device)  # what names no device must not end up on the first GPU
 
 
-def import_and_check(args: argparse.Namespace) -> None:
+def register_given(args: argparse.Namespace) -> None:
     """Let the user's module register its tasks, if one was named; a file given as --task becomes a task."""
     if args.module:
         import_tasks(args.module)

@@ -95,15 +95,15 @@ def line_of_user(error: BaseException) -> str:
 
 
 def _is_of_user(frame: traceback.FrameSummary) -> bool:
-    """Whether a line is neither ours, nor a library's, nor Python's."""
+    """Return whether a line is neither ours, nor a library's, nor Python's."""
     file = Path(frame.filename)
     libraries = {"site-packages", "dist-packages"} & {*file.parts} or file.is_relative_to(sysconfig.get_path("stdlib"))
     return not libraries and not file.is_relative_to(Path(legged.errors.__file__).parent) and file.is_file()
 
 
 def known_failure(error: BaseException) -> str | None:
-    """One line on a full disk, a file that can't be written or too little memory, whichever library met it; None for all
-    other errors.
+    """Return one line on a full disk, a file that can't be written or too little memory, whichever library met it; None for
+    all other errors.
     """
     full = full_disk_in(error)
     if full is not None:

@@ -14,14 +14,14 @@ class Output:
     """A text stream that takes what is written to it and, once it can't be written any more, drops it."""
 
     def __init__(self, stream: TextIO | None) -> None:
-        """`stream` is None in a process that was started without one."""
+        """Take `stream`, which is None in a process that was started without one."""
         self._stream = open(os.devnull, "w") if stream is None else stream  # noqa: SIM115  (as long as the process)
         self.lost: str | None = None
         """Why nothing more can be written; None while it can."""
         self._when_lost: list[Callable[[], object]] = []
 
     def write(self, text: str) -> int:
-        """Write, or drop what can't be written; the number of characters."""
+        """Write, or drop what can't be written; return the number of characters."""
         if self.lost is None:
             with self._watched():
                 self._stream.write(text)
@@ -56,7 +56,7 @@ class Output:
                 do()
 
     def __getattr__(self, name: str) -> Any:
-        """Whatever else a text stream has."""
+        """Return whatever else a text stream has."""
         return getattr(self._stream, name)
 
 
@@ -67,7 +67,7 @@ def _why(error: OSError | ValueError) -> str:
 
 
 _OUTPUTS: list[Output] = []
-"""Of the commands that run in this process, the innermost last."""
+"""Outputs of the commands that run in this process, the innermost last."""
 
 
 def when_output_is_lost(do: Callable[[], object]) -> None:

@@ -1,9 +1,10 @@
 """Typed configuration: `schema` says what can be set, `loader` reads it."""
 
 from legged.config.loader import from_dict, load_config, override, parse_override, to_dict, to_yaml
-from legged.config.schema import TaskConfig
+from legged.config.schema import LeggedConfig, TaskConfig
 
 __all__ = [
+    "LeggedConfig",
     "TaskConfig",
     "from_dict",
     "load_config",

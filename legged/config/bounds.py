@@ -1,6 +1,6 @@
 """Bounds of the schema's numbers: what is beyond them is a slip of the pen, and would end in an overflow or out of memory.
 
-Bounds hold for every item of a list and every value of a map; a list with any bound must not be empty.
+Bounds hold for every item of a list and every value of a map; a list with any bound must not be empty, unless they say so.
 """
 
 from typing import Any
@@ -18,17 +18,17 @@ LARGEST = 1e6
 
 
 def between(low: float, high: float) -> Bounds:
-    """From `low` to `high`, both included."""
+    """Return metadata: from `low` to `high`, both included."""
     return {"min": low, "max": high}
 
 
 def positive(high: float, low: float = SMALLEST) -> Bounds:
-    """Above 0: from `low` to `high`."""
+    """Return metadata: above 0, from `low` to `high`."""
     return {"above": 0, "min": low, "max": high}
 
 
 def items(most: int, bounds: Bounds | None = None) -> Bounds:
-    """A list of 1 to `most` items, each within `bounds`."""
+    """Return metadata: a list of 1 to `most` items, each within `bounds`."""
     return {"items": most, **(bounds or {})}
 
 
@@ -38,3 +38,5 @@ NAME: Bounds = {"name": True}
 NAMES = items(1000)
 """A list of texts, none of them twice."""
 NAMES["unique"] = True
+TERMS: Bounds = {**NAMES, "may_be_empty": True}
+"""The same, or none at all."""

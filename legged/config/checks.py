@@ -30,7 +30,7 @@ def hints_of(schema: type) -> dict[str, Any]:
 
 
 def shown(value: Any) -> str:
-    """A value as an error shows it: on one line, and not endless."""
+    """Return a value as an error shows it: on one line, and not endless."""
     try:
         text = repr(value)
     except ValueError:  # Python writes no integer of more than 4300 digits
@@ -40,19 +40,20 @@ def shown(value: Any) -> str:
 
 
 def plain_path(key: Any) -> str:
-    """A key as part of a dotted path in an error: on one line, and not endless."""
+    """Return a key as part of a dotted path in an error: on one line, and not endless."""
     return key if isinstance(key, str) and key and key.isprintable() and len(key) <= SHOWN else shown(key)
 
 
 def is_plain_name(name: str) -> bool:
-    """Whether `name` can be that of a folder inside another one, on every system."""
+    """Return whether `name` can be that of a folder inside another one, on every system."""
     if not name or not name.isprintable() or name.startswith(".") or name != name.strip():
         return False
     return not any(mark in name for mark in "/\\") and len(name) <= LONGEST_NAME and len(name.encode()) <= 2 * LONGEST_NAME
 
 
-def build(schema: type[T], data: Any, path: str, origins: Origins, source: str) -> T:
-    """An instance of the dataclass `schema` from a mapping, checked field by field.
+def build(schema: type[T], data: Any, path: str, origins: Origins, source: str, base: T | None = None) -> T:
+    """Make an instance of the dataclass `schema` from a mapping, checked field by field; what the mapping leaves out is that
+    of `base`, or else the schema's default.
 
     Raises:
         ConfigError: an unknown key, a wrong type, or a value beyond its bounds.
@@ -72,23 +73,36 @@ def build(schema: type[T], data: Any, path: str, origins: Origins, source: str) 
         if dataclasses.is_dataclass(hints[key]):
             values[key] = build(hints[key], value, dotted, origins, source)  # type: ignore[arg-type]
             continue
-        checked = _check(hints[key], value, dotted, origins, source)
+        is_map = typing.get_origin(hints[key]) is dict
+        factory = fields[key].default_factory
+        entries = factory() if is_map and callable(factory) else {}
+        if is_map and dataclasses.is_dataclass(typing.get_args(hints[key])[1]):
+            checked = _build_entries(typing.get_args(hints[key])[1], value, dotted, origins, source, entries)
+        else:
+            checked = _check(hints[key], value, dotted, origins, source)
         if fields[key].metadata:
             _check_bounds(checked, fields[key].metadata, dotted, f"{_origin(dotted, origins, source)}: ")
-        if typing.get_origin(hints[key]) is dict:  # maps merge with the schema's default entries
-            factory = fields[key].default_factory
-            checked = {**(factory() if callable(factory) else {}), **checked}
-        values[key] = checked
-    return schema(**values)
+        values[key] = {**entries, **checked} if is_map else checked  # maps merge with the schema's default entries
+    return schema(**values) if base is None else dataclasses.replace(base, **values)  # type: ignore[type-var]
+
+
+def _build_entries(
+    schema: Any, data: Any, path: str, origins: Origins, source: str, entries: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Build the instances of `schema` in a map of them; one that is there by default keeps what is left out."""
+    names = _check(dict[str, object], data, path, origins, source)  # of any values: they are looked at next
+    return {
+        name: build(schema, data[name], f"{path}.{plain_path(name)}", origins, source, entries.get(name)) for name in names
+    }
 
 
 def _origin(path: str, origins: Origins, source: str) -> str:
-    """Who gave the value at `path`; `source` where nobody in particular did."""
+    """Return who gave the value at `path`; `source` where nobody in particular did."""
     return origins.of(path) if path and origins else source
 
 
 def _check(kind: Any, value: Any, path: str, origins: Origins, source: str) -> Any:
-    """`value` as `kind`, or ConfigError. Integers count as floats, lists as tuples; nothing else is converted."""
+    """Return `value` as `kind`, or raise ConfigError. Integers count as floats, lists as tuples; nothing else changes."""
     origin, args = typing.get_origin(kind), typing.get_args(kind)
 
     def fail(expected: str) -> ConfigError:
@@ -141,7 +155,7 @@ def _check(kind: Any, value: Any, path: str, origins: Origins, source: str) -> A
 
 
 def _number(value: float, fail: Any) -> float:
-    """A number that float32 holds."""
+    """Return a number that float32 holds."""
     if value != value:
         raise fail("a number")
     try:
@@ -154,7 +168,7 @@ def _number(value: float, fail: Any) -> float:
 
 
 def _check_free(value: Any, fail: Any, depth: int = 0) -> Any:
-    """A value of the free space: whatever YAML can write and read, but no infinite number."""
+    """Return a value of the free space: whatever YAML can write and read, but no infinite number."""
     if depth > DEEPEST:
         raise fail(f"at most {DEEPEST} maps and lists inside each other")
     if isinstance(value, Mapping):
@@ -174,7 +188,7 @@ def _check_free(value: Any, fail: Any, depth: int = 0) -> Any:
 
 
 def _check_bounds(value: Any, bounds: Mapping[str, Any], path: str, origin: str) -> None:
-    """Holds a checked value, and all items in it, against the bounds of its field."""
+    """Hold a checked value, and all items in it, against the bounds of its field."""
     if isinstance(value, tuple):
         _check_length(value, bounds, f"{origin}{path}")
         for i, item in enumerate(value):
@@ -198,7 +212,7 @@ def _check_bounds(value: Any, bounds: Mapping[str, Any], path: str, origin: str)
 
 
 def _check_length(value: Sequence[Any], bounds: Mapping[str, Any], where: str) -> None:
-    if not value:
+    if not value and not bounds.get("may_be_empty"):
         raise ConfigError(f"{where}: must not be empty")
     if len(value) > bounds.get("items", len(value)):
         raise ConfigError(f"{where}: must have at most {bounds['items']} items, got {len(value)}")

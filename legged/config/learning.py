@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from legged.config.bounds import NAME, UNIT, between, items, positive
+from legged.config.bounds import NAME, NAMES, UNIT, between, items, positive
 
 HIDDEN = items(64, between(1, 16384))
 
@@ -12,6 +12,10 @@ HIDDEN = items(64, between(1, 16384))
 class PolicyConfig:
     """Networks of actor and critic: layers, before them `rnn_num_layers` recurrent ones if `rnn_type` says which kind."""
 
+    actor_observations: tuple[str, ...] = field(default=("actor",), metadata=NAMES)
+    """Observation groups that the policy reads, side by side in this order."""
+    critic_observations: tuple[str, ...] = field(default=("critic",), metadata=NAMES)
+    """Observation groups that the value function reads; those of the policy, if both are to see the same."""
     actor_hidden_dims: tuple[int, ...] = field(default=(512, 256, 128), metadata=HIDDEN)
     """Widths of the policy's hidden layers."""
     critic_hidden_dims: tuple[int, ...] = field(default=(512, 256, 128), metadata=HIDDEN)
@@ -20,6 +24,14 @@ class PolicyConfig:
     """Activation function, by rsl-rl's names."""
     init_noise_std: float = field(default=1.0, metadata=positive(1000, low=1e-6))
     """Standard deviation of the actions before training."""
+    min_noise_std: float = field(default=1e-6, metadata=positive(1000, low=1e-6))
+    """Least standard deviation of the actions; it keeps exploration up where the entropy would collapse."""
+    max_noise_std: float = field(default=1e6, metadata=positive(1e6, low=1e-6))
+    """Largest standard deviation of the actions."""
+    noise_std_type: Literal["scalar", "log"] = "scalar"
+    """What is learned: the standard deviation itself, or its logarithm."""
+    state_dependent_std: bool = False
+    """The policy gives the standard deviation with the actions, for each state; otherwise it is one number an action."""
     obs_normalization: bool = False
     """Normalise observations by running mean and variance."""
     rnn_type: Literal["none", "lstm", "gru"] = "none"
@@ -46,8 +58,10 @@ class AlgorithmConfig:
     """Passes over the samples of an iteration."""
     num_mini_batches: int = field(default=4, metadata=between(1, 1_000_000))
     """Parts into which the samples are split; each gives one step of the optimiser."""
+    optimizer: Literal["adam", "adamw", "sgd", "rmsprop"] = "adam"
+    """Rule by which gradients change the weights, by torch's names."""
     learning_rate: float = field(default=1e-3, metadata=positive(1, low=1e-12))
-    """Step size of Adam; where `adaptive` starts from."""
+    """Step size of the optimiser; where `adaptive` starts from."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     """`adaptive` changes the learning rate so that the policy changes by desired_kl; `fixed` leaves it."""
     gamma: float = field(default=0.99, metadata=UNIT)
@@ -58,10 +72,16 @@ class AlgorithmConfig:
     """KL divergence between two policies in a row that `adaptive` aims at."""
     max_grad_norm: float = field(default=1.0, metadata=positive(1e9))
     """Norm at which gradients are clipped."""
+    reward_scale: float = field(default=1.0, metadata=positive(1e6, low=1e-9))
+    """Factor on rewards before they are learned from; it is the learner's alone, and shows in no log or result."""
+    normalize_advantage_per_mini_batch: bool = False
+    """Normalise advantages over each mini-batch; otherwise over all samples of an iteration."""
     use_mixed_precision: bool = False
     """Networks compute in bfloat16 while they learn; weights, losses and the optimiser stay float32."""
     symmetry: bool = False
     """Learn from every sample also as its mirror image, left for right (Mittal et al., arXiv 2403.04359)."""
+    mirror_loss_coeff: float = field(default=0.0, metadata=between(0, 1000))
+    """Weight, with symmetry, of a loss for actions that differ from the mirrored ones of the mirror image; 0 for none."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +96,7 @@ class RunnerConfig:
     """Iterations between two checkpoints."""
     loop: Literal["stock", "captured"] = "captured"
     """`captured`: rsl-rl's arithmetic without the host in between, on a GPU as CUDA graphs; it falls back to `stock` where
-    a feature needs that, and says why. `stock`: rsl-rl's own training loop."""
+    networks or algorithm need that, and says why. `stock`: rsl-rl's own training loop."""
     matmul: Literal["float32", "tf32"] = "tf32"
     """Matrix products of the networks on a GPU while training; `tf32` keeps 10 of the factors' 23 bits and is faster."""
     experiment_name: str = field(default="", metadata=NAME)

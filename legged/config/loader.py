@@ -10,8 +10,10 @@ from typing import Any
 import yaml
 
 from legged.config.checks import DEEPEST, SHOWN, build, plain_path, shown
+from legged.config.legged import LeggedConfig
 from legged.config.origins import Origins
-from legged.config.schema import TaskConfig
+from legged.config.renamed import renamed
+from legged.config.task import TaskConfig
 from legged.config.yaml_files import parse, read_yaml
 from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, exists
@@ -33,7 +35,7 @@ Source = Path | Mapping[str, Any] | Registered
 
 
 def merge(base: dict[str, Any], top: Mapping[str, Any], source: str, origins: Origins, prefix: str = "") -> None:
-    """Lays `top` over `base` in place: maps merge, lists and scalars replace. Notes in `origins` who set each path.
+    """Lay `top` over `base` in place: maps merge, lists and scalars replace. Note in `origins` who set each path.
 
     Raises:
         ConfigError: maps inside each other without end.
@@ -57,17 +59,19 @@ class _Layer:
     """One of the configurations that are laid over each other."""
 
     data: Mapping[str, Any]
-    """What it sets, without `extends`."""
+    """What it sets, without `extends` and `class`."""
     name: str
     """What errors call it."""
     folder: Path
     """What its paths are relative to."""
     task: str | None
     """The name of the registered task that it is; None for a file."""
+    kind: Any
+    """What it names as the class of the task; None if it names none."""
 
 
 def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> list[_Layer]:
-    """The configuration of `task`, what it extends, what that extends, and so on.
+    """Return the configuration of `task`, what it extends, what that extends, and so on.
 
     Raises:
         ConfigError: one of them cannot be read, is not there, or extends itself.
@@ -83,11 +87,13 @@ def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> 
         if len(layers) == LONGEST_CHAIN:
             raise ConfigError(f"{name}: extends: more than {LONGEST_CHAIN} files extend each other")
         seen.append(_mark(found))
-        data = read_yaml(given) if isinstance(given, Path) else dict(given)
-        parent = data.pop("extends", None)
+        data = renamed(read_yaml(given) if isinstance(given, Path) else given, name)
+        if isinstance(data.get("cpu"), Mapping):
+            data["cpu"] = renamed(data["cpu"], f"{name}: cpu")
+        parent, kind = data.pop("extends", None), data.pop("class", None)
         beside = given.parent if isinstance(given, Path) else None
         folder = beside or (found.folder if isinstance(found, Registered) else Path.cwd())
-        layers.append(_Layer(data, name, folder, task if isinstance(found, Registered) else None))
+        layers.append(_Layer(data, name, folder, task if isinstance(found, Registered) else None, kind))
         if parent is None:
             return layers
         others = {key: entry for key, entry in registered.items() if _mark(entry) not in seen}
@@ -96,7 +102,7 @@ def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> 
 
 
 def _mark(source: Source) -> Any:
-    """What tells configurations apart."""
+    """Return what tells configurations apart."""
     given = source.config if isinstance(source, Registered) else source
     return given.resolve() if isinstance(given, Path) else id(given)
 
@@ -104,7 +110,7 @@ def _mark(source: Source) -> Any:
 def _parent(
     parent: Any, name: str, beside: Path | None, registered: Mapping[str, Registered]
 ) -> tuple[Path | Registered, str]:
-    """What `extends: parent` means: a file in the folder `beside`, a registered task, or one of ours; and its name."""
+    """Return what `extends: parent` means: a file in the folder `beside`, a registered task, or one of ours; and its name."""
     if not isinstance(parent, str) or not parent:
         raise ConfigError(f"{name}: extends: expected the name of a task or of a file beside this one, got {shown(parent)}")
     file = parent if parent.endswith((".yaml", ".yml")) else f"{parent}.yaml"
@@ -119,13 +125,26 @@ def _parent(
     raise ConfigError(f"{name}: extends: there is no {shown(parent)}{suggest(parent[:SHOWN], names)}")
 
 
-def extended_tasks(source: Source, task: str, registered: Mapping[str, Registered]) -> list[str]:
-    """Names of those tasks of `registered` that the configuration of `task` extends, the nearest first."""
-    return [layer.task for layer in _layers(source, task, registered)[1:] if layer.task is not None]
+@dataclass(frozen=True)
+class ClassHint:
+    """What one configuration of a chain says about the class of the task."""
+
+    where: str
+    """How an error about it begins."""
+    task: str | None
+    """The registered task that the configuration is of, which may have a class; None for a file."""
+    kind: Any
+    """What it has as `class:`, or None."""
 
 
-def _merged(layers: Iterable[_Layer]) -> tuple[dict[str, Any], Origins]:
-    """Layers laid over those after them. Each is checked by itself: what another one sets over it must not hide a mistake.
+def class_hints(source: Source, task: str, registered: Mapping[str, Registered]) -> list[ClassHint]:
+    """Return what the configuration of `task` and those that it extends say about its class, the nearest first."""
+    return [ClassHint(f"{layer.name}: class", layer.task, layer.kind) for layer in _layers(source, task, registered)]
+
+
+def _merged(layers: Iterable[_Layer], schema: type[TaskConfig]) -> tuple[dict[str, Any], Origins]:
+    """Return layers laid over those after them. Each is checked by itself: what another one sets over it must not hide a
+    mistake.
 
     Raises:
         ConfigError: a layer does not fit the schema.
@@ -133,7 +152,7 @@ def _merged(layers: Iterable[_Layer]) -> tuple[dict[str, Any], Origins]:
     merged: dict[str, Any] = {}
     origins = Origins()
     for layer in reversed(list(layers)):
-        _check_layer(layer.data, layer.name)
+        _check_layer(layer.data, layer.name, schema)
         data = copy.deepcopy(dict(layer.data))
         for section in (data, data.get("cpu", {})):
             if "robot" in section:
@@ -143,30 +162,31 @@ def _merged(layers: Iterable[_Layer]) -> tuple[dict[str, Any], Origins]:
 
 
 def name_of(source: Source, task: str) -> str:
-    """What errors call the configuration of a task."""
+    """Return what errors call the configuration of a task."""
     given = source.config if isinstance(source, Registered) else source
     return str(given) if isinstance(given, Path) else f"registered config of '{task}'"
 
 
-def _check_layer(data: Mapping[str, Any], name: str) -> None:
-    """What is set here, and in the `cpu:` section (found on a GPU machine too), fits the schema.
+def _check_layer(data: Mapping[str, Any], name: str, schema: type[TaskConfig]) -> None:
+    """Check that what is set here, and in the `cpu:` section (found on a GPU machine too), fits the schema.
 
     Raises:
         ConfigError: it does not.
     """
-    build(TaskConfig, {key: value for key, value in data.items() if key != "cpu"}, "", Origins(), name)
+    build(schema, {key: value for key, value in data.items() if key != "cpu"}, "", Origins(), name)
     if "cpu" in data:
         cpu = data["cpu"]
         if not isinstance(cpu, Mapping):
             raise ConfigError(f"{name}: cpu: expected a mapping of sections, got {shown(cpu)}")
         if "task" in cpu:
             raise ConfigError(f"{name}: cpu: task: a task has one name on every machine")
-        build(TaskConfig, cpu, "", Origins(), f"{name}: cpu")
+        build(schema, cpu, "", Origins(), f"{name}: cpu")
 
 
 def robot_path(robot: Any, folder: Path) -> Any:
-    """A `robot` that was named by a file in `folder`, as an absolute path if it is one: a folder beside the file or in the
-    working directory, or what holds a slash or begins with a dot. Names of robots under resources/robots/ stay as they are.
+    """Return a `robot` that was named by a file in `folder`, as an absolute path if it is one: a folder beside the file or in
+    the working directory, or what holds a slash or begins with a dot. Names of robots under resources/robots/ stay as they
+    are.
     """
     if not isinstance(robot, str) or not robot or exists(data_folder("resources") / "robots" / robot / "robot.yaml"):
         return robot
@@ -177,7 +197,7 @@ def robot_path(robot: Any, folder: Path) -> Any:
 
 
 def parse_override(text: str) -> tuple[str, Any]:
-    """`a.b=1e-3` -> ("a.b", 0.001); the value is read as YAML.
+    """Turn `a.b=1e-3` into ("a.b", 0.001); the value is read as YAML.
 
     Raises:
         ConfigError: it is not of that form.
@@ -189,7 +209,7 @@ def parse_override(text: str) -> tuple[str, Any]:
 
 
 def nest(path: str, value: Any) -> dict[str, Any]:
-    """("a.b", 1) -> {"a": {"b": 1}}."""
+    """Turn ("a.b", 1) into {"a": {"b": 1}}."""
     for key in reversed(path.split(".")):
         value = {key: value}
     return value
@@ -201,15 +221,16 @@ def load_config(
     overrides: Iterable[tuple[str, Any]] = (),
     on_cpu: bool = False,
     registered: Mapping[str, Registered] | None = None,
+    schema: type[TaskConfig] = LeggedConfig,
 ) -> TaskConfig:
-    """The task file or mapping `source`, over what it extends (a file, or one of the tasks in `registered`), under its
-    `cpu:` section (if asked) and overrides.
+    """Load the task file or mapping `source`, over what it extends (a file, or one of the tasks in `registered`), under its
+    `cpu:` section (if asked) and overrides, as an instance of `schema`.
 
     Raises:
         ConfigError: unknown key, wrong type or value, with file and dotted path.
     """
     name = name_of(source, task)
-    data, origins = _merged(_layers(source, task, registered or {}))
+    data, origins = _merged(_layers(source, task, registered or {}), schema)
     cpu = data.pop("cpu", {})
     data["task"] = task
     where = Origins(origins)
@@ -218,42 +239,51 @@ def load_config(
         merge(data, copy.deepcopy(cpu), "", set_here)
         for path in set_here:
             where.note(path, origins.of(f"cpu.{path}") + ": cpu")
-    _merge_overrides(data, overrides, where)
-    return from_dict(data, where, source=name)
+    _merge_overrides(data, overrides, where, schema)
+    return from_dict(data, where, source=name, schema=schema)
 
 
-def _merge_overrides(data: dict[str, Any], overrides: Iterable[tuple[str, Any]], origins: Origins) -> None:
-    """Lays overrides of the command line over `data`, each of them checked by itself: a later one must not hide it."""
+def _merge_overrides(
+    data: dict[str, Any], overrides: Iterable[tuple[str, Any]], origins: Origins, schema: type[TaskConfig]
+) -> None:
+    """Lay overrides of the command line over `data`, each of them checked by itself: a later one must not hide it."""
     for key, value in overrides:
         if key == "task":
             raise ConfigError("command line: task: can't be overridden; choose the task with --task")
         if key.count(".") > DEEPEST:
             raise ConfigError(f"command line: {shown(key)}: more than {DEEPEST} sections inside each other")
         layer = nest(key, robot_path(value, Path.cwd()) if key == "robot" else copy.deepcopy(value))
-        build(TaskConfig, layer, "", Origins(), "command line")
+        layer = renamed(layer, "command line")
+        build(schema, layer, "", Origins(), "command line")
         merge(data, layer, "command line", origins)
 
 
-def from_dict(data: Mapping[str, Any], origins: Origins | None = None, source: str = "config") -> TaskConfig:
-    """TaskConfig from nested plain values; `origins` says who set them, if not all are from `source`."""
+def from_dict(
+    data: Mapping[str, Any],
+    origins: Origins | None = None,
+    source: str = "config",
+    schema: type[TaskConfig] = LeggedConfig,
+) -> TaskConfig:
+    """Make an instance of `schema` from nested plain values; `origins` says who set them, if not all are from `source`."""
     if origins is None:
+        data = renamed(data, source)
         origins = Origins()
         merge({}, data, source, origins)
-    cfg = build(TaskConfig, data, "", origins, source)
+    cfg = build(schema, data, "", origins, source)
     cfg.origins.update(origins)
     return cfg
 
 
 def override(cfg: TaskConfig, overrides: Iterable[tuple[str, Any]]) -> TaskConfig:
-    """`cfg` with some dotted paths replaced, by the command line or by what it asks for, checked again."""
+    """Return `cfg` with some dotted paths replaced, by the command line or by what it asks for, checked again."""
     data = to_dict(cfg)
     origins = Origins(cfg.origins)
-    _merge_overrides(data, overrides, origins)
-    return from_dict(data, origins, source=cfg.task)
+    _merge_overrides(data, overrides, origins, type(cfg))
+    return from_dict(data, origins, source=cfg.task, schema=type(cfg))
 
 
 def to_dict(config: Any) -> Any:
-    """Nested plain values of a configuration, as YAML can write them."""
+    """Return nested plain values of a configuration, as YAML can write them."""
     if dataclasses.is_dataclass(config):
         return {f.name: to_dict(getattr(config, f.name)) for f in dataclasses.fields(config) if f.compare}
     if isinstance(config, Mapping):
@@ -264,5 +294,5 @@ def to_dict(config: Any) -> Any:
 
 
 def to_yaml(config: TaskConfig) -> str:
-    """The full configuration as YAML that `load_config` reads back."""
+    """Return the full configuration as YAML that `load_config` reads back."""
     return yaml.safe_dump(to_dict(config), sort_keys=False, default_flow_style=None, width=120)

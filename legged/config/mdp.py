@@ -1,198 +1,77 @@
-"""What the robots are asked, what they do about it, and how that is judged: commands, control, randomisation, rewards, ..."""
+"""What every task has of a Markov decision process: control, observations, rewards, terminations, randomisation."""
 
 from dataclasses import dataclass, field
-from typing import Literal
 
-from legged.config.bounds import LARGEST, LONGEST_S, NAMES, UNIT, between, positive
+from legged.config.bounds import LARGEST, NAMES, TERMS, between, positive
 
 Range = tuple[float, float]
-
-MOTION = between(-100, 100)
-"""Bounds of velocities [m/s] or [rad/s], of angles [rad] and of factors on them."""
-
-
-@dataclass(frozen=True)
-class CommandRanges:
-    """Largest commands that are sampled, and where a curriculum starts from."""
-
-    lin_vel_x: Range = field(default=(-1.0, 1.0), metadata=MOTION)
-    """Forward velocity, base frame [m/s]."""
-    lin_vel_y: Range = field(default=(-1.0, 1.0), metadata=MOTION)
-    """Leftward velocity, base frame [m/s]."""
-    ang_vel_yaw: Range = field(default=(-1.0, 1.0), metadata=MOTION)
-    """Yaw rate [rad/s]; the clip of the heading controller in heading mode."""
-    heading: Range = field(default=(-3.141592653589793, 3.141592653589793), metadata=MOTION)
-    """Heading in the world, heading mode only [rad]."""
-
-
-@dataclass(frozen=True)
-class CommandCurriculumConfig:
-    """Ranges that widen, axis by axis, while the robots follow what they are asked."""
-
-    enabled: bool = False
-    """Start at `start` times the full ranges and widen; otherwise the full ranges from the first step."""
-    start: float = field(default=0.3, metadata=UNIT)
-    """Share of the full range that each axis starts with."""
-    step: float = field(default=0.1, metadata=positive(1, low=1e-6))
-    """Share of the full range by which an axis is widened."""
-    window_s: float = field(default=1.0, metadata=positive(LONGEST_S, low=1e-5))
-    """Time over which velocities are averaged before an axis is judged [s]."""
-    threshold: float = field(default=0.75, metadata=UNIT)
-    """Share of the velocity asked for that robots must reach on average before an axis is widened."""
-
-
-@dataclass(frozen=True)
-class CommandsConfig:
-    """Velocity commands: sampling, heading mode, curriculum."""
-
-    ranges: CommandRanges = CommandRanges()
-    """Lowest and highest command on each axis."""
-    resampling_time_s: float = field(default=10.0, metadata=positive(LONGEST_S, low=1e-5))
-    """Time a command is held [s]."""
-    heading_command: bool = True
-    """Sample a heading and derive the yaw rate 0.5 * wrap(heading - yaw) from it at every step."""
-    small_command: float = field(default=0.2, metadata=between(0, 100))
-    """Sampled horizontal velocities with a norm below this are set to zero [m/s]."""
-    standing_share: float = field(default=0.0, metadata=UNIT)
-    """Share of sampled commands that ask the robot to stand still."""
-    single_axis_share: float = field(default=0.0, metadata=UNIT)
-    """Share of sampled commands that keep one random axis only: walking straight, sideways, turning on the spot."""
-    curriculum: CommandCurriculumConfig = CommandCurriculumConfig()
-    """How the ranges widen during training."""
-
-
-@dataclass(frozen=True)
-class InitStateConfig:
-    """State after a reset; the default joint angles and the spawn height are the robot's."""
-
-    dof_pos_factor: Range = field(default=(0.5, 1.5), metadata=MOTION)
-    """Joint angles are the default ones times a number drawn from this range, per joint."""
-    yaw: Range = field(default=(0.0, 0.0), metadata=MOTION)
-    """Heading of the base [rad]."""
-    base_velocity: Range = field(default=(-0.5, 0.5), metadata=MOTION)
-    """Range of each component of the base's linear [m/s] and angular [rad/s] velocity."""
 
 
 @dataclass(frozen=True)
 class ControlConfig:
-    """From actions to torques."""
+    """From actions to what moves the robot."""
 
-    control_type: Literal["P", "V", "T"] = "P"
-    """Action as joint position target (P), joint velocity target (V) or torque (T)."""
-    stiffness: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
-    """Joint-name pattern -> P gain [N m/rad]; empty takes the robot's. A pattern is a part of the joint's name."""
-    damping: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
-    """Joint-name pattern -> D gain [N m s/rad]; empty takes the robot's."""
-    action_scale: float = field(default=0.5, metadata=positive(LARGEST))
-    """Target = action_scale * action + default angle (P) [rad]."""
     decimation: int = field(default=4, metadata=between(1, 1000))
-    """Physics steps per control step; the torque is recomputed at each."""
+    """Physics steps per control step; a control law is computed anew at each."""
     clip_actions: float = field(default=100.0, metadata=positive(LARGEST))
     """Actions are clipped at plus and minus this."""
 
 
 @dataclass(frozen=True)
 class TerminationsConfig:
-    """What ends an episode early, beside the robot's `terminate_after_contacts_on` shapes feeling more than 1 N."""
+    """What ends an episode: `_terminate_<name>` terms, beside its length and numbers that are none."""
 
-    min_base_height: float = field(default=0.0, metadata=between(0, 100))
-    """Lowest base height above the ground [m]; 0 is off."""
-    max_tilt: float = field(default=0.0, metadata=between(0, 10))
-    """Largest angle between the base's up axis and the vertical [rad]; 0 is off."""
+    failures: tuple[str, ...] = field(default=(), metadata=TERMS)
+    """Terms that end the episode in a failure: nothing is to be gained after it."""
+    time_outs: tuple[str, ...] = field(default=(), metadata=TERMS)
+    """Terms that end it as time does: the learner bootstraps what would have come."""
 
 
 @dataclass(frozen=True)
 class DomainRandConfig:
-    """What differs from robot to robot, and disturbances."""
+    """What differs from robot to robot."""
 
-    randomize_friction: bool = True
-    """Draw the friction of each robot's contacts."""
-    friction_range: Range = field(default=(0.5, 1.25), metadata=between(0, 100))
-    """Coulomb friction of the contacts. PhysX averages foot and ground; MuJoCo takes the foot's (it has priority)."""
-    friction_buckets: int = field(default=64, metadata=between(1, 1_000_000))
-    """Friction is drawn from this many values."""
-    randomize_base_mass: bool = False
-    """Add a mass to each robot's base."""
-    added_mass_range: Range = field(default=(-5.0, 5.0), metadata=between(-10_000, 10_000))
-    """Mass added to the base [kg]."""
-    push_robots: bool = True
-    """Set the base's horizontal velocity now and then, each robot at its own moment."""
-    push_interval_s: float = field(default=15.0, metadata=positive(LONGEST_S, low=1e-5))
-    """Time between two pushes of a robot [s]."""
-    max_push_vel_xy: float = field(default=1.0, metadata=between(0, 100))
-    """Range of a push's velocity, per world axis [m/s]."""
+    ranges: dict[str, Range] = field(default_factory=dict, metadata=between(-LARGEST, LARGEST))
+    """Property of the model -> range from which each robot's is drawn, evenly. Properties: legged/physics/fields.py."""
 
 
 @dataclass(frozen=True)
 class RewardsConfig:
-    """Scales of the `_reward_<name>` terms and the numbers inside them."""
+    """Scales of the `_reward_<name>` terms."""
 
-    scales: dict[str, float] = field(
-        default_factory=lambda: {
-            "tracking_lin_vel": 1.0,
-            "tracking_ang_vel": 0.5,
-            "lin_vel_z": -2.0,
-            "ang_vel_xy": -0.05,
-            "torques": -1e-5,
-            "dof_acc": -2.5e-7,
-            "feet_air_time": 1.0,
-            "collision": -1.0,
-            "action_rate": -0.01,
-        },
-        metadata=between(-LARGEST, LARGEST),
-    )
-    """Term -> scale; multiplied by the control step. A scale of 0 switches the term off."""
-    only_positive_rewards: bool = True
+    scales: dict[str, float] = field(default_factory=dict, metadata=between(-LARGEST, LARGEST))
+    """Term -> scale. A scale of 0 switches the term off."""
+    times_dt: bool = True
+    """Multiply scales by the control step, so that sums over time do not depend on it."""
+    only_positive_rewards: bool = False
     """Clip the sum at zero (before `termination`) against early learning to fall."""
-    tracking_sigma: float = field(default=0.25, metadata=positive(LARGEST, low=1e-6))
-    """Tracking reward = exp(-error^2 / sigma)."""
-    air_time_target_s: float = field(default=0.5, metadata=between(0, 100))
-    """Swings longer than this are rewarded by feet_air_time, shorter ones punished [s]."""
-    base_height_target: float = field(default=0.5, metadata=positive(100))
-    """Base height wanted by base_height [m]."""
-    max_contact_force: float = field(default=500.0, metadata=positive(LARGEST))
-    """Foot forces above this are penalised by feet_contact_forces [N]."""
-    soft_dof_pos_limit: float = field(default=1.0, metadata=positive(10))
-    """Share of a joint's range outside which dof_pos_limits counts."""
-    soft_dof_vel_limit: float = field(default=1.0, metadata=positive(10))
-    """Share of a joint's velocity limit above which dof_vel_limits counts."""
-    soft_torque_limit: float = field(default=1.0, metadata=positive(10))
-    """Share of a joint's effort limit above which torque_limits counts."""
 
 
-STATE_TERMS = ("base_lin_vel", "base_ang_vel", "projected_gravity", "commands", "dof_pos", "dof_vel", "actions")
+@dataclass(frozen=True)
+class ObservationGroupConfig:
+    """What one network sees, or several."""
+
+    terms: tuple[str, ...] = field(default=(), metadata=NAMES)
+    """`_obs_<name>` terms, side by side in this order."""
+    history: int = field(default=1, metadata=between(1, 1000))
+    """Steps of the terms that are seen side by side, oldest first; a new episode repeats its first."""
+    noise: bool = False
+    """Add uniform noise to the terms."""
 
 
 @dataclass(frozen=True)
 class ObservationsConfig:
-    """Observation groups, made of `_obs_<name>` terms in this order."""
+    """Observation groups, and how their terms are scaled."""
 
-    actor: tuple[str, ...] = field(default=STATE_TERMS, metadata=NAMES)
-    """What the policy sees, with noise."""
-    actor_history: int = field(default=1, metadata=between(1, 1000))
-    """Steps of the actor's terms that the policy sees side by side, oldest first; a new episode repeats its first."""
-    critic: tuple[str, ...] = field(default=STATE_TERMS, metadata=NAMES)
-    """What the value function sees, without noise."""
-    scales: dict[str, float] = field(
-        default_factory=lambda: {"base_lin_vel": 2.0, "base_ang_vel": 0.25, "dof_vel": 0.05, "heights": 5.0},
-        metadata=between(-LARGEST, LARGEST),
-    )
-    """Term -> factor; 1 where not named. `commands` are scaled like the velocities they ask for."""
+    groups: dict[str, ObservationGroupConfig] = field(default_factory=dict)
+    """Group -> what is in it. `actor` is what the policy sees; `train.policy` says which groups a network reads."""
+    scales: dict[str, float] = field(default_factory=dict, metadata=between(-LARGEST, LARGEST))
+    """Term -> factor; 1 where not named."""
     add_noise: bool = True
-    """Add uniform noise to the actor's terms."""
+    """Add noise to the groups that ask for it."""
     noise_level: float = field(default=1.0, metadata=between(0, 1000))
     """Factor on all noise."""
-    noise: dict[str, float] = field(
-        default_factory=lambda: {
-            "base_lin_vel": 0.1,
-            "base_ang_vel": 0.2,
-            "projected_gravity": 0.05,
-            "dof_pos": 0.01,
-            "dof_vel": 1.5,
-            "heights": 0.1,
-        },
-        metadata=between(0, LARGEST),
-    )
+    noise: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
     """Term -> half width of its uniform noise, in the term's unit before scaling."""
     clip: float = field(default=100.0, metadata=positive(LARGEST))
     """Scaled observations are clipped at plus and minus this."""

@@ -5,13 +5,13 @@ class Origins(dict[str, str]):
     """Dotted path -> who set it: 'cfg/mine.yaml', 'cfg/mine.yaml: cpu', 'command line'."""
 
     def note(self, path: str, source: str) -> None:
-        """`source` set `path`: what it replaces, above and below, is forgotten."""
+        """Note that `source` set `path`, and forget what it replaces, above and below."""
         for old in [key for key in self if key.startswith(f"{path}.") or path.startswith(f"{key}.")]:
             del self[old]
         self[path] = source
 
     def of(self, path: str) -> str:
-        """Who set `path`, or, of a section, everyone who set something in it; 'the default' when nobody did.
+        """Return the source of `path`; for a section, all sources that set one of its keys; 'the default' when nobody did.
 
         An item of a list, `path[2]`, comes from whoever gave the list.
         """
@@ -20,5 +20,5 @@ class Origins(dict[str, str]):
         return ", ".join(dict.fromkeys(found)) or "the default"
 
     def where(self, path: str) -> str:
-        """'cfg/mine.yaml: terrain.border_size': how an error about the value at `path` begins."""
+        """Return 'cfg/mine.yaml: terrain.border_size', as an error about the value at `path` begins."""
         return f"{self.of(path)}: {path}"

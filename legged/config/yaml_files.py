@@ -32,7 +32,7 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """As the parser's own, which would recurse as deep as the text says."""
+        """Compose a node as the parser does, which by itself would recurse as deep as the text says."""
         self._depth = getattr(self, "_depth", 0) + 1
         if self._depth > DEEPEST:
             raise yaml.MarkedYAMLError(problem=f"more than {DEEPEST} blocks inside each other", problem_mark=self.get_mark())
@@ -42,7 +42,7 @@ class _Loader(yaml.SafeLoader):
             self._depth -= 1
 
     def _measure(self, node: yaml.Node) -> tuple[int, int]:
-        """How many values a node stands for, and how deep they lie, with aliases written out."""
+        """Return how many values a node stands for, and how deep they lie, with aliases written out."""
         if isinstance(node, yaml.ScalarNode):
             return 1, 1
         if id(node) in self._sizes:
@@ -62,7 +62,7 @@ class _Loader(yaml.SafeLoader):
         return size, depth
 
     def _refuse_key_given_twice(self, node: yaml.MappingNode) -> None:
-        """Checked before merge keys are put in place, whose keys a block may give again."""
+        """Refuse a key that is given twice, before merge keys are put in place, whose keys a block may give again."""
         seen = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode):
@@ -75,7 +75,7 @@ class _Loader(yaml.SafeLoader):
         raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        """As the constructor's own; numbers and dates that are none are an error with a line."""
+        """Construct an object as the constructor does; numbers and dates that are none are an error with a line."""
         try:
             return super().construct_object(node, deep)
         except (ValueError, OverflowError) as error:
@@ -93,7 +93,7 @@ _Loader.add_implicit_resolver(
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file.
+    """Return the mapping in a YAML file.
 
     Raises:
         ConfigError: the file is missing, too large, malformed, or no mapping.
@@ -119,7 +119,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse(text: str, source: str) -> Any:
-    """The value that a YAML text stands for; `source` says whose it is.
+    """Return the value that a YAML text stands for; `source` says whose it is.
 
     Raises:
         ConfigError: it is malformed, refers to itself, or is too large once its aliases are written out.

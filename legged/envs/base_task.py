@@ -1,9 +1,12 @@
-"""The boundary to rsl-rl: a vectorised environment whose step is one function, captured where there is a GPU."""
+"""A task of any kind: the loop of a Markov decision process on batched physics, behind rsl-rl's interface.
+
+Terms are methods: `_obs_<name>`, `_reward_<name>`, `_terminate_<name>`, `_metric_<name>`; the configuration says which of
+them run. All tensors have N rows, one an environment, and stay at their addresses, so that a step is one CUDA graph.
+"""
 
 from abc import abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import torch
 from rsl_rl.env import VecEnv
@@ -11,56 +14,94 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.config.schema import TaskConfig
-from legged.graph.step_graph import StepGraph
-from legged.mdp.observations import ObservationGroup
-from legged.mdp.statistics import Statistics
+from legged.envs.actions import as_actions, ordinary_tensors
+from legged.envs.checks import check_task
+from legged.envs.final_step import FinalStep
+from legged.envs.saved import SavedTask
+from legged.errors import ConfigError
+from legged.graph.step_graph import Branch, StepGraph
+from legged.math import masked_set_
+from legged.mdp.faults import LARGEST_STATE, Faults
+from legged.mdp.metrics import Metrics
+from legged.mdp.mirror_images import MirrorImages
+from legged.mdp.observations import ObservationGroup, ObservationTerms
+from legged.mdp.randomization import Randomization
+from legged.mdp.rewards import Rewards
+from legged.mdp.terminations import Terminations
+from legged.physics import Scene, make_physics
+from legged.process.ranks import Ranks
 
 
-@contextmanager
-def ordinary_tensors() -> Iterator[None]:
-    """Record no gradients, but make no inference tensors either, even if the caller does: what a term keeps of one step must
-    be writable in the next, whoever makes that.
-    """
-    with torch.inference_mode(False), torch.no_grad():
-        yield
-
-
-def as_actions(actions: Any, num_envs: int, num_actions: int) -> Tensor:
-    """The actions that a caller gave, as a tensor (N, D) of real numbers.
-
-    Raises:
-        ValueError: they are none.
-    """
-    wanted = f"actions: expected real numbers of shape (N, D) = ({num_envs}, {num_actions})"
-    try:
-        tensor = actions if isinstance(actions, Tensor) else torch.tensor(actions)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{wanted}, got {type(actions).__name__}: {error}") from error
-    if tensor.shape != (num_envs, num_actions):
-        raise ValueError(f"{wanted}, got {tuple(tensor.shape)}")
-    if tensor.is_complex() or tensor.dtype == torch.bool:
-        raise ValueError(f"{wanted}, got {tensor.dtype}")
-    return tensor
-
-
-class BaseTask(VecEnv):
-    """N environments on one device. Subclasses fill the buffers in `_step`; here they are handed out as copies, because
-    rsl-rl keeps references to what it is given until after the next step.
+class BaseTask(SavedTask, VecEnv):
+    """N environments on one device. A subclass says what the world is (`make_scene`), how an episode begins (`draw_reset`)
+    and which terms there are; the rest are hooks.
     """
 
-    observation_groups: dict[str, ObservationGroup]
-    statistics: Statistics
+    Config: ClassVar[type[TaskConfig]] = TaskConfig
+    """The schema of its configuration."""
+    QUANTITIES: ClassVar[tuple[str, ...]] = ()
+    """Arrays of MuJoCo's data, beside qpos and qvel, that its terms read by `self.physics.quantity(name)`."""
+    OWN_HELPERS: ClassVar[tuple[str, ...]] = ()
+    """Methods of a subclass that are named like a hook of another framework, which nothing here calls, but which the subclass
+    calls itself. Without this they are an error (legged/envs/overrides.py)."""
 
-    def __init__(self, cfg: TaskConfig, num_actions: int, device: torch.device) -> None:
-        """Allocate the buffers every task has; D = num_actions."""
+    def __init__(self, cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True) -> None:
+        """Build physics and terms on `device`; with `graph`, the step is captured on a GPU.
+
+        Raises:
+            ConfigError: the configuration names something that does not exist; nothing is compiled then.
+            TermError: a term fails or cannot be captured.
+        """
+        self.check(cfg)
+        device = torch.device(device)
+        if device.type == "cuda" and device.index is None:
+            device = torch.device("cuda", torch.cuda.current_device())
         n = cfg.env.num_envs
         self.cfg: TaskConfig = cfg  # type: ignore[assignment]
-        self.num_envs, self.num_actions, self.device = n, num_actions, device  # type: ignore[assignment]
+        self.num_envs, self.device = n, device  # type: ignore[assignment]
         self.dt = cfg.dt
         """Control step [s]."""
         self.max_episode_length = round(cfg.env.episode_length_s / cfg.dt)
         """Steps of a full episode."""
-        self.actions = torch.zeros(n, num_actions, device=device)
+        torch.manual_seed(cfg.env.seed + Ranks.now().rank)  # other robots on each GPU, on the same ground
+        self.randomization = self.make_randomization()
+        self.physics = make_physics(self.make_scene(), cfg.sim, n, device, self.randomization.fields, self.QUANTITIES)
+        self.randomization.apply(self.physics)
+        self.num_actions = self.physics.ctrl.shape[1]
+        self._allocate()
+        self._init_buffers()
+        if not self._has_buffers:
+            raise ConfigError(f"{type(self).__name__}._init_buffers must call super()._init_buffers()")
+        self._collect_terms()
+        # An engine that no graph can hold runs eagerly on a GPU; on the CPU nothing is captured, only checked.
+        self._build_graph(graph and (self.physics.capturable or device.type == "cpu"))
+
+    @classmethod
+    def check(cls, cfg: TaskConfig) -> None:
+        """Look for everything that can be wrong with a configuration, before anything is built.
+
+        Raises:
+            ConfigError: there is something.
+        """
+        check_task(cls, cfg)
+
+    @classmethod
+    def terms(cls, prefix: str) -> set[str]:
+        """Return the names of the methods that begin with `prefix`, without it."""
+        return {name.removeprefix(prefix) for name in dir(cls) if name.startswith(prefix)}
+
+    @abstractmethod
+    def make_scene(self) -> Scene:
+        """Say what a world consists of."""
+
+    def make_randomization(self) -> Randomization:
+        """Draw what differs from environment to environment."""
+        return Randomization(self.cfg.domain_rand.ranges, self.num_envs, self.device)
+
+    def _allocate(self) -> None:
+        """Allocate what every task has; D actions."""
+        n, device = self.num_envs, self.device
+        self.actions = torch.zeros(n, self.num_actions, device=device)
         """(N, D) actions of this step, clipped."""
         self.last_actions = torch.zeros_like(self.actions)
         """(N, D) actions of the step before."""
@@ -72,53 +113,85 @@ class BaseTask(VecEnv):
         """(N,) the episode ended by time; the learner bootstraps its value."""
         self.reset_buf = torch.zeros_like(self.terminated_buf)
         """(N,) either of the two."""
+        self.valid = torch.ones_like(self.terminated_buf)
+        """(N,) environments whose numbers are numbers: physics now, rewards and observations a step before; the others are
+        terminated and reset.
+        """
+        self.reset_qpos = torch.zeros_like(self.physics.qpos)
+        """(N, nq) generalised positions that the next episode of each environment begins with."""
+        self.reset_qvel = torch.zeros_like(self.physics.qvel)
+        """(N, nv) and velocities."""
+        self.qpos0 = torch.as_tensor(self.physics.model.qpos0, dtype=torch.float32, device=device)
+        """(nq,) the model's own positions."""
+        model = self.physics.model
+        low, high = torch.as_tensor(model.actuator_ctrlrange, dtype=torch.float32, device=device).unbind(dim=1)
+        limited = torch.as_tensor(model.actuator_ctrllimited, device=device).bool()
+        self.control_middle = torch.where(limited, 0.5 * (low + high), 0.0)
+        """(D,) controls at action 0."""
+        self.control_reach = torch.where(limited, 0.5 * (high - low), 1.0)
+        """(D,) how much an action of 1 adds to them."""
         self._episode_length = torch.zeros(n, dtype=torch.long, device=device)
         self._action_input = torch.zeros_like(self.actions)
-        self._graph: StepGraph | None = None
+        self._clipped_actions = torch.zeros_like(self.actions)
+        self._in_bounds = torch.ones_like(self.valid)
+        self._beside = Branch(device)  # type: ignore[arg-type]
+        self.final_step: FinalStep | None = None
+        """What episodes ended with, where somebody asked for it (`final_step.keep_final_step`)."""
         self._steps_since_log = 0
+        self._has_buffers = False
 
-    @property
-    def episode_length_buf(self) -> Tensor:
-        """(N,) steps since the episode began. Assigning copies, so that the address a graph knows stays."""
-        return self._episode_length
+    def _init_buffers(self) -> None:
+        """Allocate a subclass' own tensors and parts: physics is there, terms have not been called yet. Call super()'s."""
+        self._has_buffers = True
 
-    @episode_length_buf.setter
-    def episode_length_buf(self, value: Tensor) -> None:
-        self._episode_length.copy_(value)
+    def _collect_terms(self) -> None:
+        """Find the terms that the configuration names."""
+        cfg, device = self.cfg, self.device
+        scales = {name: scale for name, scale in cfg.rewards.scales.items() if scale != 0.0}
+        unit = self.dt if cfg.rewards.times_dt else 1.0
+        self.rewards = Rewards(
+            self._methods("_reward_", scales), scales, unit, cfg.rewards.only_positive_rewards, self.rew_buf
+        )
+        self.episode_sums = self.rewards.episode_sums
+        failures, time_outs = self.active_terminations()
+        self.terminations = Terminations(
+            self._methods("_terminate_", failures),
+            self._methods("_terminate_", time_outs),
+            self.terminated_buf,
+            self.time_out_buf,
+            self.reset_buf,
+        )
+        groups = cfg.observations.groups
+        # Those of the largest group first, so that it finds them side by side.
+        in_order = [name for group in sorted(groups.values(), key=lambda g: -len(g.terms)) for name in group.terms]
+        self.observation_terms = ObservationTerms(self._methods("_obs_", dict.fromkeys(in_order)))
+        self.observation_groups: dict[str, ObservationGroup] = {name: self._group(name) for name in groups}
+        self.faults = Faults(self.rewards.names, self.observation_terms, self.num_envs, device)  # type: ignore[arg-type]
+        metrics = self._methods("_metric_", sorted(self.terms("_metric_")))
+        full = cfg.env.episode_length_s if cfg.rewards.times_dt else self.max_episode_length
+        self.metrics = Metrics(metrics, self.rewards.names, self.terminations.names, full, self.num_envs, device)  # type: ignore[arg-type]
 
-    @property
-    def unwrapped(self) -> "BaseTask":
-        """The task itself, as Gymnasium names it."""
-        return self
+    def _methods(self, prefix: str, names: Any) -> dict[str, Callable[[], Tensor]]:
+        """Return the methods `<prefix><name>` by name."""
+        return {name: getattr(self, prefix + name) for name in names}
 
-    @property
-    def step_dt(self) -> float:
-        """Control step [s], as rsl-rl's extensions name it."""
-        return self.dt
+    def active_terminations(self) -> tuple[list[str], list[str]]:
+        """Return the failures and the time-outs that can happen."""
+        return list(self.cfg.terminations.failures), list(self.cfg.terminations.time_outs)
 
-    @property
-    def captured(self) -> bool:
-        """Whether the step runs as one CUDA graph."""
-        return self._graph is not None and self._graph.captured
+    def observation_scales(self) -> dict[str, Any]:
+        """Return the factor on each term, a number or one for each of its columns; 1 for those that are missing."""
+        return dict(self.cfg.observations.scales)
 
-    @abstractmethod
-    def _step(self) -> None:
-        """One control step, from `_action_input` to all buffers: no host reads, no new addresses."""
-
-    @abstractmethod
-    def _draw(self) -> None:
-        """Draw the random numbers that the next reset uses."""
-
-    @abstractmethod
-    def reset_idx(self, mask: Tensor) -> None:
-        """Begin new episodes in the environments of `mask` (N,)."""
-
-    @abstractmethod
-    def _observe(self) -> None:
-        """Bring state, commands and observations up to date after a reset."""
-
-    def reset_curricula(self) -> None:
-        """Go back to where training starts."""
+    def _group(self, name: str) -> ObservationGroup:
+        """Make the observation group `name`."""
+        cfg = self.cfg.observations
+        group = cfg.groups[name]
+        noisy = group.noise and cfg.add_noise
+        noise = {term: half * cfg.noise_level for term, half in cfg.noise.items()} if noisy else {}
+        return ObservationGroup(
+            self.observation_terms, group.terms, self.observation_scales(), noise, cfg.clip, group.history
+        )
 
     def _build_graph(self, enabled: bool) -> None:
         """Capture the step (on a GPU) or check that it could be (on the CPU), then start all episodes anew."""
@@ -131,25 +204,160 @@ class BaseTask(VecEnv):
             self.reset_curricula()
         self.reset()
 
+    # ---- one control step --------------------------------------------------------------------------------------------
+
+    def _step(self) -> None:
+        """Go from `_action_input` to all buffers: no host reads, no new addresses."""
+        self.take_actions()
+        for _ in range(self.cfg.control.decimation):
+            self.apply_control()
+            self.physics.step()
+        with self._beside.fork():
+            self.draw()
+        self.sense()
+        self.advance()
+        self.check_termination()
+        with self._beside.fork():
+            self.measure()
+        self.compute_reward()
+        self._beside.join()
+        if self.final_step is not None:
+            self.final_step.take()
+        with self._beside.fork():
+            self.faults.check_rewards(self.rewards.fine, self.valid)
+        self.update_curricula()
+        self.reset_idx(self.reset_buf)
+        self.disturb(~self.reset_buf)
+        self.sense()
+        self.ask()
+        self.observe()
+        self.remember()
+
+    def take_actions(self) -> None:
+        """Clip the actions; one that is no number counts as 0."""
+        clip = self.cfg.control.clip_actions
+        torch.clamp(self._action_input, -clip, clip, out=self._clipped_actions)
+        torch.nan_to_num(self._clipped_actions, nan=0.0, out=self.actions)
+        self.set_controls()
+
+    def set_controls(self) -> None:
+        """Give the actuators their controls (`physics.ctrl`) for a control step: actions from -1 to 1 span an actuator's
+        range, one without a range takes the action itself.
+        """
+        torch.addcmul(self.control_middle, self.control_reach, self.actions, out=self.physics.ctrl)
+
+    def apply_control(self) -> None:
+        """Hook before each physics step: compute `physics.ctrl` anew, for a control law that is faster than the policy."""
+
+    def draw(self) -> None:
+        """Draw random numbers for every environment, used by those that are reset, and noise. Runs beside the step."""
+        self.draw_reset()
+        self.draw_noise()
+
+    @abstractmethod
+    def draw_reset(self) -> None:
+        """Draw a state for every environment to begin an episode with, into `reset_qpos` and `reset_qvel`."""
+
+    def draw_noise(self) -> None:
+        """Draw the noise of the observations."""
+        for group in self.observation_groups.values():
+            group.draw()
+
+    def sense(self) -> None:
+        """Bring everything that follows from the physics' state up to date."""
+        self.physics.refresh()
+
+    def advance(self) -> None:
+        """Let a control step pass, for all that counts time."""
+        self.episode_length_buf.add_(1)
+
+    def check_termination(self) -> None:
+        """Judge which episodes end: by a term, by time, or because physics blew up."""
+        state = torch.cat([self.physics.qpos, self.physics.qvel, self._clipped_actions], dim=1)
+        largest = torch.linalg.vector_norm(state, torch.inf, dim=1)
+        torch.lt(largest, LARGEST_STATE, out=self._in_bounds)  # so is NaN not
+        torch.logical_and(self._in_bounds, self.faults.sound, out=self.valid)
+        self.terminations.evaluate(~self.valid, self.episode_length_buf >= self.max_episode_length)
+
+    def measure(self) -> None:
+        """Record metrics and faults of the step. Runs beside the rewards."""
+        self.metrics.add_step(self.valid, self.physics.overflowed, self.terminations.found)
+        self.faults.check_state(self._in_bounds, self._clipped_actions)
+
+    def compute_reward(self) -> None:
+        """Judge the step, before anything is reset; record the episodes that end."""
+        self.rewards.compute(self.valid)
+        self.metrics.add_episodes(self.reset_buf, self.terminated_buf, self.episode_length_buf, self.rewards.sums)
+
+    def update_curricula(self) -> None:
+        """Hook: judge the episodes that end (`reset_buf`), for what becomes harder."""
+
+    def reset_idx(self, mask: Tensor) -> None:
+        """Begin new episodes in the environments of `mask` (N,), in the states that were drawn."""
+        self.physics.write(mask, self.reset_qpos, self.reset_qvel)
+        self.rewards.reset(mask)
+        masked_set_(self.actions, mask, 0.0)
+        masked_set_(self.episode_length_buf, mask, 0)
+
+    def disturb(self, mask: Tensor) -> None:
+        """Hook: disturb the environments of `mask` (N,), whose episodes go on."""
+
+    def ask(self) -> None:
+        """Hook: renew what is asked of the robots; `reset_buf` says whose episodes have just begun."""
+
+    def observe(self) -> None:
+        """Write the observation groups."""
+        self.observation_terms.evaluate()
+        with self._beside.fork():
+            self.faults.check_observations()
+        for group in self.observation_groups.values():
+            group.advance()
+            group.compute()
+            group.restart(self.reset_buf)
+        self._beside.join()
+
+    def remember(self) -> None:
+        """Keep of this step what the next one compares with."""
+        self.last_actions.copy_(self.actions)
+
+    # ---- rsl-rl's interface ------------------------------------------------------------------------------------------
+
+    @property
+    def episode_length_buf(self) -> Tensor:
+        """(N,) steps since the episode began. Assigning copies, so that the address a graph knows stays."""
+        return self._episode_length
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: Tensor) -> None:
+        self._episode_length.copy_(value)
+
+    @property
+    def captured(self) -> bool:
+        """Whether the step runs as one CUDA graph."""
+        return self._graph.captured
+
     def reset(self) -> TensorDict:
         """Begin a new episode in every environment; returns the observations."""
         with ordinary_tensors():
             self.reset_buf.fill_(True)
-            self._draw()
+            self.draw()
             self.reset_idx(self.reset_buf)
-            self._observe()
-            self.statistics.flush()
+            self.sense()
+            self.ask()
+            self.observe()
+            self.remember()
+            self.metrics.flush()
             self._steps_since_log = 0
         return self.get_observations()
 
     def get_observations(self) -> TensorDict:
-        """Copies of the observation groups; neither steps nor resets."""
+        """Return copies of the observation groups: rsl-rl keeps what it is given until after the next step."""
         groups = {name: group.buffer.clone() for name, group in self.observation_groups.items()}
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)  # type: ignore[arg-type]
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
-        """One control step of all environments under `actions` (N, D): a tensor on any device, an array or a list, of any
-        real numbers. Nothing of it is differentiated, whether or not the caller records gradients.
+        """Make one control step of all environments under `actions` (N, D): a tensor on any device, an array or a list, of
+        any real numbers. Nothing of it is differentiated, whether or not the caller records gradients.
 
         Returns observations, rewards (N,), dones (N,) bool, and extras with `time_outs` (N,) bool and, once per
         rollout, `log`: means over the rollout as 0-dimensional tensors.
@@ -157,7 +365,6 @@ class BaseTask(VecEnv):
         Raises:
             ValueError: the actions have another shape, or are no real numbers; nothing is stepped then.
         """
-        assert self._graph is not None, "the subclass must call _build_graph"
         with ordinary_tensors():
             self._action_input.copy_(as_actions(actions, self.num_envs, self.num_actions))
             self._graph()
@@ -169,31 +376,23 @@ class BaseTask(VecEnv):
         return self.get_observations(), self.rew_buf.clone(), self.reset_buf.clone(), extras
 
     def step_in_place(self, actions: Tensor) -> None:
-        """One control step, without copies or a graph of its own: for who captures more than the step. Results are in
+        """Make one control step, without copies or a graph of its own: for who captures more than the step. Results are in
         `rew_buf`, `reset_buf`, `time_out_buf` and the buffers of `observation_groups`.
         """
         self._action_input.copy_(actions)
         self._step()
 
-    def log_rollout(self) -> dict[str, Tensor]:
-        """What is logged of a rollout: fresh 0-dimensional tensors by their name in TensorBoard."""
-        return self.statistics.flush()
-
-    def progress(self) -> dict[str, Any]:
-        """How far the curricula have got: what every checkpoint holds, whatever the number of environments."""
-        return {}
-
-    def load_progress(self, progress: dict[str, Any]) -> None:
-        """Go on from there; to be followed by `reset`."""
-
-    @abstractmethod
-    def state_dict(self) -> dict[str, Any]:
-        """Copies of everything that the next step is a function of, beside the actions and torch's random numbers."""
-
-    @abstractmethod
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Put the task back into a saved state; the next step is then the one that would have followed.
+    def mirror_images(self) -> MirrorImages | None:
+        """Return what turns observations and actions into those of the mirrored robot; None if the task has no mirror image.
 
         Raises:
-            StateError: it is of another number of environments, or of another task; nothing should be used then.
+            ConfigError: a term is not as wide as its kind says.
         """
+        return None
+
+    def log_rollout(self) -> dict[str, Tensor]:
+        """Return what is logged of a rollout: fresh 0-dimensional tensors by their name in TensorBoard."""
+        return {**self.metrics.flush(), **self.faults.flush()}
+
+    def reset_curricula(self) -> None:
+        """Go back to where training starts."""

@@ -4,10 +4,12 @@ from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from typing import get_args
 
+from legged.config.networks import check_networks
 from legged.config.schema import TaskConfig
-from legged.envs.terms import MirrorKind
+from legged.envs.overrides import check_overrides, check_terms
 from legged.errors import ConfigError, suggest
-from legged.robots.robot import Robot
+from legged.mdp.mirror_images import MirrorKind
+from legged.physics.fields import FIELDS
 
 MOST_IN_A_POOL = 2**31 - 1
 """Contacts or constraint rows of all robots, which engines count in 32 bits."""
@@ -15,27 +17,50 @@ MOST_SAMPLES = 2**28
 """Samples of an iteration."""
 MOST_WEIGHTS = 2**30
 """Weights of a network; with gradients and the optimiser's moments 16 GB."""
-MOST_POINTS = 10_000
-"""Heights measured around a robot."""
 
 
-def check_base_mass(cfg: TaskConfig, robot: Robot) -> None:
-    """The lightest base that may be drawn has a mass.
+def check_task(cls: type, cfg: TaskConfig) -> None:
+    """Look for what can be wrong with the configuration of a task of class `cls`, of whatever kind.
 
     Raises:
-        ConfigError: it has none.
+        ConfigError: there is something.
     """
-    lowest = cfg.domain_rand.added_mass_range[0]
-    if cfg.domain_rand.randomize_base_mass and robot.base_mass + lowest <= 0.0:
-        where, mass = cfg.origins.where("domain_rand.added_mass_range"), robot.base_mass
+    check_overrides(cls)
+    check_terms(cls, cfg)
+    if cfg.train.algorithm.symmetry and not hasattr(cls, "MIRRORED"):
+        where = cfg.origins.where("train.algorithm.symmetry")
+        raise ConfigError(f"{where}: {cls.__name__} knows no left and right; false learns without mirror images")
+    check_networks(cfg)
+    for field in cfg.domain_rand.ranges:
+        if field not in FIELDS:
+            where = cfg.origins.where(f"domain_rand.ranges.{field}")
+            raise ConfigError(f"{where}: there is no property '{field}' to randomise{suggest(field, FIELDS, 'properties')}")
+    check_sizes(cfg)
+    check_lengths(cfg)
+
+
+def check_lengths(cfg: TaskConfig) -> None:
+    """Hold an episode against the control step, and mini-batches against the samples.
+
+    Raises:
+        ConfigError: an episode has no step, or a mini-batch no sample.
+    """
+    origins = cfg.origins
+    if round(cfg.env.episode_length_s / cfg.dt) < 1:
+        where, given = origins.where("env.episode_length_s"), cfg.env.episode_length_s
         raise ConfigError(
-            f"{where}: the base of '{robot.name}' weighs {mass:.4g} kg, so the lowest added mass must be above {-mass:.4g},"
-            f" got {lowest:g}"
+            f"{where}: must be at least a control step of {cfg.dt:g} s (sim.dt * control.decimation), got {given:g}"
+        )
+    samples = cfg.env.num_envs * cfg.train.runner.num_steps_per_env
+    if cfg.train.algorithm.num_mini_batches > samples:
+        where, given = origins.where("train.algorithm.num_mini_batches"), cfg.train.algorithm.num_mini_batches
+        raise ConfigError(
+            f"{where}: must be at most the {samples} samples of an iteration (num_envs * num_steps_per_env), got {given}"
         )
 
 
 def check_sizes(cfg: TaskConfig) -> None:
-    """What is allocated for all robots together can be numbered.
+    """Look whether what is allocated for all robots together can be numbered.
 
     Raises:
         ConfigError: it can't.
@@ -59,16 +84,10 @@ def check_sizes(cfg: TaskConfig) -> None:
         weights = sum(a * b for a, b in pairwise(widths))
         if weights > MOST_WEIGHTS:
             raise ConfigError(f"{cfg.origins.where(field)}: these are {weights:,} weights, more than {MOST_WEIGHTS:,}")
-    points = len(cfg.terrain.measured_points_x) * len(cfg.terrain.measured_points_y)
-    if points > MOST_POINTS:
-        raise ConfigError(
-            f"{cfg.origins.where('terrain.measured_points_x')}: with measured_points_y they are {points:,} points, more than"
-            f" {MOST_POINTS:,}"
-        )
 
 
 def check_mirror_kinds(task: str, mirrored: Mapping[str, str], used: Iterable[str], where: str) -> None:
-    """Every observation in use says how it is mirrored, in a way that there is; `task` is the name of the class.
+    """Look whether every observation in use says how it is mirrored, in a way that there is; `task` is the name of the class.
 
     Raises:
         ConfigError: `where`, and which one does not.

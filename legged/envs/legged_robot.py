@@ -1,48 +1,41 @@
-"""The legged robot's MDP, top to bottom: one step, terminations, resets. Observation and reward terms are in terms.py."""
+"""The legged robot that follows velocity commands: what its task adds to every task's loop. Its terms are in terms.py."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged.config.schema import TaskConfig
+from legged.config.schema import LeggedConfig, TaskConfig
 from legged.envs.base_task import BaseTask
-from legged.envs.checks import check_base_mass, check_mirror_kinds, check_sizes
-from legged.envs.overrides import check_overrides, check_terms
-from legged.envs.recurrent import check_recurrent
+from legged.envs.legged_checks import check_legged
+from legged.envs.overrides import check_overrides
 from legged.envs.terms import Terms
-from legged.errors import ConfigError, suggest
-from legged.graph.step_graph import Branch
-from legged.math import masked_set_
+from legged.math import quat_rotate
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts
-from legged.mdp.control import Control, control_gains
-from legged.mdp.faults import LARGEST_STATE, Faults
+from legged.mdp.control import Control
 from legged.mdp.height_scan import HeightScan
-from legged.mdp.observations import ObservationGroup, ObservationTerms
-from legged.mdp.randomization import Randomization
-from legged.mdp.rewards import Rewards
-from legged.mdp.statistics import Statistics
+from legged.mdp.mirror_images import MirrorImages
+from legged.mdp.randomization import Pushes, RobotRandomization
 from legged.mdp.terrain_curriculum import TerrainCurriculum
-from legged.physics import make_physics
-from legged.process.ranks import Ranks
+from legged.physics import RobotScene, Scene
 from legged.robots.robot import Robot, load_robot
-from legged.state import load_state, state_of, take
-from legged.terrain import Terrain, check_terrain
-
-TERMINATION_FORCE = 1.0
-"""Contact force on a terminating shape that ends the episode [N]."""
+from legged.terrain import Terrain
 
 
 class LeggedRobot(Terms, BaseTask):
-    """A legged robot that follows velocity commands. Subclass it and add `_reward_<name>` or `_obs_<name>` methods;
-    the configuration names the ones that run. N robots, D joints, F feet, B tracked collision shapes.
+    """A legged robot that follows velocity commands. Subclass it and add `_reward_<name>`, `_obs_<name>`, `_terminate_<name>`
+    or `_metric_<name>` methods; the configuration names the ones that run. N robots, D joints, F feet, B tracked collision
+    shapes.
     """
 
+    Config: ClassVar[type[TaskConfig]] = LeggedConfig
+    cfg: LeggedConfig
+
     def __init__(
-        self, cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None
+        self, cfg: LeggedConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None
     ) -> None:
         """Build physics and MDP on `device`; with `graph`, the step is captured on a GPU. A `terrain` takes the place of
         the one that the configuration asks for.
@@ -51,18 +44,45 @@ class LeggedRobot(Terms, BaseTask):
             ConfigError: the configuration names something that does not exist; nothing is compiled then.
             TermError: a term fails or cannot be captured.
         """
-        robot = self.check(cfg)
-        device = torch.device(device)
-        super().__init__(cfg, robot.num_dof, device)
-        self.robot = robot
-        torch.manual_seed(cfg.env.seed + Ranks.now().rank)  # other robots on each GPU, on the same ground
-        n = self.num_envs
-        self.randomization = Randomization(cfg.domain_rand, n, self.dt, device)
-        self.terrain = terrain or self.make_terrain()
-        self.physics = make_physics(robot, cfg.sim, n, device, self.terrain, self.randomization.fields)
-        self.randomization.apply(self.physics)
+        self.terrain = terrain
+        super().__init__(cfg, device, graph)
 
-        state = self.physics.state
+    @classmethod
+    def check(cls, cfg: TaskConfig) -> None:
+        """Look for everything that can be wrong with a configuration, before anything is built.
+
+        Raises:
+            ConfigError: there is something.
+        """
+        check_overrides(cls)
+        assert isinstance(cfg, LeggedConfig)
+        robot = load_robot(cfg.robot, cfg.origins.where("robot"))
+        super().check(cfg)
+        check_legged(cls, cfg, robot)
+
+    # ---- what there is -----------------------------------------------------------------------------------------------
+
+    def make_randomization(self) -> RobotRandomization:
+        """Draw friction and mass, which are drawn in any case, and what `domain_rand.ranges` names."""
+        return RobotRandomization(self.cfg.domain_rand, self.num_envs, self.device)
+
+    def make_scene(self) -> Scene:
+        """Put the robot on its ground."""
+        self.robot: Robot = load_robot(self.cfg.robot)
+        self.terrain = self.terrain or self.make_terrain()
+        return RobotScene(self.robot, self.terrain)
+
+    def make_terrain(self) -> Terrain | None:
+        """Make the ground that the configuration asks for; None for a plane. A subclass may return one of its own."""
+        cfg = self.cfg.terrain
+        return None if cfg.mesh_type == "plane" else Terrain.build(cfg, self.cfg.env.seed)
+
+    def _init_buffers(self) -> None:
+        """Allocate what follows from the robot, its commands and its ground."""
+        super()._init_buffers()
+        cfg, robot, n, device = self.cfg, self.robot, self.num_envs, self.device
+        state = self.physics.robot_state
+        assert state is not None
         self.base_pos, self.base_quat = state.base_pos, state.base_quat
         self.base_lin_vel, self.base_ang_vel = state.base_lin_vel, state.base_ang_vel
         self.projected_gravity = state.projected_gravity
@@ -71,19 +91,14 @@ class LeggedRobot(Terms, BaseTask):
         self.contact_forces = state.contact_forces
         self.last_dof_vel = torch.zeros_like(self.dof_vel)
 
-        self.control = Control(robot, cfg.control, self.physics.torques, cfg.sim.dt)
+        self.pushes = Pushes(cfg.domain_rand, n, self.dt, device)
+        self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt)
         self.torques, self.default_dof_pos = self.control.torques, self.control.default_dof_pos
         self.command_sampler = Commands(cfg.commands, n, self.dt, device)
         self.commands, self.is_moving = self.command_sampler.commands, self.command_sampler.is_moving
         self.contacts = FeetContacts(n, len(robot.feet_indices), self.dt, device)
         full_ranges = self.command_sampler.full_ranges
         self.command_curriculum = CommandCurriculum(cfg.commands.curriculum, full_ranges, self.dt)
-        self.valid = torch.ones(n, dtype=torch.bool, device=device)
-        """(N,) robots whose numbers are numbers: physics now, rewards and observations a step before; the others are
-        terminated and reset.
-        """
-        self._in_bounds = torch.ones_like(self.valid)
-        self._clipped_actions = torch.zeros_like(self.actions)
 
         self.feet_indices = torch.tensor(robot.feet_indices, device=device)
         self.penalised_indices = torch.tensor(robot.penalised_indices, dtype=torch.long, device=device)
@@ -100,191 +115,105 @@ class LeggedRobot(Terms, BaseTask):
             self.env_origins = self.terrain_curriculum.origins
         self._spawn_offset = torch.zeros(n, 3, device=device)
         self._spawn_offset[:, 2] = robot.file.spawn_height
-        self._spawn_quat = torch.zeros(n, 4, device=device)
+        self._reset_velocity = torch.zeros(2, n, 3, device=device)  # linear, angular, both in the base frame
         self._spawn_yaw = torch.zeros(n, device=device)
-        self._reset_velocity = torch.zeros(2, n, 3, device=device)  # linear, angular
-        self._reset_dof_pos, self._reset_dof_vel = (torch.zeros(n, self.num_actions, device=device) for _ in range(2))
-        self._beside = Branch(device)
+        self.reset_qpos[:, 3] = 1.0
 
-        scales = {name: scale for name, scale in cfg.rewards.scales.items() if scale != 0.0}
-        terms = {name: getattr(self, f"_reward_{name}") for name in scales}
-        self.rewards = Rewards(terms, scales, self.dt, cfg.rewards.only_positive_rewards, self.rew_buf)
-        self.episode_sums = self.rewards.episode_sums
-        self.observation_terms = ObservationTerms({name: getattr(self, f"_obs_{name}") for name in self._term_order()})
-        self.observation_groups = {"actor": self._group("actor"), "critic": self._group("critic")}
-        self.faults = Faults(self.rewards.names, self.observation_terms, n, device)
-        self.statistics = Statistics(self.rewards.names, cfg.env.episode_length_s, device)
-        # A back-end that no graph can hold runs eagerly on a GPU; on the CPU nothing is captured, only checked.
-        self._build_graph(graph and (self.physics.capturable or device.type == "cpu"))
+    def _soft_limits(self, robot: Robot) -> Tensor:
+        """Return joint limits (D, 2), shrunk about their middle by `soft_dof_pos_limit` [rad]."""
+        limits = torch.tensor(robot.dof_pos_limits, dtype=torch.float32, device=self.device)
+        middle, half = limits.mean(dim=1, keepdim=True), 0.5 * (limits[:, 1:] - limits[:, :1])
+        soft = half * self.cfg.rewards.soft_dof_pos_limit
+        bounded = torch.cat([middle - soft, middle + soft], dim=1)
+        return torch.where(torch.isfinite(bounded), bounded, limits)
 
-    def make_terrain(self) -> Terrain | None:
-        """The ground the configuration asks for; None for a plane. A subclass may return a terrain of its own."""
-        cfg = self.cfg.terrain
-        return None if cfg.mesh_type == "plane" else Terrain.build(cfg, self.cfg.env.seed)
-
-    @classmethod
-    def check(cls, cfg: TaskConfig) -> Robot:
-        """Everything that can be wrong with a configuration, before anything is built; returns the robot."""
-        origins = cfg.origins
-        check_overrides(cls, LeggedRobot)
-        robot = load_robot(cfg.robot, origins.where("robot"))
-        rewards, terms = cls.terms("_reward_"), cls.terms("_obs_")
-        for name in cfg.rewards.scales:
-            if name not in rewards:
-                where = origins.where(f"rewards.scales.{name}")
-                raise ConfigError(f"{where}: {cls.__name__} has no reward '{name}'{suggest(name, rewards)}")
-        for part in ("actor", "critic", "scales", "noise"):
-            for name in getattr(cfg.observations, part):
-                if name not in terms:
-                    where = origins.where(f"observations.{part}" + (f".{name}" if part in ("scales", "noise") else ""))
-                    raise ConfigError(f"{where}: {cls.__name__} has no observation '{name}'{suggest(name, terms)}")
-        check_terms(cls, cfg)
-        check_recurrent(cfg)
-        if cfg.train.algorithm.symmetry:
-            where, otherwise = origins.where("train.algorithm.symmetry"), "false learns without mirror images"
-            if robot.mirror is None:
-                raise ConfigError(f"{where}: '{robot.name}' is lopsided (joints and feet at zero angles); {otherwise}")
-            used = (*cfg.observations.actor, *cfg.observations.critic)
-            check_mirror_kinds(cls.__name__, cls.MIRRORED, used, where)
-            y = cfg.terrain.measured_points_y
-            if sorted(y) != sorted(-value for value in y):
-                points = f"terrain.measured_points_y ({origins.of('terrain.measured_points_y')})"
-                raise ConfigError(f"{where}: {points} are not the same left and right: {list(y)}")
-        control_gains(robot, cfg.control, origins.where)
-        check_terrain(cfg.terrain, origins)
-        check_base_mass(cfg, robot)
-        check_sizes(cfg)
-        if round(cfg.env.episode_length_s / cfg.dt) < 1:
-            where, given = origins.where("env.episode_length_s"), cfg.env.episode_length_s
-            raise ConfigError(
-                f"{where}: must be at least a control step of {cfg.dt:g} s (sim.dt * control.decimation), got {given:g}"
-            )
-        samples = cfg.env.num_envs * cfg.train.runner.num_steps_per_env
-        if cfg.train.algorithm.num_mini_batches > samples:
-            where, given = origins.where("train.algorithm.num_mini_batches"), cfg.train.algorithm.num_mini_batches
-            raise ConfigError(
-                f"{where}: must be at most the {samples} samples of an iteration (num_envs * num_steps_per_env), got {given}"
-            )
-        return robot
-
-    @classmethod
-    def terms(cls, prefix: str) -> set[str]:
-        """Names of the methods that begin with `prefix`, without it."""
-        return {name.removeprefix(prefix) for name in dir(cls) if name.startswith(prefix)}
-
-    # ---- one control step --------------------------------------------------------------------------------------------
-
-    def _step(self) -> None:
-        clip = self.cfg.control.clip_actions
-        torch.clamp(self._action_input, -clip, clip, out=self._clipped_actions)
-        torch.nan_to_num(self._clipped_actions, nan=0.0, out=self.actions)
-        self.control.set_actions(self.actions)
-        for _ in range(self.cfg.control.decimation):
-            self.control.compute(self.dof_pos, self.dof_vel)
-            self.physics.step()
-        with self._beside.fork():
-            self._draw()
-        self.physics.refresh()
-        self.height_scan.update(self.base_pos, self.base_quat)
-        self.episode_length_buf.add_(1)
-        self.contacts.update(self.contact_forces[:, self.feet_indices])
-
-        self.check_termination()
-        with self._beside.fork():
-            self.track()
-        self.compute_reward()
-        self._beside.join()
-        with self._beside.fork():
-            self.faults.check_rewards(self.rewards.fine, self.valid)
-        if self.terrain_curriculum is not None:
-            asked = self.commands[:, :2].norm(dim=1) * self.cfg.env.episode_length_s
-            self.terrain_curriculum.update(self.reset_buf & self.valid, self.base_pos, asked)
-        self.reset_idx(self.reset_buf)
-        self.randomization.push(self.physics, ~self.reset_buf)
-        self._observe()
-
-    def check_termination(self) -> None:
-        """Failures: a terminating shape feels a force, the base is too low or tilted, physics blew up. And time-outs."""
+    def active_terminations(self) -> tuple[list[str], list[str]]:
+        """Leave out limits that are 0, and a terrain that is not there."""
         cfg = self.cfg.terminations
-        state = (self.base_pos, self.base_quat, self.base_lin_vel, self.base_ang_vel, self.dof_pos, self.dof_vel)
-        largest = torch.linalg.vector_norm(torch.cat([*state, self._clipped_actions], dim=1), torch.inf, dim=1)
-        torch.lt(largest, LARGEST_STATE, out=self._in_bounds)  # so is NaN not
-        torch.logical_and(self._in_bounds, self.faults.sound, out=self.valid)
-        force = self.contact_forces[:, self.termination_indices].norm(dim=2)
-        failed = (force > TERMINATION_FORCE).any(dim=1) | ~self.valid
-        if cfg.min_base_height > 0.0:
-            failed = failed | (self.base_pos[:, 2] - self.height_scan.ground < cfg.min_base_height)
-        if cfg.max_tilt > 0.0:
-            failed = failed | (torch.acos((-self.projected_gravity[:, 2]).clamp(-1.0, 1.0)) > cfg.max_tilt)
-        self.terminated_buf.copy_(failed)
-        over = self.episode_length_buf >= self.max_episode_length
-        if self.terrain is not None:
-            x, y = self.terrain.reach  # a robot that walked off the map is not judged for it
-            over = over | (self.base_pos[:, 0].abs() > x) | (self.base_pos[:, 1].abs() > y)
-        self.time_out_buf.copy_(over & ~failed)
-        torch.logical_or(self.terminated_buf, self.time_out_buf, out=self.reset_buf)
+        off = {name for name, limit in (("base_height", cfg.min_base_height), ("tilt", cfg.max_tilt)) if limit == 0.0}
+        if self.terrain is None:
+            off.add("left_terrain")
+        failures, time_outs = super().active_terminations()
+        return [name for name in failures if name not in off], [name for name in time_outs if name not in off]
 
-    def compute_reward(self) -> None:
-        """Judged on the command that the policy saw, before anything is reset; ended episodes are recorded."""
-        self.rewards.compute(self.valid)
-        self.statistics.add_episodes(self.reset_buf, self.terminated_buf, self.episode_length_buf, self.rewards.sums)
+    def observation_scales(self) -> dict[str, Any]:
+        """Scale commands like the velocities that they ask for, unless told otherwise."""
+        scales = super().observation_scales()
+        lin, ang = scales.get("base_lin_vel", 1.0), scales.get("base_ang_vel", 1.0)
+        scales.setdefault("commands", [lin, lin, ang])
+        return scales
 
-    def track(self) -> None:
-        """Record tracking errors; let the command curriculum judge the step."""
-        velocity = torch.cat([self.base_lin_vel[:, :2], self.base_ang_vel[:, 2:]], dim=1)
-        error = (self.commands[:, :3] - velocity).square()
-        self.statistics.add_step(error[:, :2].sum(dim=1), error[:, 2], self.valid, self.physics.overflowed)
-        self.faults.check_state(self._in_bounds, self._clipped_actions)
-        self.command_curriculum.update(self.commands[:, :3], velocity, self.valid)
-        self.command_curriculum.write_ranges(self.command_sampler.ranges)
+    def mirror_images(self) -> MirrorImages | None:
+        mirror, points, seen = self.robot.mirror, self.height_scan.points, (self.observation_groups, self.num_actions)
+        return None if mirror is None else MirrorImages(type(self).__name__, self.MIRRORED, *seen, mirror, points)
 
-    def _draw(self) -> None:
-        """Random numbers for every robot, used by those that are reset, pushed or given a new command, and noise."""
+    # ---- one control step: what differs from every task's ------------------------------------------------------------
+
+    def set_controls(self) -> None:
+        """Tell the control law what is wanted of the joints."""
+        self.control.set_actions(self.actions)
+
+    def apply_control(self) -> None:
+        self.control.compute(self.dof_pos, self.dof_vel)
+
+    def draw(self) -> None:
+        self.draw_reset()
+        self.command_sampler.draw()
+        self.pushes.draw()
+        self.draw_noise()
+
+    def draw_reset(self) -> None:
+        """Draw joints near the default pose and a base at its spawn height, moving."""
         cfg = self.cfg.init_state
-        self._reset_dof_pos.uniform_(*cfg.dof_pos_factor).mul_(self.default_dof_pos)
+        self.reset_qpos[:, 7:].uniform_(*cfg.dof_pos_factor).mul_(self.default_dof_pos)
         self._reset_velocity.uniform_(*cfg.base_velocity)
         self._spawn_yaw.uniform_(*cfg.yaw)
         if self.terrain_curriculum is not None:
             reach = self.cfg.terrain.spawn_range
             self._spawn_offset[:, :2].uniform_(-reach, reach)
             self.terrain_curriculum.draw()
-        self.command_sampler.draw()
-        self.randomization.draw()
-        for group in self.observation_groups.values():
-            group.draw()
+        self.reset_qvel[:, :6].unflatten(1, (2, 3)).copy_(self._reset_velocity.transpose(0, 1))
+        if cfg.yaw != (0.0, 0.0):
+            torch.cos(0.5 * self._spawn_yaw, out=self.reset_qpos[:, 3])
+            torch.sin(0.5 * self._spawn_yaw, out=self.reset_qpos[:, 6])
+            # MuJoCo has the linear velocity of a floating base in the world frame, the angular one in the base's.
+            self.reset_qvel[:, :3].copy_(quat_rotate(self.reset_qpos[:, 3:7], self._reset_velocity[0]))
+
+    def sense(self) -> None:
+        super().sense()
+        self.height_scan.update(self.base_pos, self.base_quat)
+
+    def advance(self) -> None:
+        super().advance()
+        self.contacts.update(self.contact_forces[:, self.feet_indices])
+
+    def measure(self) -> None:
+        super().measure()
+        velocity = torch.cat([self.base_lin_vel[:, :2], self.base_ang_vel[:, 2:]], dim=1)
+        self.command_curriculum.update(self.commands[:, :3], velocity, self.valid)
+        self.command_curriculum.write_ranges(self.command_sampler.ranges)
+
+    def update_curricula(self) -> None:
+        if self.terrain_curriculum is not None:
+            asked = self.commands[:, :2].norm(dim=1) * self.cfg.env.episode_length_s
+            self.terrain_curriculum.update(self.reset_buf & self.valid, self.base_pos, asked)
 
     def reset_idx(self, mask: Tensor) -> None:
-        """New episodes for the robots in `mask` (N,): joints near the default pose, base at its spawn height, moving."""
-        torch.cos(0.5 * self._spawn_yaw, out=self._spawn_quat[:, 0])
-        torch.sin(0.5 * self._spawn_yaw, out=self._spawn_quat[:, 3])
-        self.physics.write_state(
-            mask,
-            base_pos=self.env_origins + self._spawn_offset,
-            base_quat=self._spawn_quat,
-            base_lin_vel=self._reset_velocity[0],
-            base_ang_vel=self._reset_velocity[1],
-            dof_pos=self._reset_dof_pos,
-            dof_vel=self._reset_dof_vel,
-        )
+        torch.add(self.env_origins, self._spawn_offset, out=self.reset_qpos[:, :3])
+        super().reset_idx(mask)
         self.control.reset(mask)
         self.contacts.reset(mask)
-        self.rewards.reset(mask)
-        masked_set_(self.actions, mask, 0.0)
-        masked_set_(self.episode_length_buf, mask, 0)
 
-    def _observe(self) -> None:
-        self.physics.refresh()
-        self.height_scan.update(self.base_pos, self.base_quat)
+    def disturb(self, mask: Tensor) -> None:
+        """Push the robots that are due."""
+        self.pushes.push(self.physics, mask)
+
+    def ask(self) -> None:
+        """Renew commands that are due, and steer towards headings."""
         self.command_sampler.update(self.reset_buf, self.base_quat)
-        self.observation_terms.evaluate()
-        with self._beside.fork():
-            self.faults.check_observations()
-        for group in self.observation_groups.values():
-            group.advance()
-            group.compute()
-            group.restart(self.reset_buf)
-        self._beside.join()
-        self.last_actions.copy_(self.actions)
+
+    def remember(self) -> None:
+        super().remember()
         self.last_dof_vel.copy_(self.dof_vel)
 
     @torch.no_grad()
@@ -299,32 +228,7 @@ class LeggedRobot(Terms, BaseTask):
             group.restart(self.episode_length_buf == 0)
         return self.get_observations()
 
-    # ---- construction and state --------------------------------------------------------------------------------------
-
-    def _group(self, name: str) -> ObservationGroup:
-        """The observation group `name`; only the actor's is noisy."""
-        cfg = self.cfg.observations
-        names = cfg.actor if name == "actor" else cfg.critic
-        scales: dict[str, Any] = dict(cfg.scales)
-        lin, ang = cfg.scales.get("base_lin_vel", 1.0), cfg.scales.get("base_ang_vel", 1.0)
-        scales.setdefault("commands", [lin, lin, ang])
-        noisy = name == "actor" and cfg.add_noise
-        noise = {term: half * cfg.noise_level for term, half in cfg.noise.items()} if noisy else {}
-        history = cfg.actor_history if name == "actor" else 1
-        return ObservationGroup(self.observation_terms, names, scales, noise, cfg.clip, history)
-
-    def _term_order(self) -> list[str]:
-        """The terms of all groups, each once; those of the largest group first, so that it finds them side by side."""
-        groups = sorted((self.cfg.observations.actor, self.cfg.observations.critic), key=len, reverse=True)
-        return list(dict.fromkeys(name for names in groups for name in names))
-
-    def _soft_limits(self, robot: Robot) -> Tensor:
-        """(D, 2) joint limits, shrunk about their middle by `soft_dof_pos_limit` [rad]."""
-        limits = torch.tensor(robot.dof_pos_limits, dtype=torch.float32, device=self.device)
-        middle, half = limits.mean(dim=1, keepdim=True), 0.5 * (limits[:, 1:] - limits[:, :1])
-        soft = half * self.cfg.rewards.soft_dof_pos_limit
-        bounded = torch.cat([middle - soft, middle + soft], dim=1)
-        return torch.where(torch.isfinite(bounded), bounded, limits)
+    # ---- curricula, and what is saved of the task --------------------------------------------------------------------
 
     def reset_curricula(self) -> None:
         self.command_curriculum.reset()
@@ -335,7 +239,7 @@ class LeggedRobot(Terms, BaseTask):
     def log_rollout(self) -> dict[str, Tensor]:
         ranges = {f"Metrics/{name}": value for name, value in self.command_curriculum.metrics().items()}
         levels = self.terrain_curriculum.metrics() if self.terrain_curriculum is not None else {}
-        return {**super().log_rollout(), **ranges, **levels, **self.faults.flush()}
+        return {**super().log_rollout(), **ranges, **levels}
 
     def progress(self) -> dict[str, Any]:
         progress = {"command_curriculum": self.command_curriculum.progress()}
@@ -349,46 +253,16 @@ class LeggedRobot(Terms, BaseTask):
         if self.terrain_curriculum is not None and "terrain_curriculum" in progress:
             self.terrain_curriculum.load_progress(progress["terrain_curriculum"])
 
-    def _parts(self) -> dict[str, Any]:
-        """What has a state of its own, by name."""
+    def parts(self) -> dict[str, Any]:
         parts = {
+            **super().parts(),
             "commands": self.command_sampler,
             "command_curriculum": self.command_curriculum,
             "contacts": self.contacts,
             "control": self.control,
-            "faults": self.faults,
-            "randomization": self.randomization,
-            "rewards": self.rewards,
-            **{f"observations_{name}": group for name, group in self.observation_groups.items()},
+            "height_scan": self.height_scan,
+            "pushes": self.pushes,
         }
         if self.terrain_curriculum is not None:
             parts["terrain_curriculum"] = self.terrain_curriculum
         return parts
-
-    def _own_tensors(self) -> dict[str, Tensor]:
-        """The task's own tensors of a row per robot, a subclass' among them; not those that are parts' or the physics'."""
-        others = [*vars(self.physics.state).values(), *self.physics.state_tensors().values(), self.height_scan.heights]
-        others += [tensor for part in self._parts().values() for tensor in vars(part).values() if isinstance(tensor, Tensor)]
-        known = {tensor.untyped_storage().data_ptr() for tensor in others}
-        return {
-            name: tensor
-            for name, tensor in vars(self).items()
-            if isinstance(tensor, Tensor)
-            and tensor.shape[:1] == (self.num_envs,)
-            and tensor.untyped_storage().data_ptr() not in known
-        }
-
-    def state_dict(self) -> dict[str, Any]:
-        return {
-            "physics": {name: tensor.clone() for name, tensor in self.physics.state_tensors().items()},
-            "task": {name: tensor.clone() for name, tensor in self._own_tensors().items()},
-            **{name: state_of(part) for name, part in self._parts().items()},
-        }
-
-    @torch.no_grad()
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        for name, part in self._parts().items():
-            load_state(part, state.get(name, {}))
-        take(self._own_tensors(), state.get("task", {}), type(self).__name__)
-        self.randomization.apply(self.physics)
-        self.physics.load_state(state.get("physics", {}))

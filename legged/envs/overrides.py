@@ -6,29 +6,27 @@ from typing import Any
 
 from legged.config.origins import Origins
 from legged.config.schema import TaskConfig
-from legged.errors import ConfigError
+from legged.errors import ConfigError, suggest
 from legged.process.paths import relative
 
-_OBSERVE = "write a method _obs_<name> for each part and list the names in observations.actor and observations.critic"
-_STEP = "override _step and call super()._step() in it, or one of what it calls: check_termination, compute_reward, reset_idx"
+_OBSERVE = "write a method _obs_<name> for each part and list the names in observations.groups.actor.terms and .critic.terms"
+_STEP = "override one of the hooks that _step() calls, and call super()'s in it: advance, compute_reward, remember, ..."
 _START = (
     "init_state.dof_pos_factor, init_state.yaw and init_state.base_velocity say how an episode begins; for more, override"
-    " reset_idx(mask) and call self.physics.write_state(mask, ...) after super().reset_idx(mask)"
+    " reset_idx(mask) and call self.physics.write(mask, qpos, qvel) after super().reset_idx(mask)"
 )
 _BUILD = "the robot is its MJCF (robot: in the task's YAML), the ground is terrain: or what make_terrain() returns"
 _DRAWING = "nothing is drawn while training; play.py makes pictures (legged/rendering)"
 _TORQUES = "control.control_type, control.stiffness and control.damping choose the law; others go into legged/mdp/control.py"
-_BUFFERS = "allocate tensors in __init__(), before super().__init__(...), which calls every term"
 
 HOOKS = {
     # legged_gym and its forks
     "_parse_cfg": "the configuration is complete when __init__() gets it; numbers of your own go under custom: in the YAML",
-    "_init_buffers": _BUFFERS,
     "_prepare_reward_function": "rewards.scales in the YAML names the _reward_<name> methods that run; self.rewards has them",
     "post_physics_step": _STEP,
     "_post_physics_step_callback": _STEP,
     "compute_observations": _OBSERVE,
-    "get_privileged_observations": "observations.critic lists the _obs_<name> methods that the critic sees",
+    "get_privileged_observations": "observations.groups.critic.terms lists the _obs_<name> methods that the critic sees",
     "_get_noise_scale_vec": "observations.noise in the YAML gives each term's noise; observations.add_noise, noise_level",
     "_resample_commands": "commands.ranges, commands.resampling_time_s, standing_share and single_axis_share say what is"
     " sampled; another way of sampling goes into legged/mdp/commands.py",
@@ -58,18 +56,19 @@ HOOKS = {
     "_apply_action": _TORQUES,
     "_get_observations": _OBSERVE,
     "_get_rewards": "write a method _reward_<name> for each part and name its scale in rewards.scales",
-    "_get_dones": "override check_termination(): call super().check_termination(), then write self.terminated_buf, reset_buf",
+    "_get_dones": "write a method _terminate_<name> and list the name in terminations.failures or terminations.time_outs",
     "_reset_idx": "override reset_idx(mask), with a bool a robot",
 }
 """Hook of another framework -> what takes its place here."""
 
 
-def check_overrides(cls: type, base: type) -> None:
-    """Look for hooks that `cls`, a subclass of `base`, or a class between them defines in vain.
+def check_overrides(cls: type) -> None:
+    """Look for hooks that `cls`, or a class between it and the class of this package that it extends, defines in vain.
 
     Raises:
-        ConfigError: there is one which `base` does not have and no OWN_HELPERS names.
+        ConfigError: there is one which that class does not have and no OWN_HELPERS names.
     """
+    base = next(part for part in cls.__mro__ if part.__module__.startswith("legged."))
     between = [part for part in cls.__mro__ if part not in base.__mro__]
     helpers: set[str] = set()
     for part in between:
@@ -84,16 +83,38 @@ def check_overrides(cls: type, base: type) -> None:
                 )
 
 
-def check_terms(cls: type, cfg: TaskConfig) -> None:
-    """Look whether the terms that a configuration names, which are there, can be called.
+KINDS = {"_reward_": "reward", "_obs_": "observation", "_terminate_": "termination"}
+"""Prefix of a term's method -> what errors call it."""
+
+
+def named_terms(cfg: TaskConfig) -> list[tuple[str, str, str]]:
+    """Return the terms that a configuration names, each with the prefix of its method and the dotted path of its name."""
+    named = [("_reward_", name, f"rewards.scales.{name}") for name in cfg.rewards.scales]
+    for group, content in cfg.observations.groups.items():
+        named += [("_obs_", name, f"observations.groups.{group}.terms") for name in content.terms]
+    for part in ("scales", "noise"):
+        named += [("_obs_", name, f"observations.{part}.{name}") for name in getattr(cfg.observations, part)]
+    for part in ("failures", "time_outs"):
+        named += [("_terminate_", name, f"terminations.{part}") for name in getattr(cfg.terminations, part)]
+    return named
+
+
+def check_terms(cls: Any, cfg: TaskConfig) -> None:
+    """Look whether the terms that a configuration names are there and can be called.
 
     Raises:
-        ConfigError: one is no method, or wants arguments.
+        ConfigError: one is missing, is no method, or wants arguments; or there are no observations.
     """
-    used = [("_reward_", name, f"rewards.scales.{name}") for name in cfg.rewards.scales]
-    for group in ("actor", "critic"):
-        used += [("_obs_", name, f"observations.{group}") for name in getattr(cfg.observations, group)]
-    for prefix, name, path in used:
+    groups = cfg.observations.groups
+    for group in groups or ("actor",):
+        if not groups or not groups[group].terms:
+            where = cfg.origins.where(f"observations.groups.{group}.terms")
+            raise ConfigError(f"{where}: must not be empty{suggest('', cls.terms('_obs_'), 'observations')}")
+    for prefix, name, path in named_terms(cfg):
+        known = cls.terms(prefix)
+        if name not in known:
+            kind = KINDS[prefix]
+            raise ConfigError(f"{cfg.origins.where(path)}: {cls.__name__} has no {kind} '{name}'{suggest(name, known)}")
         _check_term(cls, prefix + name, path, cfg.origins)
 
 

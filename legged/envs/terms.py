@@ -3,19 +3,19 @@
 Formulas and names are legged_gym's (Rudin et al., arXiv 2109.11978); where a term differs, its docstring says so.
 """
 
-from typing import Literal
-
 import torch
 from torch import Tensor
 
-from legged.config.schema import TaskConfig
+from legged.config.schema import LeggedConfig
 from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
 from legged.mdp.height_scan import HeightScan
+from legged.mdp.mirror_images import MirrorKind
+from legged.mdp.tracking_error import velocity_error, yaw_rate_error
+from legged.terrain import Terrain
 
-MirrorKind = Literal["same", "vector", "rotation", "command", "joints", "feet", "heights"]
-"""`vector`: (x, y, z) of a velocity or direction; `rotation`: of an angular velocity; `command`: (vx, vy, yaw rate);
-`joints`, `feet`: a number for each; `heights`: the height scan; `same`: numbers that know no side."""
+TERMINATION_FORCE = 1.0
+"""Contact force on a terminating shape that ends the episode [N]."""
 PENALISED_FORCE = 0.1
 """Contact force on a penalised shape that counts as a collision [N]."""
 
@@ -39,10 +39,7 @@ class Terms:
         "heights": "heights",
     }
     """Observation term -> how its numbers change when left and right are exchanged; a subclass adds its own terms'."""
-    OWN_HELPERS: tuple[str, ...] = ()
-    """Methods of a subclass that are named like a hook of another framework, which nothing here calls, but which the subclass
-    calls itself. Without this they are an error (legged/envs/overrides.py)."""
-    cfg: TaskConfig
+    cfg: LeggedConfig
     dt: float
     """Control step [s]."""
     base_pos: Tensor
@@ -85,6 +82,10 @@ class Terms:
     measured_heights: Tensor
     terminated_buf: Tensor
     """(N,) the episode ends now in a failure."""
+    termination_indices: Tensor
+    """Shapes that must not touch anything."""
+    terrain: Terrain | None
+    """The ground; None on a plane."""
 
     # ---- observations: (N, width) each; the docstrings go into policy.json, the last brackets as the unit -----------------
 
@@ -127,12 +128,12 @@ class Terms:
 
     def _reward_tracking_lin_vel(self) -> Tensor:
         """Following the commanded horizontal velocity: exp(-|error|^2 / sigma)."""
-        error = (self.commands[:, :2] - self.base_lin_vel[:, :2]).square().sum(dim=1)
+        error = velocity_error(self.commands, self.base_lin_vel)
         return torch.exp(error * (-1.0 / self.cfg.rewards.tracking_sigma))
 
     def _reward_tracking_ang_vel(self) -> Tensor:
         """Following the commanded yaw rate: exp(-error^2 / sigma)."""
-        error = (self.commands[:, 2] - self.base_ang_vel[:, 2]).square()
+        error = yaw_rate_error(self.commands, self.base_ang_vel)
         return torch.exp(error * (-1.0 / self.cfg.rewards.tracking_sigma))
 
     def _reward_lin_vel_z(self) -> Tensor:
@@ -217,3 +218,33 @@ class Terms:
         """Exactly one foot on the ground, the walk of a biped."""
         touching = self.contact_forces[:, self.feet_indices, 2] > PENALISED_FORCE
         return (touching.sum(dim=1) == 1).float()
+
+    # ---- terminations: (N,) bool each ----------------------------------------------------------------------------------
+
+    def _terminate_contact(self) -> Tensor:
+        """A shape of the robot's `terminate_after_contacts_on` feels a force."""
+        return (self.contact_forces[:, self.termination_indices].norm(dim=2) > TERMINATION_FORCE).any(dim=1)
+
+    def _terminate_base_height(self) -> Tensor:
+        """The base is too close to the ground under it."""
+        return self.base_pos[:, 2] - self.height_scan.ground < self.cfg.terminations.min_base_height
+
+    def _terminate_tilt(self) -> Tensor:
+        """The base leans too far."""
+        return torch.acos((-self.projected_gravity[:, 2]).clamp(-1.0, 1.0)) > self.cfg.terminations.max_tilt
+
+    def _terminate_left_terrain(self) -> Tensor:
+        """The base is beyond the middle of the level ground around all tiles: it cannot be judged there."""
+        assert self.terrain is not None
+        x, y = self.terrain.reach
+        return (self.base_pos[:, 0].abs() > x) | (self.base_pos[:, 1].abs() > y)
+
+    # ---- metrics: (N,) each, averaged over robots and steps; of squared errors named `_rmse` the root is logged ----------
+
+    def _metric_lin_vel_rmse(self) -> Tensor:
+        """Squared error of the horizontal velocity [m^2/s^2]."""
+        return velocity_error(self.commands, self.base_lin_vel)
+
+    def _metric_ang_vel_rmse(self) -> Tensor:
+        """Squared error of the yaw rate [rad^2/s^2]."""
+        return yaw_rate_error(self.commands, self.base_ang_vel)

@@ -1,38 +1,33 @@
-"""One policy under the same commands in every engine and solver: what it learned of walking, and what of one engine."""
+"""How a policy crosses into other engines: the same commands in every engine and solver."""
 
 import json
 import time
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
-import matplotlib
 import torch
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from legged.config import override
-from legged.config.schema import NewtonSolver
 from legged.errors import RunError
-from legged.evaluation.tracking import ready_to_track, tell
-from legged.evaluation.velocity_grid import Grid, measure
+from legged.evaluation.engines import ENGINES
+from legged.evaluation.velocity_grid import Grid
+from legged.evaluation.velocity_tracking import measure_tracking, ready_to_track
+from legged.figures import COLORS, figure
 from legged.physics import engine_name
 from legged.policies.restore import TrainedPolicy
-from legged.process.paths import make_folder, relative, replacing, write_text
+from legged.process.paths import make_folder, relative, write_text
 
 EVERYWHERE = "all"
-"""What --physics says for this."""
-ENGINES: list[list[tuple[str, Any]]] = [
-    [("sim.physics", "mujoco_warp")],
-    [("sim.physics", "mujoco")],
-    *([("sim.physics", "newton"), ("sim.solver", solver)] for solver in get_args(NewtonSolver)),
-]
+"""The value of --physics that asks for this."""
 
 
 def cross(
     policy: TrainedPolicy, grid: Grid, asked: list[tuple[str, Any]], device: torch.device, graph: bool, folder: Path
 ) -> int:
-    """Measure, print and plot; crossing.json in `folder` is written anew after every engine. Returns the exit code.
+    """Measure, print and draw; crossing.json in `folder` is written anew after every engine. Return the exit code.
 
     Engines run on `device`, the C engine on the CPU. `asked` is what the command line changes beside the engine.
     """
@@ -42,22 +37,22 @@ def cross(
     result: dict[str, Any] = {
         "task": policy.cfg.task,
         "checkpoint": policy.checkpoint.name,
-        "grid": {"vx": list(grid.vx), "vy": list(grid.vy), "yaw": list(grid.yaw)},
+        "grid": grid.axes,
         "robots_per_cell": grid.robots,
         "engines": [],
     }
-    for choice in ENGINES:
-        where = torch.device("cpu") if choice == [("sim.physics", "mujoco")] else device
-        result["engines"].append(_measured(policy, grid, [*asked, *choice], where, graph))
+    for name, engine in ENGINES.items():
+        where = torch.device("cpu") if name == "mujoco" else device
+        result["engines"].append(_measured(policy, grid, [*asked, *engine.overrides], where, graph))
         try:
             write_text(path, json.dumps(result, indent=1, allow_nan=False))
             failure = None
         except RunError as error:  # what is measured is shown all the same, and the disk may have room again by then
             failure = error
-    Console(width=110).print(report(result))
+    Console(width=110).print(crossing_table(result))
     if failure is not None:
         raise failure
-    plot(result, path.with_suffix(".png"))
+    draw_crossing(result, path.with_suffix(".png"))
     print(f"written: {relative(path)}, {relative(path.with_suffix('.png'))}")
     return 0
 
@@ -65,13 +60,12 @@ def cross(
 def _measured(
     policy: TrainedPolicy, grid: Grid, asked: list[tuple[str, Any]], device: torch.device, graph: bool
 ) -> dict[str, Any]:
-    """One engine's figures. Speed is that of the whole evaluation loop, without start-up and compilation."""
+    """Return one engine's figures. Speed is that of the whole evaluation loop, without start-up and compilation."""
     name = engine_name(override(policy.cfg, asked).sim, device)
-    tell(f"{name}: {len(grid.cells)} commands x {grid.robots} robots")
-    task, runner = ready_to_track(policy, grid, asked, device, graph)
-    act = runner.get_inference_policy(str(device))
+    print(f"{name}: {grid.size_text}", flush=True)
+    task, act = ready_to_track(policy, grid, asked, device, graph)
     start = time.perf_counter()
-    figures = measure(task, act, grid)
+    figures = measure_tracking(task, act, grid)
     seconds = time.perf_counter() - start
     return {
         "physics": name,
@@ -86,8 +80,8 @@ def _measured(
     }
 
 
-def report(result: dict[str, Any]) -> Table:
-    """A line an engine; an engine in which every robot fell before it was measured has no errors."""
+def crossing_table(result: dict[str, Any]) -> Table:
+    """Return a line an engine; an engine in which every robot fell before it was measured has no errors."""
     cells = len(result["grid"]["vx"]) * len(result["grid"]["vy"]) * len(result["grid"]["yaw"])
     title = f"{result['task']} ({result['checkpoint']}): {cells} commands x {result['robots_per_cell']} robots"
     table = Table(title=escape(title), title_justify="left")
@@ -112,31 +106,25 @@ def report(result: dict[str, Any]) -> Table:
     return table
 
 
-def plot(result: dict[str, Any], path: Path) -> None:
-    """Bars, an engine each: errors, falls, speed."""
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
+def draw_crossing(result: dict[str, Any], path: Path) -> None:
+    """Draw bars, an engine each: errors, falls, speed."""
     rows = result["engines"]
     names = [row["physics"] for row in rows]
-    figure, axes = plt.subplots(1, 4, figsize=(13, 0.6 + 0.42 * len(rows)), layout="constrained", sharey=True)
     panels = (
         ("rmse_lin", 1.0, "velocity RMSE [m/s]", "{:.3f}"),
         ("rmse_ang", 1.0, "yaw rate RMSE [rad/s]", "{:.3f}"),
         ("falls", 100.0, "falls [% of robots]", "{:.1f}"),
         ("steps_per_s", 1.0, "control steps per second", "{:,.0f}"),
     )
-    for axis, (key, factor, label, form) in zip(axes, panels, strict=True):
-        values = [None if row[key] is None else factor * row[key] for row in rows]
-        bars = axis.barh(names, [value or 0.0 for value in values], color="#1f6fb4")
-        axis.bar_label(bars, ["none" if value is None else form.format(value) for value in values], padding=3, fontsize=8)
-        axis.set_xlim(0.0, 1.3 * max([value for value in values if value], default=1.0))
-        axis.set_xlabel(label)
-        axis.spines[["top", "right"]].set_visible(False)
-    axes[0].invert_yaxis()
-    axes[3].set_xscale("log")
-    axes[3].set_xlim(1.0, None)
-    figure.suptitle(f"{result['task']} in every engine")
-    with replacing(path) as part:
-        figure.savefig(part, dpi=110, format="png")
-    plt.close(figure)
+    with figure(path, (13.0, 0.6 + 0.42 * len(rows)), columns=len(panels), share_y=True) as (drawn, axes):
+        for axis, (key, factor, label, form) in zip(axes[0], panels, strict=True):
+            values = [None if row[key] is None else factor * row[key] for row in rows]
+            bars = axis.barh(names, [value or 0.0 for value in values], color=COLORS[0])
+            axis.bar_label(bars, ["none" if value is None else form.format(value) for value in values], padding=3, fontsize=8)
+            axis.set_xlim(0.0, 1.3 * max([value for value in values if value], default=1.0))
+            axis.set_xlabel(label)
+            axis.spines[["top", "right"]].set_visible(False)
+        axes[0, 0].invert_yaxis()
+        axes[0, 3].set_xscale("log")
+        axes[0, 3].set_xlim(1.0, None)
+        drawn.suptitle(f"{result['task']} in every engine")

@@ -1,17 +1,16 @@
-"""The success sweep as a table and as curves."""
+"""Success over difficulty as a table and as curves."""
 
 import json
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
-import matplotlib
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from legged.config.schema import NewtonSolver
-from legged.evaluation.evaluation_file import check_success
-from legged.process.paths import replacing
+from legged.evaluation.engines import ENGINES
+from legged.evaluation.result_file import check_success, file_name
+from legged.figures import COLORS, figure
 from legged.terrain import TERRAIN_TYPES
 
 PANELS = {
@@ -21,19 +20,13 @@ PANELS = {
     "rough slopes": ("rough_slope_up", "rough_slope_down"),
 }
 """Types that share a panel; every other type has one of its own."""
-ENGINES = {
-    "mujoco_warp": ("mujoco-warp", "-", "o"),
-    "mujoco": ("C MuJoCo", "--", "s"),
-    **{f"newton_{solver}": (f"Newton, {solver}", "-.", "^") for solver in get_args(NewtonSolver)},
-}
-"""Engine -> its label, line and marker."""
-COLORS = ("#1f6fb4", "#d9541e")
 TRAINED: dict[str, Any] = {"color": "0.25", "ls": ":", "lw": 1.4, "zorder": 2}
 """The line where training ended."""
+TRAINED_LABEL = "hardest of training"
 
 
 def print_success(success: dict[str, Any]) -> None:
-    """One line a point; sizes beyond those of training are marked."""
+    """Print one line a point; sizes beyond those of training are marked."""
     rule = success["definition"]
     head = f"success: {rule['distance_m']:g} m from the start within {rule['time_s']:g} s, asked for {rule['vx']:g} m/s"
     table = Table(title=escape(head), title_justify="left")
@@ -61,7 +54,7 @@ def print_success(success: dict[str, Any]) -> None:
 
 
 def is_beyond(name: str, size: float, trained_to: float | None) -> bool:
-    """Whether a size is harder than the hardest of training; never where the type was not trained on."""
+    """Say whether a size is harder than the hardest of training; never where the type was not trained on."""
     if trained_to is None:
         return False
     kind = TERRAIN_TYPES[name]
@@ -69,13 +62,13 @@ def is_beyond(name: str, size: float, trained_to: float | None) -> bool:
     return size > trained_to + 1e-9 if grows else size < trained_to - 1e-9
 
 
-def with_other_engine(result: dict[str, Any], path: Path) -> list[dict[str, Any]]:
-    """`result`, and that of the other engine if it lies beside `path` (evaluation_<physics>.json) and is of the same
+def with_other_engines(result: dict[str, Any], path: Path) -> list[dict[str, Any]]:
+    """Return `result`, and those of other engines that lie beside `path` (evaluation_<physics>.json) and are of the same
     checkpoint.
     """
     found = [result]
     for engine in ENGINES:
-        other = path.with_name(f"evaluation_{engine}.json")
+        other = path.with_name(file_name(engine))
         if engine == result["physics"] or not other.is_file():
             continue
         try:
@@ -90,71 +83,74 @@ def with_other_engine(result: dict[str, Any], path: Path) -> list[dict[str, Any]
     return sorted(found, key=lambda one: list(ENGINES).index(one["physics"]))
 
 
-def plot_success(results: list[dict[str, Any]], path: Path) -> None:
-    """Curves of success over size with their intervals: a panel a kind of terrain, a colour a type, a line style an engine.
-    A dotted line is where training ended.
+def draw_success(results: list[dict[str, Any]], path: Path) -> None:
+    """Draw success over size with its intervals: a panel a kind of terrain, a colour a type, a line style an engine. A dotted
+    line is where training ended.
     """
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     panels = panels_of([name for result in results for name in result["success"]["types"]])
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
-    size = (4.8 * columns + 0.2, 2.9 * rows + 1.0)
-    figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False, sharey=True)
-    for axis in axes.flat[len(panels) :]:
-        axis.set_visible(False)
-    for axis, (title, names) in zip(axes.flat, panels.items(), strict=False):
-        axis.set_title(title if len(names) > 1 else names[0].replace("_", " "))
-        _draw_panel(axis, results, names)
-    for axis in axes[:, 0]:
-        axis.set_ylabel("success")
-    keys = []
-    for result in results:
-        label, line, marker = ENGINES[result["physics"]]
-        text = f"{label}, {result['success']['robots_per_point']} robots a point"
-        keys.append(plt.Line2D([], [], color="0.3", ls=line, marker=marker, ms=4, label=text))
-    if any(entry["trained_to"] is not None for result in results for entry in result["success"]["types"].values()):
-        keys.append(plt.Line2D([], [], **TRAINED, label="hardest of training"))
-    figure.legend(handles=keys, loc="outside lower center", ncols=len(keys) if columns > 1 else 1, frameon=False)
-    rule = results[0]["success"]["definition"]
-    text = f"{results[0]['task']}: robots that get {rule['distance_m']:g} m from their start within {rule['time_s']:g} s"
-    figure.suptitle(text if columns > 1 else text.replace(": ", "\n"), fontsize="medium" if columns == 1 else "large")
-    with replacing(path) as part:
-        figure.savefig(part, dpi=110, format="png")
-    plt.close(figure)
+    with figure(path, (4.8 * columns + 0.2, 2.9 * rows + 1.0), rows, columns, share_y=True) as (drawn, axes):
+        from matplotlib.lines import Line2D
+
+        for axis in axes.flat[len(panels) :]:
+            axis.set_visible(False)
+        for axis, (title, names) in zip(axes.flat, panels.items(), strict=False):
+            axis.set_title(title if len(names) > 1 else names[0].replace("_", " "))
+            _draw_panel(axis, results, names)
+        for axis in axes[:, 0]:
+            axis.set_ylabel("success")
+        keys = []
+        for result in results:
+            engine = ENGINES[result["physics"]]
+            text = f"{engine.label}, {result['success']['robots_per_point']} robots a point"
+            keys.append(Line2D([], [], color="0.3", ls=engine.line, marker=engine.marker, ms=4, label=text))
+        if any(entry["trained_to"] is not None for result in results for entry in result["success"]["types"].values()):
+            keys.append(Line2D([], [], **TRAINED, label=TRAINED_LABEL))
+        drawn.legend(handles=keys, loc="outside lower center", ncols=len(keys) if columns > 1 else 1, frameon=False)
+        rule = results[0]["success"]["definition"]
+        text = f"{results[0]['task']}: robots that get {rule['distance_m']:g} m from their start within {rule['time_s']:g} s"
+        size = "medium" if columns == 1 else "large"
+        drawn.suptitle(text if columns > 1 else text.replace(": ", "\n"), fontsize=size)
+
+
+def as_success(axis: Any, entry: dict[str, Any]) -> None:
+    """Label the axes of a panel of success over the size of a terrain type, and scale success from 0 to 100 %."""
+    from matplotlib.ticker import PercentFormatter
+
+    axis.set_xlabel(f"{entry['what']} [{entry['unit']}]")
+    axis.set_ylim(0.0, 1.04)
+    axis.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    axis.grid(alpha=0.3)
+    axis.spines[["top", "right"]].set_visible(False)
 
 
 def _draw_panel(axis: Any, results: list[dict[str, Any]], names: tuple[str, ...]) -> None:
-    """The curves of some types, of all engines."""
+    """Draw the curves of some types, of all engines."""
     from matplotlib.patches import Patch
-    from matplotlib.ticker import MultipleLocator, PercentFormatter
+    from matplotlib.ticker import MultipleLocator
 
     for color, name in zip(COLORS, names, strict=False):
         for result in results:
             entry = result["success"]["types"].get(name)
             if entry is None:
                 continue
-            _, line, marker = ENGINES[result["physics"]]
+            engine = ENGINES[result["physics"]]
             size, share, low, high = ([point[key] for point in entry["points"]] for key in ("size", "share", "low", "high"))
-            axis.plot(size, share, line, marker=marker, ms=4, color=color, clip_on=False, zorder=3)
+            axis.plot(size, share, engine.line, marker=engine.marker, ms=4, color=color, clip_on=False, zorder=3)
             axis.fill_between(size, low, high, color=color, alpha=0.12, lw=0)
-            axis.set_xlabel(f"{entry['what']} [{entry['unit']}]")
+            as_success(axis, entry)
             if entry["unit"] == "degrees":
                 axis.xaxis.set_major_locator(MultipleLocator(5))
             if entry["trained_to"] is not None:
                 axis.axvline(entry["trained_to"], **TRAINED)
-    axis.set_ylim(0.0, 1.04)
-    axis.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-    axis.grid(alpha=0.3)
-    axis.spines[["top", "right"]].set_visible(False)
     if len(names) > 1:
         patches = [Patch(color=color, label=name.replace("_", " ")) for color, name in zip(COLORS, names, strict=False)]
         axis.legend(handles=patches, loc="best", frameon=False, handlelength=1.0)
 
 
 def panels_of(names: list[str]) -> dict[str, tuple[str, ...]]:
-    """Title -> the types of a panel, of those that were measured."""
+    """Return title -> the types of a panel, of those that were measured."""
     there = dict.fromkeys(names)
     shared = {title: tuple(name for name in types if name in there) for title, types in PANELS.items()}
     panels = {title: types for title, types in shared.items() if types}

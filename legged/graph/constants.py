@@ -31,7 +31,7 @@ class Constants:
         return len(self._made)
 
     def get(self, key: Any, make: Callable[[], Tensor]) -> Tensor:
-        """The constant of that key, made if there is none yet.
+        """Return the constant of that key, made if there is none yet.
 
         Raises:
             HostReadError: the step asks for one that the step before it did not.
@@ -47,7 +47,7 @@ class Constants:
 
     @contextmanager
     def _free(self) -> Iterator[None]:
-        """The block may do what the step may not."""
+        """Let the block do what the step may not."""
         self.making = True
         try:
             yield
@@ -55,7 +55,7 @@ class Constants:
             self.making = False
 
     def index(self, tensor: Tensor, index: Any) -> Any:
-        """An index of `tensor` that says the same without lists, arrays, or tensors of another device."""
+        """Return an index of `tensor` that says the same without lists, arrays, or tensors of another device."""
         parts = index if isinstance(index, tuple) else (index,)
         if any(isinstance(part, list | tuple) and holds_tensors(part) for part in parts):
             raise HostReadError("indexes by a list of tensors, whose values a CUDA graph cannot hold; torch.stack them")
@@ -65,7 +65,7 @@ class Constants:
         return pieces if isinstance(index, tuple) or len(pieces) != 1 else pieces[0]
 
     def _positions(self, tensor: Tensor, index: Any, part: Any) -> tuple[Any, ...]:
-        """What takes the place of one part of an index."""
+        """Return what takes the place of one part of an index."""
         elsewhere = isinstance(part, Tensor) and part.device != tensor.device
         if not elsewhere and not isinstance(part, list | tuple | range | np.ndarray):
             return (part,)
@@ -87,12 +87,12 @@ class Constants:
 
 
 def holds_tensors(data: Any) -> bool:
-    """Whether there are tensors in nested lists."""
+    """Return whether there are tensors in nested lists."""
     return isinstance(data, Tensor) or (isinstance(data, list | tuple) and any(holds_tensors(value) for value in data))
 
 
 def key_of(data: Any) -> Any:
-    """What tells numbers, nested lists and arrays of them apart; None for anything else."""
+    """Return what tells numbers, nested lists and arrays of them apart; None for anything else."""
     if isinstance(data, np.ndarray):
         return data.dtype.str, data.shape, data.tobytes()
     if isinstance(data, list | tuple | range):

@@ -61,7 +61,7 @@ class ForbidHostReads:
     """Steps after which all has been judged."""
 
     def __init__(self, device: torch.device | None = None, owner: Any = None) -> None:
-        """For a step on `device`, the CPU by default, of a task `owner`."""
+        """Guard a step on `device`, the CPU by default, of a task `owner`."""
         self.device = device or torch.device("cpu")
         self.owner = owner
         self.constants = Constants()
@@ -102,14 +102,14 @@ class ForbidHostReads:
 
     @contextmanager
     def recording(self) -> Iterator[None]:
-        """While a graph is recorded: the constants are there, and others are refused."""
+        """Refuse new constants in the block, while a graph is recorded: those it needs are there."""
         self.constants.complete = True
         with self._calls:
             yield
 
     @contextmanager
     def inside(self, term: str) -> Iterator[None]:
-        """The block is a term of the task."""
+        """Take the block for a term of the task."""
         before, self._place = self._python_state(), term
         try:
             yield
@@ -154,7 +154,7 @@ class ForbidHostReads:
         read = [value for value in inputs if all(value is not other for other in over)]
         from_host = func is aten.lift_fresh.default
         if not self.constants.making and not caller().startswith("legged.physics"):
-            numbers = [repr(value) for value in inputs if not isinstance(value, Tensor)]
+            numbers = [repr(value) for value in inputs if not isinstance(value, Tensor | torch.UntypedStorage)]
             if from_host and inputs[0].dim() == 0:
                 numbers.append(repr(inputs[0].item()))
             kept = {m: v for v in (() if from_host else read) if (m := memory_of(v)) is not None and m not in self._made}
@@ -186,7 +186,7 @@ class ForbidHostReads:
             )
 
     def _tensors(self) -> Iterator[tuple[str, Tensor]]:
-        """The owner's attributes that are tensors, or lists or tables of them."""
+        """Return the owner's attributes that are tensors, or lists or tables of them."""
         for name, value in getattr(self.owner, "__dict__", {}).items():
             parts = (
                 value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple | deque) else (value,)
@@ -201,11 +201,11 @@ class Seen:
     call: str
     """Its name and what it was given that is no tensor."""
     memory: dict[int, StorageWeakRef]
-    """That of the tensors it was given which the step did not make; kept, so that none is mistaken for a later one."""
+    """Memory of the tensors it was given which the step did not make; kept, so that none is mistaken for a later one."""
 
 
 def memory_of(value: Any) -> int | None:
-    """What tells the memory of a tensor from all other memory that is known."""
+    """Return what tells the memory of a tensor from all other memory that is known."""
     return value.untyped_storage()._cdata if isinstance(value, Tensor) and value.layout is torch.strided else None
 
 
@@ -214,18 +214,18 @@ OVERWRITING = ("copy_", "fill_", "zero_", "uniform_", "normal_", "random_", "ber
 
 
 def overwritten(func: Any, args: Any, kwargs: Any) -> list[Tensor]:
-    """The tensors that an operator writes without reading them."""
+    """Return the tensors that an operator writes without reading them."""
     found = [kwargs[a.name] for a in func._schema.arguments if a.is_out and a.name in kwargs]
     return tree_leaves(found) + ([args[0]] if func._schema.name.removeprefix("aten::") in OVERWRITING else [])
 
 
 def fills(tensor: Tensor) -> bool:
-    """Whether a tensor is all of its memory."""
+    """Return whether a tensor is all of its memory."""
     return tensor.numel() * tensor.element_size() == tensor.untyped_storage().nbytes()
 
 
 def caller() -> str:
-    """The module whose code asks torch for something."""
+    """Return the module whose code asks torch for something."""
     frame = sys._getframe(1)
     while frame is not None:
         name = frame.f_globals.get("__name__", "")
@@ -236,7 +236,7 @@ def caller() -> str:
 
 
 def default_device() -> torch.device | None:
-    """What `torch.set_default_device` or `with torch.device(...)` asked for."""
+    """Return what `torch.set_default_device` or `with torch.device(...)` asked for."""
     asked = [mode.device for mode in _get_current_function_mode_stack() if isinstance(mode, DeviceContext)]
     return asked[-1] if asked else None
 
@@ -274,7 +274,7 @@ class _Operators(TorchDispatchMode):
         return self._guard.run(func, args, kwargs)
 
     def _reason(self, func: Any, args: Any, kwargs: Any) -> str:
-        """Why the operator is refused; empty if it is not."""
+        """Return why the operator is refused; empty if it is not."""
         if func in (aten.index.Tensor, aten.index_put_.default, aten.index_put.default):
             if any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
                 return "indexes by a mask, whose size is unknown; use torch.where or masked_fill"
@@ -327,14 +327,14 @@ class _Calls(TorchFunctionMode):
         return func(*args, **kwargs)
 
     def _is_host(self, *values: Any) -> bool:
-        """Whether one of the values means the CPU. On a machine without a GPU the task's own device is one, too: there,
-        only its name as text.
+        """Return whether one of the values means the CPU. On a machine without a GPU the task's own device is one, too:
+        there, only its name as text.
         """
         kinds = str if self._guard.device.type == "cpu" else str | torch.device
         return any(isinstance(value, kinds) and torch.device(value).type == "cpu" for value in values)
 
     def _factory(self, func: Any, args: Any, kwargs: Any) -> Any:
-        """A function that makes a tensor out of nothing, or of the host's data."""
+        """Call a function that makes a tensor out of nothing, or of the host's data, unless a graph could not hold it."""
         given = [*args, *kwargs.values()]
         of_tensor = bool(given) and isinstance(given[0], Tensor) and (func in self.OF_DATA or func is torch.normal)
         device = kwargs.get("device") or default_device()
@@ -349,7 +349,7 @@ class _Calls(TorchFunctionMode):
         return func(*args, **kwargs)
 
     def _constant(self, func: Any, data: Any, args: Any, kwargs: Any, kind: Any) -> Any:
-        """A copy of the constant that the call makes."""
+        """Return a copy of the constant that the call would make."""
         if holds_tensors(data) and not isinstance(data, Tensor):
             self._guard.refuse(f"{func.__name__} of a list of tensors reads their values on the host; torch.stack them")
         key = key_of(data)

@@ -8,18 +8,19 @@ from typing import Any
 import numpy as np
 
 LIBRARIES = ("builtins", "legged", "mujoco", "newton", "numpy", "tensordict", "torch", "warp")
-"""Whose objects are no state of the user's."""
+"""Packages whose objects are no state of the user's."""
 
 
 def random_states() -> dict[str, Any]:
-    """States of the host's two global random generators."""
+    """Return the states of the host's two global random generators."""
     kind, keys, *rest = np.random.get_state()
     return {"np.random": (kind, np.asarray(keys).tobytes(), *rest), "Python's random": random.getstate()}
 
 
 def plain_state(value: Any, depth: int = 3) -> Any:
-    """What a Python value is now, comparable: numbers, text, containers of them, arrays, random generators, and objects of
-    the user's own classes. Tensors and the parts of a task count for nothing: they are judged by what is read of them.
+    """Return what a Python value is now, comparable: numbers, text, containers of them, arrays, random generators, and
+    objects of the user's own classes. Tensors and the parts of a task count for nothing: they are judged by what is read of
+    them.
     """
     if value is None or isinstance(value, bool | int | float | complex | str | bytes | np.generic):
         return repr(value)
@@ -45,11 +46,11 @@ def plain_state(value: Any, depth: int = 3) -> Any:
 
 
 def attributes(owner: Any, depth: int = 3) -> dict[str, Any]:
-    """The plain state of an object's attributes."""
+    """Return the plain state of an object's attributes."""
     return {name: plain_state(value, depth) for name, value in vars(owner).items()} if hasattr(owner, "__dict__") else {}
 
 
 def shown(state: Any) -> str:
-    """Its text, cut where it is long."""
+    """Return its text, cut where it is long."""
     text = str(state)
     return text if len(text) <= 40 else f"{text[:37]}..."

@@ -19,12 +19,12 @@ class Branch:
     """
 
     def __init__(self, device: torch.device) -> None:
-        """On the CPU everything runs in order."""
+        """Make a branch on `device`; on the CPU everything runs in order."""
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
 
     @contextmanager
     def fork(self) -> Iterator[None]:
-        """The block may run at the same time as what follows it, up to `join`."""
+        """Let the block run at the same time as what follows it, up to `join`."""
         if self._stream is None:
             yield
             return
@@ -33,7 +33,7 @@ class Branch:
             yield
 
     def join(self) -> None:
-        """What follows waits for the block."""
+        """Let what follows wait for the block."""
         if self._stream is not None:
             torch.cuda.current_stream(self._stream.device).wait_stream(self._stream)
 
@@ -55,8 +55,8 @@ class StepGraph:
         warm_up_steps: int = WARM_UP_STEPS,
         rehearse: Callable[[], None] | None = None,
     ) -> None:
-        """With `enabled` false the function runs eagerly and unchecked. Of a function that does the same many times,
-        `rehearse` does it once: enough to warm up, and to check.
+        """Check or capture `function`; with `enabled` false it runs eagerly and unchecked. Of a function that does the same
+        many times, `rehearse` does it once: enough to warm up, and to check.
 
         Raises:
             TermError: a term of the task can't be captured.
@@ -89,6 +89,7 @@ class StepGraph:
         import warp as wp
 
         stream = torch.cuda.Stream(device)
+        wp.init()  # within a capture it would break that
         stream.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.stream(stream):
             for _ in range(self._warm_up_steps):

@@ -13,7 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from legged.config import TaskConfig
+from legged.config import LeggedConfig, TaskConfig
+from legged.config.networks import NETWORKS, groups_of
 from legged.envs import BaseTask
 from legged.errors import ConfigError
 from legged.learning.recurrent import rnn_of
@@ -22,7 +23,6 @@ from legged.robots.robot import load_robot
 
 FORMAT = 2
 """Version of `infos`. Files without one, of rsl-rl or from before there were versions, are read as 1."""
-NETWORKS = ("actor", "critic")
 Saved = dict[str, Any]
 
 
@@ -67,9 +67,8 @@ def read_checkpoint(path: Path, device: str = "cpu") -> Saved:
     """
     saved = load_plain(path, device)
     name = relative(path)
-    wanted = {*(f"{network}_state_dict" for network in NETWORKS), "iter"}
-    if not isinstance(saved, dict) or not wanted <= saved.keys():
-        raise ConfigError(f"{name}: not a checkpoint of rsl-rl (no actor, critic and iteration in it)")
+    if not isinstance(saved, dict) or not {"actor_state_dict", "iter"} <= saved.keys():
+        raise ConfigError(f"{name}: not a checkpoint of rsl-rl (no actor and iteration in it)")
     infos = {} if saved.get("infos") is None else saved["infos"]
     _check_kind(f"{name}: not a checkpoint: its", saved, PARTS)
     _check_kind(f"{name}: not a checkpoint: its infos.", infos, INFOS)
@@ -78,9 +77,14 @@ def read_checkpoint(path: Path, device: str = "cpu") -> Saved:
     version = infos.get("format", 1)
     if version > FORMAT:
         raise ConfigError(f"{name}: written in format {version} by a newer legged; this one reads formats up to {FORMAT}")
-    for network in NETWORKS:
+    for network in networks_in(saved):
         check_weights(saved[f"{network}_state_dict"], f"{name}: its {network}")
     return {**saved, "infos": infos}
+
+
+def networks_in(saved: Mapping[str, Any]) -> list[str]:
+    """Return the networks that a checkpoint holds: actor and critic, or the actor alone, which is enough to act."""
+    return [network for network in NETWORKS if f"{network}_state_dict" in saved]
 
 
 Kind = type | tuple[type, ...] | dict[Any, Any]
@@ -97,8 +101,11 @@ INFOS: dict[str, Kind] = {
     "task": str,
     "task_state": {str: {str: Tensor}},
     "observations": {str: {str: int}},
+    "histories": {str: int},
     "networks": {str: {str: (*PLAIN, list)}},
+    "optimizer": str,
     "robot": {str: (str, list)},
+    "transferred_from": {str: (str, int)},
     "learning_rate": float,
     "wall_s": float,
 }
@@ -168,19 +175,21 @@ def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str) -> d
 
 
 def describe(task: BaseTask) -> dict[str, Any]:
-    """What a checkpoint says of where it fits: `infos` without what changes during a training."""
+    """Return what a checkpoint says of where it fits: `infos` without what changes during a training."""
     robot = getattr(task, "robot", None)
     return {
         "format": FORMAT,
         "task": task.cfg.task,
         "observations": observation_layout(task),
+        "histories": {name: group.history for name, group in task.observation_groups.items()},
         "networks": networks(task.cfg),
+        "optimizer": task.cfg.train.algorithm.optimizer,
         **({} if robot is None else {"robot": {"name": robot.name, "joints": list(robot.joint_names)}}),
     }
 
 
 def observation_layout(task: BaseTask) -> dict[str, dict[str, int]]:
-    """Group -> term -> width."""
+    """Return the widths of terms: group -> term -> width."""
     return {
         name: {term.name: term.columns.stop - term.columns.start for term in group.terms}
         for name, group in task.observation_groups.items()
@@ -188,7 +197,7 @@ def observation_layout(task: BaseTask) -> dict[str, dict[str, int]]:
 
 
 def networks(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
-    """Network -> what of `train.policy` decides which weights it has, and what they compute."""
+    """Return what of `train.policy` decides which weights each network has, and what they compute."""
     policy = cfg.train.policy
     recurrent = policy.rnn_type != "none"
     shared = {
@@ -198,19 +207,43 @@ def networks(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
         "rnn_hidden_dim": policy.rnn_hidden_dim if recurrent else 0,
         "rnn_num_layers": policy.rnn_num_layers if recurrent else 0,
     }
-    history = {"actor": cfg.observations.actor_history}
-    return {
-        name: {"hidden_dims": list(getattr(policy, f"{name}_hidden_dims")), "history": history.get(name, 1), **shared}
-        for name in NETWORKS
-    }
+    std = {"noise_std_type": policy.noise_std_type, "state_dependent_std": policy.state_dependent_std}
+    groups = cfg.observations.groups
+    described = {}
+    for name in NETWORKS:
+        read = groups_of(cfg, name)
+        own = {"observations": list(read), "history": groups[read[0]].history}  # the latter for versions that know no other
+        hidden = list(getattr(policy, f"{name}_hidden_dims"))
+        described[name] = {"hidden_dims": hidden, **own, **shared, **(std if name == "actor" else {})}
+    return described
 
 
 def network_of(state: dict[str, Any]) -> dict[str, Any]:
-    """As far as weights tell, the same, of a checkpoint that does not say it."""
+    """Return the same, as far as weights tell, of a checkpoint that does not say it."""
     layers = [tensor for name, tensor in state.items() if name.startswith("mlp.") and name.endswith(".weight")]
-    hidden = [layer.shape[0] for layer in layers[:-1]]
+    hidden = [(*layer.shape, 0)[0] for layer in layers[:-1]]
     rnn = dict(zip(("rnn_type", "rnn_hidden_dim", "rnn_num_layers"), rnn_of(state), strict=True))
-    return {"hidden_dims": hidden, "obs_normalization": any("obs_normalizer" in name for name in state), **rnn}
+    kinds = {"scalar": "distribution.std_param", "log": "distribution.log_std_param"}
+    std: dict[str, Any] = {}
+    for kind, name in kinds.items():
+        if name in state:
+            std = {"noise_std_type": kind, "state_dependent_std": False}
+    return {"hidden_dims": hidden, "obs_normalization": any("obs_normalizer" in name for name in state), **rnn, **std}
+
+
+def described_networks(saved: Saved) -> dict[str, dict[str, Any]]:
+    """Return what a checkpoint says of each network, and beside it what only its weights tell."""
+    said: dict[str, Any] = saved["infos"].get("networks", {})
+    return {name: {**network_of(saved[f"{name}_state_dict"]), **said.get(name, {})} for name in networks_in(saved)}
+
+
+def histories(saved: Saved) -> dict[str, int]:
+    """Return the steps that each observation group of a checkpoint holds, as far as it says so. Before groups had names of
+    their own, each network read the group of its name.
+    """
+    infos = saved["infos"]
+    old = {name: said["history"] for name, said in infos.get("networks", {}).items() if "history" in said}
+    return infos.get("histories", old)
 
 
 def check_fits(path: Path, saved: Saved, cfg: TaskConfig) -> None:
@@ -220,29 +253,67 @@ def check_fits(path: Path, saved: Saved, cfg: TaskConfig) -> None:
         ConfigError: it was made for another robot, other observations, or other networks.
     """
     name, infos = relative(path), saved["infos"]
-    joints = infos.get("robot", {}).get("joints")
-    robot = load_robot(cfg.robot, cfg.origins.where("robot"))
-    if joints is not None and list(robot.joint_names) != joints:
-        theirs = f"'{infos['robot'].get('name')}' with {len(joints)} joints"
-        raise ConfigError(f"{name}: made for another robot: {theirs}, not '{robot.name}' with {robot.num_dof}: {joints}")
+    check_joints(name, infos.get("robot", {}), cfg)
     layout: dict[str, dict[str, int]] = infos.get("observations", {})
-    described: dict[str, Any] = infos.get("networks", {})
-    for network, wanted in networks(cfg).items():
-        terms = tuple(getattr(cfg.observations, network))
-        if network in layout and tuple(layout[network]) != terms:
-            known = {term: width for widths in layout.values() for term, width in widths.items()}
-            size = sum(known[term] for term in terms) if set(terms) <= set(known) else "other"
-            raise ConfigError(
-                f"{name}: made for other observations: its {network} takes {sum(layout[network].values())} numbers"
-                f" ({', '.join(layout[network])}), '{cfg.task}' gives {size} ({', '.join(terms)})"
-            )
-        found = described.get(network) or network_of(saved[f"{network}_state_dict"])
+    steps = histories(saved)
+    for network in NETWORKS:
+        for group, wanted in ((group, cfg.observations.groups[group]) for group in groups_of(cfg, network)):
+            if group in layout and tuple(layout[group]) != wanted.terms:
+                known = {term: width for widths in layout.values() for term, width in widths.items()}
+                size = sum(known[term] for term in wanted.terms) if set(wanted.terms) <= set(known) else "other"
+                raise ConfigError(
+                    f"{name}: made for other observations: its {group} takes {sum(layout[group].values())} numbers"
+                    f" ({', '.join(layout[group])}), '{cfg.task}' gives {size} ({', '.join(wanted.terms)})"
+                )
+            if steps.get(group, wanted.history) != wanted.history:
+                given = f"observations.groups.{group}.history {wanted.history}"
+                raise ConfigError(f"{name}: its {network} has history {steps[group]}, the configuration has {given}")
+    check_networks_fit(name, saved, cfg)
+
+
+def check_joints(name: str, made_for: Mapping[str, Any], cfg: TaskConfig) -> None:
+    """Compare the robot of a checkpoint, its `name` and `joints`, with that of a configuration.
+
+    Raises:
+        ConfigError: it has other joints, or in another order.
+    """
+    joints = made_for.get("joints")
+    if joints is None or not isinstance(cfg, LeggedConfig):
+        return
+    robot = load_robot(cfg.robot, cfg.origins.where("robot"))
+    if list(robot.joint_names) != joints:
+        theirs = f"'{made_for.get('name')}' with {len(joints)} joints"
+        raise ConfigError(f"{name}: made for another robot: {theirs}, not '{robot.name}' with {robot.num_dof}: {joints}")
+
+
+def check_networks_fit(name: str, saved: Saved, cfg: TaskConfig) -> None:
+    """Compare the networks of a checkpoint with those of a configuration.
+
+    Raises:
+        ConfigError: they have other weights, compute something else, or read other groups.
+    """
+    described = described_networks(saved)
+    for network in described:
+        wanted = networks(cfg)[network]
+        found = {"observations": [network], **described[network]}
         for key, value in wanted.items():
-            if key in found and found[key] != value:
-                field = f"train.policy.{network}_hidden_dims" if key == "hidden_dims" else f"train.policy.{key}"
-                field = "observations.actor_history" if key == "history" else field
-                what = "hidden layers" if key == "hidden_dims" else key
+            if key in found and found[key] != value and key != "history":
+                own = key in ("hidden_dims", "observations")
+                field = f"train.policy.{network}_{key}" if own else f"train.policy.{key}"
+                what = {"hidden_dims": "hidden layers", "observations": "the observations"}.get(key, key)
                 raise ConfigError(f"{name}: its {network} has {what} {found[key]}, the configuration has {field} {value}")
+
+
+def check_optimizer(path: Path, saved: Saved, cfg: TaskConfig) -> None:
+    """Check that the state of the optimiser in a checkpoint is that of the configured one.
+
+    Raises:
+        ConfigError: it is of another one; those that do not say it are of Adam.
+    """
+    found, wanted = saved["infos"].get("optimizer", "adam"), cfg.train.algorithm.optimizer
+    if found != wanted:
+        where = f"the configuration has train.algorithm.optimizer {wanted}"
+        raise ConfigError(f"{relative(path)}: its optimiser is {found}, {where}")
 
 
 def describe_mismatch(path: Path, saved: Saved, wanted: dict[str, Any], task: str) -> str:

@@ -3,6 +3,8 @@
 import sys
 from dataclasses import dataclass
 from datetime import timedelta
+from itertools import zip_longest
+from math import isnan, nan
 
 from rich.console import Console
 from rich.live import Live
@@ -10,6 +12,37 @@ from rich.markup import escape
 from rich.table import Table
 
 PLAIN_LINES_EVERY_S = 2.0
+
+
+@dataclass(frozen=True)
+class Style:
+    """How a metric is written, other than by its name and two decimals."""
+
+    row: str
+    """What the table calls it."""
+    word: str
+    """What the line calls it; empty if it follows the metric before it."""
+    spec: str
+    unit: str
+    factor: float = 1.0
+    of: str = ""
+    """What the table says after the unit."""
+
+
+STYLES = {
+    "lin_vel_rmse": Style("velocity error", "error", ".3f", "m/s"),
+    "ang_vel_rmse": Style("yaw rate error", "", ".3f", "rad/s"),
+    "falls": Style("falls", "falls", ".1f", "%", 100.0, " of episodes"),
+    "episode_length": Style("episode length", "episode", ".0f", "steps"),
+}
+"""The metrics that come first, in this order, where a task logs them."""
+ON_THE_LINE = len(STYLES)
+"""Metrics on the line; a task that logs fewer of those gets others in their place."""
+WARNINGS = {
+    "non_finite_worlds": "{:.0f} robots reset after numbers overflowed",
+    "contact_overflows": "contacts lost in {:.0f} robot steps: raise sim.nconmax, sim.njmax",
+}
+"""Metrics of what should never happen: shown if it did."""
 
 
 @dataclass(frozen=True)
@@ -27,80 +60,109 @@ class Progress:
     """Mean return of the last 100 episodes."""
     action_std: float
     values: dict[str, float]
-    """The task's log: `rew_<term>` per second of a full episode, `Metrics/...`."""
+    """The task's log: `rew_<term>` per second of a full episode, `Metrics/...` and other sections; NaN for no value yet."""
 
-    def metric(self, name: str) -> float:
-        """A metric of the task, NaN if it has none."""
-        return self.values.get(f"Metrics/{name}", float("nan"))
+    def metrics(self) -> dict[str, float]:
+        """Return the metrics of the task by name, those with a style of their own first."""
+        section = "Metrics/"
+        found = {key.removeprefix(section): value for key, value in self.values.items() if key.startswith(section)}
+        first = {name: found[name] for name in STYLES if name in found}
+        return {**first, **{name: value for name, value in found.items() if name not in (*STYLES, *WARNINGS)}}
 
-    def text(self, name: str, spec: str, unit: str, factor: float = 1.0) -> str:
-        """A metric with its unit, a dash while it has no value."""
-        value = factor * self.metric(name)
-        return f"{value:{spec}} {unit}" if value == value else "-"
+    def others(self) -> dict[str, float]:
+        """Return the entries of sections that have no place of their own, as 'section: name'."""
+        found = {}
+        for key, value in self.values.items():
+            section, _, name = key.partition("/")
+            if name and section not in ("Metrics", "Terrain"):
+                found[f"{section.lower()}: {plain(name)}"] = value
+        return found
 
     def line(self) -> str:
-        """The iteration on one line."""
+        """Return the iteration on one line."""
+        shown = "".join(self._word(name, value) for name, value in [*self.metrics().items()][:ON_THE_LINE])
         return (
             f"it {self.iteration}/{self.total}  {_time(self.elapsed_s)} < {_time(self.eta_s)}  "
-            f"{self.steps_per_s:,.0f} steps/s ({self.collect_s:.2f}+{self.learn_s:.2f} s)  reward {self.reward:.2f}  "
-            f"error {self.text('lin_vel_rmse', '.3f', 'm/s')} {self.text('ang_vel_rmse', '.3f', 'rad/s')}  "
-            f"falls {self.text('falls', '.1f', '%', 100)}  episode {self.text('episode_length', '.0f', 'steps')}  "
-            f"std {self.action_std:.2f}" + self.level() + self.warnings()
+            f"{self.steps_per_s:,.0f} steps/s ({self.collect_s:.2f}+{self.learn_s:.2f} s)  reward {self._reward()}"
+            f"{shown}  std {self.action_std:.2f}" + self.level() + self.warnings()
         )
 
+    def _word(self, name: str, value: float) -> str:
+        """Return a metric as the line has it, with the space before it."""
+        style = STYLES.get(name)
+        if style is None:
+            return f"  {plain(name)} {number(value):>8}"
+        return (f"  {style.word} " if style.word else " ") + styled(value, style)
+
+    def _reward(self) -> str:
+        """Return the mean return, a dash before the first episode has ended."""
+        return "-" if isnan(self.reward) else f"{self.reward:.2f}"
+
     def level(self) -> str:
-        """The mean terrain level, if there is one."""
-        return f"  level {self.values['Terrain/level']:.2f}" if "Terrain/level" in self.values else ""
+        """Return the mean terrain level, if there is one."""
+        level = self.values.get("Terrain/level", nan)
+        return "" if isnan(level) else f"  level {level:.2f}"
 
     def levels(self) -> dict[str, str]:
-        """Terrain type -> mean level, and shares of episodes that moved up and down."""
+        """Return for each terrain type its mean level, and the shares of episodes that moved up and down."""
         found = {}
         for key, level in self.values.items():
             name = key.removeprefix("Terrain/level_")
-            if name != key:
-                up, down = (self.values.get(f"Terrain/{what}_{name}", float("nan")) for what in ("promoted", "demoted"))
-                found[name] = f"level {level:.2f}  +{100 * up:.0f} % -{100 * down:.0f} %"
+            if name != key and not isnan(level):
+                up, down = (self.values.get(f"Terrain/{what}_{name}", nan) for what in ("promoted", "demoted"))
+                shares = "" if isnan(up + down) else f"  +{100 * up:.0f} % -{100 * down:.0f} %"
+                found[name] = f"level {level:.2f}{shares}"
         return found
 
     def warnings(self) -> str:
-        """What should never happen, if it did."""
-        text = ""
-        if self.metric("non_finite_worlds") > 0:
-            text += f"  ! {self.metric('non_finite_worlds'):.0f} robots reset after numbers overflowed"
-        if self.metric("contact_overflows") > 0:
-            text += f"  ! contacts lost in {self.metric('contact_overflows'):.0f} robot steps: raise sim.nconmax, sim.njmax"
-        return text
+        """Return what should never happen, if it did."""
+        counts = {text: self.values.get(f"Metrics/{name}", 0.0) for name, text in WARNINGS.items()}
+        return "".join(f"  ! {text.format(count)}" for text, count in counts.items() if count > 0)
 
     def table(self, title: str) -> Table:
-        """The iteration as a table, reward terms beside the state of training."""
+        """Return the iteration as a table, reward terms beside the state of training."""
         left = {
             "iteration": f"{self.iteration} / {self.total}",
             "elapsed, to go": f"{_time(self.elapsed_s)}, {_time(self.eta_s)}",
             "steps/s": f"{self.steps_per_s:,.0f}",
             "collect + learn": f"{self.collect_s:.2f} + {self.learn_s:.2f} s",
-            "mean return": f"{self.reward:.2f}",
-            "velocity error": self.text("lin_vel_rmse", ".3f", "m/s"),
-            "yaw rate error": self.text("ang_vel_rmse", ".3f", "rad/s"),
-            "falls": self.text("falls", ".1f", "% of episodes", 100),
-            "episode length": self.text("episode_length", ".0f", "steps"),
-            "action std": f"{self.action_std:.2f}",
+            "mean return": self._reward(),
         }
-        known = ("lin_vel_rmse", "ang_vel_rmse", "falls", "episode_length", "non_finite_worlds", "contact_overflows")
-        other = {k.removeprefix("Metrics/"): v for k, v in self.values.items() if k.startswith("Metrics/")}
-        left.update({k.replace("_", " "): f"{v:.2f}" for k, v in other.items() if k not in known})
-        if "Terrain/level" in self.values:
+        metrics = self.metrics()
+        for name, style in STYLES.items():
+            if name in metrics:
+                left[style.row] = styled(metrics[name], style) + ("" if isnan(metrics[name]) else style.of)
+        left["action std"] = f"{self.action_std:.2f}"
+        left.update({plain(name): number(value) for name, value in metrics.items() if name not in STYLES})
+        if self.level():
             left["terrain level"] = f"{self.values['Terrain/level']:.2f}"
-        right = {k.removeprefix("rew_"): f"{v:+.4f}" for k, v in self.values.items() if k.startswith("rew_")}
+        left.update({name: number(value) for name, value in self.others().items()})
+        rewards = {key.removeprefix("rew_"): value for key, value in self.values.items() if key.startswith("rew_")}
+        right = {name: "-" if isnan(value) else f"{value:+.4f}" for name, value in rewards.items()}
         right.update(self.levels())
         table = Table(title=escape(title), caption=escape(self.warnings()) or None, title_justify="left")
         for name, justify in (("training", "left"), ("", "right"), ("reward per second", "left"), (" ", "right")):
             table.add_column(name, justify=justify)  # type: ignore[arg-type]
-        left_rows, right_rows = list(left.items()), list(right.items())
-        for i in range(max(len(left_rows), len(right_rows))):
-            a = left_rows[i] if i < len(left_rows) else ("", "")
-            b = right_rows[i] if i < len(right_rows) else ("", "")
+        for a, b in zip_longest(left.items(), right.items(), fillvalue=("", "")):
             table.add_row(*(escape(text) for text in (*a, *b)))
         return table
+
+
+def plain(name: str) -> str:
+    """Return a name as words: 'x_velocity' -> 'x velocity'."""
+    return name.replace("_", " ")
+
+
+def styled(value: float, style: Style) -> str:
+    """Return a number with its unit, a dash for one that has no value yet."""
+    return "-" if isnan(value) else f"{style.factor * value:{style.spec}} {style.unit}"
+
+
+def number(value: float) -> str:
+    """Return a number of unknown size in at most nine letters, a dash for one that has no value yet."""
+    if isnan(value):
+        return "-"
+    return f"{value:.2f}" if value == 0.0 or 0.005 <= abs(value) < 1e5 else f"{value:.2e}"
 
 
 class Display:

@@ -31,7 +31,9 @@ class QuietLogger(Logger):
         self.loop_s = 0.0
         """Time spent in iterations so far, this process [s]."""
         self.latest: dict[str, float] = {}
-        """The last value of everything the task logs; an iteration in which no episode ended has no episode means."""
+        """The last value of everything the task logs, NaN while it had none: an iteration in which no episode ended has no
+        episode means.
+        """
 
     @property
     def steps_per_iteration(self) -> int:
@@ -57,6 +59,7 @@ class QuietLogger(Logger):
         """
         # An episode mean has no value (NaN) in a rollout in which none ended; leave it out rather than write NaN.
         values: dict[str, float] = {}
+        names = dict.fromkeys((name for entry in self.ep_extras for name in entry if not name.startswith(FAULT)), math.nan)
         for entry in self.ep_extras:
             stacked = torch.stack([value.reshape(()) for value in entry.values()]).tolist()  # one transfer, not twenty
             values.update({key: value for key, value in zip(entry, stacked, strict=True) if value == value})
@@ -68,7 +71,7 @@ class QuietLogger(Logger):
         with contextlib.redirect_stdout(io.StringIO()):
             super().log(it, start_it, total_it, collect_time, learn_time, loss_dict=losses, **kwargs)
         self.watch.judge(values, left_out)
-        self.latest = {name: value for name, value in self.latest.items() if not name.startswith(FAULT)} | values
+        self.latest = names | {name: value for name, value in self.latest.items() if not name.startswith(FAULT)} | values
         self.loop_s += collect_time + learn_time
         if self.display is not None:
             self.display.show(

@@ -3,13 +3,14 @@
 from typing import Any
 
 import torch
-from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.modules.normalization import EmpiricalNormalization
 from torch import Tensor
 
 from legged.learning.distributed import sum_over_ranks_
+from legged.learning.networks import action_std
+from legged.learning.scaled_rewards import ScaledRewards
 
 LOWEST_RATE, HIGHEST_RATE, RATE_STEP = 1e-5, 1e-2, 1.5
 """Bounds of the adaptive learning rate and the factor by which it moves, as in rsl-rl."""
@@ -20,7 +21,7 @@ HALF_LOG_2PI = 0.9189385332046727
 """0.5 * log(2 pi)."""
 
 
-class DevicePPO(PPO):
+class DevicePPO(ScaledRewards):
     """PPO (Schulman et al., arXiv 1707.06347) as rsl-rl computes it, for Gaussian MLP policies.
 
     What differs is where and how often: the learning rate is a tensor on the device; samples are shuffled into contiguous
@@ -58,9 +59,8 @@ class DevicePPO(PPO):
         return [*models, *moments, self._rate]
 
     def _why_stock(self) -> str:
-        if self.rnd:
-            return "random network distillation"
-        if self.symmetry and (self.symmetry.use_mirror_loss or not self.symmetry.use_data_augmentation):
+        """Name the first thing that only rsl-rl's own update can do; empty if there is none. Configurations reach all."""
+        if self.symmetry and self.symmetry.use_mirror_loss:
             return "a mirror loss"
         for name, model in (("actor", self.actor), ("critic", self.critic)):
             if type(model) is not MLPModel:
@@ -245,11 +245,8 @@ class DevicePPO(PPO):
             return model.mlp(model.obs_normalizer(inputs)).float()
 
     def action_std(self) -> Tensor:
-        """(D,) standard deviation of the actions."""
-        distribution = self.actor.distribution
-        if distribution.std_type == "scalar":
-            return distribution.std_param.clamp(*distribution.std_range)
-        return distribution.log_std_param.clamp(*distribution.log_std_range).exp()
+        """Return the standard deviation (D,) of the actions."""
+        return action_std(self.actor)
 
     @torch.no_grad()
     def _adapt_rate(self, kl: Tensor) -> None:

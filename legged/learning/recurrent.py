@@ -1,38 +1,40 @@
-"""Recurrent policies: their memory while they act, and the kind of one that a checkpoint holds."""
+"""Recurrent policies: their memory, and the kind of one that a checkpoint holds."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
-from tensordict import TensorDict
 from torch import Tensor
-
-from legged.envs import BaseTask
 
 GATES = {4: "lstm", 3: "gru"}
 """Rows of a recurrent layer's weights, over its width -> its kind."""
 
 
-class Remembering:
-    """A recurrent policy that forgets, robot by robot, the episodes that have ended."""
+def hidden_states(networks: Mapping[str, Any], num_envs: int) -> dict[str, Tensor]:
+    """Return the hidden states (layers, N, width) of those of rsl-rl's networks that have any, by name and number; zeros
+    take the place of one that is not there yet.
+    """
+    found: dict[str, Tensor] = {}
+    for name, network in networks.items():
+        if not network.is_recurrent:
+            continue
+        if network.get_hidden_state() is None:
+            layers = network.rnn.rnn
+            like = next(layers.parameters())
+            states = [like.new_zeros(layers.num_layers, num_envs, layers.hidden_size) for _ in range(parts_of(layers))]
+            network.reset(hidden_state=tuple(states) if len(states) > 1 else states[0])
+        hidden = network.get_hidden_state()
+        found |= {f"{name}_{i}": state for i, state in enumerate(hidden if isinstance(hidden, tuple) else (hidden,))}
+    return found
 
-    def __init__(self, policy: Any, task: BaseTask) -> None:
-        """`policy` is rsl-rl's model, which keeps the hidden state of the task's robots from call to call."""
-        self._policy, self._task = policy, task
 
-    def __call__(self, observations: TensorDict) -> Tensor:
-        """Actions (N, D), once for every step of the task."""
-        begun = self._task.reset_buf.view(1, -1, 1)
-        hidden = self._policy.get_hidden_state()
-        if hidden is not None:
-            # A new tensor: the old one may come from inference mode, and the call from outside of it.
-            pair = hidden if isinstance(hidden, tuple) else (hidden,)
-            kept = tuple(torch.where(begun.to(state.device), 0.0, state.detach()) for state in pair)
-            self._policy.reset(hidden_state=kept if isinstance(hidden, tuple) else kept[0])
-        return self._policy(observations)
+def parts_of(layers: torch.nn.Module) -> int:
+    """Return how many tensors the hidden state of recurrent layers is made of."""
+    return 2 if isinstance(layers, torch.nn.LSTM) else 1
 
 
 def rnn_of(state: dict[str, Tensor]) -> tuple[str, int, int]:
-    """Kind, width and number of the recurrent layers in a model's state; ("none", 0, 0) without any."""
+    """Return kind, width and number of the recurrent layers in a model's state; ("none", 0, 0) without any."""
     layers = [name for name in state if "weight_hh_l" in name]
     if not layers:
         return "none", 0, 0

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from legged.commandline.arguments import overrides
-from legged.config import TaskConfig, override, to_dict
+from legged.config import LeggedConfig, TaskConfig, override, to_dict
 from legged.errors import ConfigError
-from legged.learning.checkpoint import check_fits, read_checkpoint
+from legged.learning.checkpoint import check_fits, check_optimizer, read_checkpoint
 from legged.learning.run_folder import find_checkpoint, find_run, run_config
 from legged.process.paths import relative
 from legged.registry import task_class, task_config
@@ -31,7 +31,7 @@ def resumed(args: argparse.Namespace) -> tuple[TaskConfig, Path, list[str]]:
     if before.task != args.task:
         raise ConfigError(f"--load_run: {relative(folder)} was trained on '{before.task}', not on '{args.task}'")
     cfg = override(before, asked)
-    if cfg.robot != before.robot:
+    if isinstance(cfg, LeggedConfig) and isinstance(before, LeggedConfig) and cfg.robot != before.robot:
         raise ConfigError(
             f"{cfg.origins.where('robot')}: a resumed training keeps its robot, '{before.robot}'; got '{cfg.robot}'"
         )
@@ -41,6 +41,7 @@ def resumed(args: argparse.Namespace) -> tuple[TaskConfig, Path, list[str]]:
     check_fits(path, saved, cfg)
     if "optimizer_state_dict" not in saved:
         raise ConfigError(f"{relative(path)}: holds no optimiser; it can be played, not trained on")
+    check_optimizer(path, saved, cfg)
     done, until = saved["iter"] + 1, cfg.train.runner.max_iterations
     if done >= until:
         raise ConfigError(

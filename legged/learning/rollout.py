@@ -12,7 +12,7 @@ from legged.learning.ppo import DevicePPO, gaussian_log_prob
 
 
 class Rollout:
-    """The T control steps of an iteration, as rsl-rl's runner and PPO make them, in one function that a graph can hold."""
+    """The T control steps of an iteration, as rsl-rl's training loop makes them, in one function that a graph can hold."""
 
     def __init__(self, env: BaseTask, alg: DevicePPO) -> None:
         """For a task and a learner on the same device."""
@@ -70,6 +70,8 @@ class Rollout:
         st.distribution_params[1].copy_(std.expand_as(st.actions))
         st.actions_log_prob.copy_(gaussian_log_prob(st.actions, st.distribution_params[0], std).unsqueeze(-1))
         st.values.copy_(alg.critic.mlp(self._input(alg.critic, st.observations)))
+        if alg.reward_scale != 1.0:
+            st.rewards.mul_(alg.reward_scale)
         # The value of the state that was acted on stands for the one that a time-out cut off, as in rsl-rl.
         st.rewards.add_(alg.gamma * self._cut_off * st.values)
 

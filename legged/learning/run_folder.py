@@ -14,6 +14,7 @@ from legged.config import TaskConfig, from_dict, to_yaml
 from legged.config.loader import read_yaml
 from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, make_folder, not_made, relative, write_text
+from legged.registry import task_schema
 
 LOGS = Path("logs")
 CONFIG_FILE = "config.yaml"
@@ -131,6 +132,29 @@ def find_run(cfg: TaskConfig, load_run: str | None) -> Path:
     raise ConfigError(f"--load_run: there is no run '{load_run}'{suggest(str(load_run), [p.name for p in runs], 'runs')}")
 
 
+def find_run_of_any_task(cfg: TaskConfig, load_run: str) -> Path:
+    """Return the run folder that `load_run` names: as `find_run` does; or below logs/ as <experiment>/<run>; or the newest of
+    an experiment; or a policy that comes with this package, by the name of its task or as resources/policies/<task>.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if load_run == "-1":
+        return find_run(cfg, None)
+    shipped = data_folder("resources")
+    parents = (experiment_folder(cfg), Path(), LOGS, shipped.parent, shipped / "policies")
+    for folder in (parent / load_run for parent in parents if load_run.strip()):
+        with suppress(OSError, ValueError):  # no name of a folder
+            if checkpoints(folder):
+                return folder
+            runs = [run for run in folder.glob("*") if checkpoints(run)]
+            if runs:
+                return max(runs, key=_last_saved)
+    known = [f"{run.parent.name}/{run.name}" for run in LOGS.glob("*/*") if checkpoints(run)]
+    known += [policy.name for policy in (shipped / "policies").glob("*") if checkpoints(policy)]
+    raise ConfigError(f"--load_run: there is no run '{load_run}'{suggest(load_run, known, 'runs')}")
+
+
 def find_checkpoint(folder: Path, checkpoint: int | None) -> Path:
     """The checkpoint of that iteration in a run folder, or the latest.
 
@@ -163,7 +187,8 @@ def run_config(folder: Path) -> TaskConfig:
     path = folder / CONFIG_FILE
     if not path.is_file():
         raise ConfigError(f"--load_run: {relative(folder)} is no run folder (it has no {CONFIG_FILE})")
-    return from_dict(read_yaml(path), source=str(path))
+    data = read_yaml(path)
+    return from_dict(data, source=str(path), schema=task_schema(str(data.get("task", ""))))
 
 
 def _last_saved(folder: Path) -> float:

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -11,8 +12,7 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 from torch import Tensor
 
-from legged.config import TaskConfig
-from legged.envs import BaseTask, LeggedRobot
+from legged.envs import BaseTask
 from legged.errors import ConfigError, RunError
 from legged.learning.checkpoint import (
     check_weights,
@@ -25,9 +25,12 @@ from legged.learning.checkpoint import (
 from legged.learning.display import Display
 from legged.learning.distributed import RankLost, join, leave
 from legged.learning.logger import Interrupted, QuietLogger
+from legged.learning.networks import keep_std_in_bounds, network_settings, use_matmul
+from legged.learning.recurrent import hidden_states
 from legged.learning.run_state import generators, read_run_state, remove_older, set_generators, write_run_state
 from legged.learning.step_guard import StepGuard
-from legged.learning.symmetry import MirrorImages, augment
+from legged.learning.symmetry import augment, images_of
+from legged.learning.transfer import check_built, tell_taken
 from legged.learning.watch import Diverged
 from legged.process.paths import relative
 from legged.process.ranks import Ranks
@@ -35,37 +38,31 @@ from legged.process.startup import STARTED_S
 from legged.state import StateError, take
 
 
-def runner_config(cfg: TaskConfig, algorithm_class: str) -> dict[str, Any]:
-    """The dictionary rsl-rl wants."""
-    policy, runner = cfg.train.policy, cfg.train.runner
+def runner_config(task: BaseTask, algorithm_class: str) -> dict[str, Any]:
+    """Return the dictionary rsl-rl wants.
+
+    Raises:
+        ConfigError: the task is to learn from mirror images, and has none.
+    """
+    cfg, runner = task.cfg, task.cfg.train.runner
     settings = dict(vars(cfg.train.algorithm))
-    if settings.pop("symmetry"):
-        settings["symmetry_cfg"] = {"data_augmentation_func": augment, "use_data_augmentation": True}
-    shared = {
-        "class_name": "MLPModel",
-        "activation": policy.activation,
-        "obs_normalization": policy.obs_normalization,
-    }
-    if policy.rnn_type != "none":
-        shared["class_name"] = "RNNModel"
-        shared |= {name: getattr(policy, name) for name in ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")}
+    if settings.pop("reward_scale") != 1.0 and algorithm_class == "PPO":
+        algorithm_class = "legged.learning.scaled_rewards:ScaledRewards"
+    symmetry, mirror_loss = settings.pop("symmetry"), settings.pop("mirror_loss_coeff")
+    if symmetry:
+        settings["symmetry_cfg"] = {
+            "data_augmentation_func": partial(augment, images_of(task)),
+            "use_data_augmentation": True,
+            "use_mirror_loss": mirror_loss > 0.0,
+            "mirror_loss_coeff": mirror_loss,
+        }
     return {
         "num_steps_per_env": runner.num_steps_per_env,
         "save_interval": runner.save_interval,
         "run_name": runner.run_name,
         "logger": "tensorboard",
         "check_for_nan": False,  # it would wait for the GPU at every step; the task terminates and counts such robots
-        "obs_groups": {"actor": ["actor"], "critic": ["critic"]},
-        "actor": {
-            **shared,
-            "hidden_dims": list(policy.actor_hidden_dims),
-            "distribution_cfg": {
-                "class_name": "GaussianDistribution",
-                "init_std": policy.init_noise_std,
-                "std_type": "scalar",
-            },
-        },
-        "critic": {**shared, "hidden_dims": list(policy.critic_hidden_dims)},
+        **network_settings(cfg),
         "algorithm": {"class_name": algorithm_class, **settings},
     }
 
@@ -81,14 +78,15 @@ class Runner(OnPolicyRunner):
         self, env: BaseTask, log_dir: Path | None = None, device: str = "cpu", display: Display | None = None
     ) -> None:
         """`log_dir` is where checkpoints and TensorBoard files go; without one nothing is written."""
-        config = runner_config(env.cfg, self.ALGORITHM)
-        torch.backends.cuda.matmul.allow_tf32 = env.cfg.train.runner.matmul == "tf32"  # of this process
-        if env.cfg.train.algorithm.symmetry and isinstance(env, LeggedRobot):
-            env.mirror_images = MirrorImages(env)  # type: ignore[attr-defined]  # where `augment` finds them
+        config = runner_config(env, self.ALGORITHM)
+        use_matmul(env.cfg)
         with contextlib.redirect_stdout(io.StringIO()):
             super().__init__(env, config, str(log_dir) if log_dir else None, device)
+        self.alg.reward_scale = env.cfg.train.algorithm.reward_scale
         self._state: dict[str, Any] | None = None
+        self._transferred_from: dict[str, Any] | None = None
         self._last_saved = ""
+        keep_std_in_bounds(self.alg.get_policy(), self.alg.optimizer)
         self._guard = None if hasattr(self.alg.optimizer, "found_inf") else StepGuard(self.alg.optimizer)
         self.logger = QuietLogger(
             log_dir=str(log_dir) if log_dir else None,
@@ -179,9 +177,12 @@ class Runner(OnPolicyRunner):
             "learning_rate": self.alg.learning_rate,
             "wall_s": time.perf_counter() - STARTED_S,  # since this process began
         }
+        if self._transferred_from is not None:
+            saved["infos"]["transferred_from"] = self._transferred_from
         if not self.is_distributed:  # the other processes' robots are not here
             saved["infos"]["id"] = uuid4().hex
             state = {"generators": generators(), "task": self.env.state_dict(), "episodes": self._episodes()}
+            state["memory"] = {name: tensor.clone() for name, tensor in self._memory().items()}
             write_run_state(Path(path), {"id": saved["infos"]["id"], **state})
         write_checkpoint(Path(path), saved)
         remove_older(Path(path))
@@ -196,18 +197,9 @@ class Runner(OnPolicyRunner):
             ConfigError: the file is no checkpoint, or of a network of another size.
         """
         saved = read_checkpoint(Path(path), map_location or self.device)
-        parts = load_cfg or dict.fromkeys(("actor", "critic", "iteration"), True)
-        parts = {"optimizer": "optimizer_state_dict" in saved, **parts}
-        if parts["optimizer"]:
-            wanted, where = saved["optimizer_state_dict"], f"{relative(Path(path))}: its optimiser"
-            saved["optimizer_state_dict"] = fit_optimizer(wanted, self.alg.optimizer, where)
         infos = saved["infos"]
-        try:
-            self.alg.load(saved, parts, strict)
-            self.alg.learning_rate = float(infos.get("learning_rate", self.alg.learning_rate))
-        except (RuntimeError, ValueError, KeyError, TypeError) as error:
-            policy = self.alg.get_policy().state_dict()
-            raise ConfigError(describe_mismatch(Path(path), saved, policy, self.env.cfg.task)) from error
+        self._load_learner(Path(path), saved, load_cfg, strict)
+        self._transferred_from = infos.get("transferred_from")
         # rsl-rl saves the index of the last finished iteration; going on from it would repeat that one.
         self.current_learning_iteration = saved["iter"] + 1
         try:
@@ -216,6 +208,47 @@ class Runner(OnPolicyRunner):
         except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ConfigError(f"{path}: the progress of its curricula is damaged ({error})") from error
         return infos
+
+    def _load_learner(self, path: Path, saved: dict[str, Any], parts: dict | None = None, strict: bool = True) -> None:
+        """Take the networks, the optimiser (if there is one) and the learning rate of a checkpoint that was read, or those
+        `parts` of it.
+
+        Raises:
+            ConfigError: they do not fit.
+        """
+        parts = parts or dict.fromkeys(("actor", "critic", "iteration"), True)
+        parts = {"optimizer": "optimizer_state_dict" in saved, **parts}
+        if parts["optimizer"]:
+            wanted, where = saved["optimizer_state_dict"], f"{relative(path)}: its optimiser"
+            saved["optimizer_state_dict"] = fit_optimizer(wanted, self.alg.optimizer, where)
+        try:
+            self.alg.load(saved, parts, strict)
+            self.alg.learning_rate = float(saved["infos"].get("learning_rate", self.alg.learning_rate))
+        except (RuntimeError, ValueError, KeyError, TypeError) as error:
+            policy = self.alg.get_policy().state_dict()
+            raise ConfigError(describe_mismatch(path, saved, policy, self.env.cfg.task)) from error
+
+    def transfer(self, path: str) -> str:
+        """Take networks, normaliser and optimiser of another task's checkpoint, to begin a training with them: iterations,
+        curricula and robots begin anew. Return what was taken, in words.
+
+        Raises:
+            ConfigError: the file is no checkpoint, or its observations, actions or networks are others.
+        """
+        saved = read_checkpoint(Path(path), self.device)
+        check_built(Path(path), saved, self.env)
+        settings = self.env.cfg.train.algorithm
+        if saved["infos"].get("optimizer", "adam") != settings.optimizer:
+            saved.pop("optimizer_state_dict", None)
+        self._load_learner(Path(path), saved)
+        if settings.schedule == "fixed":
+            self.alg.learning_rate = settings.learning_rate
+        for group in self.alg.optimizer.param_groups:
+            if not isinstance(group["lr"], Tensor):
+                group["lr"] = self.alg.learning_rate
+        task = saved["infos"].get("task", "")
+        self._transferred_from = {"file": relative(Path(path)), "task": task, "iteration": saved["iter"]}
+        return tell_taken(Path(path), saved, self.alg.get_policy(), self.env.cfg, self.alg.learning_rate)
 
     def resume(self, path: str) -> str:
         """Load a checkpoint to train on from. Robots, random numbers and episodes go on where they were, if their state lies
@@ -248,8 +281,13 @@ class Runner(OnPolicyRunner):
         """Put task, episodes and random generators into a state; StateError if it does not fit."""
         self.env.load_state_dict(state["task"])
         take(self._episodes(), state["episodes"], "episodes")
+        take(self._memory(), state.get("memory", {}), "memory")
         set_generators(state["generators"])
 
     def _episodes(self) -> dict[str, Tensor]:
         """Return and length so far of the episode of each environment, (N,) each, as they are counted for the log."""
         return {"return": self.logger.cur_reward_sum, "length": self.logger.cur_episode_length}
+
+    def _memory(self) -> dict[str, Tensor]:
+        """Return what recurrent networks remember of their robots, (layers, N, width) each; nothing without any."""
+        return hidden_states({"actor": self.alg.actor, "critic": self.alg.critic}, self.env.num_envs)

@@ -17,7 +17,7 @@ class CommandCurriculum:
     STATE = ("share", "_sums", "_steps")
 
     def __init__(self, cfg: CommandCurriculumConfig, full_ranges: Tensor, dt: float) -> None:
-        """`full_ranges` (3, 2); `dt` is the control step [s]."""
+        """Widen up to `full_ranges` (3, 2); `dt` is the control step [s]."""
         self.cfg, self.full_ranges = cfg, full_ranges.clone()
         self._full_limit = full_ranges.abs().amax(dim=1)
         self.window_steps = max(1, round(cfg.window_s / dt))
@@ -54,14 +54,14 @@ class CommandCurriculum:
         self._steps.masked_fill_(due, 0.0)
 
     def metrics(self) -> dict[str, Tensor]:
-        """The widest command of each axis now, fresh 0-dimensional tensors."""
+        """Return the widest command of each axis now, fresh 0-dimensional tensors."""
         if not self.cfg.enabled:
             return {}
         names = ("command_vx", "command_vy", "command_yaw")
         return dict(zip(names, (self._full_limit * self.share).unbind(), strict=True))
 
     def progress(self) -> dict[str, Tensor]:
-        """How far it has got, whatever the number of robots."""
+        """Return how far it has got, whatever the number of robots."""
         return {"share": self.share.clone()}
 
     def load_progress(self, state: dict[str, Tensor]) -> None:

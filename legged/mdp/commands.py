@@ -18,7 +18,7 @@ class Commands:
     STATE = ("commands", "is_moving", "ranges", "time_left", "held", "steered", "standing")
 
     def __init__(self, cfg: CommandsConfig, num_envs: int, dt: float, device: torch.device) -> None:
-        """All commands start at zero, due to be sampled at the first update; `dt` is the control step [s]."""
+        """Start all commands at zero, due to be sampled at the first update; `dt` is the control step [s]."""
         self.cfg, self.dt = cfg, dt
         ranges = (cfg.ranges.lin_vel_x, cfg.ranges.lin_vel_y, cfg.ranges.ang_vel_yaw)
         self.full_ranges = torch.tensor(ranges, device=device)

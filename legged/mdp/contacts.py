@@ -17,7 +17,7 @@ class FeetContacts:
     STATE = ("_flags", "_times")
 
     def __init__(self, num_envs: int, num_feet: int, dt: float, device: torch.device) -> None:
-        """All feet start on the ground, at rest; `dt` is the control step [s]."""
+        """Start all feet on the ground, at rest; `dt` is the control step [s]."""
         self.dt = dt
         # Views of two blocks, so that a reset is two launches.
         self._flags = torch.zeros(num_envs, 3, num_feet, dtype=torch.bool, device=device)

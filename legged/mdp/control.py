@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legged.config.schema import ControlConfig
+from legged.config.schema import LeggedControlConfig
 from legged.math import masked_set_
 from legged.robots.robot import Robot
 
@@ -21,8 +21,8 @@ class Control:
 
     STATE = ("_last_dof_vel",)
 
-    def __init__(self, robot: Robot, cfg: ControlConfig, torques: Tensor, sim_dt: float) -> None:
-        """Torques are written to `torques` (N, D), the physics' own tensor, which takes their device along. Gains come
+    def __init__(self, robot: Robot, cfg: LeggedControlConfig, torques: Tensor, sim_dt: float) -> None:
+        """Write torques to `torques` (N, D), the physics' own tensor, which takes their device along. Gains come
         from `cfg` if it names any, else from the robot.
 
         Raises:
@@ -51,7 +51,7 @@ class Control:
             self._target.add_(self.default_dof_pos)
 
     def compute(self, dof_pos: Tensor, dof_vel: Tensor) -> Tensor:
-        """Torques (N, D) [N m] at joint angles [rad] and velocities [rad/s], each (N, D), for one physics step."""
+        """Compute torques (N, D) [N m] at joint angles [rad] and velocities [rad/s], each (N, D), for one physics step."""
         if self.control_type == "P":
             torques = torch.addcmul(self.stiffness * (self._target - dof_pos), self.damping, dof_vel, value=-1.0)
         elif self.control_type == "V":
@@ -68,9 +68,9 @@ class Control:
             masked_set_(self._last_dof_vel, mask, 0.0)
 
 
-def control_gains(robot: Robot, cfg: ControlConfig, where: Callable[[str], str] = str) -> tuple[np.ndarray, np.ndarray]:
-    """(D,) stiffness and damping of a task: its own tables where it has them, else the robot's. `where` makes of a dotted
-    path how an error begins.
+def control_gains(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> tuple[np.ndarray, np.ndarray]:
+    """Return stiffness and damping of a task, (D,): its own tables where it has them, else the robot's. `where` makes of a
+    dotted path how an error begins.
     """
 
     def gains(name: str, own: dict[str, float], robots: dict[str, float]) -> np.ndarray:

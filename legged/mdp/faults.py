@@ -23,7 +23,7 @@ class Faults:
     STATE = ("sound",)
 
     def __init__(self, rewards: Sequence[str], observations: ObservationTerms, num_envs: int, device: torch.device) -> None:
-        """`rewards` are the names of the reward terms, in the order of their rows."""
+        """Watch `rewards`, the names of the reward terms, in the order of their rows."""
         self.sound = torch.ones(num_envs, dtype=torch.bool, device=device)
         """(N,) robots whose rewards and observations of the last step were numbers; the others end at the next one."""
         self._terms = observations

@@ -14,8 +14,10 @@ class HeightScan:
     As in legged_gym a point's height is the lowest of three neighbouring cells (HeightMap.scan_map).
     """
 
+    STATE: tuple[str, ...] = ()  # heights follow from where the robots are
+
     def __init__(self, cfg: TerrainConfig, terrain: Terrain | None, num_envs: int, device: torch.device) -> None:
-        """Points are cfg.measured_points_x times cfg.measured_points_y, x changing slowest."""
+        """Scan at cfg.measured_points_x times cfg.measured_points_y, x changing slowest."""
         self._on_plane = terrain is None
         x = torch.tensor(cfg.measured_points_x, device=device)
         y = torch.tensor(cfg.measured_points_y, device=device)

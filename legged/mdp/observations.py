@@ -14,7 +14,7 @@ class ObservationTerms:
     """The terms that a task's groups name, evaluated once a step for all of them and laid side by side."""
 
     def __init__(self, functions: Mapping[str, Callable[[], Tensor]]) -> None:
-        """Functions by term, in order, each (N, width); each is called once to learn its width."""
+        """Take functions by term, in order, each (N, width); each is called once to learn its width."""
         self._functions = dict(functions)
         self.columns: dict[str, slice] = {}
         """Term -> where it lies in `values`."""
@@ -72,7 +72,7 @@ class ObservationGroup:
         clip: float,
         history: int = 1,
     ) -> None:
-        """The group of the terms `names` of `source`, in that order. No noise where none is named."""
+        """Make the group of the terms `names` of `source`, in that order. No noise where none is named."""
         self.clip, self.history = clip, history
         self.terms: list[ObservationTerm] = []
         num_envs, device = source.values.shape[0], source.values.device
@@ -110,9 +110,22 @@ class ObservationGroup:
 
     def compute(self) -> None:
         """Take the terms' values into the newest step."""
+        self._write(self._now)
+
+    def preview(self, out: Tensor) -> None:
+        """Write into `out` (N, history * width) what `advance` and `compute` would make of the terms' values now; the group
+        itself stays as it is.
+        """
+        steps = out.view_as(self._steps)
+        if self.history > 1:
+            steps[:, :-1].copy_(self._steps[:, 1:])
+        self._write(steps[:, -1])
+
+    def _write(self, step: Tensor) -> None:
+        """Write the terms' values, scaled, noised and clipped, into `step` (N, width)."""
         values = self._values if self._columns is None else self._values.index_select(1, self._columns)
-        torch.addcmul(self._noise, values, self._scale, out=self._now)
-        self._now.clamp_(-self.clip, self.clip)
+        torch.addcmul(self._noise, values, self._scale, out=step)
+        step.clamp_(-self.clip, self.clip)
 
     def restart(self, mask: Tensor) -> None:
         """Fill the history of the robots in `mask` (N,) with the newest step."""

@@ -23,7 +23,7 @@ class Rewards:
         only_positive: bool,
         total: Tensor,
     ) -> None:
-        """Functions and scales by term; `dt` is the control step [s]; sums are written to `total` (N,)."""
+        """Take functions and scales by term; `dt` is the control step [s]; sums are written to `total` (N,)."""
         num_envs, device = len(total), total.device
         self.functions = dict(functions)
         self.names = tuple(functions)
@@ -38,6 +38,9 @@ class Rewards:
         """(N,) reward of the last step."""
         self.sums = torch.zeros(len(self.names), num_envs, device=device)
         """(terms, N) sum of each scaled term over the episode so far."""
+        self.last = torch.zeros_like(self.sums)
+        """(terms, N) each scaled term of the last step."""
+        self._zero = torch.zeros((), device=device)
         self.fine = torch.ones(len(self.names), num_envs, dtype=torch.bool, device=device)
         """(terms, N) whether each term was a number at the last step."""
         self.episode_sums = {name: self.sums[i] for i, name in enumerate(self.names)}
@@ -59,7 +62,7 @@ class Rewards:
         # Stacked, so that scaling, masking and summing cost a launch each and not one a term.
         scaled = torch.stack(values) * self._factors
         torch.lt(scaled.abs(), LARGEST, out=self.fine)
-        scaled = torch.where(self.fine & valid, scaled, 0.0)
+        scaled = torch.where(self.fine & valid, scaled, self._zero, out=self.last)
         self.sums.add_(scaled)
         if not self.only_positive:
             return torch.sum(scaled, dim=0, out=self.total)

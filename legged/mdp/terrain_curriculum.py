@@ -18,7 +18,7 @@ class TerrainCurriculum:
     STATE = ("levels", "columns", "origins", "_sums")
 
     def __init__(self, cfg: TerrainConfig, terrain: Terrain, num_envs: int, device: torch.device) -> None:
-        """Robots are spread evenly over the columns, at levels up to cfg.max_init_terrain_level."""
+        """Spread robots evenly over the columns, at levels up to cfg.max_init_terrain_level."""
         self.enabled = cfg.curriculum
         self.rows, columns = terrain.origins.shape[:2]
         highest = cfg.max_init_terrain_level if cfg.curriculum else self.rows - 1
@@ -74,8 +74,8 @@ class TerrainCurriculum:
         torch.index_select(self._tiles, 0, self.levels * self._count + self.columns, out=self.origins)
 
     def metrics(self) -> dict[str, Tensor]:
-        """Fresh tensors: per type the mean level, and the shares of ended episodes that moved up and down, averaged over
-        about the last ten calls (one rollout ends few episodes of each type).
+        """Return fresh tensors: per type the mean level, and the shares of ended episodes that moved up and down, averaged
+        over about the last ten calls (one rollout ends few episodes of each type).
         """
         if not self.enabled:
             return {}
@@ -89,7 +89,7 @@ class TerrainCurriculum:
         return log
 
     def progress(self) -> dict[str, Tensor]:
-        """How far the robots have got."""
+        """Return how far the robots have got."""
         return {"levels": self.levels.clone()}
 
     def load_progress(self, state: dict[str, Tensor]) -> None:

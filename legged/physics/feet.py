@@ -9,7 +9,7 @@ from torch import Tensor
 
 from legged.errors import ConfigError
 from legged.math import quat_to_matrix
-from legged.physics.base import RobotState
+from legged.physics.robot_state import RobotState
 from legged.robots.robot import Robot
 
 

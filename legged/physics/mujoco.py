@@ -1,5 +1,7 @@
 """The C engine on all CPU cores, through `mujoco.batch.Batch`: the default without a GPU, and the reference."""
 
+from collections.abc import Collection, Mapping
+
 import mujoco
 import numpy as np
 import torch
@@ -7,15 +9,18 @@ from mujoco.batch import Batch
 from torch import Tensor
 
 from legged.config.schema import SimConfig
-from legged.math import quat_rotate, quat_rotate_inverse
-from legged.physics.base import Physics, RandomizedField, allocate_state, setter_of
+from legged.math import quat_rotate_inverse
+from legged.physics.base import Physics
 from legged.physics.engine_warnings import keep_out_of_files
 from legged.physics.feet import FeetKinematics
-from legged.physics.scene.robot_scene import build_model, contact_sensor_columns
+from legged.physics.fields import FIELDS, RandomizedModel
+from legged.physics.quantities import LAST_STEP, STAGES, stage_of
+from legged.physics.robot_state import RobotState, robot_state
+from legged.physics.scene import Scene
+from legged.physics.scene.robot_scene import contact_sensor_columns
 from legged.process.cores import available_cores
 from legged.process.ranks import Ranks
 from legged.robots.robot import Robot
-from legged.terrain import Terrain
 
 OVERFLOW = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
 
@@ -26,106 +31,155 @@ class MujocoPhysics(Physics):
     capturable = False
 
     def __init__(
-        self, robot: Robot, sim: SimConfig, num_envs: int, device: torch.device, terrain: Terrain | None = None
+        self,
+        scene: Scene,
+        sim: SimConfig,
+        num_envs: int,
+        device: torch.device,
+        randomized: Collection[str] = (),
+        quantities: Collection[str] = (),
     ) -> None:
-        """Build the scene and place all robots at the model's initial state; `device` must be the CPU."""
+        """Build the scene and place all worlds at the model's initial state; `device` must be the CPU."""
         if device.type != "cpu":
-            raise ValueError(f"the mujoco back-end runs on the CPU, not on {device}")
+            raise ValueError(f"the engine mujoco runs on the CPU, not on {device}")
         keep_out_of_files()
         self.num_envs, self.dt, self.device = num_envs, sim.dt, device
-        self.model = build_model(robot, sim, terrain, contact_sensors=True)
+        self.model = scene.model(sim, contact_sensors=True)
         # A world that blows up must stay non-finite until the task sees it; the engine would put it back silently.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         # A world holds one robot; looking for parts that do not touch each other costs 6 % of a step.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
-        self.robot = robot
-        self.state = allocate_state(num_envs, robot, device)
-        self.torques = torch.zeros(num_envs, robot.num_dof)
+        self._randomized = RandomizedModel(scene, self.model, randomized, torch.float64, device)
+        self.qpos, self.qvel = torch.zeros(num_envs, self.model.nq), torch.zeros(num_envs, self.model.nv)
+        self.ctrl = torch.zeros(num_envs, self.model.nu)
         self.overflowed = torch.zeros(num_envs, dtype=torch.bool)
         self.batch = Batch(self.model, num_envs, sim.threads or max(1, available_cores() // Ranks.now().local_count))
-        self._qpos = torch.from_numpy(self.batch.bind("qpos"))
-        self._qvel = torch.from_numpy(self.batch.bind("qvel"))
-        self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))
-        self._warmstart = self.batch.bind("qacc_warmstart")
-        start, end = contact_sensor_columns(self.model, robot)
-        self._forces = self.batch.bind("sensordata")[:, start:end]
-        self._stepped = torch.zeros(num_envs, 1, 1, dtype=torch.bool)  # false: reset since the last step
-        self._feet = FeetKinematics(self.model, robot)
-        self._down = torch.tensor([0.0, 0.0, -1.0]).expand(num_envs, 3)
+        names = ("qpos", "qvel", "ctrl", "act", "qacc_warmstart")
+        self._qpos, self._qvel, self._ctrl, self._act, self._warmstart = (
+            torch.from_numpy(self.batch.bind(name)) for name in names
+        )
+        self._robot: _RobotReader | None = None
+        if scene.robot is not None:
+            self.robot_state = robot_state(self.qpos, self.qvel, scene.robot)
+            self._robot = _RobotReader(self.batch, self.robot_state, scene.robot)
+        self._reader = _QuantityReader(self.batch, quantities)
+        self._quantities = self._reader.values
         self._warnings = self.batch.warning[:, OVERFLOW, 1].copy()
         self.refresh()
 
     def step(self) -> None:
-        self._ctrl.copy_(self.torques)
+        self._ctrl.copy_(self.ctrl)
         self.batch.step()
-        self._stepped.fill_(True)
-        self._read_joints()
+        if self._robot is not None:
+            self._robot.stepped = True
+        self._reader.note_step()
+        self._read()
 
     def refresh(self) -> None:
-        state = self.state
-        state.base_pos.copy_(self._qpos[:, :3])
-        state.base_quat.copy_(self._qpos[:, 3:7])
-        # MuJoCo's free joint: linear velocity in the world frame, angular in the base's.
-        state.base_lin_vel_w.copy_(self._qvel[:, :3])
-        state.base_lin_vel.copy_(quat_rotate_inverse(state.base_quat, state.base_lin_vel_w))
-        state.base_ang_vel.copy_(self._qvel[:, 3:6])
-        state.projected_gravity.copy_(quat_rotate_inverse(state.base_quat, self._down))
-        self._read_joints()
-        self._feet.write(state)
-        forces = torch.from_numpy(self._forces.astype(np.float32)).view_as(state.contact_forces)
-        state.contact_forces.copy_(torch.where(self._stepped, -forces, 0.0))
+        self._read()
+        if self._robot is not None:
+            self._robot.read()  # first: the sensors hold what the last call left
+        self._reader.read()
         warnings = self.batch.warning[:, OVERFLOW, 1]
         self.overflowed.copy_(torch.from_numpy((warnings > self._warnings).any(axis=1)))
         self._warnings = warnings.copy()
 
-    def _read_joints(self) -> None:
-        self.state.dof_pos.copy_(self._qpos[:, 7:])
-        self.state.dof_vel.copy_(self._qvel[:, 6:])
+    def _read(self) -> None:
+        self.qpos.copy_(self._qpos)
+        self.qvel.copy_(self._qvel)
 
-    def write_state(
-        self,
-        mask: Tensor,
-        base_pos: Tensor,
-        base_quat: Tensor,
-        base_lin_vel: Tensor,
-        base_ang_vel: Tensor,
-        dof_pos: Tensor,
-        dof_vel: Tensor,
-    ) -> None:
+    def write(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         rows = mask.view(-1, 1)
-        qpos = torch.cat([base_pos, base_quat, dof_pos], dim=1).to(torch.float64)
-        qvel = torch.cat([quat_rotate(base_quat, base_lin_vel), base_ang_vel, dof_vel], dim=1).to(torch.float64)
-        self._qpos.copy_(torch.where(rows, qpos, self._qpos))
-        self._qvel.copy_(torch.where(rows, qvel, self._qvel))
-        self.torques.masked_fill_(rows, 0.0)
-        self._warmstart[mask.numpy()] = 0.0
-        self._stepped.masked_fill_(mask.view(-1, 1, 1), False)
+        self._qpos.copy_(torch.where(rows, qpos.to(torch.float64), self._qpos))
+        self._qvel.copy_(torch.where(rows, qvel.to(torch.float64), self._qvel))
+        for cleared in (self.ctrl, self._act, self._warmstart):
+            cleared.masked_fill_(rows, 0.0)
+        if self.robot_state is not None:
+            self.robot_state.contact_forces.masked_fill_(mask.view(-1, 1, 1), 0.0)
+        self._reader.note_write(mask)
 
-    def push(self, mask: Tensor, lin_vel_xy: Tensor) -> None:
-        self._qvel[:, :2].add_(torch.where(mask.view(-1, 1), lin_vel_xy, 0.0))
+    def push(self, mask: Tensor, delta: Tensor) -> None:
+        self._reader.stale |= mask
+        self._qvel[:, : delta.shape[1]].add_(torch.where(mask.view(-1, 1), delta, 0.0))
 
-    def randomize(self, field: RandomizedField, values: Tensor) -> None:
-        setter_of(field, friction=self._set_friction, added_base_mass=self._add_base_mass)(values)
-
-    def _set_friction(self, values: Tensor) -> None:
-        geoms = [self.model.geom(name).id for name in self.robot.contact_names]
-        self.batch.expand("geom_friction")[:, geoms, 0] = values.double().numpy()[:, None]
-
-    def _add_base_mass(self, values: Tensor) -> None:
-        base = self.model.body(self.robot.file.base).id
-        self.batch.expand("body_mass")[:, base] = self.model.body_mass[base] + values.double().numpy()
-        self.batch.set_const()
+    def randomize(self, field: str, values: Tensor) -> None:
+        for name, array in self._randomized.give(field, values).items():
+            self.batch.expand(name)[:] = array.numpy()
+        if FIELDS[field].derived:
+            self.batch.set_const()
+        self._reader.stale.fill_(True)
 
     def state_tensors(self) -> dict[str, Tensor]:
-        return {
-            "qpos": self._qpos,
-            "qvel": self._qvel,
-            "warmstart": torch.from_numpy(self._warmstart),
-            "contact_forces": self.state.contact_forces,
-            "stepped": self._stepped,
-        }
+        state = {"qpos": self._qpos, "qvel": self._qvel, "act": self._act, "warmstart": self._warmstart}
+        if self.robot_state is not None:
+            state["contact_forces"] = self.robot_state.contact_forces
+        return {**state, **self._reader.of_last_step}
+
+    def load_state(self, saved: Mapping[str, Tensor]) -> None:
+        self._reader.stale.fill_(True)
+        super().load_state(saved)
 
     def copy_to(self, env_id: int, data: mujoco.MjData) -> None:
         data.qpos[:] = self._qpos[env_id].numpy()
         data.qvel[:] = self._qvel[env_id].numpy()
         mujoco.mj_forward(self.model, data)
+
+
+class _RobotReader:
+    """Fills the fields of RobotState that are no views of qpos and qvel."""
+
+    def __init__(self, batch: Batch, state: RobotState, robot: Robot) -> None:
+        """For the model of `batch`, which has contact sensors."""
+        self.stepped = False
+        """Whether the sensors hold forces that `state` does not hold yet."""
+        self._state = state
+        start, end = contact_sensor_columns(batch.model, robot)
+        self._forces = batch.bind("sensordata")[:, start:end]
+        self._feet = FeetKinematics(batch.model, robot)
+        self._down = torch.tensor([0.0, 0.0, -1.0]).expand(len(state.base_pos), 3)
+
+    def read(self) -> None:
+        """Read velocities and gravity in the base's frame, feet, and, once a step, forces."""
+        state = self._state
+        state.base_lin_vel.copy_(quat_rotate_inverse(state.base_quat, state.base_lin_vel_w))
+        state.projected_gravity.copy_(quat_rotate_inverse(state.base_quat, self._down))
+        self._feet.write(state)
+        if self.stepped:  # a write in between has cleared its worlds' forces
+            state.contact_forces.copy_(torch.from_numpy(-self._forces.astype(np.float32)).view_as(state.contact_forces))
+            self.stepped = False
+
+
+class _QuantityReader:
+    """Keeps the quantities that were asked for: copies of the batch's arrays, brought up to date where they are stale."""
+
+    def __init__(self, batch: Batch, names: Collection[str]) -> None:
+        """Bind `names`, none of which costs anything but itself."""
+        self._batch, self._stage = batch, stage_of(names)
+        self._bound = {name: batch.bind(name) for name in names}
+        self.values = {name: torch.zeros(bound.shape) for name, bound in self._bound.items()}
+        self.of_last_step = {name: self.values[name] for name in LAST_STEP if name in names}
+        self.stale = torch.ones(batch.nsim, dtype=torch.bool)
+        """(N,) worlds whose state has changed since the last reading."""
+
+    def note_step(self) -> None:
+        """Take what the step that was just made leaves: no later call computes it."""
+        self.stale.fill_(True)
+        for name, value in self.of_last_step.items():
+            value.copy_(torch.from_numpy(self._bound[name].astype(np.float32)))
+
+    def note_write(self, mask: Tensor) -> None:
+        """Forget the last step of the worlds of `mask` (N,)."""
+        self.stale |= mask
+        for value in self.of_last_step.values():
+            value.masked_fill_(mask.view(-1, 1), 0.0)
+
+    def read(self) -> None:
+        """Compute and copy what depends on the state alone."""
+        if self._stage and self.stale.any():
+            worlds = self.stale.nonzero().flatten()
+            ids = worlds.numpy()
+            self._batch.forward(ids, stage=self._stage)
+            for name, value in self.values.items():
+                if name in STAGES:
+                    value[worlds] = torch.from_numpy(self._bound[name][ids].astype(np.float32))
+        self.stale.fill_(False)

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from legged.config import TaskConfig
+from legged.config import LeggedConfig
 from legged.envs import LeggedRobot
-from legged.errors import ConfigError, suggest
-from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, check_terrain
+from legged.errors import ConfigError
+from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, check_terrain, terrain_type
 
 DIFFICULTIES = (0.5, 0.8)
-"""Of the tiles on which robots start, and of those behind them, which they reach."""
+"""Difficulty of the tiles on which robots start, and of those behind them, which they reach."""
 COLUMNS = 4
 """Tiles side by side where there is only one type; those of random types differ."""
 SETTING: tuple[tuple[str, Any], ...] = (
@@ -37,17 +37,17 @@ class Playground:
     """Columns in the order in which robots are put there: those worth seeing first."""
 
     @classmethod
-    def of(cls, cfg: TaskConfig, name: str | None, difficulty: float | None) -> "Playground | None":
-        """What --terrain and --difficulty ask for: COLUMNS tiles of the type `name`, else one of each of the task's own
-        types; None for a task on a plane.
+    def of(cls, cfg: LeggedConfig, name: str | None, difficulty: float | None) -> "Playground | None":
+        """Return what --terrain and --difficulty ask for: COLUMNS tiles of the type `name`, else one of each of the task's
+        own types; None for a task on a plane.
 
         Raises:
             ConfigError: no such type, or no such difficulty.
         """
         if difficulty is not None and not 0.0 <= difficulty <= 1.0:
             raise ConfigError(f"--difficulty: must be between 0 and 1, got {difficulty:g}")
-        if name is not None and name not in TERRAIN_TYPES:
-            raise ConfigError(f"--terrain: there is no terrain type '{name}'{suggest(name, TERRAIN_TYPES)}")
+        if name is not None:
+            terrain_type(name, "--terrain")
         if name is None and cfg.terrain.mesh_type == "plane":
             if difficulty is not None:
                 raise ConfigError(f"--difficulty: {cfg.task} stands on a plane; name a type with --terrain")
@@ -69,11 +69,11 @@ class Playground:
 
     @property
     def types(self) -> list[str]:
-        """The types there are, each once."""
+        """Return the types there are, each once."""
         return list(dict.fromkeys(spec.type for spec in self.rows[0]))
 
-    def changes(self, cfg: TaskConfig) -> list[tuple[str, Any]]:
-        """Overrides under which a task of configuration `cfg` stands on this ground; what its policy sees stays."""
+    def changes(self, cfg: LeggedConfig) -> list[tuple[str, Any]]:
+        """Return overrides under which a task of configuration `cfg` stands on this ground; what its policy sees stays."""
         shares = dict.fromkeys(cfg.terrain.proportions, 0.0) | dict.fromkeys(self.types, 1.0 / len(self.types))
         return [
             ("terrain.mesh_type", "height_map"),
@@ -85,8 +85,8 @@ class Playground:
             ("sim.njmax", max(cfg.sim.njmax, ROWS_NEEDED)),
         ]
 
-    def build(self, cfg: TaskConfig) -> Terrain:
-        """The terrain; `cfg`, with the changes above, says how large tiles are.
+    def build(self, cfg: LeggedConfig) -> Terrain:
+        """Build the terrain; `cfg`, with the changes above, says how large tiles are.
 
         Raises:
             ConfigError: too small.
@@ -95,7 +95,7 @@ class Playground:
         return Terrain.of_tiles(self.rows, cfg.terrain, np.random.default_rng(cfg.env.seed))
 
     def columns(self, num_envs: int, shift: int = 0) -> list[int]:
-        """The column of each of that many robots; `shift` moves all on to the next ones in `order`."""
+        """Return the column of each of that many robots; `shift` moves all on to the next ones in `order`."""
         return [self.order[(i + shift) % len(self.order)] for i in range(num_envs)]
 
     def place(self, task: LeggedRobot, shift: int = 0) -> None:
@@ -105,7 +105,7 @@ class Playground:
         task.terrain_curriculum.place_at(torch.zeros_like(columns), columns)
 
     def label(self, terrain: Terrain, base_pos: Sequence[float]) -> str:
-        """Type and size of the tile below `base_pos` (x, y, ...), or of the nearest one: 'stairs_up, step height 0.19 m'."""
+        """Name the tile below `base_pos` (x, y, ...), or the nearest one: 'stairs_up, step height 0.194 m'."""
         first = terrain.origins[0, 0]
         r, c = (
             int(np.clip(np.round((base_pos[axis] - first[axis]) / terrain.tile_size[axis]), 0, count - 1))
@@ -114,7 +114,7 @@ class Playground:
         return label(self.rows[r][c].type, [self.rows[r][c].size])
 
     def labels(self) -> dict[str, str]:
-        """Type -> its name with the sizes there are of it."""
+        """Return type -> its name with the sizes there are of it."""
         return {
             kind: label(kind, list(dict.fromkeys(spec.size for row in self.rows for spec in row if spec.type == kind)))
             for kind in self.types
@@ -122,9 +122,6 @@ class Playground:
 
 
 def label(kind: str, sizes: Sequence[float]) -> str:
-    """'stairs_up, step height 0.14 to 0.19 m'."""
+    """Name tiles of one type and some sizes: 'stairs_up, step height 0.14 to 0.194 m'."""
     info = TERRAIN_TYPES[kind]
-    if kind == "flat":
-        return kind
-    numbers = " to ".join(f"{size:.0f}" if info.unit == "degrees" else f"{size:.2f}" for size in sizes)
-    return f"{kind}, {info.what} {numbers} {info.unit}"
+    return kind if kind == "flat" else f"{kind}, {info.what} {info.text(*sizes)}"

@@ -9,10 +9,10 @@ import imageio_ffmpeg
 import numpy as np
 from PIL import Image
 
-from legged.envs import LeggedRobot
+from legged.envs import BaseTask, LeggedRobot
 from legged.errors import RunError
 from legged.process.paths import DISK_FULL, make_folder, relative, replacing
-from legged.rendering import Camera
+from legged.rendering import ModelCamera, RobotsCamera
 
 FPS = 25
 """Frames a second; fewer where control steps are longer."""
@@ -21,13 +21,26 @@ GIF_S = 12.0
 """Length of a GIF; as many seconds of the film as a page can take [s]."""
 
 
+def camera_of(task: BaseTask, count: int) -> ModelCamera | RobotsCamera:
+    """Return what draws a task: of legged robots, the first `count` of them.
+
+    Raises:
+        RunError: nothing can be rendered.
+    """
+    return RobotsCamera(task, count) if isinstance(task, LeggedRobot) else ModelCamera(task)
+
+
 class Video:
     """Collects pictures of a task's first robots while it is stepped; without a folder it does nothing."""
 
-    def __init__(self, task: LeggedRobot, count: int, folder: Path | None, gif: bool = False) -> None:
-        """Raises RunError where nothing can be rendered, or the folder can't be made."""
-        self.task, self.folder, self.gif = task, folder, gif
-        self.camera = Camera(task, count) if folder else None
+    def __init__(self, task: BaseTask, count: int, folder: Path | None, gif: bool = False) -> None:
+        """Open the camera and make the folder.
+
+        Raises:
+            RunError: nothing can be rendered, or the folder can't be made.
+        """
+        self.folder, self.gif = folder, gif
+        self.camera = camera_of(task, count) if folder else None
         if folder:
             make_folder(folder)
         self.every = max(1, round(1.0 / (FPS * task.dt)))
@@ -38,18 +51,18 @@ class Video:
         self._start = time.perf_counter()
 
     def follow(self, robot: int) -> None:
-        """On terrain, the robot that is in the middle of the picture from now on."""
+        """Put another robot in the middle of the picture, from now on; on a plane all are in it."""
         if self.camera:
             self.camera.followed = robot
 
     def due(self, step: int) -> bool:
-        """Whether a frame is to be taken after this control step."""
+        """Say whether a frame is to be taken after this control step."""
         return self.camera is not None and step % self.every == 0
 
-    def take(self, robots: slice, *lines: str) -> None:
-        """A frame, with the velocities of `robots` and `lines` written on it."""
+    def take(self, *lines: str) -> None:
+        """Take a frame, with `lines` written on it."""
         if self.camera:
-            self.frames.append(self.camera.picture([*velocities(self.task, robots), *lines]))
+            self.frames.append(self.camera.picture(lines))
 
     def write(self) -> None:
         """Write play.mp4 and, if asked for, a smaller play.gif.
@@ -64,15 +77,6 @@ class Video:
         if self.gif:
             _write_gif(self.frames, self.folder / "play.gif", self.fps)
         print(f"recorded {len(self.frames)} frames in {time.perf_counter() - self._start:.1f} s")
-
-
-def velocities(task: LeggedRobot, robots: slice) -> list[str]:
-    """Commanded velocity of the first of `robots`, and the mean of their actual ones."""
-    wanted = task.commands[robots][0, :3].tolist()
-    actual = [*task.base_lin_vel[robots, :2].mean(dim=0).tolist(), float(task.base_ang_vel[robots, 2].mean())]
-    return [
-        f"{name}  {v[0]:+.2f}  {v[1]:+.2f} m/s  {v[2]:+.2f} rad/s" for name, v in (("commanded", wanted), ("actual", actual))
-    ]
 
 
 def _write_mp4(frames: list[np.ndarray], path: Path, fps: float) -> None:

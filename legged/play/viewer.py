@@ -9,16 +9,20 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged.envs import LeggedRobot
+from legged.envs import BaseTask, LeggedRobot
 from legged.play.playground import Playground
-from legged.rendering import display_model, size_of
+from legged.rendering import display_model, drawn_model, follow_root, size_of
 
 STEP = (0.1, 0.1, 0.2)
 """Change of vx, vy [m/s] and yaw rate [rad/s] by one key press."""
 UP, DOWN, LEFT, RIGHT, SPACE, COMMA, PERIOD, BACKSPACE, NEXT = 265, 264, 263, 262, 32, 44, 46, 259, ord("N")
 HELP = """viewer: up/down vx, left/right yaw rate, comma/period vy, space stands still, backspace starts anew;
 close the window to record the video"""
+HELP_WITHOUT_COMMANDS = "viewer: backspace starts anew; close the window to record the video"
 HELP_ON_TERRAIN = "n goes to the next tile"
+
+
+PANELS = {"show_left_ui": False, "show_right_ui": False}
 
 
 class Keyboard:
@@ -27,7 +31,7 @@ class Keyboard:
     MOVES = {UP: (0, 1), DOWN: (0, -1), COMMA: (1, 1), PERIOD: (1, -1), LEFT: (2, 1), RIGHT: (2, -1)}
 
     def __init__(self, low: list[float], high: list[float]) -> None:
-        """Lowest and highest command per axis."""
+        """Begin at rest; `low` and `high` are the least and the greatest command of each axis."""
         self.low, self.high = low, high
         self.command = [0.0, 0.0, 0.0]
         self.restart = False
@@ -57,13 +61,12 @@ def view(task: LeggedRobot, act: Callable[[TensorDict], Tensor], playground: Pla
     model = display_model(task.robot, 1, 640, 480, task.terrain)
     data = mujoco.MjData(model)
     length = size_of(task.robot).longest
-    simulated = mujoco.MjData(task.physics.model)  # type: ignore[attr-defined]
+    simulated = mujoco.MjData(task.physics.model)
     print(HELP)
     if playground:
         print(HELP_ON_TERRAIN)
     begin_anew(task, playground, keyboard)
-    panels = {"show_left_ui": False, "show_right_ui": False}
-    with mujoco.viewer.launch_passive(model, data, key_callback=keyboard.press, **panels) as window:
+    with mujoco.viewer.launch_passive(model, data, key_callback=keyboard.press, **PANELS) as window:
         window.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
         window.cam.trackbodyid = model.body(f"0/{task.robot.file.base}").id
         window.cam.distance, window.cam.azimuth, window.cam.elevation = (
@@ -79,6 +82,34 @@ def view(task: LeggedRobot, act: Callable[[TensorDict], Tensor], playground: Pla
             with window.lock():
                 task.physics.copy_to(0, simulated)
                 data.qpos[:], data.qvel[:] = simulated.qpos, simulated.qvel
+                mujoco.mj_forward(model, data)
+            window.sync()
+            time.sleep(max(0.0, task.dt - (time.perf_counter() - begin)))
+
+
+@torch.inference_mode()
+def watch(task: BaseTask, act: Callable[[TensorDict], Tensor]) -> None:
+    """Show the first environment of a task without commands in real time until the window is closed."""
+    model = drawn_model(task, 640, 480)
+    data = mujoco.MjData(model)
+    restart: list[int] = []
+    print(HELP_WITHOUT_COMMANDS)
+    observations = task.reset()
+
+    def press(key: int) -> None:
+        if key == BACKSPACE:
+            restart.append(key)
+
+    with mujoco.viewer.launch_passive(model, data, key_callback=press, **PANELS) as window:
+        follow_root(window.cam, model)
+        while window.is_running():
+            begin = time.perf_counter()
+            if restart:
+                restart.clear()
+                observations = task.reset()
+            observations, _, _, _ = task.step(act(observations))
+            with window.lock():
+                task.physics.copy_to(0, data)
                 mujoco.mj_forward(model, data)
             window.sync()
             time.sleep(max(0.0, task.dt - (time.perf_counter() - begin)))

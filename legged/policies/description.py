@@ -4,9 +4,11 @@ import inspect
 import re
 from typing import Any
 
-from legged.envs import LeggedRobot
+from legged.config.networks import groups_of
+from legged.envs import BaseTask, LeggedRobot
 from legged.envs.terms import HEIGHTS_LIMIT, HEIGHTS_OFFSET
 from legged.mdp.observations import ObservationTerm
+from legged.policies.model_description import describe_control
 
 LAWS = {
     "P": "stiffness * (action_scale * action + default_joint_angles - q) - damping * dq",
@@ -17,19 +19,30 @@ LAWS = {
 FRAMES = ("base frame", "yaw frame", "world frame")
 
 
-def describe(task: LeggedRobot) -> dict[str, Any]:
-    """Observation layout with units, frames and formulas, joints, control law, time; keys are never renamed."""
-    cfg, robot, control = task.cfg, task.robot, task.control
-    group = task.observation_groups["actor"]
-    low, high = task.command_sampler.full_ranges.t().tolist()
+def describe(task: BaseTask) -> dict[str, Any]:
+    """Return observation layout with units, frames and formulas, joints, control law, time; keys are never renamed."""
+    cfg = task.cfg
+    groups = describe_groups(task)
     return {
         "task": cfg.task,
-        "robot": robot.name,
-        "conventions": conventions(task),
-        "observation": [describe_term(task, term) for term in group.terms],
-        "observation_history": group.history,
+        "observation": [
+            describe_term(task, term, group) for group in groups for term in task.observation_groups[group["name"]].terms
+        ],
+        "observation_history": groups[0]["history"],
+        "observation_groups": groups,
         "observation_clip": cfg.observations.clip,
         "recurrent": describe_memory(task),
+        **(describe_robot(task) if isinstance(task, LeggedRobot) else describe_control(task)),
+    }
+
+
+def describe_robot(task: LeggedRobot) -> dict[str, Any]:
+    """Return the robot of a task, its commands and its control law."""
+    cfg, robot, control = task.cfg, task.robot, task.control
+    low, high = task.command_sampler.full_ranges.t().tolist()
+    return {
+        "robot": robot.name,
+        "conventions": conventions(task),
         "command_ranges": dict(zip(("vx", "vy", "yaw_rate"), zip(low, high, strict=True), strict=True)),
         "joint_names": list(robot.joint_names),
         "default_joint_angles": control.default_dof_pos.tolist(),
@@ -45,7 +58,7 @@ def describe(task: LeggedRobot) -> dict[str, Any]:
 
 
 def conventions(task: LeggedRobot) -> dict[str, str]:
-    """Frames, orders and the way of time, in words."""
+    """Return frames, orders and the way of time, in words."""
     law = LAWS[task.cfg.control.control_type]
     return {
         "base frame": f"fixed to the body '{task.robot.file.base}': x forward, y left, z up",
@@ -57,33 +70,48 @@ def conventions(task: LeggedRobot) -> dict[str, str]:
         " start + size, without noise",
         "history": "the last observation_history observations side by side, oldest first; at the start of an episode all are"
         " the first one",
+        "observation_groups": "group by group side by side, each at its columns start to start + history * size, with as many"
+        " observations of its own terms as its history says; start of a term is where it lies in the oldest of them",
         "action": "actions = policy(observation), then clipped at plus and minus action_clip, one for each joint",
         "torque": f"clip({law}, -torque_limits, torque_limits), anew every sim_dt",
         "time": "every control_dt: observe, run the policy, hold its action for control_dt",
     }
 
 
-def describe_term(task: LeggedRobot, term: ObservationTerm) -> dict[str, Any]:
-    """One observation term; unit, frame and formula are those that its method's docstring says."""
+def describe_groups(task: BaseTask) -> list[dict[str, Any]]:
+    """Return name, first column, width of one observation and history of each group that the policy reads, in order."""
+    groups: list[dict[str, Any]] = []
+    start = 0
+    for name in groups_of(task.cfg, "actor"):
+        group = task.observation_groups[name]
+        width = group.buffer.shape[1]
+        groups.append({"name": name, "start": start, "size": width // group.history, "history": group.history})
+        start += width
+    return groups
+
+
+def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any]) -> dict[str, Any]:
+    """Return one observation term; unit, frame and formula are those that its method's docstring says."""
     text = " ".join((inspect.getdoc(getattr(type(task), f"_obs_{term.name}")) or "").partition("\n\n")[0].split())
     unit = re.search(r"\[([^\]]*)\]\.?$", text)
     entry: dict[str, Any] = {
         "name": term.name,
-        "start": term.columns.start,
+        "group": group["name"],
+        "start": group["start"] + term.columns.start,
         "size": term.columns.stop - term.columns.start,
         "scale": [float(value) for value in term.scale],
         "unit": unit.group(1) if unit else None,
         "frame": next((frame for frame in FRAMES if frame in text), None),
         "formula": text or None,
     }
-    if term.name == "heights":
+    if isinstance(task, LeggedRobot) and term.name == "heights":
         points = [[round(value, 6) for value in point] for point in task.height_scan.points.tolist()]
         entry |= {"points": points, "offset": HEIGHTS_OFFSET, "limit": HEIGHTS_LIMIT}
     return entry
 
 
-def describe_memory(task: LeggedRobot) -> dict[str, Any] | None:
-    """How to keep the hidden state of a recurrent policy; None for one that has none."""
+def describe_memory(task: BaseTask) -> dict[str, Any] | None:
+    """Return how to keep the hidden state of a recurrent policy; None for one that has none."""
     policy = task.cfg.train.policy
     if policy.rnn_type == "none":
         return None
@@ -95,4 +123,5 @@ def describe_memory(task: LeggedRobot) -> dict[str, Any] | None:
         "onnx_outputs": [f"{name}_out" for name in kept],
         "use": "ONNX: zeros at the start of an episode, then what the last call gave; TorchScript: batch 1, kept inside,"
         " reset() at the start of an episode",
+        "reset": {"onnx": "zeros in onnx_inputs, in the rows of the batch whose episode begins", "torchscript": "reset()"},
     }

@@ -13,15 +13,18 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged.envs import LeggedRobot
+from legged.envs import BaseTask
 from legged.errors import RunError
-from legged.learning.runner import Runner
 from legged.policies.description import describe
 from legged.process.paths import make_folder, write_bytes, write_text
 
+EXPORTED = "exported"
+"""Folder of the files, beside a film or a checkpoint."""
 CHECKED_OBSERVATIONS = 1000
 CHECKED_SEQUENCE = (100, 3)
 """Steps and robots on which a recurrent policy is checked."""
+NEW_EPISODES = ((40, 1), (70, 0), (70, 2))
+"""Step and robot of the episodes that begin in between."""
 LARGEST_DIFFERENCE = 1e-4
 """Exports that differ from the policy by more than this, in actions or as a share of the largest, are refused."""
 
@@ -30,40 +33,46 @@ class ExportError(RunError):
     """An exported policy does not compute what the policy does."""
 
 
-def export(runner: Runner, folder: Path) -> dict[str, float]:
-    """Write policy.pt (TorchScript) and policy.onnx to `folder`; returns the largest difference of each to the policy.
+def export(task: BaseTask, policy: Any, folder: Path) -> dict[str, float]:
+    """Write `policy`, rsl-rl's network of the actor, as policy.pt (TorchScript) and policy.onnx to `folder`; return the
+    largest difference of each to it.
 
-    Both take one flat observation (batch, width) and give actions (batch, joints), without noise. With a history of H
-    steps, width is H times that of the layout, oldest step first. Of a recurrent policy the TorchScript keeps the hidden
-    state of a batch of 1 inside, until its reset(); the ONNX takes it and gives it back. The metadata is in the ONNX file
-    and beside it in policy.json.
+    Both take one flat observation (batch, width) and give actions (batch, joints), without noise: the groups that the policy
+    reads side by side, and of each with a history of H steps H times its layout, oldest step first. Of a recurrent policy
+    the TorchScript keeps the hidden state of a batch of 1 inside, until its reset(); the ONNX takes it and gives it back. The
+    metadata is in the ONNX file and beside it in policy.json.
 
     Raises:
         ExportError: a file computes something else.
         RunError: a file can't be written.
     """
-    task: LeggedRobot = runner.env  # type: ignore[assignment]
     metadata = describe(task)
-    policy = runner.alg.get_policy()
     device = next(policy.parameters()).device
-    width = task.observation_groups["actor"].buffer.shape[1]
+    widths = {name: task.observation_groups[name].buffer.shape[1] for name in policy.obs_groups}
     # A sequence of batches; only a policy with a memory cares which comes first.
     length, batch = CHECKED_SEQUENCE if policy.is_recurrent else (1, CHECKED_OBSERVATIONS)
-    observations = torch.randn(length, batch, width)
+    observations = torch.randn(length, batch, sum(widths.values()))
+    begins = torch.zeros(length, batch, dtype=torch.bool)
+    begins[0] = True
+    if policy.is_recurrent:
+        for step, robot in NEW_EPISODES:
+            begins[step, robot] = True
     # In memory first, written once they have been read back and agree: onto a full disk torch would abort the process.
     hidden = policy.get_hidden_state()
     try:
         policy.to("cpu").eval()
-        wanted = _run_policy(policy, observations)
+        wanted = _run_policy(policy, observations, begins, widths)
         script, network = _torchscript(policy), _onnx(policy, metadata)
     finally:
         policy.to(device)
         policy.reset(hidden_state=hidden)
     if policy.is_recurrent:
-        by_script = [(_run_script(script, observations[:, i : i + 1]), wanted[:, i : i + 1]) for i in range(batch)]
+        by_script = [
+            (_run_script(script, observations[:, i : i + 1], begins[:, i]), wanted[:, i : i + 1]) for i in range(batch)
+        ]
     else:
-        by_script = [(_run_script(script, observations), wanted)]
-    by_onnx = [(_run_onnx(network, observations, metadata["recurrent"]), wanted)]
+        by_script = [(_run_script(script, observations, begins[:, 0]), wanted)]
+    by_onnx = [(_run_onnx(network, observations, begins, metadata["recurrent"]), wanted)]
     differences = {}
     for name, pairs in (("policy.pt", by_script), ("policy.onnx", by_onnx)):
         difference = float(np.max([np.abs(found - right).max() / max(1.0, np.abs(right).max()) for found, right in pairs]))
@@ -78,48 +87,61 @@ def export(runner: Runner, folder: Path) -> dict[str, float]:
 
 
 @torch.inference_mode()
-def _run_policy(policy: Any, observations: Tensor) -> np.ndarray:
-    """The policy's own actions (T, batch, D) for observations (T, batch, width), from the start of an episode on."""
+def _run_policy(policy: Any, observations: Tensor, begins: Tensor, widths: dict[str, int]) -> np.ndarray:
+    """Return the policy's own actions (T, batch, D) for observations (T, batch, width): its groups, of these `widths`, side
+    by side. Before a step, episodes begin where `begins` (T, batch) says so.
+    """
     policy.reset()
-    (group,) = policy.obs_groups
-    steps = [policy(TensorDict({group: step}, batch_size=[len(step)])) for step in observations]
-    return torch.stack(steps).numpy()
+    actions = []
+    for step, new in zip(observations, begins, strict=True):
+        policy.reset(new)
+        groups = dict(zip(widths, step.split([*widths.values()], dim=1), strict=True))
+        actions.append(policy(TensorDict(groups, batch_size=[len(step)])))
+    return torch.stack(actions).numpy()
 
 
 @torch.inference_mode()
-def _run_script(content: bytes, observations: Tensor) -> np.ndarray:
-    """Those of the TorchScript file; it must begin anew by its reset()."""
+def _run_script(content: bytes, observations: Tensor, begins: Tensor) -> np.ndarray:
+    """Return those of the TorchScript file, which begins anew by its reset() where `begins` (T,) says so."""
     script = torch.jit.load(io.BytesIO(content))
     script(observations[0])
-    script.reset()
-    return torch.stack([script(step) for step in observations]).numpy()
+    actions = []
+    for step, new in zip(observations, begins, strict=True):
+        if new:
+            script.reset()
+        actions.append(script(step))
+    return torch.stack(actions).numpy()
 
 
-def _run_onnx(content: bytes, observations: Tensor, memory: dict[str, Any] | None) -> np.ndarray:
-    """Those of the ONNX file; a hidden state, as `memory` describes it, begins with zeros and is handed on."""
+def _run_onnx(content: bytes, observations: Tensor, begins: Tensor, memory: dict[str, Any] | None) -> np.ndarray:
+    """Return those of the ONNX file; a hidden state, as `memory` describes it, is handed on, and is zeros where `begins`
+    (T, batch) says that an episode does.
+    """
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     hidden: dict[str, np.ndarray] = {}
     if memory is not None:
         layers, _, width = memory["shape"]
-        zeros = np.zeros((layers, observations.shape[1], width), dtype=np.float32)
-        hidden = dict.fromkeys(memory["onnx_inputs"], zeros)
+        size = (layers, observations.shape[1], width)
+        hidden = {name: np.ones(size, dtype=np.float32) for name in memory["onnx_inputs"]}
     actions = []
-    for step in observations:
-        action, *state = session.run(None, {"obs": step.numpy(), **hidden})
-        hidden = dict(zip(hidden, state, strict=True))
+    for step, new in zip(observations, begins.numpy(), strict=True):
+        for state in hidden.values():
+            state[:, new] = 0.0
+        action, *states = session.run(None, {"obs": step.numpy(), **hidden})
+        hidden = {name: np.array(state) for name, state in zip(hidden, states, strict=True)}
         actions.append(np.asarray(action))
     return np.stack(actions)
 
 
 def _torchscript(policy: Any) -> bytes:
-    """The file of the TorchScript policy."""
+    """Return the file of the TorchScript policy."""
     buffer = io.BytesIO()
     torch.jit.save(torch.jit.script(policy.as_jit().to("cpu")), buffer)
     return buffer.getvalue()
 
 
 def _onnx(policy: Any, metadata: dict[str, Any]) -> bytes:
-    """The file of rsl-rl's ONNX model with a free batch size and the metadata as JSON strings, one property a key."""
+    """Return the file of rsl-rl's ONNX model with a free batch size and the metadata as JSON strings, one property a key."""
     module = policy.as_onnx(verbose=False).to("cpu").eval()
     buffer = io.BytesIO()
     inputs, outputs = module.input_names, module.output_names

@@ -1,23 +1,19 @@
 """Finding a trained policy and putting it back into its task."""
 
 import argparse
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict
-from torch import Tensor
 
 from legged.commandline.arguments import overrides
 from legged.config import TaskConfig, override
-from legged.envs import LeggedRobot
 from legged.errors import ConfigError
 from legged.learning.checkpoint import check_fits, read_checkpoint
-from legged.learning.recurrent import Remembering
 from legged.learning.run_folder import find_checkpoint, find_run, run_config, shipped_policy
-from legged.learning.runner import Runner
+from legged.policies.actor import Actor
 from legged.process.paths import relative
 from legged.registry import make_task, task_class, task_config
 from legged.terrain import Terrain
@@ -36,14 +32,14 @@ class TrainedPolicy:
         return self.checkpoint.parent
 
     def output(self, what: str) -> Path:
-        """Where files about it go by default: the run folder; logs/<what>/<task> for a policy that is shipped, whose folder
-        belongs to the package and may not be writable.
+        """Return where files about it go by default: the run folder; logs/<what>/<task> for a policy that is shipped, whose
+        folder belongs to the package and may not be writable.
         """
         return Path("logs") / what / self.folder.name if self.folder.parent.name == "policies" else self.folder
 
 
 def find_policy(args: argparse.Namespace) -> TrainedPolicy:
-    """What --task, --load_run and --checkpoint name: the newest run of the task, else the policy that is shipped.
+    """Find what --task, --load_run and --checkpoint name: the newest run of the task, else the policy that is shipped.
 
     Raises:
         ConfigError: there is none, or it is of another task.
@@ -67,7 +63,7 @@ def find_policy(args: argparse.Namespace) -> TrainedPolicy:
 
 
 def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:
-    """Overrides for measuring: no noise, no pushes, friction 1, nominal mass, no curriculum, episodes that don't end."""
+    """Return overrides for measuring: no noise, pushes or curriculum, friction 1, nominal mass, episodes that don't end."""
     return [
         ("env.num_envs", num_envs),
         ("env.episode_length_s", seconds + 10.0),
@@ -79,23 +75,14 @@ def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:
     ]
 
 
-class RestoredRunner(Runner):
-    """A runner that trains no more, whose policy forgets the episodes that have ended."""
-
-    def get_inference_policy(self, device: str | None = None) -> Callable[[TensorDict], Tensor]:  # type: ignore[override]
-        """Observations -> actions (N, D), without noise; one call a step, if the policy is recurrent."""
-        policy = super().get_inference_policy(device)
-        return Remembering(policy, self.env) if policy.is_recurrent else policy
-
-
 def restore(
     policy: TrainedPolicy,
     changes: Iterable[tuple[str, Any]],
     device: torch.device,
     graph: bool = True,
     terrain: Terrain | None = None,
-) -> tuple[LeggedRobot, Runner]:
-    """The task with some settings changed, on its own terrain or on the one given, and a runner that holds the policy;
+) -> tuple[Any, Actor]:
+    """Build the task with some settings changed, on its own terrain or on the one given, and the policy that acts in it;
     nothing is written.
 
     Raises:
@@ -106,6 +93,6 @@ def restore(
     task_class(cfg.task).check(cfg)
     check_fits(policy.checkpoint, read_checkpoint(policy.checkpoint), cfg)
     task = make_task(cfg, device, graph, terrain)
-    runner = RestoredRunner(task, None, str(device))
-    runner.load(str(policy.checkpoint))
-    return task, runner
+    actor = Actor(task, device)
+    actor.load(policy.checkpoint)
+    return task, actor

@@ -16,8 +16,8 @@ def available_cores() -> int:
 
 
 def quota(root: Path, membership: Path) -> float:
-    """Cores' worth of time that the groups of this process may use, the smallest of theirs; infinite where nothing is said.
-    `membership` lists the groups, whose folders lie below `root`.
+    """Return the cores' worth of time that the groups of this process may use, the smallest of theirs; infinite where nothing
+    is said. `membership` lists the groups, whose folders lie below `root`.
     """
     try:
         groups = [line.split(":", 2) for line in membership.read_text().splitlines()]
@@ -37,7 +37,7 @@ def quota(root: Path, membership: Path) -> float:
 
 
 def _share(folder: Path) -> float:
-    """Cores' worth of time that one group may use: cpu.max of cgroup v2, cpu.cfs_* of v1."""
+    """Return the cores' worth of time that one group may use: cpu.max of cgroup v2, cpu.cfs_* of v1."""
     try:
         if (folder / "cpu.max").is_file():
             most, period = (folder / "cpu.max").read_text().split()

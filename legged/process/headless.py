@@ -20,7 +20,7 @@ ON = ("", "enable", "enabled", "on", "true", "1")
 
 
 def display_answers() -> bool:
-    """Whether there is a display on this machine that takes connections; DISPLAY may name one that has gone."""
+    """Return whether there is a display on this machine that takes connections; DISPLAY may name one that has gone."""
     if sys.platform != "linux":
         return True
     wayland = os.environ.get("WAYLAND_DISPLAY")
@@ -32,7 +32,7 @@ def display_answers() -> bool:
 
 
 def _x_answers(name: str) -> bool:
-    """Whether an X server listens at a display's name: 'host:number.screen', where no host or 'unix' is this machine."""
+    """Return whether an X server listens at a display's name, 'host:number.screen'; no host or 'unix' is this machine."""
     if name.startswith("/"):  # a socket by its path, as on macOS
         return _connects(socket.AF_UNIX, name) or _connects(socket.AF_UNIX, name.rpartition(".")[0])
     match = re.fullmatch(r"(?:[a-z]+/)?(.*):(\d+)(?:\.\d+)?", name)
@@ -46,7 +46,7 @@ def _x_answers(name: str) -> bool:
 
 
 def _connects(family: socket.AddressFamily, address: str | tuple[str, int]) -> bool:
-    """Whether something takes a connection there."""
+    """Return whether something takes a connection there."""
     try:
         if isinstance(address, tuple):
             socket.create_connection(address, timeout=ANSWER_S).close()
@@ -60,7 +60,7 @@ def _connects(family: socket.AddressFamily, address: str | tuple[str, int]) -> b
 
 
 def off_screen_library() -> str | None:
-    """The value of MUJOCO_GL that works here: 'egl', 'osmesa' or none.
+    """Return the value of MUJOCO_GL that works here: 'egl', 'osmesa' or none.
 
     MuJoCo fails at import if it names a library that is missing, so a machine that only trains must not set it.
     """

@@ -18,13 +18,13 @@ DISK_FULL = "no space left on the disk"
 ABANDONED_S = 3600.0
 """An unfinished file that nobody has written to for so long was left by a process that was killed [s]."""
 LONGEST_NAME = 255
-"""Of a file or folder, on the file systems there are [bytes]."""
+"""Longest name of a file or folder on the file systems there are [bytes]."""
 _REASONS = {errno.ENOSPC: DISK_FULL, errno.EDQUOT: f"{DISK_FULL} (the quota is used up)"}
 _COUNTER = itertools.count()
 
 
 def data_folder(name: str) -> Path:
-    """The folder `name` ('cfg' or 'resources') of this installation.
+    """Return the folder `name` ('cfg' or 'resources') of this installation.
 
     Raises:
         FileNotFoundError: the installation lacks it.
@@ -37,7 +37,7 @@ def data_folder(name: str) -> Path:
 
 
 def relative(path: Path) -> str:
-    """`path` as it is shortest to read: below the working directory if it lies there."""
+    """Return `path` as it is shortest to read: below the working directory if it lies there."""
     try:
         return str(path.resolve().relative_to(Path.cwd()))
     except (OSError, ValueError):
@@ -45,7 +45,7 @@ def relative(path: Path) -> str:
 
 
 def exists(path: Path) -> bool:
-    """Whether there is a file or folder; there is none under a name that no system takes."""
+    """Return whether there is a file or folder; there is none under a name that no system takes."""
     try:
         return path.exists()
     except (OSError, ValueError):

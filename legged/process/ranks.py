@@ -21,7 +21,7 @@ class Ranks:
 
     @classmethod
     def now(cls) -> "Ranks":
-        """As the environment says; one process, where it says nothing.
+        """Return what the environment says; one process, where it says nothing.
 
         Raises:
             ConfigError: it says something that can't be.
@@ -47,7 +47,7 @@ class Ranks:
 
 
 def _whole(name: str, default: int, least: int) -> int:
-    """A whole number in the environment; one that is empty says nothing."""
+    """Return a whole number in the environment; one that is empty says nothing."""
     text = os.environ.get(name, "").strip()
     if not text:
         return default

@@ -28,7 +28,7 @@ os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
 
 @contextmanager
 def importing() -> Iterator[None]:
-    """Imports without garbage collection: they make a million objects that stay, and looking through them time and again
+    """Import without garbage collection: imports make a million objects that stay, and looking through them time and again
     takes a quarter of a start.
     """
     enabled = gc.isenabled()
@@ -41,14 +41,14 @@ def importing() -> Iterator[None]:
 
 
 def is_a_command() -> None:
-    """This process is one of our commands: what it has imported is never garbage, nor is anything when it ends."""
+    """Freeze garbage collection in a process that is one of our commands: imports stay, and nothing is collected at exit."""
     gc.freeze()
     atexit.register(gc.freeze)
 
 
 def command_of_ours() -> str | None:
-    """How this process was started, if as one of our commands: 'script' (train.py, play.py), 'module' (python -m legged...)
-    or 'installed' (legged-train, legged-play).
+    """Return how this process was started, if as one of our commands: 'script' (train.py, play.py), 'module' (python -m
+    legged...) or 'installed' (legged-train, legged-play).
     """
     given = sys.orig_argv
     if "-m" in given[:-1]:
@@ -62,7 +62,7 @@ def command_of_ours() -> str | None:
 
 
 def in_main_thread() -> bool:
-    """Whether this is the thread in which signal handlers can be set."""
+    """Return whether this is the thread in which signal handlers can be set."""
     return threading.current_thread() is threading.main_thread()
 
 

@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 
+from legged.rendering.framing import direction
 from legged.terrain import HeightMap
 
 SMOOTH = np.array([0.12, 0.12, 0.05])
@@ -50,14 +51,11 @@ class Follower:
         view.azimuth, view.elevation = self.azimuth, self.elevation
 
     def _free_elevation(self) -> float:
-        """The flattest elevation at which no ground is between camera and robot [degrees]."""
+        """Return the flattest elevation at which no ground is between camera and robot [degrees]."""
         assert self.lookat is not None
-        along = np.linspace(0.25, 1.0, 12) * self.distance
-        azimuth = np.radians(self.azimuth)
+        along = np.linspace(0.25, 1.0, 12)[:, None] * self.distance
         for elevation in np.arange(FLATTEST, STEEPEST, -2.0):
-            e = np.radians(elevation)
-            x = self.lookat[0] - along * np.cos(e) * np.cos(azimuth)
-            y = self.lookat[1] - along * np.cos(e) * np.sin(azimuth)
-            if (self.lookat[2] - along * np.sin(e) > self.ground.height_at(x, y) + CLEAR).all():
+            x, y, z = (self.lookat - along * direction(self.azimuth, elevation)).T
+            if (z > self.ground.height_at(x, y) + CLEAR).all():
                 return float(elevation)
         return STEEPEST

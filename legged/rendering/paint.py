@@ -6,7 +6,7 @@ import numpy as np
 from legged.physics.scene.terrain_geoms import SAME, add_terrain
 from legged.terrain import Terrain
 
-DEPTH = 0.6
+SHOWN_DEPTH = 0.6
 """Ground that is shown below the lowest point [m]."""
 LOW, MIDDLE, HIGH = np.array([[0.42, 0.52, 0.58], [0.80, 0.77, 0.70], [0.78, 0.58, 0.42]])
 """Colours of the deepest, the level and the highest ground."""
@@ -34,7 +34,7 @@ def add_painted_terrain(scene: mujoco.MjSpec, terrain: Terrain, checkered: bool 
         material = scene.add_material(name=GROUND, specular=0.0, texuniform=True, texrepeat=[0.5 / SQUARE, 0.5 / SQUARE])
         material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = GROUND
         span = max(span, float(np.abs(terrain.height_map.corners).max()))
-    for geom in add_terrain(scene, terrain, collide=False, depth=DEPTH):
+    for geom in add_terrain(scene, terrain, collide=False, depth=SHOWN_DEPTH):
         _paint(scene, geom, span, terrain.height_map.cell if checkered else None)
 
 
@@ -49,8 +49,8 @@ def add_horizon(scene: mujoco.MjSpec, terrain: Terrain) -> None:
         ):
             scene.worldbody.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_BOX,
-                pos=[*place, -0.5 * DEPTH],
-                size=[*size, 0.5 * DEPTH],
+                pos=[*place, -0.5 * SHOWN_DEPTH],
+                size=[*size, 0.5 * SHOWN_DEPTH],
                 rgba=[*MIDDLE, 1.0],
                 material=GROUND,
                 contype=0,
@@ -64,17 +64,17 @@ def _paint(scene: mujoco.MjSpec, geom: mujoco.MjsGeom, span: float, cell: float 
     """
     if geom.type == mujoco.mjtGeom.mjGEOM_BOX:
         top = geom.pos[2] + geom.size[2]
-        geom.rgba = [*colour(np.array(top), span), 1.0]
+        geom.rgba = [*color(np.array(top), span), 1.0]
         if cell is not None and abs(top) < SAME:
             geom.material = GROUND
         return
     shape = scene.hfield(geom.hfieldname)
     heights = geom.pos[2] + shape.size[2] * np.array(shape.userdata).reshape(shape.nrow, shape.ncol)
-    colours = colour(heights, span)
+    colors = color(heights, span)
     if cell is not None:
         rows, columns = (np.arange(n) * cell // SQUARE for n in heights.shape)
-        colours = colours * np.where((rows[:, None] + columns) % 2 > 0, *CHECKER)[:, :, None]
-    pixels = (255 * colours).astype(np.uint8)
+        colors = colors * np.where((rows[:, None] + columns) % 2 > 0, *CHECKER)[:, :, None]
+    pixels = (255 * colors).astype(np.uint8)
     scene.add_texture(
         name=geom.name,
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -88,7 +88,7 @@ def _paint(scene: mujoco.MjSpec, geom: mujoco.MjsGeom, span: float, cell: float 
     geom.material = geom.name
 
 
-def colour(heights: np.ndarray, span: float = LEVEL_RANGE) -> np.ndarray:
-    """(..., 3) colours between 0 and 1 of heights [m], which change up and down to `span` [m]."""
+def color(heights: np.ndarray, span: float = LEVEL_RANGE) -> np.ndarray:
+    """Return (..., 3) colours between 0 and 1 of heights [m], which change up and down to `span` [m]."""
     t = np.clip(heights / span, -1.0, 1.0)
     return np.stack([np.interp(t, (-1.0, 0.0, 1.0), stops) for stops in np.array([LOW, MIDDLE, HIGH]).T], axis=-1)

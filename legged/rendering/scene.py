@@ -13,7 +13,7 @@ from legged.terrain import Terrain
 
 
 def add_sky(scene: mujoco.MjSpec) -> None:
-    """A pale blue sky, white at the horizon."""
+    """Add a pale blue sky, white at the horizon."""
     scene.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -26,7 +26,7 @@ def add_sky(scene: mujoco.MjSpec) -> None:
 
 
 def display_model(robot: Robot, count: int, width: int, height: int, terrain: Terrain | None = None) -> mujoco.MjModel:
-    """`count` copies of the robot over one checkered floor, or a terrain, under a sky; for drawing, not for simulating."""
+    """Compile `count` copies of the robot over one checkered floor, or a terrain, under a sky; it is drawn, not simulated."""
     scene = mujoco.MjSpec()
     scene.visual.global_.offwidth, scene.visual.global_.offheight = width, height
     scene.visual.quality.shadowsize = scene.visual.quality.offsamples = 0  # ten times faster without a GPU
@@ -41,14 +41,19 @@ def display_model(robot: Robot, count: int, width: int, height: int, terrain: Te
         add_horizon(scene, terrain)
         # Little light from the camera and much from the left behind it: treads, risers and flanks differ.
         _light(scene, [0.3, -0.35, -0.9], ambient=0.42, headlight=0.12, sun=0.62)
-    for i in range(count):
-        frame = scene.worldbody.add_frame()
-        scene.attach(mujoco.MjSpec.from_file(str(robot.model_path)), prefix=f"{i}/", frame=frame)
+    add_robots(scene, robot, count)
     return scene.compile()
 
 
+def add_robots(scene: mujoco.MjSpec, robot: Robot, count: int) -> None:
+    """Add copies of the robot, whose names begin with 0/, 1/, ..."""
+    for i in range(count):
+        frame = scene.worldbody.add_frame()
+        scene.attach(mujoco.MjSpec.from_file(str(robot.model_path)), prefix=f"{i}/", frame=frame)
+
+
 def make_renderer(model: mujoco.MjModel, width: int, height: int, instead: str = "") -> mujoco.Renderer:
-    """What draws a model.
+    """Return what draws a model.
 
     Raises:
         RunError: nothing can be drawn on this machine; `instead` is what the user might do then.
@@ -58,7 +63,7 @@ def make_renderer(model: mujoco.MjModel, width: int, height: int, instead: str =
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # glfw warns, and then fails
             return mujoco.Renderer(model, height, width, max_geom=model.ngeom + 1000)
-    except Exception as error:  # each GL back-end fails in its own way
+    except Exception as error:  # each GL library fails in its own way
         raise RunError(
             f"cannot render here ({error}); without a display MUJOCO_GL=egl or MUJOCO_GL=osmesa and their libraries are"
             f" needed{instead}"
@@ -66,7 +71,7 @@ def make_renderer(model: mujoco.MjModel, width: int, height: int, instead: str =
 
 
 def _add_floor(scene: mujoco.MjSpec) -> None:
-    """A checkered plane."""
+    """Add a checkered plane."""
     scene.add_texture(
         name="checker",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -82,6 +87,6 @@ def _add_floor(scene: mujoco.MjSpec) -> None:
 
 
 def _light(scene: mujoco.MjSpec, direction: Sequence[float], ambient: float, headlight: float, sun: float) -> None:
-    """A sun that shines in a direction, and a light at the camera."""
+    """Add a sun that shines in a direction, and a light at the camera."""
     scene.visual.headlight.ambient, scene.visual.headlight.diffuse = [ambient] * 3, [headlight] * 3
     scene.worldbody.add_light(pos=[0, 0, 20], dir=direction, type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, diffuse=[sun] * 3)

@@ -10,7 +10,7 @@ from legged.robots.robot import Robot
 
 @dataclass(frozen=True)
 class RobotSize:
-    """Of the upright box around a robot in its default pose: ANYmal C's is 1.04 m long and 0.77 m high."""
+    """The upright box around a robot in its default pose: ANYmal C's is 1.04 m long and 0.77 m high."""
 
     longest: float
     """Its longest side [m]."""
@@ -21,9 +21,16 @@ class RobotSize:
 def size_of(robot: Robot) -> RobotSize:
     """Measure the shapes of a robot, seen or touched."""
     model = mujoco.MjModel.from_xml_path(str(robot.model_path))
+    qpos = np.zeros(model.nq)
+    qpos[3:7] = [1.0, 0.0, 0.0, 0.0]
+    qpos[7 : 7 + robot.num_dof] = robot.default_dof_pos
+    return size_of_model(model, qpos)
+
+
+def size_of_model(model: mujoco.MjModel, qpos: np.ndarray) -> RobotSize:
+    """Measure the shapes of all bodies of a model but its world, at the positions `qpos` (nq,)."""
     data = mujoco.MjData(model)
-    data.qpos[3:7] = [1.0, 0.0, 0.0, 0.0]
-    data.qpos[7 : 7 + robot.num_dof] = robot.default_dof_pos
+    data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
     own = [i for i in range(model.ngeom) if model.geom_bodyid[i] > 0 and model.geom_type[i] != mujoco.mjtGeom.mjGEOM_PLANE]
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)

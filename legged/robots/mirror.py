@@ -25,8 +25,8 @@ class Mirror:
 
     @classmethod
     def of(cls, model: mujoco.MjModel, joints: Sequence[int], feet: Sequence[str]) -> "Mirror | None":
-        """That of a robot with the hinges `joints` (ids) and the shapes `feet`, by where they are at zero angles; None if
-        some have no partner.
+        """Return the symmetry of a robot with the hinges `joints` (ids) and the shapes `feet`, by where they are at zero
+        angles; None if some have no partner.
         """
         data = mujoco.MjData(model)
         data.qpos[:] = 0.0
@@ -45,7 +45,7 @@ class Mirror:
 
 
 def _partners(places: np.ndarray, reflected: np.ndarray) -> list[int] | None:
-    """For each row of `places` the row of `reflected` that lies there; None if one has none."""
+    """Return for each row of `places` the row of `reflected` that lies there; None if one has none."""
     distance = np.linalg.norm(places[:, None] - reflected[None], axis=2)
     if distance.size == 0 or (distance.min(axis=1) > APART).any():
         return None

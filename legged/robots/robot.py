@@ -83,12 +83,14 @@ class Robot:
         return self.folder / self.file.model
 
     def gains(self, table: Mapping[str, float], where: str) -> np.ndarray:
-        """(D,) values of a pattern table; ConfigError for a pattern without joint or a joint without pattern."""
+        """Return the values (D,) of a pattern table; raise ConfigError for a pattern without joint or a joint without
+        pattern.
+        """
         return match_values(table, self.joint_names, where)
 
 
 def load_robot(name: str, where: str = "robot") -> Robot:
-    """The robot of that name under resources/robots/, or in the folder `name`; `where` says who asks for it.
+    """Return the robot of that name under resources/robots/, or in the folder `name`; `where` says who asks for it.
 
     Raises:
         ConfigError: no such robot, or robot.yaml and model do not fit together.
@@ -138,7 +140,7 @@ def _folder(name: str, where: str) -> Path:
 
 
 def match_names(patterns: Sequence[str], names: Sequence[str], where: str) -> tuple[int, ...]:
-    """Indices of the names that contain any of the patterns, in the order of `names`."""
+    """Return the indices of the names that contain any of the patterns, in the order of `names`."""
     for pattern in patterns:
         if not pattern:
             raise ConfigError(f"{where}: an empty pattern would match everything{suggest(pattern, names, 'names')}")
@@ -148,7 +150,7 @@ def match_names(patterns: Sequence[str], names: Sequence[str], where: str) -> tu
 
 
 def match_values(table: Mapping[str, float], names: Sequence[str], where: str) -> np.ndarray:
-    """(len(names),) the value of the longest pattern that each name contains.
+    """Return the value of the longest pattern that each name contains, (len(names),).
 
     Raises:
         ConfigError: a pattern that no name contains, or a name without pattern.

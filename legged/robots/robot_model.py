@@ -1,4 +1,4 @@
-"""A robot's MJCF: read, and held against what the back-ends rely on."""
+"""A robot's MJCF: read, and held against what engines rely on."""
 
 import contextlib
 import re
@@ -22,7 +22,7 @@ NUMBERS = ("qpos0", "qpos_spring", "body_", "jnt_", "dof_", "geom_", "site_", "a
 
 
 def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
-    """The model in `file` in `folder`; `where` says who names it.
+    """Return the model in `file` in `folder`; `where` says who names it.
 
     Raises:
         ConfigError: there is no such file, MuJoCo refuses it, or it holds numbers that are not finite.
@@ -65,7 +65,7 @@ def _warnings_to(warnings: list[str]) -> Iterator[None]:
 
 
 def check_model(model: mujoco.MjModel, base: str, where: str) -> None:
-    """What the back-ends rely on: one free base, then the hinges; one motor a hinge, in the same order; named shapes.
+    """Check what engines rely on: one free base, then the hinges; one motor a hinge, in the same order; named shapes.
 
     Raises:
         ConfigError: `where` and what is not so.
@@ -90,12 +90,12 @@ def check_model(model: mujoco.MjModel, base: str, where: str) -> None:
 
 
 def base_mass(model: mujoco.MjModel, base: str) -> float:
-    """Mass of the floating body [kg]."""
+    """Return the mass of the floating body [kg]."""
     return float(model.body(base).mass[0])
 
 
 def hinges(model: mujoco.MjModel) -> list[int]:
-    """Ids of the hinge joints."""
+    """Return the ids of the hinge joints."""
     return [i for i in range(model.njnt) if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE]
 
 
@@ -116,7 +116,7 @@ def _check_tree(model: mujoco.MjModel, base: str, where: str) -> None:
 
 
 def _check_motors(model: mujoco.MjModel, where: str) -> None:
-    """The task computes torques of the joints, so actuators must pass them on as they are."""
+    """Check that actuators pass on torques as they are, because the task computes those of the joints."""
     names = tuple(model.joint(i).name for i in hinges(model))
     on_joints = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
     driven = tuple(model.joint(model.actuator_trnid[i, 0]).name if on_joints[i] else "no joint" for i in range(model.nu))
@@ -129,7 +129,7 @@ def _check_motors(model: mujoco.MjModel, where: str) -> None:
 
 
 def _why_no_torque_motor(model: mujoco.MjModel, i: int) -> str:
-    """Why an actuator does not pass on a torque as it is; '' if it does."""
+    """Return why an actuator does not pass on a torque as it is; '' if it does."""
     gain, bias, dynamics = model.actuator_gaintype[i], model.actuator_biastype[i], model.actuator_dyntype[i]
     if (
         gain != mujoco.mjtGain.mjGAIN_FIXED
@@ -144,12 +144,12 @@ def _why_no_torque_motor(model: mujoco.MjModel, i: int) -> str:
 
 
 def _first(values: Sequence[float]) -> float:
-    """The first of some numbers, if the others are 0; else NaN."""
+    """Return the first of some numbers, if the others are 0; else NaN."""
     return float(values[0]) if not np.any(values[1:]) else float("nan")
 
 
 def _why_no_torque_limit(model: mujoco.MjModel, i: int) -> str:
-    """Why an actuator's range of forces is no torque limit; '' if it is one."""
+    """Return why an actuator's range of forces is no torque limit; '' if it is one."""
     low, high = model.actuator_forcerange[i]
     if not model.actuator_forcelimited[i]:
         return "has no limit: every motor needs a forcerange (the torque limit)"

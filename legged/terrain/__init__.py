@@ -1,7 +1,18 @@
 """Rough ground: tile generators, one height map, and how it is sampled."""
 
-from legged.terrain.generators import TERRAIN_TYPES
+from legged.terrain.generators import BUMPS, TERRAIN_TYPES, terrain_type, terrain_types
 from legged.terrain.height_map import HeightMap
-from legged.terrain.terrain import Terrain, TileSpec, check_terrain
+from legged.terrain.terrain import Terrain, TileSpec, check_terrain, hardest_difficulty, tile_size
 
-__all__ = ["TERRAIN_TYPES", "HeightMap", "Terrain", "TileSpec", "check_terrain"]
+__all__ = [
+    "BUMPS",
+    "TERRAIN_TYPES",
+    "HeightMap",
+    "Terrain",
+    "TileSpec",
+    "check_terrain",
+    "hardest_difficulty",
+    "terrain_type",
+    "terrain_types",
+    "tile_size",
+]

@@ -10,6 +10,8 @@ from math import atan, degrees, radians, tan
 
 import numpy as np
 
+from legged.errors import ConfigError, suggest
+
 HOLE_DEPTH = 1.0
 """Depth of gaps and of the space between stepping stones: more than a leg's length [m]."""
 TREAD = 0.31
@@ -20,6 +22,10 @@ JOINT = 0.1
 """Gap between two stepping stones [m]."""
 WAVE = 2.0
 """Length of a wave [m]."""
+BUMPS = 0.05
+"""Largest height and depth of the bumps of rough ground [m]."""
+LEDGE = 1.0
+"""How far a single step goes on before it goes down again [m]."""
 NARROWEST_DITCH = 0.5
 """Cells must not be larger than this for a ditch whose width grows to 1 m [m]."""
 
@@ -35,16 +41,16 @@ class Tile:
     """Source of all randomness of the tile."""
 
     def cells(self, metres: float) -> int:
-        """A length in whole cells."""
+        """Return a length in whole cells."""
         return int(metres / self.cell + 1e-6)
 
     def from_centre(self) -> np.ndarray:
-        """(length, width) distance of each cell's centre from the tile's, as the larger of |x| and |y| [m]."""
+        """Return (length, width) the distance of each cell's centre from the tile's, as the larger of |x| and |y| [m]."""
         x, y = (np.abs(np.arange(n) - 0.5 * (n - 1)) * self.cell for n in self.heights.shape)
         return np.maximum(x[:, None], y[None, :])
 
     def middle(self, side: float) -> tuple[slice, slice]:
-        """The cells of a square of that side [m] in the middle, or what of it is on the tile."""
+        """Return the cells of a square of that side [m] in the middle, or what of it is on the tile."""
         spans = []
         for n in self.heights.shape:
             first = max(0, (n - self.cells(side)) // 2)
@@ -53,20 +59,20 @@ class Tile:
 
 
 def slope(tile: Tile, degrees_up: float, platform: float = 3.0) -> None:
-    """A pyramid with a flat top (or, for a negative angle, bottom) and its foot at the tile's edge."""
+    """Make a pyramid with a flat top (or, for a negative angle, bottom) and its foot at the tile's edge."""
     distance = 0.5 * min(tile.heights.shape) * tile.cell - tile.from_centre()
     edge = 0.5 * (min(tile.heights.shape) * tile.cell - platform)
     tile.heights[:] = tan(radians(degrees_up)) * np.clip(distance, 0.0, edge)
 
 
 def rough_slope(tile: Tile, degrees_up: float, platform: float = 3.0) -> None:
-    """A pyramid with bumps of up to 5 cm, in steps of 5 mm, drawn every 0.2 m and joined by straight lines."""
+    """Make a pyramid with bumps, in steps of 5 mm, drawn every 0.2 m and joined by straight lines."""
     slope(tile, degrees_up, platform)
-    tile.heights[:] += bumps(tile, 0.05)
+    tile.heights[:] += bumps(tile, BUMPS)
 
 
 def bumps(tile: Tile, amplitude: float, step: float = 0.005, spacing: float = 0.2) -> np.ndarray:
-    """(length, width) heights of rough ground: U(-amplitude, amplitude) on a coarse lattice, linear in between."""
+    """Return (length, width) heights of rough ground: U(-amplitude, amplitude) on a coarse lattice, linear in between."""
     levels = np.arange(-amplitude, amplitude + 0.5 * step, step)
     every = max(1, tile.cells(spacing))
     counts = [n // every + 2 for n in tile.heights.shape]
@@ -77,7 +83,7 @@ def bumps(tile: Tile, amplitude: float, step: float = 0.005, spacing: float = 0.
 
 
 def stairs(tile: Tile, riser: float, platform: float = 3.0, tread: float = TREAD) -> None:
-    """Rings of steps up to a platform in the middle (down, for a negative riser). The tread is cut to whole cells."""
+    """Make rings of steps up to a platform in the middle (down, for a negative riser). The tread is cut to whole cells."""
     width, across = max(1, tile.cells(tread)), tile.cells(platform)
     first = 0
     while min(tile.heights.shape) - 2 * first > across:
@@ -85,8 +91,15 @@ def stairs(tile: Tile, riser: float, platform: float = 3.0, tread: float = TREAD
         tile.heights[first : tile.heights.shape[0] - first, first : tile.heights.shape[1] - first] += riser
 
 
+def step(tile: Tile, height: float, platform: float = 3.0, ledge: float = LEDGE) -> None:
+    """Make one step up, all around the platform, and one down behind it."""
+    outer, inner = tile.middle(platform + 2.0 * max(1, tile.cells(ledge)) * tile.cell), tile.middle(platform)
+    tile.heights[outer] = height
+    tile.heights[inner] = 0.0
+
+
 def obstacles(tile: Tile, height: float, platform: float = 3.0, count: int = 20) -> None:
-    """Rectangular blocks and pits of 1 to 2 m, as high or deep as `height` or half of it, anywhere but in the middle."""
+    """Make rectangular blocks and pits of 1 to 2 m, as high or deep as `height` or half of it, anywhere but in the middle."""
     rows, columns = tile.heights.shape
     sides = [max(1, tile.cells(0.1 * tenths)) for tenths in range(10, 20, 4)]
     for _ in range(count):
@@ -98,7 +111,7 @@ def obstacles(tile: Tile, height: float, platform: float = 3.0, count: int = 20)
 
 
 def stepping_stones(tile: Tile, stone: float, platform: float = 4.0, gap: float = JOINT) -> None:
-    """Square stones of side `stone`, in rows shifted against each other, with gaps around them."""
+    """Make square stones of side `stone`, in rows shifted against each other, with gaps around them."""
     side, between = max(1, tile.cells(stone)), max(1, tile.cells(gap))
     rows, columns = tile.heights.shape
     tile.heights[:] = -HOLE_DEPTH
@@ -109,18 +122,18 @@ def stepping_stones(tile: Tile, stone: float, platform: float = 4.0, gap: float 
 
 
 def gap(tile: Tile, width: float, platform: float = 3.0) -> None:
-    """A ditch around the platform."""
+    """Make a ditch around the platform."""
     tile.heights[tile.middle(platform + 2.0 * tile.cells(width) * tile.cell)] = -HOLE_DEPTH
     tile.heights[tile.middle(platform)] = 0.0
 
 
 def pit(tile: Tile, depth: float, platform: float = 4.0) -> None:
-    """A square hole in which robots start."""
+    """Make a square hole in which robots start."""
     tile.heights[tile.middle(platform)] = -depth
 
 
 def waves(tile: Tile, amplitude: float, length: float = WAVE) -> None:
-    """Sine waves in both directions, level at the tile's edge: heights from -amplitude to amplitude."""
+    """Make sine waves in both directions, level at the tile's edge: heights from -amplitude to amplitude."""
     x, y = ((np.arange(n) + 0.5) * tile.cell for n in tile.heights.shape)
     pattern = np.sin(2.0 * np.pi * x[:, None] / length) + np.sin(2.0 * np.pi * y[None, :] / length)
     fade = np.clip((0.5 * min(tile.heights.shape) * tile.cell - tile.from_centre()) / (0.5 * length), 0.0, 1.0)
@@ -128,7 +141,7 @@ def waves(tile: Tile, amplitude: float, length: float = WAVE) -> None:
 
 
 def flat(tile: Tile, size: float = 0.0) -> None:
-    """Level ground, however difficult."""
+    """Leave the ground level, however difficult."""
 
 
 @dataclass(frozen=True)
@@ -144,14 +157,23 @@ class TerrainType:
     """What the size measures."""
     stepped: bool
     """Made of steps with vertical faces, not of slopes."""
+    regular: bool = True
+    """All tiles of a size are the same: nothing in them is drawn at random."""
     platform: float = 3.0
     """Side of the level square in the middle [m]."""
     finest: tuple[float, str] | None = None
     """Length of the smallest part that a tile is made of [m], and its name; cells must not be larger."""
 
+    def text(self, *sizes: float) -> str:
+        """Return sizes in words, to three digits and whole degrees: '0.194 m', '11 to 18 degrees'."""
+        return f"{' to '.join(f'{size:.0f}' if self.unit == DEGREES else f'{size:.3g}' for size in sizes)} {self.unit}"
+
+
+DEGREES = "degrees"
+
 
 def _angle(difficulty: float) -> float:
-    """Rise over run 0.4 * difficulty, as an angle [degrees]."""
+    """Return the angle of a rise over run of 0.4 * difficulty [degrees]."""
     return degrees(atan(0.4 * difficulty))
 
 
@@ -160,25 +182,30 @@ def _riser(difficulty: float) -> float:
 
 
 OF_WAVES, OF_STAIRS = (WAVE / 4, "quarter of a wave"), (TREAD, "tread of a step")
+OF_LEDGE = (LEDGE, "ledge of a step")
 OF_BLOCKS, OF_STONES = (SMALLEST_BLOCK, "side of a block"), (JOINT, "gap between two stones")
 OF_DITCH = (NARROWEST_DITCH, "width of a ditch")
 
 TERRAIN_TYPES: dict[str, TerrainType] = {
     "flat": TerrainType(flat, lambda d: 0.0, "m", "height", stepped=False, platform=0.0),
-    "slope_up": TerrainType(lambda t, s: slope(t, -s), _angle, "degrees", "angle", stepped=False),
-    "slope_down": TerrainType(slope, _angle, "degrees", "angle", stepped=False),
-    "rough_slope_up": TerrainType(lambda t, s: rough_slope(t, -s), _angle, "degrees", "angle", stepped=False),
-    "rough_slope_down": TerrainType(rough_slope, _angle, "degrees", "angle", stepped=False),
+    "slope_up": TerrainType(lambda t, s: slope(t, -s), _angle, DEGREES, "angle", stepped=False),
+    "slope_down": TerrainType(slope, _angle, DEGREES, "angle", stepped=False),
+    "rough_slope_up": TerrainType(lambda t, s: rough_slope(t, -s), _angle, DEGREES, "angle", stepped=False, regular=False),
+    "rough_slope_down": TerrainType(rough_slope, _angle, DEGREES, "angle", stepped=False, regular=False),
     "waves": TerrainType(waves, lambda d: 0.2 * d, "m", "amplitude", stepped=False, platform=0.0, finest=OF_WAVES),
     "stairs_up": TerrainType(lambda t, s: stairs(t, -s), _riser, "m", "step height", stepped=True, finest=OF_STAIRS),
     "stairs_down": TerrainType(stairs, _riser, "m", "step height", stepped=True, finest=OF_STAIRS),
-    "obstacles": TerrainType(obstacles, lambda d: 0.05 + 0.2 * d, "m", "height", stepped=True, finest=OF_BLOCKS),
+    "step": TerrainType(step, _riser, "m", "height", stepped=True, platform=3.0 + 2.0 * LEDGE, finest=OF_LEDGE),
+    "obstacles": TerrainType(
+        obstacles, lambda d: 0.05 + 0.2 * d, "m", "height", stepped=True, regular=False, finest=OF_BLOCKS
+    ),
     "stepping_stones": TerrainType(
         stepping_stones,
         lambda d: 1.5 * (1.05 - d),
         "m",
         "stone size",
         stepped=True,
+        regular=False,
         platform=4.0,
         finest=OF_STONES,
     ),
@@ -186,3 +213,28 @@ TERRAIN_TYPES: dict[str, TerrainType] = {
     "pit": TerrainType(pit, lambda d: 1.0 * d, "m", "depth", stepped=True, platform=4.0),
 }
 """Every type, by the name under which `terrain.proportions` asks for it."""
+
+
+def terrain_type(name: str, where: str) -> TerrainType:
+    """Return the type of that name; `where` says who asks for it, in the error.
+
+    Raises:
+        ConfigError: there is none of that name.
+    """
+    if name not in TERRAIN_TYPES:
+        raise ConfigError(f"{where}: there is no terrain type '{name}'{suggest(name, TERRAIN_TYPES)}")
+    return TERRAIN_TYPES[name]
+
+
+def terrain_types(flag: str, text: str) -> list[str]:
+    """Return the names in a comma-separated list that was given to `flag`: 'gap, pit' -> ['gap', 'pit'].
+
+    Raises:
+        ConfigError: one of them is no type, or comes twice.
+    """
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        terrain_type(name, flag)
+        if names.count(name) > 1:
+            raise ConfigError(f"{flag}: '{name}' is given twice")
+    return names

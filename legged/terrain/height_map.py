@@ -35,17 +35,17 @@ class HeightMap:
 
     @property
     def size(self) -> tuple[float, float]:
-        """Extent along x and y [m]."""
+        """Return the extent along x and y [m]."""
         return self.heights.shape[0] * self.cell, self.heights.shape[1] * self.cell
 
     def index(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Cells that hold the world points, the nearest ones for points outside."""
+        """Return the cells that hold the world points, the nearest ones for points outside."""
         i = np.floor((np.asarray(x) - self.origin[0]) / self.cell).astype(int)
         j = np.floor((np.asarray(y) - self.origin[1]) / self.cell).astype(int)
         return np.clip(i, 0, self.heights.shape[0] - 1), np.clip(j, 0, self.heights.shape[1] - 1)
 
     def height_at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Exact height of the surface at world points [m]; on a vertical face, that of the cell on its far side."""
+        """Return the height of the surface at world points [m]; on a vertical face, that of the cell on its far side."""
         i, j = self.index(x, y)
         u = np.clip((np.asarray(x) - self.origin[0]) / self.cell - i, 0.0, 1.0)
         v = np.clip((np.asarray(y) - self.origin[1]) / self.cell - j, 0.0, 1.0)
@@ -55,7 +55,7 @@ class HeightMap:
         return low * (1.0 - v) + high * v
 
     def ceiling(self, reach: int) -> np.ndarray:
-        """(X, Y) float32: the highest corner among the cells at most `reach` away in x and y."""
+        """Return (X, Y) float32: the highest corner among the cells at most `reach` away in x and y."""
         top = self.corners.max(axis=2)
         for axis in (0, 1):
             padded = np.pad(top, [(reach, reach) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
@@ -64,15 +64,15 @@ class HeightMap:
         return top.astype(np.float32)
 
     def scan_map(self) -> np.ndarray:
-        """(X, Y) float32: for every cell the lowest of its own height and those of its next neighbours in x and y, which
-        is what legged_gym's height measurements return at a vertical face.
+        """Return (X, Y) float32: for every cell the lowest of its own height and those of its next neighbours in x and y,
+        which is what legged_gym's height measurements return at a vertical face.
         """
         heights = np.pad(self.heights, ((0, 1), (0, 1)), mode="edge")
         return np.minimum(np.minimum(heights[:-1, :-1], heights[1:, :-1]), heights[:-1, 1:]).astype(np.float32)
 
 
 def join(heights: np.ndarray, rise: np.ndarray) -> np.ndarray:
-    """(X, Y, 4) corners: at each lattice point, cells around it that are joined share the mean of their heights.
+    """Return (X, Y, 4) corners: at each lattice point, cells around it that are joined share the mean of their heights.
 
     Two neighbours are joined if they differ by no more than the smaller of their `rise` [m]; around a point, being
     joined passes on from neighbour to neighbour.

@@ -8,18 +8,20 @@ import numpy as np
 
 from legged.config.origins import Origins
 from legged.config.schema import TerrainConfig
-from legged.errors import ConfigError, suggest
-from legged.terrain.generators import TERRAIN_TYPES, Tile
+from legged.errors import ConfigError
+from legged.terrain.generators import TERRAIN_TYPES, Tile, terrain_type
 from legged.terrain.height_map import HeightMap
 
 SPAWN_SQUARE = 2.0
 """Robots start at the height of the highest point in a square of this side in the middle of their tile [m]."""
 EDGE = 1.0
 """Robots closer than this to the end of the map have left it [m]."""
+WITHOUT_CURRICULUM = (0.5, 0.75, 0.9)
+"""Difficulties of which each row of a terrain without a curriculum has one: those of the upper rows of ten."""
 MOST_TILES = 10_000
-"""Each of them is made and laid out by itself."""
+"""Largest number of tiles: each is made and laid out by itself."""
 MOST_CELLS = 2**24
-"""As many as float32 can number, which the height scan does."""
+"""Largest number of cells: as many as float32 can number, which the height scan does."""
 
 
 @dataclass(frozen=True)
@@ -47,19 +49,18 @@ class Terrain:
 
     @classmethod
     def build(cls, cfg: TerrainConfig, seed: int) -> "Terrain":
-        """The terrain of a training: columns are types by their proportions, rows get harder."""
+        """Build the terrain of a training: columns are types by their shares, rows get harder."""
         columns = column_types(cfg.proportions, cfg.num_cols)
         rng = np.random.default_rng(seed)
         rows = []
         for row in range(cfg.num_rows):
-            # Without a curriculum every row is as hard as the upper rows of one.
-            d = row / cfg.num_rows if cfg.curriculum else float(rng.choice([0.5, 0.75, 0.9]))
-            rows.append([TileSpec(name, TERRAIN_TYPES[name].size(d)) for name in columns])
+            d = row / cfg.num_rows if cfg.curriculum else float(rng.choice(WITHOUT_CURRICULUM))
+            rows.append([TileSpec(name, tile_size(cfg, name, d)) for name in columns])
         return cls.of_tiles(rows, cfg, rng)
 
     @classmethod
     def of_tiles(cls, rows: Sequence[Sequence[TileSpec]], cfg: TerrainConfig, rng: np.random.Generator) -> "Terrain":
-        """A terrain of the given tiles; of `cfg` only sizes and the slope threshold count."""
+        """Build a terrain of the given tiles; of `cfg` only sizes and the slope threshold count."""
         cell = cfg.horizontal_scale
         length, width, border = (round(x / cell) for x in (cfg.terrain_length, cfg.terrain_width, cfg.border_size))
         count = (len(rows), len(rows[0]))
@@ -92,18 +93,28 @@ class Terrain:
 
     @cached_property
     def type_names(self) -> tuple[str, ...]:
-        """The types there are, each once, in the order of the columns."""
+        """Return the types there are, each once, in the order of the columns."""
         return tuple(dict.fromkeys(self.types))
 
     @property
     def reach(self) -> tuple[float, float]:
-        """|x| and |y| beyond which a robot has left the map [m]."""
+        """Return |x| and |y| beyond which a robot has left the map [m]."""
         x, y = self.height_map.size
         return 0.5 * x - EDGE, 0.5 * y - EDGE
 
 
+def tile_size(cfg: TerrainConfig, name: str, difficulty: float) -> float:
+    """Return the size of a tile of the type `name` in a row of that difficulty, in the type's unit [m or degrees]."""
+    return cfg.sizes.get(name, TERRAIN_TYPES[name].size(difficulty))
+
+
+def hardest_difficulty(cfg: TerrainConfig) -> float:
+    """Return the difficulty of the hardest row that `Terrain.build` makes, 0 to 1."""
+    return (cfg.num_rows - 1) / cfg.num_rows if cfg.curriculum else max(WITHOUT_CURRICULUM)
+
+
 def column_types(proportions: dict[str, float], num_cols: int) -> list[str]:
-    """The type of each column: the one whose share of the unit interval holds the column's middle."""
+    """Return the type of each column: the one whose share of the unit interval holds the column's middle."""
     names = [name for name, share in proportions.items() if share > 0.0]
     ends = np.cumsum([proportions[name] for name in names])
     middles = (np.arange(num_cols) + 0.5) / num_cols
@@ -111,7 +122,7 @@ def column_types(proportions: dict[str, float], num_cols: int) -> list[str]:
 
 
 def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
-    """Everything that can be wrong with a terrain's configuration.
+    """Look for everything that can be wrong with a terrain's configuration.
 
     Raises:
         ConfigError: names the field, and who set it and what it does not fit, by the `origins` of the task's configuration.
@@ -127,14 +138,15 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
 
     for name, share in cfg.proportions.items():
         at = where(f"proportions.{name}")
-        if name not in TERRAIN_TYPES:
-            raise ConfigError(f"{at}: there is no terrain type '{name}'{suggest(name, TERRAIN_TYPES)}")
+        terrain_type(name, at)
         if share < 0.0:
             raise ConfigError(f"{at}: must be at least 0, got {share}")
     total = sum(cfg.proportions.values())
     if abs(total - 1.0) > 1e-6:
         listed = ", ".join(f"{name} {share:g}" for name, share in cfg.proportions.items())
         raise ConfigError(f"{where('proportions')}: must sum to 1, got {total:g} ({listed})")
+    for name in cfg.sizes:
+        terrain_type(name, where(f"sizes.{name}"))
     found = column_types(cfg.proportions, cfg.num_cols)
     for name, share in cfg.proportions.items():
         if share > 0.0 and name not in found:

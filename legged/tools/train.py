@@ -14,13 +14,14 @@ import torch
 from legged.commandline.arguments import (
     add_run_arguments,
     add_task_arguments,
-    import_and_check,
     overrides,
     pick_device,
+    register_given,
     settle_on,
 )
 from legged.commandline.command import EXIT_FAILED, run_main
 from legged.commandline.output import when_output_is_lost
+from legged.commandline.show import summary
 from legged.commandline.stopping import quiet_writers, stopping_on_signals
 from legged.config import TaskConfig, to_yaml
 from legged.errors import ConfigError, RunError
@@ -30,6 +31,7 @@ from legged.learning.distributed import RankLost, check_reachable
 from legged.learning.resume import resumed
 from legged.learning.run_folder import create_run, discard_run, experiment_folder, find_run
 from legged.learning.runner import Runner
+from legged.learning.transfer import transferred
 from legged.physics import engine_name, resolve_physics
 from legged.process.cores import available_cores
 from legged.process.paths import full_disk_in, ready_to_write, reason, relative
@@ -52,28 +54,34 @@ def _main(argv: list[str] | None) -> int:
     add_task_arguments(parser)
     add_run_arguments(parser)
     parser.add_argument("--resume", action="store_true", help="go on from a checkpoint, in a new run folder")
+    parser.add_argument("--transfer", action="store_true", help="begin with the networks of --load_run, also of another task")
     parser.add_argument("--run_name", help="appended to the run folder's name")
     parser.add_argument("--max_iterations", type=int, help="length of the whole training")
     parser.add_argument("--rl_device", help="device of the networks; that of the simulation by default")
     parser.add_argument("--runner", choices=["stock", "captured"], help="training loop (train.runner.loop)")
     parser.add_argument("--headless", action="store_true", help="accepted for legged_gym's sake: training draws nothing")
-    parser.add_argument("--show", action="store_true", help="print the full configuration and stop")
+    parser.add_argument(
+        "--show", action="store_true", help="print the full configuration, terms, actions and joints, and stop"
+    )
     args = parser.parse_intermixed_args(argv)
 
-    import_and_check(args)
+    register_given(args)
     device = pick_device(args.sim_device)
     rl_device = pick_device(args.rl_device, "--rl_device") if args.rl_device else device
     checkpoint: Path | None = None
     changed: list[str] = []
-    if args.resume or args.load_run or args.checkpoint is not None:
+    if args.transfer:
+        cfg, checkpoint = transferred(args, on_cpu=device.type == "cpu")
+    elif args.resume or args.load_run or args.checkpoint is not None:
         cfg, checkpoint, changed = resumed(args)
     else:
         cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
     resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics"))
     if args.show:
         print(to_yaml(cfg), end="")
+        print(*summary(cfg), sep="\n")
         return 0
-    if checkpoint:
+    if checkpoint and not args.transfer:
         print(f"going on with the settings of {relative(checkpoint.parent)}" + "".join(f"; {text}" for text in changed))
     settle_on(device)
     if Ranks.now().first:
@@ -97,10 +105,14 @@ def _train(
         ready_to_write(experiment_folder(cfg), ROOM_MB)
         print(describe(cfg, device), flush=True)
     task = make_task(cfg, device, graph=not args.no_graph)
+    if first and task.physics.why_library:
+        print(f"mujoco-warp's own launches: {task.physics.why_library}", flush=True)
     with Display(cfg.task) if first else contextlib.nullcontext() as display:
         kind = CapturedRunner if cfg.train.runner.loop == "captured" else Runner
         runner = kind(task, None, str(rl_device), display)
-        if checkpoint:
+        if checkpoint and args.transfer:
+            print(runner.transfer(str(checkpoint)), flush=True)
+        elif checkpoint:
             why_anew = runner.resume(str(checkpoint))
             how = f"all robots begin anew: {why_anew}" if why_anew else "robots and random numbers go on where they were"
             print(f"resumed {relative(checkpoint)} after iteration {runner.current_learning_iteration}; {how}", flush=True)

@@ -8,7 +8,7 @@ import argparse
 import sys
 import time
 
-from legged.commandline.arguments import add_task_arguments, import_and_check, overrides, pick_device, settle_on
+from legged.commandline.arguments import add_task_arguments, overrides, pick_device, register_given, settle_on
 from legged.commandline.command import run_main
 from legged.physics import kernel_cache, resolve_physics
 from legged.process.startup import STARTED_S
@@ -16,7 +16,7 @@ from legged.registry import make_task, task_config
 
 
 def main(argv: list[str] | None = None) -> int:
-    """The command; returns its exit code."""
+    """Run the command; return its exit code."""
     return run_main(_main, argv)
 
 
@@ -25,7 +25,7 @@ def _main(argv: list[str] | None) -> int:
     parser = argparse.ArgumentParser(prog="warmup", description=__doc__)
     add_task_arguments(parser)
     args = parser.parse_intermixed_args(argv)
-    import_and_check(args)
+    register_given(args)
     device = pick_device(args.sim_device)
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
     if resolve_physics(cfg.sim.physics, device) == "mujoco":

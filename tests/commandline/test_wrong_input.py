@@ -14,7 +14,9 @@ import legged.registry
 import legged.tools.train
 from legged.tools import benchmark, evaluate, play, train
 
-SMALLER = 'observations.actor=["base_ang_vel", "projected_gravity", "commands", "dof_pos", "dof_vel"]'  # 33 numbers
+SMALLER = (
+    'observations.groups.actor.terms=["base_ang_vel", "projected_gravity", "commands", "dof_pos", "dof_vel"]'  # 33 numbers
+)
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -95,11 +97,23 @@ def test_a_missing_task_and_an_unknown_flag(fails, main):
             "rewards.scales.torqes=-1",
             ("command line: rewards.scales.torqes", "no reward 'torqes'", "did you mean 'torques'?"),
         ),
-        ("observations.actor=[dof_poss]", ("command line: observations.actor", "'dof_poss'", "did you mean 'dof_pos'?")),
-        ("observations.critic=[dof_poss]", ("command line: observations.critic", "did you mean 'dof_pos'?")),
+        (
+            "observations.groups.actor.terms=[dof_poss]",
+            ("command line: observations.groups.actor.terms", "'dof_poss'", "did you mean 'dof_pos'?"),
+        ),
+        (
+            "observations.groups.critic.terms=[dof_poss]",
+            ("command line: observations.groups.critic.terms", "did you mean 'dof_pos'?"),
+        ),
+        (
+            "observations.actor=[dof_poss]",
+            ("command line: observations.groups.actor.terms", "did you mean 'dof_pos'?"),
+        ),  # once
+        ("terminations.failures=[contacts]", ("terminations.failures", "termination 'contacts'", "did you mean 'contact'?")),
+        ("domain_rand.ranges.frictoin=[0, 1]", ("domain_rand.ranges.frictoin", "did you mean 'friction'?")),
         ("observations.scales.dof_poss=1", ("observations.scales", "did you mean 'dof_pos'?")),
         ("observations.noise.dof_poss=1", ("observations.noise", "did you mean 'dof_pos'?")),
-        ("observations.actor=[]", ("observations.actor",)),
+        ("observations.groups.actor.terms=[]", ("observations.groups.actor.terms",)),
         ("control.stiffness.XYZ=1", ("command line: control.stiffness", "'XYZ'", "LF_HAA")),
         ("control.stiffness.HAA=1", ("control.stiffness", "LF_HFE")),  # then no pattern is left for the other joints
         ("robot=anymal_x", ("command line: robot", "'anymal_x'", "did you mean 'anymal_c'?")),
@@ -164,7 +178,12 @@ def test_a_number_of_iterations_that_cannot_be(fails):
 
 @pytest.mark.parametrize("name", ["a\nb", "x" * 5000, "\x1b[31m"])
 def test_an_odd_name_is_still_one_line(fails, name):
-    err = fails(train.main, task(f"observations.actor=[{json.dumps(name)}]"), "observations.actor", "no observation")
+    err = fails(
+        train.main,
+        task(f"observations.groups.actor.terms=[{json.dumps(name)}]"),
+        "observations.groups.actor.terms",
+        "no observation",
+    )
     assert err.count("\n") == 1
     assert len(err) < 2100
     assert "\x1b" not in err

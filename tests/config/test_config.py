@@ -7,7 +7,7 @@ import yaml
 from helpers import TASK
 
 from legged import registry
-from legged.config import TaskConfig, from_dict, load_config, override, parse_override, to_dict, to_yaml
+from legged.config import LeggedConfig, TaskConfig, from_dict, load_config, override, parse_override, to_dict, to_yaml
 from legged.config.loader import read_yaml
 from legged.errors import ConfigError
 from legged.process.paths import data_folder
@@ -48,14 +48,14 @@ def test_maps_merge_over_the_parent_while_lists_and_scalars_replace(write):
         "parent",
         "robot: anymal_c\n"
         "rewards: {tracking_sigma: 0.5, scales: {torques: -0.1, lin_vel_z: -3.0}}\n"
-        "observations: {actor: [base_lin_vel, commands, dof_pos]}\n"
+        "observations: {groups: {actor: {terms: [base_lin_vel, commands, dof_pos]}}}\n"
         "domain_rand: {friction_range: [0.1, 0.2]}\n",
     )
     child = write(
         "child",
         "extends: parent\n"
         "rewards: {scales: {torques: -0.2}}\n"
-        "observations: {actor: [dof_vel]}\n"
+        "observations: {groups: {actor: {terms: [dof_vel]}}}\n"
         "domain_rand: {friction_range: [0.7, 0.9]}\n",
     )
     cfg = load_config(child, "child")
@@ -64,7 +64,8 @@ def test_maps_merge_over_the_parent_while_lists_and_scalars_replace(write):
     assert cfg.rewards.scales["torques"] == -0.2  # the child's
     assert cfg.rewards.scales["lin_vel_z"] == -3.0  # the parent's, beside it
     assert cfg.rewards.scales["action_rate"] == -0.01  # the schema's, below both
-    assert cfg.observations.actor == ("dof_vel",)
+    assert cfg.observations.groups["actor"].terms == ("dof_vel",)
+    assert cfg.observations.groups["actor"].noise
     assert cfg.domain_rand.friction_range == (0.7, 0.9)
 
 
@@ -229,8 +230,18 @@ def test_a_key_unlike_any_other_gets_no_suggestion_but_the_list(write):
         ("rewards: {scales: 3}", "rewards.scales", "expected a mapping, got 3"),
         ("rewards: 3", "rewards", "expected a mapping"),
         ("robot: 3", "robot", "expected text, got 3"),
-        ("observations: {actor: dof_pos}", "observations.actor", "expected a list, got 'dof_pos'"),
-        ("observations: {actor: [dof_pos, 3]}", "observations.actor[1]", "expected text, got 3"),
+        (
+            "observations: {groups: {actor: {terms: dof_pos}}}",
+            "observations.groups.actor.terms",
+            "expected a list, got 'dof_pos'",
+        ),
+        (
+            "observations: {groups: {actor: {terms: [dof_pos, 3]}}}",
+            "observations.groups.actor.terms[1]",
+            "expected text, got 3",
+        ),
+        ("observations: {groups: {actor: 3}}", "observations.groups.actor", "expected a mapping with keys of"),
+        ("observations: {groups: [actor]}", "observations.groups", "expected a mapping, got ['actor']"),
         ("domain_rand: {friction_range: [1]}", "domain_rand.friction_range", "expected a list of 2 numbers"),
         ("domain_rand: {friction_range: [a, 2]}", "domain_rand.friction_range[0]", "expected a number, got 'a'"),
         ("control: {control_type: X}", "control.control_type", "unknown value 'X'"),
@@ -299,8 +310,8 @@ def test_every_shipped_task_loads_names_what_exists_and_survives_a_round_trip(pa
     assert cfg.task == path.stem
     written = tmp_path / "config.yaml"
     written.write_text(to_yaml(cfg))
-    assert from_dict(read_yaml(written)) == cfg
-    assert from_dict(yaml.safe_load(to_yaml(cfg))) == cfg  # other readers of YAML understand it too
+    assert from_dict(read_yaml(written), schema=type(cfg)) == cfg
+    assert from_dict(yaml.safe_load(to_yaml(cfg)), schema=type(cfg)) == cfg  # other readers of YAML understand it too
 
 
 def test_the_round_trip_keeps_tiny_numbers_empty_maps_and_free_space():
@@ -318,7 +329,8 @@ def test_the_round_trip_keeps_tiny_numbers_empty_maps_and_free_space():
 
 
 def test_a_default_configuration_is_the_schema_s():
-    assert from_dict({}) == TaskConfig()
+    assert from_dict({}) == LeggedConfig()
+    assert from_dict({}, schema=TaskConfig) == TaskConfig()
     assert to_dict(TaskConfig())["env"] == {"num_envs": 4096, "episode_length_s": 20.0, "seed": 1}
     assert TaskConfig().dt == pytest.approx(0.02)
 

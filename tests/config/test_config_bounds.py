@@ -10,7 +10,7 @@ import pytest
 from helpers import TASK, small_config
 
 from legged import config
-from legged.config import TaskConfig, load_config, override
+from legged.config import LeggedConfig, load_config, override
 from legged.config.bounds import FLOAT32_MAX
 from legged.config.loader import nest
 from legged.errors import ConfigError
@@ -26,8 +26,11 @@ def fields_of(schema: type, prefix: str = "") -> dict[str, tuple[typing.Any, dat
     for field in dataclasses.fields(schema):
         if not field.compare:
             continue
+        entry = typing.get_args(hints[field.name])[1:]
         if dataclasses.is_dataclass(hints[field.name]):
             found |= fields_of(hints[field.name], f"{prefix}{field.name}.")
+        elif entry and dataclasses.is_dataclass(entry[0]):  # a map of sections
+            found |= fields_of(entry[0], f"{prefix}{field.name}.actor.")
         else:
             found[prefix + field.name] = hints[field.name], field
     return found
@@ -37,7 +40,7 @@ def numbers_in(kind: typing.Any) -> bool:
     return kind in (int, float) or any(numbers_in(part) for part in typing.get_args(kind))
 
 
-FIELDS = fields_of(TaskConfig)
+FIELDS = fields_of(LeggedConfig)
 NUMBERS = {path: found for path, found in FIELDS.items() if numbers_in(found[0])}
 
 
@@ -45,7 +48,8 @@ def holding(kind: typing.Any, number: float) -> tuple[str, typing.Any]:
     """(what follows the path in an error, the value of a field of that type) for one number in it."""
     origin = typing.get_origin(kind)
     if origin is dict:
-        return ".torques", {"torques": number}
+        at, value = holding(typing.get_args(kind)[1], number)
+        return f".torques{at}", {"torques": value}
     if origin is tuple:
         items = typing.get_args(kind)
         return "[0]", [number] if items[1] is Ellipsis else [number, number]
@@ -69,7 +73,7 @@ def test_every_number_has_finite_bounds_that_are_named(path):
         for number in (beyond, sign * 10**400):
             at, value = holding(kind, number)
             with pytest.raises(ConfigError) as error:
-                override(TaskConfig(), [(path, value)])
+                override(LeggedConfig(), [(path, value)])
             text = str(error.value)
             assert text.startswith(f"command line: {path}{at}: ")
             assert "got " in text
@@ -83,14 +87,14 @@ def test_every_number_has_finite_bounds_that_are_named(path):
 def test_no_number_may_be_infinite(path, number):
     at, value = holding(NUMBERS[path][0], number)
     with pytest.raises(ConfigError, match=path.replace(".", r"\.")) as error:
-        override(TaskConfig(), [(path, value)])
+        override(LeggedConfig(), [(path, value)])
     assert str(error.value).startswith(f"command line: {path}{at}: ")
 
 
 @pytest.mark.parametrize("value", [math.inf, math.nan, [1.0, {"a": -math.inf}], 10**400])
 def test_not_even_in_the_free_space(value):
     with pytest.raises(ConfigError, match=r"command line: custom\.mine: expected finite numbers"):
-        override(TaskConfig(), [("custom.mine", value)])
+        override(LeggedConfig(), [("custom.mine", value)])
 
 
 def test_bounds_leave_room():
@@ -108,7 +112,7 @@ def test_bounds_leave_room():
         ("control.stiffness.J", 20_000),
         ("terrain.measured_points_x", [0.01 * i for i in range(400)]),
     ]
-    cfg = override(TaskConfig(), generous)
+    cfg = override(LeggedConfig(), generous)
     assert cfg.env.num_envs == 262_144
     assert cfg.train.policy.actor_hidden_dims == (4096,) * 8
 
@@ -136,13 +140,13 @@ def test_every_field_says_what_it_means():
 
 @pytest.mark.parametrize("group", ["actor", "critic"])
 def test_an_observation_named_twice_is_refused(group):
-    with pytest.raises(ConfigError, match=rf"command line: observations\.{group}: 'dof_pos' is named twice"):
-        small_config((f"observations.{group}", ["dof_pos", "dof_vel", "dof_pos"]))
+    with pytest.raises(ConfigError, match=rf"command line: observations\.groups\.{group}\.terms: 'dof_pos' is named twice"):
+        small_config((f"observations.groups.{group}.terms", ["dof_pos", "dof_vel", "dof_pos"]))
 
 
 def test_a_list_must_not_be_endless():
     with pytest.raises(ConfigError, match=r"actor_hidden_dims: must have at most 64 items, got 65"):
-        override(TaskConfig(), [("train.policy.actor_hidden_dims", [8] * 65)])
+        override(LeggedConfig(), [("train.policy.actor_hidden_dims", [8] * 65)])
 
 
 @pytest.mark.parametrize("field", ["experiment_name", "run_name"])
@@ -214,7 +218,7 @@ def test_measuring_points_are_counted():
         (("rewards.scales", []), ("rewards.scales.torques", -1.0)),
         (("env.num_envs", "many"), ("env.num_envs", 4)),
         (("sim.dt", -1.0), ("sim.dt", 0.005)),
-        (("observations.actor", []), ("observations.actor", ["dof_pos"])),
+        (("observations.groups.actor.terms", []), ("observations.groups.actor.terms", ["dof_pos"])),
     ],
 )
 def test_a_later_override_hides_no_earlier_one(wrong, hiding):

@@ -82,7 +82,10 @@ def test_a_configuration_knows_its_origins_but_they_are_no_setting(mine):
             "rewards: {scales: {torqes: 1}}",
             "rewards.scales.torqes: LeggedRobot has no reward 'torqes'; did you mean 'torques'",
         ),
-        ("observations: {actor: [dof_poss]}", "observations.actor: LeggedRobot has no observation 'dof_poss'"),
+        (
+            "observations: {groups: {actor: {terms: [dof_poss]}}}",
+            "observations.groups.actor.terms: LeggedRobot has no observation 'dof_poss'",
+        ),
         ("observations: {noise: {dof_poss: 1}}", "observations.noise.dof_poss: LeggedRobot has no observation 'dof_poss'"),
         ("control: {stiffness: {XYZ: 1}}", "control.stiffness: pattern 'XYZ' matches nothing"),
         ("env: {episode_length_s: 0.001}", "env.episode_length_s: must be at least a control step of 0.02 s"),
@@ -138,7 +141,9 @@ def test_a_cpu_section_is_blamed_on_the_file_that_it_stands_in(mine):
 
 def test_an_item_of_a_list_is_blamed_on_who_gave_the_list(mine):
     mine("observations: {clip: 5.0}")
-    assert error_of(("observations.actor", ["dof_pos", 3])).startswith("command line: observations.actor[1]: expected text")
+    assert error_of(("observations.groups.actor.terms", ["dof_pos", 3])).startswith(
+        "command line: observations.groups.actor.terms[1]: expected text"
+    )
 
 
 def test_a_robot_s_own_gains_are_blamed_on_its_file(robot, tmp_path):

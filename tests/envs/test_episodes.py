@@ -245,7 +245,7 @@ def test_pushes_change_the_horizontal_velocity_only_and_are_seen_at_once():
         ("domain_rand.max_push_vel_xy", 1.0),
     ]
     task = standing(*settings)
-    task.randomization.push_time_left.copy_(torch.tensor([0.05, 50.0, 50.0, 50.0]))
+    task.pushes.push_time_left.copy_(torch.tensor([0.05, 50.0, 50.0, 50.0]))
     speeds = []
     for _ in range(4):
         observations, *_ = task.step(zero_actions(task))
@@ -261,7 +261,7 @@ def test_pushes_change_the_horizontal_velocity_only_and_are_seen_at_once():
 def test_a_reset_robot_is_not_pushed_out_of_its_initial_state():
     settings = [("domain_rand.push_robots", True), ("domain_rand.push_interval_s", 1.0), ("domain_rand.max_push_vel_xy", 3.0)]
     task = standing(*settings, ("env.episode_length_s", 0.02))
-    task.randomization.push_time_left.zero_()
+    task.pushes.push_time_left.zero_()
     task.step(zero_actions(task))
     assert task.reset_buf.all()
     assert (task.base_lin_vel == 0.0).all()

@@ -11,6 +11,7 @@ from rsl_rl.algorithms import PPO
 
 from legged.envs import LeggedRobot
 from legged.errors import RunError
+from legged.evaluation.learning_curves import read_scalars
 from legged.learning.ppo import DevicePPO
 from legged.learning.runner import Runner
 from legged.learning.step_guard import StepGuard
@@ -18,7 +19,6 @@ from legged.learning.watch import PATIENCE, FaultWatch
 from legged.mdp.faults import LARGEST, LARGEST_STATE
 from legged.registry import _REGISTERED, make_task, register, task_config
 from legged.tools import train
-from legged.tools.plot import read_scalars
 
 pytestmark = pytest.mark.usefixtures("workplace")
 NAN, INF = float("nan"), float("inf")

@@ -1,5 +1,6 @@
 """A method that nothing would call is an error which says what takes its place."""
 
+import dataclasses
 import functools
 
 import pytest
@@ -14,7 +15,6 @@ pytestmark = pytest.mark.usefixtures("workplace")
 
 LEGGED_GYM = [
     "_parse_cfg",
-    "_init_buffers",
     "_prepare_reward_function",
     "post_physics_step",
     "_post_physics_step_callback",
@@ -81,7 +81,7 @@ def test_no_hook_of_the_table_is_one_of_this_package():
 def test_what_the_table_names_is_there():
     """The methods, settings and files that take the place of a hook."""
     text = " ".join(HOOKS.values())
-    for method in ("_step", "check_termination", "compute_reward", "reset_idx", "make_terrain"):
+    for method in ("_step", "advance", "compute_reward", "reset_idx", "remember", "make_terrain"):
         assert method in text
         assert callable(getattr(LeggedRobot, method))
     cfg = small_config()
@@ -91,8 +91,8 @@ def test_what_the_table_names_is_there():
         "init_state.base_velocity",
         "control.control_type",
         "rewards.scales",
-        "observations.actor",
-        "observations.critic",
+        "terminations.failures",
+        "terminations.time_outs",
         "observations.noise",
         "observations.add_noise",
         "commands.ranges",
@@ -113,8 +113,8 @@ def test_hooks_of_a_class_between_and_of_a_mixin_are_found():
     between = subclass("Between", compute_observations=hook)
     with pytest.raises(ConfigError, match=r"Between\.compute_observations"):
         subclass("Last", (between,)).check(small_config())
-    mixin = type("Mixin", (), {"_init_buffers": hook})
-    with pytest.raises(ConfigError, match=r"Mixin\._init_buffers"):
+    mixin = type("Mixin", (), {"_create_envs": hook})
+    with pytest.raises(ConfigError, match=r"Mixin\._create_envs"):
         subclass("Last", (mixin, LeggedRobot)).check(small_config())
 
 
@@ -171,7 +171,8 @@ def with_term(member: object, prefix: str = "_reward_") -> None:
     if prefix == "_reward_":
         cfg.rewards.scales["mine"] = 1.0
     else:
-        object.__setattr__(cfg.observations, "actor", (*cfg.observations.actor, "mine"))
+        actor = cfg.observations.groups["actor"]
+        cfg.observations.groups["actor"] = dataclasses.replace(actor, terms=(*actor.terms, "mine"))
     mirrored = {**LeggedRobot.MIRRORED, "mine": "same"}
     subclass(**{f"{prefix}mine": member}, MIRRORED=mirrored).check(cfg)
 
@@ -189,7 +190,9 @@ def with_term(member: object, prefix: str = "_reward_") -> None:
     ],
     ids=str,
 )
-@pytest.mark.parametrize(("prefix", "path"), [("_reward_", r"rewards\.scales\.mine"), ("_obs_", r"observations\.actor")])
+@pytest.mark.parametrize(
+    ("prefix", "path"), [("_reward_", r"rewards\.scales\.mine"), ("_obs_", r"observations\.groups\.actor\.terms")]
+)
 def test_a_term_that_cannot_be_called_is_refused(member, text, prefix, path):
     with pytest.raises(ConfigError, match=rf"{path}: Mine\.{prefix}mine {text}"):
         with_term(member, prefix)

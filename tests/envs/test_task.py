@@ -1,6 +1,5 @@
 """The task on the C engine: observations, resets, terminations, and what rsl-rl relies on."""
 
-import math
 from typing import ClassVar
 
 import pytest
@@ -139,7 +138,7 @@ def addresses(task: LeggedRobot) -> dict[str, int]:
     """Of every tensor of the task and its parts."""
     owners = {
         "task": vars(task),
-        "state": vars(task.physics.state),
+        "state": vars(task.physics.robot_state),
         "physics": vars(task.physics),
         "rewards": vars(task.rewards),
         "contacts": vars(task.contacts),
@@ -147,7 +146,7 @@ def addresses(task: LeggedRobot) -> dict[str, int]:
         "commands": vars(task.command_sampler),
         "curriculum": vars(task.command_curriculum),
         "randomization": vars(task.randomization),
-        "statistics": vars(task.statistics),
+        "metrics": vars(task.metrics),
         **{name: vars(group) for name, group in task.observation_groups.items()},
     }
     return {
@@ -201,7 +200,7 @@ def test_the_log_comes_once_a_rollout_with_tensors_of_its_own():
             logs[step] = extras["log"]
     assert list(logs) == [6, 12, 18, 24]
     storages = [value.untyped_storage().data_ptr() for log in logs.values() for value in log.values()]
-    static = {task.statistics._steps.data_ptr(), task.statistics._episodes.data_ptr()}
+    static = {task.metrics._steps.data_ptr(), task.metrics._episodes.data_ptr()}
     assert not static & set(storages)
     assert all(value.shape == () for log in logs.values() for value in log.values())
     # One of five steps ends all episodes; the fourth rollout, steps 19 to 24, has one such step, after 5 steps of life.
@@ -316,7 +315,7 @@ def test_a_reward_that_waits_for_the_gpu_is_refused_by_name_on_a_machine_without
 
 
 def test_an_observation_that_indexes_by_a_mask_is_refused_by_name(register):
-    register("masks", {**BASE, "observations": {"actor": ["masks"]}}, Masks)
+    register("masks", {**BASE, "observations": {"groups": {"actor": {"terms": ["masks"]}}}}, Masks)
     with pytest.raises(TermError, match="_obs_masks: indexes by a mask"):
         make_task(registry.task_config("masks"))
 
@@ -329,4 +328,3 @@ def test_a_control_step_is_decimation_physics_steps():
     task.step(zero_actions(task))
     # In free fall from the spawn height the feet hang above the ground: 20 ms of gravity, moved a little by the legs.
     assert torch.allclose(task.physics._qvel[:, 2].float() - velocity, torch.tensor(-9.81 * 0.02), atol=0.15)
-    assert math.isclose(task.step_dt, 0.02)

@@ -138,15 +138,12 @@ def test_a_robot_that_walks_off_the_map_is_reset_and_not_blamed(task):
     """The map is 4 tiles of 8 m and a border of 4 m long: it ends at x = 20, and robots have left it at 19."""
     task.reset()
     assert task.terrain.reach == (19.0, 11.0)
-    states = task.physics.state
+    states = task.physics.robot_state
     place = states.base_pos.clone()
     place[2], place[3] = torch.tensor([19.2, 0.0, 0.6]), torch.tensor([0.0, -11.2, 0.6])
     place[4] = torch.tensor([18.8, 10.8, 0.6])
-    still = torch.zeros(8, 3)
     everyone = torch.ones(8, dtype=torch.bool)
-    task.physics.write_state(
-        everyone, place, states.base_quat.clone(), still, still, states.dof_pos.clone(), torch.zeros(8, 12)
-    )
+    task.physics.write(everyone, torch.cat([place, task.physics.qpos[:, 3:]], dim=1), torch.zeros(8, 18))
     _, _, dones, extras = task.step(zero_actions(task))
     assert dones.tolist() == [False, False, True, True, False, False, False, False]
     assert extras["time_outs"].tolist() == dones.tolist()

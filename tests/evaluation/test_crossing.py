@@ -38,13 +38,13 @@ def result(engine: str, **changes: float | None) -> dict:
 
 
 def test_all_engines_there_are_take_part():
-    names = [dict(choice) for choice in crossing.ENGINES]
-    assert [f"newton_{name['sim.solver']}" if "sim.solver" in name else name["sim.physics"] for name in names] == ENGINES
+    asked = [dict(engine.overrides) for engine in crossing.ENGINES.values()]
+    names = [f"newton_{one['sim.solver']}" if "sim.solver" in one else one["sim.physics"] for one in asked]
+    assert names == list(crossing.ENGINES) == ENGINES
 
 
 def test_the_command_measures_each_engine_and_writes_beside_the_checkpoint(run, capsys, monkeypatch):
-    chosen = [choice for choice in crossing.ENGINES if choice[-1] in (("sim.physics", "mujoco"), ("sim.solver", "mujoco"))]
-    assert len(chosen) == 2
+    chosen = {name: crossing.ENGINES[name] for name in ("mujoco", "newton_mujoco")}
     monkeypatch.setattr(crossing, "ENGINES", chosen)
     assert call(evaluate.main, ["--task", TASK, "--physics", "all", "--sim_device", "cpu", *GRID, "sim.threads=1"]) == 0
     out = capsys.readouterr().out
@@ -65,11 +65,11 @@ def test_an_engine_in_which_everybody_fell_is_shown_without_numbers(tmp_path, ca
     rows = [result("mujoco"), result("newton_xpbd", rmse_lin=None, rmse_ang=None, cost_of_transport=None, falls=1.0)]
     summary = {"task": TASK, "checkpoint": "m.pt", "grid": {"vx": [0], "vy": [0], "yaw": [0]}, "robots_per_cell": 2}
     summary["engines"] = rows
-    Console(width=110).print(crossing.report(summary))
+    Console(width=110).print(crossing.crossing_table(summary))
     line = next(line for line in capsys.readouterr().out.splitlines() if "newton_xpbd" in line)
     assert line.count("none") == 3
     assert "100.0 %" in line
-    crossing.plot(summary, tmp_path / "p.png")
+    crossing.draw_crossing(summary, tmp_path / "p.png")
     assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -11,17 +11,19 @@ from helpers import POLICY, TASK, call, kept_global_state, run_folders, small_co
 from legged import make_task
 from legged.config import override
 from legged.errors import RunError
-from legged.evaluation.velocity_grid import Grid, measure
+from legged.evaluation import crossing, following
+from legged.evaluation.velocity_grid import Grid, axis_values
+from legged.evaluation.velocity_tracking import measure_tracking
+from legged.play import schedule
 from legged.policies.restore import TrainedPolicy, undisturbed
 from legged.tools import evaluate, play
-from legged.tools.evaluate import axis_values
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
 
 def on_grid(grid: Grid, act=stand, *settings):
     changes = [*undisturbed(grid.num_envs, grid.hold_s), ("init_state.base_velocity", [0.0, 0.0]), *settings]
-    return measure(make_task(override(small_config(), changes)), act, grid)
+    return measure_tracking(make_task(override(small_config(), changes)), act, grid)
 
 
 # ---- the grid --------------------------------------------------------------------------------------------------------
@@ -85,7 +87,7 @@ def test_robots_that_are_made_to_fall_are_counted_and_measured_up_to_their_fall(
             task.physics._qpos[5:, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64)
         return stand(observations)
 
-    result = measure(task, topple, grid)
+    result = measure_tracking(task, topple, grid)
     assert [cell["falls"] for cell in result["cells"]] == [0.0, 0.75]
     assert result["falls"] == 0.375
     assert result["cells"][1]["rmse_lin"] == pytest.approx(0.5, abs=0.15)
@@ -165,7 +167,7 @@ SHORT = ((1.1, (0.5, 0.0, 0.0)), (1.1, (9.0, 0.0, 0.0)))  # the second is outsid
 
 
 def test_play_without_video_exports_and_prints_a_table(run, capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(play, "SCHEDULE", SHORT)
+    monkeypatch.setattr(schedule, "SCHEDULE", SHORT)
     arguments = [
         "--task",
         TASK,
@@ -201,7 +203,7 @@ def test_play_records_a_short_video_where_something_can_be_drawn(run, capsys, mo
         mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
     except Exception as error:
         pytest.skip(f"nothing can be rendered here: {error}")
-    monkeypatch.setattr(play, "SCHEDULE", SHORT[:1])
+    monkeypatch.setattr(schedule, "SCHEDULE", SHORT[:1])
     arguments = [
         "--task",
         TASK,
@@ -236,7 +238,7 @@ def test_evaluations_of_a_shipped_policy_do_not_touch_the_package(tmp_path):
         (["--vx=-1:1:1e-9"], "--vx: '-1:1:1e-9' makes 2,000,000,001 cells"),
         (["--vx=1e30"], "--vx: '1e30' asks for more than 20"),
         (["--robots", "100000000"], "125 cells x 100,000,000 robots are 12,500,000,000 robots"),
-        (["--robots-per-point", "99999999"], "--robots-per-point: at most 65,536"),
+        (["--robots-per-point", "99999999"], "--robots-per-point: must be at most 65,536, got 99,999,999"),
     ],
 )
 def test_grids_that_no_machine_holds_are_refused_with_their_size(options, words, capsys):
@@ -246,7 +248,8 @@ def test_grids_that_no_machine_holds_are_refused_with_their_size(options, words,
 
 def test_a_folder_that_cannot_be_written_is_found_before_anything_is_measured(tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("mine")
-    monkeypatch.setattr(evaluate, "ready_to_track", lambda *_, **__: pytest.fail("measured"))
+    for module in (following, crossing):
+        monkeypatch.setattr(module, "ready_to_track", lambda *_, **__: pytest.fail("measured"))
     arguments = ["--task", TASK, "--sim_device", "cpu", "--load_run", str(POLICY), "--out", str(tmp_path / "file")]
     for physics in ("mujoco", "all"):
         assert call(evaluate.main, [*arguments, "--physics", physics]) == 2
@@ -257,7 +260,7 @@ def test_a_disk_that_fills_up_meanwhile_costs_the_files_and_not_the_table(tmp_pa
     def full(path, _text):
         raise RunError(f"{path.name}: no space left on the disk")
 
-    monkeypatch.setattr(evaluate, "write_text", full)
+    monkeypatch.setattr(following, "write_text", full)
     grid = ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1", "--physics", "mujoco", "sim.threads=1"]
     arguments = ["--task", TASK, "--load_run", str(POLICY), "--out", str(tmp_path), *grid]
     assert call(evaluate.main, arguments) == 1

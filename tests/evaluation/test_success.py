@@ -10,22 +10,22 @@ from helpers import ENGINE, POLICY, small_config, stand
 
 from legged import make_task
 from legged.config import override
-from legged.evaluation import success
+from legged.evaluation import success, tiles
 from legged.evaluation.success import (
     FELL,
     OPEN,
     REACHED,
     STUCK,
     Scores,
-    on_terrain,
     point,
-    tiles,
     wilson,
 )
+from legged.evaluation.tiles import on_terrain, tiles_of_sizes
 from legged.learning.run_folder import find_checkpoint, run_config
 from legged.math import yaw_of
 from legged.policies.restore import TrainedPolicy, restore, undisturbed
 from legged.registry import task_config
+from legged.terrain import TERRAIN_TYPES
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -36,7 +36,7 @@ def task_on(name, sizes, num_envs, *settings, side=success.TILE, spawn_range=suc
     changes = [*on_terrain(cfg, side, spawn_range), ("init_state.base_velocity", [0.0, 0.0])]
     changes += [("commands.heading_command", True), ("init_state.yaw", [-math.pi, math.pi]), *settings]
     cfg = override(cfg, changes)
-    return make_task(cfg, terrain=tiles(name, sizes, cfg.terrain, 1))
+    return make_task(cfg, terrain=tiles_of_sizes(name, sizes, cfg.terrain, 1))
 
 
 # ---- the rules -------------------------------------------------------------------------------------------------------
@@ -135,7 +135,7 @@ def test_scripted_robots_on_a_real_task(monkeypatch):
             qpos[1, 0] += 4.5
         return stand(observations)
 
-    points, overflows = success.measure(task, script, [0.0, 0.0], 2)
+    points, overflows = success.measure_success(task, script, [0.0, 0.0], 2)
     assert steps == 50  # the whole second, for the last robot
     assert overflows == 0
     first, second = ({key: entry[key] for key in ("successes", "fell", "stuck")} for entry in points)
@@ -154,7 +154,7 @@ def test_it_stops_when_everyone_is_done():
         task.physics._qpos[:, 0] += 1.0
         return stand(observations)
 
-    (entry,), _ = success.measure(task, carry, [0.0], 2)
+    (entry,), _ = success.measure_success(task, carry, [0.0], 2)
     assert (entry["successes"], steps) == (2, 4)
 
 
@@ -173,7 +173,7 @@ def test_robots_stand_on_the_tile_of_their_point_and_are_asked_to_leave_it(monke
             task.physics._qpos[:, 3:7] = torch.stack([half.cos(), 0.0 * half, 0.0 * half, half.sin()], dim=1)
         return stand(observations)
 
-    points, _ = success.measure(task, watch, [0.05, 0.2], 8)
+    points, _ = success.measure_success(task, watch, [0.05, 0.2], 8)
     assert [entry["size"] for entry in points] == [0.05, 0.2]
     position, yaw, commands, observed = seen[0]
     # A platform of 3 m below nine treads of 0.3 m: 0.45 m and 1.8 m down.
@@ -196,7 +196,7 @@ def test_robots_stand_on_the_tile_of_their_point_and_are_asked_to_leave_it(monke
 
 
 def test_robots_are_shared_out_among_random_tiles(monkeypatch):
-    monkeypatch.setattr(success, "VARIANTS", 4)
+    monkeypatch.setattr(tiles, "VARIANTS", 4)
     task = task_on("obstacles", [0.1, 0.2], 12)
     success.place(task, 6)
     task.reset()
@@ -207,9 +207,9 @@ def test_robots_are_shared_out_among_random_tiles(monkeypatch):
 
 
 def test_tiles_are_apart_from_each_other_and_random_ones_differ(monkeypatch):
-    monkeypatch.setattr(success, "VARIANTS", 4)
+    monkeypatch.setattr(tiles, "VARIANTS", 4)
     cfg = override(small_config(), on_terrain(small_config(), 8.0, 0.1)).terrain
-    terrain = tiles("obstacles", [0.1, 0.3], cfg, seed=3)
+    terrain = tiles_of_sizes("obstacles", [0.1, 0.3], cfg, seed=3)
     heights, border = terrain.height_map.heights, 30
     assert heights.shape == (3 * 80 + 2 * border, 7 * 80 + 2 * border)
     at = [[heights[border + 80 * r :, border + 80 * c :][:80, :80] for c in range(7)] for r in range(3)]
@@ -218,10 +218,10 @@ def test_tiles_are_apart_from_each_other_and_random_ones_differ(monkeypatch):
             highest = (0.1 if r == 0 else 0.3) if r != 1 and c % 2 == 0 else 0.0
             assert abs(at[r][c]).max() == pytest.approx(highest)
     assert (at[0][0] != at[0][2]).any()
-    assert (tiles("obstacles", [0.1, 0.3], cfg, seed=3).height_map.heights == heights).all()
-    assert (tiles("obstacles", [0.1, 0.3], cfg, seed=4).height_map.heights != heights).any()
-    for name in success.REGULAR:  # one tile stands for all
-        two = [tiles(name, [0.1], cfg, seed=seed).height_map.heights for seed in (1, 2)]
+    assert (tiles_of_sizes("obstacles", [0.1, 0.3], cfg, seed=3).height_map.heights == heights).all()
+    assert (tiles_of_sizes("obstacles", [0.1, 0.3], cfg, seed=4).height_map.heights != heights).any()
+    for name in (name for name, kind in TERRAIN_TYPES.items() if kind.regular):  # one tile stands for all
+        two = [tiles_of_sizes(name, [0.1], cfg, seed=seed).height_map.heights for seed in (1, 2)]
         assert two[0].shape == (80 + 2 * border, 80 + 2 * border)
         assert (two[0] == two[1]).all()
 
@@ -230,7 +230,7 @@ def test_the_policy_sees_what_it_saw_in_training():
     """The same points, scales and noise; what is changed is the ground, not the observation."""
     cfg = task_config("anymal_c", [("env.num_envs", 2), *ENGINE], on_cpu=True)
     changed = override(cfg, [*undisturbed(2, 20.0), *on_terrain(cfg, 8.0, 0.1), ("observations.add_noise", True)])
-    task = make_task(changed, terrain=tiles("pit", [0.4], changed.terrain, 1))
+    task = make_task(changed, terrain=tiles_of_sizes("pit", [0.4], changed.terrain, 1))
     success.place(task, 2)
     seen = task.reset()
     heights = seen["critic"][:, 48:]
@@ -241,7 +241,7 @@ def test_the_policy_sees_what_it_saw_in_training():
     assert 0.4 < noise.abs().max() <= 0.501  # 5 times U(-0.1, 0.1)
 
 
-def test_configuration_of_the_sweep(monkeypatch):
+def test_configuration_of_the_tasks(monkeypatch, capsys):
     """As trained, but for the ground, the commands and what is switched off on purpose; the command line comes last."""
     cfg = task_config("anymal_c", [("observations.noise_level", 0.7), ("terrain.num_rows", 10), *ENGINE], on_cpu=True)
     found = []
@@ -252,16 +252,16 @@ def test_configuration_of_the_sweep(monkeypatch):
 
     monkeypatch.setattr(success, "_on_type", fake)
     policy = TrainedPolicy(cfg, Path("model_0.pt"))
-    lines = []
     names, asked = ["stairs_up", "pit"], [("sim.threads", 2)]
-    result = success.sweep(policy, names, 5, False, asked, torch.device("cpu"), tell=lines.append)
+    result = success.success_over_difficulty(policy, names, 5, False, asked, torch.device("cpu"))
+    lines = capsys.readouterr().out.splitlines()
     assert lines == ["stairs_up: 6 sizes x 5 robots, 100 % got out", "pit: 6 sizes x 5 robots, 100 % got out"]
     assert result["contact_overflows"] == 6
     assert result["types"]["stairs_up"]["trained_to"] == pytest.approx(0.212)
     assert result["types"]["pit"]["trained_to"] is None
     run = found[0]
     assert (run.env.num_envs, run.sim.threads) == (30, 2)
-    assert run.env.episode_length_s > 20.0  # the sweep's own clock is the one that runs out
+    assert run.env.episode_length_s > 20.0  # the measurement's own clock is the one that runs out
     assert run.observations == cfg.observations
     assert run.observations.add_noise
     assert run.init_state == replace(cfg.init_state, yaw=(-math.pi, math.pi))
@@ -281,8 +281,8 @@ def test_the_shipped_policy_climbs_a_gentle_slope_and_not_a_wall():
     cfg = override(policy.cfg, changes)
 
     def points(name, size):
-        task, runner = restore(policy, changes, torch.device("cpu"), terrain=tiles(name, [size], cfg.terrain, 1))
-        ((entry,), _) = success.measure(task, runner.get_inference_policy("cpu"), [size], 8)
+        task, act = restore(policy, changes, torch.device("cpu"), terrain=tiles_of_sizes(name, [size], cfg.terrain, 1))
+        ((entry,), _) = success.measure_success(task, act, [size], 8)
         return entry
 
     slope, pit = points("slope_up", 10.0), points("pit", 1.0)

@@ -11,14 +11,16 @@ from legged import make_task
 from legged.config import override
 from legged.errors import ConfigError
 from legged.evaluation import success
+from legged.evaluation.overflows import warn_of_overflows
 from legged.evaluation.success import (
     chosen_types,
-    on_terrain,
     sizes_of,
     trained_to,
 )
-from legged.evaluation.success_report import is_beyond, panels_of, with_other_engine
-from legged.evaluation.velocity_grid import Grid, measure, rough_ground, rough_side
+from legged.evaluation.success_report import is_beyond, panels_of, with_other_engines
+from legged.evaluation.tiles import on_terrain, rough_ground, rough_side
+from legged.evaluation.velocity_grid import Grid
+from legged.evaluation.velocity_tracking import measure_tracking
 from legged.policies.restore import undisturbed
 from legged.registry import task_config
 from legged.terrain import Terrain, TileSpec
@@ -67,7 +69,7 @@ def test_panels():
 def test_types_that_are_asked_for():
     rough, flat = task_config("anymal_c", on_cpu=True), small_config()
     assert chosen_types(rough, None) == [name for name, share in rough.terrain.proportions.items() if share > 0.0]
-    assert chosen_types(rough, "pit, gap,pit") == ["pit", "gap"]
+    assert chosen_types(rough, "pit, gap") == ["pit", "gap"]
     assert chosen_types(flat, None) == []
     assert chosen_types(flat, "pit") == ["pit"]
     with pytest.raises(ConfigError, match=r"--types: there is no terrain type 'stair_up'; did you mean 'stairs_up'"):
@@ -99,7 +101,7 @@ def test_height_of_the_gait_is_above_the_ground():
     grid = Grid([0.0], [0.0], [0.0], robots=2, hold_s=1.0, settle_s=0.5)
     cfg = override(small_config(), [*undisturbed(2, 1.0), *on_terrain(small_config(), 8.0, 0.1)])
     pit = Terrain.of_tiles([[TileSpec("pit", 0.8)]], cfg.terrain, None)
-    result = measure(make_task(cfg, terrain=pit), stand, grid)
+    result = measure_tracking(make_task(cfg, terrain=pit), stand, grid)
     assert 0.45 < result["gait"]["base_height"] < 0.6
     assert result["contact_overflows"] == 0
 
@@ -115,7 +117,7 @@ def test_lost_contacts_are_counted_over_all_rollouts(monkeypatch):
         task.physics.overflowed.fill_(True)
 
     monkeypatch.setattr(task.physics, "refresh", lose)
-    assert measure(task, stand, grid)["contact_overflows"] == 90
+    assert measure_tracking(task, stand, grid)["contact_overflows"] == 90
 
 
 # ---- the command -----------------------------------------------------------------------------------------------------
@@ -173,12 +175,12 @@ def test_the_other_engine_is_drawn_too_if_it_is_of_the_same_checkpoint(tmp_path)
     others = ("physics", "physx"), ("checkpoint", "model_2.pt")
     foreign = [{"success": bare}, {"success": {"types": {}}}, {"success": 3}, *({name: value} for name, value in others)]
     path, other = tmp_path / "evaluation_mujoco.json", tmp_path / "evaluation_mujoco_warp.json"
-    assert with_other_engine(mine, path) == [mine]
+    assert with_other_engines(mine, path) == [mine]
     for text in ("{}", "[]", "nonsense", *(json.dumps({**mine, "physics": "mujoco_warp", **change}) for change in foreign)):
         other.write_text(text)
-        assert with_other_engine(mine, path) == [mine]
+        assert with_other_engines(mine, path) == [mine]
     other.write_text(json.dumps({**mine, "physics": "mujoco_warp"}))
-    assert [one["physics"] for one in with_other_engine(mine, path)] == ["mujoco_warp", "mujoco"]
+    assert [one["physics"] for one in with_other_engines(mine, path)] == ["mujoco_warp", "mujoco"]
 
 
 def test_a_plane_task_is_evaluated_as_ever_and_crosses_terrain_only_if_asked(tmp_path, monkeypatch, capsys):
@@ -199,9 +201,9 @@ def test_a_plane_task_is_evaluated_as_ever_and_crosses_terrain_only_if_asked(tmp
 
 
 def test_lost_contacts_are_warned_of(capsys):
-    evaluate.warn_of_overflows("success", 0)
+    warn_of_overflows("success", 0)
     assert capsys.readouterr().err == ""
-    evaluate.warn_of_overflows("success", 7)
+    warn_of_overflows("success", 7)
     assert "7 times" in capsys.readouterr().err
 
 
@@ -210,6 +212,7 @@ def test_lost_contacts_are_warned_of(capsys):
     [
         (["--types", "stairsup"], ["--types", "did you mean 'stairs_up'?"]),
         (["--types", ""], ["--types", "no terrain type ''"]),
+        (["--types", "pit,gap,pit"], ["--types: 'pit' is given twice"]),
         (["--robots-per-point", "0"], ["--robots-per-point", "at least 1, got 0"]),
     ],
 )

@@ -13,6 +13,8 @@ from outcomes import refused_in_a_line
 from legged.learning.checkpoint import check_fits, read_checkpoint
 from legged.learning.run_folder import run_config
 from legged.learning.runner import Runner
+from legged.learning.transfer import check_source
+from legged.policies.restore import TrainedPolicy, restore
 from legged.registry import make_task
 from legged.tools import play, train
 
@@ -45,6 +47,35 @@ def load(folder: Path, name: str) -> None:
     observations = runner.env.get_observations()
     assert torch.isfinite(runner.alg.get_policy()(observations)).all()
     runner.env.step(torch.zeros(runner.env.num_envs, runner.env.num_actions))
+
+
+def begin_with(folder: Path, name: str) -> None:
+    """As training does that begins with another one's networks."""
+    path = folder / name
+    cfg = run_config(folder)
+    check_source(path, read_checkpoint(path), cfg)
+    runner = Runner(make_task(cfg))
+    assert runner.transfer(str(path)).startswith("took from")
+    assert runner.current_learning_iteration == 0
+    for model in (runner.alg.actor, runner.alg.critic):
+        assert all(torch.isfinite(tensor).all() for tensor in model.state_dict().values())
+
+
+def act_by(folder: Path, name: str) -> None:
+    """As playing and evaluating do."""
+    task, act = restore(TrainedPolicy(run_config(folder), folder / name), [], torch.device("cpu"))
+    assert torch.isfinite(act(task.get_observations())).all()
+
+
+@given(data=st.data(), how=HOW, value=ANYTHING, use=st.sampled_from([begin_with, act_by]))
+def test_a_changed_part_of_a_checkpoint_that_others_begin_with(data, how, value, use, trained, in_new_folder):
+    content = torch.load(trained / "model_1.pt", weights_only=True)
+    path = data.draw(st.sampled_from(places(content)))
+    with in_new_folder() as folder:
+        shutil.copytree(trained, folder / "run")
+        torch.save(mutated(content, path, how, value), folder / "run" / "model_1.pt")
+        with refused_in_a_line():
+            use(folder / "run", "model_1.pt")
 
 
 @given(data=st.data(), how=HOW, value=ANYTHING, of=st.sampled_from(["model_1.pt", "state_1.pt"]))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from legged.process.paths import data_folder
 from legged.registry import _REGISTERED
-from legged.tools import benchmark, compare, evaluate, play, plot, show_terrain, time_to_walk, train
+from legged.tools import benchmark, compare, evaluate, play, plot, show_terrain, train
 
 POLICIES = data_folder("resources") / "policies"
 EVALUATIONS = [POLICIES / "anymal_c" / "evaluation_mujoco.json", POLICIES / TASK / "evaluation_mujoco.json"]
@@ -70,7 +70,11 @@ COMMANDS = {
         {"--difficulty": SMALL_NUMBERS, "--terrain": st.one_of(TYPES, WORDS), "--out": WORDS},
         ["--no-video"],
     ),
-    "time_to_walk": (time_to_walk.main, {"--rmse": SMALL_NUMBERS, "--falls": SMALL_NUMBERS}, ["--robots=1"]),
+    "evaluate --all-checkpoints": (
+        evaluate.main,
+        {"--rmse": SMALL_NUMBERS, "--falls": SMALL_NUMBERS},
+        ["--all-checkpoints", "--robots=1", "--vx=0", "--vy=0"],
+    ),
     "benchmark": (
         benchmark.main,
         {"--steps": SMALL_NUMBERS, "--repeats": SMALL_NUMBERS, "--iterations": SMALL_NUMBERS, "--json": WORDS},

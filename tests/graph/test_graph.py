@@ -111,8 +111,10 @@ def config(backend: str) -> TaskConfig:
 
 def test_the_whole_step_of_the_task_can_be_captured(backend):
     """Steps with resets, pushes and new commands among them, on every back-end."""
-    task = make_task(config(backend))
-    resets = torch.zeros(4)
+    engine, _, on_gpu = backend.partition(", ")
+    device = "cuda:0" if on_gpu else "cpu"
+    task = make_task(config(engine), device, graph=not on_gpu)
+    resets = torch.zeros(4, device=device)
     with torch.inference_mode():
         for _ in range(12):
             task._action_input.normal_()

@@ -11,14 +11,14 @@ from helpers import TASK, call, checkpoints, kept_global_state, tiny_run
 from legged.errors import ConfigError
 from legged.learning.checkpoint import FORMAT, read_checkpoint
 from legged.learning.run_folder import shipped_policy
-from legged.tools import evaluate, play, time_to_walk, train
+from legged.tools import evaluate, play, train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 COMMANDS = {
     "resume": (train.main, ["--resume", "--max_iterations", "9"]),
     "play": (play.main, ["--no-video"]),
     "evaluate": (evaluate.main, ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1"]),
-    "time_to_walk": (time_to_walk.main, ["--robots", "1"]),
+    "evaluate --all-checkpoints": (evaluate.main, ["--all-checkpoints", "--robots", "1"]),
 }
 
 
@@ -231,7 +231,9 @@ def test_a_checkpoint_that_does_not_say_its_sizes_is_read_by_its_weights(model):
 
     saved = torch.load(model, weights_only=True)
     plain = {"rnn_type": "none", "rnn_hidden_dim": 0, "rnn_num_layers": 0}
-    assert network_of(saved["actor_state_dict"]) == {"hidden_dims": [8], "obs_normalization": False, **plain}
+    std = {"noise_std_type": "scalar", "state_dependent_std": False}
+    assert network_of(saved["actor_state_dict"]) == {"hidden_dims": [8], "obs_normalization": False, **plain, **std}
+    assert network_of(saved["critic_state_dict"]) == {"hidden_dims": [8], "obs_normalization": False, **plain}
     layers = {f"mlp.{i}.weight": torch.zeros(shape) for i, shape in ((0, (16, 5)), (2, (4, 16)), (4, (2, 4)))}
     normalised = {"obs_normalizer._mean": torch.zeros(1, 5), **layers}
     assert network_of(normalised) == {"hidden_dims": [16, 4], "obs_normalization": True, **plain}

@@ -12,11 +12,12 @@ from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, small_c
 import legged.policies.export as export_module
 from legged.errors import ConfigError
 from legged.learning.checkpoint import check_fits, read_checkpoint
-from legged.learning.recurrent import Remembering, rnn_of
+from legged.learning.recurrent import rnn_of
 from legged.learning.run_folder import run_config
 from legged.learning.runner import Runner
+from legged.policies.actor import Actor
 from legged.policies.export import ExportError, export
-from legged.policies.restore import RestoredRunner, find_policy, restore
+from legged.policies.restore import find_policy, restore
 from legged.registry import task_config
 from legged.tools import play, train
 
@@ -137,8 +138,8 @@ def test_a_checkpoint_of_another_width_or_depth_is_refused(tmp_path):
 @pytest.mark.parametrize("inference", [True, False])
 def test_who_begins_an_episode_acts_as_if_nothing_had_been(kind, inference):
     task = small_task(*recurrent(kind))
-    policy = Runner(task).get_inference_policy("cpu")
-    act = Remembering(policy, task)
+    act = Actor(task, "cpu")
+    policy = act.network
     torch.manual_seed(0)
     first, second = (task.get_observations().apply(torch.randn_like) for _ in range(2))
     task.reset()
@@ -161,13 +162,12 @@ def test_who_begins_an_episode_acts_as_if_nothing_had_been(kind, inference):
         assert torch.allclose(act(second), fresh, atol=1e-6)
 
 
-def test_a_restored_policy_forgets_and_one_without_memory_is_left_alone(tmp_path):
+def test_a_restored_policy_forgets(tmp_path):
     folder = tiny_run(*flags("lstm"))
     args = type("Args", (), {"task": TASK, "load_run": str(folder), "checkpoint": None, "overrides": [], "solver": None})()
     policy = find_policy(args)
-    task, runner = restore(policy, [("env.num_envs", 3)], torch.device("cpu"))
-    assert isinstance(runner.get_inference_policy("cpu"), Remembering)
-    act, observations = runner.get_inference_policy("cpu"), task.reset()
+    task, act = restore(policy, [("env.num_envs", 3)], torch.device("cpu"))
+    observations = task.reset()
     with torch.inference_mode():
         before = act(observations)
         for _ in range(3):
@@ -175,10 +175,9 @@ def test_a_restored_policy_forgets_and_one_without_memory_is_left_alone(tmp_path
         task.reset_buf.fill_(True)
         start = task.get_observations().apply(torch.zeros_like)
         again = act(start)
-        runner.alg.get_policy().reset()
-        assert torch.allclose(runner.alg.get_policy()(start), again, atol=1e-6)
+        act.network.reset()
+        assert torch.allclose(act.network(start), again, atol=1e-6)
     assert before.shape == (3, 12)
-    assert not isinstance(RestoredRunner(small_task()).get_inference_policy("cpu"), Remembering)
 
 
 # ---- export --------------------------------------------------------------------------------------------------------------
@@ -195,7 +194,7 @@ def test_exports_compute_the_policy_over_a_sequence(kind, tmp_path):
             parameter.mul_(3.0)  # so that the past matters
         act(task.get_observations())
     kept = policy.get_hidden_state()
-    differences = export(runner, tmp_path)
+    differences = export(runner.env, runner.alg.get_policy(), tmp_path)
     assert policy.get_hidden_state() is kept, "an export must not touch what the robots remember"
     assert all(value < 1e-5 for value in differences.values())
 
@@ -230,12 +229,12 @@ def test_an_export_that_forgets_is_refused(tmp_path, monkeypatch):
             parameter.mul_(5.0)
     run = export_module._run_onnx
 
-    def forgetful(path, observations, memory):
-        return np.concatenate([run(path, step[None], memory) for step in observations])
+    def forgetful(content, observations, begins, memory):
+        return run(content, observations, torch.ones_like(begins), memory)
 
     monkeypatch.setattr(export_module, "_run_onnx", forgetful)
     with pytest.raises(ExportError, match=r"policy\.onnx: differs"):
-        export(runner, tmp_path)
+        export(runner.env, runner.alg.get_policy(), tmp_path)
 
 
 def test_without_recurrent_layers_nothing_changes():

@@ -23,6 +23,11 @@ VARIANTS = {
     "torques from velocities": ["control.control_type=V"],
     "terrain": ["--task", "anymal_c"],
     "history": ["--task", "anymal_c_proprio"],
+    "bounds of the std": ["train.policy.min_noise_std=0.498", "train.policy.noise_std_type=log"],
+    "std by state": ["train.policy.state_dependent_std=true"],
+    "rmsprop": ["train.algorithm.optimizer=rmsprop"],
+    "lstm": ["train.policy.rnn_type=lstm", "train.policy.rnn_hidden_dim=6", "train.algorithm.symmetry=false"],
+    "gru": ["train.policy.rnn_type=gru", "train.policy.rnn_num_layers=2", "train.algorithm.symmetry=false"],
 }
 
 
@@ -41,7 +46,7 @@ def same(a, b) -> bool:
 
 @pytest.mark.parametrize("arguments", VARIANTS.values(), ids=VARIANTS)
 def test_two_and_two_iterations_are_four(arguments):
-    """Weights, moments, curricula, robots and random generators, bit by bit."""
+    """Weights, moments, curricula, robots, their memory and random generators, bit by bit."""
     four = tiny_run(*arguments, *EVENTFUL, num_envs=24, iterations=4)
     two = tiny_run(*arguments, *EVENTFUL, num_envs=24, iterations=2)
     task = arguments[:2] if "--task" in arguments else []
@@ -134,8 +139,8 @@ def test_settings_are_those_of_the_run_and_changes_are_said(capsys):
         ("train.policy.actor_hidden_dims=[16]", ("hidden layers [8]", "train.policy.actor_hidden_dims [16]")),
         ("train.policy.activation=relu", ("activation elu", "train.policy.activation relu")),
         ("train.policy.obs_normalization=true", ("obs_normalization False", "train.policy.obs_normalization True")),
-        ("observations.actor_history=2", ("history 1", "observations.actor_history 2")),
-        ("observations.critic=[dof_pos]", ("made for other observations", "critic")),
+        ("observations.groups.actor.history=2", ("history 1", "observations.groups.actor.history 2")),
+        ("observations.groups.critic.terms=[dof_pos]", ("made for other observations", "critic")),
     ],
 )
 def test_another_network_or_observation_is_refused(capsys, change, words):

@@ -6,14 +6,15 @@ import mujoco
 import pytest
 import torch
 from helpers import call, small_config, small_task, tiny_run
-from reference import random_states
+from reference import States, random_states
 from tensordict import TensorDict
 
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
 from legged.learning.captured import CapturedRunner
 from legged.learning.runner import Runner
-from legged.learning.symmetry import MirrorImages, augment
+from legged.learning.symmetry import augment
+from legged.mdp.mirror_images import MirrorImages
 from legged.registry import make_task, task_config
 from legged.robots.mirror import Mirror
 from legged.tools import train
@@ -54,7 +55,7 @@ def test_a_mirrored_world_goes_on_as_the_mirror_image(robot):
     differs a little left and right.)
     """
     task = small_task(num_envs=12)
-    images = MirrorImages(task)
+    images = task.mirror_images()
     state = random_states(robot, 6, seed=3)
     state.base_pos[:, 2] += 0.3
     flip, turn = torch.tensor([1.0, -1.0, 1.0]), torch.tensor([-1.0, 1.0, -1.0])
@@ -65,16 +66,14 @@ def test_a_mirrored_world_goes_on_as_the_mirror_image(robot):
 
     task.reset()
     quat = state.base_quat * torch.tensor([1.0, -1.0, 1.0, -1.0])
-    task.physics.write_state(
-        torch.ones(12, dtype=torch.bool),
+    States(
         both(state.base_pos, state.base_pos * flip),
         both(state.base_quat, quat),
         both(state.base_lin_vel, state.base_lin_vel * flip),
         both(state.base_ang_vel, state.base_ang_vel * turn),
         both(state.dof_pos, state.dof_pos[:, columns] * signs),
         both(state.dof_vel, state.dof_vel[:, columns] * signs),
-    )
-    task.physics.refresh()
+    ).write(task.physics)
     torch.manual_seed(0)
     command = torch.rand(6, 3) - 0.5
     task.hold_commands(both(command, command * torch.tensor([1.0, -1.0, -1.0])))
@@ -94,25 +93,25 @@ def test_a_mirrored_world_goes_on_as_the_mirror_image(robot):
 
 def test_the_mirror_of_the_mirror_is_the_sample():
     task = rough_task("anymal_c_proprio")
-    task.mirror_images = MirrorImages(task)
+    images = task.mirror_images()
     observations = TensorDict({"actor": torch.randn(3, 270), "critic": torch.randn(3, 235)}, batch_size=[3])
     actions = torch.randn(3, 12)
-    seen, done = augment(task, observations, actions)
+    seen, done = augment(images, task, observations, actions)
     assert seen.batch_size == (6,)
-    back, undone = augment(task, seen[3:], done[3:])
+    back, undone = augment(images, task, seen[3:], done[3:])
     for name in ("actor", "critic"):
         torch.testing.assert_close(seen[name][:3], observations[name])
         torch.testing.assert_close(back[name][3:], observations[name])
         assert not torch.equal(seen[name][3:], observations[name])
     torch.testing.assert_close(undone[3:], actions)
-    assert augment(task, None, actions)[0] is None
-    assert augment(task, observations, None)[1] is None
+    assert augment(images, task, None, actions)[0] is None
+    assert augment(images, task, observations, None)[1] is None
 
 
 def test_heights_on_the_left_are_seen_on_the_right():
     """A ground that rises to the left by 1 m/m, so that heights are y: mirrored, it falls."""
     task = rough_task("anymal_c")
-    images = MirrorImages(task)
+    images = task.mirror_images()
     columns, signs = images.groups["critic"]
     y = torch.zeros(1, 235)
     y[0, 48:] = task.height_scan.points[:, 1]
@@ -122,7 +121,7 @@ def test_heights_on_the_left_are_seen_on_the_right():
 def test_every_step_of_a_history_is_mirrored_in_its_place():
     """Gravity to the left, 1 to 6 in six steps: to the right in the same steps."""
     task = rough_task("anymal_c_proprio")
-    columns, signs = MirrorImages(task).groups["actor"]
+    columns, signs = task.mirror_images().groups["actor"]
     history = torch.zeros(1, 6, 45)
     history[0, :, 4] = torch.arange(1.0, 7.0)  # after three rates: projected gravity's y
     torch.testing.assert_close((history.flatten(1)[:, columns] * signs).view(1, 6, 45), -history)
@@ -165,11 +164,11 @@ class Knowing(Looking):
 
 def test_own_observations_need_to_say_how_they_are_mirrored():
     cfg = small_config(SYMMETRIC)
-    observations = dataclasses.replace(cfg.observations, critic=(*cfg.observations.critic, "foot_contact"))
-    cfg = dataclasses.replace(cfg, observations=observations)
+    groups = cfg.observations.groups
+    groups["critic"] = dataclasses.replace(groups["critic"], terms=(*groups["critic"].terms, "foot_contact"))
     with pytest.raises(ConfigError, match=r"Looking\.MIRRORED does not say how observation 'foot_contact'"):
         Looking(cfg)
-    columns, _ = MirrorImages(Knowing(cfg)).groups["critic"]
+    columns, _ = Knowing(cfg).mirror_images().groups["critic"]
     assert columns[48:].tolist() == [49, 48, 51, 50]
 
 
@@ -192,7 +191,7 @@ class Unequal(Looking):
 
 
 def looking_config():
-    return small_config(SYMMETRIC, ("observations.critic", ["dof_pos", "foot_contact"]))
+    return small_config(SYMMETRIC, ("observations.groups.critic.terms", ["dof_pos", "foot_contact"]))
 
 
 @pytest.fixture
@@ -214,5 +213,35 @@ def test_a_misspelt_kind_of_mirror_is_refused_at_the_start(looking):
 @pytest.mark.parametrize(("task", "words"), [(TooNarrow, "kind 'joints' is for 12"), (Unequal, "kind 'vector' is for 3")])
 def test_a_kind_of_mirror_of_another_width_is_refused(looking, task, words):
     with pytest.raises(ConfigError, match=rf"{task.__name__}\.MIRRORED: observation 'foot_contact' has 4 numbers.*{words}"):
-        MirrorImages(task(looking))
-    assert MirrorImages(Knowing(looking)).groups["critic"][0].tolist()[12:] == [13, 12, 15, 14]
+        task(looking).mirror_images()
+    assert Knowing(looking).mirror_images().groups["critic"][0].tolist()[12:] == [13, 12, 15, 14]
+
+
+class Sideless(LeggedRobot):
+    """A task that knows no left and right."""
+
+    def mirror_images(self):
+        return None
+
+
+def test_a_task_without_mirror_images_learns_without_symmetry_only():
+    task = Sideless(small_config(SYMMETRIC))
+    with pytest.raises(ConfigError, match=r"train\.algorithm\.symmetry: Sideless has no mirror images; false learns without"):
+        Runner(task)
+    Runner(Sideless(small_config(("train.algorithm.symmetry", False))))
+
+
+def test_what_no_kind_of_mirror_fits_is_refused(robot):
+    """By the images themselves too, whoever asks for them."""
+    task = small_task()
+
+    def images(kinds):
+        return MirrorImages("Mine", kinds, task.observation_groups, 12, robot.mirror, task.height_scan.points)
+
+    assert images(LeggedRobot.MIRRORED).actions[0].tolist() == list(robot.mirror.joints)
+    with pytest.raises(ConfigError, match=r"Mine\.MIRRORED: there is no way to mirror 'typo'"):
+        images({**LeggedRobot.MIRRORED, "dof_vel": "typo"})
+    with pytest.raises(ConfigError, match=r"Mine\.MIRRORED does not say how observation 'commands' is mirrored"):
+        images({name: kind for name, kind in LeggedRobot.MIRRORED.items() if name != "commands"})
+    with pytest.raises(ConfigError, match=r"observation 'actions' has 12 numbers, but its kind 'feet' is for 4"):
+        images({**LeggedRobot.MIRRORED, "actions": "feet"})

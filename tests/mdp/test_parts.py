@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from legged.config.schema import CommandCurriculumConfig, CommandRanges, CommandsConfig, ControlConfig
+from legged.config.schema import CommandCurriculumConfig, CommandRanges, CommandsConfig, LeggedControlConfig
 from legged.errors import TermError
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
@@ -284,7 +284,7 @@ def test_a_reset_forgets_the_swing_of_the_masked_robots_only():
 
 def control(kind: str) -> Control:
     """ANYmal C with gains 10 / 2, 20 / 3 and 30 / 4 for HAA, HFE and KFE, two robots, 5 ms."""
-    cfg = ControlConfig(
+    cfg = LeggedControlConfig(
         control_type=kind,
         stiffness={"HAA": 10.0, "HFE": 20.0, "KFE": 30.0},
         damping={"HAA": 2.0, "HFE": 3.0, "KFE": 4.0},

@@ -1,11 +1,14 @@
 """The one-launch constraint solver: what C MuJoCo finds, on every kind of row; worlds that end by themselves."""
 
+import re
+
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import pytest
 import torch
 import warp as wp
+from devices import on_gpu
 from helpers import call
 from reference import heaps, random_states, roll
 
@@ -38,9 +41,9 @@ EVERY_ROW = """
 """Equality, dry friction, a joint limit and a contact: rows of every kind that a pyramidal cone has."""
 
 
-def solved(model: mujoco.MjModel, datas: list[mujoco.MjData]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def solved(model: mujoco.MjModel, datas: list[mujoco.MjData], device: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of worlds in the states of `datas`: acceleration, constraint force and rounds, by the one-launch solver."""
-    with wp.ScopedDevice("cpu"):
+    with wp.ScopedDevice(device):
         m = mjw.put_model(model)
         d = mjw.make_data(model, nworld=len(datas), nconmax=16, njmax=64)
         d.qpos.assign(np.stack([data.qpos for data in datas]))
@@ -67,7 +70,7 @@ def states_of_every_row(model: mujoco.MjModel, count: int) -> list[mujoco.MjData
     return datas
 
 
-def test_every_kind_of_row_pushes_as_in_c_mujoco():
+def test_every_kind_of_row_pushes_as_in_c_mujoco(device):
     model = mujoco.MjModel.from_xml_string(EVERY_ROW)
     datas = states_of_every_row(model, 30)
     kinds = np.concatenate([data.efc_type for data in datas])
@@ -82,7 +85,7 @@ def test_every_kind_of_row_pushes_as_in_c_mujoco():
     sides = np.concatenate([data.efc_state[data.efc_type == t.mjCNSTR_FRICTION_DOF] for data in datas])
     s = mujoco.mjtConstraintState
     assert {int(side) for side in sides} >= {int(s.mjCNSTRSTATE_LINEARNEG), int(s.mjCNSTRSTATE_LINEARPOS)}
-    acceleration, force, rounds = solved(model, datas)
+    acceleration, force, rounds = solved(model, datas, device)
     for i, data in enumerate(datas):
         scale = max(1.0, np.abs(data.qfrc_constraint).max())
         np.testing.assert_allclose(force[i], data.qfrc_constraint, atol=2e-4 * scale, err_msg=str(i))
@@ -91,28 +94,36 @@ def test_every_kind_of_row_pushes_as_in_c_mujoco():
     assert 1 <= rounds.max() < 20
 
 
-def test_without_constraints_the_acceleration_is_that_of_a_free_body():
+def test_without_constraints_the_acceleration_is_that_of_a_free_body(device):
     model = mujoco.MjModel.from_xml_string(EVERY_ROW.replace('frictionloss="0.8"', "").split("<equality>")[0] + "</mujoco>")
     data = mujoco.MjData(model)
     data.qpos[2] = 2.0
     mujoco.mj_forward(model, data)
     assert data.nefc == 0
-    acceleration, force, _ = solved(model, [data])
+    acceleration, force, _ = solved(model, [data], device)
     np.testing.assert_allclose(acceleration[0], data.qacc, atol=1e-4)
     assert not force.any()
 
 
-@pytest.mark.parametrize("start", [random_states, heaps])
-def test_robots_are_pushed_as_by_mujoco_warps_own_solver(robot, make_physics, start):
+@pytest.mark.parametrize(
+    ("start", "name"),
+    [
+        pytest.param(random_states, "mujoco_warp", id="random_states"),
+        pytest.param(heaps, "mujoco_warp", id="heaps"),
+        on_gpu(random_states, "mujoco_warp, cuda", id="random_states, cuda"),
+        on_gpu(heaps, "mujoco_warp, cuda", id="heaps, cuda"),
+    ],
+)
+def test_robots_are_pushed_as_by_mujoco_warps_own_solver(robot, make_physics, start, name):
     """Ten steps from the same states: the two solvers stop at their tolerance, on different sides of the minimum."""
-    engines = [make_physics("mujoco_warp", constraint_solver=solver) for solver in ("rounds", "auto")]
+    engines = [make_physics(name, **way) for way in ({"step": "library"}, {"tag": "stages"})]
     states = start(robot, 6, seed=4)
     for engine in engines:
         states.write(engine)
         roll(engine, states.dof_pos, 10)
         engine.refresh()
     for name in ("base_pos", "dof_pos", "base_quat"):
-        first, second = (getattr(engine.state, name) for engine in engines)
+        first, second = (getattr(engine.robot_state, name) for engine in engines)
         torch.testing.assert_close(first, second, atol=2e-5, rtol=0.0, msg=name)
 
 
@@ -122,18 +133,18 @@ def test_a_world_that_is_no_number_ends_and_harms_no_neighbour(robot, make_physi
     states.write(engine)
     roll(engine, states.dof_pos, 4)
     engine.refresh()
-    untouched = engine.state.base_pos.clone()
+    untouched = engine.robot_state.base_pos.clone()
     states.write(engine)
     states.base_lin_vel[2] = torch.nan
     states.write(engine)
     roll(engine, states.dof_pos, 4)
     engine.refresh()
     others = [i for i in range(6) if i != 2]
-    assert torch.equal(engine.state.base_pos[others], untouched[others])
+    assert torch.equal(engine.robot_state.base_pos[others], untouched[others])
     states.base_lin_vel[2] = 0.0
     states.write(engine)
     roll(engine, states.dof_pos, 4)
-    assert engine.state.base_pos.isfinite().all()
+    assert engine.robot_state.base_pos.isfinite().all()
 
 
 @pytest.mark.parametrize(
@@ -141,13 +152,14 @@ def test_a_world_that_is_no_number_ends_and_harms_no_neighbour(robot, make_physi
     [({"cone": "elliptic"}, "friction cones are elliptic"), ({"njmax": 1000}, "1000 constraint rows .* do not fit")],
 )
 def test_what_it_does_not_know_is_refused(make_physics, sim, reason):
-    with pytest.raises(ConfigError, match=f"constraint_solver=fused: .*{reason}"):
-        make_physics("mujoco_warp", num_envs=1, constraint_solver="fused", **sim)
+    with pytest.raises(ConfigError, match=f"sim.step=fused: .*{reason}"):
+        make_physics("mujoco_warp", num_envs=1, step="fused", **sim)
+    assert re.search(reason, make_physics("mujoco_warp", num_envs=1, **sim).why_library)
 
 
 def test_a_wrong_name_says_which_are_right(capsys):
-    arguments = ["--task", "anymal_c_flat", "sim.constraint_solver=fuse", "--show"]
+    arguments = ["--task", "anymal_c_flat", "sim.step=fuse", "--show"]
     assert call(main, arguments) == 2
     text = capsys.readouterr().err
-    assert "sim.constraint_solver" in text
+    assert "sim.step" in text
     assert "fused" in text

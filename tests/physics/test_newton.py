@@ -1,7 +1,7 @@
 """Newton's solvers: what every one of them must keep of the contract, and how near to C MuJoCo it comes.
 
-Newton's MuJoCo solver meets the whole contract (tests/physics/test_physics.py). The others are other physics: they stand, carry
-their weight, and keep their worlds apart.
+Newton's MuJoCo solver meets the whole contract (tests/physics/test_physics.py). The others are other physics: they
+stand, carry their weight, and keep their worlds apart.
 """
 
 import importlib.util
@@ -15,7 +15,7 @@ from reference import TOUCHING, CWorlds, States, bits, pd, random_states, roll, 
 
 from legged.config.schema import NewtonSolver, SimConfig, TerrainConfig
 from legged.errors import ConfigError
-from legged.physics import Physics, engine_name, make_physics, resolve_physics
+from legged.physics import Physics, RobotScene, engine_name, make_physics, resolve_physics
 from legged.terrain import Terrain, TileSpec
 
 N = 4
@@ -52,7 +52,7 @@ def solver(request) -> str:
 @pytest.fixture
 def newton(solver, make_physics) -> Physics:
     """Four worlds, in whatever state the last test left them."""
-    return make_physics("newton", num_envs=N, solver=solver)
+    return make_physics("newton", num_envs=N, tag="randomized", solver=solver)
 
 
 def only(index: int) -> torch.Tensor:
@@ -69,15 +69,15 @@ def test_it_stands_like_c_mujoco_and_the_ground_carries_its_weight(newton, solve
     reference = CWorlds(robot, SimConfig(), standing(robot, 1))
     states.write(newton)
     roll(newton, states.dof_pos, 160)
-    forces = torch.zeros_like(newton.state.contact_forces)
+    forces = torch.zeros_like(newton.robot_state.contact_forces)
     for _ in range(40):
         roll(newton, states.dof_pos, 1)
-        forces += newton.state.contact_forces / 40
+        forces += newton.robot_state.contact_forces / 40
     for _ in range(200):
         reference.step_pd(states.dof_pos[:1])
     height = float(reference.observe()["base_pos"][0, 2])
-    assert (newton.state.base_pos[:, 2] - height).abs().max() < tolerance.height
-    assert (newton.state.projected_gravity[:, 2] < -0.999).all()
+    assert (newton.robot_state.base_pos[:, 2] - height).abs().max() < tolerance.height
+    assert (newton.robot_state.projected_gravity[:, 2] < -0.999).all()
     weight = robot.mass * GRAVITY
     total = forces.sum(dim=1)
     torch.testing.assert_close(total[:, 2], torch.full((N,), weight), rtol=tolerance.weight, atol=0.0)
@@ -99,27 +99,27 @@ def test_it_falls_freely_and_turns_freely(newton, solver, robot):
     states.write(newton)
     reference = CWorlds(robot, SimConfig(), states)
     for _ in range(40):
-        torques = pd(newton.state.dof_pos, newton.state.dof_vel, states.dof_pos)
-        newton.torques.copy_(torques)
+        torques = pd(newton.robot_state.dof_pos, newton.robot_state.dof_vel, states.dof_pos)
+        newton.ctrl.copy_(torques)
         newton.step()
         reference.step_pd(states.dof_pos)
     newton.refresh()
     expected = {name: torch.from_numpy(value).float() for name, value in reference.observe().items()}
-    assert (newton.state.contact_forces == 0.0).all()
+    assert (newton.robot_state.contact_forces == 0.0).all()
     fall = TOLERANCES[solver].fall
-    torch.testing.assert_close(newton.state.base_lin_vel_w[:, 2], torch.full((N,), -GRAVITY * 0.2), atol=fall, rtol=0.0)
+    torch.testing.assert_close(newton.robot_state.base_lin_vel_w[:, 2], torch.full((N,), -GRAVITY * 0.2), atol=fall, rtol=0.0)
     loose = 10.0 * fall
-    torch.testing.assert_close(newton.state.base_lin_vel_w, expected["base_lin_vel_w"], atol=loose, rtol=0.0)
-    torch.testing.assert_close(newton.state.base_ang_vel, expected["base_ang_vel"], atol=2.0 * loose, rtol=0.0)
-    torch.testing.assert_close(newton.state.base_pos, expected["base_pos"], atol=loose, rtol=0.0)
+    torch.testing.assert_close(newton.robot_state.base_lin_vel_w, expected["base_lin_vel_w"], atol=loose, rtol=0.0)
+    torch.testing.assert_close(newton.robot_state.base_ang_vel, expected["base_ang_vel"], atol=2.0 * loose, rtol=0.0)
+    torch.testing.assert_close(newton.robot_state.base_pos, expected["base_pos"], atol=loose, rtol=0.0)
 
 
 def test_written_state_reads_back(newton, robot):
     states = random_states(robot, N, seed=5)
     states.write(newton)
     for name in ("base_pos", "base_quat", "base_ang_vel", "dof_pos", "dof_vel"):
-        assert torch.equal(getattr(newton.state, name), getattr(states, name)), name
-    torch.testing.assert_close(newton.state.base_lin_vel, states.base_lin_vel, atol=1e-6, rtol=0.0)
+        assert torch.equal(getattr(newton.robot_state, name), getattr(states, name)), name
+    torch.testing.assert_close(newton.robot_state.base_lin_vel, states.base_lin_vel, atol=1e-6, rtol=0.0)
 
 
 def test_writing_a_world_and_blowing_it_up_leaves_the_others_bit_identical(newton, robot):
@@ -159,16 +159,16 @@ def test_a_push_is_felt_by_its_worlds_only(newton, robot):
     states.base_pos[:, 2] += 1.0
     states.write(newton)
     roll(newton, states.dof_pos, 3)
-    before, velocity = snapshot(newton), newton.state.base_lin_vel_w.clone()
+    before, velocity = snapshot(newton), newton.robot_state.base_lin_vel_w.clone()
     mask = torch.tensor([True, False, False, True])
     by = torch.tensor([[0.5, -1.0], [3.0, 3.0], [torch.nan, 1.0], [-2.0, 0.25]])
     newton.push(mask, by)
     newton.refresh()
     assert torch.equal(bits(snapshot(newton)[~mask]), bits(before[~mask]))
-    torch.testing.assert_close(newton.state.base_lin_vel_w[mask, :2], velocity[mask, :2] + by[mask])
+    torch.testing.assert_close(newton.robot_state.base_lin_vel_w[mask, :2], velocity[mask, :2] + by[mask])
     newton.step()
     newton.refresh()
-    felt = newton.state.base_lin_vel_w[:, :2] - velocity[:, :2]
+    felt = newton.robot_state.base_lin_vel_w[:, :2] - velocity[:, :2]
     torch.testing.assert_close(felt[mask], by[mask], atol=0.1, rtol=0.0)
     assert (felt[~mask].abs() < 0.1).all()
 
@@ -180,9 +180,9 @@ def test_friction_is_drawn_per_world(newton, robot):
     states = standing(robot, N, height=TOUCHING - 0.001)
     states.base_lin_vel[:, 1] = 1.0
     states.write(newton)
-    start = newton.state.feet_pos.mean(dim=1)[:, 1].clone()
+    start = newton.robot_state.feet_pos.mean(dim=1)[:, 1].clone()
     roll(newton, states.dof_pos, 150)
-    slid = newton.state.feet_pos.mean(dim=1)[:, 1] - start
+    slid = newton.robot_state.feet_pos.mean(dim=1)[:, 1] - start
     newton.randomize("friction", torch.ones(N))
     assert (slid[friction == 0.1] > 0.3).all()
     assert (slid[friction == 1.0].abs() < 0.12).all()
@@ -197,7 +197,7 @@ def test_added_base_mass_is_drawn_per_world(newton, solver, robot):
     carried = torch.zeros(N)
     for _ in range(40):
         roll(newton, states.dof_pos, 1)
-        carried += newton.state.contact_forces.sum(dim=1)[:, 2] / 40
+        carried += newton.robot_state.contact_forces.sum(dim=1)[:, 2] / 40
     newton.randomize("added_base_mass", torch.zeros(N))
     tolerance = TOLERANCES[solver].weight + 0.015  # it has not quite come to rest; nor has it in C MuJoCo
     torch.testing.assert_close(carried, (robot.mass + added) * GRAVITY, rtol=tolerance, atol=0.0)
@@ -242,10 +242,10 @@ def test_it_stands_on_terrain_like_c_mujoco(robot, solver, collider, near):
     found = []
     other = SimConfig(physics="newton", solver=solver, terrain_collider=collider)
     for sim in (SimConfig(physics="mujoco", threads=1), other):
-        physics = make_physics(robot, sim, 2, torch.device("cpu"), terrain)
+        physics = make_physics(RobotScene(robot, terrain), sim, 2, torch.device("cpu"))
         states.write(physics)
         roll(physics, states.dof_pos, 200)
-        found.append(physics.state)
+        found.append(physics.robot_state)
     torch.testing.assert_close(found[1].base_pos, found[0].base_pos, atol=near, rtol=0.0)
     torch.testing.assert_close(found[1].projected_gravity, found[0].projected_gravity, atol=0.02, rtol=0.0)
 
@@ -258,10 +258,10 @@ def test_legs_touch_each_other_if_asked(robot, solver):
     thighs = [i for i, name in enumerate(robot.contact_names) if "THIGH" in name]
     for asked in (True, False):
         sim = SimConfig(physics="newton", solver=solver, self_collisions=asked)
-        physics = make_physics(robot, sim, 2, torch.device("cpu"))
+        physics = make_physics(RobotScene(robot), sim, 2, torch.device("cpu"))
         states.write(physics)
         roll(physics, states.dof_pos, 1)
-        forces = physics.state.contact_forces
+        forces = physics.robot_state.contact_forces
         assert (forces[:, thighs].norm(dim=2) > 100.0).all() == asked
         assert (forces != 0.0).any() == asked
         assert (forces.sum(dim=1).norm(dim=1) < 1.0).all()

@@ -6,10 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from devices import build
 from reference import FIELDS, TOUCHING, CWorlds, States, heaps, pd, random_states, roll, standing
 
 from legged.config.schema import SimConfig
-from legged.physics import make_physics as build_physics
+from legged.physics import RobotScene
 from legged.robots.robot import load_robot
 
 GRAVITY = 9.81
@@ -25,7 +26,7 @@ def only(index: int, count: int = 6) -> torch.Tensor:
 
 def feet_forces(physics, robot) -> torch.Tensor:
     """(N, F, 3)"""
-    return physics.state.contact_forces[:, list(robot.feet_indices)]
+    return physics.robot_state.contact_forces[:, list(robot.feet_indices)]
 
 
 # ---- the same numbers as C MuJoCo ----------------------------------------------------------------------------------------
@@ -43,9 +44,9 @@ def test_state_is_that_of_c_mujoco(physics, robot, start):
     states.write(physics)
     reference = CWorlds(robot, SimConfig(), states)
     torques = pd(states.dof_pos, states.dof_vel, states.dof_pos + 0.1)
-    physics.torques.copy_(torques)
+    physics.ctrl.copy_(torques)
     for name in COMPUTED:
-        getattr(physics.state, name).fill_(torch.nan)
+        getattr(physics.robot_state, name).fill_(torch.nan)
     comparable = np.ones(6, dtype=bool)
     for _ in range(5):
         physics.step()
@@ -58,7 +59,7 @@ def test_state_is_that_of_c_mujoco(physics, robot, start):
     observed = reference.observe()
     for name in FIELDS:
         tolerance = {"contact_forces": 0.05, "dof_vel": 1e-3, "feet_vel": 1e-3}.get(name, 5e-5)
-        actual, expected = getattr(physics.state, name)[comparable], observed[name][comparable]
+        actual, expected = getattr(physics.robot_state, name)[comparable], observed[name][comparable]
         np.testing.assert_allclose(actual, expected, atol=tolerance, rtol=1e-5, err_msg=name)
 
 
@@ -76,7 +77,7 @@ def drift(physics, robot, sim: SimConfig) -> dict[str, float]:
         roll(physics, targets, 1)
         reference.step_pd(targets)
         for name, expected in reference.observe().items():
-            difference = np.abs(getattr(physics.state, name) - expected).max().item()
+            difference = np.abs(getattr(physics.robot_state, name) - expected).max().item()
             largest[name] = max(largest[name], difference) if np.isfinite(difference) else np.inf
     return largest
 
@@ -111,12 +112,12 @@ def test_feet_are_right_on_legs_with_turned_bodies_and_joints_off_centre(robot, 
     shutil.copy(robot.folder / "robot.yaml", tmp_path)
     (tmp_path / "anymal_c.xml").write_text(spec.to_xml())
     other = load_robot(str(tmp_path))
-    physics = build_physics(other, SimConfig(physics=backend), 6, torch.device("cpu"))
+    physics = build(RobotScene(other), backend, 6)
     states = heaps(other, 6, seed=7)
     states.write(physics)
     reference = CWorlds(other, SimConfig(), states)
-    np.testing.assert_allclose(physics.state.feet_pos, reference.observe()["feet_pos"], atol=1e-5)
-    np.testing.assert_allclose(physics.state.feet_vel, reference.observe()["feet_vel"], atol=1e-5)
+    np.testing.assert_allclose(physics.robot_state.feet_pos, reference.observe()["feet_pos"], atol=1e-5)
+    np.testing.assert_allclose(physics.robot_state.feet_vel, reference.observe()["feet_vel"], atol=1e-5)
     parallel = CWorlds(robot, SimConfig(), states)
     assert np.abs(parallel.observe()["feet_pos"] - reference.observe()["feet_pos"]).max() > 0.05
 
@@ -129,7 +130,7 @@ def test_at_rest_the_ground_carries_the_weight(physics, robot):
     states = standing(robot, 6)
     states.write(physics)
     roll(physics, states.dof_pos, 300)
-    forces = physics.state.contact_forces
+    forces = physics.robot_state.contact_forces
     torch.testing.assert_close(forces.sum(dim=1)[:, 2], torch.full((6,), robot.mass * GRAVITY), rtol=0.01, atol=0.0)
     assert (feet_forces(physics, robot)[:, :, 2] > 50.0).all()
     assert (forces.sum(dim=1)[:, :2].abs() < 5.0).all()  # friction sums to nothing
@@ -143,11 +144,11 @@ def test_in_the_air_nothing_is_felt_and_the_robot_falls_freely(physics, robot):
     for _ in range(40):
         physics.step()
     physics.refresh()
-    assert (physics.state.contact_forces == 0.0).all()
+    assert (physics.robot_state.contact_forces == 0.0).all()
     # Semi-implicit Euler over n steps of dt, of the centre of mass; without torques the legs fall along.
     fallen = GRAVITY * 0.005**2 * 40 * 41 / 2
-    torch.testing.assert_close(physics.state.base_pos[:, 2], torch.full((6,), 2.0 - fallen), atol=1e-4, rtol=0.0)
-    torch.testing.assert_close(physics.state.base_lin_vel[:, 2], torch.full((6,), -GRAVITY * 0.2), atol=1e-3, rtol=0.0)
+    torch.testing.assert_close(physics.robot_state.base_pos[:, 2], torch.full((6,), 2.0 - fallen), atol=1e-4, rtol=0.0)
+    torch.testing.assert_close(physics.robot_state.base_lin_vel[:, 2], torch.full((6,), -GRAVITY * 0.2), atol=1e-3, rtol=0.0)
 
 
 def test_friction_is_drawn_per_world(make_physics, backend, robot):
@@ -158,9 +159,9 @@ def test_friction_is_drawn_per_world(make_physics, backend, robot):
     states = standing(robot, 6, height=TOUCHING - 0.001)
     states.base_lin_vel[:, 1] = 1.0
     states.write(physics)
-    start = physics.state.feet_pos.mean(dim=1)[:, 1].clone()
+    start = physics.robot_state.feet_pos.mean(dim=1)[:, 1].clone()
     roll(physics, states.dof_pos, 200)
-    slid = physics.state.feet_pos.mean(dim=1)[:, 1] - start
+    slid = physics.robot_state.feet_pos.mean(dim=1)[:, 1] - start
     physics.randomize("friction", torch.ones(6))
     assert (slid[friction == 0.1] > 0.3).all()
     assert (slid[friction == 1.0].abs() < 0.1).all()
@@ -173,7 +174,7 @@ def test_added_base_mass_is_drawn_per_world(make_physics, backend, robot):
     states = standing(robot, 6)
     states.write(physics)
     roll(physics, states.dof_pos, 300)
-    carried = physics.state.contact_forces.sum(dim=1)[:, 2]
+    carried = physics.robot_state.contact_forces.sum(dim=1)[:, 2]
     physics.randomize("added_base_mass", torch.zeros(6))
     torch.testing.assert_close(carried, (robot.mass + added) * GRAVITY, rtol=0.005, atol=0.0)
 
@@ -192,7 +193,7 @@ def test_added_base_mass_replaces_the_one_before(make_physics, backend, robot):
 
 
 def test_an_unknown_property_is_no_mass(make_physics, backend):
-    """Every back-end names what was asked for and what there is."""
+    """Every back-end names what was asked for and what it was made for."""
     physics = make_physics(backend, tag="randomized")
-    with pytest.raises(ValueError, match=r"no property 'added_mass'; did you mean 'added_base_mass'\? .*friction"):
+    with pytest.raises(ValueError, match=r"'added_mass' is none of .*; did you mean 'added_base_mass'\? .*friction"):
         physics.randomize("added_mass", torch.full((6,), 30.0))

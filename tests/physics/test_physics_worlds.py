@@ -6,11 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from reference import FIELDS, TOUCHING, CWorlds, States, bits, heaps, random_states, roll, snapshot, standing
+from devices import engine_of
+from reference import FIELDS, TOUCHING, CWorlds, States, assert_same, bits, heaps, random_states, roll, snapshot, standing
 
 from legged.config.schema import SimConfig
 from legged.errors import ConfigError
-from legged.physics import resolve_physics
+from legged.physics import RobotScene, resolve_physics
 from legged.physics.mujoco import MujocoPhysics
 from legged.physics.warp.mujoco_warp import absent_stages
 
@@ -32,31 +33,33 @@ def test_written_state_reads_back(physics, robot):
     states = heaps(robot, 6, seed=5)
     states.write(physics)
     for name in ("base_pos", "base_quat", "base_ang_vel", "dof_pos", "dof_vel"):
-        assert torch.equal(getattr(physics.state, name), getattr(states, name)), name
-    torch.testing.assert_close(physics.state.base_lin_vel, states.base_lin_vel, atol=1e-6, rtol=0.0)
+        assert torch.equal(getattr(physics.robot_state, name), getattr(states, name)), name
+    torch.testing.assert_close(physics.robot_state.base_lin_vel, states.base_lin_vel, atol=1e-6, rtol=0.0)
     reference = CWorlds(robot, SimConfig(), states).observe()
     for name in ("base_lin_vel_w", "projected_gravity", "feet_pos", "feet_vel"):
-        np.testing.assert_allclose(getattr(physics.state, name), reference[name], atol=1e-5, err_msg=name)
+        np.testing.assert_allclose(getattr(physics.robot_state, name), reference[name], atol=1e-5, err_msg=name)
 
 
 def test_write_clears_forces_and_torques_of_its_worlds_only(physics, robot):
     states = standing(robot, 6)
     states.write(physics)
     roll(physics, states.dof_pos + 0.1, 60)
-    torques, forces = physics.torques.clone(), physics.state.contact_forces.clone()
+    torques, forces = physics.ctrl.clone(), physics.robot_state.contact_forces.clone()
     mask = only(2)
     states.write(physics, mask)
-    assert (physics.torques[mask] == 0.0).all()
-    assert (physics.state.contact_forces[mask] == 0.0).all()
-    assert torch.equal(physics.torques[~mask], torques[~mask])
-    assert torch.equal(physics.state.contact_forces[~mask], forces[~mask])
+    assert (physics.ctrl[mask] == 0.0).all()
+    assert (physics.robot_state.contact_forces[mask] == 0.0).all()
+    assert torch.equal(physics.ctrl[~mask], torques[~mask])
+    assert torch.equal(physics.robot_state.contact_forces[~mask], forces[~mask])
     assert (forces[:, :, 2].sum(dim=1) > 100.0).all()
     assert (torques != 0.0).any(dim=1).all()
 
 
 @pytest.mark.parametrize("written", [0, 3])
 def test_writing_one_world_leaves_the_others_bit_identical(physics, robot, written):
-    """In the middle of contact, now and for the next 20 steps; mujoco-warp's own reset_data drops everybody's contacts."""
+    """In the middle of contact, now and for the next 20 steps, then as far as runs can be repeated; mujoco-warp's own
+    reset_data drops everybody's contacts.
+    """
     start, new = random_states(robot, 6, seed=6), heaps(robot, 6, seed=8)
     others = ~only(written)
 
@@ -67,15 +70,15 @@ def test_writing_one_world_leaves_the_others_bit_identical(physics, robot, writt
         if write:
             new.write(physics, only(written))
             assert torch.equal(bits(snapshot(physics)[others]), bits(before[others]))
-            assert not torch.equal(physics.state.base_pos[written], before[written, :3])
+            assert not torch.equal(physics.robot_state.base_pos[written], before[written, :3])
         return before, roll(physics, start.dof_pos, 20)
 
     before, expected = run(write=False)
     again, actual = run(write=True)
-    assert torch.equal(bits(again), bits(before))  # runs are reproducible, else the next line says nothing
-    assert torch.equal(bits(actual[:, others]), bits(expected[:, others]))
+    assert_same(physics, again, before)  # runs are reproducible, else the next line says nothing
+    assert_same(physics, actual[:, others], expected[:, others])
     assert not torch.equal(actual[:, written], expected[:, written])
-    assert (physics.state.contact_forces[others].norm(dim=2).sum(dim=1) > 100.0).all()
+    assert (physics.robot_state.contact_forces[others].norm(dim=2).sum(dim=1) > 100.0).all()
 
 
 @pytest.fixture
@@ -99,13 +102,13 @@ def test_a_world_that_blows_up_is_confined_and_curable(physics, robot):
     roll(physics, start.dof_pos, 20)
     broken.write(physics, only(sick))
     actual = roll(physics, start.dof_pos, 40)
-    assert torch.equal(bits(actual[:, others]), bits(expected[20:, others]))
+    assert_same(physics, actual[:, others], expected[20:, others])
     assert actual[:, sick, :3].isnan().all()
-    assert physics.state.dof_pos[sick].isnan().all()
+    assert physics.robot_state.dof_pos[sick].isnan().all()
 
     start.write(physics)
     assert torch.isfinite(snapshot(physics)).all()
-    assert torch.equal(bits(roll(physics, start.dof_pos, 60)), bits(expected))
+    assert_same(physics, roll(physics, start.dof_pos, 60), expected)
 
 
 @pytest.mark.usefixtures("elsewhere")
@@ -119,7 +122,7 @@ def test_a_single_bad_number_is_visible_after_a_step_wherever_it_began(physics, 
     start.write(physics)
     roll(physics, standing(robot, 6).dof_pos, 1)
     for world, name in enumerate(names):
-        numbers = torch.cat([getattr(physics.state, other)[world] for other in names])
+        numbers = torch.cat([getattr(physics.robot_state, other)[world] for other in names])
         assert not torch.isfinite(numbers).all(), name
     random_states(robot, 6, seed=13).write(physics)
     assert torch.isfinite(roll(physics, standing(robot, 6).dof_pos, 20)).all()
@@ -129,17 +132,17 @@ def test_push_changes_the_horizontal_velocity_of_its_worlds_only(physics, robot)
     states = heaps(robot, 6, seed=10)
     states.write(physics)
     before = snapshot(physics)
-    velocity = physics.state.base_lin_vel_w.clone()
+    velocity = physics.robot_state.base_lin_vel_w.clone()
     mask = torch.tensor([True, False, False, True, True, False])
     by = torch.tensor([[0.5, -1.0], [3.0, 3.0], [torch.nan, 1.0], [0.0, 0.25], [-2.0, 0.0], [9.0, 9.0]])
     physics.push(mask, by)
     physics.refresh()
     assert torch.equal(bits(snapshot(physics)[~mask]), bits(before[~mask]))
     expected = velocity[mask] + torch.nn.functional.pad(by[mask], (0, 1))
-    torch.testing.assert_close(physics.state.base_lin_vel_w[mask], expected, atol=1e-6, rtol=0.0)
-    assert torch.equal(physics.state.base_lin_vel_w[:, 2], velocity[:, 2])
+    torch.testing.assert_close(physics.robot_state.base_lin_vel_w[mask], expected, atol=1e-6, rtol=0.0)
+    assert torch.equal(physics.robot_state.base_lin_vel_w[:, 2], velocity[:, 2])
     for name in ("base_pos", "base_quat", "base_ang_vel", "dof_pos", "dof_vel"):
-        assert torch.equal(getattr(physics.state, name), getattr(states, name)), name
+        assert torch.equal(getattr(physics.robot_state, name), getattr(states, name)), name
 
 
 # ---- memory --------------------------------------------------------------------------------------------------------------
@@ -159,11 +162,11 @@ def test_refresh_twice_is_refresh_once(physics, robot):
 
 def test_tensors_stay_where_they_are(physics, robot):
     """The task keeps them and a CUDA graph knows their addresses."""
-    states = standing(robot, 6)
+    states, engine = standing(robot, 6), engine_of(physics)
 
     def addresses() -> dict[str, int]:
-        found = {name: getattr(physics.state, name).data_ptr() for name in FIELDS}
-        return {**found, "torques": physics.torques.data_ptr(), "overflowed": physics.overflowed.data_ptr()}
+        found = {name: getattr(engine.robot_state, name).data_ptr() for name in FIELDS}
+        return {**found, "ctrl": engine.ctrl.data_ptr(), "overflowed": engine.overflowed.data_ptr()}
 
     before = addresses()
     states.write(physics, only(0))
@@ -175,7 +178,7 @@ def test_tensors_stay_where_they_are(physics, robot):
 
 
 def test_state_is_float32_of_the_promised_shapes(physics):
-    shapes = {name: tuple(getattr(physics.state, name).shape) for name in FIELDS}
+    shapes = {name: tuple(getattr(physics.robot_state, name).shape) for name in FIELDS}
     vectors = dict.fromkeys(("base_pos", "base_lin_vel", "base_lin_vel_w", "base_ang_vel", "projected_gravity"), (6, 3))
     assert shapes == {
         **vectors,
@@ -186,8 +189,8 @@ def test_state_is_float32_of_the_promised_shapes(physics):
         "feet_vel": (6, 4, 3),
         "contact_forces": (6, 13, 3),
     }
-    assert all(getattr(physics.state, name).dtype == torch.float32 for name in FIELDS)
-    assert (physics.num_envs, physics.dt, physics.torques.shape) == (6, 0.005, (6, 12))
+    assert all(getattr(physics.robot_state, name).dtype == torch.float32 for name in FIELDS)
+    assert (physics.num_envs, physics.dt, physics.ctrl.shape) == (6, 0.005, (6, 12))
     assert (physics.overflowed.dtype, physics.overflowed.shape) == (torch.bool, (6,))
 
 
@@ -214,7 +217,7 @@ def test_default_memory_holds_robots_lying_in_a_heap(make_physics, backend, robo
     for _ in range(200):
         roll(physics, states.dof_pos, 1)
         lost |= physics.overflowed
-        most = torch.maximum(most, (physics.state.contact_forces.norm(dim=2) > 0.0).sum(dim=1))
+        most = torch.maximum(most, (physics.robot_state.contact_forces.norm(dim=2) > 0.0).sum(dim=1))
     assert not lost.any()
     assert torch.isfinite(snapshot(physics)).all()
     assert most.max() >= 5  # shapes of one robot on the ground at once: it was a heap
@@ -240,21 +243,23 @@ def test_the_c_engine_on_a_gpu_is_an_error_that_says_what_to_do():
 
 
 def test_make_physics_builds_what_is_named(make_physics, backend):
-    built = make_physics(backend)
+    built = engine_of(make_physics(backend))
+    name, _, gpu = backend.partition(", ")
     assert (
         type(built).__name__
         == {
             "mujoco": "MujocoPhysics",
             "mujoco_warp": "MujocoWarpPhysics",
             "newton": "NewtonPhysics",
-        }[backend]
+        }[name]
     )
-    assert built.capturable == (backend != "mujoco")
+    assert built.capturable == (name != "mujoco")
+    assert built.qpos.device.type == (gpu or "cpu")
 
 
 def test_the_c_engine_is_not_built_for_a_gpu(robot):
     with pytest.raises(ValueError, match="runs on the CPU"):
-        MujocoPhysics(robot, SimConfig(), 1, torch.device("cuda:0"))
+        MujocoPhysics(RobotScene(robot), SimConfig(), 1, torch.device("cuda:0"))
 
 
 def test_copy_to_shows_one_world_as_it_is_now(physics, robot):
@@ -264,7 +269,7 @@ def test_copy_to_shows_one_world_as_it_is_now(physics, robot):
     roll(physics, states.dof_pos, 10)
     data = mujoco.MjData(physics.model)
     physics.copy_to(4, data)
-    state = physics.state
+    state = physics.robot_state
     np.testing.assert_allclose(data.qpos, torch.cat([state.base_pos[4], state.base_quat[4], state.dof_pos[4]]), atol=1e-6)
     np.testing.assert_allclose(data.qvel[:3], state.base_lin_vel_w[4], atol=1e-6)
     np.testing.assert_allclose(data.qvel[6:], state.dof_vel[4], atol=1e-5)

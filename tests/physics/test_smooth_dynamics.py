@@ -1,112 +1,153 @@
-"""Poses, inertias and bias forces in one launch: those of C MuJoCo, for this robot and for crooked ones."""
+"""Poses, inertias and forces in one launch: those of C MuJoCo, for a shipped robot and for trees of all kinds of joints."""
 
 import mujoco
-import mujoco_warp as mjw
 import numpy as np
 import pytest
 import warp as wp
+from mechanisms import CROOKED, EVERY_JOINT, FusedWorlds, c_worlds, packaged, random_motion, relative_error
 
 from legged.config.schema import SimConfig
-from legged.errors import ConfigError
 from legged.physics.fused.smooth_dynamics import SmoothDynamics
-from legged.physics.scene.robot_scene import build_model
+from legged.physics.scene import RobotScene
 from legged.physics.warp.compile import launched
 
-CROOKED = """
-<mujoco>
-  <compiler angle="radian"/>
-  <option gravity="0.4 -0.3 -9"/>
-  <worldbody>
-    <geom name="floor" type="plane" size="0 0 1" pos="0.1 0.2 -0.3"/>
-    <body name="base" pos="0 0 1">
-      <freejoint/>
-      <geom name="trunk" type="box" size=".3 .2 .1" mass="5" pos=".02 .01 0" quat=".9 .1 .3 -.2"/>
-      <body name="mast" pos="0 0 .2" quat=".8 .2 -.1 .4"><geom name="mast" type="capsule" size=".02 .1" mass=".7"/></body>
-      <body name="arm" pos=".3 .1 0" quat=".7 .3 .2 -.4">
-        <joint name="shoulder" type="hinge" axis="1 2 -1" pos=".02 -.03 .05" armature="0.03" ref="0.4"/>
-        <joint name="twist" type="hinge" axis="0 1 1" pos=".01 0 0"/>
-        <geom name="arm" type="box" size=".2 .04 .03" mass="1.1" pos=".1 0 .02"/>
-        <body name="hand" pos=".4 0 0" quat=".9 -.2 .3 .1">
-          <joint name="wrist" type="hinge" axis="0 0 1" pos="-.05 0 0"/>
-          <geom name="hand" size=".05" mass=".3" pos=".05 .02 0"/>
-        </body>
-      </body>
-      <body name="tail" pos="-.3 0 0">
-        <joint name="tail" type="hinge" axis="0 1 0"/>
-        <geom name="tail" type="capsule" fromto="0 0 0 -.3 0 .1" size=".02" mass=".4"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <motor joint="shoulder"/><motor joint="twist"/><motor joint="wrist"/><motor joint="tail"/>
-  </actuator>
-</mujoco>
-"""
-"""A welded body, two hinges in one body, joints off their bodies' origins, a reference angle, gravity aslant."""
+MODELS = {
+    "shipped": lambda robot: RobotScene(robot).model(SimConfig()),
+    "crooked": lambda _: mujoco.MjModel.from_xml_string(CROOKED),
+    "every joint": lambda _: mujoco.MjModel.from_xml_string(EVERY_JOINT),
+    "half cheetah": lambda _: packaged("half_cheetah.xml"),
+    "humanoid": lambda _: packaged("humanoid.xml"),
+}
+DRAWN = (
+    "body_mass",
+    "body_inertia",
+    "body_ipos",
+    "body_iquat",
+    "body_pos",
+    "jnt_axis",
+    "jnt_pos",
+    "jnt_stiffness",
+    "jnt_actfrcrange",
+    "qpos_spring",
+    "dof_armature",
+    "dof_damping",
+    "geom_pos",
+    "actuator_gear",
+    "actuator_gainprm",
+    "actuator_biasprm",
+    "actuator_ctrlrange",
+    "actuator_forcerange",
+)
+"""Arrays of a model in which worlds may differ."""
 
 
-def shipped(robot) -> mujoco.MjModel:
-    return build_model(robot, SimConfig())
-
-
-def crooked(robot) -> mujoco.MjModel:
-    return mujoco.MjModel.from_xml_string(CROOKED)
-
-
-@pytest.mark.parametrize("build", [shipped, crooked])
-def test_poses_inertias_and_forces_are_those_of_c_mujoco(robot, build):
-    """In six worlds in any pose, moving fast, with quaternions of any length, and a base of another mass in each."""
-    model, count, rng = build(robot), 6, np.random.default_rng(0)
-    base, hinges = model.body("base").id, model.nv - 6
-    limit = 20.0
-    qpos = np.tile(model.qpos0, (count, 1)) + rng.normal(size=(count, model.nq))
-    qpos[:, 3:7] = rng.normal(size=(count, 4))
-    qvel, torques = 3.0 * rng.normal(size=(count, model.nv)), 20.0 * rng.normal(size=(count, hinges))
-    mass = model.body_mass[base] * np.linspace(0.5, 1.5, count)
-    with wp.ScopedDevice("cpu"):
-        m = mjw.put_model(model, batch_sizes={"body_mass": count})
-        d = mjw.make_data(model, nworld=count, nconmax=24, njmax=96)
-        masses = m.body_mass.numpy()
-        masses[:, base] = mass
-        m.body_mass.assign(masses)
-        for array, values in ((d.qpos, qpos), (d.qvel, qvel), (d.ctrl, torques)):
-            array.assign(np.float32(values))
-        SmoothDynamics(model, m, d, base, np.array([[-limit] * hinges, [limit] * hinges])).launch()
-        found = {
-            name: getattr(d, name).numpy() for name in ("geom_xpos", "geom_xmat", "subtree_com", "cdof", "M", "qfrc_smooth")
-        }
-        rows, starts, columns = (getattr(m, name).numpy() for name in ("M_rownnz", "M_rowadr", "M_colind"))
-    for i in range(count):
-        model.body_mass[base] = mass[i]
-        mujoco.mj_setConst(model, data := mujoco.MjData(model))
-        data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
+def check(fused: FusedWorlds, models: list[mujoco.MjModel], motion: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+    """Check that a launch computes all that C MuJoCo does in each world's own model."""
+    fused.write(*motion)
+    with wp.ScopedDevice(fused.device):
+        fused._step.begin()
+    matrices = fused.mass_matrices()
+    names = ("geom_xpos", "geom_xmat", "subtree_com", "cdof", "qfrc_passive", "qfrc_actuator", "qfrc_smooth")
+    found = {name: fused.read(name) for name in names}
+    for i, model in enumerate(models):
+        (data,) = c_worlds(model, *(values[i : i + 1] for values in motion))
         mujoco.mj_forward(model, data)
-        np.testing.assert_allclose(found["geom_xpos"][i], data.geom_xpos, atol=2e-6)
+        roots = np.unique(model.body_rootid[model.dof_bodyid])
+        np.testing.assert_allclose(found["geom_xpos"][i], data.geom_xpos, atol=4e-6)
         np.testing.assert_allclose(found["geom_xmat"][i].reshape(-1, 9), data.geom_xmat, atol=2e-6)
-        np.testing.assert_allclose(found["subtree_com"][i, base], data.subtree_com[base], atol=2e-6)
+        np.testing.assert_allclose(found["subtree_com"][i, roots], data.subtree_com[roots], atol=4e-6)
         np.testing.assert_allclose(found["cdof"][i], data.cdof, atol=5e-6)
         full = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, full)
-        for r in range(model.nv):
-            entries = slice(starts[r], starts[r] + rows[r])
-            np.testing.assert_allclose(found["M"][i, entries], full[r, columns[entries]], atol=2e-5)
-        forces = -data.qfrc_bias
-        forces[6:] += np.clip(torques[i], -limit, limit)
-        np.testing.assert_allclose(found["qfrc_smooth"][i], forces, rtol=1e-5, atol=1e-3)
+        assert relative_error(matrices[i], full) < 1e-5
+        for name in ("qfrc_passive", "qfrc_actuator", "qfrc_smooth"):
+            assert relative_error(found[name][i], getattr(data, name)) < 1e-5, name
 
 
-@pytest.mark.parametrize(("way", "one_launch"), [("auto", True), ("fused", True), ("stages", False)])
-def test_a_shipped_robot_takes_one_launch_unless_asked_for_stages(make_physics, way, one_launch):
-    sim = {} if way == "auto" else {"smooth_dynamics": way}
+@pytest.mark.parametrize("name", MODELS)
+def test_poses_inertias_and_forces_are_those_of_c_mujoco(robot, name, device):
+    """In six worlds in any pose, moving fast, with quaternions of any length."""
+    model = MODELS[name](robot)
+    qpos, qvel, ctrl = random_motion(model, 6, seed=0)
+    if model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE:
+        qpos[:, 3:7] = np.float32(qpos[:, 3:7] * np.linspace(0.5, 2.0, 6)[:, None])
+    check(FusedWorlds(model, 6, device=device), [model] * 6, (qpos, 3.0 * qvel, 20.0 * ctrl))
+
+
+@pytest.mark.parametrize("name", ["crooked", "every joint"])
+def test_worlds_may_differ_in_most_of_the_model(robot, name, device):
+    """Every array that a randomisation may draw is read by world: each is C MuJoCo's world of its own model."""
+    rng = np.random.default_rng(1)
+    models = [MODELS[name](robot) for _ in range(4)]
+    for model in models:
+        for array in DRAWN:
+            values = getattr(model, array)
+            values[:] = np.float32(values * rng.uniform(0.8, 1.2, values.shape))
+        model.geom_sameframe[:], model.body_sameframe[:] = (
+            0,
+            0,
+        )  # short cuts of C MuJoCo for frames that are no longer the same
+        model.jnt_axis[:] = np.float32(model.jnt_axis / np.linalg.norm(model.jnt_axis, axis=1, keepdims=True))
+        model.body_iquat[:] = np.float32(model.body_iquat / np.linalg.norm(model.body_iquat, axis=1, keepdims=True))
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+    drawn = {array: np.stack([getattr(model, array) for model in models]) for array in DRAWN}
+    check(FusedWorlds(models[0], 4, drawn, device=device), models, random_motion(models[0], 4, seed=2))
+
+
+def test_dampers_and_springs_that_only_some_worlds_have_are_felt(device):
+    """The model itself has none, so that its own launch would not look for them."""
+    models = [mujoco.MjModel.from_xml_string(CROOKED) for _ in range(3)]
+    models[1].dof_damping[6:], models[2].jnt_stiffness[1:] = 0.7, 9.0
+    drawn = {array: np.stack([getattr(model, array) for model in models]) for array in ("dof_damping", "jnt_stiffness")}
+    check(FusedWorlds(models[0], 3, drawn, device=device), models, random_motion(models[0], 3, seed=3))
+
+
+@pytest.mark.parametrize(
+    ("sim", "one_launch"), [({}, True), ({"step": "fused"}, True), ({"tag": "stages"}, False), ({"step": "library"}, False)]
+)
+def test_a_shipped_robot_takes_one_launch_unless_asked_for_others(make_physics, sim, one_launch):
     physics = make_physics("mujoco_warp", **sim)
     modules = " ".join(build.module.name for build in launched(wp.get_device("cpu"), (physics._step,)))
     assert ("dynamics_kernel" in modules) == one_launch
     assert ("mujoco_warp._src.smooth" in modules) != one_launch
+    assert ("solver_kernel" in modules) == (sim.get("step") != "library")
+    assert (physics.why_library == "") == one_launch
 
 
-def test_what_it_does_not_compute_is_refused(make_physics):
-    with pytest.raises(ConfigError, match=r"smooth_dynamics=fused: needs the fused sim\.constraint_solver"):
-        make_physics("mujoco_warp", num_envs=1, smooth_dynamics="fused", constraint_solver="rounds")
-    welded = CROOKED.replace("<actuator>", '<equality><weld body1="hand" body2="tail"/></equality><actuator>')
-    assert "equality constraints" in SmoothDynamics.why_not(mujoco.MjModel.from_xml_string(welded))
-    assert SmoothDynamics.why_not(mujoco.MjModel.from_xml_string(CROOKED)) == ""
+REFUSED = {
+    "equality constraints": ("<actuator>", "<equality><weld body1='hand' body2='tail'/></equality><actuator>"),
+    "compensation of gravity": ('<body name="tail"', '<body name="tail" gravcomp="1"'),
+    "a free or ball joint has a spring": ("<freejoint/>", '<joint type="free" stiffness="1"/>'),
+    "dampers or armature of actuators": ('<motor joint="tail"', '<motor joint="tail" armature="0.1"'),
+    "not linear": ('axis="0 1 0"', 'axis="0 1 0" damping="1 2"'),
+    "actuators with a state": ("<motor joint", '<general dyntype="filter" joint'),
+    "no motor, position or velocity servo": ("<motor joint", '<general gaintype="affine" joint'),
+    "something else than a slide or a hinge": ("<actuator>", '<actuator><adhesion body="tail" ctrlrange="0 1"/>'),
+    "tendons that pull": (
+        "<actuator>",
+        '<tendon><fixed stiffness="1"><joint joint="tail" coef="1"/></fixed></tendon><actuator>',
+    ),
+    "mocap bodies": ("<worldbody>", '<worldbody><body mocap="true"/>'),
+    "in a fluid": ("<option", '<option density="1.2"'),
+    "disables spring": ("<worldbody>", '<option><flag spring="disable"/></option><worldbody>'),
+    "enables features": ("<worldbody>", '<option><flag energy="enable"/></option><worldbody>'),
+}
+
+
+@pytest.mark.parametrize("reason", REFUSED)
+def test_what_it_does_not_compute_is_refused(reason):
+    old, new = REFUSED[reason]
+    assert old in CROOKED
+    assert reason in SmoothDynamics.why_not(mujoco.MjModel.from_xml_string(CROOKED.replace(old, new, 1)))
+
+
+def test_what_it_computes_is_not_refused(robot):
+    for name, build in MODELS.items():
+        assert SmoothDynamics.why_not(build(robot), DRAWN) == "", name
+    nothing = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    assert "no joints" in SmoothDynamics.why_not(nothing)
+
+
+@pytest.mark.parametrize("array", ["body_gravcomp", "dof_dampingpoly", "actuator_armature", "tendon_stiffness"])
+def test_worlds_that_differ_in_what_it_does_not_read_are_refused(array):
+    assert array in SmoothDynamics.why_not(mujoco.MjModel.from_xml_string(CROOKED), ("geom_friction", array))

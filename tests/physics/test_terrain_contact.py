@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from devices import ON_A_GPU, build, on_gpu
 from reference import roll, standing
 
 from legged.config.schema import SimConfig, TerrainConfig
 from legged.errors import ConfigError
-from legged.physics import make_physics
+from legged.physics import RobotScene, make_physics
 from legged.physics.collider.terrain_contact import TerrainContact
 from legged.physics.scene.terrain_geoms import add_terrain
 from legged.terrain import HeightMap, Terrain, TileSpec
@@ -241,7 +242,7 @@ def test_c_mujoco_s_height_fields_lean_at_seams_and_ours_follow_the_slope():
     spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{free_body('foot')}</worldbody></mujoco>")
     add_terrain(spec, ground)
     theirs = leans(c_contacts(spec.compile(), qpos))
-    # A bracket around the figure in README: outside it MuJoCo has changed, and README and CONTRIBUTING must, too.
+    # A bracket around the figure in docs/results.md and decisions.md: outside it MuJoCo has changed, and both must, too.
     assert 0.2 < (theirs > 10.0).mean() < 0.32
     assert theirs.max() < 25.0
 
@@ -289,22 +290,17 @@ def tiles(*names_and_sizes: tuple[str, float]) -> Terrain:
     return Terrain.of_tiles([[TileSpec(*pair) for pair in names_and_sizes]], cfg, np.random.default_rng(5))
 
 
-@pytest.fixture(scope="module")
-def on_stairs(robot):
-    """All back-ends on the same four tiles, four robots each: one tile a robot."""
-    ground = tiles(("stairs_up", 0.15), ("slope_down", 15.0), ("rough_slope_up", 10.0), ("obstacles", 0.15))
-    return ground, {
-        name: make_physics(robot, SimConfig(physics=name, threads=1, njmax=128), 4, torch.device("cpu"), ground)
-        for name in ("mujoco", "mujoco_warp", "newton")
-    }
-
-
-def test_robots_tumble_and_come_to_rest_alike_on_all_back_ends(robot, on_stairs):
+@pytest.mark.parametrize("where", [pytest.param("", id="cpu"), on_gpu(ON_A_GPU, id="cuda")])
+def test_robots_tumble_and_come_to_rest_alike_on_all_back_ends(robot, where):
     """Dropped off the platform onto stairs, a slope and rough ground, which throws two of them over: after 0.5 s, with
     the trunk and legs on risers and rims, positions agree within 2 mm where the surface is the same (not on the rough
     ground, where the C engine has triangles). Once at rest, upright or fallen, forces sum to the weight.
     """
-    ground, engines = on_stairs
+    ground = tiles(("stairs_up", 0.15), ("slope_down", 15.0), ("rough_slope_up", 10.0), ("obstacles", 0.15))
+    engines = {
+        name: build(RobotScene(robot, ground), name + (where if name != "mujoco" else ""), 4, threads=1, njmax=128)
+        for name in ("mujoco", "mujoco_warp", "newton")
+    }
     states = standing(robot, 4)
     for i, x in enumerate((1.75, 2.0, 1.9, 2.0)):
         place = ground.origins[0, i]
@@ -315,11 +311,11 @@ def test_robots_tumble_and_come_to_rest_alike_on_all_back_ends(robot, on_stairs)
     for name, physics in engines.items():
         states.write(physics)
         roll(physics, states.dof_pos, 100)
-        places[name] = physics.state.base_pos.clone().numpy()
+        places[name] = physics.robot_state.base_pos.clone().numpy()
         roll(physics, states.dof_pos, 900)
-        tilted[name] = physics.state.projected_gravity[:, 2] > -0.9
-        assert (physics.state.base_lin_vel.norm(dim=1) < 0.02).all()
-        force = physics.state.contact_forces[:, :, 2].sum(dim=1)
+        tilted[name] = physics.robot_state.projected_gravity[:, 2] > -0.9
+        assert (physics.robot_state.base_lin_vel.norm(dim=1) < 0.02).all()
+        force = physics.robot_state.contact_forces[:, :, 2].sum(dim=1)
         np.testing.assert_allclose(force.numpy(), robot.mass * 9.81, rtol=0.01, err_msg=name)
         assert not physics.overflowed.any()
     exact = [0, 1, 3]
@@ -338,21 +334,21 @@ def test_the_general_collider_carries_a_robot_too(robot):
     found = []
     for name, collider in (("mujoco", "cells"), ("mujoco_warp", "convex")):
         sim = SimConfig(physics=name, threads=1, terrain_collider=collider, nconmax=64, njmax=256)
-        physics = make_physics(robot, sim, 1, torch.device("cpu"), ground)
+        physics = make_physics(RobotScene(robot, ground), sim, 1, torch.device("cpu"))
         states.write(physics)
         roll(physics, states.dof_pos, 200)
-        found.append(physics.state)
+        found.append(physics.robot_state)
         assert not physics.overflowed.any()
     assert (found[0].contact_forces[0, :, 2] > 50.0).sum() == 4
     torch.testing.assert_close(found[1].base_pos, found[0].base_pos, atol=2e-4, rtol=0.0)
     torch.testing.assert_close(found[1].base_quat, found[0].base_quat, atol=2e-4, rtol=0.0)
 
 
-def test_self_collisions_are_kept_if_asked(robot, on_stairs):
+def test_self_collisions_are_kept_if_asked(robot):
     """Knees turned inward until left and right thigh meet: they feel each other, on level ground far above it."""
     ground = tiles(("flat", 0.0))
     sim = SimConfig(physics="mujoco_warp", self_collisions=True)
-    physics = make_physics(robot, sim, 2, torch.device("cpu"), ground)
+    physics = make_physics(RobotScene(robot, ground), sim, 2, torch.device("cpu"))
     states = standing(robot, 2, height=3.0)
     inward = [i for i, name in enumerate(robot.joint_names) if "HAA" in name]
     signs = [-1.0 if robot.joint_names[i][0] == "L" else 1.0 for i in inward]
@@ -360,10 +356,10 @@ def test_self_collisions_are_kept_if_asked(robot, on_stairs):
     states.write(physics)
     physics.step()
     physics.refresh()
-    touching = physics.state.contact_forces.norm(dim=2) > 0.0
+    touching = physics.robot_state.contact_forces.norm(dim=2) > 0.0
     assert not touching[0].any()
     assert touching[1].any()
-    np.testing.assert_allclose(physics.state.contact_forces[1].sum(dim=0).numpy(), 0.0, atol=1e-2)
+    np.testing.assert_allclose(physics.robot_state.contact_forces[1].sum(dim=0).numpy(), 0.0, atol=1e-2)
 
 
 @pytest.mark.parametrize("far", [1e9, 1e30, np.inf, np.nan])

@@ -10,8 +10,8 @@ from helpers import POLICY, TASK, call, small_task, stand
 
 import legged.policies.restore
 from legged.errors import RunError
-from legged.learning.runner import Runner
-from legged.play import video
+from legged.play import schedule, video
+from legged.policies.actor import Actor
 from legged.policies.export import export
 from legged.process.paths import DISK_FULL
 from legged.tools import play
@@ -35,15 +35,15 @@ class FakeCamera:
 
 @pytest.fixture
 def short(monkeypatch):
-    monkeypatch.setattr(play, "SCHEDULE", ((0.2, (0.5, 0.0, 0.0)),))
-    monkeypatch.setattr(video, "Camera", FakeCamera)
+    monkeypatch.setattr(schedule, "SCHEDULE", ((0.2, (0.5, 0.0, 0.0)),))
+    monkeypatch.setattr(video, "camera_of", FakeCamera)
 
 
 def test_a_command_that_is_over_before_it_is_measured_has_no_error(short):
     """One control step lasts 1.25 s, the command 0.2 s: one step, in whose first second nothing is measured."""
     task = small_task(("control.decimation", 250), num_envs=2)
     film = video.Video(task, 1, Path("film"))
-    table = play.record(task, stand, film)
+    table = schedule.follow_schedule(task, stand, film)
     assert list(table.columns[1].cells) == ["-"]
     assert film.fps == pytest.approx(1 / task.dt)
     film.write()
@@ -70,7 +70,7 @@ def test_where_nothing_can_be_drawn_commands_are_followed_all_the_same(short, mo
     def fail(*_):
         raise RunError("cannot render here")
 
-    monkeypatch.setattr(video, "Camera", fail)
+    monkeypatch.setattr(video, "camera_of", fail)
     assert call(play.main, [*HERE, "--headless", "--num_envs", "1", "--out", "out"]) == 1
     out, err = capsys.readouterr()
     assert "following commands" in out
@@ -95,12 +95,13 @@ def test_a_folder_that_cannot_be_written_is_found_before_anything_is_built(monke
 
 def test_an_export_onto_a_full_disk_is_one_line(monkeypatch):
     """Torch would abort the process; so it never writes to the disk itself."""
-    runner = Runner(small_task(num_envs=2))
+    task = small_task(num_envs=2)
+    policy = Actor(task, "cpu").network
 
     def full(self, _data):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(RunError, match=r"out/policy\.pt: no space left on the disk"):
-        export(runner, Path("out"))
+        export(task, policy, Path("out"))
     assert not list(Path("out").iterdir())

@@ -14,7 +14,8 @@ from legged.config import TaskConfig, override
 from legged.envs import LeggedRobot
 from legged.math import yaw_of
 from legged.play import outing, video
-from legged.play.playground import SETTING, Playground, label
+from legged.play.errors import TrackingErrors
+from legged.play.playground import ROWS_NEEDED, SETTING, Playground, label
 from legged.process.paths import data_folder
 from legged.registry import make_task, task_config
 from legged.terrain import TERRAIN_TYPES
@@ -98,11 +99,15 @@ def test_a_plane_stays_one_unless_a_type_is_named():
 
 
 def test_labels_give_sizes_in_the_units_of_the_types():
-    assert label("stairs_up", [0.194]) == "stairs_up, step height 0.19 m"
+    assert label("stairs_up", [0.19400000000000003]) == "stairs_up, step height 0.194 m"
     assert label("slope_down", [11.3, 17.7]) == "slope_down, angle 11 to 18 degrees"
     assert label("flat", [0.0]) == "flat"
-    assert playground(config()).labels()["stairs_down"] == "stairs_down, step height 0.14 to 0.19 m"
+    assert playground(config()).labels()["stairs_down"] == "stairs_down, step height 0.14 to 0.194 m"
     assert playground(config(), difficulty=0.5).labels()["stairs_down"] == "stairs_down, step height 0.14 m"
+
+
+def test_a_task_on_steps_has_the_constraint_rows_that_play_gives_to_others():
+    assert task_config("anymal_c").sim.njmax == ROWS_NEEDED
 
 
 def test_robots_start_on_their_tiles_and_face_along_x():
@@ -122,7 +127,7 @@ def test_robots_start_on_their_tiles_and_face_along_x():
     assert ground.label(task.terrain, task.base_pos[0].tolist()).startswith("stairs_down, step height 0.14")
     # A tile length farther along x it stands on the harder one.
     x, y, z = task.base_pos[0].tolist()
-    assert ground.label(task.terrain, (x + 8.0, y, z)) == "stairs_down, step height 0.19 m"
+    assert ground.label(task.terrain, (x + 8.0, y, z)) == "stairs_down, step height 0.194 m"
 
 
 # ---- walking ---------------------------------------------------------------------------------------------------------
@@ -135,14 +140,14 @@ def test_errors_are_root_mean_squares_of_settled_robots():
         commands=torch.tensor([[0.7, 0.0, 0.2, 0.0]] * 3),
         base_lin_vel=torch.tensor([[0.4, 0.4, 9.0], [5.0, 5.0, 5.0], [7.0, 7.0, 7.0]]),
         base_ang_vel=torch.tensor([[9.0, 9.0, 0.3], [5.0, 5.0, 5.0], [7.0, 7.0, 7.0]]),
-        episode_length_buf=torch.tensor([50, 49, 0]),
         terminated_buf=torch.tensor([False, False, True]),
     )
-    tracking = outing.Tracking(3, torch.device("cpu"))
-    tracking.add(task)
-    tracking.add(task)
-    assert tracking.row(torch.tensor([True, True, False])) == ("0.500 m/s", "0.100 rad/s", "0")
-    assert tracking.row(torch.tensor([False, False, True])) == ("-", "-", "2")
+    errors = TrackingErrors(3, torch.device("cpu"))
+    for _ in range(2):
+        errors.add(task, torch.tensor([True, False, False]))
+    assert errors.row(torch.tensor([True, True, False])) == ("0.500 m/s", "0.100 rad/s", "0")
+    assert errors.row(torch.tensor([False, False, True])) == ("-", "-", "2")
+    assert errors.row() == ("0.500 m/s", "0.100 rad/s", "2")
 
 
 @pytest.mark.parametrize("heading", [True, False])
@@ -186,7 +191,7 @@ class FakeCamera:
 def test_each_episode_shows_another_robot_and_says_what_is_below_it(monkeypatch, tmp_path):
     monkeypatch.setattr(outing, "EPISODE_S", 0.08)
     monkeypatch.setattr(outing, "EPISODES", 3)
-    monkeypatch.setattr(video, "Camera", FakeCamera)
+    monkeypatch.setattr(video, "camera_of", FakeCamera)
     monkeypatch.setattr(FakeCamera, "shots", [])
     ground = playground(config(), difficulty=0.5)
     task = on(ground, config(), num_envs=2)
@@ -254,7 +259,7 @@ def test_play_records_a_film_of_one_type(run, short, tmp_path, capsys, monkeypat
     assert call(play.main, arguments(run, tmp_path, *more)) == 0
     out = capsys.readouterr().out
     assert "recorded 25 frames" in out
-    assert "stairs_down, step height 0.19 m" in out
+    assert "stairs_down, step height 0.194 m" in out
     assert {path.name for path in tmp_path.iterdir()} == {"exported", "play.mp4", "play.gif"}
     assert os.path.getsize(tmp_path / "play.mp4") > 1000
 

@@ -1,11 +1,15 @@
 """Keys of the viewer -> commands; on terrain, tiles."""
 
+import contextlib
+
+import mujoco
 import torch
 from helpers import CALM, ENGINE
 
 from legged.config import override
+from legged.play import viewer
 from legged.play.playground import SETTING, Playground
-from legged.play.viewer import BACKSPACE, COMMA, DOWN, LEFT, NEXT, RIGHT, SPACE, UP, Keyboard, begin_anew
+from legged.play.viewer import BACKSPACE, COMMA, DOWN, LEFT, NEXT, RIGHT, SPACE, UP, Keyboard, begin_anew, watch
 from legged.registry import make_task, task_config
 
 
@@ -69,3 +73,41 @@ def test_on_a_plane_robots_just_begin_anew(capsys):
     assert int(task.episode_length_buf[0]) == 0
     assert not keyboard.restart
     assert capsys.readouterr().out == ""
+
+
+class FakeWindow:
+    """A window that is open for five pictures, in whose third somebody presses backspace."""
+
+    def __init__(self, data, press) -> None:
+        self.data, self.press, self.cam, self.seen = data, press, mujoco.MjvCamera(), []
+
+    def is_running(self) -> bool:
+        if len(self.seen) == 3:
+            self.press(BACKSPACE)
+        return len(self.seen) < 5
+
+    def lock(self):
+        return contextlib.nullcontext()
+
+    def sync(self) -> None:
+        self.seen.append(self.data.qpos.copy())
+
+
+def test_a_task_without_commands_is_shown_as_it_is_simulated(monkeypatch):
+    task = make_task(task_config("half_cheetah", [*ENGINE, ("env.num_envs", 2)], on_cpu=True))
+    windows, lengths = [], []
+
+    @contextlib.contextmanager
+    def launch(model, data, key_callback, **_):
+        windows.append(FakeWindow(data, key_callback))
+        yield windows[0]
+
+    def act(_observations):
+        lengths.append(int(task.episode_length_buf[0]))
+        return torch.full((2, 6), 0.5)
+
+    monkeypatch.setattr(viewer.mujoco.viewer, "launch_passive", launch)
+    watch(task, act)
+    assert lengths == [0, 1, 2, 0, 1]  # it began anew
+    assert abs(torch.tensor(windows[0].seen[-1]) - task.physics.qpos[0]).max() < 1e-5
+    assert windows[0].cam.trackbodyid == 1

@@ -8,6 +8,7 @@ import pytest
 import torch
 from helpers import CALM, ENGINE, small_config, small_task
 
+from legged.config.schema import ObservationGroupConfig
 from legged.envs import LeggedRobot
 from legged.learning.runner import Runner
 from legged.policies.description import describe
@@ -121,7 +122,7 @@ def test_a_controller_that_reads_only_the_exported_files_does_the_same(name, tmp
     with torch.no_grad():
         for parameter in policy.mlp[-1].parameters():
             parameter.mul_(3.0)  # actions of a size that matters
-    export(runner, tmp_path)
+    export(task, policy, tmp_path)
     act = runner.get_inference_policy("cpu")
 
     def ground(x: float, y: float) -> float:
@@ -203,7 +204,7 @@ def test_a_term_of_the_users_is_described_by_its_docstring():
             return self.base_pos[:, 2:]
 
     cfg = small_config()
-    object.__setattr__(cfg.observations, "actor", ("feet", "bare"))
+    cfg.observations.groups["actor"] = ObservationGroupConfig(("feet", "bare"))
     feet, bare = describe(Mine(cfg))["observation"]
     assert feet["formula"] == "Which feet are on the ground, in the world frame [1]."
     assert (feet["unit"], feet["frame"], feet["size"]) == ("1", "world frame", 4)

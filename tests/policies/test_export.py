@@ -32,7 +32,7 @@ def runner(request):
 @pytest.fixture(scope="module")
 def exported(runner, tmp_path_factory):
     folder = tmp_path_factory.mktemp("exported")
-    return folder, export(runner, folder)
+    return folder, export(runner.env, runner.alg.get_policy(), folder)
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +122,7 @@ def test_an_export_that_computes_something_else_is_refused_by_name(runner, tmp_p
 
     monkeypatch.setattr(export_module, function, write_another)
     with pytest.raises(ExportError, match=rf"{file}: differs from the policy by"):
-        export(runner, tmp_path)
+        export(runner.env, runner.alg.get_policy(), tmp_path)
     assert not list(tmp_path.iterdir()), "a refused export must not look like one that passed"
 
 
@@ -136,7 +136,7 @@ def test_an_export_that_gives_nan_is_refused(runner, tmp_path, monkeypatch):
 
     monkeypatch.setattr(export_module.onnxruntime, "InferenceSession", Session)
     with pytest.raises(ExportError, match=r"policy\.onnx"):
-        export(runner, tmp_path)
+        export(runner.env, runner.alg.get_policy(), tmp_path)
     assert not (tmp_path / "policy.json").exists()
 
 
@@ -148,4 +148,4 @@ def test_a_policy_of_large_actions_may_differ_by_their_share(tmp_path):
         for parameter in runner.alg.get_policy().mlp.parameters():
             parameter.mul_(100.0)
         assert runner.alg.get_policy()(runner.env.get_observations()).abs().max() > 1e5
-    assert max(export(runner, tmp_path / "exported").values()) < 1e-4
+    assert max(export(runner.env, runner.alg.get_policy(), tmp_path / "exported").values()) < 1e-4

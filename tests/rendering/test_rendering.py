@@ -10,7 +10,7 @@ import torch
 from legged.config import override
 from legged.play.playground import SETTING, Playground
 from legged.registry import make_task, task_config
-from legged.rendering import Camera, display_model, size_of
+from legged.rendering import RobotsCamera, display_model, size_of
 from legged.rendering.follower import BEHIND, CUT, FLATTEST, FRONT, Follower
 from legged.rendering.paint import LOW, MIDDLE
 from legged.terrain import HeightMap
@@ -34,7 +34,7 @@ def camera(task):
     task.reset()
     task.commands.zero_()
     task.base_lin_vel.zero_()
-    camera = Camera(task, count=2, width=WIDTH, height=HEIGHT)
+    camera = RobotsCamera(task, count=2, width=WIDTH, height=HEIGHT)
     yield camera
     camera.close()
 
@@ -62,7 +62,7 @@ def test_picture_shows_the_robots(camera):
 def test_each_robot_is_drawn(task, camera):
     """One robot from the same distance shows half of the red, and for one the camera comes nearer."""
     both = red(camera.picture()).sum()
-    single = Camera(task, count=1, width=WIDTH, height=HEIGHT)
+    single = RobotsCamera(task, count=1, width=WIDTH, height=HEIGHT)
     assert single.view.distance < camera.view.distance
     single.view.distance = camera.view.distance
     one = red(single.picture()).sum()
@@ -133,7 +133,7 @@ def pit():
 
 @pytest.fixture
 def camera_in_pit(camera, pit):
-    found = Camera(pit, count=2, width=WIDTH, height=HEIGHT)
+    found = RobotsCamera(pit, count=2, width=WIDTH, height=HEIGHT)
     yield found
     found.close()
 
@@ -153,7 +153,7 @@ def warm(picture: np.ndarray) -> float:
 def test_the_ground_is_in_the_picture(camera_in_pit):
     """At the foot of stairs it is cold, on top of a pyramid it is warm; either way there are the robots and risers."""
     deep = camera_in_pit.picture()
-    top = Camera(on_terrain("stairs_down"), count=2, width=WIDTH, height=HEIGHT)
+    top = RobotsCamera(on_terrain("stairs_down"), count=2, width=WIDTH, height=HEIGHT)
     high = top.picture()
     top.close()
     assert cold(deep) > 0.1 > 0.01 > cold(high)
@@ -292,8 +292,8 @@ def test_the_camera_comes_nearer_to_smaller_robots(task, camera, monkeypatch):
     assert camera.view.distance == pytest.approx(2.0 + 1.1 * 2**0.5, rel=0.01)  # ANYmal C's
     assert camera.offsets[1, 1] - camera.offsets[0, 1] == pytest.approx(1.9, rel=0.01)
     size = size_of(task.robot)
-    monkeypatch.setattr("legged.rendering.camera.size_of", lambda _: replace(size, longest=0.5 * size.longest))
-    near = Camera(task, count=2, width=WIDTH, height=HEIGHT)
+    monkeypatch.setattr("legged.rendering.robots_camera.size_of", lambda _: replace(size, longest=0.5 * size.longest))
+    near = RobotsCamera(task, count=2, width=WIDTH, height=HEIGHT)
     near.close()
     assert near.view.distance == pytest.approx(0.5 * camera.view.distance)
     assert np.ptp(near.offsets[:, 1]) == pytest.approx(0.5 * np.ptp(camera.offsets[:, 1]))

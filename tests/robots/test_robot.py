@@ -9,11 +9,10 @@ import pytest
 import torch
 from reference import TOUCHING, roll, standing
 
-from legged.config.schema import ControlConfig, SimConfig
+from legged.config.schema import LeggedControlConfig, SimConfig
 from legged.errors import ConfigError
 from legged.mdp.control import control_gains
-from legged.physics import make_physics
-from legged.physics.scene.robot_scene import build_model
+from legged.physics import RobotScene, make_physics
 from legged.robots.robot import Robot, load_robot, match_names, match_values
 
 # Sides by the leg's name: front legs are at +x, left legs at +y.
@@ -23,7 +22,7 @@ LEFT = {"LF": 1, "LH": 1, "RF": -1, "RH": -1}
 
 @pytest.fixture(scope="module")
 def model(robot):
-    return build_model(robot, SimConfig())
+    return RobotScene(robot).model(SimConfig())
 
 
 def posed(model: mujoco.MjModel, angles: np.ndarray) -> mujoco.MjData:
@@ -139,14 +138,14 @@ def test_standing_robot_keeps_its_height(robot, options, after_2_s, after_5_s):
     shipped options lose a centimetre, the costly ones nothing.
     """
     sim = SimConfig(physics="mujoco", **options)
-    physics = make_physics(robot, sim, 1, torch.device("cpu"))
+    physics = make_physics(RobotScene(robot), sim, 1, torch.device("cpu"))
     start = standing(robot, 1, TOUCHING)
     start.write(physics)
     roll(physics, start.dof_pos, 400, stiffness=80.0, damping=2.0)
-    assert physics.state.base_pos[0, 2].item() == pytest.approx(after_2_s, abs=0.003)
+    assert physics.robot_state.base_pos[0, 2].item() == pytest.approx(after_2_s, abs=0.003)
     roll(physics, start.dof_pos, 600, stiffness=80.0, damping=2.0)
-    assert physics.state.base_pos[0, 2].item() == pytest.approx(after_5_s, abs=0.003)
-    assert physics.state.projected_gravity[0, 2].item() < -0.999
+    assert physics.robot_state.base_pos[0, 2].item() == pytest.approx(after_5_s, abs=0.003)
+    assert physics.robot_state.projected_gravity[0, 2].item() < -0.999
 
 
 def test_shipped_options_are_those_that_the_standing_test_is_about():
@@ -159,7 +158,7 @@ def test_shipped_options_are_those_that_the_standing_test_is_about():
 )
 def test_scene_has_the_options_of_the_configuration(robot, cone, kind):
     """And semi-implicit Euler with Newton's solver, which none of them chooses."""
-    option = build_model(robot, SimConfig(dt=0.002, cone=cone, impratio=7.0, iterations=3, ls_iterations=4)).opt
+    option = RobotScene(robot).model(SimConfig(dt=0.002, cone=cone, impratio=7.0, iterations=3, ls_iterations=4)).opt
     assert (option.timestep, option.impratio, option.iterations, option.ls_iterations) == (0.002, 7.0, 3, 4)
     assert option.cone == kind
     assert option.integrator == mujoco.mjtIntegrator.mjINT_EULER
@@ -180,19 +179,19 @@ def test_names_keep_the_order_of_the_model_whatever_the_order_of_the_patterns():
 
 
 def test_gains_come_from_the_task_if_it_names_any_else_from_the_robot(robot):
-    stiffness, damping = control_gains(robot, ControlConfig(stiffness={"HAA": 1.0, "FE": 2.0}))
+    stiffness, damping = control_gains(robot, LeggedControlConfig(stiffness={"HAA": 1.0, "FE": 2.0}))
     assert stiffness.tolist() == [1.0, 2.0, 2.0] * 4
     assert damping.tolist() == [4.0] * 12
 
 
 def test_gain_pattern_without_a_joint_is_an_error_that_names_it(robot):
     with pytest.raises(ConfigError, match=r"control\.stiffness: pattern 'HFA' matches nothing \(names: LF_HAA, "):
-        control_gains(robot, ControlConfig(stiffness={"HAA": 80.0, "HFE": 80.0, "KFE": 80.0, "HFA": 80.0}))
+        control_gains(robot, LeggedControlConfig(stiffness={"HAA": 80.0, "HFE": 80.0, "KFE": 80.0, "HFA": 80.0}))
 
 
 def test_joint_without_a_gain_is_an_error_that_names_it(robot):
     with pytest.raises(ConfigError, match=r"control\.damping: no pattern matches joint 'LF_KFE'"):
-        control_gains(robot, ControlConfig(damping={"HAA": 2.0, "HFE": 2.0}))
+        control_gains(robot, LeggedControlConfig(damping={"HAA": 2.0, "HFE": 2.0}))
 
 
 MOTOR = '<motor name="LF_HAA" joint="LF_HAA"/>'
@@ -335,4 +334,4 @@ def test_feet_at_different_depths_are_refused(folder):
     """The feet's kinematics are computed level by level, for all feet at once."""
     edit(folder / "robot.yaml", "feet: [FOOT]", "feet: [FOOT, base]")
     with pytest.raises(ConfigError, match="all feet must hang on the same number of bodies"):
-        make_physics(load_robot(str(folder)), SimConfig(physics="mujoco"), 1, torch.device("cpu"))
+        make_physics(RobotScene(load_robot(str(folder))), SimConfig(physics="mujoco"), 1, torch.device("cpu"))

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from legged.config.schema import SimConfig, TerrainConfig
-from legged.physics.scene.robot_scene import build_model, robot_source
+from legged.physics.scene import RobotScene
+from legged.physics.scene.robot_scene import robot_source
 from legged.robots.robot import Robot, load_robot
 from legged.terrain import Terrain, TileSpec
 
@@ -77,9 +78,9 @@ FOLDED = [1.4, -2.8] * 4
 @pytest.mark.parametrize("bits", FILES.values(), ids=FILES)
 def test_a_folded_robot_touches_itself_only_if_asked(dog, bits):
     robot = dog(bits)
-    alone = build_model(robot, SimConfig(self_collisions=False))
+    alone = RobotScene(robot).model(SimConfig(self_collisions=False))
     assert touching(alone, 3.0, FOLDED) == set()
-    among = build_model(robot, SimConfig(self_collisions=True))
+    among = RobotScene(robot).model(SimConfig(self_collisions=True))
     found = touching(among, 3.0, FOLDED)
     assert frozenset(("trunk", "fl_foot")) in found
     for pair in found:  # never neighbours: the trunk and a thigh, a thigh and its shank
@@ -92,14 +93,14 @@ def test_a_folded_robot_touches_itself_only_if_asked(dog, bits):
 @pytest.mark.parametrize("bits", FILES.values(), ids=FILES)
 def test_every_shape_meets_every_kind_of_ground(dog, bits, self_collisions):
     own, sim = dog(bits), SimConfig(self_collisions=self_collisions)
-    model = build_model(own, sim)
+    model = RobotScene(own).model(sim)
     # Half a metre below the ground, everything is in it.
     met = touching(model, -0.5, 0.0)
     assert {frozenset((name, "floor")) for name in own.contact_names} <= met
     small = TerrainConfig(terrain_length=2.0, terrain_width=2.0, border_size=2.0)
     terrain = Terrain.of_tiles([[TileSpec("flat", 0.0)]], small, np.random.default_rng(0))
     for ground in ("exact", "height_field"):
-        met = touching(build_model(own, sim, terrain, ground), 0.3, 0.0)
+        met = touching(RobotScene(own, terrain).model(sim, ground), 0.3, 0.0)
         feet = {next(iter(pair - {name})) for pair in met for name in pair if name.startswith("terrain_")}
         assert {f"{leg}_foot" for leg in LEGS} <= feet
 
@@ -107,15 +108,15 @@ def test_every_shape_meets_every_kind_of_ground(dog, bits, self_collisions):
 def test_explicit_pairs_and_an_unfiltered_file_change_nothing(dog):
     pairs = "".join(f'<pair geom1="{n}_foot" geom2="trunk"/>' for n in LEGS)
     robot = dog(extra=f"<contact>{pairs}</contact>", options='<option><flag filterparent="disable"/></option>')
-    assert touching(build_model(robot, SimConfig()), 3.0, FOLDED) == set()
-    among = touching(build_model(robot, SimConfig(self_collisions=True)), 3.0, 0.0)
+    assert touching(RobotScene(robot).model(SimConfig()), 3.0, FOLDED) == set()
+    among = touching(RobotScene(robot).model(SimConfig(self_collisions=True)), 3.0, 0.0)
     assert frozenset(("fl_thigh", "fl_shank")) not in among
 
 
 @pytest.mark.parametrize("bits", ["", 'condim="1"', 'priority="-1"', 'friction="0.01 0.005 0.0001"'])
 def test_the_friction_of_the_robot_acts(dog, bits):
     """That is what randomisation sets. The ground has 1; without a priority MuJoCo takes the larger, and slides at 1."""
-    model = build_model(dog(bits), SimConfig())
+    model = RobotScene(dog(bits)).model(SimConfig())
     model.geom_friction[[model.geom(name).id for name in shapes_of(model)], 0] = 0.25
     data = mujoco.MjData(model)
     data.qpos[2] = 0.425  # the feet are half a centimetre in the ground, the shanks above it
@@ -127,7 +128,7 @@ def test_the_friction_of_the_robot_acts(dog, bits):
 
 def test_shapes_have_priority_over_the_ground(dog):
     for bits, priority, condim in (("", 1, 3), ('priority="5" condim="4"', 5, 4), ('condim="1"', 1, 3), ('condim="6"', 1, 6)):
-        model = build_model(dog(bits), SimConfig())
+        model = RobotScene(dog(bits)).model(SimConfig())
         shapes = [model.geom(name).id for name in shapes_of(model)]
         assert set(model.geom_priority[shapes]) == {priority}
         assert set(model.geom_condim[shapes]) == {condim}
@@ -142,7 +143,7 @@ def shapes_of(model: mujoco.MjModel) -> list[str]:
 def test_anymal_c_is_simulated_as_its_file_says(robot):
     """Its bits and priorities are the scene's already, so an engine that reads files gets its file, and C MuJoCo the same."""
     assert robot_source(robot, False) == str(robot.model_path)
-    model, file = build_model(robot, SimConfig()), mujoco.MjModel.from_xml_path(str(robot.model_path))
+    model, file = RobotScene(robot).model(SimConfig()), mujoco.MjModel.from_xml_path(str(robot.model_path))
     for name, field in itertools.product(robot.contact_names, ("contype", "conaffinity", "priority", "condim", "friction")):
         np.testing.assert_array_equal(getattr(model.geom(name), field), getattr(file.geom(name), field))
 

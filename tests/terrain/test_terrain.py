@@ -10,7 +10,7 @@ from legged.config.loader import merge
 from legged.config.origins import Origins
 from legged.config.schema import TerrainConfig
 from legged.errors import ConfigError
-from legged.terrain import TERRAIN_TYPES, HeightMap, Terrain, TileSpec, check_terrain
+from legged.terrain import TERRAIN_TYPES, HeightMap, Terrain, TileSpec, check_terrain, tile_size
 from legged.terrain.height_map import CORNERS, join
 from legged.terrain.terrain import column_types
 
@@ -287,8 +287,24 @@ def test_wrong_terrain_is_named(changes, words):
         {"proportions": {"stairs_up": 0.95, "gap": 0.05}},  # one column
         {"horizontal_scale": 0.31},  # a cell a step
         {"horizontal_scale": 2.0, "proportions": {"flat": 1.0}},
-        {"proportions": dict.fromkeys(TERRAIN_TYPES, 1.0 / 12.0), "num_cols": 12},
+        {"proportions": dict.fromkeys(TERRAIN_TYPES, 1.0 / 13.0), "num_cols": 13},
     ],
 )
 def test_right_terrain_passes(changes):
     check_terrain(replace(CFG, **changes), Origins())
+
+
+def test_a_size_of_ones_own_takes_the_place_of_those_that_grow():
+    cfg = TerrainConfig(
+        mesh_type="height_map", proportions={"step": 0.5, "pit": 0.5}, sizes={"step": 0.15}, num_rows=4, num_cols=2
+    )
+    assert [tile_size(cfg, "step", d) for d in (0.0, 0.5, 1.0)] == [0.15] * 3
+    assert [tile_size(cfg, "pit", d) for d in (0.0, 0.5, 1.0)] == [0.0, 0.5, 1.0]
+    terrain = Terrain.build(cfg, 1)
+    assert terrain.height_map.heights.max() == pytest.approx(0.15)
+
+
+def test_a_size_of_a_type_that_there_is_not_is_refused():
+    cfg = TerrainConfig(mesh_type="height_map", proportions={"step": 1.0}, sizes={"stpe": 0.15})
+    with pytest.raises(ConfigError, match=r"terrain\.sizes\.stpe: there is no terrain type 'stpe'; did you mean 'step'"):
+        check_terrain(cfg, Origins())

@@ -210,3 +210,27 @@ def test_the_largest_cells_that_are_admitted_make_the_type(name):
         one = Tile(np.zeros((count, count)), kind.finest[0], np.random.default_rng(0))
         kind.generate(one, kind.size(difficulty))
         assert len(np.unique(one.heights.round(6))) > 1
+
+
+@pytest.mark.parametrize("name", TERRAIN_TYPES)
+def test_tiles_of_regular_types_are_the_same_and_others_are_not(name):
+    kind, tiles = TERRAIN_TYPES[name], [Tile(np.zeros((80, 80)), 0.1, np.random.default_rng(seed)) for seed in (1, 2)]
+    for tile in tiles:
+        kind.generate(tile, kind.size(0.5))
+    assert (tiles[0].heights == tiles[1].heights).all() == kind.regular
+
+
+def test_sizes_in_words():
+    assert TERRAIN_TYPES["stairs_up"].text(0.19400000000000003) == "0.194 m"
+    assert TERRAIN_TYPES["gap"].text(0.125, 0.30000000000000004, 1.0) == "0.125 to 0.3 to 1 m"
+    assert TERRAIN_TYPES["slope_up"].text(11.31, 17.74) == "11 to 18 degrees"
+
+
+def test_a_single_step_goes_up_all_around_the_platform_and_down_again():
+    """On a tile of 8 m: level to 1.5 m from the middle, 15 cm up to 2.5 m, level from there."""
+    tile = Tile(np.zeros((80, 80)), 0.1, np.random.default_rng(0))
+    TERRAIN_TYPES["step"].generate(tile, 0.15)
+    distance = tile.from_centre()
+    assert (tile.heights[(distance > 1.5) & (distance < 2.5)] == 0.15).all()
+    assert (tile.heights[(distance < 1.5) | (distance > 2.5)] == 0.0).all()
+    assert (tile.heights > 0.0).sum() == 50**2 - 30**2

@@ -5,7 +5,10 @@ import json
 import pytest
 from helpers import call, small_config, small_task
 
+from legged.benchmarks.iteration_times import time_iterations
+from legged.benchmarks.report import report
 from legged.benchmarks.scale import others
+from legged.benchmarks.step_times import time_steps
 from legged.learning.captured import CapturedRunner
 from legged.learning.runner import Runner
 from legged.registry import make_task
@@ -39,18 +42,25 @@ def test_times_of_step_physics_and_iterations_are_written(tmp_path, capsys):
 def test_mujoco_warps_own_step_is_timed_beside_ours():
     """Both move the robots; on the CPU too ours takes less."""
     task = make_task(small_config(("sim.physics", "mujoco_warp"), num_envs=8))
-    before = task.physics.state.base_pos.clone()
-    result = benchmark.measure(task, 10, 3)
-    assert not before.equal(task.physics.state.base_pos)
+    before = task.physics.robot_state.base_pos.clone()
+    result = time_steps(task, 10, 3)
+    assert not before.equal(task.physics.robot_state.base_pos)
     assert result["library_ms"] > result["physics_ms"] > 0.0
     low, high = result["library_ms_range"]
     assert low <= result["library_ms"] <= high
+    assert "own launches" not in report(task, result | {"build_s": 0.0})
+
+
+def test_why_a_step_is_mujoco_warps_own_is_said():
+    task = make_task(small_config(("sim.physics", "mujoco_warp"), ("sim.cone", "elliptic"), num_envs=2))
+    text = report(task, time_steps(task, 1, 1) | {"build_s": 0.0})
+    assert "  mujoco-warp's own launches: friction cones are elliptic (sim.cone)\n" in text
 
 
 @pytest.mark.parametrize("kind", [Runner, CapturedRunner])
 def test_iterations_are_counted_without_the_first(kind):
     task = small_task(num_envs=4)
-    times = benchmark.time_iterations(kind, task, 3)
+    times = time_iterations(kind, task, 3)
     low, high = times["iteration_ms_range"]
     assert low <= times["iteration_ms"] <= high
     assert times["rollout_ms"] + times["update_ms"] == pytest.approx(times["iteration_ms"], rel=0.7)
@@ -117,7 +127,7 @@ def broken_task(folder, statement: str) -> list[str]:
         "from legged import LeggedRobot, register\n"
         "class Broken(LeggedRobot):\n"
         f"    def _obs_broken(self): {statement}\n"
-        "cfg = {'extends': 'anymal_c_flat', 'observations': {'actor': ['broken']}}\n"
+        "cfg = {'extends': 'anymal_c_flat', 'observations': {'groups': {'actor': {'terms': ['broken']}}}}\n"
         "register('broken', {**cfg, 'train': {'algorithm': {'symmetry': False}}}, Broken)\n"
     )
     return ["--task", "broken", "--import", "broken.py", "--sim_device", "cpu", "--scale", "4,5"]

@@ -5,7 +5,8 @@ import json
 import pytest
 from helpers import call
 
-from legged.tools.compare import grouped, main, shares, spread
+from legged.evaluation.comparison import grouped, shares, spread
+from legged.tools.compare import main
 
 RULE = {"distance_m": 4.0, "time_s": 20.0, "vx": 0.75}
 

@@ -7,6 +7,7 @@ from PIL import Image
 from torch.utils.tensorboard import SummaryWriter
 
 from legged.errors import ConfigError
+from legged.evaluation import learning_curves
 from legged.tools import plot
 
 
@@ -24,12 +25,12 @@ def write_run(folder, levels):
 
 def test_runs_are_read_and_averaged_over_common_iterations(tmp_path):
     write_run(tmp_path / "a", 1.0)
-    runs = [plot.read_scalars(tmp_path / "a")]
+    runs = [learning_curves.read_scalars(tmp_path / "a")]
     steps, values = runs[0]["Terrain/level_pit"]
     assert steps.tolist() == [0, 1, 2, 3, 4]
     assert values == pytest.approx([1.0, 2.0, 3.0, 4.0, 5.0])
     runs.append({"Terrain/level_pit": (np.array([1, 3, 9]), np.array([4.0, 8.0, 1.0]))})
-    steps, values = plot.mean_of(runs, "Terrain/level_pit")
+    steps, values = learning_curves.mean_of(runs, "Terrain/level_pit")
     assert steps.tolist() == [2, 4]  # counted from 1
     assert values == pytest.approx([3.0, 6.0])
 
@@ -38,7 +39,7 @@ def test_levels_get_panels_of_their_own(tmp_path):
     write_run(tmp_path / "rough", 1.0)
     assert plot.main([str(tmp_path / "rough"), "--out", str(tmp_path / "rough.png")]) == 0
     runs = {"flat": {"Metrics/lin_vel_rmse": (np.arange(5), np.ones(5))}}
-    plot.draw(runs, tmp_path / "flat.png")
+    learning_curves.draw_runs(runs, tmp_path / "flat.png")
     with Image.open(tmp_path / "rough.png") as rough, Image.open(tmp_path / "flat.png") as flat:
         assert rough.height == pytest.approx(1.5 * flat.height, rel=0.02)
         assert np.asarray(rough.convert("L"))[-flat.height // 2 :].std() > 10.0
@@ -46,7 +47,7 @@ def test_levels_get_panels_of_their_own(tmp_path):
 
 def test_a_folder_without_events_is_named(tmp_path):
     with pytest.raises(ConfigError, match="holds no TensorBoard file"):
-        plot.read_scalars(tmp_path)
+        learning_curves.read_scalars(tmp_path)
 
 
 def write_config(folder, name=""):
@@ -61,22 +62,26 @@ def test_runs_are_called_what_they_are(tmp_path):
     write_config(folders[0])
     write_config(folders[1], name="[wide]")
     write_config(folders[2])
-    configs = [plot.read_config(folder) for folder in folders]
-    assert plot.labels(folders, configs) == [
+    configs = [learning_curves.read_config(folder) for folder in folders]
+    assert learning_curves.labels(folders, configs) == [
         "anymal_c, seed 3 (a)",  # as the third
         "anymal_c, [wide], seed 3",
         "anymal_c, seed 3 (c)",
         "d",  # no configuration
     ]
-    assert plot.labels([folders[0]] * 2, [configs[0]] * 2) == ["anymal_c, seed 3 (a) [1]", "anymal_c, seed 3 (a) [2]"]
+    twice = learning_curves.labels([folders[0]] * 2, [configs[0]] * 2)
+    assert twice == [
+        "anymal_c, seed 3 (a) [1]",
+        "anymal_c, seed 3 (a) [2]",
+    ]
 
 
 @pytest.mark.parametrize("text", ["[1, 2]", "env: 3\ntask: x", "{", "train: {runner: [1]}"])
 def test_a_configuration_that_someone_broke_costs_the_label_only(text, tmp_path):
     (tmp_path / "config.yaml").write_text(text)
-    config = plot.read_config(tmp_path)
-    assert plot.labels([tmp_path], [config]) == ["x" if "task" in text else tmp_path.name]
-    assert plot.always_promoted(config) is None
+    config = learning_curves.read_config(tmp_path)
+    assert learning_curves.labels([tmp_path], [config]) == ["x" if "task" in text else tmp_path.name]
+    assert learning_curves.always_promoted(config) is None
 
 
 def test_who_is_always_promoted_has_two_thirds_of_the_levels():
@@ -88,16 +93,16 @@ def test_who_is_always_promoted_has_two_thirds_of_the_levels():
             moved = levels + 1
             levels = np.where(moved >= rows, random.integers(0, rows, 500), moved)
             seen.append(levels.mean())
-        expected = plot.always_promoted({"terrain": {"num_rows": rows}})
+        expected = learning_curves.always_promoted({"terrain": {"num_rows": rows}})
         assert np.mean(seen[50:]) == pytest.approx(expected, abs=0.05)
-    assert plot.always_promoted({"terrain": {"num_rows": 5}}) == pytest.approx(8 / 3)
+    assert learning_curves.always_promoted({"terrain": {"num_rows": 5}}) == pytest.approx(8 / 3)
 
 
 def test_the_line_is_that_of_the_runs_rows(tmp_path, monkeypatch):
     write_run(tmp_path / "run", 1.0)
     write_config(tmp_path / "run")
     drawn = []
-    monkeypatch.setattr(plot, "draw", lambda runs, path, always: drawn.append((list(runs), set(always))))
+    monkeypatch.setattr(plot, "draw_runs", lambda runs, path, always: drawn.append((list(runs), set(always))))
     assert plot.main([str(tmp_path / "run"), "--out", str(tmp_path / "x.png")]) == 0
     assert drawn == [(["anymal_c, seed 3"], {8 / 3})]
 
@@ -135,3 +140,23 @@ def test_a_run_that_was_killed_while_it_logged_is_drawn(tmp_path):
     writer.close()
     assert plot.main([str(tmp_path / "run"), "--out", str(tmp_path / "curve.png")]) == 0
     assert Image.open(tmp_path / "curve.png").size[0] > 100
+
+
+def test_curves_are_those_of_the_kind_of_task():
+    values = (np.arange(3), np.ones(3))
+    other = (
+        "Train/mean_reward",
+        "Metrics/x_velocity",
+        "Metrics/falls",
+        "Metrics/contact_overflows",
+        "Metrics/episode_length",
+    )
+    following = {"Metrics/lin_vel_rmse": values, "Metrics/x_velocity": values}
+    assert learning_curves.curves_of([following]) == learning_curves.CURVES
+    assert [tag for tag, _, _ in learning_curves.curves_of([dict.fromkeys(other, values)])] == [
+        "Train/mean_reward",
+        "Metrics/episode_length",
+        "Metrics/x_velocity",
+        "Metrics/falls",
+    ]
+    assert [tag for tag, _, _ in learning_curves.curves_of([{"Metrics/x_velocity": values}])] == ["Metrics/x_velocity"]

@@ -6,8 +6,7 @@ import pytest
 from helpers import TASK, call
 from PIL import Image
 
-from legged.rendering.paint import HIGH, LOW, MIDDLE, colour
-from legged.rendering.terrain_picture import Camera
+from legged.rendering.paint import HIGH, LOW, MIDDLE, color
 from legged.tools import show_terrain
 
 
@@ -52,36 +51,9 @@ def test_the_grid_of_a_task(tmp_path, can_render):
     assert red(picture).sum() > 500
 
 
-def test_pixels_are_where_mujoco_draws(can_render):
-    """A small red ball at a place that the camera says to be off its middle."""
-    place = np.array([1.0, -2.0, 0.5])
-    camera = Camera.on(np.array([[-4.0, -4.0, 0.0], [4.0, 4.0, 0.0], [4.0, -4.0, 1.0], [-4.0, 4.0, 1.0]]), 400, 300)
-    spec = mujoco.MjSpec()
-    spec.visual.global_.fovy = 30.0
-    spec.worldbody.add_geom(size=[0.1, 0, 0], pos=place, rgba=[1, 0, 0, 1])
-    spec.worldbody.add_light(pos=[0, 0, 9])
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    with mujoco.Renderer(model, 300, 400) as renderer:
-        renderer.update_scene(data, camera.view())
-        row, column = np.argwhere(renderer.render()[:, :, 0] > 20).mean(axis=0)
-    expected = camera.pixels(place[None])[0]
-    assert np.abs(expected - [200, 150]).max() > 30
-    np.testing.assert_allclose([column + 0.5, row + 0.5], expected, atol=1.5)
-
-
-def test_camera_sees_all_points_and_not_much_more():
-    points = np.array([[x, y, z] for x in (-20.0, 20.0) for y in (-5.0, 7.0) for z in (-1.0, 0.5)])
-    at = Camera.on(points, 640, 360, fill=0.9).pixels(points)
-    low, high = at.min(axis=0), at.max(axis=0)
-    np.testing.assert_allclose(0.5 * (low + high), [320, 180], atol=3)
-    assert max((high - low) / [640, 360]) == pytest.approx(0.9, abs=0.01)
-
-
 def test_colours_by_height():
     """Level ground in the middle, ends at 0.9 m up and down and beyond."""
-    np.testing.assert_allclose(colour(np.array([-3.0, 0.0, 0.45, 0.9])), [LOW, MIDDLE, 0.5 * (MIDDLE + HIGH), HIGH])
+    np.testing.assert_allclose(color(np.array([-3.0, 0.0, 0.45, 0.9])), [LOW, MIDDLE, 0.5 * (MIDDLE + HIGH), HIGH])
 
 
 @pytest.mark.parametrize(

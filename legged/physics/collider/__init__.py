@@ -1,1 +1,5 @@
 """The collider for height maps."""
+
+from legged.physics.warp import settings
+
+__all__ = ["settings"]  # imported before anything here declares a kernel

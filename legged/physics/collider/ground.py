@@ -10,8 +10,6 @@ import warp as wp
 
 from legged.terrain import HeightMap
 
-wp.set_module_options({"enable_backward": False})
-
 FACE = wp.constant(1e-4)
 """Neighbouring surfaces further apart than this are separated by a vertical face [m]."""
 RIDGE = wp.constant(0.02)

@@ -24,8 +24,6 @@ from legged.errors import ConfigError
 from legged.physics.collider.ground import Ground, Hits, around_point, between_ends, ground_of
 from legged.terrain import HeightMap
 
-wp.set_module_options({"enable_backward": False})
-
 MODEL_FIELDS = (
     "geom_condim",
     "geom_priority",

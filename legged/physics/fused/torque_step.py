@@ -1,28 +1,31 @@
-"""What a physics step needs around the constraint solver, for robots moved by torques alone.
+"""A physics step in few launches: one before contacts, one for constraint forces, one for integration.
 
-mujoco-warp launches a stage for everything that a model might have: springs, dampers, gravity compensation, external
-forces, muscles with lengths and activations. At 4096 worlds a launch costs microseconds whether it finds anything or not;
-together these are a fifth of a step. Where a model has none of them, what comes before contacts is one launch, and
-integration is another.
+mujoco-warp launches a stage for everything that a model might have: gravity compensation, external forces, muscles with
+lengths and activations, fluids, tendons. At 4096 worlds a launch costs microseconds whether it finds anything or not;
+together these are a fifth of a step. Here are trees of joints with springs and dampers, moved by motors; `why_not` says what
+else a model has. Forces applied from outside (`qfrc_applied`, `xfrc_applied`), sensors, and the poses of bodies, sites and
+cameras are not computed.
 """
 
+from collections.abc import Collection
 from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
-import numpy as np
 import warp as wp
 
-from legged.physics.fused.smooth_dynamics import SmoothDynamics
+from legged.physics.fused.constraint_solver import ConstraintSolver
+from legged.physics.fused.smooth_dynamics import BALL, FREE, SmoothDynamics, has_dampers
 
 NEFC, BROADPHASE, NARROWPHASE = (int(getattr(mjw.OverflowType, n)) for n in ("NEFC", "BROADPHASE", "NARROWPHASE"))
+FREE_JOINT, BALL_JOINT = wp.constant(FREE), wp.constant(BALL)
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
 def turned_by(quat: wp.vec4, rotation: wp.vec3) -> wp.vec4:
-    """A unit quaternion (w, x, y, z) after turning by a rotation vector [rad] in its own frame."""
+    """Return a unit quaternion (w, x, y, z) after turning by a rotation vector [rad] in its own frame."""
     angle = wp.length(rotation)
     w, xyz = wp.cos(0.5 * angle), wp.sin(0.5 * angle) * wp.normalize(rotation)
     old = wp.vec3(quat[1], quat[2], quat[3])
@@ -32,7 +35,11 @@ def turned_by(quat: wp.vec4, rotation: wp.vec3) -> wp.vec4:
 
 @wp.kernel
 def integrate(
-    dt: wp.array[float],
+    timestep: wp.array[float],
+    jnt_type: wp.array[int],
+    jnt_qposadr: wp.array[int],
+    jnt_dofadr: wp.array[int],
+    advance: wp.array2d[float],
     qacc: wp.array2d[float],
     nefc: wp.array[int],
     nacon: wp.array[int],
@@ -44,24 +51,26 @@ def integrate(
     warmstart: wp.array2d[float],
     overflow: wp.array[int],
 ):
-    """One thread a world and joint, the base first: semi-implicit Euler, and the flags of what found no room."""
+    """One thread a world and joint: semi-implicit Euler; the first also sets the flags of what found no room."""
     world, joint = wp.tid()
-    h = dt[0]
+    h = timestep[world % timestep.shape[0]]
+    at, dof = jnt_qposadr[joint], jnt_dofadr[joint]
+    kind = jnt_type[joint]
+    moving = wp.where(kind == FREE_JOINT, 3, wp.where(kind == BALL_JOINT, 0, 1))  # numbers in qpos, before any quaternion
+    turning = wp.where(moving == 1, 0, 3)  # degrees of freedom of the quaternion
+    for k in range(dof, dof + moving + turning):
+        qvel[world, k] += h * advance[world, k]
+        warmstart[world, k] = qacc[world, k]
+    for k in range(moving):
+        qpos[world, at + k] += h * qvel[world, dof + k]
+    if turning > 0:
+        i, v = at + moving, dof + moving
+        quat = wp.vec4(qpos[world, i], qpos[world, i + 1], qpos[world, i + 2], qpos[world, i + 3])
+        quat = turned_by(quat, h * wp.vec3(qvel[world, v], qvel[world, v + 1], qvel[world, v + 2]))
+        for k in range(4):
+            qpos[world, i + k] = quat[k]
     if joint > 0:
-        dof = 5 + joint
-        qvel[world, dof] += h * qacc[world, dof]
-        qpos[world, dof + 1] += h * qvel[world, dof]
-        warmstart[world, dof] = qacc[world, dof]
         return
-    for dof in range(6):
-        qvel[world, dof] += h * qacc[world, dof]
-        warmstart[world, dof] = qacc[world, dof]
-    for k in range(3):
-        qpos[world, k] += h * qvel[world, k]
-    quat = wp.vec4(qpos[world, 3], qpos[world, 4], qpos[world, 5], qpos[world, 6])
-    quat = turned_by(quat, h * wp.vec3(qvel[world, 3], qvel[world, 4], qvel[world, 5]))
-    for k in range(4):
-        qpos[world, 3 + k] = quat[k]
     if nefc[world] > most_rows:
         overflow[world] |= NEFC
     if ncollision[0] > most_contacts:
@@ -71,53 +80,35 @@ def integrate(
 
 
 class TorqueStep:
-    """Launches on mujoco-warp's arrays what comes before contacts and after the solver."""
+    """Launches on mujoco-warp's arrays all of a step but contacts and constraint rows, which are made in between."""
 
-    def __init__(self, model: mujoco.MjModel, m: Any, d: Any, base: int) -> None:
-        """For a model of which nothing is said by `why_not`, whose free body is `base`. Call with the arrays' device as
-        Warp's current one.
+    def __init__(self, model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = ()) -> None:
+        """Prepare the launches for mujoco-warp's `m` and `d` of a `model` of which neither `why_not` nor that of
+        `ConstraintSolver` says anything, in whose arrays `randomized` worlds differ. Call with their device as Warp's
+        current one.
         """
-        free = np.array([-np.inf, np.inf])
-        controls = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, free)
-        forces = np.where(model.actuator_forcelimited[:, None], model.actuator_forcerange, free)
-        limits = np.stack([np.maximum(controls, forces)[:, 0], np.minimum(controls, forces)[:, 1]])
-        self._dynamics = SmoothDynamics(model, m, d, base, limits)
-        state = [d.qpos, d.qvel, d.qacc_warmstart, d.overflow]
+        self._dynamics = SmoothDynamics(model, m, d, randomized)
+        self._solver = ConstraintSolver(m, d, damped=has_dampers(model, randomized))
+        joints = [m.jnt_type, m.jnt_qposadr, m.jnt_dofadr]
         counts = [d.nefc, d.nacon, d.ncollision, d.njmax, d.naconmax]
-        self._integration = (d.nworld, m.njnt), [m.opt.timestep, d.qacc, *counts], state
-
-    @classmethod
-    def why_not(cls, model: mujoco.MjModel) -> str:
-        """What of a model this does not step; empty if nothing."""
-        if not cls.moved_by_torques(model):
-            return "more than torques moves the robot: springs, dampers, geared or affine actuators, a fluid"
-        return SmoothDynamics.why_not(model)
+        inputs = [m.opt.timestep, *joints, self._solver.advance, d.qacc, *counts]
+        self._integration = (d.nworld, m.njnt), inputs, [d.qpos, d.qvel, d.qacc_warmstart, d.overflow]
 
     @staticmethod
-    def moved_by_torques(model: mujoco.MjModel) -> bool:
-        """Whether nothing but motors of gear 1, gravity and constraints moves the robot."""
-        passive = [model.jnt_stiffness, model.jnt_stiffnesspoly, model.dof_damping, model.dof_dampingpoly]
-        passive += [model.actuator_damping, model.actuator_dampingpoly, model.body_gravcomp, model.opt.wind]
-        passive += [model.opt.density, model.opt.viscosity, model.geom_adhesion, model.jnt_actfrclimited]
-        if model.ntendon or model.nflex or any(np.any(values) for values in passive):
-            return False
-        plain = np.zeros_like(model.actuator_gear)
-        plain[:, 0] = 1.0
-        gain = np.zeros_like(model.actuator_gainprm)
-        gain[:, 0] = 1.0
-        return bool(
-            (model.actuator_gear == plain).all()
-            and (model.actuator_gainprm == gain).all()
-            and (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED).all()
-            and (model.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE).all()
-            and (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE).all()
-        )
+    def why_not(model: mujoco.MjModel, randomized: Collection[str] = ()) -> str:
+        """Return what of a model this does not step, where worlds differ in the arrays `randomized`, by the names that
+        MuJoCo gives them; empty if nothing.
+        """
+        if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
+            return "the model's integrator is not Euler"
+        return SmoothDynamics.why_not(model, randomized)
 
     def begin(self) -> None:
-        """From qpos, qvel and controls: where shapes are, what contacts need to know of the robot, and qfrc_smooth."""
+        """Compute from qpos, qvel and ctrl where shapes are, what contacts need to know, and all other forces."""
         self._dynamics.launch()
 
-    def integrate(self) -> None:
-        """From qacc: the next state, the next warm start, and the overflow flags."""
+    def finish(self) -> None:
+        """Compute, with the rows of constraints made, their forces, the next state and warm start, and overflow flags."""
+        self._solver.solve()
         dim, inputs, outputs = self._integration
         wp.launch(integrate, dim=dim, inputs=inputs, outputs=outputs)

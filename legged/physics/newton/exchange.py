@@ -11,12 +11,10 @@ import numpy as np
 import torch
 import warp as wp
 
-from legged.physics.base import RobotState
 from legged.physics.newton.simulation import Simulation
-from legged.physics.warp.exchange import StateExchange, rotate, rotate_inverse
+from legged.physics.robot_state import RobotState
+from legged.physics.warp.exchange import EngineArrays, RobotExchange, rotate, rotate_inverse
 from legged.robots.robot import Robot
-
-wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
@@ -127,27 +125,28 @@ def take_flags(flags: wp.array[Any], lost: int, overflow: wp.array[int]):
     flags[world] = flags.dtype(0)
 
 
-class NewtonExchange(StateExchange):
+class NewtonExchange(RobotExchange):
     """Launches the kernels above on fixed arrays: those of a simulation, and the task's."""
 
     def __init__(
         self,
         simulation: Simulation,
+        task: tuple[wp.array, ...],
+        overflowed: torch.Tensor,
         model: mujoco.MjModel,
         robot: Robot,
         state: RobotState,
-        qpos: wp.array,
-        qvel: wp.array,
-        torques: wp.array,
-        overflowed: torch.Tensor,
     ) -> None:
-        """All after `simulation` is the task's side, arrays (N, ...). Call with the device as Warp's current one."""
-        count, layout = len(qpos), simulation.layout
+        """`task` is qpos, qvel and ctrl, which with all after it is the task's side. Call with the device as Warp's current
+        one.
+        """
+        self._qpos, self._qvel, self._torques = task
+        count, layout = len(overflowed), simulation.layout
         self._overflow = wp.zeros(count, dtype=int)
         nothing = wp.zeros((count, 0), dtype=float)  # the solver clears its warm start itself
-        super().__init__(model, robot, state, qpos, qvel, torques, nothing, self._overflow, 1, overflowed)
+        arrays = EngineArrays(*task, nothing, nothing, self._overflow, lost=1)
+        super().__init__(arrays, overflowed, model, robot, state)
         self._simulation = simulation
-        self._qpos, self._qvel, self._torques = qpos, qvel, torques
         self._joint_q = simulation.state.joint_q.reshape((count, layout.coords))
         self._joint_qd = simulation.state.joint_qd.reshape((count, layout.dofs))
         self._joint_f = simulation.control.joint_f.reshape((count, layout.dofs))

@@ -13,9 +13,9 @@ from legged.physics.collider.terrain_contact import TerrainContact
 from legged.physics.newton.model import build_newton_model, meets_cells
 from legged.physics.newton.solvers import SOLVERS
 from legged.physics.newton.springs import launch_spring_forces
-from legged.physics.scene.robot_scene import FLOOR
 from legged.physics.warp.exchange import LOST
 from legged.robots.robot import Robot
+from legged.robots.robot_model import FLOOR
 from legged.terrain import Terrain
 
 

@@ -3,8 +3,6 @@
 import newton
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
-
 
 @wp.func
 def point_motion(

@@ -1,9 +1,10 @@
-"""Between mujoco-warp's arrays and the task: one Warp launch to write states, one to read kinematics, two for forces.
+"""Between an engine's arrays and the task: one Warp launch to write states, one to read kinematics, two for forces.
 
 The same formulas in torch (mujoco.py, feet.py) take some 140 launches a control step, a third of its time at 4096 robots.
 """
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -11,14 +12,12 @@ import mujoco_warp as mjw
 import torch
 import warp as wp
 
-from legged.physics.base import RobotState
 from legged.physics.feet import FootChains
+from legged.physics.robot_state import RobotState
 from legged.robots.robot import Robot
 
 # Contacts or constraint rows were dropped; the other bits (iteration caps) are no loss.
 LOST = int(mjw.OverflowType.NEFC | mjw.OverflowType.NJMAX_NNZ | mjw.OverflowType.BROADPHASE | mjw.OverflowType.NARROWPHASE)
-
-wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
@@ -111,71 +110,106 @@ def add_contact_forces(
 
 
 @wp.kernel
+def read_flags(overflow: wp.array[int], lost: int, overflowed: wp.array[wp.bool]):
+    """One thread a world, where no robot is read."""
+    world = wp.tid()
+    overflowed[world] = (overflow[world] & lost) != 0
+    overflow[world] = 0
+
+
+@wp.kernel
 def write_states(
     mask: wp.array[wp.bool],
-    base_pos: wp.array2d[float],
-    base_quat: wp.array2d[float],
-    base_lin_vel: wp.array2d[float],
-    base_ang_vel: wp.array2d[float],
-    dof_pos: wp.array2d[float],
-    dof_vel: wp.array2d[float],
+    new_qpos: wp.array2d[float],
+    new_qvel: wp.array2d[float],
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
     ctrl: wp.array2d[float],
+    act: wp.array2d[float],
     warmstart: wp.array2d[float],
     contact_forces: wp.array2d[wp.vec3],
 ):
-    """One thread a world. Clears what would carry over a step: controls and the solver's warm start."""
+    """One thread a world. Clears what would carry over a step: controls, activations and the solver's warm start."""
     world = wp.tid()
     if not mask[world]:
         return
-    quat = wp.vec4(base_quat[world, 0], base_quat[world, 1], base_quat[world, 2], base_quat[world, 3])
-    linear = rotate(quat, wp.vec3(base_lin_vel[world, 0], base_lin_vel[world, 1], base_lin_vel[world, 2]))
-    for i in range(3):
-        qpos[world, i] = base_pos[world, i]
-        qvel[world, i] = linear[i]
-        qvel[world, 3 + i] = base_ang_vel[world, i]
-    for i in range(4):
-        qpos[world, 3 + i] = quat[i]
-    for i in range(dof_pos.shape[1]):
-        qpos[world, 7 + i] = dof_pos[world, i]
-        qvel[world, 6 + i] = dof_vel[world, i]
+    for i in range(qpos.shape[1]):
+        qpos[world, i] = new_qpos[world, i]
+    for i in range(qvel.shape[1]):
+        qvel[world, i] = new_qvel[world, i]
     for i in range(ctrl.shape[1]):
         ctrl[world, i] = 0.0
+    for i in range(act.shape[1]):
+        act[world, i] = 0.0
     for i in range(warmstart.shape[1]):
         warmstart[world, i] = 0.0
     for i in range(contact_forces.shape[1]):
         contact_forces[world, i] = wp.vec3(0.0)
 
 
-class StateExchange(ABC):
+@dataclass(frozen=True)
+class EngineArrays:
+    """What of an engine a write changes and a read takes, (N, ...) each; `qpos` and `qvel` in MuJoCo's layout."""
+
+    qpos: wp.array
+    qvel: wp.array
+    ctrl: wp.array
+    act: wp.array
+    """Activations of actuators that have a state; (N, 0) without."""
+    warmstart: wp.array
+    """The solver's; (N, 0) where the engine clears it itself."""
+    overflow: wp.array
+    """(N,) flags of what found no room, which reading clears."""
+    lost: int
+    """Those bits of `overflow` that mean that contacts were dropped."""
+
+
+class StateExchange:
     """Launches the kernels that write states and read kinematics on fixed arrays, so that a capture can hold them."""
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        robot: Robot,
-        state: RobotState,
-        qpos: wp.array,
-        qvel: wp.array,
-        torques: wp.array,
-        warmstart: wp.array,
-        overflow: wp.array,
-        lost: int,
-        overflowed: torch.Tensor,
-    ) -> None:
-        """Arrays are (N, ...), `qpos` and `qvel` in MuJoCo's layout; the bits `lost` of `overflow` mean that contacts were
-        dropped. Call with the arrays' device as Warp's current one.
+    def __init__(self, arrays: EngineArrays, overflowed: torch.Tensor) -> None:
+        """For a model without a robot: nothing is read but `overflowed` (N,). Call with the arrays' device as Warp's current
+        one.
         """
+        self._arrays = arrays
+        self._overflowed = wp.from_torch(overflowed)
+        self._contact_forces = wp.zeros((len(overflowed), 0), dtype=wp.vec3)
+
+    def write(self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
+        """Write the state of the worlds of `mask` (N,): `qpos` (N, nq) and `qvel` (N, nv).
+
+        mujoco-warp's own reset_data would drop the contacts of all worlds.
+        """
+        own = self._arrays
+        inputs = [wp.from_torch(mask), wp.from_torch(qpos.contiguous()), wp.from_torch(qvel.contiguous())]
+        outputs = [own.qpos, own.qvel, own.ctrl, own.act, own.warmstart, self._contact_forces]
+        wp.launch(write_states, dim=len(mask), inputs=inputs, outputs=outputs)
+
+    def kinematics(self) -> None:
+        """Read everything but forces; clears the overflow flags."""
+        inputs = [self._arrays.overflow, self._arrays.lost]
+        wp.launch(read_flags, dim=len(self._overflowed), inputs=inputs, outputs=[self._overflowed])
+
+    def contact_forces(self) -> None:
+        """Read the contact forces of tracked shapes, as the last step's solver left them; nothing without a robot."""
+
+
+class RobotExchange(StateExchange, ABC):
+    """The same for a robot with a floating base and feet."""
+
+    def __init__(
+        self, arrays: EngineArrays, overflowed: torch.Tensor, model: mujoco.MjModel, robot: Robot, state: RobotState
+    ) -> None:
+        """Fill those fields of `state` that are no views. Call with the arrays' device as Warp's current one."""
+        super().__init__(arrays, overflowed)
         chains = FootChains.of(model, robot)
-        self._state = state
         self._contact_forces = wp.from_torch(state.contact_forces, dtype=wp.vec3)
-        self._written = [qpos, qvel, torques, warmstart, self._contact_forces]
+        self._dim = tuple(state.feet_pos.shape[:2])
         self._inputs = [
-            qpos,
-            qvel,
-            overflow,
-            lost,
+            arrays.qpos,
+            arrays.qvel,
+            arrays.overflow,
+            arrays.lost,
             wp.array(chains.offset, dtype=wp.vec3),
             wp.array(chains.joint, dtype=int),
             wp.array(chains.axis, dtype=wp.vec3),
@@ -184,34 +218,30 @@ class StateExchange(ABC):
             wp.array(chains.body_quat, dtype=wp.vec4),
         ]
         vectors = (state.base_lin_vel, state.projected_gravity, state.feet_pos, state.feet_vel)
-        self._outputs = [*(wp.from_torch(t, dtype=wp.vec3) for t in vectors), wp.from_torch(overflowed)]
-
-    def write(self, mask: torch.Tensor, *values: torch.Tensor) -> None:
-        """Task -> engine, for the worlds of `mask`: values as Physics.write_state takes them, in its order.
-
-        mujoco-warp's own reset_data would drop the contacts of all worlds.
-        """
-        inputs = [wp.from_torch(mask), *(wp.from_torch(value.contiguous()) for value in values)]
-        wp.launch(write_states, dim=self._state.feet_pos.shape[0], inputs=inputs, outputs=self._written)
+        self._outputs = [*(wp.from_torch(t, dtype=wp.vec3) for t in vectors), self._overflowed]
 
     def kinematics(self) -> None:
-        """Engine -> base_lin_vel, projected_gravity, feet_pos, feet_vel, overflowed; clears the overflow flags."""
-        dim = self._state.feet_pos.shape[:2]
-        wp.launch(read_kinematics, dim=tuple(dim), inputs=self._inputs, outputs=self._outputs)
+        """Read base_lin_vel, projected_gravity, feet_pos, feet_vel, overflowed; clears the overflow flags."""
+        wp.launch(read_kinematics, dim=self._dim, inputs=self._inputs, outputs=self._outputs)
 
     @abstractmethod
-    def contact_forces(self) -> None:
-        """Engine -> contact_forces, as the last step's solver left them."""
+    def contact_forces(self) -> None: ...
 
 
-class Exchange(StateExchange):
-    """The same with the arrays of mujoco-warp, and its contact forces."""
+class MujocoWarpExchange(RobotExchange):
+    """The same with the contact forces of mujoco-warp."""
 
     def __init__(
-        self, m: Any, d: Any, model: mujoco.MjModel, robot: Robot, state: RobotState, overflowed: torch.Tensor
+        self,
+        m: Any,
+        d: Any,
+        overflowed: torch.Tensor,
+        model: mujoco.MjModel,
+        robot: Robot,
+        state: RobotState,
     ) -> None:
         """`m`, `d` are mujoco-warp's model and data; call with their device as Warp's current one."""
-        super().__init__(model, robot, state, d.qpos, d.qvel, d.ctrl, d.qacc_warmstart, d.overflow, LOST, overflowed)
+        super().__init__(arrays_of(d), overflowed, model, robot, state)
         self._m, self._d = m, d
         shapes = [-1] * model.ngeom
         for index, name in enumerate(robot.contact_names):
@@ -230,3 +260,8 @@ class Exchange(StateExchange):
             inputs=[d.nacon, d.contact.geom, d.contact.worldid, self._forces, self._shape_of_geom],
             outputs=[self._contact_forces],
         )
+
+
+def arrays_of(d: Any) -> EngineArrays:
+    """Return what of mujoco-warp's data is written and read."""
+    return EngineArrays(d.qpos, d.qvel, d.ctrl, d.act, d.qacc_warmstart, d.overflow, LOST)

@@ -12,31 +12,34 @@ from torch import Tensor
 
 from legged.config.schema import SimConfig
 from legged.errors import ConfigError
-from legged.math import masked_set_
-from legged.physics.base import RandomizedField, setter_of
 from legged.physics.collider.terrain_contact import TerrainContact
+from legged.physics.fields import DERIVED, FIELDS, RandomizedModel, changed_arrays
 from legged.physics.fused.constraint_solver import ConstraintSolver
 from legged.physics.fused.torque_step import TorqueStep
-from legged.physics.scene.robot_scene import build_model
+from legged.physics.quantities import LAST_STEP, stage_of
+from legged.physics.robot_state import robot_state
+from legged.physics.scene import Scene
 from legged.physics.warp.compile import compile_ahead
-from legged.physics.warp.exchange import Exchange
+from legged.physics.warp.exchange import MujocoWarpExchange, StateExchange, arrays_of
 from legged.physics.warp.physics import WarpPhysics
-from legged.robots.robot import Robot
 from legged.robots.robot_model import FLOOR
-from legged.terrain import Terrain
 
-# Fields of the model that differ per world once friction or mass are drawn, and those that set_const derives from mass.
-PER_WORLD = ("geom_friction", "body_mass", "body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
+PER_WORLD = ("geom_friction", "body_mass", *DERIVED)
+"""Arrays of the model that always differ per world, beside those of the fields that are randomised."""
 
 
-def absent_stages(model: mujoco.MjModel) -> int:
-    """Flags of the stages that have nothing to do in `model`: mujoco-warp would still launch them."""
+def absent_stages(model: mujoco.MjModel, randomized: Collection[str] = ()) -> int:
+    """Return the flags of the stages that have nothing to do in `model`, not even once the arrays `randomized` have other
+    values: mujoco-warp would still launch them.
+    """
     bits, flags = mujoco.mjtDisableBit, 0
-    if not any(
-        a.any() for a in (model.dof_damping, model.dof_dampingpoly, model.actuator_damping, model.actuator_dampingpoly)
-    ):
+
+    def without(*arrays: str) -> bool:
+        return not any(name in randomized or getattr(model, name).any() for name in arrays)
+
+    if without("dof_damping", "dof_dampingpoly", "actuator_damping", "actuator_dampingpoly"):
         flags |= bits.mjDSBL_EULERDAMP  # no damping to integrate implicitly
-    if not (model.dof_frictionloss.any() or model.tendon_frictionloss.any()):
+    if without("dof_frictionloss", "tendon_frictionloss"):
         flags |= bits.mjDSBL_FRICTIONLOSS
     return flags
 
@@ -46,21 +49,25 @@ class MujocoWarpPhysics(WarpPhysics):
 
     def __init__(
         self,
-        robot: Robot,
+        scene: Scene,
         sim: SimConfig,
         num_envs: int,
         device: torch.device,
-        terrain: Terrain | None = None,
-        randomized: Collection[RandomizedField] = (),
+        randomized: Collection[str] = (),
+        quantities: Collection[str] = (),
     ) -> None:
-        """Build the scene on `device` and place all robots at the model's initial state; compiles on first use, for
+        """Build the scene on `device` and place all worlds at the model's initial state; compiles on first use, for
         `randomized` fields too.
         """
-        super().__init__(robot, num_envs, sim.dt, device)
+        super().__init__(num_envs, sim.dt, device)
+        terrain = scene.terrain
         cells = terrain is not None and sim.terrain_collider == "cells"
-        self.model = build_model(robot, sim, terrain, "none" if cells else "height_field")
+        self.model = scene.model(sim, "none" if cells else "height_field")
+        self._randomized = RandomizedModel(scene, self.model, randomized, torch.float32, device)
+        self._per_world = changed_arrays(randomized)
+        """Names of the model's arrays that are given per world."""
         with wp.ScopedDevice(self._wp_device):
-            self._m = mjw.put_model(self.model, batch_sizes={name: num_envs for name in PER_WORLD})
+            self._m = self._put_model(scene.name)
             self._m.opt.warn_overflow = 0  # counted in refresh instead of printed by each thread
             self._d = mjw.make_data(self.model, nworld=num_envs, nconmax=sim.nconmax, njmax=sim.njmax)
             if terrain is not None and cells:
@@ -68,60 +75,99 @@ class MujocoWarpPhysics(WarpPhysics):
                 shapes, floor = np.flatnonzero(of_robot), self.model.geom(FLOOR).id
                 TerrainContact(self._m, self._d, self.model, floor, terrain.height_map, shapes)
             d = self._d
-            self._qpos, self._qvel, self.torques = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
-            self.state = self._allocate_state()
-            self._exchange = Exchange(self._m, d, self.model, robot, self.state, self.overflowed)
-            self._solver = self._choose_solver(sim)
-            self._torque_step = self._choose_torque_step(sim)
-            self._m.opt.disableflags |= absent_stages(self.model)
+            self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
+            if scene.robot is None:
+                self._exchange = StateExchange(arrays_of(d), self.overflowed)
+            else:
+                self.robot_state = robot_state(self.qpos, self.qvel, scene.robot)
+                self._exchange = MujocoWarpExchange(self._m, d, self.overflowed, self.model, scene.robot, self.robot_state)
+            sample = mujoco.MjData(self.model)
+            self._quantities = {
+                name: wp.to_torch(getattr(d, name)).view(num_envs, *getattr(sample, name).shape) for name in quantities
+            }
+            self._choose_step(sim.step)
+            self._m.opt.disableflags |= absent_stages(self.model, self._per_world)
         exchanges = (self._exchange.kinematics, self._exchange.contact_forces)
-        constants = (self._set_constants,) if "added_base_mass" in randomized else ()
-        compile_ahead(self._wp_device, (self._step, *exchanges, *constants))
+        constants = (self._set_constants,) if any(FIELDS[name].derived for name in randomized) else ()
+        compile_ahead(self._wp_device, (self._step, self._update_quantities, *exchanges, *constants))
+        self.library_step = self._library_step
         if self._wp_device.is_cpu:
             self._advance = self._captured_step()
         self.refresh()
 
+    def _put_model(self, scene: str) -> Any:
+        """Return mujoco-warp's model, with room for what differs per world."""
+        sizes = {name: self.num_envs for name in (*PER_WORLD, *self._per_world) if getattr(self.model, name).size}
+        try:
+            return mjw.put_model(self.model, batch_sizes=sizes)
+        except NotImplementedError as error:
+            raise ConfigError(f"sim.physics: mujoco_warp cannot simulate {scene}, mujoco might: {error}") from error
+
+    def refresh(self) -> None:
+        super().refresh()
+        if self._quantities:
+            with self._on_device():
+                self._update_quantities()
+
+    def _update_quantities(self) -> None:
+        """Launch what the quantities that were asked for depend on."""
+        stage = stage_of(self._quantities)
+        if stage >= int(mujoco.mjtStage.mjSTAGE_POS):
+            mjw.kinematics(self._m, self._d)
+            mjw.com_pos(self._m, self._d)
+        if stage >= int(mujoco.mjtStage.mjSTAGE_VEL):
+            mjw.com_vel(self._m, self._d)
+
+    def write(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
+        super().write(mask, qpos, qvel)
+        for forces in self._of_last_step().values():
+            forces.masked_fill_(mask.view(-1, 1), 0.0)
+
+    def _of_last_step(self) -> dict[str, Tensor]:
+        """Return those quantities that only a step computes."""
+        return {name: self._quantities[name] for name in LAST_STEP if name in self._quantities}
+
     def _step(self) -> None:
         m, d = self._m, self._d
-        if self._solver is None:
-            mjw.step(m, d)
-            return
-        if self._torque_step is not None:
-            self._torque_step.begin()
+        if self._fused_step is not None:
+            self._fused_step.begin()
             mjw.collision(m, d)
             mjw.make_constraint(m, d)
+            self._fused_step.finish()
+        elif self._solver is not None:
+            mjw.fwd_position(m, d, factorize=False)
+            mjw.fwd_velocity(m, d)
+            mjw.fwd_actuation(m, d)
+            mjw.fwd_acceleration(m, d)
             self._solver.solve()
-            self._torque_step.integrate()
+            mjw.euler(m, d)
+        else:
+            mjw.step(m, d)
+
+    def _choose_step(self, step: str) -> None:
+        """Prepare what `sim.step` asks for: our launches for the whole step, our constraint solver within mujoco-warp's
+        launches, or nothing, which leaves the step to mujoco-warp. Raises ConfigError where the model keeps `fused` off.
+        """
+        self._fused_step: TorqueStep | None = None
+        self._solver: ConstraintSolver | None = None
+        if step == "library":
+            self.why_library = "sim.step=library"
             return
-        mjw.fwd_position(m, d, factorize=False)
-        mjw.fwd_velocity(m, d)
-        mjw.fwd_actuation(m, d)
-        mjw.fwd_acceleration(m, d)
-        self._solver.solve()
-        mjw.euler(m, d)
+        per_world = (*PER_WORLD, *self._per_world)
+        no_solver = ConstraintSolver.why_not(self._m, self._d)
+        self.why_library = no_solver or TorqueStep.why_not(self.model, per_world)
+        if step == "fused" and self.why_library:
+            raise ConfigError(f"sim.step=fused: {self.why_library}; sim.step=auto takes what fits")
+        if no_solver:
+            return
+        self._m.opt.run_qacc_smooth = False  # our solver does not start from it
+        if self.why_library:
+            self._solver = ConstraintSolver(self._m, self._d)
+        else:
+            self._fused_step = TorqueStep(self.model, self._m, self._d, per_world)
 
-    def _choose_solver(self, sim: SimConfig) -> ConstraintSolver | None:
-        """Ours, or none for mujoco-warp's own."""
-        if sim.constraint_solver == "rounds":
-            return None
-        if why_not := ConstraintSolver.why_not(self._m, self._d):
-            if sim.constraint_solver == "fused":
-                raise ConfigError(f"sim.constraint_solver=fused: {why_not}; sim.constraint_solver=auto takes what fits")
-            return None
-        self._m.opt.run_qacc_smooth = False  # ours does not start from it
-        return ConstraintSolver(self._m, self._d)
-
-    def _choose_torque_step(self, sim: SimConfig) -> TorqueStep | None:
-        """What replaces mujoco-warp's stages around our solver, where the model allows it."""
-        why_not = TorqueStep.why_not(self.model) if self._solver else "needs the fused sim.constraint_solver"
-        if sim.smooth_dynamics == "fused" and why_not:
-            raise ConfigError(f"sim.smooth_dynamics=fused: {why_not}; sim.smooth_dynamics=auto takes what fits")
-        if sim.smooth_dynamics == "stages" or why_not:
-            return None
-        return TorqueStep(self.model, self._m, self._d, self.model.body(self.robot.file.base).id)
-
-    def library_step(self) -> None:
-        """A physics step as mujoco-warp makes it by itself, to compare with."""
+    def _library_step(self) -> None:
+        """Make a physics step as mujoco-warp does by itself."""
         with self._on_device():
             asked = self._m.opt.run_qacc_smooth
             self._m.opt.run_qacc_smooth = True  # its solver starts from it
@@ -133,31 +179,22 @@ class MujocoWarpPhysics(WarpPhysics):
 
     def _captured_step(self) -> Callable[[], Any]:
         """The recorded step, and the state as before it."""
-        start = [tensor.clone() for tensor in (self._qpos, self._qvel)]
+        start = [tensor.clone() for tensor in (self.qpos, self.qvel)]
         recorded = self._record_step()
-        for tensor, value in zip((self._qpos, self._qvel), start, strict=True):
+        for tensor, value in zip((self.qpos, self.qvel), start, strict=True):
             tensor.copy_(value)
-        for array in (self._d.qacc_warmstart, self._d.efc.force, self._d.overflow):
+        d = self._d
+        for array in (d.qacc_warmstart, d.act, d.qfrc_actuator, d.efc.force, d.overflow):
             array.zero_()
         return recorded
 
     def state_tensors(self) -> dict[str, Tensor]:
-        return {**super().state_tensors(), "warmstart": wp.to_torch(self._d.qacc_warmstart)}
+        own = {"act": wp.to_torch(self._d.act), "warmstart": wp.to_torch(self._d.qacc_warmstart)}
+        return {**super().state_tensors(), **own, **self._of_last_step()}
 
-    def push(self, mask: Tensor, lin_vel_xy: Tensor) -> None:
-        masked_set_(self._qvel[:, :2], mask, self._qvel[:, :2] + lin_vel_xy)
-
-    def randomize(self, field: RandomizedField, values: Tensor) -> None:
-        setter_of(field, friction=self._set_friction, added_base_mass=self._add_base_mass)(values)
-
-    def _set_friction(self, values: Tensor) -> None:
-        geoms = [self.model.geom(name).id for name in self.robot.contact_names]
-        friction = wp.to_torch(self._m.geom_friction)
-        friction[:, geoms, 0] = values.to(self.device).unsqueeze(1).expand(-1, len(geoms))
-
-    def _add_base_mass(self, values: Tensor) -> None:
-        base = self.model.body(self.robot.file.base).id
-        mass = wp.to_torch(self._m.body_mass)
-        mass[:, base] = float(self.model.body_mass[base]) + values.to(self.device)
-        with wp.ScopedDevice(self._wp_device):
-            self._set_constants()
+    def randomize(self, field: str, values: Tensor) -> None:
+        for name, array in self._randomized.give(field, values).items():
+            wp.to_torch(getattr(self._m, name)).copy_(array)
+        if FIELDS[field].derived:
+            with wp.ScopedDevice(self._wp_device):
+                self._set_constants()

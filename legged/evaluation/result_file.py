@@ -1,12 +1,41 @@
-"""What an evaluation's file holds, checked: it may come from anywhere."""
+"""The file of an evaluation's result, read and checked: it may come from anywhere."""
 
+import json
 import math
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 from legged.errors import ConfigError
 
 
-def check(result: Any, where: str) -> None:
+def file_name(engine: str) -> str:
+    """Return what the result of an evaluation in an engine is called."""
+    return f"evaluation_{engine}.json"
+
+
+def read_results(paths: Iterable[Path]) -> list[dict[str, Any]]:
+    """Read the results in files and folders.
+
+    Raises:
+        ConfigError: a path is not there, holds no evaluation, or is none.
+    """
+    results = []
+    for path in paths:
+        files = sorted(path.glob(file_name("*"))) if path.is_dir() else [path]
+        if not files or not all(file.is_file() for file in files):
+            raise ConfigError(f"{path}: holds no evaluation_<physics>.json; python -m legged.tools.evaluate writes it")
+        for file in files:
+            try:
+                result = json.loads(file.read_text(encoding="utf-8"))
+            except (OSError, ValueError, RecursionError) as error:
+                raise ConfigError(f"{file}: is not the result of an evaluation ({error})") from error
+            check_result(result, str(file))
+            results.append(result)
+    return results
+
+
+def check_result(result: Any, where: str) -> None:
     """Check the fields of an evaluation that comparisons read; `where` names its file.
 
     Raises:
@@ -15,6 +44,9 @@ def check(result: Any, where: str) -> None:
     fields = _mapping(result, where, "the whole file")
     for name in ("task", "physics"):
         _text(fields, name, where, "")
+    if "episodes" in fields:
+        check_episodes(fields, where)
+        return
     tracking, path = (fields["rough"], "rough.") if "rough" in fields else (fields, "")
     _mapping(tracking, where, "rough")
     _number(tracking, "falls", where, path)
@@ -25,8 +57,21 @@ def check(result: Any, where: str) -> None:
         check_success(fields, where)
 
 
+def check_episodes(result: Any, where: str) -> None:
+    """Check the part that says what episodes of a task without commands came to. Raises as `check_result`."""
+    episodes = _mapping(_mapping(result, where, "the whole file").get("episodes"), where, "episodes")
+    for name in ("count", "failures"):
+        _number(episodes, name, where, "episodes.")
+    for name in ("return", "length"):
+        for part in ("mean", "std", "min", "max"):
+            _number(_mapping(episodes.get(name), where, f"episodes.{name}"), part, where, f"episodes.{name}.")
+    for name in ("terms", "metrics"):
+        for key in _mapping(episodes.get(name), where, f"episodes.{name}"):
+            _number(episodes[name], key, where, f"episodes.{name}.")
+
+
 def check_success(result: Any, where: str) -> None:
-    """Check the part that says how hard a terrain was crossed. Raises as `check`."""
+    """Check the part that says how hard a terrain was crossed. Raises as `check_result`."""
     success = _mapping(_mapping(result, where, "the whole file").get("success"), where, "success")
     types = _mapping(success.get("types"), where, "success.types")
     for name, entry in types.items():
@@ -45,7 +90,7 @@ def check_success(result: Any, where: str) -> None:
 
 
 def tracking_of(result: dict[str, Any]) -> dict[str, Any]:
-    """The part of a result that says how commands were followed."""
+    """Return the part of a result that says how commands were followed."""
     return result.get("rough", result)
 
 

@@ -6,12 +6,14 @@ import pytest
 import torch
 from helpers import TASK, call, run_folders, tiny_run
 
+from legged.evaluation.all_checkpoints import walks
 from legged.learning.checkpoint import read_checkpoint, write_checkpoint
-from legged.tools import time_to_walk
+from legged.tools import evaluate
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
-HERE = ["--task", TASK, "--sim_device", "cpu", "--robots", "1", "sim.threads=1"]
+HERE = ["--task", TASK, "--sim_device", "cpu", "--robots", "1", "sim.threads=1", "--all-checkpoints"]
+AXIS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 
 def test_checkpoints_are_judged_in_order_and_the_first_good_one_is_named(capsys):
@@ -29,8 +31,8 @@ def test_checkpoints_are_judged_in_order_and_the_first_good_one_is_named(capsys)
             if number and "mlp" in name:
                 saved["actor_state_dict"][name] = torch.zeros_like(tensor)
         write_checkpoint(path, saved)
-    stands = sum((x * x + y * y) ** 0.5 for x in time_to_walk.AXIS for y in time_to_walk.AXIS) / 25
-    assert time_to_walk.main([*HERE, "--rmse", "0.1"]) == 0
+    stands = sum((x * x + y * y) ** 0.5 for x in AXIS for y in AXIS) / 25
+    assert evaluate.main([*HERE, "--rmse", "0.1"]) == 0
     assert "never" in capsys.readouterr().out
     result = json.loads((folder / "time_to_walk.json").read_text())
     assert result["first"] is None
@@ -38,7 +40,7 @@ def test_checkpoints_are_judged_in_order_and_the_first_good_one_is_named(capsys)
     assert result["checkpoints"][1]["rmse_lin"] == pytest.approx(stands, abs=0.05)
     assert [row["wall_s"] for row in result["checkpoints"]] == [4.0, 5.0, 6.5]
     limit = result["checkpoints"][1]["rmse_lin"] + 0.02  # resets are random
-    assert time_to_walk.main([*HERE, "--rmse", str(limit), "--falls", "0.5"]) == 0
+    assert evaluate.main([*HERE, "--rmse", str(limit), "--falls", "0.5"]) == 0
     first = json.loads((folder / "time_to_walk.json").read_text())["first"]
     wanted = 4.0 if result["checkpoints"][0]["rmse_lin"] < limit else 5.0
     assert first["wall_s"] == wanted
@@ -47,11 +49,26 @@ def test_checkpoints_are_judged_in_order_and_the_first_good_one_is_named(capsys)
 
 def test_a_robot_that_always_falls_does_not_walk():
     row = {"rmse_lin": None, "falls": 1.0}
-    assert not time_to_walk.walks(row, 10.0, 2.0)
-    assert time_to_walk.walks({"rmse_lin": 0.14, "falls": 0.005}, 0.15, 0.01)
-    assert not time_to_walk.walks({"rmse_lin": 0.14, "falls": 0.02}, 0.15, 0.01)
+    assert not walks(row, 10.0, 2.0)
+    assert walks({"rmse_lin": 0.14, "falls": 0.005}, 0.15, 0.01)
+    assert not walks({"rmse_lin": 0.14, "falls": 0.02}, 0.15, 0.01)
 
 
 def test_wrong_limits_are_refused(capsys):
-    assert call(time_to_walk.main, [*HERE, "--rmse", "-1"]) == 2
+    assert call(evaluate.main, [*HERE, "--rmse", "-1"]) == 2
     assert "--rmse: must be above 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([*HERE, "--checkpoint", "3"], "--checkpoint: --all-checkpoints tracks commands with every checkpoint"),
+        ([*HERE, "--types", "pit"], "--types: --all-checkpoints tracks commands"),
+        ([*HERE, "--physics", "all"], "--all-checkpoints: looks at one engine"),
+        ([*HERE[:-1], "--rmse", "0.1"], "--rmse: is a limit of --all-checkpoints; add it"),
+        ([*HERE[:-1], "--falls", "0.1"], "--falls: is a limit of --all-checkpoints; add it"),
+    ],
+)
+def test_flags_that_contradict_each_other_are_refused(arguments, words, capsys):
+    assert call(evaluate.main, arguments) == 2
+    assert words in capsys.readouterr().err

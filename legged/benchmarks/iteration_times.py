@@ -1,0 +1,50 @@
+"""How long an iteration of a training takes, in each training loop."""
+
+import contextlib
+import io
+import tempfile
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from legged.envs import BaseTask
+from legged.learning.captured import CapturedRunner
+from legged.learning.display import Progress
+from legged.learning.runner import Runner
+
+LOOPS: dict[str, type[Runner]] = {"stock": Runner, "captured": CapturedRunner}
+"""Training loops that are timed."""
+
+
+class Recorder:
+    """A stand-in for the display of a training that keeps its times."""
+
+    def __init__(self) -> None:
+        self.progress: list[Progress] = []
+
+    def show(self, progress: Progress) -> None:
+        """Keep an iteration."""
+        self.progress.append(progress)
+
+
+def time_iterations(kind: type[Runner], task: BaseTask, count: int) -> dict[str, Any]:
+    """Train for `count` iterations with a training loop, from new networks; return milliseconds of rollout, update and both
+    (medians, and the range of both), the first iteration left out.
+    """
+    recorder = Recorder()
+    with tempfile.TemporaryDirectory() as folder:
+        runner = kind(task, Path(folder), str(task.device), recorder)  # type: ignore[arg-type]
+        with contextlib.redirect_stdout(io.StringIO()) as said:
+            runner.learn(count + 1, init_at_random_ep_len=True)
+    seen = recorder.progress[1:]
+    whole = sorted(1e3 * (progress.collect_s + progress.learn_s) for progress in seen)
+    steps = task.cfg.train.runner.num_steps_per_env
+    return {
+        "rollout_ms": 1e3 * median([progress.collect_s for progress in seen]),
+        "update_ms": 1e3 * median([progress.learn_s for progress in seen]),
+        "iteration_ms": median(whole),
+        "iteration_ms_range": [whole[0], whole[-1]],
+        "steps_per_iteration": steps,
+        "robot_steps_per_s": task.num_envs * steps / median(whole) * 1e3,
+        "note": said.getvalue().strip(),
+    }

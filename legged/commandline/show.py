@@ -1,0 +1,125 @@
+"""What a configuration comes to: terms with their columns, actions and joints, for `--show`."""
+
+import inspect
+from collections.abc import Iterator, Sequence
+
+import mujoco
+import torch
+
+from legged.config import TaskConfig, override
+from legged.envs import BaseTask, LeggedRobot
+from legged.registry import make_task
+
+ALONE = [("env.num_envs", 1), ("sim.physics", "mujoco"), ("sim.threads", 1), ("train.algorithm.num_mini_batches", 1)]
+"""What is changed to build a task of one robot on any machine."""
+
+
+def summary(cfg: TaskConfig) -> list[str]:
+    """Return lines about a task that is built for it, with one robot on the C engine; each begins with '#', so that they may
+    follow a configuration in YAML.
+
+    Raises:
+        ConfigError: the task cannot be built.
+        TermError: one of its terms fails.
+    """
+    if torch.get_num_threads() > 1:
+        torch.set_num_threads(1)
+    task = make_task(override(cfg, ALONE), "cpu", graph=False)
+    lines = [line for part in (_observations, _rewards, _terminations, _actions, _joints) for line in part(task)]
+    return [f"# {line}".rstrip() for line in lines]
+
+
+def _says(task: BaseTask, method: str) -> str:
+    """Return the first sentence of a term's docstring."""
+    text = " ".join((inspect.getdoc(getattr(task, method)) or "").split())
+    return text.partition(". ")[0].rstrip(".")
+
+
+def _table(title: str, rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
+    """Yield a title and rows in columns, the last of any width."""
+    yield ""
+    yield title
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)][:-1]
+    for row in rows:
+        yield "  " + "  ".join([cell.ljust(width) for cell, width in zip(row, widths, strict=False)] + [row[-1]])
+
+
+def _number(value: float) -> str:
+    return f"{value:.6g}"
+
+
+def _observations(task: BaseTask) -> Iterator[str]:
+    for name, group in task.observation_groups.items():
+        width = sum(len(term.scale) for term in group.terms)
+        rows = [("columns", "term", "scale", "noise", "what it is")]
+        for term in group.terms:
+            scales = term.scale.tolist()
+            scales = scales[:1] if len(set(scales)) == 1 else scales
+            noise = f"+-{_number(term.noise)}" if term.noise else "-"
+            columns = f"{term.columns.start}:{term.columns.stop}"
+            rows.append((columns, term.name, ", ".join(map(_number, scales)), noise, _says(task, f"_obs_{term.name}")))
+        steps = f" x {group.history} steps, oldest first" if group.history > 1 else ""
+        yield from _table(f"observations '{name}': {width} numbers{steps}; noise before scaling", rows)
+
+
+def _rewards(task: BaseTask) -> Iterator[str]:
+    scales = task.cfg.rewards.scales
+    times = f"times the control step of {task.dt:g} s" if task.cfg.rewards.times_dt else "a control step"
+    rows = [("reward", "scale", "what it is")]
+    rows += [(name, _number(scales[name]), _says(task, f"_reward_{name}")) for name in task.rewards.names]
+    off = [name for name, scale in scales.items() if scale == 0.0]
+    clip = "; their sum is clipped at 0" if task.cfg.rewards.only_positive_rewards else ""
+    yield from _table(f"rewards, {times}{clip}{'; off: ' + ', '.join(off) if off else ''}", rows)
+
+
+def _terminations(task: BaseTask) -> Iterator[str]:
+    failures, time_outs = task.active_terminations()
+    rows = [("termination", "kind", "what it is")]
+    for kind, names in (("failure", failures), ("time-out", time_outs)):
+        rows += [(name, kind, _says(task, f"_terminate_{name}")) for name in names]
+    rows.append(("(time)", "time-out", f"{task.max_episode_length} control steps, {task.cfg.env.episode_length_s:g} s"))
+    rows.append(("(numbers)", "failure", "a number of the physics, a reward or an observation is none"))
+    yield from _table("terminations", rows)
+
+
+def _actions(task: BaseTask) -> Iterator[str]:
+    model, clip = task.physics.model, task.cfg.control.clip_actions
+    rows = [("action", "actuator", "what it does")]
+    for i in range(task.num_actions):
+        joint = model.joint(int(model.actuator_trnid[i, 0])).name
+        rows.append((str(i), model.actuator(i).name or f"({i})", _effect(task, i, joint)))
+    yield from _table(f"actions: {task.num_actions} numbers, clipped at +-{clip:g}", rows)
+
+
+def _effect(task: BaseTask, i: int, joint: str) -> str:
+    """Say what action `i` does to its joint."""
+    if not isinstance(task, LeggedRobot):
+        model = task.physics.model
+        force = float(model.actuator_gear[i, 0] * model.actuator_gainprm[i, 0])
+        middle = float(task.control_middle[i]) * force
+        slides = model.joint(joint).type[0] == mujoco.mjtJoint.mjJNT_SLIDE
+        offset = f"{middle:g} + " if middle else ""
+        return f"{joint}: {offset}{float(task.control_reach[i]) * force:g} a [{'N' if slides else 'N m'}]"
+    control, law = task.control, task.cfg.control
+    p, d, limit = (float(values[i]) for values in (control.stiffness, control.damping, control.torque_limits))
+    if law.control_type == "P":
+        target = f"position {float(task.default_dof_pos[i]):g} + {law.action_scale:g} a [rad]"
+    else:
+        target = f"{'velocity' if law.control_type == 'V' else 'torque'} {law.action_scale:g} a"
+    gains = "" if law.control_type == "T" else f", stiffness {p:g}, damping {d:g}"
+    return f"{joint}: {target}{gains}, torque at most {limit:g} N m"
+
+
+def _joints(task: BaseTask) -> Iterator[str]:
+    model = task.physics.model
+    kinds = {int(kind): kind.name.removeprefix("mjJNT_").lower() for kind in mujoco.mjtJoint.__members__.values()}
+    rows = [("joint", "kind", "qpos", "qvel", "range")]
+    for i in range(model.njnt):
+        joint = model.joint(i)
+        qpos, qvel = (
+            f"{adr}:{adr + len(now)}"
+            for adr, now in ((int(joint.qposadr[0]), joint.qpos0), (int(joint.dofadr[0]), joint.damping))
+        )
+        limits = f"{joint.range[0]:.4g} to {joint.range[1]:.4g}" if joint.limited else "-"
+        rows.append((joint.name or f"({i})", kinds[int(joint.type[0])], qpos, qvel, limits))
+    yield from _table(f"joints: {model.nq} positions, {model.nv} velocities", rows)

@@ -1,0 +1,45 @@
+"""The last step of an episode, kept for those who learn from it: the task begins the next episode within the same step."""
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from legged.mdp.observations import ObservationGroup, ObservationTerms
+from legged.physics import Physics
+
+if TYPE_CHECKING:
+    from legged.envs.base_task import BaseTask
+
+
+class FinalStep:
+    """What every environment was like in the last step when its reward was judged, before any was reset, pushed or given a
+    new command.
+    """
+
+    def __init__(self, terms: ObservationTerms, groups: dict[str, ObservationGroup], physics: Physics) -> None:
+        """For the observation groups of a task and its physics."""
+        self._terms, self._groups, self._physics = terms, groups, physics
+        self.observations = {name: torch.zeros_like(group.buffer) for name, group in groups.items()}
+        """By group what it would have shown, (N, history * width)."""
+        self.qpos, self.qvel = torch.zeros_like(physics.qpos), torch.zeros_like(physics.qvel)
+        """(N, nq) and (N, nv) generalised positions and velocities."""
+
+    def take(self) -> None:
+        """Observe the environments as they are now, in the middle of a step: terms are evaluated once more."""
+        self._terms.evaluate()
+        for name, group in self._groups.items():
+            group.preview(self.observations[name])
+        self.qpos.copy_(self._physics.qpos)
+        self.qvel.copy_(self._physics.qvel)
+
+
+def keep_final_step(task: "BaseTask", graph: bool = True) -> FinalStep:
+    """Let a task keep the last step of its episodes from now on, and return where it does. All episodes begin anew. With
+    `graph` the step is captured (again, if the task was built with a graph), or checked on the CPU, as at its start.
+
+    Raises:
+        TermError: the step cannot be captured.
+    """
+    task.final_step = FinalStep(task.observation_terms, task.observation_groups, task.physics)
+    task._build_graph(graph and (task.physics.capturable or task.physics.device.type == "cpu"))
+    return task.final_step

@@ -1,0 +1,19 @@
+"""Models that come with the package gymnasium (MIT licence)."""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+from legged.errors import ConfigError
+
+
+def gymnasium_model(name: str) -> Path:
+    """Return the MJCF file `name` of Gymnasium's MuJoCo environments; Gymnasium itself is not imported.
+
+    Raises:
+        ConfigError: this installation of gymnasium has no such file.
+    """
+    found = find_spec("gymnasium")
+    folder = Path(found.origin).parent / "envs" / "mujoco" / "assets" if found and found.origin else Path()
+    if not (folder / name).is_file():
+        raise ConfigError(f"the package gymnasium has no model {name} here: pip install gymnasium")
+    return folder / name

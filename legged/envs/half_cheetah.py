@@ -1,0 +1,63 @@
+"""A planar cheetah with two legs runs as fast as it can: Gymnasium's HalfCheetah-v5, term by term.
+
+Wawrzynski, "A cat-like robot real-time learning to run", 2009; the model is Gymnasium's half_cheetah.xml.
+"""
+
+import torch
+from torch import Tensor
+
+from legged.envs.base_task import BaseTask
+from legged.envs.gymnasium_models import gymnasium_model
+from legged.physics import ModelScene, Scene
+
+
+class HalfCheetah(BaseTask):
+    """Nine generalised positions: x [m], z [m] and pitch [rad] of the torso, then six joints [rad] with a motor each. Nothing
+    ends an episode but time.
+    """
+
+    GYMNASIUM_ID = "HalfCheetah-v5"
+    """What Gymnasium calls the same task: same observations, actions and rewards."""
+    POSITION_NOISE, VELOCITY_NOISE = 0.1, 0.1
+    """An episode begins within this of the model's own positions (even) and of rest (normal)."""
+
+    def make_scene(self) -> Scene:
+        """Take Gymnasium's cheetah on its floor."""
+        return ModelScene(gymnasium_model("half_cheetah.xml"))
+
+    def _init_buffers(self) -> None:
+        super()._init_buffers()
+        self.last_x = torch.zeros(self.num_envs, device=self.device)
+        """(N,) x of the torso a control step before [m]."""
+
+    def draw_reset(self) -> None:
+        self.reset_qpos.uniform_(-self.POSITION_NOISE, self.POSITION_NOISE).add_(self.qpos0)
+        self.reset_qvel.normal_(0.0, self.VELOCITY_NOISE)
+
+    def remember(self) -> None:
+        super().remember()
+        self.last_x.copy_(self.physics.qpos[:, 0])
+
+    def x_velocity(self) -> Tensor:
+        """Return the mean forward velocity over the control step, (N,) [m/s]."""
+        return (self.physics.qpos[:, 0] - self.last_x) / self.dt
+
+    def _obs_position(self) -> Tensor:
+        """Generalised positions but x: z, pitch, and six joint angles, of the back leg first [m, rad]."""
+        return self.physics.qpos[:, 1:]
+
+    def _obs_velocity(self) -> Tensor:
+        """Generalised velocities: x, z, pitch, and six joints [m/s, rad/s]."""
+        return self.physics.qvel
+
+    def _reward_forward(self) -> Tensor:
+        """Forward velocity [m/s]."""
+        return self.x_velocity()
+
+    def _reward_control(self) -> Tensor:
+        """Squared actions."""
+        return self.actions.square().sum(dim=1)
+
+    def _metric_x_velocity(self) -> Tensor:
+        """Forward velocity [m/s]."""
+        return self.x_velocity()

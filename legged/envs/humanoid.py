@@ -1,0 +1,126 @@
+"""A humanoid runs as fast as it can, with the observations and rewards of the tutorial that came with MuJoCo XLA.
+
+The task goes back to Tassa, Erez and Todorov, "Synthesis and stabilization of complex behaviors through online trajectory
+optimization", 2012; the model is Gymnasium's humanoid.xml.
+"""
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from legged.config.bounds import between
+from legged.config.schema import Range, TaskConfig
+from legged.envs.base_task import BaseTask
+from legged.envs.gymnasium_models import gymnasium_model
+from legged.physics import ModelScene, Scene
+
+TORSO = 1
+"""Number of the floating body."""
+
+
+@dataclass(frozen=True)
+class HumanoidConfig(TaskConfig):
+    """What the humanoid's task has beside every task's sections."""
+
+    healthy_z: Range = field(default=(1.0, 1.5), metadata=between(0, 10))
+    """Heights of the torso between which the humanoid counts as on its feet [m]."""
+    reset_noise: float = field(default=0.01, metadata=between(0, 1))
+    """An episode begins within this of the model's own positions and of rest [m, rad, m/s, rad/s]."""
+
+
+class Humanoid(BaseTask):
+    """A floating torso with 17 motors on 17 joints; 13 bodies, 23 degrees of freedom."""
+
+    Config: ClassVar[type[TaskConfig]] = HumanoidConfig
+    cfg: HumanoidConfig
+    QUANTITIES = ("subtree_com", "cinert", "cvel", "qfrc_actuator")
+
+    def make_scene(self) -> Scene:
+        """Take Gymnasium's humanoid on its floor."""
+        return ModelScene(gymnasium_model("humanoid.xml"))
+
+    def _init_buffers(self) -> None:
+        super()._init_buffers()
+        self.com = self.physics.quantity("subtree_com")[:, TORSO]
+        """(N, 3) centre of mass [m]."""
+        self.com_velocity = torch.zeros(self.num_envs, 3, device=self.device)
+        """(N, 3) mean velocity of the centre of mass over the control step [m/s]."""
+        self.last_com = torch.zeros_like(self.com_velocity)
+        self.cinert, self.cvel, self.qfrc_actuator = (self.physics.quantity(name) for name in self.QUANTITIES[1:])
+
+    def draw_reset(self) -> None:
+        noise = self.cfg.reset_noise
+        self.reset_qpos.uniform_(-noise, noise).add_(self.qpos0)
+        self.reset_qvel.uniform_(-noise, noise)
+
+    def advance(self) -> None:
+        super().advance()
+        torch.sub(self.com, self.last_com, out=self.com_velocity).div_(self.dt)
+
+    def remember(self) -> None:
+        super().remember()
+        self.last_com.copy_(self.com)
+
+    def healthy(self) -> Tensor:
+        """Return which humanoids are on their feet, (N,)."""
+        low, high = self.cfg.healthy_z
+        height = self.physics.qpos[:, 2]
+        return (height >= low) & (height <= high)
+
+    def _obs_position(self) -> Tensor:
+        """Generalised positions but x and y: z and orientation (w, x, y, z) of the torso, then the joints [m, 1, rad]."""
+        return self.physics.qpos[:, 2:]
+
+    def _obs_velocity(self) -> Tensor:
+        """Generalised velocities: linear (world) and angular (torso's frame) of the torso, then the joints [m/s, rad/s]."""
+        return self.physics.qvel
+
+    def _obs_inertia(self) -> Tensor:
+        """MuJoCo's cinert of each body: inertia about the centre of mass, in world axes, offset by mass, and mass [kg, m]."""
+        return self.cinert[:, TORSO:].flatten(1)
+
+    def _obs_body_velocity(self) -> Tensor:
+        """MuJoCo's cvel of each body: angular and linear velocity about the centre of mass, in world axes [rad/s, m/s]."""
+        return self.cvel[:, TORSO:].flatten(1)
+
+    def _obs_actuator_force(self) -> Tensor:
+        """MuJoCo's qfrc_actuator: what motors do to each degree of freedom, at the last physics step [N, N m]."""
+        return self.qfrc_actuator
+
+    def _reward_linvel(self) -> Tensor:
+        """Forward velocity of the centre of mass [m/s]."""
+        return self.com_velocity[:, 0]
+
+    def _reward_alive(self) -> Tensor:
+        """Being on its feet."""
+        return self.healthy().float()
+
+    def _reward_quadctrl(self) -> Tensor:
+        """Squared actions."""
+        return self.actions.square().sum(dim=1)
+
+    def _terminate_unhealthy(self) -> Tensor:
+        """The torso is too low or too high."""
+        return ~self.healthy()
+
+    def _metric_x_position(self) -> Tensor:
+        """How far forward of where it began the centre of mass is [m]."""
+        return self.com[:, 0]
+
+    def _metric_y_position(self) -> Tensor:
+        """And how far to the left [m]."""
+        return self.com[:, 1]
+
+    def _metric_distance_from_origin(self) -> Tensor:
+        """How far from where it began the centre of mass is [m]."""
+        return self.com.norm(dim=1)
+
+    def _metric_x_velocity(self) -> Tensor:
+        """Forward velocity of the centre of mass [m/s]."""
+        return self.com_velocity[:, 0]
+
+    def _metric_y_velocity(self) -> Tensor:
+        """Velocity of the centre of mass to the left [m/s]."""
+        return self.com_velocity[:, 1]

@@ -1,0 +1,74 @@
+"""Settings of a legged robot's task that are right by themselves and do not fit each other, or not the robot."""
+
+from typing import Any
+
+from legged.config.schema import LeggedConfig
+from legged.envs.checks import check_mirror_kinds
+from legged.errors import ConfigError
+from legged.mdp.control import control_gains
+from legged.robots.robot import Robot
+from legged.terrain import check_terrain
+
+MOST_POINTS = 10_000
+"""Heights measured around a robot."""
+
+
+def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
+    """Look for what can be wrong with the configuration of a task of class `cls` beside what every task's can be.
+
+    Raises:
+        ConfigError: there is something.
+    """
+    if cfg.train.algorithm.symmetry:
+        check_symmetry(cls, cfg, robot)
+    control_gains(robot, cfg.control, cfg.origins.where)
+    check_terrain(cfg.terrain, cfg.origins)
+    check_base_mass(cfg, robot)
+    check_points(cfg)
+
+
+def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
+    """Look whether robot, observations and height scan have a mirror image.
+
+    Raises:
+        ConfigError: one of them has none.
+    """
+    origins = cfg.origins
+    where, otherwise = origins.where("train.algorithm.symmetry"), "false learns without mirror images"
+    if robot.mirror is None:
+        raise ConfigError(f"{where}: '{robot.name}' is lopsided (joints and feet at zero angles); {otherwise}")
+    used = [term for group in cfg.observations.groups.values() for term in group.terms]
+    check_mirror_kinds(cls.__name__, cls.MIRRORED, used, where)
+    y = cfg.terrain.measured_points_y
+    if sorted(y) != sorted(-value for value in y):
+        points = f"terrain.measured_points_y ({origins.of('terrain.measured_points_y')})"
+        raise ConfigError(f"{where}: {points} are not the same left and right: {list(y)}")
+
+
+def check_base_mass(cfg: LeggedConfig, robot: Robot) -> None:
+    """Look whether the lightest base that may be drawn has a mass.
+
+    Raises:
+        ConfigError: it has none.
+    """
+    lowest = cfg.domain_rand.added_mass_range[0]
+    if cfg.domain_rand.randomize_base_mass and robot.base_mass + lowest <= 0.0:
+        where, mass = cfg.origins.where("domain_rand.added_mass_range"), robot.base_mass
+        raise ConfigError(
+            f"{where}: the base of '{robot.name}' weighs {mass:.4g} kg, so the lowest added mass must be above {-mass:.4g},"
+            f" got {lowest:g}"
+        )
+
+
+def check_points(cfg: LeggedConfig) -> None:
+    """Look whether the height scan is of a size that fits memory.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    points = len(cfg.terrain.measured_points_x) * len(cfg.terrain.measured_points_y)
+    if points > MOST_POINTS:
+        raise ConfigError(
+            f"{cfg.origins.where('terrain.measured_points_x')}: with measured_points_y they are {points:,} points, more than"
+            f" {MOST_POINTS:,}"
+        )

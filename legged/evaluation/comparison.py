@@ -1,0 +1,191 @@
+"""Several evaluations side by side, as tables and as curves; those of one task in one engine are its seeds."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from legged.errors import ConfigError, suggest
+from legged.evaluation.engines import engine_of
+from legged.evaluation.result_file import tracking_of
+from legged.evaluation.success_report import TRAINED, TRAINED_LABEL, as_success
+from legged.figures import COLORS, figure
+
+Evaluations = dict[tuple[str, str], list[dict[str, Any]]]
+"""(task, physics) -> results, one a seed."""
+FIGURES = (
+    ("velocity RMSE, mean [m/s]", "rmse_lin", "mean", 1.0, 3),
+    ("velocity RMSE, worst cell [m/s]", "rmse_lin", "worst", 1.0, 3),
+    ("yaw rate RMSE, mean [rad/s]", "rmse_ang", "mean", 1.0, 3),
+    ("yaw rate RMSE, worst cell [rad/s]", "rmse_ang", "worst", 1.0, 3),
+    ("falls [%]", "falls", None, 100.0, 2),
+)
+"""Label, where it is in a result, factor, decimals."""
+
+
+def keep_types(results: Sequence[dict[str, Any]], types: Sequence[str]) -> None:
+    """Leave only some terrain types in `results`, in the order given.
+
+    Raises:
+        ConfigError: a type is in none of them.
+    """
+    there = {name for result in results for name in result.get("success", {}).get("types", {})}
+    for name in types:
+        if name not in there:
+            raise ConfigError(f"--types: {name}: none of the evaluations holds it{suggest(name, there)}")
+    for result in results:
+        if "success" in result:
+            found = result["success"]["types"]
+            result["success"]["types"] = {name: found[name] for name in types if name in found}
+
+
+def grouped(results: Sequence[dict[str, Any]]) -> Evaluations:
+    """Return the seeds of the same task in the same engine together, in the order of their first."""
+    groups: Evaluations = {}
+    for result in results:
+        groups.setdefault((result["task"], result["physics"]), []).append(result)
+    return groups
+
+
+def spread(values: Sequence[float]) -> float:
+    """Return how far the farthest value is from the mean, as a share of it; 0 where all are 0."""
+    middle = mean(values)
+    return max(abs(value - middle) for value in values) / middle if middle else 0.0
+
+
+def tracking_table(groups: Evaluations) -> Table:
+    """Return a column a group: mean over its seeds, and the spread where there are several."""
+    table = Table(title="following commands: mean of seeds (farthest from it)", title_justify="left")
+    table.add_column("measure")
+    for key, results in groups.items():
+        table.add_column(escape(heading(key, len(results))), justify="right")
+    for label, name, part, factor, decimals in FIGURES:
+        cells = []
+        for results in groups.values():
+            found = [tracking_of(result)[name] for result in results]
+            every = [value if part is None else value[part] for value in found]
+            values = [factor * value for value in every if value is not None]
+            if not values:  # every robot fell before it was measured
+                cells.append("none")
+                continue
+            text = f"{mean(values):.{decimals}f}"
+            cells.append(f"{text} ({100 * spread(values):.0f} %)" if len(values) > 1 else text)
+        table.add_row(escape(label), *cells)
+    return table
+
+
+def episodes_comparison(groups: Evaluations) -> Table:
+    """Return a column a group of evaluations of episodes: mean over its seeds, and the range where there are several."""
+    table = Table(title="episodes: mean of seeds (lowest to highest)", title_justify="left")
+    table.add_column("measure")
+    for key, results in groups.items():
+        table.add_column(escape(heading(key, len(results))), justify="right")
+    found = [[_episode_figures(result["episodes"]) for result in results] for results in groups.values()]
+    for label in dict.fromkeys(label for seeds in found for seed in seeds for label in seed):
+        columns = [[seed[label] for seed in seeds if label in seed] for seeds in found]
+        table.add_row(escape(label), *(_mean_and_range(values) for values in columns))
+    return table
+
+
+def _episode_figures(episodes: dict[str, Any]) -> dict[str, float]:
+    """Return label -> number of what is compared of an evaluation of episodes."""
+    return {
+        "return": episodes["return"]["mean"],
+        "standard deviation of the return": episodes["return"]["std"],
+        "least return": episodes["return"]["min"],
+        "episode length [steps]": episodes["length"]["mean"],
+        "episodes that ended in a failure [%]": 100.0 * episodes["failures"],
+        **{f"return of {name}": value for name, value in episodes["terms"].items()},
+        **episodes["metrics"],
+    }
+
+
+def _mean_and_range(values: Sequence[float]) -> str:
+    """Return numbers in words; nothing of none."""
+    if not values:
+        return ""
+    decimals = 1 if abs(mean(values)) >= 100 else 2
+    text = f"{mean(values):.{decimals}f}"
+    return f"{text} ({min(values):.{decimals}f} to {max(values):.{decimals}f})" if len(values) > 1 else text
+
+
+def heading(key: tuple[str, str], seeds: int) -> str:
+    """Return a group in words."""
+    task, physics = key
+    return f"{task}\n{engine_of(physics).label}, {seeds} seed{'s' if seeds > 1 else ''}"
+
+
+def shares(results: Sequence[dict[str, Any]], terrain: str) -> dict[float, list[float]]:
+    """Return size -> success of every seed, for the sizes that all of them were measured at."""
+    found = [
+        {point["size"]: point["share"] for point in result["success"]["types"][terrain]["points"]}
+        for result in results
+        if terrain in result["success"]["types"]
+    ]
+    common = set.intersection(*(set(one) for one in found)) if found else set()
+    return {size: [one[size] for one in found] for size in sorted(common)}
+
+
+def types_of(groups: Evaluations) -> dict[str, dict[str, Any]]:
+    """Return terrain type -> one of its entries, of all types that were measured."""
+    entries = [result["success"]["types"] for results in groups.values() for result in results]
+    return {name: entry for one in entries for name, entry in one.items()}
+
+
+def success_table(groups: Evaluations) -> Table:
+    """Return a line a type and size: mean success over seeds, and the range where there are several."""
+    table = Table(title="success [%]: mean of seeds (lowest to highest)", title_justify="left")
+    table.add_column("terrain")
+    table.add_column("size", justify="right")
+    for key, results in groups.items():
+        table.add_column(escape(heading(key, len(results))), justify="right")
+    for name, entry in types_of(groups).items():
+        columns = [shares(results, name) for results in groups.values()]
+        for i, size in enumerate(sorted(set().union(*columns))):
+            cells = [_share(column.get(size, [])) for column in columns]
+            table.add_row(escape(name if i == 0 else ""), escape(f"{size:g} {entry['unit']}"), *cells)
+        table.add_section()
+    return table
+
+
+def _share(values: Sequence[float]) -> str:
+    if not values:
+        return ""
+    text = f"{100 * mean(values):.1f}"
+    return f"{text} ({100 * min(values):.0f} to {100 * max(values):.0f})" if len(values) > 1 else text
+
+
+def draw_comparison(groups: Evaluations, path: Path) -> None:
+    """Draw a panel a terrain type: a colour a task, a line style an engine, a band from the worst to the best seed."""
+    names = types_of(groups)
+    tasks = list(dict.fromkeys(task for task, _ in groups))
+    colors = {task: COLORS[i % len(COLORS)] for i, task in enumerate(tasks)}
+    columns = min(2, len(names))
+    rows = -(-len(names) // columns)
+    with figure(path, (4.8 * columns + 0.2, 2.6 * rows + 1.0), rows, columns, share_y=True) as (drawn, axes):
+        from matplotlib.lines import Line2D
+
+        for axis in axes.flat[len(names) :]:
+            axis.set_visible(False)
+        for axis, (name, entry) in zip(axes.flat, names.items(), strict=False):
+            for (task, physics), results in groups.items():
+                found, engine, color = shares(results, name), engine_of(physics), colors[task]
+                means = [mean(values) for values in found.values()]
+                axis.plot(list(found), means, engine.line, marker=engine.marker, ms=3, color=color, clip_on=False)
+                low, high = ([pick(values) for values in found.values()] for pick in (min, max))
+                axis.fill_between(list(found), low, high, color=color, alpha=0.15, lw=0)
+            entries = [result["success"]["types"].get(name) for results in groups.values() for result in results]
+            for end in {one["trained_to"] for one in entries if one is not None} - {None}:
+                axis.axvline(end, **TRAINED)
+            axis.set_title(name.replace("_", " "), fontsize="medium")
+            as_success(axis, entry)
+        keys = []
+        for (task, physics), results in groups.items():
+            engine = engine_of(physics)
+            text = f"{task}, {engine.label}" + (f", {len(results)} seeds" if len(results) > 1 else "")
+            keys.append(Line2D([], [], color=colors[task], ls=engine.line, marker=engine.marker, ms=4, label=text))
+        keys.append(Line2D([], [], **TRAINED, label=TRAINED_LABEL))
+        drawn.legend(handles=keys, loc="outside lower center", ncols=2, frameon=False)

@@ -1,0 +1,64 @@
+"""Episodes of a task without commands, as its policy was exported or in an engine: measured, printed, written."""
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+
+from legged.config import override
+from legged.evaluation.overflows import warn_of_overflows
+from legged.evaluation.result_file import file_name
+from legged.physics import engine_name
+from legged.policies.episodes import episodes_table, for_episodes, measure_episodes
+from legged.policies.restore import TrainedPolicy, restore
+from legged.process.paths import make_folder, relative, write_text
+
+MOST_EPISODES = 2**16
+"""More are not simulated at once."""
+
+
+def evaluate_episodes(
+    policy: TrainedPolicy,
+    episodes: int,
+    asked: list[tuple[str, Any]],
+    device: torch.device,
+    graph: bool,
+    folder: Path,
+    where: str = "sim.physics",
+) -> int:
+    """Run `episodes` robots through their first full episode, without noise and with nothing randomised; print a table and
+    write evaluation_<physics>.json into `folder`. Return the exit code. `where` says who asks for the engine.
+    """
+    start = time.perf_counter()
+    calm, changes = for_episodes(policy, episodes)
+    engine = engine_name(override(policy.cfg, asked).sim, device, where)
+    task, act = restore(calm, [*changes, *asked], device, graph)
+    measured = measure_episodes(task, act)
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
+    result = {**header(policy, engine, name), "wall_s": time.perf_counter() - start, "episodes": measured}
+    code = report(result, folder)
+    warn_of_overflows("episodes", measured["contact_overflows"])
+    return code
+
+
+def header(policy: TrainedPolicy, engine: str, device: str) -> dict[str, Any]:
+    """Return what every result says of what was measured."""
+    return {"task": policy.cfg.task, "checkpoint": policy.checkpoint.name, "physics": engine, "device": device}
+
+
+def report(result: dict[str, Any], folder: Path) -> int:
+    """Print the table of a result, then write its file; return the exit code.
+
+    Raises:
+        RunError: the file can't be written.
+    """
+    title = f"{result['task']} ({result['checkpoint']}) in {result.get('environment', result['physics'])}"
+    Console(width=110).print(episodes_table(result["episodes"], title))
+    make_folder(folder)
+    path = folder / file_name(result["physics"])
+    write_text(path, json.dumps(result, indent=1, allow_nan=False))
+    print(f"written: {relative(path)}")
+    return 0

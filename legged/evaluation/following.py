@@ -1,0 +1,77 @@
+"""How well legged robots follow commands, and how hard a terrain they cross: measured, printed, drawn, written."""
+
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from legged.config import LeggedConfig, override
+from legged.evaluation.episodes import header
+from legged.evaluation.overflows import warn_of_overflows
+from legged.evaluation.result_file import file_name
+from legged.evaluation.success import success_over_difficulty
+from legged.evaluation.success_report import draw_success, print_success, with_other_engines
+from legged.evaluation.tracking_report import draw_tracking, print_tracking
+from legged.evaluation.velocity_grid import Grid
+from legged.evaluation.velocity_tracking import measure_tracking, ready_to_track
+from legged.physics import engine_name
+from legged.policies.restore import TrainedPolicy
+from legged.process.paths import make_folder, relative, write_text
+from legged.terrain import BUMPS
+
+
+def evaluate_following(
+    policy: TrainedPolicy,
+    grid: Grid,
+    types: Sequence[str],
+    robots: int,
+    full: bool,
+    asked: list[tuple[str, Any]],
+    device: torch.device,
+    graph: bool,
+    folder: Path,
+    where: str = "sim.physics",
+) -> int:
+    """Measure tracking on the grid and success on the terrain `types`, `robots` a size; print tables, then write
+    evaluation_<physics>.json and .png and success_<physics>.png into `folder`. Return the exit code. `where` says who asks
+    for the engine.
+
+    Raises:
+        RunError: a file can't be written.
+    """
+    start = time.perf_counter()
+    cfg = policy.cfg
+    assert isinstance(cfg, LeggedConfig), "the task follows no commands"
+    engine = engine_name(override(cfg, asked).sim, device, where)
+    task, act = ready_to_track(policy, grid, asked, device, graph)
+    figures = measure_tracking(task, act, grid)
+    lost = figures.pop("contact_overflows")
+    rough = cfg.terrain.mesh_type != "plane"
+    head = header(policy, engine, torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu")
+    success = success_over_difficulty(policy, types, robots, full, asked, device, graph) if types else None
+    result = {
+        **head,
+        "wall_s": time.perf_counter() - start,
+        **({"rough": {"bumps": BUMPS, **figures, "contact_overflows": lost}} if rough else figures),
+        **({} if success is None else {"success": success}),
+    }
+    # First what is on the screen: no disk can take it away any more.
+    tracking = {**head, **figures, "ground": "on rough ground, " if rough else ""}
+    print_tracking(tracking)
+    warn_of_overflows("tracking", lost)
+    if success is not None:
+        print_success(success)
+        warn_of_overflows("success", success["contact_overflows"])
+    make_folder(folder)
+    path = folder / file_name(engine)
+    write_text(path, json.dumps(result, indent=1, allow_nan=False))
+    written = [path, path.with_suffix(".png")]
+    draw_tracking(tracking, written[1])
+    if success is not None:
+        written.append(folder / f"success_{engine}.png")
+        draw_success(with_other_engines(result, path), written[2])
+    print(f"written: {', '.join(relative(one) for one in written)}")
+    return 0

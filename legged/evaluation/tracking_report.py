@@ -1,0 +1,64 @@
+"""How well a policy follows commands, as a table and as heat maps."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from legged.evaluation.velocity_grid import AXES
+from legged.figures import figure
+from legged.terrain import BUMPS
+
+
+def print_tracking(result: dict[str, Any]) -> None:
+    """Print the figures over the grid, and the gait at 0.5 m/s."""
+    lin, ang, gait = result["rmse_lin"], result["rmse_ang"], result["gait"]
+    title = f"{result['task']} ({result['checkpoint']}) in {result['physics']}"
+    if result["ground"]:
+        title += f", on level ground with bumps of up to {100 * BUMPS:g} cm"
+    table = Table(title=escape(title), title_justify="left")
+    for name, justify in (("measure", "left"), ("value", "right"), ("where", "left")):
+        table.add_column(name, justify=justify)  # type: ignore[arg-type]
+    cells = f"{len(result['cells'])} cells x {result['robots_per_cell']} robots x {result['measured_s']:.0f} s"
+    for name, unit, errors in (("velocity", "m/s", lin), ("yaw rate", "rad/s", ang)):
+        if errors["mean"] is None:
+            table.add_row(f"{name} RMSE", "none", "every robot fell before it was measured")
+            continue
+        table.add_row(f"{name} RMSE, mean", f"{errors['mean']:.3f} {unit}", cells)
+        table.add_row(f"{name} RMSE, worst cell", f"{errors['worst']:.3f} {unit}", _command(errors["worst_cell"]))
+    table.add_row("falls", f"{100 * result['falls']:.2f} %", "of the robots, within the hold")
+    if result["cost_of_transport"] is not None:
+        table.add_row("cost of transport", f"{result['cost_of_transport']:.2f}", "sum |torque * speed| / (weight * speed)")
+    at = _command(gait["command"])
+    table.add_row("duty factor", f"{gait['duty_factor']:.2f}", at)
+    table.add_row("steps per second and foot", f"{gait['steps_per_s']:.2f}", at)
+    table.add_row("base height", f"{gait['base_height']:.3f} m", at)
+    table.add_row("thigh or shank contact", f"{100 * gait['thigh_contact']:.2f} % of steps", at)
+    Console(width=110).print(table)
+
+
+def _command(cell: list[float]) -> str:
+    return f"at vx {cell[0]:g}, vy {cell[1]:g} m/s, yaw {cell[2]:g} rad/s"
+
+
+def draw_tracking(result: dict[str, Any], path: Path) -> None:
+    """Draw heat maps: for each (vx, vy) and each (vx, yaw), the mean over the third command."""
+    grid = result["grid"]
+    shape = tuple(len(grid[name]) for name in AXES)
+    panels = (("rmse_lin", 2, "vy", "velocity RMSE [m/s]"), ("rmse_ang", 1, "yaw", "yaw rate RMSE [rad/s]"))
+    with figure(path, (10.0, 4.2), columns=2) as (drawn, axes):
+        for axis, (name, over, other, label) in zip(axes[0], panels, strict=True):
+            values = np.nanmean(np.array([cell[name] for cell in result["cells"]], dtype=float).reshape(shape), axis=over)
+            image = axis.imshow(values.T, origin="lower", aspect="auto", cmap="viridis_r", vmin=0.0)
+            axis.set_xticks(range(shape[0]), [f"{v:g}" for v in grid["vx"]])
+            axis.set_yticks(range(len(grid[other])), [f"{v:g}" for v in grid[other]])
+            axis.set_xlabel(f"commanded vx [{AXES['vx']}]")
+            axis.set_ylabel(f"commanded {other} [{AXES[other]}]")
+            for (i, j), value in np.ndenumerate(values):
+                dark = value > 0.6 * np.nanmax(values)
+                axis.text(i, j, f"{value:.2f}", ha="center", va="center", color="white" if dark else "black")
+            drawn.colorbar(image, ax=axis, label=label)
+        drawn.suptitle(f"{result['task']} in {result['physics']}, {result['ground']}falls {100 * result['falls']:.1f} %")

@@ -1,0 +1,165 @@
+"""How well a policy follows velocity commands: measured over a grid of held ones."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from legged.config import LeggedConfig, override
+from legged.envs import LeggedRobot
+from legged.evaluation.overflows import Overflows
+from legged.evaluation.tiles import ROUGH_SPAWN, on_terrain, rough_ground, rough_side
+from legged.evaluation.velocity_grid import Grid
+from legged.mdp.contacts import CONTACT_FORCE
+from legged.mdp.tracking_error import velocity_error, yaw_rate_error
+from legged.policies.actor import Actor
+from legged.policies.restore import TrainedPolicy, restore, undisturbed
+
+GRAVITY = 9.81
+SLOWEST = 0.1
+"""Cost of transport is not defined for robots slower than this [m/s]."""
+
+
+def ready_to_track(
+    policy: TrainedPolicy, grid: Grid, asked: list[tuple[str, Any]], device: torch.device, graph: bool
+) -> tuple[LeggedRobot, Actor]:
+    """Build a task of grid.num_envs robots and the policy that acts in it; `asked` is what the command line changes.
+
+    The task stands on a plane or, if it has terrain, on bumpy level ground.
+    """
+    assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
+    changes = undisturbed(grid.num_envs, grid.hold_s)
+    terrain = None
+    if policy.cfg.terrain.mesh_type == "plane":
+        changes += asked
+    else:
+        changes += [*on_terrain(policy.cfg, rough_side(grid), ROUGH_SPAWN), *asked]
+        cfg: Any = override(policy.cfg, changes)
+        terrain = rough_ground(cfg.terrain, cfg.env.seed)
+        print(f"tracking on rough ground: {grid.size_text}", flush=True)
+    return restore(policy, changes, device, graph, terrain)
+
+
+@torch.inference_mode()
+def measure_tracking(task: LeggedRobot, act: Callable[[TensorDict], Tensor], grid: Grid) -> dict[str, Any]:
+    """Run the grid on a task of grid.num_envs robots; return plain numbers and lists, one entry a cell in "cells".
+
+    A robot that falls counts as a fall and is measured up to its fall. Errors are instantaneous, per control step.
+    `contact_overflows` counts the robots and steps in which contacts were lost for want of memory.
+    """
+    cells = grid.cells
+    device = torch.device(task.device)
+    commands = torch.tensor(cells, dtype=torch.float32, device=device).repeat_interleave(grid.robots, dim=0)
+    task.reset()
+    observations = task.hold_commands(commands)
+    sums, overflows = _Sums(task), Overflows()
+    alive = torch.ones(task.num_envs, dtype=torch.bool, device=device)
+    settle, steps = round(grid.settle_s / task.dt), round(grid.hold_s / task.dt)
+    for step in range(steps):
+        observations, _, _, extras = task.step(act(observations))
+        overflows.add(extras)
+        alive &= ~task.terminated_buf
+        if step >= settle:
+            sums.add(task, alive)
+    fell = (~alive).float()
+    result = summarize(task, grid, cells, sums, fell, (steps - settle) * task.dt)
+    return {**result, "contact_overflows": overflows.total(task)}
+
+
+class _Sums:
+    """Sums per robot over the measured steps before it fell."""
+
+    NAMES = ("steps", "lin", "ang", "power", "positive_power", "speed", "height", "collision")
+
+    def __init__(self, task: LeggedRobot) -> None:
+        device = torch.device(task.device)
+        self.values = {name: torch.zeros(task.num_envs, device=device) for name in self.NAMES}
+        feet = len(task.robot.feet_indices)
+        self.values |= {name: torch.zeros(task.num_envs, feet, device=device) for name in ("stance", "touch_downs")}
+
+    def add(self, task: LeggedRobot, alive: Tensor) -> None:
+        power = task.torques * task.dof_vel
+        collision = task.contact_forces[:, task.penalised_indices].norm(dim=2) > CONTACT_FORCE
+        now = {
+            "steps": torch.ones_like(alive, dtype=torch.float32),
+            "lin": velocity_error(task.commands, task.base_lin_vel),
+            "ang": yaw_rate_error(task.commands, task.base_ang_vel),
+            "power": power.abs().sum(dim=1),
+            "positive_power": power.clamp(min=0.0).sum(dim=1),
+            "speed": task.base_lin_vel[:, :2].norm(dim=1),
+            "height": task.base_pos[:, 2] - task.height_scan.ground,
+            "collision": collision.any(dim=1).float(),
+            "stance": (task.contact_forces[:, task.feet_indices, 2] > CONTACT_FORCE).float(),
+            "touch_downs": task.contacts.first_contact.float(),
+        }
+        for name, value in now.items():
+            mask = alive if value.dim() == 1 else alive.unsqueeze(1)
+            self.values[name] += torch.where(mask, value, 0.0)
+
+
+def summarize(
+    task: LeggedRobot, grid: Grid, cells: np.ndarray, sums: _Sums, fell: Tensor, measured_s: float
+) -> dict[str, Any]:
+    """Return the figures cell by cell, and over the grid."""
+
+    def per_cell(name: str) -> np.ndarray:
+        values = sums.values[name].double().cpu().numpy()
+        return values.reshape(len(cells), grid.robots, *values.shape[1:]).sum(axis=1)
+
+    counted = per_cell("steps")
+    steps = np.maximum(counted, 1.0)
+    # A cell in which every robot fell before it was measured has no error; 0 would look perfect.
+    lin, ang = (np.where(counted > 0, np.sqrt(per_cell(name) / steps), np.nan) for name in ("lin", "ang"))
+    speed = per_cell("speed") / steps
+    weight = task.robot.mass * GRAVITY
+    moving = speed > SLOWEST
+    transport = {
+        name: np.where(moving, per_cell(source) / steps / (weight * np.maximum(speed, SLOWEST)), np.nan)
+        for name, source in (("cost_of_transport", "power"), ("positive_cost_of_transport", "positive_power"))
+    }
+    falls = fell.double().cpu().numpy().reshape(len(cells), grid.robots).mean(axis=1)
+    seconds = steps * task.dt
+    columns = {
+        "rmse_lin": lin,
+        "rmse_ang": ang,
+        "falls": falls,
+        **transport,
+        "duty_factor": (per_cell("stance") / steps[:, None]).mean(axis=1),
+        "steps_per_s": (per_cell("touch_downs") / seconds[:, None]).mean(axis=1),
+        "base_height": per_cell("height") / steps,
+        "thigh_contact": per_cell("collision") / steps,
+        "speed": speed,
+    }
+    rows = [
+        {"command": cells[i].tolist(), **{name: _number(column[i]) for name, column in columns.items()}}
+        for i in range(len(cells))
+    ]
+    reference = int(np.argmin(np.linalg.norm(cells - [0.5, 0.0, 0.0], axis=1)))
+    return {
+        "grid": grid.axes,
+        "robots_per_cell": grid.robots,
+        "hold_s": grid.hold_s,
+        "measured_s": measured_s,
+        "rmse_lin": _mean_and_worst(lin, cells),
+        "rmse_ang": _mean_and_worst(ang, cells),
+        "falls": float(falls.mean()),
+        **{name: _number(float(np.nanmean(values))) if moving.any() else None for name, values in transport.items()},
+        "gait": rows[reference],
+        "cells": rows,
+    }
+
+
+def _mean_and_worst(values: np.ndarray, cells: np.ndarray) -> dict[str, Any]:
+    """Return both over the cells that have a value; null if none has."""
+    if np.isnan(values).all():
+        return {"mean": None, "worst": None, "worst_cell": None}
+    worst = int(np.nanargmax(values))
+    return {"mean": float(np.nanmean(values)), "worst": float(values[worst]), "worst_cell": cells[worst].tolist()}
+
+
+def _number(value: float) -> float | None:
+    """Return a float that JSON can hold; what is not defined is null."""
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,85 @@
+"""Actor and critic as a configuration describes them, in rsl-rl's terms."""
+
+from typing import Any
+
+import torch
+from rsl_rl.models import MLPModel
+from rsl_rl.modules.distribution import GaussianDistribution
+from rsl_rl.utils import resolve_class
+from tensordict import TensorDict
+from torch import Tensor
+
+from legged.config import TaskConfig
+from legged.config.networks import NETWORKS, groups_of
+
+UNBOUNDED = (1e-6, 1e6)
+"""Bounds of the standard deviation that rsl-rl has in any case."""
+
+
+def network_settings(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
+    """Return the dictionaries `actor`, `critic` and `obs_groups` that rsl-rl wants."""
+    policy = cfg.train.policy
+    shared = {
+        "class_name": "MLPModel",
+        "activation": policy.activation,
+        "obs_normalization": policy.obs_normalization,
+    }
+    if policy.rnn_type != "none":
+        shared["class_name"] = "RNNModel"
+        shared |= {name: getattr(policy, name) for name in ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")}
+    distribution = {
+        "class_name": "HeteroscedasticGaussianDistribution" if policy.state_dependent_std else "GaussianDistribution",
+        "init_std": policy.init_noise_std,
+        "std_type": policy.noise_std_type,
+        "std_range": (policy.min_noise_std, policy.max_noise_std),
+    }
+    return {
+        "obs_groups": {network: list(groups_of(cfg, network)) for network in NETWORKS},
+        "actor": {**shared, "hidden_dims": list(policy.actor_hidden_dims), "distribution_cfg": distribution},
+        "critic": {**shared, "hidden_dims": list(policy.critic_hidden_dims)},
+    }
+
+
+def build_actor(cfg: TaskConfig, observations: TensorDict, num_actions: int) -> MLPModel:
+    """Build the policy's network alone, for observations like those given, on the CPU. No random number of the caller's is
+    drawn for its weights.
+    """
+    settings = network_settings(cfg)
+    kind, rest = resolve_class(settings["actor"])
+    with torch.random.fork_rng(devices=[]):
+        return kind(observations, settings["obs_groups"], "actor", num_actions, **rest)
+
+
+def action_std(actor: MLPModel) -> Tensor:
+    """Return the standard deviations (D,) of a policy's actions, where they do not depend on the state, within their bounds;
+    it can be differentiated.
+    """
+    distribution = actor.distribution
+    if distribution.std_type == "scalar":
+        return distribution.std_param.clamp(*distribution.std_range)
+    return distribution.log_std_param.clamp(*distribution.log_std_range).exp()
+
+
+def keep_std_in_bounds(actor: MLPModel, optimizer: torch.optim.Optimizer) -> None:
+    """Put a learned standard deviation that has left its bounds back onto them after each step of the optimiser.
+
+    rsl-rl clamps it where it is used. Beyond the bounds that passes no gradient on: without this it would never come back.
+    """
+    distribution = actor.distribution
+    if type(distribution) is not GaussianDistribution or tuple(distribution.std_range) == UNBOUNDED:
+        return
+    if distribution.std_type == "scalar":
+        parameter, bounds = distribution.std_param, distribution.std_range
+    else:
+        parameter, bounds = distribution.log_std_param, distribution.log_std_range
+
+    @torch.no_grad()
+    def clamp(*_: Any) -> None:
+        parameter.clamp_(*bounds)
+
+    optimizer.register_step_post_hook(clamp)
+
+
+def use_matmul(cfg: TaskConfig) -> None:
+    """Set, for this process, how exactly a GPU multiplies matrices."""
+    torch.backends.cuda.matmul.allow_tf32 = cfg.train.runner.matmul == "tf32"

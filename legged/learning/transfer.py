@@ -1,0 +1,183 @@
+"""What `train.py --transfer` begins with: the networks that were trained on another task."""
+
+import argparse
+from collections.abc import Mapping
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+from legged.commandline.arguments import overrides
+from legged.config import LeggedConfig, TaskConfig
+from legged.config.networks import NETWORKS, groups_of
+from legged.envs import BaseTask
+from legged.errors import ConfigError
+from legged.learning.checkpoint import (
+    Saved,
+    check_joints,
+    check_networks_fit,
+    described_networks,
+    histories,
+    observation_layout,
+    read_checkpoint,
+)
+from legged.learning.networks import action_std
+from legged.learning.run_folder import find_checkpoint, find_run_of_any_task, run_config
+from legged.process.paths import relative
+from legged.registry import task_config
+from legged.robots.robot import load_robot
+
+OPTIMIZERS = {"adam": "Adam", "adamw": "AdamW", "sgd": "SGD", "rmsprop": "RMSprop"}
+"""Optimisers by their names in a configuration."""
+
+Terms = dict[str, int | None]
+"""Term -> its width, None where that is not known, in order."""
+
+
+def transferred(args: argparse.Namespace, on_cpu: bool) -> tuple[TaskConfig, Path]:
+    """Find the configuration to train with, which is the task's own, and the checkpoint to begin with. What can be known
+    without building the task is compared here.
+
+    Raises:
+        ConfigError: the flags do not go together, there is no such run, or its robot, observations or networks are others.
+    """
+    if args.resume:
+        raise ConfigError(
+            "--transfer: begins a new training with the networks of another, --resume goes on with one; give either"
+        )
+    if args.load_run is None:
+        raise ConfigError("--transfer: needs --load_run, the run or shipped policy whose networks are taken")
+    cfg = task_config(args.task, overrides(args), on_cpu)
+    path = find_checkpoint(find_run_of_any_task(cfg, args.load_run), args.checkpoint)
+    check_source(path, read_checkpoint(path), cfg)
+    return cfg, path
+
+
+def check_source(path: Path, saved: Saved, cfg: TaskConfig) -> None:
+    """Compare a checkpoint with the configuration of another task, as far as can be without building that.
+
+    Raises:
+        ConfigError: its robot, observations or networks are others.
+    """
+    if "critic_state_dict" not in saved:
+        raise ConfigError(
+            f"{relative(path)}: holds a policy alone, without a value function; it can be played, not trained on"
+        )
+    check_joints(relative(path), made_for(path, saved), cfg)
+    there = terms_of(path, saved)
+    widths = {term: width for terms in there.values() for term, width in terms.items()}
+    here = {name: dict.fromkeys(group.terms) for name, group in cfg.observations.groups.items()}
+    here = {name: {term: widths.get(term) for term in terms} for name, terms in here.items()}
+    steps = {name: group.history for name, group in cfg.observations.groups.items()}
+    check_networks_fit(relative(path), saved, cfg)
+    _check_observations(path, cfg, here, there, steps, histories(saved))
+
+
+def check_built(path: Path, saved: Saved, task: BaseTask) -> None:
+    """Compare the observations and actions of a task with those of a checkpoint, now with their widths.
+
+    Raises:
+        ConfigError: they are others.
+    """
+    cfg = task.cfg
+    here: dict[str, Terms] = {name: {**terms} for name, terms in observation_layout(task).items()}
+    steps = {name: group.history for name, group in task.observation_groups.items()}
+    _check_observations(path, cfg, here, terms_of(path, saved), steps, histories(saved))
+    layers = [name for name in saved["actor_state_dict"] if name.startswith("mlp.") and name.endswith(".bias")]
+    outputs = (*saved["actor_state_dict"][layers[-1]].shape, 0)[0] if layers else 0
+    found = outputs // 2 if cfg.train.policy.state_dependent_std else outputs
+    if found != task.num_actions:
+        raise ConfigError(f"{relative(path)}: its policy gives {found} actions, '{cfg.task}' takes {task.num_actions}")
+
+
+def made_for(path: Path, saved: Saved) -> Mapping[str, Any]:
+    """Return the `name` and the `joints` of the robot of a checkpoint; nothing if it has none. Those of a file from before
+    they were written are its run's.
+    """
+    said: dict[str, Any] = saved["infos"].get("robot", {})
+    if "joints" in said or saved["infos"].get("format", 1) > 1:
+        return said
+    of_run = run_config(path.parent)
+    if not isinstance(of_run, LeggedConfig):
+        return {}
+    robot = load_robot(of_run.robot, of_run.origins.where("robot"))
+    return {"name": robot.name, "joints": list(robot.joint_names)}
+
+
+def terms_of(path: Path, saved: Saved) -> dict[str, Terms]:
+    """Return the terms of each observation group of a checkpoint, or of its run's if it does not say them."""
+    layout = saved["infos"].get("observations")
+    if layout is not None:
+        return layout
+    return {name: dict.fromkeys(group.terms) for name, group in run_config(path.parent).observations.groups.items()}
+
+
+def _check_observations(
+    path: Path,
+    cfg: TaskConfig,
+    here: Mapping[str, Terms],
+    there: Mapping[str, Terms],
+    steps_here: Mapping[str, int],
+    steps_there: Mapping[str, int],
+) -> None:
+    """Compare the groups that the networks read, term by term.
+
+    Raises:
+        ConfigError: some differ; with the first difference of each.
+    """
+    differences = []
+    for name in dict.fromkeys(group for network in NETWORKS for group in groups_of(cfg, network)):
+        difference = first_difference(here[name], there.get(name, {}))
+        history, before = steps_here[name], steps_there.get(name, 1)
+        if difference:
+            differences.append(f"{name}: {difference}")
+        elif history != before:
+            differences.append(f"{name}: holds the last {history} observations here, the last {before} there")
+    if differences:
+        raise ConfigError(f"{relative(path)}: made for other observations than '{cfg.task}': {'; '.join(differences)}")
+
+
+def first_difference(here: Terms, there: Terms) -> str:
+    """Return in what the terms of a group differ first, in name, place or width; empty if they are the same."""
+    for number, (mine, theirs) in enumerate(zip_longest(here.items(), there.items()), 1):
+        if mine is None or theirs is None or mine[0] != theirs[0] or (None not in (mine[1], theirs[1]) and mine != theirs):
+            return f"term {number} is {_shown(mine)} here, {_shown(theirs)} there"
+    return ""
+
+
+def _shown(term: tuple[str, int | None] | None) -> str:
+    """Return a term as an error shows it: 'heights' (187)."""
+    if term is None:
+        return "none"
+    name, width = term
+    return f"'{name}'" if width is None else f"'{name}' ({width})"
+
+
+def tell_taken(path: Path, saved: Saved, actor: Any, cfg: TaskConfig, learning_rate: float) -> str:
+    """Return in words what was taken from a checkpoint, as it is in the networks now, and what begins anew."""
+    sizes = [_sizes(network) for network in described_networks(saved).values()]
+    networks = f"actor and critic {sizes[0]}" if len({*sizes}) == 1 else f"actor {sizes[0]} and critic {sizes[1]}"
+    taken = [networks]
+    if cfg.train.policy.obs_normalization:
+        taken.append("observation normaliser")
+    ours, theirs = cfg.train.algorithm.optimizer, saved["infos"].get("optimizer", "adam")
+    if "optimizer_state_dict" in saved and ours == theirs:
+        taken.append(f"{OPTIMIZERS[ours]}'s state")
+    else:
+        why = "it holds none" if ours == theirs else f"it trained with {OPTIMIZERS.get(theirs, theirs)}"
+        taken.append(f"no state of {OPTIMIZERS[ours]} ({why})")
+    fixed = " (fixed, the configuration's)" if cfg.train.algorithm.schedule == "fixed" else ""
+    taken.append(f"learning rate {learning_rate:.2g}{fixed}")
+    anew = "iterations, curricula and robots begin anew"
+    if not cfg.train.policy.state_dependent_std:
+        std = action_std(actor).detach()
+        taken.append(f"std {float(std.min()):.2f} to {float(std.max()):.2f}")
+        anew += "; the std is the learned one, not train.policy.init_noise_std"
+    task = saved["infos"].get("task", "no task named")
+    return f"took from {relative(path.parent)} ({task}, iteration {saved['iter']}): {', '.join(taken)}\n{anew}"
+
+
+def _sizes(network: Mapping[str, Any]) -> str:
+    """Return the widths of a network's layers: (128, 64), with recurrent ones (lstm 256, 128, 64)."""
+    kind = network.get("rnn_type", "none")
+    recurrent = [] if kind == "none" else [f"{kind} {network['rnn_hidden_dim']}"] * network["rnn_num_layers"]
+    return f"({', '.join([*recurrent, *map(str, network['hidden_dims'])])})"

@@ -1,0 +1,88 @@
+"""Observations and actions seen in a mirror: left legs for right ones, leftward for rightward."""
+
+from collections.abc import Mapping
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from legged.errors import ConfigError
+from legged.mdp.observations import ObservationGroup
+from legged.robots.mirror import Mirror
+
+MirrorKind = Literal["same", "vector", "rotation", "command", "joints", "feet", "heights"]
+"""How the numbers of an observation change. `vector`: (x, y, z) of a velocity or direction; `rotation`: of an angular
+velocity; `command`: (vx, vy, yaw rate); `joints`, `feet`: a number for each; `heights`: the height scan; `same`: numbers that
+know no side."""
+SIGNS = {"vector": (1.0, -1.0, 1.0), "rotation": (-1.0, 1.0, -1.0), "command": (1.0, -1.0, -1.0)}
+"""Kind of term -> signs of its three numbers. A rotation is a pseudo-vector: it keeps its y."""
+
+Image = tuple[Tensor, Tensor]
+"""(columns, signs), each (width,): the mirror image of `x` (n, width) is x[:, columns] * signs."""
+
+
+class MirrorImages:
+    """Columns and signs under which the observations and actions of a task turn into those of its mirrored robot."""
+
+    def __init__(
+        self,
+        owner: str,
+        kinds: Mapping[str, str],
+        groups: Mapping[str, ObservationGroup],
+        num_actions: int,
+        mirror: Mirror,
+        points: Tensor,
+    ) -> None:
+        """Mirror every observation group, and the actions as the term `actions`.
+
+        `kinds` says for each term how it is mirrored (`MirrorKind`), `owner` is the name of the task's
+        class, for errors. `points` (P, 2) are where heights are measured, in the yaw frame [m].
+
+        Raises:
+            ConfigError: a term has no kind, one that there is not, or not as many numbers as its kind.
+        """
+        self._owner, self._kinds, self._mirror, self._points = owner, kinds, mirror, points.cpu()
+        device = next(iter(groups.values())).buffer.device
+        self.groups = {name: self._group(group) for name, group in groups.items()}
+        """Group -> its image, of all steps of its history."""
+        columns, signs = self._term("actions", num_actions)
+        self.actions: Image = (columns.to(device), signs.to(device))
+        """Image of the actions."""
+
+    def _group(self, group: ObservationGroup) -> Image:
+        """Return the image of a group, including its history."""
+        parts = []
+        for term in group.terms:
+            columns, signs = self._term(term.name, term.columns.stop - term.columns.start)
+            parts.append((columns + term.columns.start, signs))
+        columns, signs = (torch.cat(part) for part in zip(*parts, strict=True))
+        steps = torch.arange(group.history).unsqueeze(1) * len(columns)
+        device = group.buffer.device
+        return (columns + steps).flatten().to(device), signs.repeat(group.history).to(device)
+
+    def _term(self, name: str, width: int) -> Image:
+        """Return the image of a term by itself."""
+        if name not in self._kinds:
+            raise ConfigError(f"{self._owner}.MIRRORED does not say how observation '{name}' is mirrored")
+        kind = self._kinds[name]
+        columns, signs = self._image_of(kind, width)
+        if len(columns) != width:
+            wrong = f"observation '{name}' has {width} numbers, but its kind '{kind}' is for {len(columns)}"
+            raise ConfigError(f"{self._owner}.MIRRORED: {wrong}")
+        return columns, signs
+
+    def _image_of(self, kind: str, width: int) -> Image:
+        """Return the image of a kind of term, of as many numbers as the kind has; `same` takes any `width`."""
+        if kind in SIGNS:
+            return torch.arange(len(SIGNS[kind])), torch.tensor(SIGNS[kind])
+        if kind == "joints":
+            return torch.tensor(self._mirror.joints), torch.tensor(self._mirror.signs)
+        if kind == "same":
+            columns = torch.arange(width)
+        elif kind == "feet":
+            columns = torch.tensor(self._mirror.feet)
+        elif kind == "heights":
+            columns = torch.cdist(self._points, self._points * torch.tensor([1.0, -1.0])).argmin(dim=1)
+        else:
+            raise ConfigError(f"{self._owner}.MIRRORED: there is no way to mirror '{kind}'")
+        return columns, torch.ones(len(columns))

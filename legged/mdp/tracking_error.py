@@ -1,0 +1,20 @@
+"""How far robots are from the velocities that they are asked for, squared."""
+
+from torch import Tensor
+
+
+def velocity_error(commands: Tensor, base_lin_vel: Tensor) -> Tensor:
+    """Return the squared error of the horizontal velocity, (N,) [m^2/s^2].
+
+    `commands` (N, 3 or more) are vx, vy [m/s] and yaw rate [rad/s], `base_lin_vel` (N, 3) is the base's velocity [m/s], both
+    in the base frame.
+    """
+    return (commands[:, :2] - base_lin_vel[:, :2]).square().sum(dim=1)
+
+
+def yaw_rate_error(commands: Tensor, base_ang_vel: Tensor) -> Tensor:
+    """Return the squared error of the yaw rate, (N,) [rad^2/s^2].
+
+    `commands` are as above, `base_ang_vel` (N, 3) is the base's angular velocity, base frame [rad/s].
+    """
+    return (commands[:, 2] - base_ang_vel[:, 2]).square()

@@ -1,0 +1,59 @@
+// What both native sources share: a world is computed by a warp of 32 threads ("lanes") on a GPU, by one thread on the CPU.
+//
+// These files are bodies of a function, put together by `native_source` (native.py): constants, this file, then one of the
+// others. A macro has one meaning in all of them, so that it never needs to be undefined.
+
+#if defined(__CUDA_ARCH__)
+// Memory that all lanes of a world see.
+#define LEGGED_SHARED alignas(16) __shared__
+const int LANES = 32, lane = threadIdx.x & 31;
+// All lanes wait here for each other: it separates phases that write shared memory from those that read it.
+[[maybe_unused]] auto meet = []() { __syncwarp(); };
+// The sum of x over all lanes, the same to the bit in each.
+[[maybe_unused]] auto sum = [](float x) {
+    for (int apart = 16; apart > 0; apart >>= 1) x += __shfl_xor_sync(0xffffffffu, x, apart);
+    return x;
+};
+#else
+#define LEGGED_SHARED
+const int LANES = 1, lane = 0;
+[[maybe_unused]] auto meet = []() {};
+[[maybe_unused]] auto sum = [](float x) { return x; };
+#endif
+// Deals `count` items out to the lanes.
+#define EACH(i, count) for (int i = lane; i < (count); i += LANES)
+
+[[maybe_unused]] auto most = [](float p, float q) { return p > q ? p : q; };
+
+// Vectors are three numbers, quaternions (w, x, y, z).
+[[maybe_unused]] auto cross = [](const float* u, const float* v, float* out) {
+    out[0] = u[1] * v[2] - u[2] * v[1];
+    out[1] = u[2] * v[0] - u[0] * v[2];
+    out[2] = u[0] * v[1] - u[1] * v[0];
+};
+[[maybe_unused]] auto rotate = [&](const float* q, const float* v, float* out) {
+    float t[3], tt[3];
+    cross(q + 1, v, t);
+    for (int k = 0; k < 3; ++k) t[k] *= 2.0f;
+    cross(q + 1, t, tt);
+    for (int k = 0; k < 3; ++k) out[k] = v[k] + q[0] * t[k] + tt[k];
+};
+[[maybe_unused]] auto multiply = [&](const float* p, const float* q, float* out) {
+    float c[3];
+    cross(p + 1, q + 1, c);
+    out[0] = p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3];
+    for (int k = 0; k < 3; ++k) out[1 + k] = p[0] * q[1 + k] + q[0] * p[1 + k] + c[k];
+};
+[[maybe_unused]] auto normalize = [](float* q) {
+    const float length = sqrtf(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+    if (length < 1e-15f) { q[0] = 1.0f; q[1] = q[2] = q[3] = 0.0f; return; }
+    for (int k = 0; k < 4; ++k) q[k] /= length;
+};
+[[maybe_unused]] auto to_matrix = [](const float* q, float* out) {
+    const float xx = q[1] * q[1], yy = q[2] * q[2], zz = q[3] * q[3];
+    const float xy = q[1] * q[2], xz = q[1] * q[3], yz = q[2] * q[3];
+    const float wx = q[0] * q[1], wy = q[0] * q[2], wz = q[0] * q[3];
+    out[0] = 1.0f - 2.0f * (yy + zz); out[1] = 2.0f * (xy - wz); out[2] = 2.0f * (xz + wy);
+    out[3] = 2.0f * (xy + wz); out[4] = 1.0f - 2.0f * (xx + zz); out[5] = 2.0f * (yz - wx);
+    out[6] = 2.0f * (xz - wy); out[7] = 2.0f * (yz + wx); out[8] = 1.0f - 2.0f * (xx + yy);
+};

@@ -1,0 +1,262 @@
+// Poses, inertias and forces but those of constraints, of one world: trees of free, ball, slide and hinge joints in any order.
+// Constants: NB, NV, NJ, NG, NT (bodies, degrees of freedom, joints, shapes, trees), DEPTH (levels of bodies below the world),
+// BALLS, SLIDES, SPRINGS, DAMPERS, GEARS, GAINS, AFFINE_BIAS, CONTROL_LIMITS, FORCE_LIMITS, JOINT_LIMITS (what there is of
+// them), FREE, BALL, SLIDE, AFFINE (MuJoCo's numbers of types), and for each array of the model VARIES_<array>: whether worlds
+// may differ in it. What a model has not is left out by the compiler.
+
+LEGGED_SHARED float pos[NB * 3], quat[NB * 4], centre[NB * 3], inertia[NB * 10], carried[NB * 10];
+LEGGED_SHARED float anchor[NJ * 3], axis[NJ * 3], motion[NV * 6];
+LEGGED_SHARED float velocity[NB * 6], acceleration[NB * 6], force[NB * 6];
+
+// This world's row, of `length` floats, in an array of the model: mostly all worlds share one, or each has its own.
+auto row_of = [&](const auto& array, int length, bool varies) {
+    const float* data = reinterpret_cast<const float*>(array.data);
+    if (!varies) return data;
+    const int rows = array.shape[0];
+    return data + (long long)(world < rows ? world : world % rows) * length;
+};
+#define ROW(name, length) row_of(arrays.name, length, VARIES_##name)
+auto clamped = [](float x, const float* range) { return x < range[0] ? range[0] : x > range[1] ? range[1] : x; };
+// Momentum of a spatial inertia in motion.
+auto momentum = [&](const float* body, const float* v, float* out) {
+    float turned[3], carried_along[3];
+    cross(body + 6, v + 3, turned);
+    cross(v, body + 6, carried_along);
+    out[0] = body[0] * v[0] + body[3] * v[1] + body[4] * v[2] + turned[0];
+    out[1] = body[3] * v[0] + body[1] * v[1] + body[5] * v[2] + turned[1];
+    out[2] = body[4] * v[0] + body[5] * v[1] + body[2] * v[2] + turned[2];
+    for (int k = 0; k < 3; ++k) out[3 + k] = carried_along[k] + body[9] * v[3 + k];
+};
+
+const float* q_in = arrays.qpos.data + (long long)world * arrays.qpos.shape[1];
+const float* v_in = arrays.qvel.data + (long long)world * arrays.qvel.shape[1];
+const float* masses = ROW(body_mass, NB);
+const int* levels = arrays.body_level.data;
+const int* subtree = arrays.body_subtree.data;  // how many bodies a body carries, itself included: those that follow it
+
+meet();  // of the world before
+EACH(b, NB) if (levels[b] == 0) {
+    const float* gravity = ROW(gravity, 3);
+    for (int k = 0; k < 3; ++k) pos[b * 3 + k] = 0.0f;
+    for (int k = 0; k < 4; ++k) quat[b * 4 + k] = k == 0 ? 1.0f : 0.0f;
+    for (int k = 0; k < 6; ++k) velocity[b * 6 + k] = 0.0f;
+    for (int k = 0; k < 6; ++k) acceleration[b * 6 + k] = k < 3 ? 0.0f : -gravity[k - 3];
+}
+meet();
+// Poses, level by level away from the world.
+for (int level = 1; level <= DEPTH; ++level) {
+    EACH(b, NB) if (levels[b] == level) {
+        const int parent = arrays.body_parentid.data[b];
+        const int first = arrays.body_jntadr.data[b], last = first + arrays.body_jntnum.data[b];
+        float p[3], q[4], moved[3];
+        rotate(quat + parent * 4, ROW(body_pos, NB * 3) + b * 3, moved);
+        for (int k = 0; k < 3; ++k) p[k] = pos[parent * 3 + k] + moved[k];
+        multiply(quat + parent * 4, ROW(body_quat, NB * 4) + b * 4, q);
+        for (int j = first; j < last; ++j) {
+            const int at = arrays.jnt_qposadr.data[j], type = arrays.jnt_type.data[j];
+            if (type == FREE) {
+                for (int k = 0; k < 3; ++k) anchor[j * 3 + k] = p[k] = q_in[at + k];
+                for (int k = 0; k < 4; ++k) q[k] = q_in[at + 3 + k];
+                continue;
+            }
+            const float* at_body = ROW(jnt_pos, NJ * 3) + j * 3;
+            const float* about = ROW(jnt_axis, NJ * 3) + j * 3;
+            float turn[4], before[4];
+            rotate(q, at_body, moved);
+            for (int k = 0; k < 3; ++k) anchor[j * 3 + k] = p[k] + moved[k];
+            rotate(q, about, axis + j * 3);
+            if (BALLS && type == BALL) {
+                for (int k = 0; k < 4; ++k) turn[k] = q_in[at + k];
+                normalize(turn);
+            } else {
+                const float change = q_in[at] - ROW(qpos0, arrays.qpos0.shape[1])[at];
+                if (SLIDES && type == SLIDE) {
+                    for (int k = 0; k < 3; ++k) p[k] += axis[j * 3 + k] * change;
+                    continue;
+                }
+                const float half = 0.5f * change;
+                turn[0] = cosf(half);
+                for (int k = 0; k < 3; ++k) turn[1 + k] = sinf(half) * about[k];
+            }
+            for (int k = 0; k < 4; ++k) before[k] = q[k];
+            multiply(before, turn, q);
+            rotate(q, at_body, moved);
+            for (int k = 0; k < 3; ++k) p[k] = anchor[j * 3 + k] - moved[k];
+        }
+        normalize(q);
+        for (int k = 0; k < 3; ++k) pos[b * 3 + k] = p[k];
+        for (int k = 0; k < 4; ++k) quat[b * 4 + k] = q[k];
+    }
+    meet();
+}
+EACH(g, NG) {
+    const int b = arrays.geom_bodyid.data[g];
+    const long long at = (long long)world * NG + g;
+    float* out = reinterpret_cast<float*>(arrays.geom_xpos.data) + at * 3;
+    float moved[3], q[4];
+    rotate(quat + b * 4, ROW(geom_pos, NG * 3) + g * 3, moved);
+    for (int k = 0; k < 3; ++k) out[k] = pos[b * 3 + k] + moved[k];
+    multiply(quat + b * 4, ROW(geom_quat, NG * 4) + g * 4, q);
+    to_matrix(q, reinterpret_cast<float*>(arrays.geom_xmat.data) + at * 9);
+}
+// Centres of mass of the trees: all lanes add up the same.
+EACH(b, NB) {
+    float moved[3];
+    rotate(quat + b * 4, ROW(body_ipos, NB * 3) + b * 3, moved);
+    for (int k = 0; k < 3; ++k) centre[b * 3 + k] = pos[b * 3 + k] + moved[k];
+}
+meet();
+float coms[NT * 3];
+for (int t = 0; t < NT; ++t) {
+    const int root = arrays.tree_root.data[t];
+    float com[3] = {0.0f, 0.0f, 0.0f}, mass = 0.0f;
+    for (int b = root; b < root + subtree[root]; ++b) {
+        mass += masses[b];
+        for (int k = 0; k < 3; ++k) com[k] += masses[b] * centre[b * 3 + k];
+    }
+    for (int k = 0; k < 3; ++k) coms[t * 3 + k] = com[k] / mass;
+    if (lane == 0) {
+        float* out = reinterpret_cast<float*>(arrays.subtree_com.data) + ((long long)world * NB + root) * 3;
+        for (int k = 0; k < 3; ++k) out[k] = coms[t * 3 + k];
+    }
+}
+auto com_of = [&](int b) { return coms + (NT == 1 ? 0 : 3 * arrays.body_tree.data[b]); };
+// Inertias about it.
+EACH(b, NB) {
+    float q[4], R[9], I[6];
+    multiply(quat + b * 4, ROW(body_iquat, NB * 4) + b * 4, q);
+    to_matrix(q, R);
+    const float* main = ROW(body_inertia, NB * 3) + b * 3;
+    const int one[6] = {0, 1, 2, 0, 0, 1}, other[6] = {0, 1, 2, 1, 2, 2};
+    for (int n = 0; n < 6; ++n) {
+        I[n] = 0.0f;
+        for (int k = 0; k < 3; ++k) I[n] += R[one[n] * 3 + k] * main[k] * R[other[n] * 3 + k];
+    }
+    const float* com = com_of(b);
+    const float m = masses[b];
+    const float x = centre[b * 3] - com[0], y = centre[b * 3 + 1] - com[1], z = centre[b * 3 + 2] - com[2];
+    float* out = inertia + b * 10;
+    out[0] = I[0] + m * (y * y + z * z); out[1] = I[1] + m * (x * x + z * z); out[2] = I[2] + m * (x * x + y * y);
+    out[3] = I[3] - m * x * y; out[4] = I[4] - m * x * z; out[5] = I[5] - m * y * z;
+    out[6] = m * x; out[7] = m * y; out[8] = m * z; out[9] = m;
+}
+// How each degree of freedom moves the bodies that it carries.
+EACH(i, NV) {
+    float* out = motion + i * 6;
+    const int b = arrays.dof_bodyid.data[i], j = arrays.dof_jntid.data[i], type = arrays.jnt_type.data[j];
+    const int of_joint = i - arrays.jnt_dofadr.data[j];
+    const int turning = type == FREE ? of_joint - 3 : of_joint;  // about which axis of the body, of a free or ball joint
+    if (turning < 0) {
+        for (int k = 0; k < 6; ++k) out[k] = k == 3 + of_joint ? 1.0f : 0.0f;
+    } else if (SLIDES && type == SLIDE) {
+        for (int k = 0; k < 6; ++k) out[k] = k < 3 ? 0.0f : axis[j * 3 + k - 3];
+    } else {
+        float offset[3];
+        if (type == FREE || (BALLS && type == BALL)) {
+            const float unit[3] = {turning == 0 ? 1.0f : 0.0f, turning == 1 ? 1.0f : 0.0f, turning == 2 ? 1.0f : 0.0f};
+            rotate(quat + b * 4, unit, out);
+        } else {
+            for (int k = 0; k < 3; ++k) out[k] = axis[j * 3 + k];
+        }
+        const float* com = com_of(b);
+        for (int k = 0; k < 3; ++k) offset[k] = com[k] - anchor[j * 3 + k];
+        cross(out, offset, out + 3);
+    }
+    float* shown = reinterpret_cast<float*>(arrays.cdof.data) + ((long long)world * NV + i) * 6;
+    for (int k = 0; k < 6; ++k) shown[k] = out[k];
+}
+meet();
+EACH(b, NB)
+    for (int k = 0; k < 10; ++k) {
+        float total = 0.0f;
+        for (int c = b; c < b + subtree[b]; ++c) total += inertia[c * 10 + k];
+        carried[b * 10 + k] = total;
+    }
+// Velocities, and accelerations as if no joint accelerated, level by level.
+for (int level = 1; level <= DEPTH; ++level) {
+    EACH(b, NB) if (levels[b] == level) {
+        const int parent = arrays.body_parentid.data[b];
+        const int first = arrays.body_jntadr.data[b], last = first + arrays.body_jntnum.data[b];
+        float v[6], a[6], now[6], c[3], d[3];
+        for (int k = 0; k < 6; ++k) { v[k] = velocity[parent * 6 + k]; a[k] = acceleration[parent * 6 + k]; }
+        for (int j = first; j < last; ++j) {
+            const int type = arrays.jnt_type.data[j];
+            int from = arrays.jnt_dofadr.data[j];
+            if (type == FREE) {
+                for (int k = 0; k < 3; ++k) v[3 + k] += v_in[from + k];
+                from += 3;
+            }
+            const int to = from + (type == FREE || (BALLS && type == BALL) ? 3 : 1);  // three turn at once
+            for (int k = 0; k < 6; ++k) now[k] = v[k];
+            for (int i = from; i < to; ++i) {
+                const float* s = motion + i * 6;
+                cross(now, s, c);
+                for (int k = 0; k < 3; ++k) a[k] += c[k] * v_in[i];
+                cross(now, s + 3, c);
+                cross(now + 3, s, d);
+                for (int k = 0; k < 3; ++k) a[3 + k] += (c[k] + d[k]) * v_in[i];
+                for (int k = 0; k < 6; ++k) v[k] += s[k] * v_in[i];
+            }
+        }
+        for (int k = 0; k < 6; ++k) { velocity[b * 6 + k] = v[k]; acceleration[b * 6 + k] = a[k]; }
+    }
+    meet();
+}
+EACH(i, NV) {
+    float f[6];
+    momentum(carried + arrays.dof_bodyid.data[i] * 10, motion + i * 6, f);
+    for (int k = arrays.M_rowadr.data[i]; k < arrays.M_rowadr.data[i] + arrays.M_rownnz.data[i]; ++k) {
+        const int j = arrays.M_colind.data[k];
+        float total = i == j ? ROW(dof_armature, NV)[i] : 0.0f;
+        for (int n = 0; n < 6; ++n) total += motion[j * 6 + n] * f[n];
+        arrays.M.data[(long long)world * arrays.M.shape[1] + k] = total;
+    }
+}
+EACH(b, NB) {
+    float p[6], along[6], c[3], d[3];
+    momentum(inertia + b * 10, velocity + b * 6, p);
+    momentum(inertia + b * 10, acceleration + b * 6, along);
+    cross(velocity + b * 6, p, c);
+    cross(velocity + b * 6 + 3, p + 3, d);
+    for (int k = 0; k < 3; ++k) force[b * 6 + k] = along[k] + c[k] + d[k];
+    cross(velocity + b * 6, p + 3, c);
+    for (int k = 0; k < 3; ++k) force[b * 6 + 3 + k] = along[3 + k] + c[k];
+}
+meet();
+EACH(i, NV) {
+    const int b = arrays.dof_bodyid.data[i], j = arrays.dof_jntid.data[i], at = arrays.jnt_qposadr.data[j];
+    const long long out = (long long)world * NV + i;
+    float total = 0.0f;
+    for (int c = b; c < b + subtree[b]; ++c)
+        for (int k = 0; k < 6; ++k) total -= motion[i * 6 + k] * force[c * 6 + k];
+    // Motors, all of them on slides and hinges.
+    float driven = 0.0f;
+    for (int n = arrays.motor_start.data[i]; n < arrays.motor_start.data[i + 1]; ++n) {
+        const int u = arrays.motor.data[n], input = arrays.actuator_ctrladr.data[u];
+        const float gear = GEARS ? ROW(actuator_gear, 6 * arrays.actuator_gear.shape[1])[6 * u] : 1.0f;
+        float asked = arrays.ctrl.data[(long long)world * arrays.ctrl.shape[1] + input];
+        if (CONTROL_LIMITS && arrays.actuator_ctrllimited.data[input])
+            asked = clamped(asked, ROW(actuator_ctrlrange, 2 * arrays.actuator_ctrlrange.shape[1]) + 2 * input);
+        float push = asked;
+        if (GAINS) push *= ROW(actuator_gainprm, 10 * arrays.actuator_gainprm.shape[1])[10 * u];
+        if (AFFINE_BIAS && arrays.actuator_biastype.data[u] == AFFINE) {
+            const float* bias = ROW(actuator_biasprm, 10 * arrays.actuator_biasprm.shape[1]) + 10 * u;
+            push += bias[0] + bias[1] * (gear * q_in[at]) + bias[2] * (gear * v_in[i]);
+        }
+        if (FORCE_LIMITS && arrays.actuator_forcelimited.data[u])
+            push = clamped(push, ROW(actuator_forcerange, 2 * arrays.actuator_forcerange.shape[1]) + 2 * u);
+        driven += gear * push;
+    }
+    if (JOINT_LIMITS && arrays.jnt_actfrclimited.data[j]) driven = clamped(driven, ROW(jnt_actfrcrange, 2 * NJ) + 2 * j);
+    arrays.qfrc_actuator.data[out] = driven;
+    total += driven;
+    if (SPRINGS || DAMPERS) {
+        float passive = 0.0f;
+        if (SPRINGS && arrays.jnt_type.data[j] != FREE && arrays.jnt_type.data[j] != BALL)
+            passive -= ROW(jnt_stiffness, NJ)[j] * (q_in[at] - ROW(qpos_spring, arrays.qpos0.shape[1])[at]);
+        if (DAMPERS) passive -= ROW(dof_damping, NV)[i] * v_in[i];
+        arrays.qfrc_passive.data[out] = passive;
+        total += passive;
+    }
+    arrays.qfrc_smooth.data[out] = total;
+}

@@ -1,0 +1,65 @@
+"""What the task sees of a robot with a floating base and feet."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from legged.robots.robot import Robot
+
+
+@dataclass(frozen=True)
+class RobotState:
+    """What the task sees of N robots: float32 tensors, allocated once, written in place by the physics engine. Those that
+    `Physics.qpos` and `Physics.qvel` hold are views of them, live after a step; the others are current after a refresh.
+
+    D joints and F feet in the robot's order, B tracked collision shapes (`Robot.contact_names`).
+    """
+
+    base_pos: Tensor
+    """(N, 3) origin of the base, world frame [m]."""
+    base_quat: Tensor
+    """(N, 4) orientation of the base, (w, x, y, z)."""
+    base_lin_vel: Tensor
+    """(N, 3) velocity of the base's origin, base frame [m/s]."""
+    base_lin_vel_w: Tensor
+    """(N, 3) the same, world frame [m/s]."""
+    base_ang_vel: Tensor
+    """(N, 3) angular velocity of the base, base frame [rad/s]."""
+    projected_gravity: Tensor
+    """(N, 3) unit vector of gravity, base frame; (0, 0, -1) when level."""
+    dof_pos: Tensor
+    """(N, D) joint angles [rad]."""
+    dof_vel: Tensor
+    """(N, D) joint velocities [rad/s]."""
+    feet_pos: Tensor
+    """(N, F, 3) centres of the foot shapes, world frame [m]."""
+    feet_vel: Tensor
+    """(N, F, 3) velocities of those points, world frame [m/s]."""
+    contact_forces: Tensor
+    """(N, B, 3) sum of contact forces on each tracked shape, world frame, at the last physics step [N]; zero after a
+    reset."""
+
+
+def robot_state(qpos: Tensor, qvel: Tensor, robot: Robot) -> RobotState:
+    """Return the state of robots whose generalised positions are `qpos` (N, 7 + D) and velocities `qvel` (N, 6 + D): views
+    of them where they hold a field, zeroed tensors elsewhere.
+    """
+
+    def zeros(*shape: int) -> Tensor:
+        return torch.zeros(len(qpos), *shape, device=qpos.device)
+
+    feet, shapes = len(robot.feet_indices), len(robot.contact_names)
+    return RobotState(
+        base_pos=qpos[:, :3],
+        base_quat=qpos[:, 3:7],
+        base_lin_vel=zeros(3),
+        base_lin_vel_w=qvel[:, :3],
+        base_ang_vel=qvel[:, 3:6],
+        projected_gravity=zeros(3),
+        dof_pos=qpos[:, 7:],
+        dof_vel=qvel[:, 6:],
+        feet_pos=zeros(feet, 3),
+        feet_vel=zeros(feet, 3),
+        contact_forces=zeros(shapes, 3),
+    )

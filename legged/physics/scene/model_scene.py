@@ -1,0 +1,38 @@
+"""A world from any MJCF file that brings its own floor."""
+
+import warnings
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from legged.config.schema import SimConfig
+from legged.errors import ConfigError
+from legged.physics.scene.scene import GroundShapes, Scene, set_options
+
+
+class ModelScene(Scene):
+    """A model as its file describes it, contacts included; only the solver's options are ours."""
+
+    def __init__(self, path: Path | str) -> None:
+        """Take the MJCF file at `path`; it is read when the model is built."""
+        self.path = Path(path)
+        self.name = str(path)
+
+    def model(self, sim: SimConfig, ground: GroundShapes = "exact", contact_sensors: bool = False) -> mujoco.MjModel:
+        """Return the file's model; its ground is its own, and it has no tracked shapes."""
+        try:
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", ".* is deprecated")  # whoever simulates a file can change nothing about it
+                spec = mujoco.MjSpec.from_file(str(self.path))
+                set_options(spec.option, sim)
+                model = spec.compile()
+        except ValueError as error:
+            raise ConfigError(f"{self.name}: MuJoCo cannot read it: {error}") from error
+        for kind, count in (("delays", model.nhistory), ("plugins", model.nplugin), ("mocap bodies", model.nmocap)):
+            if count:
+                raise ConfigError(f"{self.name}: it has {kind}, whose state the engines here do not keep per world")
+        return model
+
+    def shapes(self, model: mujoco.MjModel) -> np.ndarray:
+        return np.arange(model.ngeom)

@@ -1,0 +1,100 @@
+"""Full episodes under a policy, in a task of any kind: returns in the task's own unit, term by term, and how they ended."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import torch
+from rich.markup import escape
+from rich.table import Table
+from tensordict import TensorDict
+from torch import Tensor
+
+from legged.envs import BaseTask
+from legged.policies.restore import TrainedPolicy
+
+Policy = Callable[[TensorDict], Tensor]
+"""Observations -> actions (N, D)."""
+
+
+def for_episodes(policy: TrainedPolicy, episodes: int) -> tuple[TrainedPolicy, list[tuple[str, Any]]]:
+    """Return the policy with nothing randomised, and overrides for measuring so many episodes: an environment each, without
+    noise. What is logged of a rollout comes once, at the end.
+    """
+    cfg = policy.cfg
+    calm = replace(policy, cfg=replace(cfg, domain_rand=replace(cfg.domain_rand, ranges={})))
+    steps = round(cfg.env.episode_length_s / cfg.dt)
+    return calm, [
+        ("env.num_envs", episodes),
+        ("observations.add_noise", False),
+        ("train.runner.num_steps_per_env", steps + 1),
+    ]
+
+
+def unit_of(task: BaseTask) -> float:
+    """Return what a reward is divided by to be in the task's own unit, in which a term counts scale * value a step."""
+    return task.dt if task.cfg.rewards.times_dt else 1.0
+
+
+@torch.inference_mode()
+def measure_episodes(task: BaseTask, act: Policy, after_step: Callable[[int, float], None] | None = None) -> dict[str, Any]:
+    """Run every environment through its first episode, from a reset to a failure or to the end of its time. Return plain
+    numbers: `return`, `terms` (return by reward term), `length` [steps], `failures` (share), `metrics` (means over all
+    environments and steps) and `contact_overflows`.
+
+    The return is the undiscounted sum of scale * term over steps: `rewards.times_dt` has no say in it. `after_step` is told
+    the number of the step, from 0, and the first environment's return so far.
+    """
+    observations = task.reset()
+    device = torch.device(task.device)
+    running = torch.ones(task.num_envs, dtype=torch.bool, device=device)
+    failed, length = torch.zeros_like(running), torch.zeros(task.num_envs, device=device)
+    total, terms = torch.zeros(task.num_envs, device=device), torch.zeros_like(task.rewards.last)
+    unit = unit_of(task)
+    for step in range(task.max_episode_length):
+        observations, rewards, dones, _ = task.step(act(observations))
+        total += torch.where(running, rewards, 0.0) / unit
+        terms += torch.where(running, task.rewards.last, 0.0) / unit
+        length += running
+        failed |= running & task.terminated_buf
+        running &= ~dones
+        if after_step is not None:
+            after_step(step, float(total[0]))
+    logged = {name: float(value) for name, value in task.metrics.flush().items()}
+    own = [f"Metrics/{name}" for name in sorted(task.terms("_metric_"))]
+    return {
+        "count": task.num_envs,
+        "return": spread_of(total.tolist()),
+        "terms": {name: float(row.mean()) for name, row in zip(task.rewards.names, terms, strict=True)},
+        "length": spread_of(length.tolist()),
+        "failures": float(failed.float().mean()),
+        "metrics": {name.removeprefix("Metrics/"): logged[name] for name in own},
+        "contact_overflows": int(logged["Metrics/contact_overflows"]),
+    }
+
+
+def spread_of(values: list[float]) -> dict[str, float]:
+    """Return mean, standard deviation (of these values, not of a population they are drawn from), least and greatest."""
+    numbers = torch.tensor(values, dtype=torch.float64)
+    return {
+        "mean": float(numbers.mean()),
+        "std": float(numbers.std(correction=0)),
+        "min": float(numbers.min()),
+        "max": float(numbers.max()),
+    }
+
+
+def episodes_table(episodes: dict[str, Any], title: str) -> Table:
+    """Return a line a measure: return, its terms, lengths, failures, metrics."""
+    table = Table(title=escape(f"{title}: {episodes['count']} episodes"), title_justify="left")
+    table.add_column("measure")
+    for name in ("mean", "standard deviation", "least", "greatest"):
+        table.add_column(name, justify="right")
+    for name, label in (("return", "return"), ("length", "episode length [steps]")):
+        table.add_row(escape(label), *(f"{episodes[name][key]:.1f}" for key in ("mean", "std", "min", "max")))
+    for name, value in episodes["terms"].items():
+        table.add_row(escape(f"return of {name}"), f"{value:.1f}")
+    table.add_row("episodes that ended in a failure", f"{100 * episodes['failures']:.1f} %")
+    for name, value in episodes["metrics"].items():
+        table.add_row(escape(name), f"{value:.3f}")
+    return table

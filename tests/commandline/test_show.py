@@ -1,0 +1,81 @@
+"""--show: the configuration as YAML, and behind it, as comments, what it comes to."""
+
+import pytest
+import yaml
+from helpers import TASK, call, small_config
+
+from legged.commandline.show import summary
+from legged.config import from_dict
+from legged.registry import task_config
+from legged.tools import train
+
+pytestmark = pytest.mark.usefixtures("workplace")
+
+
+def rows(lines: list[str], title: str) -> list[list[str]]:
+    """The cells of each row below a title, which are apart by two blanks or more; the header is left out."""
+    start = next(i for i, line in enumerate(lines) if line.startswith(f"# {title}"))
+    found = []
+    for line in lines[start + 2 :]:
+        if line == "#":
+            break
+        found.append([cell.strip() for cell in line.removeprefix("#").split("  ") if cell.strip()])
+    return found
+
+
+def test_it_is_yaml_still_and_builds_nothing_that_lasts(capsys, tmp_path):
+    assert call(train.main, ["--task", TASK, "--sim_device", "cpu", "--show"]) == 0
+    out = capsys.readouterr().out
+    assert from_dict(yaml.safe_load(out)) == task_config(TASK, on_cpu=True)
+    assert "# observations 'actor': 48 numbers" in out
+    assert not (tmp_path / "logs").exists()
+
+
+def test_observation_terms_have_columns_scales_and_noise():
+    lines = summary(small_config(("observations.add_noise", True), ("observations.groups.actor.history", 3)))
+    actor, critic = (
+        rows(lines, "observations 'actor': 48 numbers x 3 steps"),
+        rows(lines, "observations 'critic': 48 numbers"),
+    )
+    assert actor[0][:4] == ["0:3", "base_lin_vel", "2", "+-0.1"]
+    assert actor[3][:4] == ["9:12", "commands", "2, 2, 0.25", "-"]
+    assert actor[-1][:4] == ["36:48", "actions", "1", "-"]
+    assert [row[3] for row in critic] == ["-"] * 7
+    assert actor[0][4] == "Linear velocity (x, y, z) of the base, in the base frame [m/s]"
+
+
+def test_rewards_terminations_actions_and_joints_of_a_legged_robot():
+    lines = summary(small_config(("rewards.scales.collision", 0.0), ("terminations.max_tilt", 1.0)))
+    rewards = {row[0]: row[1] for row in rows(lines, "rewards, times the control step of 0.02 s; off: collision")}
+    assert rewards["tracking_lin_vel"] == "2"
+    assert "collision" not in rewards
+    assert [row[:2] for row in rows(lines, "terminations")] == [
+        ["contact", "failure"],
+        ["tilt", "failure"],
+        ["(time)", "time-out"],
+        ["(numbers)", "failure"],
+    ]
+    actions = rows(lines, "actions: 12 numbers, clipped at +-100")
+    assert actions[1] == ["1", "LF_HFE", "LF_HFE: position 0.4 + 0.5 a [rad], stiffness 90, damping 4, torque at most 80 N m"]
+    joints = rows(lines, "joints: 19 positions, 18 velocities")
+    assert joints[0] == ["root", "free", "0:7", "0:6", "-"]
+    assert joints[1] == ["LF_HAA", "hinge", "7:8", "6:7", "-0.72 to 0.49"]
+
+
+@pytest.mark.parametrize(("law", "effect"), [("V", "velocity 0.5 a, stiffness 90"), ("T", "torque 0.5 a, torque at most")])
+def test_other_control_laws_say_what_an_action_is(law, effect):
+    assert effect in "\n".join(summary(small_config(("control.control_type", law))))
+
+
+def test_a_task_without_a_robot_folder():
+    lines = summary(task_config("humanoid", on_cpu=True))
+    assert rows(lines, "actions: 17 numbers, clipped at +-1")[5] == ["5", "right_hip_y", "right_hip_y: 120 a [N m]"]
+    assert rows(lines, "rewards, a control step")[0] == ["linvel", "2.5", "Forward velocity of the centre of mass [m/s]"]
+    assert rows(lines, "terminations")[0][:2] == ["unhealthy", "failure"]
+    assert [row[0] for row in rows(lines, "observations 'actor': 276 numbers")] == [
+        "0:22",
+        "22:45",
+        "45:175",
+        "175:253",
+        "253:276",
+    ]

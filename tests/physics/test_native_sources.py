@@ -1,0 +1,170 @@
+"""The native sources of the fused launches: compilers take them, and their half for GPUs finds what that for the CPU does."""
+
+import ctypes
+import math
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import warp as wp
+from mechanisms import EVERY_JOINT, FusedWorlds, packaged, random_motion, relative_error
+
+from legged.physics.fused.constraint_solver import SolverArrays, solver_constants, solver_kernel
+from legged.physics.fused.native import SOURCES, native_source
+from legged.physics.fused.smooth_dynamics import DynamicsArrays, dynamics_constants, dynamics_kernel
+
+ARCHITECTURE = 90
+"""An H100's."""
+WARP_ON_CPU = Path(__file__).resolve().parents[1] / "warp_on_cpu.h"
+SHIM = """
+#include <cmath>
+template <typename T> struct array_of { T* data; int shape[4]; };
+template <int N> struct numbers { float x[N]; };
+"""
+"""What the sources know of Warp: arrays, with vectors and matrices as elements."""
+SCALARS = {wp.int32: "int", wp.float32: "float", wp.bool: "bool"}
+SETTINGS = {
+    "constraint_solver.h": "int most_rounds, int most_searches, float tolerance, float ls_tolerance, ",
+    "smooth_dynamics.h": "",
+}
+STRUCTS = {"constraint_solver.h": SolverArrays, "smooth_dynamics.h": DynamicsArrays}
+
+needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
+
+
+def constants_of(file: str, model: mujoco.MjModel) -> dict[str, int | bool]:
+    """Return those that a model gives to a source."""
+    if file == "constraint_solver.h":
+        return solver_constants(model.nv, rows=40, damped=True)
+    return dynamics_constants(model)
+
+
+def program(file: str, constants: dict[str, Any], on_gpu: bool) -> str:
+    """Return a C++ program with the native source as a function, of a Warp struct for one."""
+    types = {name: var.type.dtype for name, var in STRUCTS[file].vars.items()}
+    elements = {name: SCALARS.get(kind) or f"numbers<{math.prod(kind._shape_)}>" for name, kind in types.items()}
+    fields = "".join(f"array_of<{element}> {name};\n" for name, element in elements.items())
+    function = f"void compute_world(int world, {SETTINGS[file]}Arrays arrays) {{\n{native_source(file, constants)}}}\n"
+    return f"{WARP_ON_CPU.read_text() if on_gpu else ''}{SHIM}struct Arrays {{\n{fields}}};\n{function}"
+
+
+@needs_compiler
+@pytest.mark.parametrize("on_gpu", [False, True])
+@pytest.mark.parametrize("file", STRUCTS)
+def test_a_compiler_takes_the_source_without_a_warning(tmp_path, file, on_gpu):
+    source = tmp_path / "source.cpp"
+    source.write_text(program(file, constants_of(file, mujoco.MjModel.from_xml_string(EVERY_JOINT)), on_gpu))
+    # Unrolling is asked for in the words of NVIDIA's compiler.
+    flags = ["-std=c++17", "-fsyntax-only", "-Wall", "-Werror", "-Wno-unknown-pragmas"]
+    done = subprocess.run(["g++", *flags, str(source)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("file", STRUCTS)
+def test_the_compiler_for_gpus_takes_the_kernel(tmp_path, file):
+    """By NVIDIA's run-time compiler, which comes with Warp and needs no GPU."""
+    make = {"constraint_solver.h": solver_kernel, "smooth_dynamics.h": dynamics_kernel}[file]
+    kernel = make(constants_of(file, mujoco.MjModel.from_xml_string(EVERY_JOINT)))
+    try:
+        (compiled,) = wp.compile_aot_module(kernel.module, arch=ARCHITECTURE, module_dir=tmp_path, use_ptx=True)
+    except RuntimeError as error:
+        if "CUDA" in str(error):
+            pytest.skip(f"this Warp compiles nothing for a GPU: {error}")
+        raise
+    text = Path(compiled).read_text()
+    assert f".target sm_{ARCHITECTURE}" in text
+    assert "bar.warp.sync" in text  # the half for a GPU, in which lanes wait for each other
+
+
+def test_a_macro_has_one_meaning_in_all_sources():
+    meanings: dict[str, set[str]] = {}
+    for path in SOURCES.glob("*.h"):
+        for name in re.findall(r"#define (\w+)", path.read_text()):
+            meanings.setdefault(name, set()).add(path.name)
+    assert "EACH" in meanings
+    assert all(len(files) == 1 for files in meanings.values()), meanings
+
+
+class ArrayOf(ctypes.Structure):
+    """An array as the program knows it."""
+
+    _fields_ = [("data", ctypes.c_void_p), ("shape", ctypes.c_int * 4)]
+
+
+def lanes_of(folder: Path, file: str, constants: dict[str, Any]) -> Any:
+    """Compile the half for GPUs into a function of the number of worlds, the order of lanes and the struct's arrays."""
+    call = "compute_world(world, MOST, MOST, 1e-9f, 0.01f, *all)" if SETTINGS[file] else "compute_world(world, *all)"
+    source = folder / f"{file}.cpp"
+    source.write_text(
+        program(file, constants, on_gpu=True)
+        + "const int MOST = 50; int worlds;\n"
+        + f"void lane(void* with) {{ Arrays* all = (Arrays*)with; for (int world = 0; world < worlds; ++world) {call}; }}\n"
+        + 'extern "C" bool compute(int count, bool backwards, Arrays* all) {\n'
+        + "    worlds = count; return warp_on_cpu::run(lane, all, backwards);\n}\n"
+    )
+    library = folder / f"{file}.so"
+    flags = ["-std=c++17", "-O1", "-shared", "-fPIC", "-w"]
+    subprocess.run(["g++", *flags, str(source), "-o", str(library)], check=True)
+    return ctypes.CDLL(str(library)).compute
+
+
+def by_lanes(compute: Any, file: str, struct: Any, worlds: int, backwards: bool) -> None:
+    """Compute worlds in the arrays of an instance of the file's Warp struct."""
+    arrays = [getattr(struct, name) for name in STRUCTS[file].vars]
+    assert all(array.is_contiguous for array in arrays if array.size)
+    shapes = [(ctypes.c_int * 4)(*array.shape) for array in arrays]
+    passed = (ArrayOf * len(arrays))(*(ArrayOf(array.ptr, shape) for array, shape in zip(arrays, shapes, strict=True)))
+    compute.restype = ctypes.c_bool
+    assert compute(worlds, backwards, passed), "a lane waits where others do not"
+
+
+def in_every_way(launch: Any, compute: Any, file: str, struct: Any, names: tuple[str, ...]) -> list[list[np.ndarray]]:
+    """Return the arrays `names` of a struct as the kernel for the CPU leaves them, and as lanes do in either order."""
+    worlds = len(getattr(struct, names[0]))
+    found = []
+    for way in (launch, *(lambda back=back: by_lanes(compute, file, struct, worlds, back) for back in (False, True))):
+        for name in names:
+            getattr(struct, name).fill_(np.nan)
+        way()
+        found.append([getattr(struct, name).numpy().copy() for name in names])
+    return found
+
+
+@needs_compiler
+def test_lanes_find_what_one_thread_finds(tmp_path):
+    """The half for GPUs, on a warp of lanes that take turns. In which order they run between two meetings must not matter:
+    that it does not, to the bit, shows that none is missing.
+    """
+    model = packaged("half_cheetah.xml", timestep=0.01)
+    fused = FusedWorlds(model, 6, rows=64)
+    qpos, qvel, ctrl = random_motion(model, 6, seed=1)
+    qpos[:, 1], qpos[:, 2:] = np.linspace(-0.7, 0.2, 6), 0.3 * qpos[:, 2:]  # from deep in the ground to above it
+    fused.write(qpos, qvel, ctrl)
+    dynamics, solver = fused._step._dynamics, fused._step._solver
+    compute = lanes_of(tmp_path, "smooth_dynamics.h", dynamics_constants(model))
+    names = ("geom_xpos", "geom_xmat", "cdof", "M", "qfrc_passive", "qfrc_actuator", "qfrc_smooth")
+    results = in_every_way(dynamics.launch, compute, "smooth_dynamics.h", dynamics._arrays, names)
+    compare(names, *results)
+
+    fused.step()  # makes the rows of constraints
+    rows = fused.read("nefc")
+    assert rows.min() < 8
+    assert rows.max() > 32  # a lane has two
+    compute = lanes_of(tmp_path, "constraint_solver.h", solver_constants(model.nv, rows=64, damped=True))
+    names = ("qacc", "advance", "qfrc_constraint")
+    compare(names, *in_every_way(solver.solve, compute, "constraint_solver.h", solver._arrays, names))
+
+
+def compare(
+    names: tuple[str, ...], serial: list[np.ndarray], forwards: list[np.ndarray], backwards: list[np.ndarray]
+) -> None:
+    """Check that lanes find the same in either order, and what one thread finds up to rounding."""
+    for name, one, up, down in zip(names, serial, forwards, backwards, strict=True):
+        assert np.isfinite(one).all(), name
+        np.testing.assert_array_equal(up, down, err_msg=name)
+        assert relative_error(up, one) < 1e-4, name
