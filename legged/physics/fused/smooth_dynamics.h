@@ -1,6 +1,6 @@
 // Poses, inertias and forces but those of constraints, of one world: trees of free, ball, slide and hinge joints in any order.
 // Constants: NB, NV, NJ, NG, NT (bodies, degrees of freedom, joints, shapes, trees), DEPTH (levels of bodies below the world),
-// BALLS, SLIDES, SPRINGS, DAMPERS, GEARS, GAINS, AFFINE_BIAS, CONTROL_LIMITS, FORCE_LIMITS, JOINT_LIMITS (what there is of
+// BALLS, SLIDES, ONE_MOTOR, SPRINGS, DAMPERS, GEARS, GAINS, AFFINE_BIAS, CONTROL_LIMITS, FORCE_LIMITS, JOINT_LIMITS (what there is of
 // them), FREE, BALL, SLIDE, AFFINE (MuJoCo's numbers of types), and for each array of the model VARIES_<array>: whether worlds
 // may differ in it. What a model has not is left out by the compiler.
 
@@ -49,16 +49,19 @@ for (int level = 1; level <= DEPTH; ++level) {
         const int parent = arrays.body_parentid.data[b];
         const int first = arrays.body_jntadr.data[b], last = first + arrays.body_jntnum.data[b];
         float p[3], q[4], moved[3];
-        rotate(quat + parent * 4, ROW(body_pos, NB * 3) + b * 3, moved);
-        for (int k = 0; k < 3; ++k) p[k] = pos[parent * 3 + k] + moved[k];
-        multiply(quat + parent * 4, ROW(body_quat, NB * 4) + b * 4, q);
-        for (int j = first; j < last; ++j) {
-            const int at = arrays.jnt_qposadr.data[j], type = arrays.jnt_type.data[j];
-            if (type == FREE) {
-                for (int k = 0; k < 3; ++k) anchor[j * 3 + k] = p[k] = q_in[at + k];
-                for (int k = 0; k < 4; ++k) q[k] = q_in[at + 3 + k];
-                continue;
-            }
+        const bool floats = first < last && arrays.jnt_type.data[first] == FREE;  // such a body has no other joint
+        if (floats) {
+            const int at = arrays.jnt_qposadr.data[first];
+            for (int k = 0; k < 3; ++k) anchor[first * 3 + k] = p[k] = q_in[at + k];
+            for (int k = 0; k < 4; ++k) q[k] = q_in[at + 3 + k];
+        } else {
+            rotate(quat + parent * 4, ROW(body_pos, NB * 3) + b * 3, moved);
+            for (int k = 0; k < 3; ++k) p[k] = pos[parent * 3 + k] + moved[k];
+            multiply(quat + parent * 4, ROW(body_quat, NB * 4) + b * 4, q);
+        }
+        for (int j = floats ? last : first; j < last; ++j) {
+            const int at = arrays.jnt_qposadr.data[j];
+            [[maybe_unused]] const int type = arrays.jnt_type.data[j];
             const float* at_body = ROW(jnt_pos, NJ * 3) + j * 3;
             const float* about = ROW(jnt_axis, NJ * 3) + j * 3;
             float turn[4], before[4];
@@ -143,8 +146,8 @@ EACH(b, NB) {
 // How each degree of freedom moves the bodies that it carries.
 EACH(i, NV) {
     float* out = motion + i * 6;
-    const int b = arrays.dof_bodyid.data[i], j = arrays.dof_jntid.data[i], type = arrays.jnt_type.data[j];
-    const int of_joint = i - arrays.jnt_dofadr.data[j];
+    const int packed = arrays.dof_packed.data[i];  // one look-up instead of a chain of them
+    const int b = packed & 0xff, j = (packed >> 8) & 0xff, type = (packed >> 16) & 0xf, of_joint = packed >> 20;
     const int turning = type == FREE ? of_joint - 3 : of_joint;  // about which axis of the body, of a free or ball joint
     if (turning < 0) {
         for (int k = 0; k < 6; ++k) out[k] = k == 3 + of_joint ? 1.0f : 0.0f;
@@ -224,15 +227,20 @@ EACH(b, NB) {
 }
 meet();
 EACH(i, NV) {
-    const int b = arrays.dof_bodyid.data[i], j = arrays.dof_jntid.data[i], at = arrays.jnt_qposadr.data[j];
+    const int packed = arrays.dof_packed.data[i], b = packed & 0xff;
+    [[maybe_unused]] const int j = (packed >> 8) & 0xff, type = (packed >> 16) & 0xf;
+    [[maybe_unused]] const int at = SPRINGS || AFFINE_BIAS ? arrays.jnt_qposadr.data[j] : 0;
     const long long out = (long long)world * NV + i;
     float total = 0.0f;
     for (int c = b; c < b + subtree[b]; ++c)
         for (int k = 0; k < 6; ++k) total -= motion[i * 6 + k] * force[c * 6 + k];
     // Motors, all of them on slides and hinges.
     float driven = 0.0f;
-    for (int n = arrays.motor_start.data[i]; n < arrays.motor_start.data[i + 1]; ++n) {
-        const int u = arrays.motor.data[n], input = arrays.actuator_ctrladr.data[u];
+    // Mostly a degree of freedom has one motor at most, and a motor one control, in the same order.
+    const int from = ONE_MOTOR ? 0 : arrays.motor_start.data[i];
+    const int only = ONE_MOTOR ? arrays.motor_of_dof.data[i] : -1, to = ONE_MOTOR ? only >= 0 : arrays.motor_start.data[i + 1];
+    for (int n = from; n < to; ++n) {
+        const int u = ONE_MOTOR ? only : arrays.motor.data[n], input = ONE_MOTOR ? u : arrays.actuator_ctrladr.data[u];
         const float gear = GEARS ? ROW(actuator_gear, 6 * arrays.actuator_gear.shape[1])[6 * u] : 1.0f;
         float asked = arrays.ctrl.data[(long long)world * arrays.ctrl.shape[1] + input];
         if (CONTROL_LIMITS && arrays.actuator_ctrllimited.data[input])
@@ -252,7 +260,7 @@ EACH(i, NV) {
     total += driven;
     if (SPRINGS || DAMPERS) {
         float passive = 0.0f;
-        if (SPRINGS && arrays.jnt_type.data[j] != FREE && arrays.jnt_type.data[j] != BALL)
+        if (SPRINGS && type != FREE && type != BALL)
             passive -= ROW(jnt_stiffness, NJ)[j] * (q_in[at] - ROW(qpos_spring, arrays.qpos0.shape[1])[at]);
         if (DAMPERS) passive -= ROW(dof_damping, NV)[i] * v_in[i];
         arrays.qfrc_passive.data[out] = passive;

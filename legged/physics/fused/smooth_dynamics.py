@@ -65,6 +65,8 @@ class DynamicsArrays:
     tree_root: wp.array[int]
     motor_start: wp.array[int]
     motor: wp.array[int]
+    motor_of_dof: wp.array[int]
+    dof_packed: wp.array[int]
     body_parentid: wp.array[int]
     body_jntadr: wp.array[int]
     body_jntnum: wp.array[int]
@@ -73,7 +75,6 @@ class DynamicsArrays:
     jnt_dofadr: wp.array[int]
     jnt_actfrclimited: wp.array[bool]
     dof_bodyid: wp.array[int]
-    dof_jntid: wp.array[int]
     geom_bodyid: wp.array[int]
     actuator_ctrladr: wp.array[int]
     actuator_biastype: wp.array[int]
@@ -134,6 +135,7 @@ def dynamics_constants(model: mujoco.MjModel, randomized: Collection[str] = ()) 
         **{"NT": len(trees["tree_root"]), "DEPTH": int(trees["body_level"].max())},
         "BALLS": bool(np.any(model.jnt_type == BALL)),
         "SLIDES": bool(np.any(model.jnt_type == SLIDE)),
+        "ONE_MOTOR": _one_motor(model),
         "SPRINGS": bool(np.any(model.jnt_stiffness)) or "jnt_stiffness" in randomized,
         "DAMPERS": has_dampers(model, randomized),
         "GEARS": bool(np.any(model.actuator_gear[:, 0] != 1.0)) or "actuator_gear" in randomized,
@@ -176,7 +178,7 @@ class SmoothDynamics:
         `randomized` worlds differ. Call with their device as Warp's current one.
         """
         arrays = self._arrays = DynamicsArrays()
-        tables = _trees(model) | _motors(model)
+        tables = _trees(model) | _motors(model) | _dofs(model)
         for name in DynamicsArrays.vars:  # type: ignore[attr-defined]
             if name in tables:
                 value = wp.array(tables[name], dtype=int)
@@ -210,6 +212,8 @@ class SmoothDynamics:
             return "the model enables features, or disables groups of actuators"
         if not model.nv:
             return "the model has no joints"
+        if max(model.nbody, model.njnt) > 255:
+            return f"it has {model.nbody} bodies and {model.njnt} joints"
         if 4 * (48 * model.nbody + 6 * model.njnt + 6 * model.nv) > SHARED_BYTES:
             return f"{model.nbody} bodies do not fit a GPU's shared memory"
         scalar = (model.jnt_type == SLIDE) | (model.jnt_type == HINGE)
@@ -256,7 +260,26 @@ def _trees(model: mujoco.MjModel) -> dict[str, np.ndarray]:
 
 
 def _motors(model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """Return the motors sorted by the degree of freedom that they drive, and of each of those its first in that order."""
+    """Return the motors sorted by the degree of freedom that they drive; of each of those its first in that order, and its
+    last or -1.
+    """
     dof = model.jnt_dofadr[model.actuator_trnid[:, 0]]
     start = np.searchsorted(np.sort(dof), np.arange(model.nv + 1))
-    return {"motor_start": start, "motor": np.argsort(dof, kind="stable")}
+    of_dof = np.full(model.nv, -1)
+    of_dof[dof] = np.arange(model.nu)
+    return {"motor_start": start, "motor": np.argsort(dof, kind="stable"), "motor_of_dof": of_dof}
+
+
+def _one_motor(model: mujoco.MjModel) -> bool:
+    """Whether a degree of freedom has one motor at most, and each motor the control of its own number."""
+    joints = model.actuator_trnid[:, 0]
+    return len(set(joints.tolist())) == model.nu and bool((model.actuator_ctrladr == np.arange(model.nu)).all())
+
+
+def _dofs(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """Return of each degree of freedom its body, its joint, the joint's type and its place in the joint, packed into one
+    number: `why_not` admits fewer than 256 bodies and joints.
+    """
+    joint = model.dof_jntid
+    place = np.arange(model.nv) - model.jnt_dofadr[joint]
+    return {"dof_packed": model.dof_bodyid | joint << 8 | model.jnt_type[joint] << 16 | place << 20}
