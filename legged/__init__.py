@@ -1,4 +1,4 @@
-"""Legged robots learn to walk: legged_gym's task on batched MuJoCo, trained by rsl-rl."""
+"""Robots learn to walk and run: tasks on batched MuJoCo, trained by rsl-rl."""
 
 from legged.process.startup import importing  # first: it looks at the time
 

@@ -129,17 +129,34 @@ def task_class(name: str) -> type[BaseTask]:
 def _class_named(kind: Any, where: str) -> type[BaseTask]:
     """Return the task class of that name: one of ours, or one that a registered task has."""
     registered = {entry.task_class.__name__: entry.task_class for entry in _REGISTERED.values() if entry.task_class}
-    if isinstance(kind, str) and kind in registered:
+    if isinstance(kind, str) and kind in registered and kind not in CLASSES:  # a name of ours means our class
         return registered[kind]
     if not isinstance(kind, str) or kind not in CLASSES:
         raise ConfigError(f"{where}: there is no task class {shown(kind)}{suggest(str(kind)[:100], {*CLASSES, *registered})}")
     return getattr(import_module(CLASSES[kind]), kind)  # type: ignore[no-any-return]
 
 
+def _schema_of(kind: type[BaseTask]) -> type[TaskConfig]:
+    """Return the schema that a task class has.
+
+    Raises:
+        ConfigError: it is none, or lacks what the class that is extended here reads.
+    """
+    base, schema = (LeggedRobot if issubclass(kind, LeggedRobot) else BaseTask).Config, kind.Config
+    # Fields of a class that is not decorated itself would be left out without a word.
+    decorated = isinstance(schema, type) and "__dataclass_fields__" in vars(schema)
+    if not decorated or not issubclass(schema, base):
+        raise ConfigError(
+            f"{kind.__module__}.{kind.__name__}.Config: expected {base.__name__}, or a class with @dataclass(frozen=True)"
+            f" that extends it; got {shown(schema)}"
+        )
+    return schema
+
+
 def task_schema(name: str) -> type[TaskConfig]:
     """Return the schema of a task's configuration, or that of a legged robot for a task which is not there any more."""
     try:
-        return task_class(name).Config
+        return _schema_of(task_class(name))
     except ConfigError:
         return LeggedRobot.Config
 
@@ -151,7 +168,7 @@ def task_config(name: str, overrides: Iterable[tuple[str, Any]] = (), on_cpu: bo
         ConfigError: no such task, or a mistake in its configuration.
     """
     kind = task_class(name)
-    cfg = load_config(_entry(name), name, overrides, on_cpu, _REGISTERED, kind.Config)
+    cfg = load_config(_entry(name), name, overrides, on_cpu, _REGISTERED, _schema_of(kind))
     kind.check(cfg)
     return cfg
 

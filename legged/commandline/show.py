@@ -86,18 +86,24 @@ def _actions(task: BaseTask) -> Iterator[str]:
     model, clip = task.physics.model, task.cfg.control.clip_actions
     rows = [("action", "actuator", "what it does")]
     for i in range(task.num_actions):
-        joint = model.joint(int(model.actuator_trnid[i, 0])).name
-        rows.append((str(i), model.actuator(i).name or f"({i})", _effect(task, i, joint)))
+        rows.append((str(i), model.actuator(i).name or f"({i})", _effect(task, i)))
     yield from _table(f"actions: {task.num_actions} numbers, clipped at +-{clip:g}", rows)
 
 
-def _effect(task: BaseTask, i: int, joint: str) -> str:
-    """Say what action `i` does to its joint."""
+def _effect(task: BaseTask, i: int) -> str:
+    """Say what action `i` does."""
+    model = task.physics.model
+    on_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
+    gains = model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
+    bias = model.actuator_biastype[i] != mujoco.mjtBias.mjBIAS_NONE
+    if not on_joint or not gains or bias:  # a servo, a muscle, a tendon's motor: what it makes of its control is its own
+        return f"control {float(task.control_middle[i]):g} + {float(task.control_reach[i]):g} a"
+    number = int(model.actuator_trnid[i, 0])
+    joint = model.joint(number).name or f"({number})"
     if not isinstance(task, LeggedRobot):
-        model = task.physics.model
         force = float(model.actuator_gear[i, 0] * model.actuator_gainprm[i, 0])
         middle = float(task.control_middle[i]) * force
-        slides = model.joint(joint).type[0] == mujoco.mjtJoint.mjJNT_SLIDE
+        slides = model.jnt_type[number] == mujoco.mjtJoint.mjJNT_SLIDE
         offset = f"{middle:g} + " if middle else ""
         return f"{joint}: {offset}{float(task.control_reach[i]) * force:g} a [{'N' if slides else 'N m'}]"
     control, law = task.control, task.cfg.control

@@ -10,7 +10,10 @@ from legged.envs.overrides import check_overrides, check_terms
 from legged.errors import ConfigError, suggest
 from legged.mdp.mirror_images import MirrorKind
 from legged.physics.fields import FIELDS
+from legged.physics.quantities import LAST_STEP, STAGES
 
+RESERVED = {"falls", "episode_length", "non_finite_worlds", "contact_overflows"}
+"""Metrics that every task logs."""
 MOST_IN_A_POOL = 2**31 - 1
 """Contacts or constraint rows of all robots, which engines count in 32 bits."""
 MOST_SAMPLES = 2**28
@@ -31,6 +34,16 @@ def check_task(cls: type, cfg: TaskConfig) -> None:
         where = cfg.origins.where("train.algorithm.symmetry")
         raise ConfigError(f"{where}: {cls.__name__} knows no left and right; false learns without mirror images")
     check_networks(cfg)
+    for name in RESERVED & cls.terms("_metric_"):  # type: ignore[attr-defined]
+        raise ConfigError(f"{cls.__name__}._metric_{name}: every task logs Metrics/{name} already; give it another name")
+    for name in cfg.terminations.failures:
+        if name in cfg.terminations.time_outs:
+            where = cfg.origins.where("terminations.time_outs")
+            raise ConfigError(f"{where}: '{name}' is a failure already (terminations.failures); it can be only one of both")
+    for name in cls.QUANTITIES:  # type: ignore[attr-defined]
+        if name not in (*STAGES, *LAST_STEP):
+            known = suggest(name, (*STAGES, *LAST_STEP), "quantities")
+            raise ConfigError(f"{cls.__name__}.QUANTITIES: there is no quantity '{name}'{known}")
     for field in cfg.domain_rand.ranges:
         if field not in FIELDS:
             where = cfg.origins.where(f"domain_rand.ranges.{field}")

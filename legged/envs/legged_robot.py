@@ -54,7 +54,7 @@ class LeggedRobot(Terms, BaseTask):
         Raises:
             ConfigError: there is something.
         """
-        check_overrides(cls)
+        check_overrides(cls)  # before anything else can fail for it
         assert isinstance(cfg, LeggedConfig)
         robot = load_robot(cfg.robot, cfg.origins.where("robot"))
         super().check(cfg)
@@ -130,7 +130,11 @@ class LeggedRobot(Terms, BaseTask):
     def active_terminations(self) -> tuple[list[str], list[str]]:
         """Leave out limits that are 0, and a terrain that is not there."""
         cfg = self.cfg.terminations
-        off = {name for name, limit in (("base_height", cfg.min_base_height), ("tilt", cfg.max_tilt)) if limit == 0.0}
+        limits = (("base_height", cfg.min_base_height), ("tilt", cfg.max_tilt))
+        ours = {
+            name for name, _ in limits if getattr(type(self), f"_terminate_{name}") is getattr(Terms, f"_terminate_{name}")
+        }
+        off = {name for name, limit in limits if limit == 0.0} & ours
         if self.terrain is None:
             off.add("left_terrain")
         failures, time_outs = super().active_terminations()

@@ -54,10 +54,12 @@ class SavedTask:
         Raises:
             StateError: it is of another number of environments, or of another task; nothing should be used then.
         """
-        for name, part in self.parts().items():
-            load_state(part, state.get(name, {}))
-        take(self._own_tensors(), state.get("task", {}), type(self).__name__)
-        self.randomization.apply(self.physics)
+        try:
+            for name, part in self.parts().items():
+                load_state(part, state.get(name, {}))
+            take(self._own_tensors(), state.get("task", {}), type(self).__name__)
+        finally:
+            self.randomization.apply(self.physics)  # what is drawn and what the engine has must not part
         self.physics.load_state(state.get("physics", {}))
 
     def _own_tensors(self) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""Observation and reward terms of a legged robot, and everything they may read.
+"""Observations, rewards, terminations and metrics of a legged robot, and everything that they may read.
 
 Formulas and names are legged_gym's (Rudin et al., arXiv 2109.11978); where a term differs, its docstring says so.
 """
@@ -24,8 +24,8 @@ HEIGHTS_OFFSET, HEIGHTS_LIMIT = 0.5, 1.0
 
 
 class Terms:
-    """The methods `_obs_<name>` and `_reward_<name>` that a configuration can name. N robots, D joints, F feet, B tracked
-    collision shapes; the task allocates what is declared here.
+    """The methods `_obs_<name>`, `_reward_<name>` and `_terminate_<name>` that a configuration can name, and metrics.
+    N robots, D joints, F feet, B tracked collision shapes; the task allocates what is declared here.
     """
 
     MIRRORED: dict[str, MirrorKind] = {

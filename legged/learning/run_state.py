@@ -17,7 +17,7 @@ from legged.learning.checkpoint import load_plain, write_checkpoint
 from legged.process.paths import relative
 from legged.state import StateError
 
-FORMAT = 1
+FORMAT = 2
 
 
 def state_path(checkpoint: Path) -> Path:

@@ -68,8 +68,8 @@ def check_source(path: Path, saved: Saved, cfg: TaskConfig) -> None:
     here = {name: dict.fromkeys(group.terms) for name, group in cfg.observations.groups.items()}
     here = {name: {term: widths.get(term) for term in terms} for name, terms in here.items()}
     steps = {name: group.history for name, group in cfg.observations.groups.items()}
-    check_networks_fit(relative(path), saved, cfg)
     _check_observations(path, cfg, here, there, steps, histories(saved))
+    check_networks_fit(relative(path), saved, cfg)
 
 
 def check_built(path: Path, saved: Saved, task: BaseTask) -> None:

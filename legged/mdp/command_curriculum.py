@@ -1,4 +1,4 @@
-"""Curricula: what becomes harder while the robots succeed."""
+"""The command curriculum: ranges widen while robots follow."""
 
 import torch
 from torch import Tensor

@@ -10,7 +10,7 @@ import torch
 from legged.config import LeggedConfig
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
-from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, check_terrain, terrain_type
+from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, check_terrain, terrain_type, tile_size
 
 DIFFICULTIES = (0.5, 0.8)
 """Difficulty of the tiles on which robots start, and of those behind them, which they reach."""
@@ -62,7 +62,7 @@ class Playground:
             columns = [name] * COLUMNS
             order = sorted(range(COLUMNS), key=lambda c: abs(c - 0.5 * (COLUMNS - 1)))
         front, back = (
-            tuple(TileSpec(kind, TERRAIN_TYPES[kind].size(d)) for kind in columns)
+            tuple(TileSpec(kind, tile_size(cfg.terrain, kind, d)) for kind in columns)
             for d in (DIFFICULTIES if difficulty is None else (difficulty, difficulty))
         )
         return cls((front, back), tuple(order))

@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +89,9 @@ def restore(
         ConfigError: the checkpoint does not fit the task.
     """
     few_robots_do = ("train.algorithm.num_mini_batches", 1)  # nothing is trained
-    cfg = override(policy.cfg, [*changes, few_robots_do])
+    # What is measured and shown is the nominal model; only `changes` may ask for another.
+    nominal = replace(policy.cfg, domain_rand=replace(policy.cfg.domain_rand, ranges={}))
+    cfg = override(nominal, [*changes, few_robots_do])
     task_class(cfg.task).check(cfg)
     check_fits(policy.checkpoint, read_checkpoint(policy.checkpoint), cfg)
     task = make_task(cfg, device, graph, terrain)

@@ -15,6 +15,8 @@ ROOT = 1
 """The body that is followed: the first one after the world."""
 AWAY = 2.4
 """Distance of the camera, in lengths of what it follows."""
+DRAWN = 1000.0
+"""Half the side of the ground that is drawn [m]."""
 AZIMUTH, ELEVATION = 90.0, -12.0
 """It looks along y, so that x goes to the right [degrees]."""
 
@@ -48,19 +50,19 @@ def drawn_model(task: BaseTask, width: int, height: int) -> mujoco.MjModel:
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     model.vis.quality.shadowsize = model.vis.quality.offsamples = 0  # ten times faster without a GPU
     for plane in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE):
-        draw_without_end(model, int(plane))
+        draw_far(model, int(plane))
     return model
 
 
-def draw_without_end(model: mujoco.MjModel, plane: int) -> None:
-    """Let a plane be drawn as far as one sees, which to physics is infinite anyway: whoever runs far must not leave what is
-    drawn. Its texture keeps its scale.
+def draw_far(model: mujoco.MjModel, plane: int) -> None:
+    """Let a plane, which to physics is infinite anyway, be drawn as far as anybody runs. Its texture keeps its scale. MuJoCo
+    draws endless planes too, but shifts them with the camera, so that two pictures of one thing differ.
     """
     half, material = model.geom_size[plane, :2], int(model.geom_matid[plane])
     if material >= 0 and (half > 0.0).all() and not model.mat_texuniform[material]:
         model.mat_texrepeat[material] /= 2.0 * half
         model.mat_texuniform[material] = True  # so many a metre, not so many a plane
-    model.geom_size[plane, :2] = 0.0  # stands for no end
+    model.geom_size[plane, :2] = DRAWN
 
 
 def follow_root(view: mujoco.MjvCamera, model: mujoco.MjModel) -> None:

@@ -14,7 +14,7 @@ from legged.rendering.paint import SHOWN_DEPTH, add_painted_terrain
 from legged.rendering.scene import add_robots, add_sky
 from legged.rendering.text import labels
 from legged.robots.robot import Robot, load_robot
-from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec
+from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, tile_size
 
 MARGIN = 2.0
 """Border that is shown around the tiles [m]."""
@@ -39,7 +39,7 @@ class Place:
 
 def tiles(cfg: TerrainConfig, rows: Sequence[Sequence[str]], difficulty: float, seed: int) -> Terrain:
     """Build a terrain of the given types (R, C), all equally difficult, with a narrow border."""
-    specs = [[TileSpec(name, TERRAIN_TYPES[name].size(difficulty)) for name in row] for row in rows]
+    specs = [[TileSpec(name, tile_size(cfg, name, difficulty)) for name in row] for row in rows]
     return Terrain.of_tiles(specs, replace(cfg, border_size=MARGIN), np.random.default_rng(seed))
 
 
@@ -61,7 +61,9 @@ def picture_of_types(cfg: LeggedConfig, types: Sequence[str], difficulty: float)
     places = []
     for name, (r, c) in zip(types, at, strict=True):
         kind = TERRAIN_TYPES[name]
-        places.append(Place(r, c, name if name == "flat" else f"{name}, {kind.text(kind.size(difficulty))}"))
+        places.append(
+            Place(r, c, name if name == "flat" else f"{name}, {kind.text(tile_size(cfg.terrain, name, difficulty))}")
+        )
     return render(terrain, places, load_robot(cfg.robot))
 
 

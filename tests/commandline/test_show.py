@@ -79,3 +79,19 @@ def test_a_task_without_a_robot_folder():
         "175:253",
         "253:276",
     ]
+
+
+def test_what_is_no_plain_motor_is_told_as_a_control(tmp_path, monkeypatch):
+    """A servo's control is a target, and a tendon's motor has no joint."""
+    path = tmp_path / "servo.xml"
+    path.write_text(
+        "<mujoco><worldbody><body name='b'><joint name='x' type='slide'/><joint name='y' type='slide' axis='1 0 0'/>"
+        "<geom size='.1'/></body></worldbody><tendon><fixed name='t'><joint joint='x' coef='1'/></fixed></tendon>"
+        "<actuator><position joint='x' kp='5'/><motor tendon='t' gear='3'/>"
+        "<motor joint='y' gear='2' ctrlrange='-1 3' ctrllimited='true'/></actuator></mujoco>"
+    )
+    monkeypatch.setattr("legged.envs.half_cheetah.gymnasium_model", lambda _: path)
+    monkeypatch.setattr("legged.envs.half_cheetah.HalfCheetah._obs_position", lambda self: self.physics.qpos)
+    lines = summary(task_config("half_cheetah", on_cpu=True))
+    effects = [row[2] for row in rows(lines, "actions: 3 numbers")]
+    assert effects == ["control 0 + 1 a", "control 0 + 1 a", "y: 2 + 4 a [N]"]

@@ -5,6 +5,7 @@ import json
 import pytest
 from helpers import call, small_config, small_task
 
+from legged import registry
 from legged.benchmarks.iteration_times import time_iterations
 from legged.benchmarks.report import report
 from legged.benchmarks.scale import others
@@ -112,6 +113,7 @@ def test_sizes_are_compared_in_processes_of_their_own(tmp_path, capfd, monkeypat
 
 
 def test_sizes_of_a_task_that_is_a_file(tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr(registry, "_REGISTERED", {})  # another test's file may be called so
     (tmp_path / "mine.yaml").write_text("extends: anymal_c_flat\n")
     monkeypatch.chdir(tmp_path)
     small = [text for text in SMALL if text not in ("--num_envs", "8")]
