@@ -61,8 +61,13 @@ class Playground:
         else:
             columns = [name] * COLUMNS
             order = sorted(range(COLUMNS), key=lambda c: abs(c - 0.5 * (COLUMNS - 1)))
+
+        def size_of(kind: str, d: float) -> float:
+            """Return the size of the training, where that is fixed and nobody asks for another."""
+            return tile_size(cfg.terrain, kind, d) if difficulty is None else TERRAIN_TYPES[kind].size(d)
+
         front, back = (
-            tuple(TileSpec(kind, tile_size(cfg.terrain, kind, d)) for kind in columns)
+            tuple(TileSpec(kind, size_of(kind, d)) for kind in columns)
             for d in (DIFFICULTIES if difficulty is None else (difficulty, difficulty))
         )
         return cls((front, back), tuple(order))

@@ -69,6 +69,14 @@ def test_difficulty_alone_is_that_of_all_types():
         assert [spec.size for spec in row] == [TERRAIN_TYPES[name].size(0.25) for name in TYPES]
 
 
+def test_a_size_that_training_fixes_is_shown_unless_a_difficulty_is_asked_for():
+    cfg = config("anymal_c_step")
+    sizes = [{spec.size for row in ground.rows for spec in row} for ground in (playground(cfg), playground(cfg, "step"))]
+    assert sizes == [{0.15}, {0.15}]
+    hardest = [spec.size for row in playground(cfg, difficulty=1.0).rows for spec in row]
+    assert hardest == [pytest.approx(0.05 + 0.18)] * len(hardest)
+
+
 @pytest.mark.parametrize("task", ["anymal_c", "anymal_c_flat"])
 def test_a_chosen_type_fills_all_tiles_with_steps_of_that_size(task):
     cfg = config(task)
