@@ -28,7 +28,7 @@ from legged.mdp.observations import ObservationGroup, ObservationTerms
 from legged.mdp.randomization import Randomization
 from legged.mdp.rewards import Rewards
 from legged.mdp.terminations import Terminations
-from legged.physics import Scene, check_engine, check_ranges, make_physics
+from legged.physics import Scene, check_ranges, make_physics
 from legged.process.ranks import Ranks
 
 
@@ -67,8 +67,7 @@ class BaseTask(SavedTask, VecEnv):
         self.randomization = self.make_randomization()
         scene, fields = self.make_scene(), self.randomization.fields
         check_ranges(cfg.domain_rand.ranges, scene, cfg.sim, cfg.origins.where)
-        check_engine(scene, cfg.sim, device, cfg.origins.where, fields, self.QUANTITIES)
-        self.physics = make_physics(scene, cfg.sim, n, device, fields, self.QUANTITIES)
+        self.physics = make_physics(scene, cfg.sim, n, device, fields, self.QUANTITIES, cfg.origins.where)
         self.randomization.apply(self.physics)
         self.num_actions = self.physics.ctrl.shape[1]
         self._allocate()

@@ -98,6 +98,7 @@ def make_physics(
     device: torch.device,
     randomized: Collection[str] = (),
     quantities: Collection[str] = (),
+    where: Callable[[str], str] = str,
 ) -> Physics:
     """Return `num_envs` worlds of `scene` in the engine that `sim.physics` names. Engines are imported here, so that none
     is needed but the one used.
@@ -109,11 +110,12 @@ def make_physics(
         device: where all tensors live.
         randomized: fields (`fields.FIELDS`) that `Physics.randomize` will be given.
         quantities: arrays of MuJoCo's data that `Physics.quantity` will be asked for.
+        where: makes of a dotted path of the configuration how an error about it begins.
 
     Raises:
         ConfigError, ValueError: as `check_engine`.
     """
-    check_engine(scene, sim, device, randomized=randomized, quantities=quantities)
+    check_engine(scene, sim, device, where, randomized, quantities)
     engine = resolve_physics(sim.physics, device)
     if engine == "newton":
         with importing():

@@ -86,7 +86,7 @@ def test_without_the_state_robots_begin_anew_and_it_is_said(capsys):
     torch.save({**state, "format": torch.zeros(0)}, folder / "state_2.pt")
     assert "state_2.pt is damaged" in start_anew(capsys, folder, "--max_iterations", "4")
     torch.save({**state, "format": 99}, folder / "state_2.pt")
-    assert "state_2.pt is of format 99, this version reads 1" in start_anew(capsys, folder, "--max_iterations", "4")
+    assert "state_2.pt is of format 99, this version reads 2" in start_anew(capsys, folder, "--max_iterations", "4")
     (folder / "state_2.pt").write_bytes(b"nonsense")
     assert "state_2.pt: not a checkpoint" in start_anew(capsys, folder, "--max_iterations", "4")
 
