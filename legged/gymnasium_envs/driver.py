@@ -11,12 +11,11 @@ from torch import Tensor
 from legged.commandline.arguments import pick_device
 from legged.config.checks import shown
 from legged.config.networks import groups_of
-from legged.envs import LeggedRobot
 from legged.envs.final_step import keep_final_step
 from legged.errors import ConfigError, suggest
 from legged.gymnasium_envs.random_stream import RandomStream
 from legged.registry import make_task, task_config
-from legged.rendering import ModelCamera, RobotsCamera
+from legged.rendering import ModelCamera, RobotsCamera, camera_of
 
 Seen = Literal["actor", "dict"]
 """What is observed: what the policy is given, side by side, or every group by its name."""
@@ -155,8 +154,7 @@ class Driver:
             RunError: nothing can be rendered here.
         """
         if self._camera is None:
-            legged = isinstance(self.task, LeggedRobot)
-            self._camera = RobotsCamera(self.task, 1, width, height) if legged else ModelCamera(self.task, width, height)
+            self._camera = camera_of(self.task, 1, width, height)
         if isinstance(self._camera, RobotsCamera):
             self._camera.turn_to(env)
         else:

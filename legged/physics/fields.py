@@ -202,7 +202,7 @@ def check_ranges(
     Raises:
         ConfigError: there is no such field, the scene has nothing that it changes, or the lowest values leave no mass.
     """
-    model = scene.model(sim) if ranges else None
+    model = scene.model(sim, "none") if ranges else None  # no field is the ground's, which takes long to build
     for name in ranges:
         if name not in FIELDS:
             path = where("domain_rand.ranges")

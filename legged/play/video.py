@@ -9,25 +9,16 @@ import imageio_ffmpeg
 import numpy as np
 from PIL import Image
 
-from legged.envs import BaseTask, LeggedRobot
+from legged.envs import BaseTask
 from legged.errors import RunError
 from legged.process.paths import DISK_FULL, make_folder, relative, replacing
-from legged.rendering import ModelCamera, RobotsCamera
+from legged.rendering import camera_of
 
 FPS = 25
 """Frames a second; fewer where control steps are longer."""
 GIF_FPS = 8
 GIF_S = 12.0
 """Length of a GIF; as many seconds of the film as a page can take [s]."""
-
-
-def camera_of(task: BaseTask, count: int) -> ModelCamera | RobotsCamera:
-    """Return what draws a task: of legged robots, the first `count` of them.
-
-    Raises:
-        RunError: nothing can be rendered.
-    """
-    return RobotsCamera(task, count) if isinstance(task, LeggedRobot) else ModelCamera(task)
 
 
 class Video:
