@@ -89,8 +89,10 @@ class StepGraph:
         import warp as wp
 
         stream = torch.cuda.Stream(device)
-        wp.init()  # within a capture it would break that
         stream.wait_stream(torch.cuda.current_stream(device))
+        # Warp looks up a device at its first use, and a stream when it first sees it: within a capture that would break it.
+        with wp.ScopedStream(wp.stream_from_torch(stream), sync_enter=False):
+            wp.zeros(1, dtype=float, device=wp.device_from_torch(device))
         with torch.cuda.stream(stream):
             for _ in range(self._warm_up_steps):
                 self._rehearse()
