@@ -19,9 +19,6 @@ TERMINATION_FORCE = 1.0
 PENALISED_FORCE = 0.1
 """Contact force on a penalised shape that counts as a collision [N]."""
 
-HEIGHTS_OFFSET, HEIGHTS_LIMIT = 0.5, 1.0
-"""Observed heights are relative to this far below the base [m], and at most this large [m]."""
-
 
 class Terms:
     """The methods `_obs_<name>`, `_reward_<name>` and `_terminate_<name>` that a configuration can name, and metrics.
@@ -121,8 +118,8 @@ class Terms:
         """Base above ground, less an offset: clip(base_z - offset - ground_z, -limit, limit) at each of the points, which lie
         in the yaw frame; base_z and ground_z in the world frame [m].
         """
-        below = self.base_pos[:, 2:3] - HEIGHTS_OFFSET - self.measured_heights
-        return below.clamp(-HEIGHTS_LIMIT, HEIGHTS_LIMIT)
+        offset, limit = self.cfg.observations.heights_offset, self.cfg.observations.heights_limit
+        return (self.base_pos[:, 2:3] - offset - self.measured_heights).clamp(-limit, limit)
 
     # ---- rewards: (N,) each, times scale and control step ------------------------------------------------------------
 
