@@ -12,10 +12,15 @@ from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, exists
+from legged.robots.gains import gains
 from legged.robots.mirror import Mirror
 from legged.robots.patterns import match_values
 from legged.robots.robot_model import base_mass, check_model, hinges, read_model
 from legged.robots.shapes import Shapes
+from legged.robots.stance import stance, standing_height, swinging_joints
+
+VELOCITY_LIMIT = 30.0
+"""Largest speed of the joints of a robot that states none, as geared motors of legged robots have it [rad/s]."""
 
 
 @dataclass(frozen=True)
@@ -30,14 +35,14 @@ class RobotFile:
     """Base height above the ground after a reset [m]."""
     default_joint_angles: dict[str, float] = field(metadata=between(-100, 100))
     """Joint-name pattern -> angle at action 0 [rad]."""
-    stiffness: dict[str, float] = field(metadata=between(0, LARGEST))
-    """Joint-name pattern -> P gain [N m/rad]."""
-    damping: dict[str, float] = field(metadata=between(0, LARGEST))
-    """Joint-name pattern -> D gain [N m s/rad]."""
-    velocity_limit: dict[str, float] = field(metadata=positive(LARGEST))
-    """Joint-name pattern -> largest joint speed [rad/s]."""
     feet: tuple[str, ...] = field(metadata=NAMES)
     """Patterns of the shapes that are feet; those of one body are one foot."""
+    stiffness: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
+    """Joint-name pattern -> P gain [N m/rad]; without any, gains follow from inertia and weight (gains.py)."""
+    damping: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
+    """Joint-name pattern -> D gain [N m s/rad]; likewise."""
+    velocity_limit: dict[str, float] = field(default_factory=dict, metadata=positive(LARGEST))
+    """Joint-name pattern -> largest joint speed [rad/s]; without any, 30."""
     penalize_contacts_on: tuple[str, ...] = ()
     """Patterns of the shapes whose contact the `collision` reward counts."""
     terminate_after_contacts_on: tuple[str, ...] = ()
@@ -63,6 +68,13 @@ class Robot:
     """(D,) [rad/s]."""
     torque_limits: np.ndarray
     """(D,) [N m]."""
+    stiffness: np.ndarray
+    """(D,) P gains [N m/rad], and D gains [N m s/rad]."""
+    damping: np.ndarray
+    swings: np.ndarray
+    """(D,) whether a joint swings a leg forward and back, in the default pose."""
+    height: float
+    """Base above the ground when the robot stands level in its default pose [m]."""
     shape_names: tuple[str, ...]
     """Names of the S collision shapes, in the order of the model."""
     contact_of_shape: tuple[int, ...]
@@ -111,7 +123,7 @@ def load_robot(name: str, where: str = "robot") -> Robot:
     path = folder / "robot.yaml"
     data = read_yaml(path)
     missing = [k for k in ("model", "base", "spawn_height", "default_joint_angles", "feet") if k not in data]
-    missing += [k for k in ("stiffness", "damping", "velocity_limit") if k not in data]
+    missing += [k for k, other in (("stiffness", "damping"), ("damping", "stiffness")) if other in data and k not in data]
     if missing:
         raise ConfigError(f"{path}: missing: {', '.join(missing)}")
     file = build(RobotFile, data, "", Origins(), str(path))
@@ -119,16 +131,34 @@ def load_robot(name: str, where: str = "robot") -> Robot:
     check_model(model, file.base, str(path))
     joints = [model.joint(i) for i in hinges(model)]
     names = tuple(joint.name for joint in joints)
+    ids = [joint.id for joint in joints]
     shapes = Shapes.of(model, file.feet, f"{path}: feet")
+    foot_ids = [model.geom(name).id for foot in shapes.feet_shapes for name in foot]
+    default_dof_pos = match_values(file.default_joint_angles, names, f"{path}: default_joint_angles")
+    angles = dict(zip(names, map(float, default_dof_pos), strict=True))
+    height, torque_limits = standing_height(model, file.base, angles), model.actuator_forcerange[:, 1].copy()
+    if file.stiffness or file.damping:
+        stiffness = match_values(file.stiffness, names, f"{path}: stiffness")
+        damping = match_values(file.damping, names, f"{path}: damping")
+    else:
+        stiffness, damping = gains(model, stance(model, angles).qpos, ids, foot_ids, torque_limits, height)
+    if file.velocity_limit:
+        velocity_limits = match_values(file.velocity_limit, names, f"{path}: velocity_limit")
+    else:
+        velocity_limits = np.full(len(names), VELOCITY_LIMIT)
     return Robot(
         name=folder.name,
         folder=folder,
         file=file,
         joint_names=names,
-        default_dof_pos=match_values(file.default_joint_angles, names, f"{path}: default_joint_angles"),
+        default_dof_pos=default_dof_pos,
         dof_pos_limits=np.array([j.range if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in joints], dtype=float),
-        dof_vel_limits=match_values(file.velocity_limit, names, f"{path}: velocity_limit"),
-        torque_limits=model.actuator_forcerange[:, 1].copy(),
+        dof_vel_limits=velocity_limits,
+        torque_limits=torque_limits,
+        stiffness=stiffness,
+        damping=damping,
+        swings=swinging_joints(model, angles, ids, foot_ids),
+        height=height,
         shape_names=shapes.names,
         contact_of_shape=shapes.contact,
         contact_names=shapes.contact_names,
@@ -138,7 +168,7 @@ def load_robot(name: str, where: str = "robot") -> Robot:
         termination_indices=shapes.contacts(file.terminate_after_contacts_on, f"{path}: terminate_after_contacts_on"),
         mass=float(model.body_mass.sum()),
         base_mass=base_mass(model, file.base),
-        mirror=Mirror.of(model, [joint.id for joint in joints], shapes.feet_shapes),
+        mirror=Mirror.of(model, ids, shapes.feet_shapes),
     )
 
 

@@ -6,7 +6,8 @@ import pytest
 
 from legged.robots.gains import FREQUENCY, LARGEST_TARGET, MARGIN, RATIO, SAG, TIME_STEP, gains, mass_matrix
 from legged.robots.robot import load_robot
-from legged.robots.similarity import Size, grown, growth, size_of, standing_height
+from legged.robots.similarity import Size, grown, growth, size_of
+from legged.robots.stance import lowest_point, standing_height
 
 PENDULUM = """
 <mujoco>
@@ -27,20 +28,48 @@ PENDULUM = """
 
 
 @pytest.fixture
-def pendulum(tmp_path):
-    def write(mass=1e6):
-        path = tmp_path / "pendulum.xml"
-        path.write_text(PENDULUM.format(mass=mass))
-        return path
-
-    return write
+def pendulum():
+    return mujoco.MjModel.from_xml_string(PENDULUM.format(mass=1e6))
 
 
 def test_standing_height_is_down_to_the_lowest_shape(pendulum):
     """By hand: 0.1 + 0.4 + 0.02 m straight down; with the leg level, the trunk's underside is lowest but for the foot."""
-    assert standing_height(pendulum(), "base", {"hip": 0.0}) == pytest.approx(0.52, abs=1e-6)
-    assert standing_height(pendulum(), "base", {"hip": np.pi / 3}) == pytest.approx(0.1 + 0.2 + 0.02, abs=1e-6)
-    assert standing_height(pendulum(), "base", {"hip": np.pi}) == pytest.approx(0.05, abs=1e-6)
+    assert standing_height(pendulum, "base", {"hip": 0.0}) == pytest.approx(0.52, abs=1e-6)
+    assert standing_height(pendulum, "base", {"hip": np.pi / 3}) == pytest.approx(0.1 + 0.2 + 0.02, abs=1e-6)
+    assert standing_height(pendulum, "base", {"hip": np.pi}) == pytest.approx(0.05, abs=1e-6)
+
+
+SHAPES = {
+    "sphere": 'size="0.1"',
+    "capsule": 'size="0.05 0.2"',
+    "cylinder": 'size="0.1 0.2"',
+    "ellipsoid": 'size="0.1 0.2 0.05"',
+    "box": 'size="0.1 0.2 0.05"',
+    "mesh": 'mesh="wedge"',
+}
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_the_lowest_point_of_a_shape_is_where_c_mujoco_has_it(kind):
+    """MuJoCo's own distance to a plane far below is what it should be."""
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco>
+      <asset><mesh name="wedge" vertex="0 0 0 0.3 0 0 0 0.2 0 0 0 0.1"/></asset>
+      <worldbody>
+        <geom name="below" type="plane" size="0 0 1" pos="0 0 -10"/>
+        <body pos="0.1 0.2 0.3" quat="0.7 0.3 -0.4 0.2"><freejoint/><geom name="shape" type="{kind}" {SHAPES[kind]}/></body>
+      </worldbody></mujoco>""")
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    apart = mujoco.mj_geomDistance(model, data, 0, 1, 100.0, None)
+    assert lowest_point(model, data, 1) == pytest.approx(apart - 10.0, abs=2e-6)
+
+
+def test_joints_that_swing_a_leg_forward():
+    """Hip pitch, knee and ankle pitch; neither the hip's roll and yaw nor any joint of waist and arms."""
+    for name, expected in (("anymal_c", ("HFE", "KFE")), ("g1", ("hip_pitch", "knee", "ankle_pitch"))):
+        robot = load_robot(name)
+        found = {joint for joint, swings in zip(robot.joint_names, robot.swings, strict=True) if swings}
+        assert found == {joint for joint in robot.joint_names if any(part in joint for part in expected)}
 
 
 def test_sizes_of_robots():
@@ -60,7 +89,7 @@ def test_gains_of_a_leg_on_a_heavy_base(pendulum):
     """On a base that does not give way the leg's inertia about its hip is 0.02 + 2 * 0.3^2 = 0.2 in the air; it can't move at
     all with its foot on the ground, so that only the sag, the effort and the stability bound what follows from that.
     """
-    model = mujoco.MjModel.from_xml_path(str(pendulum()))
+    model = pendulum
     model.opt.gravity[:] = [0, 0, -1e-9]  # nothing to carry
     joint, foot = model.joint("hip").id, model.geom("foot").id
     height = 1e-9 / 9.81 * 0.52  # so that the frequency is that under 9.81
