@@ -174,8 +174,7 @@ def task_config(name: str, overrides: Iterable[tuple[str, Any]] = (), on_cpu: bo
     """
     kind = task_class(name)
     schema = _schema_of(kind)
-    carry = _carrier(kind, schema) if issubclass(kind, LeggedRobot) else None
-    cfg = load_config(_entry(name), name, overrides, on_cpu, _REGISTERED, schema, carry)
+    cfg = load_config(_entry(name), name, overrides, on_cpu, _REGISTERED, schema, _carrier(kind, schema))
     kind.check(cfg)
     return cfg
 
@@ -187,6 +186,8 @@ def _carrier(kind: type[BaseTask], schema: type[TaskConfig]) -> Carry:
         return unit_in(inspect.getdoc(getattr(kind, method, None))) or "1"
 
     def carry_layer(data: Mapping[str, Any], written_for: str, robot: str, where: str) -> Mapping[str, Any]:
+        if not issubclass(kind, LeggedRobot):
+            raise ConfigError(f"{where}: a task of {kind.__name__} has no robot to which numbers could be carried")
         reference = size_of(written_for, where)
         if not robot or robot == written_for:
             return data

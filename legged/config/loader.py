@@ -172,10 +172,11 @@ def _merged(
         name = layer.name
         if layer.written_for is not None:
             where = f"{name}: written_for"
-            if not isinstance(layer.written_for, str) or carry is None:
-                raise ConfigError(f"{where}: expected the name of a robot, in a task of one; got {shown(layer.written_for)}")
-            data = dict(carry(data, robot_path(layer.written_for, layer.folder), robot, where))
-            name += f" (written for {Path(layer.written_for).name})"
+            if not isinstance(layer.written_for, str):
+                raise ConfigError(f"{where}: expected the name of a robot, got {shown(layer.written_for)}")
+            carried = data if carry is None else carry(data, robot_path(layer.written_for, layer.folder), robot, where)
+            if carried is not data:
+                data, name = dict(carried), f"{name} (written for {Path(layer.written_for).name})"
         merge(merged, data, name, origins)
     return merged, origins
 
@@ -245,7 +246,7 @@ def load_config(
 ) -> TaskConfig:
     """Load the task file or mapping `source`, over what it extends (a file, or one of the tasks in `registered`), under its
     `cpu:` section (if asked) and overrides, as an instance of `schema`. What of it is written for another robot is carried
-    to that of the task by `carry`; overrides never are.
+    to that of the task by `carry`, if there is one; overrides never are.
 
     Raises:
         ConfigError: unknown key, wrong type or value, with file and dotted path.

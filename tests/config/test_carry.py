@@ -124,5 +124,5 @@ def test_a_robot_that_is_none(tasks, written_for, message):
 
 def test_a_task_without_a_robot_has_nobody_to_carry_to(tasks):
     tasks("carry_nobody", {"extends": "half_cheetah", "written_for": "anymal_c"})
-    with pytest.raises(ConfigError, match="written_for: expected the name of a robot, in a task of one"):
+    with pytest.raises(ConfigError, match="written_for: a task of HalfCheetah has no robot"):
         task_config("carry_nobody")

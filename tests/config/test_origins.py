@@ -10,7 +10,9 @@ from legged.errors import ConfigError
 from legged.learning.run_folder import run_config
 from legged.process.paths import data_folder
 
-ANYMAL_C = data_folder("cfg") / "anymal_c.yaml"
+BASES = data_folder("cfg") / "base"
+ROUGH = BASES / "quadruped_rough.yaml"
+"""What anymal_c extends, which extends what stands beside it."""
 
 
 @pytest.fixture
@@ -61,8 +63,8 @@ def test_a_configuration_knows_its_origins_but_they_are_no_setting(mine):
     cfg = registry.task_config("mine", [("sim.dt", 0.004)])
     assert cfg.origins.of("env.num_envs") == str(path)
     assert cfg.origins.of("terrain.proportions.gap") == cfg.origins.of("env.seed") == "the default"
-    assert cfg.origins.of("terrain.mesh_type") == str(ANYMAL_C)
-    assert cfg.origins.of("rewards.scales") == f"{data_folder('cfg') / TASK}.yaml, {ANYMAL_C}"
+    assert cfg.origins.of("terrain.mesh_type") == str(ROUGH)
+    assert cfg.origins.of("rewards.scales") == f"{BASES / 'quadruped_flat.yaml'}, {ROUGH}"
     assert override(cfg, [("env.seed", 3)]).origins.of("env") == f"{path}, command line"
     assert cfg.origins.of("env") == str(path)  # the original is left alone
     assert "origins" not in to_dict(cfg)
@@ -107,19 +109,19 @@ def test_the_command_line_is_named(mine):
 def test_everyone_is_named_who_had_a_share_in_a_sum(mine):
     path = mine("terrain: {proportions: {gap: 0.2}}")
     message = error_of(("terrain.proportions.pit", 0.1))
-    assert message.startswith(f"{ANYMAL_C}, {path}, command line: terrain.proportions: must sum to 1, got 1.3")
+    assert message.startswith(f"{ROUGH}, {path}, command line: terrain.proportions: must sum to 1, got 1.3")
 
 
 def test_what_a_value_does_not_fit_is_named_too(mine):
-    """Levels up to 5 by default, in 4 rows; a default tile, with starts too far apart for it."""
+    """Levels up to 5 by default, in 4 rows; a tile with starts too far apart for it."""
     path = mine("terrain: {num_rows: 4}")
     assert error_of() == f"the default: terrain.max_init_terrain_level: must be below num_rows = 4 ({path}), got 5"
     message = error_of(("terrain.num_rows", 10), ("terrain.spawn_range", 4))
     assert message.startswith("command line: terrain.spawn_range: ")
-    assert message.endswith("(terrain_length = 8.0 (the default), terrain_width = 8.0 (the default))")
+    assert message.endswith(f"(terrain_length = 8.0 ({ROUGH}), terrain_width = 8.0 ({ROUGH}))")
     message = error_of(("terrain.num_rows", 10), ("terrain.terrain_width", 2.5))
     assert message.startswith("command line: terrain.terrain_width: a tile of 8 x 2.5 m")
-    assert message.endswith(f"(proportions.slope_up: {ANYMAL_C})")
+    assert message.endswith(f"(proportions.slope_up: {ROUGH})")
     assert "of num_cols = 1 (command line) columns" in error_of(("terrain.num_rows", 10), ("terrain.num_cols", 1))
 
 
@@ -133,7 +135,7 @@ def test_a_cpu_section_is_blamed_on_the_file_that_it_stands_in(mine):
     """anymal_c and the flat task below it have one, too."""
     path = mine("cpu: {terrain: {max_init_terrain_level: 9}}")
     message = error_of(on_cpu=True)
-    assert message == (f"{path}: cpu: terrain.max_init_terrain_level: must be below num_rows = 5 ({ANYMAL_C}: cpu), got 9")
+    assert message == (f"{path}: cpu: terrain.max_init_terrain_level: must be below num_rows = 5 ({ROUGH}: cpu), got 9")
     registry.task_config("mine")  # the section does not count on a GPU
     path = mine("cpu: {env: {num_env: 9}}")
     assert error_of().startswith(f"{path}: cpu: env.num_env: unknown key")
