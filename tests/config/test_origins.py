@@ -1,7 +1,6 @@
 """Errors name who set the value: a file of the chain, its cpu section, the command line, a run's configuration, or nobody."""
 
 import pytest
-from helpers import TASK
 
 from legged import registry
 from legged.config import load_config, override, to_dict
