@@ -49,7 +49,7 @@ def test_cells_and_tiles_are_held_against_the_scaled_parts():
     """Treads are 0.31 m, platforms 3 m at scale 1."""
     stairs = {"mesh_type": "height_map", "proportions": {"stairs_up": 1.0}}
     check_terrain(TerrainConfig(**stairs, scale=2.0, horizontal_scale=0.5), Origins())
-    with pytest.raises(ConfigError, match="larger than the tread of a step of 'stairs_up', 0.155 m"):
+    with pytest.raises(ConfigError, match=r"larger than the tread of a step of 'stairs_up', 0\.155 m"):
         check_terrain(TerrainConfig(**stairs, scale=0.5, horizontal_scale=0.2), Origins())
     with pytest.raises(ConfigError, match="not larger than the platform of 'stairs_up', 9 m"):
         check_terrain(TerrainConfig(**stairs, scale=3.0), Origins())
