@@ -78,7 +78,7 @@ def test_a_configuration_knows_its_origins_but_they_are_no_setting(mine):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("robot: anymal_x", "robot: there is no robot 'anymal_x'; did you mean 'anymal_c'?"),
+        ("robot: anymal_cc", "robot: there is no robot 'anymal_cc'; did you mean 'anymal_c'?"),
         (
             "rewards: {scales: {torqes: 1}}",
             "rewards.scales.torqes: LeggedRobot has no reward 'torqes'; did you mean 'torques'",

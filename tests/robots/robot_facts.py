@@ -28,6 +28,8 @@ class Facts:
     standing: float | None = None
     """Base height after 2 s under the robot's own gains, started with its feet just touching, elliptic cone, impratio 100;
     none for a robot that topples."""
+    gains: tuple[float, float] | None = None
+    """Stiffness and damping with which it was made to stand, where they are not its own."""
     topples: float | None = None
     """Or when it leans by 30 degrees then [s]."""
 
@@ -46,6 +48,8 @@ def mirrored(left: dict[str, tuple[Point, Point]], right: dict[str, str]) -> dic
 G1_LEG = "hip_pitch hip_roll hip_yaw knee ankle_pitch ankle_roll"
 G1_ARM = "shoulder_pitch shoulder_roll shoulder_yaw elbow wrist_roll wrist_pitch wrist_yaw"
 G1_ARM_EFFORT = {"shoulder": 25.0, "elbow": 25.0, "wrist_roll": 25.0, "wrist_pitch": 5.0, "wrist_yaw": 5.0}
+H1_LEG = "hip_yaw hip_roll hip_pitch knee ankle"
+H1_ARM = "shoulder_pitch shoulder_roll shoulder_yaw elbow"
 
 FACTS = {
     "go2": Facts(
@@ -134,5 +138,116 @@ FACTS = {
         ),
         armature={"hx": 0.05, "hy": 0.05, "kn": 0.05},
         standing=0.473,
+    ),
+    "go1": Facts(
+        mass=12.743448,
+        centre=(-0.003959, 0.000876, -0.018427),
+        base_inertia=(0.0168128, 0.0630095, 0.0716547),
+        joints=legs("FL FR RL RR", "{}_hip_joint {}_thigh_joint {}_calf_joint"),
+        effort={"hip": 23.7, "thigh": 23.7, "calf": 35.55},
+        speed={"hip": 30.1, "thigh": 30.1, "calf": 20.06},
+        ranges={"hip": (-0.863, 0.863), "thigh": (-0.686, 4.501), "calf": (-2.818, -0.888)},
+        feet=mirrored(
+            {
+                "FL_foot": ((0.172522, 0.157429, -0.301768), (0.1881, 0.12675, -0.426)),
+                "RL_foot": ((-0.265216, 0.156501, -0.292514), (-0.1881, 0.12675, -0.426)),
+            },
+            {"FL_foot": "FR_foot", "RL_foot": "RR_foot"},
+        ),
+        armature={"hip": 0.004026312, "thigh": 0.004026312, "calf": 0.009059202},
+        standing=0.281,
+    ),
+    "a1": Facts(
+        mass=12.454,
+        centre=(-0.008414, 0.000827, -0.018355),
+        base_inertia=(0.0169399, 0.0566792, 0.0648138),
+        joints=legs("FL FR RL RR", "{}_hip_joint {}_thigh_joint {}_calf_joint"),
+        effort={"hip": 20.0, "thigh": 55.0, "calf": 55.0},
+        speed={"hip": 52.4, "thigh": 28.6, "calf": 28.6},
+        ranges={"hip": (-0.802851, 0.802851), "thigh": (-1.0472, 4.18879), "calf": (-2.69653, -0.916298)},
+        feet=mirrored(
+            {
+                "FL_foot": ((0.168372, 0.160807, -0.282359), (0.183, 0.13205, -0.4)),
+                "RL_foot": ((-0.255409, 0.159936, -0.273669), (-0.183, 0.13205, -0.4)),
+            },
+            {"FL_foot": "FR_foot", "RL_foot": "RR_foot"},
+        ),
+        armature={"joint": 0.01},
+        standing=0.2651,
+    ),
+    "anymal_b": Facts(
+        mass=30.621397,
+        centre=(-0.001075, -0.000775, -0.030933),
+        base_inertia=(0.2173911, 0.6394325, 0.6241408),
+        joints=legs("LF RF LH RH", "{}_HAA {}_HFE {}_KFE"),
+        effort={"HAA": 80.0, "HFE": 80.0, "KFE": 80.0},
+        speed={"HAA": 15.0, "HFE": 20.0, "KFE": 20.0},
+        ranges={"HAA": (-9.42, 9.42), "HFE": (-9.42, 9.42), "KFE": (-9.42, 9.42)},
+        feet=mirrored(
+            {
+                "LF_FOOT": ((0.451298, 0.246, -0.4658), (0.4405, 0.246, -0.548)),
+                "LH_FOOT": ((-0.451298, 0.246, -0.4658), (-0.4405, 0.246, -0.548)),
+            },
+            {"LF_FOOT": "RF_FOOT", "LH_FOOT": "RH_FOOT"},
+        ),
+        armature={},
+        standing=0.4791,
+        gains=(80.0, 2.0),
+    ),
+    "anymal_d": Facts(
+        mass=57.02787,
+        centre=(0.007455, -1.8e-05, -0.049393),
+        base_inertia=(0.5320396, 1.8726713, 1.6997437),
+        joints=legs("LF RF LH RH", "{}_HAA {}_HFE {}_KFE"),
+        effort={"HAA": 80.0, "HFE": 80.0, "KFE": 80.0},
+        speed={"HAA": 8.5, "HFE": 8.5, "KFE": 8.5},
+        ranges={
+            "L": (-0.785398, 0.610865),
+            "R": (-0.610865, 0.785398),
+            "HFE": (-9.424778, 9.424778),
+            "KFE": (-9.424778, 9.424778),
+        },
+        feet=mirrored(
+            {
+                "LF_FOOT": ((0.495121, 0.309609, -0.557055), (0.473, 0.309609, -0.647077)),
+                "LH_FOOT": ((-0.495121, 0.309609, -0.557055), (-0.473, 0.309609, -0.647077)),
+            },
+            {"LF_FOOT": "RF_FOOT", "LH_FOOT": "RH_FOOT"},
+        ),
+        armature={"HAA": 0.1, "HFE": 0.1, "KFE": 0.1},
+        standing=0.5426,
+        gains=(80.0, 2.0),
+    ),
+    "h1": Facts(
+        mass=51.437,
+        centre=(0.017723, 0.000972, -0.034371),
+        base_inertia=(0.044582, 0.0082464, 0.049021),
+        joints=(
+            *legs("left right", " ".join("{}_" + name + "_joint" for name in H1_LEG.split())),
+            "torso_joint",
+            *legs("left right", " ".join("{}_" + name + "_joint" for name in H1_ARM.split())),
+        ),
+        effort={"hip": 200, "knee": 300, "ankle": 40, "torso": 200, "shoulder": 40, "shoulder_yaw": 18, "elbow": 18},
+        speed={"hip": 23, "knee": 14, "ankle": 9, "torso": 23, "shoulder": 9, "shoulder_yaw": 20, "elbow": 20},
+        ranges={
+            "hip_yaw": (-0.43, 0.43),
+            "hip_roll": (-0.43, 0.43),
+            "hip_pitch": (-1.57, 1.57),
+            "knee": (-0.26, 2.05),
+            "ankle": (-0.87, 0.52),
+            "torso": (-2.35, 2.35),
+            "shoulder_pitch": (-2.87, 2.87),
+            "left_shoulder_roll": (-0.34, 3.11),
+            "right_shoulder_roll": (-3.11, 0.34),
+            "left_shoulder_yaw": (-1.3, 4.45),
+            "right_shoulder_yaw": (-4.45, 1.3),
+            "elbow": (-1.25, 2.61),
+        },
+        feet=mirrored(
+            {"left_foot": ((0.019934, 0.20286, -1.009228), (0.059468, 0.20286, -1.0192))}, {"left_foot": "right_foot"}
+        ),
+        foot_point=(0.02, 0.0, -0.045),
+        armature={"hip": 0.1, "knee": 0.1, "ankle": 0.1, "torso": 0.1, "shoulder": 0.02, "elbow": 0.02},
+        topples=1.81,
     ),
 }
