@@ -5,7 +5,8 @@ from typing import Any
 from legged.config.schema import LeggedConfig
 from legged.envs.checks import check_mirror_kinds
 from legged.errors import ConfigError
-from legged.mdp.control import control_gains
+from legged.mdp.control import acted_joints, action_scales, control_gains
+from legged.mdp.mirror_images import mirror_of_actions
 from legged.robots.robot import Robot
 from legged.terrain import check_terrain
 
@@ -22,6 +23,7 @@ def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     if cfg.train.algorithm.symmetry:
         check_symmetry(cls, cfg, robot)
     control_gains(robot, cfg.control, cfg.origins.where)
+    action_scales(robot, cfg.control, cfg.origins.where)
     check_terrain(cfg.terrain, cfg.origins)
     check_base_mass(cfg, robot)
     check_points(cfg)
@@ -37,6 +39,8 @@ def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     where, otherwise = origins.where("train.algorithm.symmetry"), "false learns without mirror images"
     if robot.mirror is None:
         raise ConfigError(f"{where}: '{robot.name}' is lopsided (joints and feet at zero angles); {otherwise}")
+    if mirror_of_actions(robot.mirror, acted_joints(robot, cfg.control, origins.where)) is None:
+        raise ConfigError(f"{origins.where('control.held')}: joints are held on one side only; {otherwise} ({where})")
     used = [term for group in cfg.observations.groups.values() for term in group.terms]
     check_mirror_kinds(cls.__name__, cls.MIRRORED, used, where)
     y = cfg.terrain.measured_points_y

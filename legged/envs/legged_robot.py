@@ -15,7 +15,7 @@ from legged.math import quat_rotate
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts
-from legged.mdp.control import Control
+from legged.mdp.control import Control, acted_joints
 from legged.mdp.height_scan import HeightScan
 from legged.mdp.mirror_images import MirrorImages
 from legged.mdp.randomization import Pushes, RobotRandomization
@@ -76,6 +76,11 @@ class LeggedRobot(Terms, BaseTask):
         """Make the ground that the configuration asks for; None for a plane. A subclass may return one of its own."""
         cfg = self.cfg.terrain
         return None if cfg.mesh_type == "plane" else Terrain.build(cfg, self.cfg.env.seed)
+
+    def _allocate(self) -> None:
+        """Leave out the actions of joints that are held."""
+        self.num_actions = len(acted_joints(self.robot, self.cfg.control))
+        super()._allocate()
 
     def _init_buffers(self) -> None:
         """Allocate what follows from the robot, its commands and its ground."""
@@ -149,8 +154,10 @@ class LeggedRobot(Terms, BaseTask):
         return scales
 
     def mirror_images(self) -> MirrorImages | None:
-        mirror, points, seen = self.robot.mirror, self.height_scan.points, (self.observation_groups, self.num_actions)
-        return None if mirror is None else MirrorImages(type(self).__name__, self.MIRRORED, *seen, mirror, points)
+        mirror, points = self.robot.mirror, self.height_scan.points
+        if mirror is None:
+            return None
+        return MirrorImages(type(self).__name__, self.MIRRORED, self.observation_groups, self.control.acted, mirror, points)
 
     # ---- one control step: what differs from every task's ------------------------------------------------------------
 

@@ -32,7 +32,7 @@ class Terms:
         "commands": "command",
         "dof_pos": "joints",
         "dof_vel": "joints",
-        "actions": "joints",
+        "actions": "actions",
         "heights": "heights",
     }
     """Observation term -> how its numbers change when left and right are exchanged; a subclass adds its own terms'."""
@@ -59,7 +59,7 @@ class Terms:
     torques: Tensor
     """(N, D) [N m]."""
     actions: Tensor
-    """(N, D) of this step; `last_actions` of the step before."""
+    """(N, A) of this step, one for each joint that is not held; `last_actions` of the step before."""
     last_actions: Tensor
     commands: Tensor
     """(N, 4) vx, vy [m/s], yaw rate [rad/s], heading [rad]; `is_moving` (N,) whether any velocity is commanded."""

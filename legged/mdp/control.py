@@ -7,7 +7,9 @@ import torch
 from torch import Tensor
 
 from legged.config.schema import LeggedControlConfig
+from legged.errors import ConfigError
 from legged.math import masked_set_
+from legged.robots.patterns import match_names, match_values
 from legged.robots.robot import Robot
 
 
@@ -17,6 +19,8 @@ class Control:
     P: stiffness * (action_scale * action + default - q) - damping * dq
     V: stiffness * (action_scale * action - dq) - damping * ddq, with ddq over one physics step
     T: action_scale * action
+
+    D joints, of which A have an action; for the others, which are held, the law has 0 in its place.
     """
 
     STATE = ("_last_dof_vel",)
@@ -26,13 +30,18 @@ class Control:
         from `cfg` if it names any, else from the robot.
 
         Raises:
-            ConfigError: a gain pattern that matches no joint, or a joint without a gain.
+            ConfigError: a pattern that matches no joint, a joint without a gain or scale, or joints held without P.
         """
 
         def tensor(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=torques.device)
 
-        self.control_type, self.action_scale, self.sim_dt = cfg.control_type, cfg.action_scale, sim_dt
+        self.control_type, self.sim_dt = cfg.control_type, sim_dt
+        self.acted = acted_joints(robot, cfg)
+        """(A,) the joint of each action."""
+        scales = action_scales(robot, cfg)
+        self.action_scale = cfg.action_scale if isinstance(cfg.action_scale, float) else tensor(scales)
+        """Of all actions, or (A,)."""
         stiffness, damping = control_gains(robot, cfg)
         self.stiffness, self.damping = tensor(stiffness), tensor(damping)
         """(D,) gains [N m/rad], [N m s/rad]."""
@@ -42,11 +51,15 @@ class Control:
         self.torques = torques
         """(N, D) torques of the last physics step [N m]."""
         self._target = torch.zeros_like(self.torques)  # joint angles, velocities or torques
+        self._columns = None if len(self.acted) == robot.num_dof else torch.tensor(self.acted, device=torques.device)
         self._last_dof_vel = torch.zeros_like(self.torques)
 
     def set_actions(self, actions: Tensor) -> None:
-        """Take the actions (N, D) that the following calls of `compute` realise."""
-        torch.mul(actions, self.action_scale, out=self._target)
+        """Take the actions (N, A) that the following calls of `compute` realise."""
+        if self._columns is None:
+            torch.mul(actions, self.action_scale, out=self._target)
+        else:
+            self._target.zero_().index_copy_(1, self._columns, actions * self.action_scale)
         if self.control_type == "P":
             self._target.add_(self.default_dof_pos)
 
@@ -77,3 +90,31 @@ def control_gains(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str],
         return robot.gains(own, where(f"control.{name}")) if own else of_robot
 
     return gains("stiffness", cfg.stiffness, robot.stiffness), gains("damping", cfg.damping, robot.damping)
+
+
+def acted_joints(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> tuple[int, ...]:
+    """Return the joints that have an action, (A,): all but those that are held. `where` is as for `control_gains`.
+
+    Raises:
+        ConfigError: a pattern that matches no joint, no joint left, or joints held by another law than P.
+    """
+    if not cfg.held:
+        return tuple(range(robot.num_dof))
+    held = match_names(cfg.held, robot.joint_names, where("control.held"))
+    if cfg.control_type != "P":
+        raise ConfigError(f"{where('control.held')}: joints are held by control_type P only, not {cfg.control_type}")
+    if len(held) == robot.num_dof:
+        raise ConfigError(f"{where('control.held')}: every joint of '{robot.name}' is held, so there is no action")
+    return tuple(i for i in range(robot.num_dof) if i not in held)
+
+
+def action_scales(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> np.ndarray:
+    """Return the scale of each action, (A,). `where` is as for `control_gains`.
+
+    Raises:
+        ConfigError: as `acted_joints`, a pattern that matches no joint with an action, or such a joint without a scale.
+    """
+    acted = acted_joints(robot, cfg, where)
+    if not isinstance(cfg.action_scale, dict):
+        return np.full(len(acted), cfg.action_scale)
+    return match_values(cfg.action_scale, [robot.joint_names[i] for i in acted], where("control.action_scale"))
