@@ -279,7 +279,7 @@ class BaseTask(SavedTask, VecEnv):
         largest = torch.linalg.vector_norm(state, torch.inf, dim=1)
         torch.lt(largest, LARGEST_STATE, out=self._in_bounds)  # so is NaN not
         torch.logical_and(self._in_bounds, self.faults.sound, out=self.valid)
-        self.terminations.evaluate(~self.valid, self.episode_length_buf >= self.max_episode_length)
+        self.terminations.evaluate(self.valid, self.episode_length_buf >= self.max_episode_length)
 
     def measure(self) -> None:
         """Record metrics and faults of the step. Runs beside the rewards."""

@@ -171,7 +171,7 @@ class Terms:
 
     def _reward_collision(self) -> Tensor:
         """Number of penalised shapes that touch something."""
-        return (self.contact_forces[:, self.penalised_indices].norm(dim=2) > PENALISED_FORCE).sum(dim=1).float()
+        return (self.contact_forces[:, self.penalised_indices].norm(dim=2) > PENALISED_FORCE).sum(dim=1, dtype=torch.float32)
 
     def _reward_termination(self) -> Tensor:
         """Failing; added after the clip at zero."""

@@ -20,19 +20,22 @@ class CommandCurriculum:
         """Widen up to `full_ranges` (3, 2); `dt` is the control step [s]."""
         self.cfg, self.full_ranges = cfg, full_ranges.clone()
         self._full_limit = full_ranges.abs().amax(dim=1)
+        self._half_limit = 0.5 * self._full_limit
         self.window_steps = max(1, round(cfg.window_s / dt))
         device = full_ranges.device
         self.share = torch.ones(3, device=device)
         """(3,) share of the full range that is in use."""
-        self._sums = torch.zeros(2, 3, device=device)  # velocity reached in the direction asked for, velocity asked for
-        self._steps = torch.zeros((), device=device)
+        # Views of one block, so that a new window is one launch.
+        self._window = torch.zeros(7, device=device)
+        self._sums = self._window[:6].view(2, 3)  # velocity reached in the direction asked for, velocity asked for
+        self._steps = self._window[6]
+        self._zero = torch.zeros((), device=device)
         self.reset()
 
     def reset(self) -> None:
         """Go back to the ranges that training starts with."""
         self.share.fill_(self.cfg.start if self.cfg.enabled else 1.0)
-        self._sums.zero_()
-        self._steps.zero_()
+        self._window.zero_()
 
     def write_ranges(self, ranges: Tensor) -> None:
         """Put the lowest and highest command of each axis now into `ranges` (3, 2)."""
@@ -43,15 +46,14 @@ class CommandCurriculum:
         if not self.cfg.enabled:
             return
         size = commands.abs()
-        asked = (size > 0.5 * self._full_limit * self.share) & valid.unsqueeze(1)
+        asked = (size > self._half_limit * self.share) & valid.unsqueeze(1)
         reached = torch.stack([velocity * commands.sign(), size])
-        self._sums.add_(torch.where(asked, reached, 0.0).sum(dim=1))
+        self._sums.add_(torch.where(asked, reached, self._zero).sum(dim=1))
         self._steps.add_(1.0)
         due = self._steps >= self.window_steps
         followed = (self._sums[0] > self.cfg.threshold * self._sums[1]) & due
         self.share.add_(followed, alpha=self.cfg.step).clamp_(max=1.0)
-        self._sums.masked_fill_(due, 0.0)
-        self._steps.masked_fill_(due, 0.0)
+        self._window.masked_fill_(due, 0.0)
 
     def metrics(self) -> dict[str, Tensor]:
         """Return the widest command of each axis now, fresh 0-dimensional tensors."""

@@ -59,7 +59,7 @@ class Commands:
     def update(self, reset: Tensor, base_quat: Tensor) -> None:
         """Take the drawn command where an episode begins or the time is up, then steer towards the headings."""
         self.time_left.sub_(self.dt)
-        due = (reset | (self.time_left <= 0.5 * self.dt)) & ~self.held
+        due = (reset | (self.time_left <= 0.5 * self.dt)) > self.held  # the one and not the other
         masked_set_(self.commands, due, self._sample)
         masked_set_(self.standing, due, self._sample_standing)
         masked_set_(self.time_left, due, self.cfg.resampling_time_s)

@@ -32,9 +32,9 @@ class FeetContacts:
         touching = feet_forces[:, :, 2] > CONTACT_FORCE
         torch.logical_or(touching, self._touching, out=self.in_contact)
         self._touching.copy_(touching)
-        self.first_contact.copy_((self.air_time > 0.0) & self.in_contact)
+        torch.logical_and(self.air_time, self.in_contact, out=self.first_contact)  # it was in the air: a time above 0
         self.air_time.add_(self.dt)
-        self.last_air_time.copy_(torch.where(self.first_contact, self.air_time, self.last_air_time))
+        torch.where(self.first_contact, self.air_time, self.last_air_time, out=self.last_air_time)
         self.air_time.masked_fill_(self.in_contact, 0.0)
 
     def reset(self, mask: Tensor) -> None:

@@ -41,14 +41,14 @@ class Control:
         self._lowest_torques = -self.torque_limits
         self.torques = torques
         """(N, D) torques of the last physics step [N m]."""
+        self._zero = torch.zeros((), device=torques.device)
         self._target = torch.zeros_like(self.torques)  # joint angles, velocities or torques
         self._last_dof_vel = torch.zeros_like(self.torques)
 
     def set_actions(self, actions: Tensor) -> None:
         """Take the actions (N, D) that the following calls of `compute` realise."""
-        torch.mul(actions, self.action_scale, out=self._target)
-        if self.control_type == "P":
-            self._target.add_(self.default_dof_pos)
+        middle = self.default_dof_pos if self.control_type == "P" else self._zero
+        torch.add(middle, actions, alpha=self.action_scale, out=self._target)
 
     def compute(self, dof_pos: Tensor, dof_vel: Tensor) -> Tensor:
         """Compute torques (N, D) [N m] at joint angles [rad] and velocities [rad/s], each (N, D), for one physics step."""

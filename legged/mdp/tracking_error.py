@@ -1,6 +1,7 @@
 """How far robots are from the velocities that they are asked for, squared."""
 
 from torch import Tensor
+from torch.nn.functional import mse_loss
 
 
 def velocity_error(commands: Tensor, base_lin_vel: Tensor) -> Tensor:
@@ -9,7 +10,7 @@ def velocity_error(commands: Tensor, base_lin_vel: Tensor) -> Tensor:
     `commands` (N, 3 or more) are vx, vy [m/s] and yaw rate [rad/s], `base_lin_vel` (N, 3) is the base's velocity [m/s], both
     in the base frame.
     """
-    return (commands[:, :2] - base_lin_vel[:, :2]).square().sum(dim=1)
+    return mse_loss(commands[:, :2], base_lin_vel[:, :2], reduction="none").sum(dim=1)
 
 
 def yaw_rate_error(commands: Tensor, base_ang_vel: Tensor) -> Tensor:
@@ -17,4 +18,4 @@ def yaw_rate_error(commands: Tensor, base_ang_vel: Tensor) -> Tensor:
 
     `commands` are as above, `base_ang_vel` (N, 3) is the base's angular velocity, base frame [rad/s].
     """
-    return (commands[:, 2] - base_ang_vel[:, 2]).square()
+    return mse_loss(commands[:, 2], base_ang_vel[:, 2], reduction="none")

@@ -214,7 +214,9 @@ def test_a_flush_starts_anew_and_its_tensors_are_fresh():
     assert (first["rew_walk"].item(), second["rew_walk"].item()) == (pytest.approx(0.2), pytest.approx(0.45))
     assert all(value.shape == () for value in first.values())
     addresses = [value.untyped_storage().data_ptr() for log in (first, second) for value in log.values()]
-    assert not {metrics._steps.data_ptr(), metrics._episodes.data_ptr()} & set(addresses)
+    kept = {value.data_ptr() for value in vars(metrics).values() if isinstance(value, torch.Tensor)}
+    assert kept
+    assert not kept & set(addresses)
 
 
 # ---- terminations ----------------------------------------------------------------------------------------------------
@@ -226,7 +228,7 @@ def test_failures_and_time_outs_are_told_apart_and_a_failure_is_no_time_out():
     left = mask(False, True, False, True, False, False)
     terminations = Terminations({"fell": lambda: fell}, {"left": lambda: left}, failed, timed_out, ended)
     broken, over = mask(False, False, True, False, False, False), mask(True, False, True, False, True, False)
-    terminations.evaluate(broken, over)
+    terminations.evaluate(~broken, over)
     assert failed.tolist() == [True, False, True, True, False, False]
     assert timed_out.tolist() == [False, True, False, False, True, False]
     assert ended.tolist() == [True, True, True, True, True, False]
@@ -238,7 +240,7 @@ def test_failures_and_time_outs_are_told_apart_and_a_failure_is_no_time_out():
 def test_a_termination_that_gives_something_else_is_refused_by_name(value):
     buffers = (torch.zeros(2, dtype=torch.bool) for _ in range(3))
     with pytest.raises(TermError, match=r"_terminate_mine: must return a tensor \(2,\) of bool, got"):
-        Terminations({"mine": lambda: value}, {}, *buffers).evaluate(mask(False, False), mask(False, False))
+        Terminations({"mine": lambda: value}, {}, *buffers).evaluate(mask(True, True), mask(False, False))
 
 
 # ---- randomization ---------------------------------------------------------------------------------------------------
