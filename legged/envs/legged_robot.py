@@ -11,7 +11,7 @@ from legged.envs.base_task import BaseTask
 from legged.envs.legged_checks import check_legged
 from legged.envs.overrides import check_overrides
 from legged.envs.terms import Terms
-from legged.math import quat_rotate
+from legged.math import evenly_spaced, quat_rotate
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts
@@ -81,6 +81,7 @@ class LeggedRobot(Terms, BaseTask):
         """Allocate what follows from the robot, its commands and its ground."""
         super()._init_buffers()
         cfg, robot, n, device = self.cfg, self.robot, self.num_envs, self.device
+        kernels = self.physics.kernels
         state = self.physics.robot_state
         assert state is not None
         self.base_pos, self.base_quat = state.base_pos, state.base_quat
@@ -91,27 +92,29 @@ class LeggedRobot(Terms, BaseTask):
         self.contact_forces = state.contact_forces
         self.last_dof_vel = torch.zeros_like(self.dof_vel)
 
-        self.pushes = Pushes(cfg.domain_rand, n, self.dt, device)
-        self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt)
+        self.pushes = Pushes(cfg.domain_rand, n, self.dt, device, kernels)
+        self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt, kernels)
         self.torques, self.default_dof_pos = self.control.torques, self.control.default_dof_pos
-        self.command_sampler = Commands(cfg.commands, n, self.dt, device)
+        self.command_sampler = Commands(cfg.commands, n, self.dt, device, kernels)
         self.commands, self.is_moving = self.command_sampler.commands, self.command_sampler.is_moving
-        self.contacts = FeetContacts(n, len(robot.feet_indices), self.dt, device)
+        self.contacts = FeetContacts(n, len(robot.feet_indices), self.dt, device, kernels)
         full_ranges = self.command_sampler.full_ranges
-        self.command_curriculum = CommandCurriculum(cfg.commands.curriculum, full_ranges, self.dt)
+        self.command_curriculum = CommandCurriculum(cfg.commands.curriculum, full_ranges, self.dt, kernels)
 
         self.feet_indices = torch.tensor(robot.feet_indices, device=device)
+        self._feet_shapes = evenly_spaced(robot.feet_indices) or self.feet_indices
         self.penalised_indices = torch.tensor(robot.penalised_indices, dtype=torch.long, device=device)
         self.termination_indices = torch.tensor(robot.termination_indices, dtype=torch.long, device=device)
+        self._terminating_shapes = evenly_spaced(robot.termination_indices) or self.termination_indices
         self.dof_vel_limits = torch.tensor(robot.dof_vel_limits, dtype=torch.float32, device=device)
         self.dof_pos_limits = self._soft_limits(robot)
-        self.height_scan = HeightScan(cfg.terrain, self.terrain, n, device)
+        self.height_scan = HeightScan(cfg.terrain, self.terrain, n, device, kernels)
         self.measured_heights = self.height_scan.heights
         self.terrain_curriculum: TerrainCurriculum | None = None
         self.env_origins = torch.zeros(n, 3, device=device)
         """(N, 3) where each robot starts, world frame [m]."""
         if self.terrain is not None:
-            self.terrain_curriculum = TerrainCurriculum(cfg.terrain, self.terrain, n, device)
+            self.terrain_curriculum = TerrainCurriculum(cfg.terrain, self.terrain, n, device, kernels)
             self.env_origins = self.terrain_curriculum.origins
         self._spawn_offset = torch.zeros(n, 3, device=device)
         self._spawn_offset[:, 2] = robot.file.spawn_height
@@ -189,15 +192,12 @@ class LeggedRobot(Terms, BaseTask):
 
     def advance(self) -> None:
         super().advance()
-        self.contacts.update(self.contact_forces[:, self.feet_indices])
+        self.contacts.update(self.contact_forces[:, self._feet_shapes])
 
-    def measure(self) -> None:
-        super().measure()
+    def update_curricula(self) -> None:
         velocity = torch.cat([self.base_lin_vel[:, :2], self.base_ang_vel[:, 2:]], dim=1)
         self.command_curriculum.update(self.commands[:, :3], velocity, self.valid)
         self.command_curriculum.write_ranges(self.command_sampler.ranges)
-
-    def update_curricula(self) -> None:
         if self.terrain_curriculum is not None:
             asked = self.commands[:, :2].norm(dim=1) * self.cfg.env.episode_length_s
             self.terrain_curriculum.update(self.reset_buf & self.valid, self.base_pos, asked)

@@ -73,6 +73,10 @@ class Terms:
     contact_forces: Tensor
     """(N, B, 3) in the world [N]; `feet_indices` and `penalised_indices` pick among the shapes."""
     feet_indices: Tensor
+    _feet_shapes: slice | Tensor
+    """The feet among the shapes, and below the shapes that must not touch anything: a slice where they are evenly spaced,
+    which costs no launch."""
+    _terminating_shapes: slice | Tensor
     penalised_indices: Tensor
     contacts: FeetContacts
     """Contact and swing times of the feet."""
@@ -223,7 +227,7 @@ class Terms:
 
     def _terminate_contact(self) -> Tensor:
         """A shape of the robot's `terminate_after_contacts_on` feels a force."""
-        return (self.contact_forces[:, self.termination_indices].norm(dim=2) > TERMINATION_FORCE).any(dim=1)
+        return (self.contact_forces[:, self._terminating_shapes].norm(dim=2) > TERMINATION_FORCE).any(dim=1)
 
     def _terminate_base_height(self) -> Tensor:
         """The base is too close to the ground under it."""

@@ -1,9 +1,14 @@
 """The command curriculum: ranges widen while robots follow."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
 from legged.config.schema import CommandCurriculumConfig
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
 
 
 class CommandCurriculum:
@@ -16,9 +21,11 @@ class CommandCurriculum:
 
     STATE = ("share", "_sums", "_steps")
 
-    def __init__(self, cfg: CommandCurriculumConfig, full_ranges: Tensor, dt: float) -> None:
+    def __init__(
+        self, cfg: CommandCurriculumConfig, full_ranges: Tensor, dt: float, kernels: "TaskKernels | None" = None
+    ) -> None:
         """Widen up to `full_ranges` (3, 2); `dt` is the control step [s]."""
-        self.cfg, self.full_ranges = cfg, full_ranges.clone()
+        self.cfg, self.full_ranges, self._kernels = cfg, full_ranges.clone(), kernels
         self._full_limit = full_ranges.abs().amax(dim=1)
         self._half_limit = 0.5 * self._full_limit
         self.window_steps = max(1, round(cfg.window_s / dt))
@@ -44,6 +51,12 @@ class CommandCurriculum:
     def update(self, commands: Tensor, velocity: Tensor, valid: Tensor) -> None:
         """Judge one step: commands and velocities (N, 3) as vx, vy, yaw rate; `valid` (N,) robots that count."""
         if not self.cfg.enabled:
+            return
+        if self._kernels is not None:
+            reached = torch.empty(2, *commands.shape, device=commands.device)
+            self._kernels.follow_commands(commands, velocity, valid, self._half_limit, self.share, reached)
+            rule = (float(self.window_steps), self.cfg.threshold, self.cfg.step)
+            self._kernels.widen_commands(reached.sum(dim=1), *rule, self._sums, self._steps.view(1), self.share)
             return
         size = commands.abs()
         asked = (size > self._half_limit * self.share) & valid.unsqueeze(1)

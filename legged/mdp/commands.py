@@ -1,10 +1,15 @@
 """Velocity commands: sampling, holding, heading mode."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
 from legged.config.schema import CommandsConfig
 from legged.math import masked_set_, uniform, wrap_to_pi, yaw_of
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
 
 MOVING = 0.1
 """Norm of (vx, vy, yaw rate) above which a robot is asked to move."""
@@ -17,9 +22,11 @@ class Commands:
 
     STATE = ("commands", "is_moving", "ranges", "time_left", "held", "steered", "standing")
 
-    def __init__(self, cfg: CommandsConfig, num_envs: int, dt: float, device: torch.device) -> None:
+    def __init__(
+        self, cfg: CommandsConfig, num_envs: int, dt: float, device: torch.device, kernels: "TaskKernels | None" = None
+    ) -> None:
         """Start all commands at zero, due to be sampled at the first update; `dt` is the control step [s]."""
-        self.cfg, self.dt = cfg, dt
+        self.cfg, self.dt, self._kernels = cfg, dt, kernels
         ranges = (cfg.ranges.lin_vel_x, cfg.ranges.lin_vel_y, cfg.ranges.ang_vel_yaw)
         self.full_ranges = torch.tensor(ranges, device=device)
         self.ranges = self.full_ranges.clone()
@@ -58,6 +65,9 @@ class Commands:
 
     def update(self, reset: Tensor, base_quat: Tensor) -> None:
         """Take the drawn command where an episode begins or the time is up, then steer towards the headings."""
+        if self._kernels is not None:
+            self._update_in_one_launch(reset, base_quat)
+            return
         self.time_left.sub_(self.dt)
         due = (reset | (self.time_left <= 0.5 * self.dt)) > self.held  # the one and not the other
         masked_set_(self.commands, due, self._sample)
@@ -69,6 +79,15 @@ class Commands:
             steered = self.steered & ~self.standing
             self.commands[:, 2].copy_(torch.where(steered, (HEADING_GAIN * error).clamp(low, high), self.commands[:, 2]))
         torch.gt(self.commands[:, :3].norm(dim=1), MOVING, out=self.is_moving)
+
+    def _update_in_one_launch(self, reset: Tensor, base_quat: Tensor) -> None:
+        assert self._kernels is not None
+        masks = (reset, self.held, self.steered)
+        drawn = (self._sample, self._sample_standing)
+        times = (self.dt, 0.5 * self.dt, self.cfg.resampling_time_s)
+        steering = (HEADING_GAIN if self.cfg.heading_command else 0.0, *self.cfg.ranges.ang_vel_yaw)
+        written = (self.commands, self.standing, self.time_left, self.is_moving)
+        self._kernels.renew_commands(*masks, *drawn, base_quat, *times, *steering, MOVING, *written)
 
     def hold(self, commands: Tensor, heading: Tensor | None = None) -> None:
         """Give all robots fixed commands, (N, 3) or one (3,) for all, which are not sampled any more. With `heading` (N,)

@@ -1,6 +1,7 @@
 """Action -> joint torque."""
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -9,6 +10,9 @@ from torch import Tensor
 from legged.config.schema import LeggedControlConfig
 from legged.math import masked_set_
 from legged.robots.robot import Robot
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
 
 
 class Control:
@@ -21,7 +25,14 @@ class Control:
 
     STATE = ("_last_dof_vel",)
 
-    def __init__(self, robot: Robot, cfg: LeggedControlConfig, torques: Tensor, sim_dt: float) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        cfg: LeggedControlConfig,
+        torques: Tensor,
+        sim_dt: float,
+        kernels: "TaskKernels | None" = None,
+    ) -> None:
         """Write torques to `torques` (N, D), the physics' own tensor, which takes their device along. Gains come
         from `cfg` if it names any, else from the robot.
 
@@ -33,6 +44,7 @@ class Control:
             return torch.as_tensor(values, dtype=torch.float32, device=torques.device)
 
         self.control_type, self.action_scale, self.sim_dt = cfg.control_type, cfg.action_scale, sim_dt
+        self._kernels = kernels
         stiffness, damping = control_gains(robot, cfg)
         self.stiffness, self.damping = tensor(stiffness), tensor(damping)
         """(D,) gains [N m/rad], [N m s/rad]."""
@@ -52,6 +64,11 @@ class Control:
 
     def compute(self, dof_pos: Tensor, dof_vel: Tensor) -> Tensor:
         """Compute torques (N, D) [N m] at joint angles [rad] and velocities [rad/s], each (N, D), for one physics step."""
+        if self.control_type == "P" and self._kernels is not None:
+            gains = (self.stiffness, self.damping, self.torque_limits)
+            shape = tuple(self.torques.shape)
+            self._kernels.hold_joints(shape, self._target, dof_pos, dof_vel, *gains, self.torques)
+            return self.torques
         if self.control_type == "P":
             torques = torch.addcmul(self.stiffness * (self._target - dof_pos), self.damping, dof_vel, value=-1.0)
         elif self.control_type == "V":

@@ -1,6 +1,7 @@
 """What differs from world to world, and pushes."""
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -8,6 +9,9 @@ from torch import Tensor
 from legged.config.schema import LeggedDomainRandConfig
 from legged.math import masked_set_, uniform
 from legged.physics import Physics
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
 
 
 class Randomization:
@@ -70,12 +74,21 @@ class Pushes:
 
     STATE = ("push_time_left",)
 
-    def __init__(self, cfg: LeggedDomainRandConfig, num_envs: int, dt: float, device: torch.device) -> None:
+    def __init__(
+        self,
+        cfg: LeggedDomainRandConfig,
+        num_envs: int,
+        dt: float,
+        device: torch.device,
+        kernels: "TaskKernels | None" = None,
+    ) -> None:
         """Spread the first pushes over a whole interval; `dt` is the control step [s]."""
-        self.cfg, self.dt = cfg, dt
+        self.cfg, self.dt, self._kernels = cfg, dt, kernels
         self.push_time_left = uniform(0.0, cfg.push_interval_s, (num_envs,), device)
         """(N,) time until the next push [s]."""
         self._push_velocity = torch.zeros(num_envs, 2, device=device)
+        self._due = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self._delta = torch.zeros_like(self._push_velocity)
 
     def draw(self) -> None:
         """Draw a push for every robot, for those that `push` finds due."""
@@ -85,6 +98,12 @@ class Pushes:
     def push(self, physics: Physics, mask: Tensor) -> None:
         """Set the base's horizontal velocity, world frame, of the robots in `mask` (N,) that are due."""
         if not self.cfg.push_robots:
+            return
+        if self._kernels is not None:
+            times = (self.dt, 0.5 * self.dt, self.cfg.push_interval_s)
+            found = (self.push_time_left, self._due, self._delta)
+            self._kernels.find_pushes(mask, self._push_velocity, physics.qvel, *times, *found)
+            physics.push(self._due, self._delta)
             return
         self.push_time_left.sub_(self.dt)
         due = (self.push_time_left <= 0.5 * self.dt) & mask
