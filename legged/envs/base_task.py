@@ -148,11 +148,11 @@ class BaseTask(SavedTask, VecEnv):
 
     def _collect_terms(self) -> None:
         """Find the terms that the configuration names."""
-        cfg, device = self.cfg, self.device
+        cfg, device, kernels = self.cfg, self.device, self.physics.kernels
         scales = {name: scale for name, scale in cfg.rewards.scales.items() if scale != 0.0}
         unit = self.dt if cfg.rewards.times_dt else 1.0
         self.rewards = Rewards(
-            self._methods("_reward_", scales), scales, unit, cfg.rewards.only_positive_rewards, self.rew_buf
+            self._methods("_reward_", scales), scales, unit, cfg.rewards.only_positive_rewards, self.rew_buf, kernels
         )
         self.episode_sums = self.rewards.episode_sums
         failures, time_outs = self.active_terminations()
