@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import torch
 from torch import Tensor
+from torch.nn.functional import mse_loss
 
 
 def quat_rotate(quat: Tensor, vec: Tensor) -> Tensor:
@@ -58,6 +59,11 @@ def masked_set_(target: Tensor, mask: Tensor, value: Tensor | float) -> None:
         torch.where(rows, value, target, out=target)
     else:
         target.masked_fill_(rows, value)
+
+
+def squared_difference(a: Tensor, b: Tensor) -> Tensor:
+    """(a - b)^2 of two tensors of one shape, in one launch."""
+    return mse_loss(a, b, reduction="none")
 
 
 def evenly_spaced(indices: Sequence[int]) -> slice | None:

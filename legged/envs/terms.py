@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from legged.config.schema import LeggedConfig
+from legged.math import squared_difference
 from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
 from legged.mdp.height_scan import HeightScan
@@ -167,11 +168,11 @@ class Terms:
 
     def _reward_dof_acc(self) -> Tensor:
         """Squared joint accelerations over a control step [rad^2/s^4]."""
-        return ((self.last_dof_vel - self.dof_vel) / self.dt).square().sum(dim=1)
+        return squared_difference(self.last_dof_vel, self.dof_vel).sum(dim=1) / self.dt**2
 
     def _reward_action_rate(self) -> Tensor:
         """Squared change of the actions."""
-        return (self.last_actions - self.actions).square().sum(dim=1)
+        return squared_difference(self.last_actions, self.actions).sum(dim=1)
 
     def _reward_collision(self) -> Tensor:
         """Number of penalised shapes that touch something."""

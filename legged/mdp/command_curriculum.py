@@ -48,16 +48,19 @@ class CommandCurriculum:
         """Put the lowest and highest command of each axis now into `ranges` (3, 2)."""
         torch.mul(self.full_ranges, self.share.unsqueeze(1), out=ranges)
 
-    def update(self, commands: Tensor, velocity: Tensor, valid: Tensor) -> None:
-        """Judge one step: commands and velocities (N, 3) as vx, vy, yaw rate; `valid` (N,) robots that count."""
+    def update(self, commands: Tensor, lin_vel: Tensor, ang_vel: Tensor, valid: Tensor) -> None:
+        """Judge one step: commands (N, 3) as vx, vy, yaw rate, velocities (N, 3) in the base frame; `valid` (N,) robots that
+        count.
+        """
         if not self.cfg.enabled:
             return
         if self._kernels is not None:
             reached = torch.empty(2, *commands.shape, device=commands.device)
-            self._kernels.follow_commands(commands, velocity, valid, self._half_limit, self.share, reached)
+            self._kernels.follow_commands(commands, lin_vel, ang_vel, valid, self._half_limit, self.share, reached)
             rule = (float(self.window_steps), self.cfg.threshold, self.cfg.step)
             self._kernels.widen_commands(reached.sum(dim=1), *rule, self._sums, self._steps.view(1), self.share)
             return
+        velocity = torch.cat([lin_vel[:, :2], ang_vel[:, 2:]], dim=1)
         size = commands.abs()
         asked = (size > self._half_limit * self.share) & valid.unsqueeze(1)
         reached = torch.stack([velocity * commands.sign(), size])

@@ -6,13 +6,16 @@ import torch
 from torch import Tensor
 
 from legged.config.schema import CommandsConfig
-from legged.math import masked_set_, uniform, wrap_to_pi, yaw_of
+from legged.math import masked_set_, wrap_to_pi, yaw_of
+from legged.mdp.uniform_numbers import UniformNumbers
 
 if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
 
 MOVING = 0.1
 """Norm of (vx, vy, yaw rate) above which a robot is asked to move."""
+STANDING = 4
+"""The last kind of command."""
 HEADING_GAIN = 0.5
 """Yaw rate per heading error in heading mode [1/s]."""
 
@@ -23,7 +26,13 @@ class Commands:
     STATE = ("commands", "is_moving", "ranges", "time_left", "held", "steered", "standing")
 
     def __init__(
-        self, cfg: CommandsConfig, num_envs: int, dt: float, device: torch.device, kernels: "TaskKernels | None" = None
+        self,
+        cfg: CommandsConfig,
+        num_envs: int,
+        dt: float,
+        device: torch.device,
+        kernels: "TaskKernels | None" = None,
+        numbers: UniformNumbers | None = None,
     ) -> None:
         """Start all commands at zero, due to be sampled at the first update; `dt` is the control step [s]."""
         self.cfg, self.dt, self._kernels = cfg, dt, kernels
@@ -45,23 +54,26 @@ class Commands:
         """(N,) robots that are asked to stand still, also in heading mode."""
         self._sample = torch.zeros(num_envs, 4, device=device)
         self._sample_standing = torch.zeros_like(self.standing)
+        self.numbers = numbers or UniformNumbers(num_envs, device)
+        self._velocity = self.numbers.between(0.0, 1.0, 3)
+        self._heading = self.numbers.between(*cfg.ranges.heading, 1)
+        self._chance = self.numbers.between(0.0, 1.0, 1)
+        # Kinds of commands: one axis only, of three, which a cube of random commands hardly contains; all axes; none.
+        single, standing = cfg.single_axis_share * (1.0 - cfg.standing_share) / 3.0, cfg.standing_share
+        self._up_to = torch.tensor([single, 2.0 * single, 3.0 * single, 1.0 - standing], device=device)
+        kept = torch.cat([torch.eye(3), torch.ones(1, 3), torch.zeros(1, 3)])
+        self._kept = torch.cat([kept, torch.ones(5, 1)], dim=1).to(device)  # a heading is kept by all kinds
 
     def draw(self) -> None:
-        """Draw a new command for every robot, for those that `update` finds due."""
-        cfg, device, n = self.cfg, self.commands.device, len(self.commands)
+        """Make a new command for every robot, for those that `update` finds due, of numbers just drawn."""
         low, high = self.ranges[:, 0], self.ranges[:, 1]
-        velocity = torch.addcmul(low, high - low, torch.rand(n, 3, device=device))
-        # One axis only, for a share of the robots: the cases a cube of random commands hardly contains.
-        axis = torch.randint(3, (n, 1), device=device)
-        chance = torch.rand(n, 2, device=device)
-        other = torch.arange(3, device=device) != axis
-        velocity = velocity.masked_fill((chance[:, :1] < cfg.single_axis_share) & other, 0.0)
-        small = velocity[:, :2].norm(dim=1, keepdim=True) < cfg.small_command
-        standing = chance[:, 1:] < cfg.standing_share
-        self._sample[:, :2].copy_(velocity[:, :2].masked_fill(small | standing, 0.0))
-        self._sample[:, 2:3].copy_(velocity[:, 2:].masked_fill(standing, 0.0))
-        self._sample_standing.copy_(standing[:, 0])
-        self._sample[:, 3].copy_(uniform(*cfg.ranges.heading, (n,), device))
+        torch.addcmul(low, high - low, self._velocity.values, out=self._sample[:, :3])
+        self._sample[:, 3:].copy_(self._heading.values)
+        kind = (self._chance.values >= self._up_to).sum(dim=1)
+        self._sample.mul_(self._kept.index_select(0, kind))
+        horizontal = self._sample[:, :2]
+        horizontal.masked_fill_(horizontal.norm(dim=1, keepdim=True) < self.cfg.small_command, 0.0)
+        torch.eq(kind, STANDING, out=self._sample_standing)
 
     def update(self, reset: Tensor, base_quat: Tensor) -> None:
         """Take the drawn command where an episode begins or the time is up, then steer towards the headings."""

@@ -1,7 +1,8 @@
 """How far robots are from the velocities that they are asked for, squared."""
 
 from torch import Tensor
-from torch.nn.functional import mse_loss
+
+from legged.math import squared_difference
 
 
 def velocity_error(commands: Tensor, base_lin_vel: Tensor) -> Tensor:
@@ -10,7 +11,7 @@ def velocity_error(commands: Tensor, base_lin_vel: Tensor) -> Tensor:
     `commands` (N, 3 or more) are vx, vy [m/s] and yaw rate [rad/s], `base_lin_vel` (N, 3) is the base's velocity [m/s], both
     in the base frame.
     """
-    return mse_loss(commands[:, :2], base_lin_vel[:, :2], reduction="none").sum(dim=1)
+    return squared_difference(commands[:, :2], base_lin_vel[:, :2]).sum(dim=1)
 
 
 def yaw_rate_error(commands: Tensor, base_ang_vel: Tensor) -> Tensor:
@@ -18,4 +19,4 @@ def yaw_rate_error(commands: Tensor, base_ang_vel: Tensor) -> Tensor:
 
     `commands` are as above, `base_ang_vel` (N, 3) is the base's angular velocity, base frame [rad/s].
     """
-    return mse_loss(commands[:, 2], base_ang_vel[:, 2], reduction="none")
+    return squared_difference(commands[:, 2], base_ang_vel[:, 2])

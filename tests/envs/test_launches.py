@@ -7,7 +7,7 @@ from launches import counting
 from legged.registry import make_task, task_config
 
 
-@pytest.mark.parametrize(("name", "most"), [("anymal_c_flat", 145), ("anymal_c", 160)])
+@pytest.mark.parametrize(("name", "most"), [("anymal_c_flat", 120), ("anymal_c", 136)])
 def test_a_step_is_few_launches(name, most):
     small = [("env.num_envs", 2), ("sim.physics", "mujoco_warp")]
     task = make_task(task_config(name, small), "cpu")

@@ -64,7 +64,7 @@ def test_the_buffer_is_rewritten_in_place():
 
 def test_noise_is_uniform_centred_of_the_stated_half_width_before_scaling_and_new_at_every_draw():
     found = group(noise={"a": 0.1, "c": 0.5}, num_envs=20_000)
-    found.draw()
+    found.numbers.draw()
     found.compute()
     first = found.buffer.clone()
     noise = first - torch.tensor([2.0, 4.0, -3.0, 1.0, 4.0, 9.0])
@@ -73,14 +73,14 @@ def test_noise_is_uniform_centred_of_the_stated_half_width_before_scaling_and_ne
     assert torch.allclose(noise.abs().amax(dim=0), half, rtol=0.01, atol=1e-6)
     assert torch.allclose(noise.mean(dim=0), torch.zeros(6), atol=0.004)
     assert torch.allclose(noise.std(dim=0), half / math.sqrt(3.0), rtol=0.02, atol=1e-6)
-    found.draw()
+    found.numbers.draw()
     found.compute()
     assert not torch.equal(found.buffer[:, 0], first[:, 0])
 
 
 def test_a_group_without_noise_is_exact():
     found = group()
-    found.draw()
+    found.numbers.draw()
     found.compute()
     assert torch.equal(found.buffer[0], torch.tensor([1.0, 2.0, -3.0, 10.0, 20.0, 30.0]) * found._scale)
 
@@ -321,7 +321,7 @@ def push_steps(pushes: Pushes, physics: FakePhysics, steps: int, allowed: torch.
     """Steps at which each robot is pushed."""
     found: list[list[int]] = [[] for _ in range(len(allowed))]
     for step in range(1, steps + 1):
-        pushes.draw()
+        pushes.numbers.draw()
         pushes.push(physics, allowed)
         for robot in physics.due.nonzero().flatten().tolist():
             found[robot].append(step)
@@ -344,7 +344,7 @@ def test_each_robot_is_pushed_at_its_own_moments_exactly_one_interval_apart(inte
 def test_a_push_sets_the_horizontal_velocity_inside_its_range():
     pushes, physics = Pushes(LeggedDomainRandConfig(max_push_vel_xy=0.8), 2000, DT, CPU), FakePhysics(2000)
     pushes.push_time_left.fill_(0.0)
-    pushes.draw()
+    pushes.numbers.draw()
     pushes.push(physics, torch.ones(2000, dtype=torch.bool))
     assert physics.due.all()
     velocity = physics.change + physics.qvel[:, :2]

@@ -19,6 +19,7 @@ from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
 from legged.mdp.height_scan import HeightScan
 from legged.mdp.randomization import Pushes
+from legged.mdp.rewards import Rewards
 from legged.mdp.terrain_curriculum import TerrainCurriculum
 from legged.physics.warp.task_kernels import TaskKernels
 from legged.robots.robot import load_robot
@@ -82,6 +83,7 @@ def test_commands_are_renewed_and_steered_alike(heading):
         reset = chance(0.1, N)
         for part in parts:
             torch.manual_seed(step)
+            part.numbers.draw()
             part.draw()
             part.held.copy_(torch.arange(N) % 7 == 0)
             part.steered.copy_(torch.arange(N) % 5 > 0)
@@ -103,7 +105,7 @@ def test_command_ranges_widen_alike():
         velocity, valid = commands * (0.6 + 0.4 * torch.rand(N, 3)), chance(0.9, N)
         velocity[~valid] = torch.nan
         for part in parts:
-            part.update(commands, velocity, valid)
+            part.update(commands, velocity, 2.0 * velocity, valid)
         assert_same(parts)
         seen.add(tuple(parts[0].share.tolist()))
     assert len(seen) > 3
@@ -157,8 +159,27 @@ def test_robots_are_pushed_alike():
         mask = chance(0.9, N)
         for part, world in zip(parts, worlds, strict=True):
             torch.manual_seed(step)
-            part.draw()
+            part.numbers.draw()
             part.push(world, mask)
         assert_same(parts)
         assert worlds[0].qvel.equal(worlds[1].qvel)
     assert worlds[0].qvel.unique().numel() > N
+
+
+@pytest.mark.parametrize("only_positive", [False, True])
+def test_rewards_are_added_alike(only_positive):
+    terms = torch.zeros(4, N)
+    functions = {name: lambda i=i: terms[i] for i, name in enumerate(("walk", "rest", "termination", "broken"))}
+    scales = {"walk": 1.0, "rest": -2.0, "termination": -50.0, "broken": 3.0}
+    parts = pair(lambda kernels: Rewards(functions, scales, DT, only_positive, torch.zeros(N), kernels))
+    for _ in range(5):
+        terms.copy_(torch.randn(4, N))
+        terms[3, :4] = torch.tensor([torch.nan, torch.inf, 1e12, -torch.inf])
+        valid = chance(0.8, N)
+        for part in parts:
+            part.compute(valid)
+        assert_same(parts)
+        assert parts[0].fine.equal(parts[1].fine)
+        assert parts[0].last.equal(parts[1].last)
+        torch.testing.assert_close(parts[0].total, parts[1].total, rtol=1e-6, atol=1e-6)
+    assert not parts[0].fine[3, :4].any()

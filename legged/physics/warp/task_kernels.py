@@ -129,7 +129,8 @@ def find_pushes(
 @wp.kernel
 def follow_commands(
     commands: wp.array2d[float],
-    velocity: wp.array2d[float],
+    lin_vel: wp.array2d[float],
+    ang_vel: wp.array2d[float],
     valid: wp.array[wp.bool],
     half_limit: wp.array[float],
     share: wp.array[float],
@@ -140,7 +141,10 @@ def follow_commands(
     command = commands[robot, axis]
     size = wp.abs(command)
     if size > half_limit[axis] * share[axis] and valid[robot]:
-        reached[0, robot, axis] = velocity[robot, axis] * wp.sign(command)
+        velocity = lin_vel[robot, axis]
+        if axis == 2:
+            velocity = ang_vel[robot, axis]
+        reached[0, robot, axis] = velocity * wp.sign(command)
         reached[1, robot, axis] = size
     else:
         reached[0, robot, axis] = 0.0
