@@ -1,7 +1,11 @@
 """Quaternions (w, x, y, z) and in-place helpers, batched over the first dimension and free of host synchronisation."""
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import torch
 from torch import Tensor
+from torch.nn.functional import mse_loss
 
 
 def quat_rotate(quat: Tensor, vec: Tensor) -> Tensor:
@@ -55,3 +59,15 @@ def masked_set_(target: Tensor, mask: Tensor, value: Tensor | float) -> None:
         torch.where(rows, value, target, out=target)
     else:
         target.masked_fill_(rows, value)
+
+
+def squared_difference(a: Tensor, b: Tensor) -> Tensor:
+    """(a - b)^2 of two tensors of one shape, in one launch."""
+    return mse_loss(a, b, reduction="none")
+
+
+def evenly_spaced(indices: Sequence[int]) -> slice | None:
+    """Return the slice that picks `indices`, if they rise in equal steps: a slice is a view and costs no launch."""
+    steps = {after - before for before, after in pairwise(indices)} or {1}
+    step = min(steps)
+    return slice(indices[0], indices[-1] + 1, step) if indices and len(steps) == 1 and step > 0 else None

@@ -11,7 +11,7 @@ from legged.envs.base_task import BaseTask
 from legged.envs.legged_checks import check_legged
 from legged.envs.overrides import check_overrides
 from legged.envs.terms import Terms
-from legged.math import quat_rotate
+from legged.math import evenly_spaced, quat_rotate
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts
@@ -86,6 +86,7 @@ class LeggedRobot(Terms, BaseTask):
         """Allocate what follows from the robot, its commands and its ground."""
         super()._init_buffers()
         cfg, robot, n, device = self.cfg, self.robot, self.num_envs, self.device
+        kernels = self.physics.kernels
         state = self.physics.robot_state
         assert state is not None
         self.base_pos, self.base_quat = state.base_pos, state.base_quat
@@ -96,33 +97,37 @@ class LeggedRobot(Terms, BaseTask):
         self.contact_forces = state.contact_forces
         self.last_dof_vel = torch.zeros_like(self.dof_vel)
 
-        self.pushes = Pushes(cfg.domain_rand, n, self.dt, device)
-        self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt)
+        self.pushes = Pushes(cfg.domain_rand, n, self.dt, device, kernels, self.numbers)
+        self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt, kernels)
         self.torques, self.default_dof_pos = self.control.torques, self.control.default_dof_pos
-        self.command_sampler = Commands(cfg.commands, n, self.dt, device)
+        self.command_sampler = Commands(cfg.commands, n, self.dt, device, kernels, self.numbers)
         self.commands, self.is_moving = self.command_sampler.commands, self.command_sampler.is_moving
-        self.contacts = FeetContacts(n, len(robot.feet_indices), self.dt, device)
+        self.contacts = FeetContacts(n, len(robot.feet_indices), self.dt, device, kernels)
         full_ranges = self.command_sampler.full_ranges
-        self.command_curriculum = CommandCurriculum(cfg.commands.curriculum, full_ranges, self.dt)
+        self.command_curriculum = CommandCurriculum(cfg.commands.curriculum, full_ranges, self.dt, kernels)
 
         self.feet_indices = torch.tensor(robot.feet_indices, device=device)
+        self._feet_shapes = evenly_spaced(robot.feet_indices) or self.feet_indices
         self.penalised_indices = torch.tensor(robot.penalised_indices, dtype=torch.long, device=device)
         self.termination_indices = torch.tensor(robot.termination_indices, dtype=torch.long, device=device)
+        self._terminating_shapes = evenly_spaced(robot.termination_indices) or self.termination_indices
         self.dof_vel_limits = torch.tensor(robot.dof_vel_limits, dtype=torch.float32, device=device)
         self.dof_pos_limits = self._soft_limits(robot)
         self.posture_joints = torch.tensor(~robot.swings, dtype=torch.float32, device=device)
-        self.height_scan = HeightScan(cfg.terrain, self.terrain, n, device)
+        self.height_scan = HeightScan(cfg.terrain, self.terrain, n, device, kernels)
         self.measured_heights = self.height_scan.heights
         self.terrain_curriculum: TerrainCurriculum | None = None
         self.env_origins = torch.zeros(n, 3, device=device)
         """(N, 3) where each robot starts, world frame [m]."""
         if self.terrain is not None:
-            self.terrain_curriculum = TerrainCurriculum(cfg.terrain, self.terrain, n, device)
+            self.terrain_curriculum = TerrainCurriculum(cfg.terrain, self.terrain, n, device, kernels)
             self.env_origins = self.terrain_curriculum.origins
-        self._spawn_offset = torch.zeros(n, 3, device=device)
-        self._spawn_offset[:, 2] = robot.file.spawn_height
-        self._reset_velocity = torch.zeros(2, n, 3, device=device)  # linear, angular, both in the base frame
-        self._spawn_yaw = torch.zeros(n, device=device)
+        reach, height = cfg.terrain.spawn_range if self.terrain is not None else 0.0, robot.file.spawn_height
+        self._spawn = self.numbers.between([-reach, -reach, height], [reach, reach, height], 3)
+        low, high = (factor * self.default_dof_pos for factor in cfg.init_state.dof_pos_factor)
+        self._reset_joints = self.numbers.between(low, high, robot.num_dof)
+        self._reset_velocity = self.numbers.between(*cfg.init_state.base_velocity, 6)  # linear, angular; base frame
+        self._reset_yaw = self.numbers.between(*cfg.init_state.yaw, 1)
         self.reset_qpos[:, 3] = 1.0
 
     def _soft_limits(self, robot: Robot) -> Tensor:
@@ -169,27 +174,21 @@ class LeggedRobot(Terms, BaseTask):
         self.control.compute(self.dof_pos, self.dof_vel)
 
     def draw(self) -> None:
-        self.draw_reset()
+        super().draw()
         self.command_sampler.draw()
-        self.pushes.draw()
-        self.draw_noise()
 
     def draw_reset(self) -> None:
         """Draw joints near the default pose and a base at its spawn height, moving."""
-        cfg = self.cfg.init_state
-        self.reset_qpos[:, 7:].uniform_(*cfg.dof_pos_factor).mul_(self.default_dof_pos)
-        self._reset_velocity.uniform_(*cfg.base_velocity)
-        self._spawn_yaw.uniform_(*cfg.yaw)
         if self.terrain_curriculum is not None:
-            reach = self.cfg.terrain.spawn_range
-            self._spawn_offset[:, :2].uniform_(-reach, reach)
             self.terrain_curriculum.draw()
-        self.reset_qvel[:, :6].unflatten(1, (2, 3)).copy_(self._reset_velocity.transpose(0, 1))
-        if cfg.yaw != (0.0, 0.0):
-            torch.cos(0.5 * self._spawn_yaw, out=self.reset_qpos[:, 3])
-            torch.sin(0.5 * self._spawn_yaw, out=self.reset_qpos[:, 6])
+        self.reset_qpos[:, 7:].copy_(self._reset_joints.values)
+        self.reset_qvel[:, :6].copy_(self._reset_velocity.values)
+        if self.cfg.init_state.yaw != (0.0, 0.0):
+            half_yaw = 0.5 * self._reset_yaw.values[:, 0]
+            torch.cos(half_yaw, out=self.reset_qpos[:, 3])
+            torch.sin(half_yaw, out=self.reset_qpos[:, 6])
             # MuJoCo has the linear velocity of a floating base in the world frame, the angular one in the base's.
-            self.reset_qvel[:, :3].copy_(quat_rotate(self.reset_qpos[:, 3:7], self._reset_velocity[0]))
+            self.reset_qvel[:, :3].copy_(quat_rotate(self.reset_qpos[:, 3:7], self._reset_velocity.values[:, :3]))
 
     def sense(self) -> None:
         super().sense()
@@ -197,21 +196,17 @@ class LeggedRobot(Terms, BaseTask):
 
     def advance(self) -> None:
         super().advance()
-        self.contacts.update(self.contact_forces[:, self.feet_indices])
-
-    def measure(self) -> None:
-        super().measure()
-        velocity = torch.cat([self.base_lin_vel[:, :2], self.base_ang_vel[:, 2:]], dim=1)
-        self.command_curriculum.update(self.commands[:, :3], velocity, self.valid)
-        self.command_curriculum.write_ranges(self.command_sampler.ranges)
+        self.contacts.update(self.contact_forces[:, self._feet_shapes])
 
     def update_curricula(self) -> None:
+        self.command_curriculum.update(self.commands[:, :3], self.base_lin_vel, self.base_ang_vel, self.valid)
+        self.command_curriculum.write_ranges(self.command_sampler.ranges)
         if self.terrain_curriculum is not None:
             asked = self.commands[:, :2].norm(dim=1) * self.cfg.env.episode_length_s
             self.terrain_curriculum.update(self.reset_buf & self.valid, self.base_pos, asked)
 
     def reset_idx(self, mask: Tensor) -> None:
-        torch.add(self.env_origins, self._spawn_offset, out=self.reset_qpos[:, :3])
+        torch.add(self.env_origins, self._spawn.values, out=self.reset_qpos[:, :3])
         super().reset_idx(mask)
         self.control.reset(mask)
         self.contacts.reset(mask)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from legged.config.schema import LeggedConfig
+from legged.math import squared_difference
 from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
 from legged.mdp.height_scan import HeightScan
@@ -70,6 +71,10 @@ class Terms:
     contact_forces: Tensor
     """(N, B, 3) in the world [N]; `feet_indices` and `penalised_indices` pick among the shapes."""
     feet_indices: Tensor
+    _feet_shapes: slice | Tensor
+    """The feet among the shapes, and below the shapes that must not touch anything: a slice where they are evenly spaced,
+    which costs no launch."""
+    _terminating_shapes: slice | Tensor
     penalised_indices: Tensor
     posture_joints: Tensor
     """(D,) 1 for joints that do not swing a leg forward and back, else 0."""
@@ -162,15 +167,15 @@ class Terms:
 
     def _reward_dof_acc(self) -> Tensor:
         """Squared joint accelerations over a control step [rad^2/s^4]."""
-        return ((self.last_dof_vel - self.dof_vel) / self.dt).square().sum(dim=1)
+        return squared_difference(self.last_dof_vel, self.dof_vel).sum(dim=1) / self.dt**2
 
     def _reward_action_rate(self) -> Tensor:
         """Squared change of the actions."""
-        return (self.last_actions - self.actions).square().sum(dim=1)
+        return squared_difference(self.last_actions, self.actions).sum(dim=1)
 
     def _reward_collision(self) -> Tensor:
         """Number of penalised shapes that touch something."""
-        return (self.contact_forces[:, self.penalised_indices].norm(dim=2) > PENALISED_FORCE).sum(dim=1).float()
+        return (self.contact_forces[:, self.penalised_indices].norm(dim=2) > PENALISED_FORCE).sum(dim=1, dtype=torch.float32)
 
     def _reward_termination(self) -> Tensor:
         """Failing; added after the clip at zero."""
@@ -247,7 +252,7 @@ class Terms:
 
     def _terminate_contact(self) -> Tensor:
         """A shape of the robot's `terminate_after_contacts_on` feels a force."""
-        return (self.contact_forces[:, self.termination_indices].norm(dim=2) > TERMINATION_FORCE).any(dim=1)
+        return (self.contact_forces[:, self._terminating_shapes].norm(dim=2) > TERMINATION_FORCE).any(dim=1)
 
     def _terminate_base_height(self) -> Tensor:
         """The base is too close to the ground under it."""

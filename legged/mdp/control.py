@@ -1,6 +1,7 @@
 """Action -> joint torque."""
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,6 +12,9 @@ from legged.errors import ConfigError
 from legged.math import masked_set_
 from legged.robots.patterns import match_names, match_values
 from legged.robots.robot import Robot
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
 
 
 class Control:
@@ -25,7 +29,14 @@ class Control:
 
     STATE = ("_last_dof_vel",)
 
-    def __init__(self, robot: Robot, cfg: LeggedControlConfig, torques: Tensor, sim_dt: float) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        cfg: LeggedControlConfig,
+        torques: Tensor,
+        sim_dt: float,
+        kernels: "TaskKernels | None" = None,
+    ) -> None:
         """Write torques to `torques` (N, D), the physics' own tensor, which takes their device along. Gains come
         from `cfg` if it names any, else from the robot.
 
@@ -36,7 +47,7 @@ class Control:
         def tensor(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=torques.device)
 
-        self.control_type, self.sim_dt = cfg.control_type, sim_dt
+        self.control_type, self.sim_dt, self._kernels = cfg.control_type, sim_dt, kernels
         self.acted = acted_joints(robot, cfg)
         """(A,) the joint of each action."""
         scales = action_scales(robot, cfg)
@@ -50,21 +61,30 @@ class Control:
         self._lowest_torques = -self.torque_limits
         self.torques = torques
         """(N, D) torques of the last physics step [N m]."""
+        self._zero = torch.zeros((), device=torques.device)
         self._target = torch.zeros_like(self.torques)  # joint angles, velocities or torques
         self._columns = None if len(self.acted) == robot.num_dof else torch.tensor(self.acted, device=torques.device)
         self._last_dof_vel = torch.zeros_like(self.torques)
 
     def set_actions(self, actions: Tensor) -> None:
         """Take the actions (N, A) that the following calls of `compute` realise."""
+        middle = self.default_dof_pos if self.control_type == "P" else self._zero
+        if self._columns is None and isinstance(self.action_scale, float):
+            torch.add(middle, actions, alpha=self.action_scale, out=self._target)
+            return
         if self._columns is None:
             torch.mul(actions, self.action_scale, out=self._target)
         else:
             self._target.zero_().index_copy_(1, self._columns, actions * self.action_scale)
-        if self.control_type == "P":
-            self._target.add_(self.default_dof_pos)
+        self._target.add_(middle)
 
     def compute(self, dof_pos: Tensor, dof_vel: Tensor) -> Tensor:
         """Compute torques (N, D) [N m] at joint angles [rad] and velocities [rad/s], each (N, D), for one physics step."""
+        if self.control_type == "P" and self._kernels is not None:
+            gains = (self.stiffness, self.damping, self.torque_limits)
+            shape = tuple(self.torques.shape)
+            self._kernels.hold_joints(shape, self._target, dof_pos, dof_vel, *gains, self.torques)
+            return self.torques
         if self.control_type == "P":
             torques = torch.addcmul(self.stiffness * (self._target - dof_pos), self.damping, dof_vel, value=-1.0)
         elif self.control_type == "V":

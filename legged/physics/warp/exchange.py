@@ -147,6 +147,15 @@ def write_states(
         contact_forces[world, i] = wp.vec3(0.0)
 
 
+@wp.kernel
+def add_velocities(mask: wp.array[wp.bool], delta: wp.array2d[float], qvel: wp.array2d[float]):
+    """One thread a world."""
+    world = wp.tid()
+    if mask[world]:
+        for i in range(delta.shape[1]):
+            qvel[world, i] = qvel[world, i] + delta[world, i]
+
+
 @dataclass(frozen=True)
 class EngineArrays:
     """What of an engine a write changes and a read takes, (N, ...) each; `qpos` and `qvel` in MuJoCo's layout."""
@@ -184,6 +193,11 @@ class StateExchange:
         inputs = [wp.from_torch(mask), wp.from_torch(qpos.contiguous()), wp.from_torch(qvel.contiguous())]
         outputs = [own.qpos, own.qvel, own.ctrl, own.act, own.warmstart, self._contact_forces]
         wp.launch(write_states, dim=len(mask), inputs=inputs, outputs=outputs)
+
+    def push(self, mask: torch.Tensor, delta: torch.Tensor, qvel: torch.Tensor) -> None:
+        """Add `delta` (N, K) to the first K of `qvel` in the worlds of `mask` (N,)."""
+        inputs = [wp.from_torch(mask), wp.from_torch(delta), wp.from_torch(qvel)]
+        wp.launch(add_velocities, dim=len(mask), inputs=inputs)
 
     def kinematics(self) -> None:
         """Read everything but forces; clears the overflow flags."""
