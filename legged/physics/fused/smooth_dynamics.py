@@ -19,6 +19,7 @@ from legged.physics.fused.native import LANES, SHARED_BYTES, native_source
 
 FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("FREE", "BALL", "SLIDE", "HINGE"))
 AFFINE = int(mujoco.mjtBias.mjBIAS_AFFINE)
+SOURCE = ("smooth_dynamics.h",)
 UNKNOWN = {
     "compensation of gravity": ("body_gravcomp",),
     "springs that are not linear": ("jnt_stiffnesspoly", "jnt_springyield"),
@@ -152,7 +153,7 @@ def dynamics_constants(model: mujoco.MjModel, randomized: Collection[str] = ()) 
 def dynamics_kernel(constants: dict[str, int | bool]) -> Any:
     """Return the kernel for some `dynamics_constants`; launched for (worlds, lanes)."""
 
-    @wp.func_native(native_source("smooth_dynamics.h", constants))
+    @wp.func_native(native_source(SOURCE, constants))
     def move_world(world: int, arrays: DynamicsArrays) -> None: ...
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=(LANES, MOST_BLOCKS))

@@ -162,7 +162,7 @@ class MujocoWarpPhysics(WarpPhysics):
             return
         self._m.opt.run_qacc_smooth = False  # our solver does not start from it
         if self.why_library:
-            self._solver = ConstraintSolver(self._m, self._d)
+            self._solver = ConstraintSolver(self.model, self._m, self._d)
         else:
             self._fused_step = TorqueStep(self.model, self._m, self._d, per_world)
 
