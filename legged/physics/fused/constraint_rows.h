@@ -40,7 +40,8 @@ const float TINY = 1e-15f;
 const int ne = arrays.equalities.data[world], nf = ne + (FRICTION ? arrays.frictions.data[world] : 0);
 const int rows = arrays.nefc.data[world] < ROWS ? arrays.nefc.data[world] : ROWS;
 const int width = arrays.jacobian.shape[2];  // padded
-const long long first_row = (long long)world * arrays.stiffness.shape[1];
+// A number of row r; arrays differ in how many rows they have room for.
+auto number_of = [&](const auto& array, int r) { return array.data[(long long)world * array.shape[1] + r]; };
 const float* jacobian = arrays.jacobian.data + (long long)world * arrays.jacobian.shape[1] * width;
 // Calls `use(r, row)` with `row` the Jacobian's: those in shared memory and the others, in few worlds, are read differently.
 auto with_row = [&](int r, auto use) {
@@ -71,7 +72,7 @@ auto pull = [&](int r, float at, float& side) {
     side = d;
     if (r >= nf && at >= 0.0f) { side = 0.0f; return 0.0f; }
     if (FRICTION && r >= ne && r < nf) {
-        const float loss = arrays.frictionloss.data[first_row + r];
+        const float loss = number_of(arrays.frictionloss, r);
         if (d * at > loss) { side = -1.0f; return loss; }
         if (d * at < -loss) { side = -2.0f; return -loss; }
     }
@@ -91,8 +92,8 @@ ROLLED EACH(k, NV * STRIDE) M[k] = 0.0f;
 }
 #endif
 EACH_ROW(r) {
-    D[r] = arrays.stiffness.data[first_row + r];
-    x[r] = -arrays.reference.data[first_row + r];
+    D[r] = number_of(arrays.stiffness, r);
+    x[r] = -number_of(arrays.reference, r);
     sides[r] = -3;
 }
 EACH_DOF(i) {

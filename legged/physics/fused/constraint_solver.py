@@ -101,6 +101,12 @@ def solver_kernel(constants: dict[str, int | bool]) -> Any:
     return solve_constraints
 
 
+def ask_for_dense_rows(model: mujoco.MjModel) -> None:
+    """Let mujoco-warp keep the Jacobian's rows whole, as this solver reads them; above 32 degrees of freedom it would not."""
+    if model.nv <= MOST_DOFS:
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+
+
 class ConstraintSolver:
     """Constraint forces and accelerations of all worlds, from what mujoco-warp has put into its data."""
 
@@ -147,7 +153,7 @@ class ConstraintSolver:
         if not 1 <= m.nv <= MOST_DOFS:
             return f"it takes 1 to {MOST_DOFS} degrees of freedom, the model has {m.nv}"
         if m.is_sparse:
-            return f"with {m.nv} degrees of freedom mujoco-warp keeps Jacobians sparse"
+            return "mujoco-warp keeps the model's Jacobians sparse"
         if d.njmax > MOST_ROWS:
             return f"{d.njmax} constraint rows (sim.njmax) are more than {MOST_ROWS}"
         if m.opt.solver != mujoco.mjtSolver.mjSOL_NEWTON:

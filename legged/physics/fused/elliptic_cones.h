@@ -12,8 +12,8 @@ LEGGED_SHARED float bent[CONE_ROWS];  // there: of the first row and the second,
 
 if (ELLIPTIC) EACH_ROW(r) {
     directions[r] = 0;
-    if (arrays.type.data[first_row + r] == ELLIPTIC_ROW) {
-        const int c = arrays.id.data[first_row + r], n = arrays.contact_dim.data[c];
+    if (number_of(arrays.type, r) == ELLIPTIC_ROW) {
+        const int c = number_of(arrays.id, r), n = arrays.contact_dim.data[c];
         const int k = r - arrays.contact_row.data[(long long)c * arrays.contact_row.shape[1]];
         const float* friction = reinterpret_cast<const float*>(arrays.friction.data) + 5 * c;
         const float soften = arrays.impratio_invsqrt.data[world % arrays.impratio_invsqrt.shape[0]];

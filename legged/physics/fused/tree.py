@@ -6,10 +6,13 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+CONNECT, WELD, JOINT = (int(getattr(mujoco.mjtEq, f"mjEQ_{name}")) for name in ("CONNECT", "WELD", "JOINT"))
+SITE = int(mujoco.mjtObj.mjOBJ_SITE)
 MOST_ROOT = 6
 """Degrees of freedom of the root that each lane solves for by itself: their entries must find room in its registers, and
 with the right-hand side those of a triangle of 6 are no more than there are lanes."""
-MOST_DOFS = 64
+MOST_DOFS = 60
+"""mujoco-warp keeps the rows of a Jacobian whole up to so many; a lane of a GPU can have two, which would be 64."""
 
 
 @dataclass(frozen=True)
@@ -121,10 +124,9 @@ def _of_body(model: mujoco.MjModel, body: int) -> list[int]:
 
 def _coupled(model: mujoco.MjModel) -> Iterable[set[int]]:
     """Yield the degrees of freedom that rows of each equality constraint of bodies, sites or joints move."""
-    kinds, site = mujoco.mjtEq, mujoco.mjtObj.mjOBJ_SITE
     for kind, of, *pair in zip(model.eq_type, model.eq_objtype, model.eq_obj1id, model.eq_obj2id, strict=True):
-        if kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
-            bodies = [model.site_bodyid[one] if of == site else one for one in pair]
+        if kind in (CONNECT, WELD):
+            bodies = [model.site_bodyid[one] if of == SITE else one for one in pair]
             yield {dof for body in bodies for dof in _of_body(model, body)}
-        elif kind == kinds.mjEQ_JOINT:
+        elif kind == JOINT:
             yield {int(model.jnt_dofadr[joint]) for joint in pair if joint >= 0}
