@@ -11,7 +11,7 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from legged.physics.fused.constraint_solver import ConstraintSolver
+from legged.physics.fused.constraint_solver import ConstraintSolver, ask_for_dense_rows
 from legged.physics.fused.torque_step import TorqueStep
 from legged.physics.warp.mujoco_warp import absent_stages
 
@@ -168,6 +168,7 @@ class FusedWorlds:
         """Build `count` worlds, which differ in the arrays `drawn` of the model, of one row a world."""
         drawn = drawn or {}
         self.model, self.device = model, device
+        ask_for_dense_rows(model)
         with wp.ScopedDevice(device):
             self.m = mjw.put_model(model, batch_sizes={name: count for name in drawn})
             for name, values in drawn.items():

@@ -53,7 +53,7 @@ def solved(model: mujoco.MjModel, datas: list[mujoco.MjData], device: str) -> tu
         mjw.fwd_velocity(m, d)
         mjw.fwd_actuation(m, d)
         mjw.fwd_acceleration(m, d)
-        ConstraintSolver(m, d).solve()
+        ConstraintSolver(model, m, d).solve()
         return d.qacc.numpy(), d.qfrc_constraint.numpy(), d.solver_niter.numpy()
 
 

@@ -14,9 +14,11 @@ import pytest
 import warp as wp
 from mechanisms import EVERY_JOINT, FusedWorlds, packaged, random_motion, relative_error
 
+from legged.physics.fused import constraint_solver, smooth_dynamics
 from legged.physics.fused.constraint_solver import SolverArrays, solver_constants, solver_kernel
 from legged.physics.fused.native import SOURCES, native_source
 from legged.physics.fused.smooth_dynamics import DynamicsArrays, dynamics_constants, dynamics_kernel
+from legged.physics.fused.tree import Tree
 
 ARCHITECTURE = 90
 """An H100's."""
@@ -27,20 +29,21 @@ template <typename T> struct array_of { T* data; int shape[4]; };
 template <int N> struct numbers { float x[N]; };
 """
 """What the sources know of Warp: arrays, with vectors and matrices as elements."""
-SCALARS = {wp.int32: "int", wp.float32: "float", wp.bool: "bool"}
+SCALARS = {wp.int32: "int", wp.float32: "float", wp.bool: "bool", wp.uint64: "unsigned long long"}
 SETTINGS = {
-    "constraint_solver.h": "int most_rounds, int most_searches, float tolerance, float ls_tolerance, ",
-    "smooth_dynamics.h": "",
+    "solver": "int most_rounds, int most_searches, float tolerance, float ls_tolerance, ",
+    "dynamics": "",
 }
-STRUCTS = {"constraint_solver.h": SolverArrays, "smooth_dynamics.h": DynamicsArrays}
+FILES = {"solver": constraint_solver.SOURCE, "dynamics": smooth_dynamics.SOURCE}
+STRUCTS = {"solver": SolverArrays, "dynamics": DynamicsArrays}
 
 needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
 
 
 def constants_of(file: str, model: mujoco.MjModel) -> dict[str, int | bool]:
     """Return those that a model gives to a source."""
-    if file == "constraint_solver.h":
-        return solver_constants(model.nv, rows=40, damped=True)
+    if file == "solver":
+        return solver_constants(Tree.of(model), rows=40, entries=model.nM, damped=True, elliptic=True)
     return dynamics_constants(model)
 
 
@@ -49,7 +52,7 @@ def program(file: str, constants: dict[str, Any], on_gpu: bool) -> str:
     types = {name: var.type.dtype for name, var in STRUCTS[file].vars.items()}
     elements = {name: SCALARS.get(kind) or f"numbers<{math.prod(kind._shape_)}>" for name, kind in types.items()}
     fields = "".join(f"array_of<{element}> {name};\n" for name, element in elements.items())
-    function = f"void compute_world(int world, {SETTINGS[file]}Arrays arrays) {{\n{native_source(file, constants)}}}\n"
+    function = f"void compute_world(int world, {SETTINGS[file]}Arrays arrays) {{\n{native_source(FILES[file], constants)}}}\n"
     return f"{WARP_ON_CPU.read_text() if on_gpu else ''}{SHIM}struct Arrays {{\n{fields}}};\n{function}"
 
 
@@ -68,7 +71,7 @@ def test_a_compiler_takes_the_source_without_a_warning(tmp_path, file, on_gpu):
 @pytest.mark.parametrize("file", STRUCTS)
 def test_the_compiler_for_gpus_takes_the_kernel(tmp_path, file):
     """By NVIDIA's run-time compiler, which comes with Warp and needs no GPU."""
-    make = {"constraint_solver.h": solver_kernel, "smooth_dynamics.h": dynamics_kernel}[file]
+    make = {"solver": solver_kernel, "dynamics": dynamics_kernel}[file]
     kernel = make(constants_of(file, mujoco.MjModel.from_xml_string(EVERY_JOINT)))
     try:
         (compiled,) = wp.compile_aot_module(kernel.module, arch=ARCHITECTURE, module_dir=tmp_path, use_ptx=True)
@@ -146,18 +149,18 @@ def test_lanes_find_what_one_thread_finds(tmp_path):
     qpos[:, 1], qpos[:, 2:] = np.linspace(-0.7, 0.2, 6), 0.3 * qpos[:, 2:]  # from deep in the ground to above it
     fused.write(qpos, qvel, ctrl)
     dynamics, solver = fused._step._dynamics, fused._step._solver
-    compute = lanes_of(tmp_path, "smooth_dynamics.h", dynamics_constants(model))
+    compute = lanes_of(tmp_path, "dynamics", dynamics_constants(model))
     names = ("geom_xpos", "geom_xmat", "cdof", "M", "qfrc_passive", "qfrc_actuator", "qfrc_smooth")
-    results = in_every_way(dynamics.launch, compute, "smooth_dynamics.h", dynamics._arrays, names)
+    results = in_every_way(dynamics.launch, compute, "dynamics", dynamics._arrays, names)
     compare(names, *results)
 
     fused.step()  # makes the rows of constraints
     rows = fused.read("nefc")
     assert rows.min() < 8
     assert rows.max() > 32  # a lane has two
-    compute = lanes_of(tmp_path, "constraint_solver.h", solver_constants(model.nv, rows=64, damped=True))
+    compute = lanes_of(tmp_path, "solver", solver.constants)
     names = ("qacc", "advance", "qfrc_constraint")
-    compare(names, *in_every_way(solver.solve, compute, "constraint_solver.h", solver._arrays, names))
+    compare(names, *in_every_way(solver.solve, compute, "solver", solver._arrays, names))
 
 
 def compare(

@@ -14,7 +14,7 @@ from legged.config.schema import SimConfig
 from legged.errors import ConfigError
 from legged.physics.collider.terrain_contact import TerrainContact
 from legged.physics.fields import DERIVED, FIELDS, RandomizedModel, changed_arrays
-from legged.physics.fused.constraint_solver import ConstraintSolver
+from legged.physics.fused.constraint_solver import ConstraintSolver, ask_for_dense_rows
 from legged.physics.fused.torque_step import TorqueStep
 from legged.physics.quantities import LAST_STEP, stage_of
 from legged.physics.robot_state import robot_state
@@ -63,6 +63,8 @@ class MujocoWarpPhysics(WarpPhysics):
         terrain = scene.terrain
         cells = terrain is not None and sim.terrain_collider == "cells"
         self.model = scene.model(sim, "none" if cells else "height_field")
+        if sim.step != "library":
+            ask_for_dense_rows(self.model)
         self._randomized = RandomizedModel(scene, self.model, randomized, torch.float32, device)
         self._per_world = changed_arrays(randomized)
         """Names of the model's arrays that are given per world."""
@@ -162,7 +164,7 @@ class MujocoWarpPhysics(WarpPhysics):
             return
         self._m.opt.run_qacc_smooth = False  # our solver does not start from it
         if self.why_library:
-            self._solver = ConstraintSolver(self._m, self._d)
+            self._solver = ConstraintSolver(self.model, self._m, self._d)
         else:
             self._fused_step = TorqueStep(self.model, self._m, self._d, per_world)
 
