@@ -21,7 +21,7 @@ from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import vec5
 
 from legged.errors import ConfigError
-from legged.physics.collider.ground import Ground, Hits, around_point, between_ends, ground_of
+from legged.physics.collider.ground import Ground, Hits, around_point, between_ends, ground_of, room_for_hits
 from legged.terrain import HeightMap
 
 MODEL_FIELDS = (
@@ -110,6 +110,7 @@ def probes_of(model: mujoco.MjModel, shapes: Iterable[int]) -> Iterator[Probe]:
 @wp.kernel
 def touch_ground(
     ground: Ground,
+    hits: Hits,
     terrain: int,
     probe_geom: wp.array[int],
     probe_start: wp.array[wp.vec3],
@@ -163,12 +164,13 @@ def touch_ground(
     position, turn = geom_xpos[world, geom], geom_xmat[world, geom]
     a = position + turn * probe_start[probe]
 
-    hits = Hits()
+    row = world * probe_geom.shape[0] + probe
+    count = wp.int32(0)
     if probe_long[probe]:
-        hits = between_ends(ground, a, position + turn * probe_end[probe], near)
+        count = between_ends(ground, a, position + turn * probe_end[probe], near, hits, row)
     else:
-        hits = around_point(ground, a, near)
-    if hits.count == 0:
+        count = around_point(ground, a, near, hits, row)
+    if count == 0:
         return
     condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
         geom_condim,
@@ -188,10 +190,10 @@ def touch_ground(
         -1,
         world,
     )
-    for k in range(hits.count):
-        normal = wp.vec3(hits.normal[k, 0], hits.normal[k, 1], hits.normal[k, 2])
-        point = wp.vec3(hits.point[k, 0], hits.point[k, 1], hits.point[k, 2])
-        dist = hits.dist[k] - radius
+    for k in range(count):
+        normal = hits.normal[row, k]
+        point = hits.point[row, k]
+        dist = hits.dist[row, k] - radius
         write_contact(
             naconmax,
             k,
@@ -240,11 +242,15 @@ class TerrainContact:
         Raises:
             ConfigError: a colliding shape that is neither sphere, capsule nor box.
         """
-        probes = list(probes_of(model, shapes))
+        self.terrain = terrain
+        self.probes = probes = list(probes_of(model, shapes))
         largest = max(probe.radius for probe in probes) + float((model.geom_margin + model.geom_gap).max())
         longest = max(float(np.linalg.norm(probe.end - probe.start)) for probe in probes)
+        self.ground = ground_of(height_map, largest, longest)
+        self.hits = room_for_hits(d.nworld * len(probes))
         self._inputs = [
-            ground_of(height_map, largest, longest),
+            self.ground,
+            self.hits,
             terrain,
             wp.array([probe.geom for probe in probes], dtype=int),
             wp.array([probe.start for probe in probes], dtype=wp.vec3),

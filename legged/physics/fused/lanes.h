@@ -14,11 +14,21 @@ const int LANES = 32, lane = threadIdx.x & 31;
     for (int apart = 16; apart > 0; apart >>= 1) x += __shfl_xor_sync(0xffffffffu, x, apart);
     return x;
 };
+// The sum of x over the lanes before this one.
+[[maybe_unused]] auto before = [&](float x) {
+    float total = x;
+    for (int apart = 1; apart < 32; apart <<= 1) {
+        const float other = __shfl_sync(0xffffffffu, total, lane < apart ? lane : lane - apart);
+        if (lane >= apart) total += other;
+    }
+    return total - x;
+};
 #else
 #define LEGGED_SHARED
 const int LANES = 1, lane = 0;
 [[maybe_unused]] auto meet = []() {};
 [[maybe_unused]] auto sum = [](float x) { return x; };
+[[maybe_unused]] auto before = [](float) { return 0.0f; };
 #endif
 // Deals `count` items out to the lanes.
 #define EACH(i, count) for (int i = lane; i < (count); i += LANES)
