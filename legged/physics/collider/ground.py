@@ -1,8 +1,7 @@
 """A height map on the device, and what of it a sphere or a capsule can touch: Warp functions, geometry only.
 
-A shape is looked at as probes: spheres (a sphere, the ends of a capsule, the corners of a box with radius 0) and what lies
-between the ends of a capsule. Each looks at the few cells under it: the cell's surface below, the vertical faces and
-their rims beside it.
+A shape is looked at as probes (probes.py). Each looks at the few cells under it: the cell's surface below, the vertical
+faces and their rims beside it.
 """
 
 import numpy as np
@@ -234,8 +233,10 @@ def add(hits: Hits, row: int, count: int, hit: Hit) -> int:
 
 
 @wp.func
-def around_point(ground: Ground, p: wp.vec3, near: float, hits: Hits, row: int) -> int:
-    """Find what the ground offers to a sphere around `p` that reaches out to `near`; returns how many hits are in the row."""
+def around_point(ground: Ground, p: wp.vec3, near: float, faces_only: bool, hits: Hits, row: int) -> int:
+    """Find what the ground offers to a sphere around `p` that reaches out to `near`, or only its vertical faces with their
+    rims; returns how many hits are in the row.
+    """
     count = wp.int32(0)
     cell = cell_of(ground, p[0], p[1])
     i, j = cell[0], cell[1]
@@ -245,7 +246,7 @@ def around_point(ground: Ground, p: wp.vec3, near: float, hits: Hits, row: int) 
     own = on_plane(p, wp.vec3(p[0], p[1], s[0]), s)
     if own.dist < 0.0:
         own = leave_sideways(ground, i, j, p, own)
-    if own.dist < near:
+    if own.dist < near and not faces_only:
         count = add(hits, row, count, own)
     crease = Hit()
     crease.dist = NOTHING
@@ -261,7 +262,7 @@ def around_point(ground: Ground, p: wp.vec3, near: float, hits: Hits, row: int) 
                     count = add(hits, row, count, hit)
                 elif hit.dist < crease.dist:
                     crease = hit
-    if crease.dist < near and wp.dot(crease.normal, own.normal) < SAME:
+    if crease.dist < near and not faces_only and wp.dot(crease.normal, own.normal) < SAME:
         count = add(hits, row, count, crease)
     return count
 

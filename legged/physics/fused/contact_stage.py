@@ -20,7 +20,8 @@ from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import ConstraintType, ContactType
 
 from legged.physics.collider import shapes, touches
-from legged.physics.collider.ground import Ground, Hits, around_point, between_ends
+from legged.physics.collider.ground import Ground, Hits
+from legged.physics.collider.probes import look
 from legged.physics.collider.terrain_contact import TerrainContact
 from legged.physics.fused.native import LANES, native_source
 
@@ -115,10 +116,10 @@ class Candidates:
     point_radius: wp.array[float]
     pair_touch: wp.array[int]
     probe_touch: wp.array[int]
+    probe_kind: wp.array[int]
     probe_start: wp.array[wp.vec3]
     probe_end: wp.array[wp.vec3]
     probe_radius: wp.array[float]
-    probe_long: wp.array[wp.bool]
     geom_size: wp.array[wp.vec3]
     geom_xpos: wp.array2d[wp.vec3]
     geom_xmat: wp.array2d[wp.mat33]
@@ -225,11 +226,17 @@ def stage_kernel(constants: dict[str, int | bool], planes: bool, pairs: bool, gr
                     radius = items.probe_radius[item]
                     near = radius + arrays.touch_margin[touch]
                     position, turn = items.geom_xpos[world, geom], items.geom_xmat[world, geom]
-                    begin = position + turn * items.probe_start[item]
-                    if items.probe_long[item]:
-                        count = between_ends(cells, begin, position + turn * items.probe_end[item], near, hits, row)
-                    else:
-                        count = around_point(cells, begin, near, hits, row)
+                    count = look(
+                        cells,
+                        items.probe_kind[item],
+                        position,
+                        turn,
+                        items.probe_start[item],
+                        items.probe_end[item],
+                        near,
+                        hits,
+                        row,
+                    )
                 dealt = deal(count)
                 for k in range(count):
                     up = hits.normal[row, k]
@@ -364,10 +371,10 @@ class ContactStage:
         items.point_radius = wp.array([p.radius for p in points], dtype=float)
         items.pair_touch = wp.array(round_pairs, dtype=int)
         items.probe_touch = wp.array([touch for touch, _ in probes], dtype=int)
+        items.probe_kind = wp.array([p.kind for _, p in probes], dtype=int)
         items.probe_start = wp.array([p.start for _, p in probes], dtype=wp.vec3)
         items.probe_end = wp.array([p.end for _, p in probes], dtype=wp.vec3)
         items.probe_radius = wp.array([p.radius for _, p in probes], dtype=float)
-        items.probe_long = wp.array([p.long for _, p in probes], dtype=wp.bool)
         items.geom_size = wp.array(model.geom_size, dtype=wp.vec3)
         items.geom_xpos, items.geom_xmat = d.geom_xpos, d.geom_xmat
         return items
