@@ -5,6 +5,7 @@ import math
 import re
 import shutil
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from mechanisms import EVERY_JOINT, FusedWorlds, packaged, random_motion, relati
 
 from legged.physics.fused import constraint_solver, smooth_dynamics
 from legged.physics.fused.constraint_solver import SolverArrays, solver_constants, solver_kernel
+from legged.physics.fused.contact_stage import StageArrays, stage_constants, stage_kernel
 from legged.physics.fused.native import SOURCES, native_source
 from legged.physics.fused.smooth_dynamics import DynamicsArrays, dynamics_constants, dynamics_kernel
 from legged.physics.fused.tree import Tree
@@ -33,9 +35,25 @@ SCALARS = {wp.int32: "int", wp.float32: "float", wp.bool: "bool", wp.uint64: "un
 SETTINGS = {
     "solver": "int most_rounds, int most_searches, float tolerance, float ls_tolerance, ",
     "dynamics": "",
+    "contacts": "int found, ",
 }
-FILES = {"solver": constraint_solver.SOURCE, "dynamics": smooth_dynamics.SOURCE}
-STRUCTS = {"solver": SolverArrays, "dynamics": DynamicsArrays}
+FILES = {"solver": constraint_solver.SOURCE, "dynamics": smooth_dynamics.SOURCE, "contacts": "contact_stage.h"}
+STRUCTS = {"solver": SolverArrays, "dynamics": DynamicsArrays, "contacts": StageArrays}
+GIVEN = {
+    "solver": "MOST, MOST, 1e-9f, 0.01f, ",
+    "dynamics": "",
+    "contacts": "counted(all, world), ",
+}
+"""What a world is called with, beside its number and the arrays."""
+COUNTED = """
+int counted(const Arrays* all, int world) {  // contacts of a world, by those slots that have rows
+    const int each = all->contact_dist.shape[0] / all->nefc.shape[0];
+    int count = 0;
+    for (int k = world * each; k < (world + 1) * each; ++k)
+        count += all->contact_efc_address.data[k * all->contact_efc_address.shape[1]] >= 0;
+    return count;
+}
+"""
 
 needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
 
@@ -44,6 +62,8 @@ def constants_of(file: str, model: mujoco.MjModel) -> dict[str, int | bool]:
     """Return those that a model gives to a source."""
     if file == "solver":
         return solver_constants(Tree.of(model), rows=40, entries=model.nM, damped=True, elliptic=True)
+    if file == "contacts":
+        return stage_constants(model, rows=40, slots=8, dim=6, frictions=True, limits=True)
     return dynamics_constants(model)
 
 
@@ -71,8 +91,11 @@ def test_a_compiler_takes_the_source_without_a_warning(tmp_path, file, on_gpu):
 @pytest.mark.parametrize("file", STRUCTS)
 def test_the_compiler_for_gpus_takes_the_kernel(tmp_path, file):
     """By NVIDIA's run-time compiler, which comes with Warp and needs no GPU."""
-    make = {"solver": solver_kernel, "dynamics": dynamics_kernel}[file]
-    kernel = make(constants_of(file, mujoco.MjModel.from_xml_string(EVERY_JOINT)))
+    constants = constants_of(file, mujoco.MjModel.from_xml_string(EVERY_JOINT))
+    if file == "contacts":
+        kernel = stage_kernel(constants, planes=True, pairs=True, ground=True)
+    else:
+        kernel = {"solver": solver_kernel, "dynamics": dynamics_kernel}[file](constants)
     try:
         (compiled,) = wp.compile_aot_module(kernel.module, arch=ARCHITECTURE, module_dir=tmp_path, use_ptx=True)
     except RuntimeError as error:
@@ -101,11 +124,12 @@ class ArrayOf(ctypes.Structure):
 
 def lanes_of(folder: Path, file: str, constants: dict[str, Any]) -> Any:
     """Compile the half for GPUs into a function of the number of worlds, the order of lanes and the struct's arrays."""
-    call = "compute_world(world, MOST, MOST, 1e-9f, 0.01f, *all)" if SETTINGS[file] else "compute_world(world, *all)"
+    call = f"compute_world(world, {GIVEN[file]}*all)"
     source = folder / f"{file}.cpp"
     source.write_text(
         program(file, constants, on_gpu=True)
         + "const int MOST = 50; int worlds;\n"
+        + (COUNTED if file == "contacts" else "")
         + f"void lane(void* with) {{ Arrays* all = (Arrays*)with; for (int world = 0; world < worlds; ++world) {call}; }}\n"
         + 'extern "C" bool compute(int count, bool backwards, Arrays* all) {\n'
         + "    worlds = count; return warp_on_cpu::run(lane, all, backwards);\n}\n"
@@ -154,6 +178,19 @@ def test_lanes_find_what_one_thread_finds(tmp_path):
     results = in_every_way(dynamics.launch, compute, "dynamics", dynamics._arrays, names)
     compare(names, *results)
 
+    stage = fused._contacts
+    compute = lanes_of(tmp_path, "contacts", stage.constants)
+    names = ("jacobian", "stiffness", "reference", "contact_friction")
+    stage.launch()
+    rows = fused.read("nefc")
+    ways = in_every_way(stage.launch, compute, "contacts", stage._arrays, names)
+    for name, *found in zip(names, *ways, strict=True):  # what no row or contact needs stays as it was
+        made = np.isfinite(found[0])
+        assert all((np.isfinite(array) == made).all() for array in found), name
+        compare([name], *([np.where(made, array, 0.0)] for array in found))
+        if name == "stiffness":
+            np.testing.assert_array_equal(made.sum(axis=1), rows)
+
     fused.step()  # makes the rows of constraints
     rows = fused.read("nefc")
     assert rows.min() < 8
@@ -163,9 +200,7 @@ def test_lanes_find_what_one_thread_finds(tmp_path):
     compare(names, *in_every_way(solver.solve, compute, "solver", solver._arrays, names))
 
 
-def compare(
-    names: tuple[str, ...], serial: list[np.ndarray], forwards: list[np.ndarray], backwards: list[np.ndarray]
-) -> None:
+def compare(names: Sequence[str], serial: list[np.ndarray], forwards: list[np.ndarray], backwards: list[np.ndarray]) -> None:
     """Check that lanes find the same in either order, and what one thread finds up to rounding."""
     for name, one, up, down in zip(names, serial, forwards, backwards, strict=True):
         assert np.isfinite(one).all(), name

@@ -48,6 +48,15 @@ const int LANES = 32, lane = threadIdx.x & 31;
 #define BY_TWO _Pragma("unroll 2")
 #define BY_FOUR _Pragma("unroll 4")
 #define ROLLED _Pragma("unroll 1")
+// The sum of x over the lanes before this one.
+[[maybe_unused]] auto before = [&](float x) {
+    float total = x;
+    for (int apart = 1; apart < 32; apart <<= 1) {
+        const float other = __shfl_sync(0xffffffffu, total, lane < apart ? lane : lane - apart);
+        if (lane >= apart) total += other;
+    }
+    return total - x;
+};
 #else
 #define LEGGED_SHARED
 const int LANES = 1, lane = 0;
@@ -61,6 +70,7 @@ const int LANES = 1, lane = 0;
 #define BY_TWO
 #define BY_FOUR
 #define ROLLED
+[[maybe_unused]] auto before = [](float) { return 0.0f; };
 #endif
 // Deals `count` items out to the lanes.
 #define EACH(i, count) for (int i = lane; i < (count); i += LANES)

@@ -15,6 +15,7 @@ from legged.errors import ConfigError
 from legged.physics.collider.terrain_contact import TerrainContact
 from legged.physics.fields import DERIVED, FIELDS, RandomizedModel, changed_arrays
 from legged.physics.fused.constraint_solver import ConstraintSolver, ask_for_dense_rows
+from legged.physics.fused.contact_stage import ContactStage
 from legged.physics.fused.torque_step import TorqueStep
 from legged.physics.quantities import LAST_STEP, stage_of
 from legged.physics.robot_state import robot_state
@@ -72,10 +73,11 @@ class MujocoWarpPhysics(WarpPhysics):
             self._m = self._put_model(scene.name)
             self._m.opt.warn_overflow = 0  # counted in refresh instead of printed by each thread
             self._d = mjw.make_data(self.model, nworld=num_envs, nconmax=sim.nconmax, njmax=sim.njmax)
+            self._on_cells: TerrainContact | None = None
             if terrain is not None and cells:
                 of_robot = (self.model.geom_contype != 0) & (self.model.geom_bodyid != 0)
                 shapes, floor = np.flatnonzero(of_robot), self.model.geom(FLOOR).id
-                TerrainContact(self._m, self._d, self.model, floor, terrain.height_map, shapes)
+                self._on_cells = TerrainContact(self._m, self._d, self.model, floor, terrain.height_map, shapes)
             d = self._d
             self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
             if scene.robot is None:
@@ -133,8 +135,11 @@ class MujocoWarpPhysics(WarpPhysics):
         m, d = self._m, self._d
         if self._fused_step is not None:
             self._fused_step.begin()
-            mjw.collision(m, d)
-            mjw.make_constraint(m, d)
+            if self._contacts is not None:
+                self._contacts.launch()
+            else:
+                mjw.collision(m, d)
+                mjw.make_constraint(m, d)
             self._fused_step.finish()
         elif self._solver is not None:
             mjw.fwd_position(m, d, factorize=False)
@@ -151,6 +156,7 @@ class MujocoWarpPhysics(WarpPhysics):
         launches, or nothing, which leaves the step to mujoco-warp. Raises ConfigError where the model keeps `fused` off.
         """
         self._fused_step: TorqueStep | None = None
+        self._contacts: ContactStage | None = None
         self._solver: ConstraintSolver | None = None
         if step == "library":
             self.why_library = "sim.step=library"
@@ -167,6 +173,11 @@ class MujocoWarpPhysics(WarpPhysics):
             self._solver = ConstraintSolver(self.model, self._m, self._d)
         else:
             self._fused_step = TorqueStep(self.model, self._m, self._d, per_world)
+            no_contacts = ContactStage.why_not(self.model, self._m, per_world)
+            if no_contacts:
+                self.why_library = f"for contacts alone, {no_contacts}"
+            else:
+                self._contacts = ContactStage(self.model, self._m, self._d, per_world, self._on_cells)
 
     def _library_step(self) -> None:
         """Make a physics step as mujoco-warp does by itself."""
