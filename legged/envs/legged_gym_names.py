@@ -98,9 +98,7 @@ def _noise_scale_vec(task: Any) -> Tensor:
 
 
 def _command_ranges(task: Any) -> dict[str, Any]:
-    says = (
-        "self.command_ranges: commands.curriculum in the YAML widens ranges; what is sampled is self.command_sampler.ranges"
-    )
+    says = "self.command_ranges cannot be written: commands.curriculum in the YAML says how ranges widen"
     rows = zip(("lin_vel_x", "lin_vel_y", "ang_vel_yaw"), task.command_sampler.ranges, strict=True)
     return {name: ReadOnly.of(row, says) for name, row in rows} | {"heading": list(task.cfg.commands.ranges.heading)}
 

@@ -54,7 +54,7 @@ HOOKS = {
     "compute_self_observations": _OBSERVE,
     "compute_termination_observations": "a task whose episodes end keeps what they ended with where somebody asks for it"
     " (legged/envs/final_step.py)",
-    "_disturbance_robots": "domain_rand.push_robots pushes; another disturbance overrides disturb(mask), with self.physics.push",
+    "_disturbance_robots": "domain_rand.push_robots pushes; others override disturb(mask), with self.physics.push",
     "_step_contact_targets": "override advance(), call super().advance() and write your own tensors in place",
     "_call_train_eval": _STEP,
     "_randomize_dof_props": _RANDOM,
