@@ -39,6 +39,16 @@ def yaw_of(quat: Tensor) -> Tensor:
     return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
+def get_euler_xyz(quat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Roll, pitch and yaw [rad], (N,) each, of `quat` (N, 4), w first: the turns about the world's x, y and z axes, in this
+    order, that make up the rotation. Each lies in [-pi, pi] (Isaac Gym's are in [0, 2 pi), of quaternions with w last).
+    """
+    w, x, y, z = quat.unbind(dim=1)
+    roll = torch.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = torch.asin((2.0 * (w * y - z * x)).clamp(-1.0, 1.0))
+    return roll, pitch, yaw_of(quat)
+
+
 def wrap_to_pi(angle: Tensor) -> Tensor:
     """The same angle in [-pi, pi)."""
     return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi

@@ -9,6 +9,7 @@ from torch import Tensor
 from legged.config.schema import LeggedConfig, TaskConfig
 from legged.envs.base_task import BaseTask
 from legged.envs.legged_checks import check_legged
+from legged.envs.legged_gym_names import LeggedGymNames
 from legged.envs.overrides import check_overrides
 from legged.envs.terms import Terms
 from legged.math import evenly_spaced, quat_rotate
@@ -25,7 +26,7 @@ from legged.robots.robot import Robot, load_robot
 from legged.terrain import Terrain
 
 
-class LeggedRobot(Terms, BaseTask):
+class LeggedRobot(Terms, LeggedGymNames, BaseTask):
     """A legged robot that follows velocity commands. Subclass it and add `_reward_<name>`, `_obs_<name>`, `_terminate_<name>`
     or `_metric_<name>` methods; the configuration names the ones that run. N robots, D joints, F feet, B tracked collision
     shapes.

@@ -62,6 +62,10 @@ class Rewards:
         for name, function in self.functions.items():
             with calling(f"_reward_{name}"):
                 value = function()
+                if isinstance(value, int | float):  # the same for every robot, such as `return 1.0` for being alive
+                    value = torch.full_like(self.total, value)
+                if not isinstance(value, Tensor):
+                    raise ValueError(f"must return a tensor ({self.num_envs},), got {type(value).__name__}")
                 if value.shape != (self.num_envs,):
                     raise ValueError(f"must return a tensor ({self.num_envs},), got {tuple(value.shape)}")
             values.append(value)
