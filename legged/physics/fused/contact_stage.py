@@ -25,6 +25,8 @@ from legged.physics.collider.probes import look
 from legged.physics.collider.terrain_contact import TerrainContact
 from legged.physics.fused.native import LANES, native_source
 
+SOURCE = ("contact_stage.h",)
+"""Of what the native function is put together."""
 Vector5 = wp.types.vector(length=5, dtype=wp.float32)
 FIXED = (
     *("geom_size", "geom_margin", "geom_priority", "geom_solmix", "geom_solref", "geom_solimp", "jnt_solref", "jnt_solimp"),
@@ -142,11 +144,11 @@ def stage_kernel(constants: dict[str, int | bool], planes: bool, pairs: bool, gr
     """Return the kernel for some `stage_constants`, of models of which these may touch; launched for (worlds, lanes)."""
     most = int(constants["SLOTS"])
 
-    @wp.func_native(native_source("deal.h", {}))
+    @wp.func_native(native_source(("deal.h",), {}))
     def deal(count: int) -> int:  # type: ignore[empty-body]
         ...
 
-    @wp.func_native(native_source("contact_stage.h", constants))
+    @wp.func_native(native_source(SOURCE, constants))
     def make_rows(world: int, found: int, arrays: StageArrays) -> None: ...
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=(LANES, 32))
