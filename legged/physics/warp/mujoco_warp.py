@@ -64,6 +64,7 @@ class MujocoWarpPhysics(WarpPhysics):
         terrain = scene.terrain
         cells = terrain is not None and sim.terrain_collider == "cells"
         self.model = scene.model(sim, "none" if cells else "height_field")
+        self.fitted = scene.fitted
         self._randomized = RandomizedModel(scene, self.model, randomized, torch.float32, device)
         self._per_world = changed_arrays(randomized)
         """Names of the model's arrays that are given per world."""
