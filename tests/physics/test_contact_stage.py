@@ -6,11 +6,16 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import pytest
+import torch
 import warp as wp
-from devices import on_gpu
+from devices import ON_A_GPU, build, on_gpu
+from reference import heaps, random_states, roll
 
+from legged.config.schema import TerrainConfig
+from legged.physics import RobotScene
 from legged.physics.collider.touches import spring_of
 from legged.physics.fused.contact_stage import ContactStage
+from legged.terrain import Terrain, TileSpec
 
 ALOFT = '<geom name="plane" type="plane" size="0 0 1" pos=".1 -.2 .3" quat=".9 .2 -.3 .1" condim="1"/>'
 SHAPES = {
@@ -318,3 +323,41 @@ def test_impedance_and_spring_are_worked_by_hand():
     assert spring_of(solref, solimp, 0.015, True)[0] == pytest.approx(1231.148, rel=1e-6)
     assert spring_of(solref, solimp, 0.015, False)[0] == pytest.approx(2770.083, rel=1e-6)
     np.testing.assert_allclose(spring_of(np.array([-900.0, -30.0]), solimp, 0.005, True)[:2], [997.2299, 31.57895], rtol=1e-6)
+
+
+@pytest.mark.parametrize("where", [pytest.param("", id="cpu"), on_gpu(ON_A_GPU, id="cuda")])
+@pytest.mark.parametrize(("start", "self_collisions"), [(random_states, False), (heaps, False), (heaps, True)])
+def test_robots_move_as_by_mujoco_warps_own_launches(robot, make_physics, start, self_collisions, where):
+    """Ten steps on the plane, through contacts of feet, legs and trunks, also with each other; forces are read alike."""
+    states, found = start(robot, 6, seed=4), []
+    for step in ("library", "fused"):
+        physics = make_physics("mujoco_warp" + where, step=step, self_collisions=self_collisions)
+        states.write(physics)
+        roll(physics, states.dof_pos, 10)
+        found.append({name: getattr(physics.robot_state, name).clone() for name in ("base_pos", "base_quat", "dof_pos")})
+        found[-1]["forces"] = physics.robot_state.contact_forces / 1e3
+    for name in found[0]:
+        torch.testing.assert_close(found[1][name], found[0][name], atol=2e-5, rtol=1e-4, msg=name)
+    assert found[0]["forces"].abs().max() > 0.1
+
+
+@pytest.mark.parametrize("where", [pytest.param("", id="cpu"), on_gpu(ON_A_GPU, id="cuda")])
+def test_robots_on_stairs_move_as_by_mujoco_warps_own_launches(robot, where):
+    """Fifty steps with our collider behind mujoco-warp's own, and inside our launch."""
+    cfg = TerrainConfig(mesh_type="height_map", border_size=4.0)
+    ground = Terrain.of_tiles([[TileSpec("stairs_up", 0.15)]], cfg, np.random.default_rng(5))
+    states, found = random_states(robot, 6, seed=4), []
+    states.base_pos[:, :2] = torch.tensor(ground.origins[0, 0, :2] + [1.5, 0.0], dtype=torch.float32)
+    states.base_pos[:, 1] += torch.linspace(-0.5, 0.5, 6)
+    states.base_pos[:, 2] += float(ground.origins[0, 0, 2])
+    for step in ("library", "fused"):
+        physics = build(RobotScene(robot, ground), "mujoco_warp" + where, 6, step=step, njmax=128, nconmax=32)
+        states.write(physics)
+        force = torch.zeros(6)
+        for _ in range(5):
+            roll(physics, states.dof_pos, 10)
+            force = torch.maximum(force, physics.robot_state.contact_forces.norm(dim=2).sum(dim=1))
+        assert (force > 50.0).all()
+        found.append(physics.robot_state)
+    for name in ("base_pos", "base_quat", "dof_pos"):
+        torch.testing.assert_close(getattr(found[1], name), getattr(found[0], name), atol=1e-4, rtol=0.0, msg=name)

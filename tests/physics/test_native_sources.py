@@ -5,11 +5,12 @@ import math
 import re
 import shutil
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import mujoco
+import mujoco_warp as mjw
 import numpy as np
 import pytest
 import warp as wp
@@ -17,7 +18,7 @@ from mechanisms import EVERY_JOINT, FusedWorlds, packaged, random_motion, relati
 
 from legged.physics.fused import constraint_solver, contact_stage, smooth_dynamics
 from legged.physics.fused.constraint_solver import SolverArrays, solver_constants, solver_kernel
-from legged.physics.fused.contact_stage import StageArrays, stage_constants, stage_kernel
+from legged.physics.fused.contact_stage import ContactStage, StageArrays, stage_constants, stage_kernel
 from legged.physics.fused.native import SOURCES, native_source
 from legged.physics.fused.smooth_dynamics import DynamicsArrays, dynamics_constants, dynamics_kernel
 from legged.physics.fused.tree import Tree
@@ -178,18 +179,8 @@ def test_lanes_find_what_one_thread_finds(tmp_path):
     results = in_every_way(dynamics.launch, compute, "dynamics", dynamics._arrays, names)
     compare(names, *results)
 
-    stage = fused._contacts
-    compute = lanes_of(tmp_path, "contacts", stage.constants)
-    names = ("jacobian", "stiffness", "reference", "contact_friction")
-    stage.launch()
-    rows = fused.read("nefc")
-    ways = in_every_way(stage.launch, compute, "contacts", stage._arrays, names)
-    for name, *found in zip(names, *ways, strict=True):  # what no row or contact needs stays as it was
-        made = np.isfinite(found[0])
-        assert all((np.isfinite(array) == made).all() for array in found), name
-        compare([name], *([np.where(made, array, 0.0)] for array in found))
-        if name == "stiffness":
-            np.testing.assert_array_equal(made.sum(axis=1), rows)
+    assert fused._contacts is not None
+    compare_stage(tmp_path, fused._contacts, lambda: fused.read("nefc"))
 
     fused.step()  # makes the rows of constraints
     rows = fused.read("nefc")
@@ -198,6 +189,51 @@ def test_lanes_find_what_one_thread_finds(tmp_path):
     compute = lanes_of(tmp_path, "solver", solver.constants)
     names = ("qacc", "advance", "qfrc_constraint")
     compare(names, *in_every_way(solver.solve, compute, "solver", solver._arrays, names))
+
+
+def compare_stage(folder: Path, stage: ContactStage, read_rows: Callable[[], np.ndarray]) -> None:
+    """Check that lanes make the rows that one thread makes, and as many as it counts."""
+    compute = lanes_of(folder, "contacts", stage.constants)
+    names = ("jacobian", "stiffness", "reference", "contact_friction")
+    stage.launch()
+    ways = in_every_way(stage.launch, compute, "contacts", stage._arrays, names)
+    for name, *found in zip(names, *ways, strict=True):  # what no row or contact needs stays as it was
+        made = np.isfinite(found[0])
+        assert all((np.isfinite(array) == made).all() for array in found), name
+        compare([name], *([np.where(made, array, 0.0)] for array in found))
+        if name == "stiffness":
+            np.testing.assert_array_equal(made.sum(axis=1), read_rows())
+
+
+@needs_compiler
+def test_lanes_make_rows_of_two_degrees_of_freedom_each(tmp_path):
+    """A chain of 40 hinges with limits and dry friction, each link a capsule, lying across the floor."""
+    link = (
+        '<body pos="0 0 .1"><joint axis="0 1 0" range="-.1 .1" frictionloss=".1"/>'
+        '<geom type="capsule" fromto="0 0 0 0 0 .1" size=".02"/>'
+    )
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><compiler angle="radian"/><option jacobian="dense"/><worldbody><geom type="plane" size="0 0 1" contype="2"/>'
+        + 40 * link.replace("<geom", '<geom contype="0" conaffinity="2"')
+        + 40 * "</body>"
+        + "</worldbody></mujoco>"
+    )
+    rng = np.random.default_rng(0)
+    with wp.ScopedDevice("cpu"):
+        m = mjw.put_model(model)
+        d = mjw.make_data(model, nworld=4, nconmax=40, njmax=240)
+        qpos = 0.08 * rng.normal(size=(4, 40))
+        qpos[:, 0] += np.linspace(1.5, 1.7, 4)
+        d.qpos.assign(np.float32(qpos))
+        d.qvel.assign(np.float32(rng.normal(size=(4, 40))))
+        for part in (mjw.kinematics, mjw.com_pos):
+            part(m, d)
+        assert ContactStage.why_not(model, m) == ""
+        stage = ContactStage(model, m, d)
+        compare_stage(tmp_path, stage, lambda: d.nefc.numpy())
+    assert (d.nf.numpy() == 40).all()
+    assert d.nl.numpy().min() > 0
+    assert (d.nefc.numpy() - d.nf.numpy() - d.nl.numpy()).max() > 40  # more than ten contacts
 
 
 def compare(names: Sequence[str], serial: list[np.ndarray], forwards: list[np.ndarray], backwards: list[np.ndarray]) -> None:
