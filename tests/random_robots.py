@@ -50,7 +50,9 @@ def random_robot(seed: int, hinges: int, extras: Collection[str] = ()) -> mujoco
         parent = base if k < chains else made[int(rng.integers(0, len(made)))] if branch else made[k - chains]
         turn = 2.0 * np.pi * (k % chains) / chains
         step = [0.12 * np.cos(turn), 0.12 * np.sin(turn), 0.0] if parent is base else [0.02, 0.01, -0.28 * chains / hinges]
-        body = parent.add_body(name=f"limb{k}", pos=np.array(step) + rng.normal(0.0, 0.01, 3), quat=[1, *rng.normal(0, 0.1, 3)])
+        body = parent.add_body(
+            name=f"limb{k}", pos=np.array(step) + rng.normal(0.0, 0.01, 3), quat=[1, *rng.normal(0, 0.1, 3)]
+        )
         made.append(body)
         ends = [end for end in ends if end is not parent] + [body]
         body.add_geom(
@@ -62,7 +64,9 @@ def random_robot(seed: int, hinges: int, extras: Collection[str] = ()) -> mujoco
             conaffinity=0,
         )
         axis = np.eye(3)[k % 3] + rng.normal(0.0, 0.1, 3)
-        joint = body.add_joint(name=f"hinge{k}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis, armature=rng.uniform(0.01, 0.05))
+        joint = body.add_joint(
+            name=f"hinge{k}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis, armature=rng.uniform(0.01, 0.05)
+        )
         _furnish(spec, joint, rng, extras)
     directions = (1, 3, 4, 6) if "elliptic" in extras else (3,)
     for n, end in enumerate(ends):

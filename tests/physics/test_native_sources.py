@@ -16,9 +16,11 @@ import pytest
 import warp as wp
 from mechanisms import EVERY_JOINT, FusedWorlds, packaged, random_motion, relative_error
 
-from legged.physics.fused import constraint_solver, contact_stage, smooth_dynamics
+from legged.physics.fused import constraint_solver, smooth_dynamics
 from legged.physics.fused.constraint_solver import SolverArrays, solver_constants, solver_kernel
-from legged.physics.fused.contact_stage import ContactStage, StageArrays, stage_constants, stage_kernel
+from legged.physics.fused.contact_kernel import SOURCE as CONTACT_SOURCE
+from legged.physics.fused.contact_kernel import StageArrays, stage_constants, stage_kernel
+from legged.physics.fused.contact_stage import ContactStage
 from legged.physics.fused.native import SOURCES, native_source
 from legged.physics.fused.smooth_dynamics import DynamicsArrays, dynamics_constants, dynamics_kernel
 from legged.physics.fused.tree import Tree
@@ -38,7 +40,7 @@ SETTINGS = {
     "dynamics": "",
     "contacts": "int found, ",
 }
-FILES = {"solver": constraint_solver.SOURCE, "dynamics": smooth_dynamics.SOURCE, "contacts": contact_stage.SOURCE}
+FILES = {"solver": constraint_solver.SOURCE, "dynamics": smooth_dynamics.SOURCE, "contacts": CONTACT_SOURCE}
 STRUCTS = {"solver": SolverArrays, "dynamics": DynamicsArrays, "contacts": StageArrays}
 GIVEN = {
     "solver": "MOST, MOST, 1e-9f, 0.01f, ",

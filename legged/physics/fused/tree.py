@@ -88,7 +88,11 @@ class Tree:
         at_depth = [np.flatnonzero(depth == t) for t in range(depth.max() + 1)]
         # Those that hang on one are side by side when sorted by their paths.
         at_depth = [np.array(sorted(those, key=lambda i: paths[i])) for those in at_depth]
-        place, of_path, below = np.zeros(nv, dtype=int), np.zeros((len(at_depth), nv), int), np.zeros((len(at_depth), nv), int)
+        place, of_path, below = (
+            np.zeros(nv, dtype=int),
+            np.zeros((len(at_depth), nv), int),
+            np.zeros((len(at_depth), nv), int),
+        )
         for t, those in enumerate(at_depth):
             place[those] = np.arange(len(those))
             for i in range(nv):
