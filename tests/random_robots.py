@@ -42,6 +42,7 @@ def random_robot(seed: int, hinges: int, extras: Collection[str] = ()) -> mujoco
     meets = 2 if "self-collision" in extras else 0  # others' bits, beside the floor's
     shape = {"contype": meets, "conaffinity": 1 | meets}
     base.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.12, 0, 0], mass=3.0 + 0.2 * hinges, **shape)
+    apart = 0.06 if meets else 0.12  # so near that feet meet
     chains = max(1, min(4, hinges // 2))
     made: list[Any] = []
     ends: list[Any] = []
@@ -49,10 +50,8 @@ def random_robot(seed: int, hinges: int, extras: Collection[str] = ()) -> mujoco
         branch = rng.random() < 0.2 and len(made) > chains
         parent = base if k < chains else made[int(rng.integers(0, len(made)))] if branch else made[k - chains]
         turn = 2.0 * np.pi * (k % chains) / chains
-        step = [0.12 * np.cos(turn), 0.12 * np.sin(turn), 0.0] if parent is base else [0.02, 0.01, -0.28 * chains / hinges]
-        body = parent.add_body(
-            name=f"limb{k}", pos=np.array(step) + rng.normal(0.0, 0.01, 3), quat=[1, *rng.normal(0, 0.1, 3)]
-        )
+        step = [apart * np.cos(turn), apart * np.sin(turn), 0.0] if parent is base else [0.02, 0.01, -0.28 * chains / hinges]
+        body = parent.add_body(name=f"limb{k}", pos=np.array(step) + rng.normal(0.0, 0.01, 3), quat=[1, *rng.normal(0, 0.1, 3)])
         made.append(body)
         ends = [end for end in ends if end is not parent] + [body]
         body.add_geom(
@@ -64,9 +63,7 @@ def random_robot(seed: int, hinges: int, extras: Collection[str] = ()) -> mujoco
             conaffinity=0,
         )
         axis = np.eye(3)[k % 3] + rng.normal(0.0, 0.1, 3)
-        joint = body.add_joint(
-            name=f"hinge{k}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis, armature=rng.uniform(0.01, 0.05)
-        )
+        joint = body.add_joint(name=f"hinge{k}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis, armature=rng.uniform(0.01, 0.05))
         _furnish(spec, joint, rng, extras)
     directions = (1, 3, 4, 6) if "elliptic" in extras else (3,)
     for n, end in enumerate(ends):
@@ -128,7 +125,7 @@ def _close(spec: Any, model: mujoco.MjModel, ends: list[Any]) -> None:
         other.data[10] = 1.0
 
 
-def rollout(model: mujoco.MjModel, seed: int, steps: int, every: int, most: float = 1.0) -> list[dict[str, np.ndarray]]:
+def rollout(model: mujoco.MjModel, seed: int, steps: int, every: int, most: float = 1.0) -> list[dict[str, Any]]:
     """Return each `every`th of `steps` states that C MuJoCo passes under random controls, in numbers of float32, with what one
     step makes of it.
     """
@@ -144,6 +141,6 @@ def rollout(model: mujoco.MjModel, seed: int, steps: int, every: int, most: floa
         mujoco.mj_step(model, data)
         if k % every == every - 1:
             names = ("qacc", "qfrc_constraint", "qfrc_smooth")
-            after = {"qpos after": data.qpos.copy(), "qvel after": data.qvel.copy(), "rows": np.array(data.nefc)}
+            after = {"qpos after": data.qpos.copy(), "qvel after": data.qvel.copy(), "rows": data.nefc, "touching": data.ncon > 0}
             passed.append(state | {name: getattr(data, name).copy() for name in names} | after)
     return passed

@@ -2,6 +2,7 @@
 // Constants: DAMPED (whether dampers are integrated implicitly), SPLIT, FRICTION, ELLIPTIC (as there).
 
 int round = 0;
+[[maybe_unused]] float dragged[DOFS];  // the force of dry friction, against the motion
 while (true) {
     if (!advancing) {
         // Forces, whether rows changed sides, and the gradient.
@@ -21,6 +22,14 @@ while (true) {
             changed |= side != sides[r];
             sides[r] = side;
         }
+        if (DRY) EACH_DOF(i) {
+            float piece;
+            OF(dragged, i) = rub(dry_D[i], dry_loss[i], OF(a, i) - dry_reference[i], piece);
+            dry_curvature[i] = most(piece, 0.0f);
+            const int side = piece > 0.0f ? 1 : (int)piece;
+            changed |= side != dry_sides[i];
+            dry_sides[i] = side;
+        }
         if (ELLIPTIC) meet();
         bool coupled = false;
         pushers = near_pushers = 0;
@@ -39,7 +48,7 @@ while (true) {
         float pushed_of[DOFS] = {};
         each_pushing([&](int r, const float* row) { EACH_DOF(i) OF(pushed_of, i) += row[i] * force[r]; });
         EACH_DOF(i) {
-            const float pushed = OF(pushed_of, i);
+            const float pushed = DRY ? OF(pushed_of, i) - OF(dragged, i) : OF(pushed_of, i);
             arrays.qfrc_constraint.data[world * arrays.qfrc_constraint.shape[1] + i] = pushed;
             OF(grad, i) = OF(Ma, i) - OF(smooth, i) - pushed;
             squares += OF(grad, i) * OF(grad, i);
@@ -92,6 +101,11 @@ while (true) {
             first += jv[r] * pull(r, x[r] + alpha * jv[r], piece);
             second += jv[r] * jv[r] * most(piece, 0.0f);
         }
+        if (DRY) EACH_DOF(i) {
+            float piece;
+            first += OF(s, i) * rub(dry_D[i], dry_loss[i], OF(a, i) + alpha * OF(s, i) - dry_reference[i], piece);
+            second += OF(s, i) * OF(s, i) * most(piece, 0.0f);
+        }
         first = sum(first) + slope + alpha * bend;
         second = sum(second) + bend;
         if (!(fabsf(first) > flat)) break;
@@ -115,5 +129,8 @@ EACH_DOF(i) {
     arrays.qacc.data[world * arrays.qacc.shape[1] + i] = OF(a, i);
     arrays.inertial.data[world * arrays.inertial.shape[1] + i] = OF(Ma, i);
 }
-EACH_ROW(r) arrays.efc_force.data[world * arrays.efc_force.shape[1] + r] = force[r];
+EACH_ROW(r) arrays.efc_force.data[(long long)world * arrays.efc_force.shape[1] + efc_row(r)] = force[r];
+if (DRY) EACH_DOF(i) {
+    if (dry_row[i] >= 0) arrays.efc_force.data[(long long)world * arrays.efc_force.shape[1] + dry_row[i]] = -OF(dragged, i);
+}
 if (lane == 0) arrays.rounds.data[world] = round;

@@ -19,8 +19,10 @@ from legged.physics.fused.tree import MOST_DOFS, Tree
 SOURCE = ("constraint_rows.h", "elliptic_cones.h", "elimination.h", "constraint_solver.h")
 ELLIPTIC_ROW = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)
 MOST_ROWS = 512
-MOST_BLOCKS = 16
-"""Worlds that a multiprocessor shall hold at least: more registers a lane than that leaves are of no use."""
+KEPT_BYTES = 3600
+"""Of a Jacobian in a block's shared memory: more rows are read from elsewhere, so that more worlds are computed at once."""
+MULTIPROCESSOR_BYTES, BYTES_OF_A_BLOCK = 228 * 1024, 1024
+"""Shared memory of a multiprocessor (an H100's), and what each block takes of it for itself."""
 Vector5 = wp.types.vector(length=5, dtype=wp.float32)
 
 
@@ -50,6 +52,7 @@ class SolverArrays:
     warmstart: wp.array2d[float]
     equalities: wp.array[int]
     frictions: wp.array[int]
+    limits: wp.array[int]
     nefc: wp.array[int]
     type: wp.array2d[int]
     id: wp.array2d[int]
@@ -72,15 +75,29 @@ class SolverArrays:
 
 
 def solver_constants(
-    tree: Tree, rows: int, entries: int, damped: bool = False, friction: bool = True, elliptic: bool = False
+    tree: Tree, rows: int, entries: int, damped: bool = False, friction: bool = True, dry: bool = True, elliptic: bool = False
 ) -> dict[str, int | bool]:
     """Return what the sources ask for, of models of a tree, with at most `rows` constraint rows and `entries` of the mass
-    matrix, with dampers to integrate implicitly or without, with rows of dry friction, and with elliptic cones.
+    matrix, with dampers to integrate implicitly or without, with rows of dry friction, all of which are `dry` degrees of
+    freedom and none tendons, and with elliptic cones.
     """
     nv = len(tree.parent)
     sizes = {"NV": nv, "ROWS": rows, "STRIDE": row_length(nv), "ENTRIES": entries}
-    kinds = {"DAMPED": damped, "FRICTION": friction, "ELLIPTIC": elliptic, "ELLIPTIC_ROW": ELLIPTIC_ROW}
+    sizes["KEPT_ROWS"] = min(rows, KEPT_BYTES // (4 * sizes["STRIDE"]))
+    kinds = {"DAMPED": damped, "FRICTION": friction, "DRY": friction and dry, "ELLIPTIC": elliptic, "ELLIPTIC_ROW": ELLIPTIC_ROW}
     return {**sizes, **kinds, **tree.constants()}
+
+
+def blocks(constants: dict[str, int | bool]) -> int:
+    """Return how many worlds a multiprocessor shall hold at least, which bounds the registers of a lane: as many as have room
+    in its shared memory, the same for each of its four schedulers.
+    """
+    nv, rows, stride = constants["NV"], constants["ROWS"], constants["STRIDE"]
+    pitch, path = (4 * ((n + 4) // 4) for n in (constants["DEPTH"], nv))
+    board = max(constants["WIDTH"] * pitch, path if constants["SPLIT"] else 0)
+    floats = (constants["KEPT_ROWS"] + nv + 1) * stride + 2 * board + constants["CORNER"]
+    taken = 4 * floats + (20 + (13 if constants["ELLIPTIC"] else 0)) * rows + (19 * nv if constants["DRY"] else 0)
+    return max(4, min(32, MULTIPROCESSOR_BYTES // (taken + BYTES_OF_A_BLOCK) // 4 * 4))
 
 
 def solver_kernel(constants: dict[str, int | bool]) -> Any:
@@ -91,7 +108,7 @@ def solver_kernel(constants: dict[str, int | bool]) -> Any:
         world: int, most_rounds: int, most_searches: int, tolerance: float, ls_tolerance: float, arrays: SolverArrays
     ) -> None: ...
 
-    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(LANES, MOST_BLOCKS))
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(LANES, blocks(constants)))
     def solve_constraints(
         most_rounds: int, most_searches: int, tolerance: float, ls_tolerance: float, arrays: SolverArrays
     ) -> None:
@@ -120,8 +137,9 @@ class ConstraintSolver:
         tree, elliptic = Tree.of(model), m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
         friction = not m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
         counts, columns = m.M_rownnz.numpy(), m.M_colind.numpy()
+        dry = not model.ntendon
         rows = np.repeat(np.arange(m.nv), counts)
-        self.constants = solver_constants(tree, d.njmax, len(rows), damped, friction, elliptic)
+        self.constants = solver_constants(tree, d.njmax, len(rows), damped, friction, dry, elliptic)
         self._kernel = solver_kernel(self.constants)
         self._lanes = 1 if d.qacc.device.is_cpu else LANES
         efc, opt = d.efc, m.opt
@@ -136,7 +154,7 @@ class ConstraintSolver:
             setattr(arrays, name, wp.array(table, dtype=wp.uint64 if name == "path" else int))
         arrays.entry_row, arrays.entry_column = wp.array(rows, dtype=int), wp.array(columns[: len(rows)], dtype=int)
         arrays.inertia, arrays.qfrc_smooth, arrays.warmstart = d.M, d.qfrc_smooth, d.qacc_warmstart
-        arrays.equalities, arrays.frictions, arrays.nefc = d.ne, d.nf, d.nefc
+        arrays.equalities, arrays.frictions, arrays.limits, arrays.nefc = d.ne, d.nf, d.nl, d.nefc
         arrays.type, arrays.id, arrays.jacobian, arrays.stiffness, arrays.reference = efc.type, efc.id, efc.J, efc.D, efc.aref
         arrays.frictionloss = efc.frictionloss
         arrays.contact_dim, arrays.contact_row, arrays.friction = d.contact.dim, d.contact.efc_address, d.contact.friction

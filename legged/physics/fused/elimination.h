@@ -90,6 +90,16 @@ auto solve = [&](auto tree) {
             }
         }
     });
+    if (DRY && !(DAMPED && advancing)) {
+        EACH_LIMB(i) {
+            UNROLLED for (int e = ROOT; e < height; ++e)
+                OF(H, i)[e] += e == (branches ? OF(depth_of, i) : i) ? dry_curvature[i] : 0.0f;
+        }
+        EACH_CORNER(n) {
+            const int i = OF_CORNER(row_of, n);
+            if (i == OF_CORNER(column_of, n)) OF_CORNER(C, n) += dry_curvature[i];
+        }
+    }
     if (DAMPED && advancing) {
         const float h = arrays.timestep.data[world % arrays.timestep.shape[0]];
         const float* damping = arrays.damping.data + (long long)(world % arrays.damping.shape[0]) * NV;

@@ -12,9 +12,9 @@ LEGGED_SHARED float bent[CONE_ROWS];  // there: of the first row and the second,
 
 if (ELLIPTIC) EACH_ROW(r) {
     directions[r] = 0;
-    if (number_of(arrays.type, r) == ELLIPTIC_ROW) {
+    if (r >= nf + arrays.limits.data[world] && number_of(arrays.type, r) == ELLIPTIC_ROW) {
         const int c = number_of(arrays.id, r), n = arrays.contact_dim.data[c];
-        const int k = r - arrays.contact_row.data[(long long)c * arrays.contact_row.shape[1]];
+        const int k = efc_row(r) - arrays.contact_row.data[(long long)c * arrays.contact_row.shape[1]];
         const float* friction = reinterpret_cast<const float*>(arrays.friction.data) + 5 * c;
         const float soften = arrays.impratio_invsqrt.data[world % arrays.impratio_invsqrt.shape[0]];
         directions[r] = k == 0 ? n : -1;
@@ -22,6 +22,8 @@ if (ELLIPTIC) EACH_ROW(r) {
         if (r - k + n > rows) { directions[r] = 0; D[r] = 0.0f; }  // not all of the contact found room
     }
 }
+
+if (ELLIPTIC) meet();
 
 // The forces of the contact that begins with row r, for `sides` of the piece of its cost.
 [[maybe_unused]] auto press = [&](int r) {

@@ -222,12 +222,11 @@ for (int level = 1; level <= DEPTH; ++level) {
                 }
             }
         }
-        if (EQUALITIES)
-            for (int k = 0; k < 6; ++k) reinterpret_cast<float*>(arrays.cvel.data)[((long long)world * NB + b) * 6 + k] = v[k];
         for (int k = 0; k < 6; ++k) { velocity[b * 6 + k] = v[k]; acceleration[b * 6 + k] = a[k]; }
     }
     meet();
 }
+if (EQUALITIES) EACH(k, 6 * NB) reinterpret_cast<float*>(arrays.cvel.data)[(long long)world * 6 * NB + k] = velocity[k];
 EACH(i, NV) {
     float f[6];
     momentum(carried + arrays.dof_bodyid.data[i] * 10, motion + i * 6, f);
