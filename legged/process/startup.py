@@ -12,6 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
+from legged.process.deferred_compiler import defer_compiler
+
 STARTED_S = time.perf_counter()
 """When this package was first imported, on the clock of `time.perf_counter` [s]."""
 INTERRUPTED = 128 + signal.SIGINT
@@ -89,3 +91,4 @@ def raise_at_interrupts() -> None:
 
 if command_of_ours():
     leave_at_interrupts()
+    defer_compiler()
