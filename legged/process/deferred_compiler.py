@@ -1,9 +1,9 @@
 """torch's compiler, imported when somebody compiles and not before.
 
-`torch._dynamo` and what it imports (sympy, torch._inductor, parts of torch.distributed) are a third of all modules of a training
-and two fifths of its start, and nothing here compiles. But it is imported in passing: tensordict marks some of its functions for
-it, torch's optimisers and dispatch modes switch it off around themselves. Until somebody wants more of it than that, a module
-stands in its place which notes these marks; then the real one is imported, and is given them.
+`torch._dynamo` and what it imports (sympy, torch._inductor, parts of torch.distributed) are a third of all modules of a
+training and a third of its start, and nothing here compiles. But it is imported in passing: tensordict marks some of its
+functions for it, torch's optimisers and dispatch modes switch it off around themselves. Until somebody wants more of it than
+that, a module stands in its place which notes these marks; then the real one is imported, and is given them.
 """
 
 import importlib
@@ -19,18 +19,17 @@ NAME = "torch._dynamo"
 
 
 class DeferredCompiler(ModuleType):
-    """What stands in for `torch._dynamo`: the four functions that are called by code that does not compile. Anything else that
-    is asked of it, or of a module inside it, is asked of the real one.
+    """What stands in for `torch._dynamo`: the four functions that are called by code that does not compile. Anything else is
+    asked of the real one, and so is a module inside it.
     """
 
     def __init__(self, folder: Path) -> None:
         """Stand in for the package in `folder`."""
-        super().__init__(NAME, "Stands in for torch's compiler.")
+        super().__init__(NAME, "A stand-in for torch's compiler.")
         spec = importlib.util.spec_from_file_location(NAME, folder / "__init__.py", submodule_search_locations=[str(folder)])
         # Who looks through all modules, for a file for instance, shall not cause an import.
         self.__spec__, self.__file__, self.__path__ = spec, str(folder / "__init__.py"), [str(folder)]
         self.__package__ = NAME
-        self._real: ModuleType | None = None
         self._marks: list[tuple[str, Any]] = []
         self._not_disabled: list[Any] = []
 
@@ -43,8 +42,8 @@ class DeferredCompiler(ModuleType):
         return self._mark("assume_constant_result", function)
 
     def _mark(self, name: str, function: Any) -> Any:
-        if self._real is not None:
-            return getattr(self._real, name)(function)
+        if not self.stands:
+            return getattr(self.real(), name)(function)
         self._marks.append((name, function))
         return function
 
@@ -52,15 +51,15 @@ class DeferredCompiler(ModuleType):
         """Leave a function as it is for torch's own wrapper, which asks when it is called first and keeps what it is given;
         nobody else is served before the compiler is there.
         """
-        if self._real is None and sys._getframe(1).f_globals.get("__name__") == "torch._compile":
+        if self.stands and sys._getframe(1).f_globals.get("__name__") == "torch._compile":
             self._not_disabled.append(function)
             return function
         return self.real().disable(function, *args, **kwargs)
 
     def graph_break(self, *args: Any, **kwargs: Any) -> None:
         """Do nothing: outside of what is being compiled, the real one does nothing either."""
-        if self._real is not None:
-            self._real.graph_break(*args, **kwargs)
+        if not self.stands:
+            self.real().graph_break(*args, **kwargs)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -69,15 +68,20 @@ class DeferredCompiler(ModuleType):
 
     def real(self) -> ModuleType:
         """Return the real module, imported by the first who asks, and told of the marks."""
-        if self._real is None:
-            if sys.modules.get(NAME) is self:
-                del sys.modules[NAME]
-            self._real = importlib.import_module(NAME)
-            for name, function in self._marks:
-                getattr(self._real, name)(function)
-            for function in self._not_disabled:
-                vars(function).pop("__dynamo_disable", None)  # torch's wrapper will ask again
-        return self._real
+        if not self.stands:
+            return importlib.import_module(NAME)
+        del sys.modules[NAME]
+        real = importlib.import_module(NAME)
+        for name, function in self._marks:
+            getattr(real, name)(function)
+        for function in self._not_disabled:
+            vars(function).pop("__dynamo_disable", None)  # torch's wrapper will ask again
+        return real
+
+    @property
+    def stands(self) -> bool:
+        """Whether nobody has wanted the real module yet."""
+        return sys.modules.get(NAME) is self
 
 
 class _Submodules:
@@ -88,7 +92,7 @@ class _Submodules:
 
     def find_spec(self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
         """Find a module that has just been imported in passing; all others are left to Python."""
-        if not name.startswith(f"{NAME}."):
+        if not self._stand_in.stands or not name.startswith(f"{NAME}."):
             return None
         self._stand_in.real()
         module = sys.modules.get(name)
