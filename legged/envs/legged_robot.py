@@ -24,6 +24,9 @@ from legged.physics import RobotScene, Scene
 from legged.robots.robot import Robot, load_robot
 from legged.terrain import Terrain
 
+POSES = 256
+"""Poses with closed loops that are drawn at the start."""
+
 
 class LeggedRobot(Terms, BaseTask):
     """A legged robot that follows velocity commands. Subclass it and add `_reward_<name>`, `_obs_<name>`, `_terminate_<name>`
@@ -123,6 +126,18 @@ class LeggedRobot(Terms, BaseTask):
         self._reset_velocity = torch.zeros(2, n, 3, device=device)  # linear, angular, both in the base frame
         self._spawn_yaw = torch.zeros(n, device=device)
         self.reset_qpos[:, 3] = 1.0
+        self._poses: Tensor | None = None
+        """(K, nq) poses with closed loops, of which resets take one, where there are passive joints."""
+        if robot.passive is not None:
+            where = cfg.origins.where("init_state.dof_pos_factor")
+            poses = robot.passive.draw(robot.default_qpos, cfg.init_state.dof_pos_factor, POSES, cfg.env.seed, where)
+            self._poses = torch.tensor(poses, dtype=torch.float32, device=device)[:, 7:]
+            self._pose_draw = torch.zeros(n, device=device)
+            self.passive_default_pos = torch.tensor(
+                robot.default_qpos[list(robot.passive.qpos_columns)], dtype=torch.float32, device=device
+            )
+            self.passive_qpos_columns = torch.tensor(robot.passive.qpos_columns, device=device)
+            self.passive_qvel_columns = torch.tensor(robot.passive.qvel_columns, device=device)
 
     def _soft_limits(self, robot: Robot) -> Tensor:
         """Return joint limits (D, 2), shrunk about their middle by `soft_dof_pos_limit` [rad]."""
@@ -174,9 +189,15 @@ class LeggedRobot(Terms, BaseTask):
         self.draw_noise()
 
     def draw_reset(self) -> None:
-        """Draw joints near the default pose and a base at its spawn height, moving."""
+        """Draw joints near the default pose and a base at its spawn height, moving. Of a robot with passive joints, a pose is
+        one of those that were drawn at the start: loops must close.
+        """
         cfg = self.cfg.init_state
-        self.reset_qpos[:, 7:].uniform_(*cfg.dof_pos_factor).mul_(self.default_dof_pos)
+        if self._poses is None:
+            self.reset_qpos[:, 7:].uniform_(*cfg.dof_pos_factor).mul_(self.default_dof_pos)
+        else:
+            chosen = self._pose_draw.uniform_(0.0, len(self._poses)).long().clamp_(max=len(self._poses) - 1)
+            self.reset_qpos[:, 7:].copy_(self._poses[chosen])
         self._reset_velocity.uniform_(*cfg.base_velocity)
         self._spawn_yaw.uniform_(*cfg.yaw)
         if self.terrain_curriculum is not None:

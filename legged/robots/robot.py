@@ -6,15 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from legged.config.bounds import LARGEST, NAMES, between, positive
+from legged.config.bounds import LARGEST, NAMES, TERMS, between, positive
 from legged.config.checks import build, shown
 from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, exists
 from legged.robots.mirror import Mirror
+from legged.robots.passive_joints import PassiveJoints, default_qpos
 from legged.robots.patterns import match_values
-from legged.robots.robot_model import base_mass, check_model, hinges, read_model
+from legged.robots.robot_model import base_mass, check_model, driven_joints, passive_joints, read_model
 from legged.robots.shapes import Shapes
 
 
@@ -42,11 +43,14 @@ class RobotFile:
     """Patterns of the shapes whose contact the `collision` reward counts."""
     terminate_after_contacts_on: tuple[str, ...] = ()
     """Patterns of the shapes whose contact ends the episode."""
+    passive_joints: tuple[str, ...] = field(default=(), metadata=TERMS)
+    """Patterns of the joints that no motor drives: springs, rods, whatever closes a loop. They may be slides and balls."""
 
 
 @dataclass(frozen=True)
 class Robot:
-    """What the task needs to know of a robot. D joints in the order of the model, S collision shapes, F feet, B contacts.
+    """What the task needs to know of a robot. D joints with a motor, in the order of the model, P passive hinges and slides,
+    S collision shapes, F feet, B contacts. Where nothing else is said, a joint is one with a motor.
 
     A contact is what a contact force is stated for: a collision shape, or all shapes of a foot together.
     """
@@ -63,6 +67,14 @@ class Robot:
     """(D,) [rad/s]."""
     torque_limits: np.ndarray
     """(D,) [N m]."""
+    qpos_columns: tuple[int, ...]
+    """(D,) where each joint's angle is in MuJoCo's generalised positions; `qvel_columns` in the velocities."""
+    qvel_columns: tuple[int, ...]
+    passive: PassiveJoints | None
+    """Joints that no motor drives; none if every joint has one."""
+    default_qpos: np.ndarray
+    """(nq,) MuJoCo's generalised positions at action 0: the base level at the origin, passive joints where springs and loops
+    put them."""
     shape_names: tuple[str, ...]
     """Names of the S collision shapes, in the order of the model."""
     contact_of_shape: tuple[int, ...]
@@ -116,19 +128,27 @@ def load_robot(name: str, where: str = "robot") -> Robot:
         raise ConfigError(f"{path}: missing: {', '.join(missing)}")
     file = build(RobotFile, data, "", Origins(), str(path))
     model = read_model(folder, file.model, str(path))
-    check_model(model, file.base, str(path))
-    joints = [model.joint(i) for i in hinges(model)]
+    check_model(model, file.base, str(path), file.passive_joints)
+    undriven = passive_joints(model, file.passive_joints, str(path))
+    joints = [model.joint(i) for i in driven_joints(model, undriven)]
     names = tuple(joint.name for joint in joints)
+    default = match_values(file.default_joint_angles, names, f"{path}: default_joint_angles")
+    numbers = [joint.id for joint in joints]
+    passive = PassiveJoints.of(model, numbers, undriven) if undriven else None
     shapes = Shapes.of(model, file.feet, f"{path}: feet")
     return Robot(
         name=folder.name,
         folder=folder,
         file=file,
         joint_names=names,
-        default_dof_pos=match_values(file.default_joint_angles, names, f"{path}: default_joint_angles"),
+        default_dof_pos=default,
         dof_pos_limits=np.array([j.range if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in joints], dtype=float),
         dof_vel_limits=match_values(file.velocity_limit, names, f"{path}: velocity_limit"),
         torque_limits=model.actuator_forcerange[:, 1].copy(),
+        qpos_columns=tuple(int(joint.qposadr[0]) for joint in joints),
+        qvel_columns=tuple(int(joint.dofadr[0]) for joint in joints),
+        passive=passive,
+        default_qpos=default_qpos(model, numbers, default, passive, f"{path}: default_joint_angles"),
         shape_names=shapes.names,
         contact_of_shape=shapes.contact,
         contact_names=shapes.contact_names,
@@ -138,7 +158,7 @@ def load_robot(name: str, where: str = "robot") -> Robot:
         termination_indices=shapes.contacts(file.terminate_after_contacts_on, f"{path}: terminate_after_contacts_on"),
         mass=float(model.body_mass.sum()),
         base_mass=base_mass(model, file.base),
-        mirror=Mirror.of(model, [joint.id for joint in joints], shapes.feet_shapes),
+        mirror=Mirror.of(model, numbers, shapes.feet_shapes, passive.numbers if passive else ()),
     )
 
 

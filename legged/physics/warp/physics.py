@@ -13,6 +13,7 @@ from torch import Tensor
 
 from legged.math import masked_set_
 from legged.physics.base import Physics
+from legged.physics.robot_state import DrivenJoints
 from legged.physics.warp.exchange import StateExchange
 
 
@@ -26,6 +27,7 @@ class WarpPhysics(Physics):
 
     capturable = True
     _exchange: StateExchange
+    _joints: DrivenJoints | None = None
 
     def __init__(self, num_envs: int, dt: float, device: torch.device) -> None:
         """Prepare the part that needs no engine."""
@@ -65,10 +67,14 @@ class WarpPhysics(Physics):
     def step(self) -> None:
         with self._on_device():
             self._advance()
+            if self._joints is not None:
+                self._joints.read()
         self._forces_read = False
 
     def refresh(self) -> None:
         with self._on_device():
+            if self._joints is not None:
+                self._joints.read()
             self._exchange.kinematics()
             if not self._forces_read:  # once a step: a reset in between has cleared its worlds' forces
                 self._exchange.contact_forces()
