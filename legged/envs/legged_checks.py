@@ -23,6 +23,7 @@ def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     if cfg.train.algorithm.symmetry:
         check_symmetry(cls, cfg, robot)
     control_gains(robot, cfg.control, cfg.origins.where)
+    check_passive(cfg, robot)
     action_scales(robot, cfg.control, cfg.origins.where)
     check_terrain(cfg.terrain, cfg.origins)
     check_base_mass(cfg, robot)
@@ -47,6 +48,20 @@ def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     if sorted(y) != sorted(-value for value in y):
         points = f"terrain.measured_points_y ({origins.of('terrain.measured_points_y')})"
         raise ConfigError(f"{where}: {points} are not the same left and right: {list(y)}")
+
+
+def check_passive(cfg: LeggedConfig, robot: Robot) -> None:
+    """Look whether observations of passive joints are of a robot that has some.
+
+    Raises:
+        ConfigError: it has none.
+    """
+    names = ("passive_pos", "passive_vel")
+    for group, terms in ((name, group.terms) for name, group in cfg.observations.groups.items()):
+        for term in terms:
+            if term in names and (robot.passive is None or not robot.passive.names):
+                where = cfg.origins.where(f"observations.groups.{group}.terms")
+                raise ConfigError(f"{where}: {term}: '{robot.name}' has no passive hinges or slides (passive_joints)")
 
 
 def check_base_mass(cfg: LeggedConfig, robot: Robot) -> None:

@@ -25,6 +25,9 @@ from legged.physics import RobotScene, Scene
 from legged.robots.robot import Robot, load_robot
 from legged.terrain import Terrain
 
+POSES = 256
+"""Poses with closed loops that are drawn at the start."""
+
 
 class LeggedRobot(Terms, LeggedGymNames, BaseTask):
     """A legged robot that follows velocity commands. Subclass it and add `_reward_<name>`, `_obs_<name>`, `_terminate_<name>`
@@ -130,6 +133,18 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self._reset_velocity = self.numbers.between(*cfg.init_state.base_velocity, 6)  # linear, angular; base frame
         self._reset_yaw = self.numbers.between(*cfg.init_state.yaw, 1)
         self.reset_qpos[:, 3] = 1.0
+        self._poses: Tensor | None = None
+        """(K, nq) poses with closed loops, of which resets take one, where there are passive joints."""
+        if robot.passive is not None:
+            where = cfg.origins.where("init_state.dof_pos_factor")
+            poses = robot.passive.draw(robot.default_qpos, cfg.init_state.dof_pos_factor, POSES, cfg.env.seed, where)
+            self._poses = torch.tensor(poses, dtype=torch.float32, device=device)[:, 7:]
+            self._pose_draw = self.numbers.between(0.0, float(len(poses)), 1)
+            self.passive_default_pos = torch.tensor(
+                robot.default_qpos[list(robot.passive.qpos_columns)], dtype=torch.float32, device=device
+            )
+            self.passive_qpos_columns = torch.tensor(robot.passive.qpos_columns, device=device)
+            self.passive_qvel_columns = torch.tensor(robot.passive.qvel_columns, device=device)
 
     def _soft_limits(self, robot: Robot) -> Tensor:
         """Return joint limits (D, 2), shrunk about their middle by `soft_dof_pos_limit` [rad]."""
@@ -179,10 +194,15 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.command_sampler.draw()
 
     def draw_reset(self) -> None:
-        """Draw joints near the default pose and a base at its spawn height, moving."""
+        """Draw joints near the default pose and a base at its spawn height, moving. Of a robot with passive joints, a pose is
+        one of those that were drawn at the start: loops must close.
+        """
         if self.terrain_curriculum is not None:
             self.terrain_curriculum.draw()
-        self.reset_qpos[:, 7:].copy_(self._reset_joints.values)
+        if self._poses is None:
+            self.reset_qpos[:, 7:].copy_(self._reset_joints.values)
+        else:
+            self.reset_qpos[:, 7:].copy_(self._poses[self._pose_draw.values[:, 0].long().clamp_(max=len(self._poses) - 1)])
         self.reset_qvel[:, :6].copy_(self._reset_velocity.values)
         if self.cfg.init_state.yaw != (0.0, 0.0):
             half_yaw = 0.5 * self._reset_yaw.values[:, 0]

@@ -13,6 +13,7 @@ from legged.mdp.control import Control
 from legged.mdp.height_scan import HeightScan
 from legged.mdp.mirror_images import MirrorKind
 from legged.mdp.tracking_error import velocity_error, yaw_rate_error
+from legged.physics import Physics
 from legged.terrain import Terrain
 
 TERMINATION_FORCE = 1.0
@@ -35,11 +36,14 @@ class Terms:
         "dof_vel": "joints",
         "actions": "actions",
         "heights": "heights",
+        "passive_pos": "passive",
+        "passive_vel": "passive",
     }
     """Observation term -> how its numbers change when left and right are exchanged; a subclass adds its own terms'."""
     cfg: LeggedConfig
     dt: float
     """Control step [s]."""
+    physics: Physics
     base_pos: Tensor
     """(N, 3) base in the world [m]; `base_quat` (N, 4) is its orientation (w, x, y, z)."""
     base_quat: Tensor
@@ -54,6 +58,11 @@ class Terms:
     last_dof_vel: Tensor
     default_dof_pos: Tensor
     """(D,) joint angles at action 0 [rad]."""
+    passive_default_pos: Tensor
+    """(P,) passive hinges [rad] and slides [m] at action 0; where they are among the generalised positions and velocities.
+    Only robots with passive joints have these three."""
+    passive_qpos_columns: Tensor
+    passive_qvel_columns: Tensor
     dof_pos_limits: Tensor
     """(D, 2) soft limits [rad]; `dof_vel_limits` (D,) [rad/s]."""
     dof_vel_limits: Tensor
@@ -116,6 +125,14 @@ class Terms:
     def _obs_dof_vel(self) -> Tensor:
         """Joint velocity, by joint [rad/s]."""
         return self.dof_vel
+
+    def _obs_passive_pos(self) -> Tensor:
+        """Angles of the passive joints, less those of the default pose: among them how far springs give way [rad]."""
+        return self.physics.qpos[:, self.passive_qpos_columns] - self.passive_default_pos
+
+    def _obs_passive_vel(self) -> Tensor:
+        """Velocities of the passive joints [rad/s]."""
+        return self.physics.qvel[:, self.passive_qvel_columns]
 
     def _obs_actions(self) -> Tensor:
         """The policy's last output within plus and minus action_clip, by joint; 0 at the start of an episode [1]."""

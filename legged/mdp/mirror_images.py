@@ -10,10 +10,10 @@ from legged.errors import ConfigError
 from legged.mdp.observations import ObservationGroup
 from legged.robots.mirror import Mirror
 
-MirrorKind = Literal["same", "vector", "rotation", "command", "joints", "actions", "feet", "heights"]
+MirrorKind = Literal["same", "vector", "rotation", "command", "joints", "actions", "passive", "feet", "heights"]
 """How the numbers of an observation change. `vector`: (x, y, z) of a velocity or direction; `rotation`: of an angular
-velocity; `command`: (vx, vy, yaw rate); `joints`, `actions`, `feet`: a number for each; `heights`: the height scan; `same`:
-numbers that know no side."""
+velocity; `command`: (vx, vy, yaw rate); `joints`, `actions`, `passive` (joints), `feet`: a number for each; `heights`: the
+height scan; `same`: numbers that know no side."""
 SIGNS = {"vector": (1.0, -1.0, 1.0), "rotation": (-1.0, 1.0, -1.0), "command": (1.0, -1.0, -1.0)}
 """Kind of term -> signs of its three numbers. A rotation is a pseudo-vector: it keeps its y."""
 
@@ -78,6 +78,8 @@ class MirrorImages:
             return torch.arange(len(SIGNS[kind])), torch.tensor(SIGNS[kind])
         if kind == "joints":
             return torch.tensor(self._mirror.joints), torch.tensor(self._mirror.signs)
+        if kind == "passive":
+            return torch.tensor(self._mirror.passive, dtype=torch.long), torch.tensor(self._mirror.passive_signs)
         if kind == "actions":
             image = mirror_of_actions(self._mirror, self._acted)
             if image is None:

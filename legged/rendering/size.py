@@ -21,10 +21,7 @@ class RobotSize:
 def size_of(robot: Robot) -> RobotSize:
     """Measure the shapes of a robot, seen or touched."""
     model = mujoco.MjModel.from_xml_path(str(robot.model_path))
-    qpos = np.zeros(model.nq)
-    qpos[3:7] = [1.0, 0.0, 0.0, 0.0]
-    qpos[7 : 7 + robot.num_dof] = robot.default_dof_pos
-    return size_of_model(model, qpos)
+    return size_of_model(model, robot.default_qpos)
 
 
 def size_of_model(model: mujoco.MjModel, qpos: np.ndarray) -> RobotSize:

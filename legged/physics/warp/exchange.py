@@ -50,7 +50,8 @@ def read_kinematics(
     overflow: wp.array[int],
     lost: int,
     foot_offset: wp.array[wp.vec3],
-    joint: wp.array2d[int],
+    position: wp.array2d[int],
+    speed: wp.array2d[int],
     axis: wp.array2d[wp.vec3],
     anchor: wp.array2d[wp.vec3],
     body_pos: wp.array2d[wp.vec3],
@@ -70,12 +71,11 @@ def read_kinematics(
 
     point = foot_offset[foot]
     velocity = wp.vec3(0.0)
-    for level in range(joint.shape[0]):
-        j = joint[level, foot]
+    for level in range(position.shape[0]):
         a = axis[level, foot]
-        angle = qpos[world, 7 + j]
+        angle = qpos[world, position[level, foot]]
         point = turn(point - anchor[level, foot], a, angle)
-        velocity = turn(velocity, a, angle) + qvel[world, 6 + j] * wp.cross(a, point)
+        velocity = turn(velocity, a, angle) + qvel[world, speed[level, foot]] * wp.cross(a, point)
         point = rotate(body_quat[level, foot], point + anchor[level, foot]) + body_pos[level, foot]
         velocity = rotate(body_quat[level, foot], velocity)
     feet_pos[world, foot] = base + rotate(quat, point)
@@ -225,7 +225,8 @@ class RobotExchange(StateExchange, ABC):
             arrays.overflow,
             arrays.lost,
             wp.array(chains.offset, dtype=wp.vec3),
-            wp.array(chains.joint, dtype=int),
+            wp.array(chains.position, dtype=int),
+            wp.array(chains.speed, dtype=int),
             wp.array(chains.axis, dtype=wp.vec3),
             wp.array(chains.anchor, dtype=wp.vec3),
             wp.array(chains.body_pos, dtype=wp.vec3),

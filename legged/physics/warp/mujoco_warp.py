@@ -18,7 +18,7 @@ from legged.physics.fused.constraint_solver import ConstraintSolver, ask_for_den
 from legged.physics.fused.contact_stage import ContactStage
 from legged.physics.fused.torque_step import TorqueStep
 from legged.physics.quantities import LAST_STEP, stage_of
-from legged.physics.robot_state import robot_state
+from legged.physics.robot_state import DrivenJoints, robot_state
 from legged.physics.scene import Scene
 from legged.physics.warp.compile import compile_ahead
 from legged.physics.warp.exchange import MujocoWarpExchange, StateExchange, arrays_of
@@ -85,6 +85,7 @@ class MujocoWarpPhysics(WarpPhysics):
                 self._exchange = StateExchange(arrays_of(d), self.overflowed)
             else:
                 self.robot_state = robot_state(self.qpos, self.qvel, scene.robot)
+                self._joints = DrivenJoints(self.qpos, self.qvel, self.robot_state, scene.robot)
                 self._exchange = MujocoWarpExchange(self._m, d, self.overflowed, self.model, scene.robot, self.robot_state)
             sample = mujoco.MjData(self.model)
             self._quantities = {

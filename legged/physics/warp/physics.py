@@ -12,6 +12,7 @@ import warp as wp
 from torch import Tensor
 
 from legged.physics.base import Physics
+from legged.physics.robot_state import DrivenJoints
 from legged.physics.warp.exchange import StateExchange
 from legged.physics.warp.task_kernels import TaskKernels
 
@@ -27,6 +28,7 @@ class WarpPhysics(Physics):
     capturable = True
     kernels: TaskKernels
     _exchange: StateExchange
+    _joints: DrivenJoints | None = None
 
     def __init__(self, num_envs: int, dt: float, device: torch.device) -> None:
         """Prepare the part that needs no engine."""
@@ -67,10 +69,14 @@ class WarpPhysics(Physics):
     def step(self) -> None:
         with self._on_device():
             self._advance()
+            if self._joints is not None:
+                self._joints.read()
         self._forces_read = False
 
     def refresh(self) -> None:
         with self._on_device():
+            if self._joints is not None:
+                self._joints.read()
             self._exchange.kinematics()
             if not self._forces_read:  # once a step: a reset in between has cleared its worlds' forces
                 self._exchange.contact_forces()
