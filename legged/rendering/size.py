@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from legged.robots.importing.adapted import robot_spec_of
 from legged.robots.robot import Robot
 
 
@@ -20,7 +21,7 @@ class RobotSize:
 
 def size_of(robot: Robot) -> RobotSize:
     """Measure the shapes of a robot, seen or touched."""
-    model = mujoco.MjModel.from_xml_path(str(robot.model_path))
+    model = robot_spec_of(robot.model_path).compile()
     qpos = np.zeros(model.nq)
     qpos[3:7] = [1.0, 0.0, 0.0, 0.0]
     qpos[7 : 7 + robot.num_dof] = robot.default_dof_pos

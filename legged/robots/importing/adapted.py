@@ -15,9 +15,9 @@ URDF = ".urdf"
 
 
 def robot_spec_of(path: Path, drawn: bool = False) -> mujoco.MjSpec:
-    """Return a robot's model. A URDF, and MJCF that was written for something else, are adapted: the floor and the lights of a
-    scene go, the base floats, welded links are merged, every hinge that is driven has a motor, in their order, each shape that
-    collides has a name and is a primitive. Shapes that are only seen are left out of those unless `drawn`.
+    """Return a robot's model. A URDF, and MJCF that was written for something else, are adapted: what a scene has beside the
+    robot goes, the base floats, welded links are merged, hinges that are driven have motors, in their order, and each shape
+    that collides has a name and is a primitive. Shapes that are only seen are left out of those unless `drawn`.
 
     Raises:
         ConfigError: there is no robot in the file.
@@ -49,9 +49,14 @@ def _adapted(path: Path, _stamp: tuple[int, int], drawn: bool) -> str:
         raise ConfigError(f"{path}: can't be adapted: {error}") from error
 
 
+def is_plain_file(path: Path) -> bool:
+    """Return whether a robot's file is used as it is."""
+    return path.suffix.lower() != URDF and is_plain(mujoco.MjSpec.from_file(str(path)))
+
+
 def is_plain(spec: mujoco.MjSpec) -> bool:
-    """Return whether a spec is a robot alone, as engines rely on it: one body with a free joint on the world, hinges below it,
-    motors in their order, and shapes that collide with names, none of them a mesh.
+    """Return whether a spec is a robot alone, as engines rely on it: one body with a free joint on the world, hinges below
+    it, motors in their order, and shapes that collide with names, none of them a mesh.
     """
     world = spec.worldbody
     if len(world.bodies) != 1 or world.geoms:

@@ -2,7 +2,7 @@
 with names, drawn shapes apart.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -15,9 +15,7 @@ DRAWN_GROUP, TOUCHED_GROUP = 2, 3
 GREY = "0.7 0.7 0.72 1"
 
 
-def mjcf_of(
-    tree: Tree, files: Mapping[str, Path] | None = None, height: float = 0.0, remarks: list[str] | None = None
-) -> str:
+def mjcf_of(tree: Tree, files: Mapping[str, Path] | None = None, height: float = 0.0, remarks: Sequence[str] = ()) -> str:
     """Return a tree as MJCF. `files` says where the drawn meshes lie, by their names; without it, or where a name is missing
     in it, meshes are not drawn. The base is drawn at `height` [m]; `remarks` stand at the top.
     """
