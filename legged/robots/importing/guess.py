@@ -17,6 +17,8 @@ from legged.robots.importing.text import mjcf_of
 from legged.robots.importing.tree import Shape, Tree
 from legged.robots.importing.urdf import read_urdf
 
+LIGHT = 0.002
+"""Joints that move a smaller part of the mass are none that walking needs: fingers, sensors."""
 ABOVE = 1.03
 """Spawn height, in that of the standing base."""
 LOST = 1e-6
@@ -44,7 +46,7 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
         ConfigError: there is no robot with legs in it, or mass was lost.
     """
     fit_meshes(tree)
-    mend(tree, hold)
+    mend(tree, hold, LIGHT)
     face_forward(tree)
     legs = find_legs(tree)
     name_shapes(tree)

@@ -29,15 +29,15 @@ TINY = 1e-12
 """Principal moments [kg m^2] and masses [kg] below this are none."""
 
 
-def mend(tree: Tree, hold: Sequence[str] = ()) -> None:
-    """Put a tree right in place: hold the joints whose names contain one of `hold`, weld what carries no mass, merge welded
-    links, mend inertias.
+def mend(tree: Tree, hold: Sequence[str] = (), light: float = 0.0) -> None:
+    """Put a tree right in place: hold the joints whose names contain one of `hold`, and those that move at most the part
+    `light` of the mass, weld what carries no mass, merge welded links, mend inertias.
 
     Raises:
         ConfigError: a pattern of `hold` matches no joint, or there is no mass.
     """
     _hold(tree, hold)
-    _weld_what_weighs_nothing(tree)
+    _hold_what_is_light(tree, light)
     merge_welded(tree)
     if not tree.links[0].mass + sum(link.mass for link in tree.links) > 0.0:
         raise ConfigError(f"{tree.source}: no link has a mass")
@@ -66,16 +66,25 @@ def fix(link: Link, hinge: Hinge, angle: float) -> None:
     link.hinges = [other for other in link.hinges if other is not hinge]
 
 
-def _weld_what_weighs_nothing(tree: Tree) -> None:
-    """Take the hinges from links that move no mass, their own or another link's."""
+def _hold_what_is_light(tree: Tree, light: float) -> None:
+    """Hold joints that move no mass, their own link's or another's, or nearly none of the robot's, as those of fingers do."""
     moved = [link.mass for link in tree.links]
-    for i in reversed(range(len(tree.links))):
-        link = tree.links[i]
-        if link.hinges and moved[i] <= TINY:
-            tree.say("joints that move no mass are held", link.hinges[0].name)
-            link.hinges = []
-        if link.parent >= 0:
-            moved[link.parent] += moved[i]
+    for i in reversed(range(1, len(tree.links))):
+        moved[tree.links[i].parent] += moved[i]
+    for i, link in enumerate(tree.links):
+        for hinge in list(link.hinges):
+            if moved[i] <= TINY:
+                tree.say("joints that move no mass are held", hinge.name)
+                fix(link, hinge, 0.0)
+            elif moved[i] < light * moved[0]:
+                angle = rest_angle(tree, hinge)
+                tree.say(f"joints that move less than {light:.1%} of the mass are held", f"{hinge.name} at {angle:.3g} rad")
+                fix(link, hinge, angle)
+
+
+def rest_angle(tree: Tree, hinge: Hinge) -> float:
+    """Return the angle [rad] at which a joint is held: that of the keyframe, else the nearest to 0."""
+    return float(np.clip((tree.home or {}).get(hinge.name, 0.0), *(hinge.range or (-np.inf, np.inf))))
 
 
 def merge_welded(tree: Tree) -> None:
@@ -88,7 +97,7 @@ def merge_welded(tree: Tree) -> None:
         parent, turn = tree.links[link.parent], matrix(link.quat)
         add_mass(parent, link.mass, link.pos + turn @ link.com, turn @ link.inertia @ turn.T)
         for shape in link.shapes:
-            shape.pos, shape.quat = link.pos + turn @ shape.pos, quat_product(link.quat, shape.quat)
+            shape.move(link.pos, link.quat)
         parent.shapes += link.shapes
         for child in tree.links:
             if child.parent == i:

@@ -17,6 +17,10 @@ READ = (".stl", ".obj", ".msh")
 """Files that MuJoCo reads."""
 MOST_FACES = 200_000
 """Of an STL file, by MuJoCo's decoder."""
+ENOUGH_FACES = 50_000
+"""Of one that had too many."""
+FINEST = 600
+"""Cells along the longest side of a mesh that is thinned, at first."""
 STL_HEADER, STL_FACE = 84, 50
 """[bytes]"""
 
@@ -55,13 +59,30 @@ def read(path: Path, scale: Vector) -> list[tuple[Mesh, Vector | None]]:
         with path.open("rb") as file:
             head = file.read(STL_HEADER)
         faces = int.from_bytes(head[80:84], "little")
-        if path.stat().st_size == STL_HEADER + STL_FACE * faces:
-            if faces > MOST_FACES:
-                raise MeshProblem(f"{path.name} has {faces:,} faces, and MuJoCo reads {MOST_FACES:,}")
+        if path.stat().st_size == STL_HEADER + STL_FACE * faces and faces <= MOST_FACES:
             return [(Mesh(path.stem, path, scale), None)]
     elif path.suffix.lower() in READ:
         return [(Mesh(path.stem, path, scale), None)]
-    return [(Mesh(path.stem, None, scale, v * scale, f), rgba) for v, f, rgba in _converted(path)]
+    parts = [(*_thinned(vertices, faces), rgba) for vertices, faces, rgba in _converted(path)]
+    return [(Mesh(path.stem, None, scale, vertices * scale, faces), rgba) for vertices, faces, rgba in parts]
+
+
+def _thinned(vertices: Vector, faces: Vector) -> tuple[Vector, Vector]:
+    """Return vertices (V, 3) and faces (T, 3) of a mesh that MuJoCo reads: of one with too many faces, vertices that are near
+    each other become one.
+    """
+    cells = FINEST
+    low, extent = vertices.min(axis=0), max(float(np.ptp(vertices, axis=0).max()), 1e-9)
+    points, corners = vertices, faces
+    if len(faces) <= MOST_FACES:
+        return vertices, faces
+    while len(corners) > ENOUGH_FACES and cells > 1:
+        places, which = np.unique(np.round((vertices - low) / extent * cells).astype(int), axis=0, return_inverse=True)
+        points, corners = low + places * extent / cells, which.reshape(-1)[faces]
+        a, b, c = corners.T
+        corners = corners[(a != b) & (b != c) & (a != c)]
+        cells = cells * 2 // 3
+    return points, corners
 
 
 @cache

@@ -164,7 +164,7 @@ def _turn_upright(base: Link) -> None:
     turn = matrix(base.quat)
     base.com, base.inertia = turn @ base.com, turn @ base.inertia @ turn.T
     for shape in base.shapes:
-        shape.pos, shape.quat = turn @ shape.pos, quat_product(base.quat, shape.quat)
+        shape.move(np.zeros(3), base.quat)
     base.pos, base.quat = np.zeros(3), np.array(IDENTITY)
 
 

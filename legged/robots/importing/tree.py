@@ -44,6 +44,13 @@ class Shape:
     fits: dict[str, tuple[Vector, Vector, Vector]] = field(default_factory=dict)
     """What else a primitive in place of a mesh could be: size, position and orientation by its kind."""
 
+    def move(self, pos: Vector, quat: Vector) -> None:
+        """Take the shape into another frame, in which its own is at `pos` (3,) [m], turned by `quat` (4,)."""
+        self.pos, self.quat = pos + rotate(quat, self.pos), quat_product(quat, self.quat)
+        self.fits = {
+            kind: (size, pos + rotate(quat, at), quat_product(quat, turned)) for kind, (size, at, turned) in self.fits.items()
+        }
+
 
 @dataclass
 class Hinge:
@@ -119,7 +126,7 @@ class Tree:
         base, turn = self.links[0], matrix(quat)
         base.com, base.inertia = turn @ base.com, turn @ base.inertia @ turn.T
         for shape in base.shapes:
-            shape.pos, shape.quat = turn @ shape.pos, quat_product(quat, shape.quat)
+            shape.move(np.zeros(3), quat)
         for child in self.children(0):
             link = self.links[child]
             link.pos, link.quat = turn @ link.pos, quat_product(quat, link.quat)
