@@ -1,8 +1,10 @@
 """Task names -> task class and configuration. Every `cfg/*.yaml` is a task; outside code adds its own."""
 
+import inspect
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -10,12 +12,15 @@ from typing import Any
 import torch
 
 from legged.config import TaskConfig, load_config
+from legged.config.carry import carry
 from legged.config.checks import PLAIN, is_plain_name, shown
-from legged.config.loader import Registered, class_hints
+from legged.config.loader import Carry, Registered, class_hints
+from legged.config.units import unit_in
 from legged.envs import BaseTask, LeggedRobot
 from legged.errors import ConfigError, suggest
 from legged.gymnasium_ids import add_ids
 from legged.process.paths import data_folder, exists
+from legged.robots.similarity import grown, size_of
 from legged.terrain import Terrain
 from legged.user_modules import import_tasks
 
@@ -168,9 +173,33 @@ def task_config(name: str, overrides: Iterable[tuple[str, Any]] = (), on_cpu: bo
         ConfigError: no such task, or a mistake in its configuration.
     """
     kind = task_class(name)
-    cfg = load_config(_entry(name), name, overrides, on_cpu, _REGISTERED, _schema_of(kind))
+    schema = _schema_of(kind)
+    cfg = load_config(_entry(name), name, overrides, on_cpu, _REGISTERED, schema, _carrier(kind, schema))
     kind.check(cfg)
     return cfg
+
+
+def _carrier(kind: type[BaseTask], schema: type[TaskConfig]) -> Carry:
+    """Return what carries the numbers of a configuration from the robot that they are written for to another one."""
+
+    def unit_of(method: str) -> str:
+        return unit_in(inspect.getdoc(getattr(kind, method, None))) or "1"
+
+    def carry_layer(data: Mapping[str, Any], written_for: str, robot: str, where: str) -> Mapping[str, Any]:
+        if not issubclass(kind, LeggedRobot):
+            raise ConfigError(f"{where}: a task of {kind.__name__} has no robot to which numbers could be carried")
+        reference = size_of(written_for, where)
+        if not robot or robot == written_for:
+            return data
+        try:
+            size = size_of(robot)
+        except ConfigError:
+            return data  # `check` says what is wrong with it, and who named it
+        factor = partial(grown, written_for=reference, robot=size)
+        carried = carry({key: value for key, value in data.items() if key != "cpu"}, schema, factor, unit_of)
+        return carried | ({"cpu": carry(data["cpu"], schema, factor, unit_of)} if "cpu" in data else {})
+
+    return carry_layer
 
 
 def make_task(cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None) -> Any:

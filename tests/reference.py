@@ -1,5 +1,6 @@
 """What the physics tests share: states to put robots in, a PD law, and single worlds of C MuJoCo as the reference."""
 
+import itertools
 from dataclasses import dataclass, fields, replace
 
 import mujoco
@@ -152,8 +153,8 @@ class CWorlds:
 
     def __init__(self, robot: Robot, sim: SimConfig, states: States) -> None:
         self.robot, self.model = robot, RobotScene(robot).model(sim)
-        self.shapes = {self.model.geom(name).id: i for i, name in enumerate(robot.contact_names)}
-        self.feet = [self.model.geom(name).id for name in robot.feet_names]
+        self.shapes = {self.model.geom(name).id: i for name, i in zip(robot.shape_names, robot.contact_of_shape, strict=True)}
+        self.feet = [[self.model.geom(name).id for name in shapes] for shapes in robot.feet_shapes]
         self._live = mujoco.MjData(self.model)
         self.worlds = []
         for i in range(len(states.base_pos)):
@@ -199,9 +200,9 @@ class CWorlds:
         mujoco.mj_comPos(self.model, live)
         mujoco.mj_comVel(self.model, live)
         to_base = live.body(self.robot.file.base).xmat.reshape(3, 3).T
-        velocity = np.zeros((len(self.feet), 6))
-        for i, foot in enumerate(self.feet):
-            mujoco.mj_objectVelocity(self.model, live, mujoco.mjtObj.mjOBJ_GEOM, foot, velocity[i], 0)
+        velocity = np.zeros((self.model.ngeom, 6))
+        for i in itertools.chain(*self.feet):
+            mujoco.mj_objectVelocity(self.model, live, mujoco.mjtObj.mjOBJ_GEOM, i, velocity[i], 0)
         return {
             "base_pos": data.qpos[:3],
             "base_quat": data.qpos[3:7],
@@ -211,14 +212,14 @@ class CWorlds:
             "projected_gravity": to_base @ [0.0, 0.0, -1.0],
             "dof_pos": data.qpos[7:],
             "dof_vel": data.qvel[6:],
-            "feet_pos": live.geom_xpos[self.feet].copy(),
-            "feet_vel": velocity[:, 3:],
+            "feet_pos": np.array([live.geom_xpos[shapes].mean(axis=0) for shapes in self.feet]),
+            "feet_vel": np.array([velocity[shapes, 3:].mean(axis=0) for shapes in self.feet]),
             "contact_forces": self._contact_forces(data),
         }
 
     def _contact_forces(self, data: mujoco.MjData) -> np.ndarray:
-        """What the last step's solver left, summed over each shape's contacts, world frame."""
-        forces = np.zeros((len(self.shapes), 3))
+        """What the last step's solver left, summed over the contacts of each shape or foot, world frame."""
+        forces = np.zeros((len(self.robot.contact_names), 3))
         wrench = np.zeros(6)
         for i in range(data.ncon):
             contact = data.contact[i]

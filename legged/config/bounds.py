@@ -32,6 +32,16 @@ def items(most: int, bounds: Bounds | None = None) -> Bounds:
     return {"items": most, **(bounds or {})}
 
 
+def carried(unit: str, bounds: Bounds) -> Bounds:
+    """Return metadata: a quantity of `unit` that grows with the robot (carry.py), within `bounds`."""
+    return {**bounds, "unit": unit}
+
+
+def carried_by_term(prefix: str, power: int, bounds: Bounds) -> Bounds:
+    """Return metadata: for each term a number that grows with that power of what the method `<prefix><term>` returns."""
+    return {**bounds, "unit_of": (prefix, power)}
+
+
 UNIT = between(0, 1)
 NAME: Bounds = {"name": True}
 """Text that becomes the name of a folder; it may be empty."""

@@ -2,7 +2,7 @@
 
 import copy
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,8 @@ class Registered:
 
 
 Source = Path | Mapping[str, Any] | Registered
+Carry = Callable[[Mapping[str, Any], str, str, str], Mapping[str, Any]]
+"""Data of a layer, the robot it is written for, the robot of the task, and how errors begin -> data for the task's robot."""
 
 
 def merge(base: dict[str, Any], top: Mapping[str, Any], source: str, origins: Origins, prefix: str = "") -> None:
@@ -59,7 +61,7 @@ class _Layer:
     """One of the configurations that are laid over each other."""
 
     data: Mapping[str, Any]
-    """What it sets, without `extends` and `class`."""
+    """What it sets, without `extends`, `class` and `written_for`."""
     name: str
     """What errors call it."""
     folder: Path
@@ -68,6 +70,8 @@ class _Layer:
     """The name of the registered task that it is; None for a file."""
     kind: Any
     """What it names as the class of the task; None if it names none."""
+    written_for: Any
+    """The robot for which its numbers are meant; None if they are meant for any."""
 
 
 def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> list[_Layer]:
@@ -90,10 +94,10 @@ def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> 
         data = renamed(read_yaml(given) if isinstance(given, Path) else given, name)
         if isinstance(data.get("cpu"), Mapping):
             data["cpu"] = renamed(data["cpu"], f"{name}: cpu")
-        parent, kind = data.pop("extends", None), data.pop("class", None)
+        parent, kind, written_for = (data.pop(key, None) for key in ("extends", "class", "written_for"))
         beside = given.parent if isinstance(given, Path) else None
         folder = beside or (found.folder if isinstance(found, Registered) else Path.cwd())
-        layers.append(_Layer(data, name, folder, task if isinstance(found, Registered) else None, kind))
+        layers.append(_Layer(data, name, folder, task if isinstance(found, Registered) else None, kind, written_for))
         if parent is None:
             return layers
         others = {key: entry for key, entry in registered.items() if _mark(entry) not in seen}
@@ -142,22 +146,38 @@ def class_hints(source: Source, task: str, registered: Mapping[str, Registered])
     return [ClassHint(f"{layer.name}: class", layer.task, layer.kind) for layer in _layers(source, task, registered)]
 
 
-def _merged(layers: Iterable[_Layer], schema: type[TaskConfig]) -> tuple[dict[str, Any], Origins]:
+def _merged(
+    layers: Iterable[_Layer], schema: type[TaskConfig], carry: Carry | None, robot: str | None, on_cpu: bool
+) -> tuple[dict[str, Any], Origins]:
     """Return layers laid over those after them. Each is checked by itself: what another one sets over it must not hide a
-    mistake.
+    mistake. Numbers that a layer means for some robot are carried to `robot`, or if None, to that of the layers.
 
     Raises:
         ConfigError: a layer does not fit the schema.
     """
-    merged: dict[str, Any] = {}
-    origins = Origins()
+    parts = []
     for layer in reversed(list(layers)):
         _check_layer(layer.data, layer.name, schema)
         data = copy.deepcopy(dict(layer.data))
         for section in (data, data.get("cpu", {})):
             if "robot" in section:
                 section["robot"] = robot_path(section["robot"], layer.folder)
-        merge(merged, data, layer.name, origins)
+        parts.append((layer, data))
+    if robot is None:
+        asked = [data.get("cpu", {}).get("robot") for _, data in parts if on_cpu], [data.get("robot") for _, data in parts]
+        robot = next((name for names in asked for name in reversed(names) if name), "")
+    merged: dict[str, Any] = {}
+    origins = Origins()
+    for layer, data in parts:
+        name = layer.name
+        if layer.written_for is not None:
+            where = f"{name}: written_for"
+            if not isinstance(layer.written_for, str):
+                raise ConfigError(f"{where}: expected the name of a robot, got {shown(layer.written_for)}")
+            carried = data if carry is None else carry(data, robot_path(layer.written_for, layer.folder), robot, where)
+            if carried is not data:
+                data, name = dict(carried), f"{name} (written for {Path(layer.written_for).name})"
+        merge(merged, data, name, origins)
     return merged, origins
 
 
@@ -222,15 +242,20 @@ def load_config(
     on_cpu: bool = False,
     registered: Mapping[str, Registered] | None = None,
     schema: type[TaskConfig] = LeggedConfig,
+    carry: Carry | None = None,
 ) -> TaskConfig:
     """Load the task file or mapping `source`, over what it extends (a file, or one of the tasks in `registered`), under its
-    `cpu:` section (if asked) and overrides, as an instance of `schema`.
+    `cpu:` section (if asked) and overrides, as an instance of `schema`. What of it is written for another robot is carried
+    to that of the task by `carry`, if there is one; overrides never are.
 
     Raises:
         ConfigError: unknown key, wrong type or value, with file and dotted path.
     """
     name = name_of(source, task)
-    data, origins = _merged(_layers(source, task, registered or {}), schema)
+    overrides = list(overrides)
+    named = [robot_path(value, Path.cwd()) for key, value in overrides if key == "robot"]
+    robot = named[-1] if named else None
+    data, origins = _merged(_layers(source, task, registered or {}), schema, carry, robot, on_cpu)
     cpu = data.pop("cpu", {})
     data["task"] = task
     where = Origins(origins)

@@ -105,6 +105,7 @@ class LeggedRobot(Terms, BaseTask):
         self.termination_indices = torch.tensor(robot.termination_indices, dtype=torch.long, device=device)
         self.dof_vel_limits = torch.tensor(robot.dof_vel_limits, dtype=torch.float32, device=device)
         self.dof_pos_limits = self._soft_limits(robot)
+        self.posture_joints = torch.tensor(~robot.swings, dtype=torch.float32, device=device)
         self.height_scan = HeightScan(cfg.terrain, self.terrain, n, device)
         self.measured_heights = self.height_scan.heights
         self.terrain_curriculum: TerrainCurriculum | None = None

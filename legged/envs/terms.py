@@ -19,9 +19,6 @@ TERMINATION_FORCE = 1.0
 PENALISED_FORCE = 0.1
 """Contact force on a penalised shape that counts as a collision [N]."""
 
-HEIGHTS_OFFSET, HEIGHTS_LIMIT = 0.5, 1.0
-"""Observed heights are relative to this far below the base [m], and at most this large [m]."""
-
 
 class Terms:
     """The methods `_obs_<name>`, `_reward_<name>` and `_terminate_<name>` that a configuration can name, and metrics.
@@ -74,6 +71,8 @@ class Terms:
     """(N, B, 3) in the world [N]; `feet_indices` and `penalised_indices` pick among the shapes."""
     feet_indices: Tensor
     penalised_indices: Tensor
+    posture_joints: Tensor
+    """(D,) 1 for joints that do not swing a leg forward and back, else 0."""
     contacts: FeetContacts
     """Contact and swing times of the feet."""
     control: Control
@@ -121,8 +120,8 @@ class Terms:
         """Base above ground, less an offset: clip(base_z - offset - ground_z, -limit, limit) at each of the points, which lie
         in the yaw frame; base_z and ground_z in the world frame [m].
         """
-        below = self.base_pos[:, 2:3] - HEIGHTS_OFFSET - self.measured_heights
-        return below.clamp(-HEIGHTS_LIMIT, HEIGHTS_LIMIT)
+        offset, limit = self.cfg.observations.heights_offset, self.cfg.observations.heights_limit
+        return (self.base_pos[:, 2:3] - offset - self.measured_heights).clamp(-limit, limit)
 
     # ---- rewards: (N,) each, times scale and control step ------------------------------------------------------------
 
@@ -213,6 +212,31 @@ class Terms:
         """Foot forces beyond the allowed [N]."""
         force = self.contact_forces[:, self.feet_indices].norm(dim=2)
         return (force - self.cfg.rewards.max_contact_force).clamp(min=0.0).sum(dim=1)
+
+    def _reward_single_stance(self) -> Tensor:
+        """Swings of a biped: how long a foot has been in the air while exactly the other one stands, up to the target, while
+        any velocity is commanded [s].
+        """
+        alone = (self.contacts.in_contact.sum(dim=1) == 1) & self.is_moving
+        return self.contacts.air_time.amax(dim=1).clamp(max=self.cfg.rewards.air_time_target_s) * alone
+
+    def _reward_feet_slide(self) -> Tensor:
+        """Squared horizontal speed of feet on the ground [m^2/s^2]."""
+        return (self.feet_vel[:, :, :2].square().sum(dim=2) * self.contacts.in_contact).sum(dim=1)
+
+    def _reward_feet_clearance(self) -> Tensor:
+        """Feet that move forward at another height above the lowest foot than the target: squared difference times horizontal
+        speed [m^3/s].
+        """
+        height = self.feet_pos[:, :, 2] - self.feet_pos[:, :, 2].amin(dim=1, keepdim=True)
+        apart = (height - self.cfg.rewards.feet_clearance_target).square() * self.feet_vel[:, :, :2].norm(dim=2)
+        return (apart * ~self.contacts.in_contact).sum(dim=1)
+
+    def _reward_posture(self) -> Tensor:
+        """Squared angles away from the default, of joints that do not swing a leg forward: hips that spread or turn, waist,
+        arms [rad^2].
+        """
+        return ((self.dof_pos - self.default_dof_pos) * self.posture_joints).square().sum(dim=1)
 
     def _reward_no_fly(self) -> Tensor:
         """Exactly one foot on the ground, the walk of a biped."""

@@ -2,7 +2,8 @@
 
 Sizes and commands are those of Rudin et al. (arXiv 2109.11978), Fig. 5: robots start in the middle of a tile, are
 asked for 0.75 m/s forward and up to 0.1 m/s sideways, and keep their heading; sizes go on beyond those of training. What
-counts as success is defined by `Scores`.
+counts as success is defined by `Scores`. All this is for a robot half a metre high: lengths are times the `terrain.scale`
+of the task, velocities times its root (the same Froude number).
 """
 
 import gc
@@ -22,7 +23,7 @@ from legged.evaluation.overflows import Overflows
 from legged.evaluation.tiles import on_terrain, tiles_of_sizes
 from legged.math import uniform, yaw_of
 from legged.policies.restore import TrainedPolicy, restore, undisturbed
-from legged.terrain import TERRAIN_TYPES, hardest_difficulty, terrain_types, tile_size
+from legged.terrain import METRES, TERRAIN_TYPES, hardest_difficulty, terrain_types, tile_size
 
 TILE = 8.0
 """Side of a tile [m]."""
@@ -59,13 +60,13 @@ OPEN, REACHED, FELL, STUCK = range(4)
 
 
 class Scores:
-    """The first thing that happens to each of N robots: it gets DISTANCE away from its start, it falls (the task terminates
+    """The first thing that happens to each of N robots: it gets far enough away from its start, it falls (the task terminates
     it), or its time is up. What it does after that, or after the reset that follows a fall, does not count.
     """
 
-    def __init__(self, start: Tensor) -> None:
-        """Begin with robots that stand at `start` (N, 2 or more), world frame [m]."""
-        self._start = start[:, :2].clone()
+    def __init__(self, start: Tensor, distance: float = DISTANCE) -> None:
+        """Begin with robots that stand at `start` (N, 2 or more), world frame [m], and have to get `distance` away [m]."""
+        self._start, self._distance = start[:, :2].clone(), distance
         self.outcome = torch.full((len(start),), OPEN, device=start.device)
         """(N,) OPEN, REACHED, FELL or STUCK."""
         self.time_s = torch.zeros(len(start), device=start.device)
@@ -76,7 +77,7 @@ class Scores:
         waiting = self.outcome == OPEN
         fell = waiting & terminated
         # A robot that fell in this step has been put back to its start already: its position says nothing.
-        reached = waiting & ~terminated & ((base_pos[:, :2] - self._start).norm(dim=1) >= DISTANCE)
+        reached = waiting & ~terminated & ((base_pos[:, :2] - self._start).norm(dim=1) >= self._distance)
         self.outcome.masked_fill_(fell, FELL)
         self.outcome.masked_fill_(reached, REACHED)
         self.time_s.masked_fill_(fell | reached, time_s)
@@ -104,11 +105,13 @@ def wilson(successes: int, trials: int, z: float = Z95) -> tuple[float, float]:
 # ---- what is measured ------------------------------------------------------------------------------------------------
 
 
-def sizes_of(name: str, full: bool) -> tuple[float, ...]:
-    """Return the sizes of a type that are measured, growing, in its unit."""
+def sizes_of(name: str, full: bool, scale: float = 1.0) -> tuple[float, ...]:
+    """Return the sizes of a type that are measured on ground of that scale, growing, in its unit; lengths to a millimetre."""
+    kind = TERRAIN_TYPES[name]
     found = SIZES.get(name) if full else FEWER.get(name, SIZES.get(name))
     # Of a type that is not listed, what training could hold and one step more.
-    return found or tuple(sorted(TERRAIN_TYPES[name].size(d) for d in (0.2, 0.4, 0.6, 0.8, 1.0, 1.2)))
+    found = found or tuple(sorted(kind.size(d) for d in (0.2, 0.4, 0.6, 0.8, 1.0, 1.2)))
+    return found if kind.unit != METRES or scale == 1.0 else tuple(round(size * scale, 3) for size in found)
 
 
 def chosen_types(cfg: LeggedConfig, asked: str | None) -> list[str]:
@@ -153,10 +156,11 @@ def measure_success(
     place(task, robots)
     task.reset()
     commands = torch.zeros(task.num_envs, 3, device=task.device)
-    commands[:, 0] = FORWARD
-    commands[:, 1] = uniform(-SIDEWAYS, SIDEWAYS, (task.num_envs,), torch.device(task.device))
+    scale = task.cfg.terrain.scale
+    commands[:, 0] = FORWARD * sqrt(scale)
+    commands[:, 1] = uniform(-SIDEWAYS, SIDEWAYS, (task.num_envs,), torch.device(task.device)) * sqrt(scale)
     observations = task.hold_commands(commands, yaw_of(task.base_quat))
-    scores, overflows = Scores(task.base_pos), Overflows()
+    scores, overflows = Scores(task.base_pos, DISTANCE * scale), Overflows()
     for step in range(1, round(TIME_S / task.dt) + 1):
         observations, _, _, extras = task.step(act(observations))
         overflows.add(extras)
@@ -200,14 +204,14 @@ def success_over_difficulty(
     configuration come after our own. Return plain numbers and lists.
     """
     assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
-    trained = trained_to(policy.cfg)
+    trained, scale = trained_to(policy.cfg), policy.cfg.terrain.scale
     found: dict[str, Any] = {}
     lost = 0
     for name in names:
-        sizes = sizes_of(name, full)
+        sizes = sizes_of(name, full, scale)
         own = [
             *undisturbed(robots * len(sizes), TIME_S),
-            *on_terrain(policy.cfg, TILE, SPAWN_RANGE),
+            *on_terrain(policy.cfg, TILE * scale, SPAWN_RANGE * scale),
             ("observations.add_noise", policy.cfg.observations.add_noise),
             ("commands.heading_command", True),
             ("init_state.yaw", [-np.pi, np.pi]),
@@ -221,10 +225,10 @@ def success_over_difficulty(
         print(f"{name}: {len(sizes)} sizes x {robots} robots, {100 * reached / count:.0f} % got out", flush=True)
     return {
         "definition": {
-            "distance_m": DISTANCE,
+            "distance_m": DISTANCE * scale,
             "time_s": TIME_S,
-            "vx": FORWARD,
-            "vy": [-SIDEWAYS, SIDEWAYS],
+            "vx": FORWARD * sqrt(scale),
+            "vy": [-SIDEWAYS * sqrt(scale), SIDEWAYS * sqrt(scale)],
             "interval": "Wilson 95 %",
         },
         "robots_per_point": robots,

@@ -28,7 +28,7 @@ TRAINED_LABEL = "hardest of training"
 def print_success(success: dict[str, Any]) -> None:
     """Print one line a point; sizes beyond those of training are marked."""
     rule = success["definition"]
-    head = f"success: {rule['distance_m']:g} m from the start within {rule['time_s']:g} s, asked for {rule['vx']:g} m/s"
+    head = f"success: {rule['distance_m']:.3g} m from the start within {rule['time_s']:g} s, asked for {rule['vx']:.3g} m/s"
     table = Table(title=escape(head), title_justify="left")
     for name in ("terrain", "size", "success", "95 % interval", "fell", "stuck", "time to success"):
         table.add_column(name, justify="left" if name == "terrain" else "right")
@@ -109,7 +109,9 @@ def draw_success(results: list[dict[str, Any]], path: Path) -> None:
             keys.append(Line2D([], [], **TRAINED, label=TRAINED_LABEL))
         drawn.legend(handles=keys, loc="outside lower center", ncols=len(keys) if columns > 1 else 1, frameon=False)
         rule = results[0]["success"]["definition"]
-        text = f"{results[0]['task']}: robots that get {rule['distance_m']:g} m from their start within {rule['time_s']:g} s"
+        text = (
+            f"{results[0]['task']}: robots that get {rule['distance_m']:.3g} m from their start within {rule['time_s']:g} s"
+        )
         size = "medium" if columns == 1 else "large"
         drawn.suptitle(text if columns > 1 else text.replace(": ", "\n"), fontsize=size)
 

@@ -73,9 +73,7 @@ def control_gains(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str],
     dotted path how an error begins.
     """
 
-    def gains(name: str, own: dict[str, float], robots: dict[str, float]) -> np.ndarray:
-        if own:
-            return robot.gains(own, where(f"control.{name}"))
-        return robot.gains(robots, f"{robot.folder / 'robot.yaml'}: {name}")
+    def gains(name: str, own: dict[str, float], of_robot: np.ndarray) -> np.ndarray:
+        return robot.gains(own, where(f"control.{name}")) if own else of_robot
 
-    return gains("stiffness", cfg.stiffness, robot.file.stiffness), gains("damping", cfg.damping, robot.file.damping)
+    return gains("stiffness", cfg.stiffness, robot.stiffness), gains("damping", cfg.damping, robot.damping)

@@ -20,7 +20,7 @@ class FootChains:
     """
 
     offset: np.ndarray
-    """(F, 3) centre of the foot shape in its body."""
+    """(F, 3) mean of the centres of the foot's shapes, in their body."""
     joint: np.ndarray
     """(levels, F) index of the hinge among the robot's joints."""
     axis: np.ndarray
@@ -35,9 +35,9 @@ class FootChains:
         Raises:
             ConfigError: feet at different depths, or a body in between without exactly one hinge.
         """
-        geoms = [model.geom(name) for name in robot.feet_names]
+        feet = [[model.geom(name) for name in shapes] for shapes in robot.feet_shapes]
         base = model.body(robot.file.base).id
-        bodies = [_chain(model, int(geom.bodyid[0]), base) for geom in geoms]
+        bodies = [_chain(model, int(geoms[0].bodyid[0]), base) for geoms in feet]
         if len({len(chain) for chain in bodies}) != 1:
             raise ConfigError(f"{robot.folder}: feet: all feet must hang on the same number of bodies")
         body = np.array(bodies, dtype=int).T
@@ -45,7 +45,7 @@ class FootChains:
             raise ConfigError(f"{robot.folder}: feet: every body between base and foot needs exactly one hinge")
         joint = model.body_jntadr[body]
         return cls(
-            offset=np.array([geom.pos for geom in geoms]),
+            offset=np.array([np.mean([geom.pos for geom in geoms], axis=0) for geoms in feet]),
             joint=model.jnt_dofadr[joint] - 6,
             axis=model.jnt_axis[joint],
             anchor=model.jnt_pos[joint],

@@ -136,6 +136,9 @@ class _RobotReader:
         start, end = contact_sensor_columns(batch.model, robot)
         self._forces = batch.bind("sensordata")[:, start:end]
         self._feet = FeetKinematics(batch.model, robot)
+        contacts = robot.contact_of_shape
+        self._contacts = None if len(set(contacts)) == len(contacts) else torch.tensor(contacts)
+        """Contact of each shape; none where each shape has its own."""
         self._down = torch.tensor([0.0, 0.0, -1.0]).expand(len(state.base_pos), 3)
 
     def read(self) -> None:
@@ -145,7 +148,11 @@ class _RobotReader:
         state.projected_gravity.copy_(quat_rotate_inverse(state.base_quat, self._down))
         self._feet.write(state)
         if self.stepped:  # a write in between has cleared its worlds' forces
-            state.contact_forces.copy_(torch.from_numpy(-self._forces.astype(np.float32)).view_as(state.contact_forces))
+            forces = torch.from_numpy(-self._forces.astype(np.float32)).view(len(self._forces), -1, 3)
+            if self._contacts is None:
+                state.contact_forces.copy_(forces)
+            else:
+                state.contact_forces.zero_().index_add_(1, self._contacts, forces)
             self.stepped = False
 
 

@@ -13,7 +13,7 @@ class RobotState:
     """What the task sees of N robots: float32 tensors, allocated once, written in place by the physics engine. Those that
     `Physics.qpos` and `Physics.qvel` hold are views of them, live after a step; the others are current after a refresh.
 
-    D joints and F feet in the robot's order, B tracked collision shapes (`Robot.contact_names`).
+    D joints and F feet in the robot's order, B contacts (`Robot.contact_names`).
     """
 
     base_pos: Tensor
@@ -33,12 +33,12 @@ class RobotState:
     dof_vel: Tensor
     """(N, D) joint velocities [rad/s]."""
     feet_pos: Tensor
-    """(N, F, 3) centres of the foot shapes, world frame [m]."""
+    """(N, F, 3) centres of the feet, world frame [m]: of a foot of several shapes the mean of theirs."""
     feet_vel: Tensor
     """(N, F, 3) velocities of those points, world frame [m/s]."""
     contact_forces: Tensor
-    """(N, B, 3) sum of contact forces on each tracked shape, world frame, at the last physics step [N]; zero after a
-    reset."""
+    """(N, B, 3) sum of contact forces on each collision shape, or on all of a foot, world frame, at the last physics step
+    [N]; zero after a reset."""
 
 
 def robot_state(qpos: Tensor, qvel: Tensor, robot: Robot) -> RobotState:

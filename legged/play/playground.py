@@ -64,7 +64,7 @@ class Playground:
 
         def size_of(kind: str, d: float) -> float:
             """Return the size of the training, where that is fixed and nobody asks for another."""
-            return tile_size(cfg.terrain, kind, d) if difficulty is None else TERRAIN_TYPES[kind].size(d)
+            return tile_size(cfg.terrain, kind, d) if difficulty is None else TERRAIN_TYPES[kind].sized(d, cfg.terrain.scale)
 
         front, back = (
             tuple(TileSpec(kind, size_of(kind, d)) for kind in columns)

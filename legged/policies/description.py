@@ -1,12 +1,11 @@
 """What a robot's controller must know to run an exported policy, as plain data: policy.json."""
 
 import inspect
-import re
 from typing import Any
 
 from legged.config.networks import groups_of
+from legged.config.units import unit_in
 from legged.envs import BaseTask, LeggedRobot
-from legged.envs.terms import HEIGHTS_LIMIT, HEIGHTS_OFFSET
 from legged.mdp.observations import ObservationTerm
 from legged.policies.model_description import describe_control
 
@@ -92,21 +91,22 @@ def describe_groups(task: BaseTask) -> list[dict[str, Any]]:
 
 def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any]) -> dict[str, Any]:
     """Return one observation term; unit, frame and formula are those that its method's docstring says."""
-    text = " ".join((inspect.getdoc(getattr(type(task), f"_obs_{term.name}")) or "").partition("\n\n")[0].split())
-    unit = re.search(r"\[([^\]]*)\]\.?$", text)
+    docstring = inspect.getdoc(getattr(type(task), f"_obs_{term.name}"))
+    text = " ".join((docstring or "").partition("\n\n")[0].split())
     entry: dict[str, Any] = {
         "name": term.name,
         "group": group["name"],
         "start": group["start"] + term.columns.start,
         "size": term.columns.stop - term.columns.start,
         "scale": [float(value) for value in term.scale],
-        "unit": unit.group(1) if unit else None,
+        "unit": unit_in(docstring),
         "frame": next((frame for frame in FRAMES if frame in text), None),
         "formula": text or None,
     }
     if isinstance(task, LeggedRobot) and term.name == "heights":
         points = [[round(value, 6) for value in point] for point in task.height_scan.points.tolist()]
-        entry |= {"points": points, "offset": HEIGHTS_OFFSET, "limit": HEIGHTS_LIMIT}
+        cfg = task.cfg.observations
+        entry |= {"points": points, "offset": cfg.heights_offset, "limit": cfg.heights_limit}
     return entry
 
 

@@ -126,9 +126,17 @@ def _pose(model: mujoco.MjModel, data: mujoco.MjData, terrain: Terrain, places: 
         states[i, 3:7] = [np.cos(np.radians(110.0)), 0.0, 0.0, np.sin(np.radians(110.0))]
     mujoco.mj_kinematics(model, data)
     for i in range(len(places)):
-        feet = [model.geom(f"{i}/{name}").id for name in robot.feet_names]
-        low = data.geom_xpos[feet, 2] - model.geom_rbound[feet]
-        states[i, 2] += terrain.origins[places[i].row, places[i].col, 2] - low.min()
+        feet = [model.geom(f"{i}/{name}").id for shapes in robot.feet_shapes for name in shapes]
+        low = min(_lowest(model, data, foot) for foot in feet)
+        states[i, 2] += terrain.origins[places[i].row, places[i].col, 2] - low
+
+
+def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
+    """Return the height of the lowest point of a sphere, capsule or box [m]; of any other shape, of the box around it."""
+    size, up = model.geom_size[geom], np.abs(data.geom_xmat[geom][6:])
+    if model.geom_type[geom] in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
+        return float(data.geom_xpos[geom, 2] - size[0] - up[2] * size[1])
+    return float(data.geom_xpos[geom, 2] - up @ model.geom_aabb[geom, 3:])
 
 
 def _outline(terrain: Terrain) -> np.ndarray:

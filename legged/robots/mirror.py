@@ -24,8 +24,8 @@ class Mirror:
     """(F,) for each foot, the one whose place it takes over."""
 
     @classmethod
-    def of(cls, model: mujoco.MjModel, joints: Sequence[int], feet: Sequence[str]) -> "Mirror | None":
-        """Return the symmetry of a robot with the hinges `joints` (ids) and the shapes `feet`, by where they are at zero
+    def of(cls, model: mujoco.MjModel, joints: Sequence[int], feet: Sequence[Sequence[str]]) -> "Mirror | None":
+        """Return the symmetry of a robot with the hinges `joints` (ids) and `feet` of those shapes, by where they are at zero
         angles; None if some have no partner.
         """
         data = mujoco.MjData(model)
@@ -35,7 +35,7 @@ class Mirror:
         anchors, axes = data.xanchor[list(joints)], data.xaxis[list(joints)]
         # Joints of a hip may share a point; a reflection keeps the sizes of an axis' components, which tells them apart.
         partners = _partners(np.hstack([anchors, np.abs(axes)]), np.hstack([anchors * FLIP, np.abs(axes)]))
-        centres = np.array([data.geom(name).xpos for name in feet])
+        centres = np.array([np.mean([data.geom(name).xpos for name in shapes], axis=0) for shapes in feet])
         foot_partners = _partners(centres, centres * FLIP)
         if partners is None or foot_partners is None:
             return None

@@ -1,6 +1,6 @@
 """A robot folder (robot.yaml and MJCF) -> names, indices, limits and gains."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,8 +12,15 @@ from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, exists
+from legged.robots.gains import gains
 from legged.robots.mirror import Mirror
+from legged.robots.patterns import match_values
 from legged.robots.robot_model import base_mass, check_model, hinges, read_model
+from legged.robots.shapes import Shapes
+from legged.robots.stance import stance, standing_height, swinging_joints
+
+VELOCITY_LIMIT = 30.0
+"""Largest speed of the joints of a robot that states none, as geared motors of legged robots have it [rad/s]."""
 
 
 @dataclass(frozen=True)
@@ -28,14 +35,14 @@ class RobotFile:
     """Base height above the ground after a reset [m]."""
     default_joint_angles: dict[str, float] = field(metadata=between(-100, 100))
     """Joint-name pattern -> angle at action 0 [rad]."""
-    stiffness: dict[str, float] = field(metadata=between(0, LARGEST))
-    """Joint-name pattern -> P gain [N m/rad]."""
-    damping: dict[str, float] = field(metadata=between(0, LARGEST))
-    """Joint-name pattern -> D gain [N m s/rad]."""
-    velocity_limit: dict[str, float] = field(metadata=positive(LARGEST))
-    """Joint-name pattern -> largest joint speed [rad/s]."""
     feet: tuple[str, ...] = field(metadata=NAMES)
-    """Patterns of the shapes that are feet."""
+    """Patterns of the shapes that are feet; those of one body are one foot."""
+    stiffness: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
+    """Joint-name pattern -> P gain [N m/rad]; without any, gains follow from inertia and weight (gains.py)."""
+    damping: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
+    """Joint-name pattern -> D gain [N m s/rad]; likewise."""
+    velocity_limit: dict[str, float] = field(default_factory=dict, metadata=positive(LARGEST))
+    """Joint-name pattern -> largest joint speed [rad/s]; without any, 30."""
     penalize_contacts_on: tuple[str, ...] = ()
     """Patterns of the shapes whose contact the `collision` reward counts."""
     terminate_after_contacts_on: tuple[str, ...] = ()
@@ -44,7 +51,10 @@ class RobotFile:
 
 @dataclass(frozen=True)
 class Robot:
-    """What the task needs to know of a robot. D joints in the order of the model, B collision shapes, F feet."""
+    """What the task needs to know of a robot. D joints in the order of the model, S collision shapes, F feet, B contacts.
+
+    A contact is what a contact force is stated for: a collision shape, or all shapes of a foot together.
+    """
 
     name: str
     folder: Path
@@ -58,9 +68,23 @@ class Robot:
     """(D,) [rad/s]."""
     torque_limits: np.ndarray
     """(D,) [N m]."""
+    stiffness: np.ndarray
+    """(D,) P gains [N m/rad], and D gains [N m s/rad]."""
+    damping: np.ndarray
+    swings: np.ndarray
+    """(D,) whether a joint swings a leg forward and back, in the default pose."""
+    height: float
+    """Base above the ground when the robot stands level in its default pose [m]."""
+    shape_names: tuple[str, ...]
+    """Names of the S collision shapes, in the order of the model."""
+    contact_of_shape: tuple[int, ...]
+    """(S,) which of the contacts each shape belongs to."""
     contact_names: tuple[str, ...]
-    """Names of the B collision shapes, whose contact forces are tracked."""
+    """Names of the B contacts: a shape's own, or that of a foot of several shapes: how their names begin."""
+    feet_shapes: tuple[tuple[str, ...], ...]
+    """The shapes of each of the F feet."""
     feet_indices: tuple[int, ...]
+    """(F,) the feet among the contacts; likewise what is penalised, and what ends an episode."""
     penalised_indices: tuple[int, ...]
     termination_indices: tuple[int, ...]
     mass: float
@@ -99,7 +123,7 @@ def load_robot(name: str, where: str = "robot") -> Robot:
     path = folder / "robot.yaml"
     data = read_yaml(path)
     missing = [k for k in ("model", "base", "spawn_height", "default_joint_angles", "feet") if k not in data]
-    missing += [k for k in ("stiffness", "damping", "velocity_limit") if k not in data]
+    missing += [k for k, other in (("stiffness", "damping"), ("damping", "stiffness")) if other in data and k not in data]
     if missing:
         raise ConfigError(f"{path}: missing: {', '.join(missing)}")
     file = build(RobotFile, data, "", Origins(), str(path))
@@ -107,24 +131,44 @@ def load_robot(name: str, where: str = "robot") -> Robot:
     check_model(model, file.base, str(path))
     joints = [model.joint(i) for i in hinges(model)]
     names = tuple(joint.name for joint in joints)
-    shapes = tuple(model.geom(i).name for i in range(model.ngeom) if model.geom_contype[i] or model.geom_conaffinity[i])
-    feet = match_names(file.feet, shapes, f"{path}: feet")
+    ids = [joint.id for joint in joints]
+    shapes = Shapes.of(model, file.feet, f"{path}: feet")
+    foot_ids = [model.geom(name).id for foot in shapes.feet_shapes for name in foot]
+    default_dof_pos = match_values(file.default_joint_angles, names, f"{path}: default_joint_angles")
+    angles = dict(zip(names, map(float, default_dof_pos), strict=True))
+    height, torque_limits = standing_height(model, file.base, angles), model.actuator_forcerange[:, 1].copy()
+    if file.stiffness or file.damping:
+        stiffness = match_values(file.stiffness, names, f"{path}: stiffness")
+        damping = match_values(file.damping, names, f"{path}: damping")
+    else:
+        stiffness, damping = gains(model, stance(model, angles).qpos, ids, foot_ids, torque_limits, height)
+    if file.velocity_limit:
+        velocity_limits = match_values(file.velocity_limit, names, f"{path}: velocity_limit")
+    else:
+        velocity_limits = np.full(len(names), VELOCITY_LIMIT)
     return Robot(
         name=folder.name,
         folder=folder,
         file=file,
         joint_names=names,
-        default_dof_pos=match_values(file.default_joint_angles, names, f"{path}: default_joint_angles"),
+        default_dof_pos=default_dof_pos,
         dof_pos_limits=np.array([j.range if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in joints], dtype=float),
-        dof_vel_limits=match_values(file.velocity_limit, names, f"{path}: velocity_limit"),
-        torque_limits=model.actuator_forcerange[:, 1].copy(),
-        contact_names=shapes,
-        feet_indices=feet,
-        penalised_indices=match_names(file.penalize_contacts_on, shapes, f"{path}: penalize_contacts_on"),
-        termination_indices=match_names(file.terminate_after_contacts_on, shapes, f"{path}: terminate_after_contacts_on"),
+        dof_vel_limits=velocity_limits,
+        torque_limits=torque_limits,
+        stiffness=stiffness,
+        damping=damping,
+        swings=swinging_joints(model, angles, ids, foot_ids),
+        height=height,
+        shape_names=shapes.names,
+        contact_of_shape=shapes.contact,
+        contact_names=shapes.contact_names,
+        feet_shapes=shapes.feet_shapes,
+        feet_indices=shapes.feet,
+        penalised_indices=shapes.contacts(file.penalize_contacts_on, f"{path}: penalize_contacts_on"),
+        termination_indices=shapes.contacts(file.terminate_after_contacts_on, f"{path}: terminate_after_contacts_on"),
         mass=float(model.body_mass.sum()),
         base_mass=base_mass(model, file.base),
-        mirror=Mirror.of(model, [joint.id for joint in joints], [shapes[i] for i in feet]),
+        mirror=Mirror.of(model, ids, shapes.feet_shapes),
     )
 
 
@@ -137,29 +181,3 @@ def _folder(name: str, where: str) -> Path:
         if exists(folder / "robot.yaml"):
             return folder.resolve()
     raise ConfigError(f"{where}: there is no robot {shown(name)}{known}")
-
-
-def match_names(patterns: Sequence[str], names: Sequence[str], where: str) -> tuple[int, ...]:
-    """Return the indices of the names that contain any of the patterns, in the order of `names`."""
-    for pattern in patterns:
-        if not pattern:
-            raise ConfigError(f"{where}: an empty pattern would match everything{suggest(pattern, names, 'names')}")
-        if not any(pattern in name for name in names):
-            raise ConfigError(f"{where}: pattern '{pattern}' matches nothing{suggest(pattern, names, 'names')}")
-    return tuple(i for i, name in enumerate(names) if any(pattern in name for pattern in patterns))
-
-
-def match_values(table: Mapping[str, float], names: Sequence[str], where: str) -> np.ndarray:
-    """Return the value of the longest pattern that each name contains, (len(names),).
-
-    Raises:
-        ConfigError: a pattern that no name contains, or a name without pattern.
-    """
-    match_names(tuple(table), names, where)
-    values = np.zeros(len(names))
-    for i, name in enumerate(names):
-        matching = [pattern for pattern in table if pattern in name]
-        if not matching:
-            raise ConfigError(f"{where}: no pattern matches joint '{name}' (patterns: {', '.join(table) or 'none'})")
-        values[i] = table[max(matching, key=len)]
-    return values

@@ -2,6 +2,9 @@
 
 Every generator takes a `Tile` of zeros and the size of its difficulty, in metres or degrees, and fills in the heights of
 the cells [m]. Robots start in the middle and walk outward, so `stairs_up` has its platform at the bottom.
+
+All other lengths here (treads, platforms, bumps, blocks) are for a robot that stands half a metre high; a tile of another
+`scale` has them times that.
 """
 
 from collections.abc import Callable
@@ -39,10 +42,12 @@ class Tile:
     """Edge of a cell [m]."""
     rng: np.random.Generator
     """Source of all randomness of the tile."""
+    scale: float = 1.0
+    """Factor on the lengths that its type is made of."""
 
     def cells(self, metres: float) -> int:
-        """Return a length in whole cells."""
-        return int(metres / self.cell + 1e-6)
+        """Return a length, times the tile's scale, in whole cells."""
+        return int(metres * self.scale / self.cell + 1e-6)
 
     def from_centre(self) -> np.ndarray:
         """Return (length, width) the distance of each cell's centre from the tile's, as the larger of |x| and |y| [m]."""
@@ -50,7 +55,7 @@ class Tile:
         return np.maximum(x[:, None], y[None, :])
 
     def middle(self, side: float) -> tuple[slice, slice]:
-        """Return the cells of a square of that side [m] in the middle, or what of it is on the tile."""
+        """Return the cells of a square of that side [m], times the scale, in the middle, or what of it is on the tile."""
         spans = []
         for n in self.heights.shape:
             first = max(0, (n - self.cells(side)) // 2)
@@ -61,7 +66,7 @@ class Tile:
 def slope(tile: Tile, degrees_up: float, platform: float = 3.0) -> None:
     """Make a pyramid with a flat top (or, for a negative angle, bottom) and its foot at the tile's edge."""
     distance = 0.5 * min(tile.heights.shape) * tile.cell - tile.from_centre()
-    edge = 0.5 * (min(tile.heights.shape) * tile.cell - platform)
+    edge = 0.5 * (min(tile.heights.shape) * tile.cell - platform * tile.scale)
     tile.heights[:] = tan(radians(degrees_up)) * np.clip(distance, 0.0, edge)
 
 
@@ -73,7 +78,7 @@ def rough_slope(tile: Tile, degrees_up: float, platform: float = 3.0) -> None:
 
 def bumps(tile: Tile, amplitude: float, step: float = 0.005, spacing: float = 0.2) -> np.ndarray:
     """Return (length, width) heights of rough ground: U(-amplitude, amplitude) on a coarse lattice, linear in between."""
-    levels = np.arange(-amplitude, amplitude + 0.5 * step, step)
+    levels = tile.scale * np.arange(-amplitude, amplitude + 0.5 * step, step)
     every = max(1, tile.cells(spacing))
     counts = [n // every + 2 for n in tile.heights.shape]
     lattice = tile.rng.choice(levels, counts)
@@ -93,7 +98,8 @@ def stairs(tile: Tile, riser: float, platform: float = 3.0, tread: float = TREAD
 
 def step(tile: Tile, height: float, platform: float = 3.0, ledge: float = LEDGE) -> None:
     """Make one step up, all around the platform, and one down behind it."""
-    outer, inner = tile.middle(platform + 2.0 * max(1, tile.cells(ledge)) * tile.cell), tile.middle(platform)
+    along = max(1, tile.cells(ledge)) * tile.cell / tile.scale  # in whole cells
+    outer, inner = tile.middle(platform + 2.0 * along), tile.middle(platform)
     tile.heights[outer] = height
     tile.heights[inner] = 0.0
 
@@ -112,9 +118,9 @@ def obstacles(tile: Tile, height: float, platform: float = 3.0, count: int = 20)
 
 def stepping_stones(tile: Tile, stone: float, platform: float = 4.0, gap: float = JOINT) -> None:
     """Make square stones of side `stone`, in rows shifted against each other, with gaps around them."""
-    side, between = max(1, tile.cells(stone)), max(1, tile.cells(gap))
+    side, between = max(1, tile.cells(stone / tile.scale)), max(1, tile.cells(gap))
     rows, columns = tile.heights.shape
-    tile.heights[:] = -HOLE_DEPTH
+    tile.heights[:] = -HOLE_DEPTH * tile.scale
     for x in range(0, rows, side + between):
         for y in range(-int(tile.rng.integers(0, side)), columns, side + between):
             tile.heights[x : x + side, max(0, y) : max(0, y + side)] = 0.0
@@ -123,7 +129,8 @@ def stepping_stones(tile: Tile, stone: float, platform: float = 4.0, gap: float 
 
 def gap(tile: Tile, width: float, platform: float = 3.0) -> None:
     """Make a ditch around the platform."""
-    tile.heights[tile.middle(platform + 2.0 * tile.cells(width) * tile.cell)] = -HOLE_DEPTH
+    across = tile.cells(width / tile.scale) * tile.cell / tile.scale  # in whole cells
+    tile.heights[tile.middle(platform + 2.0 * across)] = -HOLE_DEPTH * tile.scale
     tile.heights[tile.middle(platform)] = 0.0
 
 
@@ -134,9 +141,10 @@ def pit(tile: Tile, depth: float, platform: float = 4.0) -> None:
 
 def waves(tile: Tile, amplitude: float, length: float = WAVE) -> None:
     """Make sine waves in both directions, level at the tile's edge: heights from -amplitude to amplitude."""
-    x, y = ((np.arange(n) + 0.5) * tile.cell for n in tile.heights.shape)
+    x, y = ((np.arange(n) + 0.5) * tile.cell / tile.scale for n in tile.heights.shape)
     pattern = np.sin(2.0 * np.pi * x[:, None] / length) + np.sin(2.0 * np.pi * y[None, :] / length)
-    fade = np.clip((0.5 * min(tile.heights.shape) * tile.cell - tile.from_centre()) / (0.5 * length), 0.0, 1.0)
+    inside = 0.5 * min(tile.heights.shape) * tile.cell - tile.from_centre()
+    fade = np.clip(inside / (0.5 * length * tile.scale), 0.0, 1.0)
     tile.heights[:] = 0.5 * amplitude * pattern * fade
 
 
@@ -151,7 +159,7 @@ class TerrainType:
     generate: Callable[[Tile, float], None]
     """Fills a tile; its second argument is the size below."""
     size: Callable[[float], float]
-    """Difficulty (0 is the easiest of training, 1 one row beyond its hardest) -> size, in `unit`."""
+    """Difficulty (0 is the easiest of training, 1 one row beyond its hardest) -> size at scale 1, in `unit`."""
     unit: str
     what: str
     """What the size measures."""
@@ -160,16 +168,20 @@ class TerrainType:
     regular: bool = True
     """All tiles of a size are the same: nothing in them is drawn at random."""
     platform: float = 3.0
-    """Side of the level square in the middle [m]."""
+    """Side of the level square in the middle at scale 1 [m]."""
     finest: tuple[float, str] | None = None
-    """Length of the smallest part that a tile is made of [m], and its name; cells must not be larger."""
+    """Length of the smallest part that a tile of scale 1 is made of [m], and its name; cells must not be larger."""
+
+    def sized(self, difficulty: float, scale: float) -> float:
+        """Return the size at that difficulty on tiles of that scale, in `unit`: lengths grow, angles do not."""
+        return self.size(difficulty) * (scale if self.unit == METRES else 1.0)
 
     def text(self, *sizes: float) -> str:
         """Return sizes in words, to three digits and whole degrees: '0.194 m', '11 to 18 degrees'."""
         return f"{' to '.join(f'{size:.0f}' if self.unit == DEGREES else f'{size:.3g}' for size in sizes)} {self.unit}"
 
 
-DEGREES = "degrees"
+METRES, DEGREES = "m", "degrees"
 
 
 def _angle(difficulty: float) -> float:
@@ -187,30 +199,30 @@ OF_BLOCKS, OF_STONES = (SMALLEST_BLOCK, "side of a block"), (JOINT, "gap between
 OF_DITCH = (NARROWEST_DITCH, "width of a ditch")
 
 TERRAIN_TYPES: dict[str, TerrainType] = {
-    "flat": TerrainType(flat, lambda d: 0.0, "m", "height", stepped=False, platform=0.0),
+    "flat": TerrainType(flat, lambda d: 0.0, METRES, "height", stepped=False, platform=0.0),
     "slope_up": TerrainType(lambda t, s: slope(t, -s), _angle, DEGREES, "angle", stepped=False),
     "slope_down": TerrainType(slope, _angle, DEGREES, "angle", stepped=False),
     "rough_slope_up": TerrainType(lambda t, s: rough_slope(t, -s), _angle, DEGREES, "angle", stepped=False, regular=False),
     "rough_slope_down": TerrainType(rough_slope, _angle, DEGREES, "angle", stepped=False, regular=False),
-    "waves": TerrainType(waves, lambda d: 0.2 * d, "m", "amplitude", stepped=False, platform=0.0, finest=OF_WAVES),
-    "stairs_up": TerrainType(lambda t, s: stairs(t, -s), _riser, "m", "step height", stepped=True, finest=OF_STAIRS),
-    "stairs_down": TerrainType(stairs, _riser, "m", "step height", stepped=True, finest=OF_STAIRS),
-    "step": TerrainType(step, _riser, "m", "height", stepped=True, platform=3.0 + 2.0 * LEDGE, finest=OF_LEDGE),
+    "waves": TerrainType(waves, lambda d: 0.2 * d, METRES, "amplitude", stepped=False, platform=0.0, finest=OF_WAVES),
+    "stairs_up": TerrainType(lambda t, s: stairs(t, -s), _riser, METRES, "step height", stepped=True, finest=OF_STAIRS),
+    "stairs_down": TerrainType(stairs, _riser, METRES, "step height", stepped=True, finest=OF_STAIRS),
+    "step": TerrainType(step, _riser, METRES, "height", stepped=True, platform=3.0 + 2.0 * LEDGE, finest=OF_LEDGE),
     "obstacles": TerrainType(
-        obstacles, lambda d: 0.05 + 0.2 * d, "m", "height", stepped=True, regular=False, finest=OF_BLOCKS
+        obstacles, lambda d: 0.05 + 0.2 * d, METRES, "height", stepped=True, regular=False, finest=OF_BLOCKS
     ),
     "stepping_stones": TerrainType(
         stepping_stones,
         lambda d: 1.5 * (1.05 - d),
-        "m",
+        METRES,
         "stone size",
         stepped=True,
         regular=False,
         platform=4.0,
         finest=OF_STONES,
     ),
-    "gap": TerrainType(gap, lambda d: 1.0 * d, "m", "width", stepped=True, finest=OF_DITCH),
-    "pit": TerrainType(pit, lambda d: 1.0 * d, "m", "depth", stepped=True, platform=4.0),
+    "gap": TerrainType(gap, lambda d: 1.0 * d, METRES, "width", stepped=True, finest=OF_DITCH),
+    "pit": TerrainType(pit, lambda d: 1.0 * d, METRES, "depth", stepped=True, platform=4.0),
 }
 """Every type, by the name under which `terrain.proportions` asks for it."""
 

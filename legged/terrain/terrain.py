@@ -13,7 +13,8 @@ from legged.terrain.generators import TERRAIN_TYPES, Tile, terrain_type
 from legged.terrain.height_map import HeightMap
 
 SPAWN_SQUARE = 2.0
-"""Robots start at the height of the highest point in a square of this side in the middle of their tile [m]."""
+"""Robots start at the height of the highest point in a square of this side, times the scale, in the middle of their tile
+[m]."""
 EDGE = 1.0
 """Robots closer than this to the end of the map have left it [m]."""
 WITHOUT_CURRICULUM = (0.5, 0.75, 0.9)
@@ -60,7 +61,7 @@ class Terrain:
 
     @classmethod
     def of_tiles(cls, rows: Sequence[Sequence[TileSpec]], cfg: TerrainConfig, rng: np.random.Generator) -> "Terrain":
-        """Build a terrain of the given tiles; of `cfg` only sizes and the slope threshold count."""
+        """Build a terrain of the given tiles; of `cfg` only lengths, the scale and the slope threshold count."""
         cell = cfg.horizontal_scale
         length, width, border = (round(x / cell) for x in (cfg.terrain_length, cfg.terrain_width, cfg.border_size))
         count = (len(rows), len(rows[0]))
@@ -72,7 +73,7 @@ class Terrain:
         for r, row in enumerate(rows):
             for c, spec in enumerate(row):
                 kind = TERRAIN_TYPES[spec.type]
-                tile = Tile(np.zeros((length, width)), cell, rng)
+                tile = Tile(np.zeros((length, width)), cell, rng, cfg.scale)
                 kind.generate(tile, spec.size)
                 x, y = border + r * length, border + c * width
                 heights[x : x + length, y : y + width] = tile.heights
@@ -105,7 +106,7 @@ class Terrain:
 
 def tile_size(cfg: TerrainConfig, name: str, difficulty: float) -> float:
     """Return the size of a tile of the type `name` in a row of that difficulty, in the type's unit [m or degrees]."""
-    return cfg.sizes.get(name, TERRAIN_TYPES[name].size(difficulty))
+    return cfg.sizes.get(name, TERRAIN_TYPES[name].sized(difficulty, cfg.scale))
 
 
 def hardest_difficulty(cfg: TerrainConfig) -> float:
@@ -155,17 +156,18 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
                 " ask for more columns or leave the type out"
             )
         kind = TERRAIN_TYPES[name]
-        if share > 0.0 and kind.finest is not None and cfg.horizontal_scale > kind.finest[0] * (1.0 + 1e-6):
+        finest = kind.finest[0] * cfg.scale if kind.finest else float("inf")
+        if share > 0.0 and kind.finest is not None and cfg.horizontal_scale > finest * (1.0 + 1e-6):
             raise ConfigError(
                 f"{where('horizontal_scale')}: cells of {cfg.horizontal_scale:g} m are larger than the {kind.finest[1]} of"
-                f" '{name}', {kind.finest[0]:g} m (proportions.{name}: {origins.of(f'terrain.proportions.{name}')})"
+                f" '{name}', {finest:g} m (proportions.{name}: {origins.of(f'terrain.proportions.{name}')})"
             )
         side = min(cfg.terrain_length, cfg.terrain_width)
-        if share > 0.0 and side <= kind.platform:
+        if share > 0.0 and side <= kind.platform * cfg.scale:
             short = "terrain_length" if cfg.terrain_length <= cfg.terrain_width else "terrain_width"
             raise ConfigError(
                 f"{where(short)}: a tile of {cfg.terrain_length:g} x {cfg.terrain_width:g} m (terrain_length, terrain_width)"
-                f" is not larger than the platform of '{name}', {kind.platform:g} m"
+                f" is not larger than the platform of '{name}', {kind.platform * cfg.scale:g} m"
                 f" (proportions.{name}: {origins.of(f'terrain.proportions.{name}')})"
             )
     if cfg.max_init_terrain_level >= cfg.num_rows:
@@ -180,8 +182,9 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
         )
     if cfg.border_size < 2.0 * EDGE:
         raise ConfigError(f"{where('border_size')}: must be at least {2.0 * EDGE:g}, got {cfg.border_size:g}")
-    if cfg.horizontal_scale > min(side, SPAWN_SQUARE):
-        limit = f"a tile of {side:g} m" if side < SPAWN_SQUARE else f"the {SPAWN_SQUARE:g} m square in which robots start"
+    square = SPAWN_SQUARE * cfg.scale
+    if cfg.horizontal_scale > min(side, square):
+        limit = f"a tile of {side:g} m" if side < square else f"the {square:g} m square in which robots start"
         raise ConfigError(f"{where('horizontal_scale')}: cells of {cfg.horizontal_scale:g} m are larger than {limit}")
     if cfg.num_rows * cfg.num_cols > MOST_TILES:
         raise ConfigError(

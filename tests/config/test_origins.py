@@ -1,7 +1,6 @@
 """Errors name who set the value: a file of the chain, its cpu section, the command line, a run's configuration, or nobody."""
 
 import pytest
-from helpers import TASK
 
 from legged import registry
 from legged.config import load_config, override, to_dict
@@ -10,7 +9,9 @@ from legged.errors import ConfigError
 from legged.learning.run_folder import run_config
 from legged.process.paths import data_folder
 
-ANYMAL_C = data_folder("cfg") / "anymal_c.yaml"
+BASES = data_folder("cfg") / "base"
+ROUGH = BASES / "quadruped_rough.yaml"
+"""What anymal_c extends, which extends what stands beside it."""
 
 
 @pytest.fixture
@@ -61,8 +62,8 @@ def test_a_configuration_knows_its_origins_but_they_are_no_setting(mine):
     cfg = registry.task_config("mine", [("sim.dt", 0.004)])
     assert cfg.origins.of("env.num_envs") == str(path)
     assert cfg.origins.of("terrain.proportions.gap") == cfg.origins.of("env.seed") == "the default"
-    assert cfg.origins.of("terrain.mesh_type") == str(ANYMAL_C)
-    assert cfg.origins.of("rewards.scales") == f"{data_folder('cfg') / TASK}.yaml, {ANYMAL_C}"
+    assert cfg.origins.of("terrain.mesh_type") == str(ROUGH)
+    assert cfg.origins.of("rewards.scales") == f"{BASES / 'quadruped_flat.yaml'}, {ROUGH}"
     assert override(cfg, [("env.seed", 3)]).origins.of("env") == f"{path}, command line"
     assert cfg.origins.of("env") == str(path)  # the original is left alone
     assert "origins" not in to_dict(cfg)
@@ -77,7 +78,7 @@ def test_a_configuration_knows_its_origins_but_they_are_no_setting(mine):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("robot: anymal_x", "robot: there is no robot 'anymal_x'; did you mean 'anymal_c'?"),
+        ("robot: anymal_cc", "robot: there is no robot 'anymal_cc'; did you mean 'anymal_c'?"),
         (
             "rewards: {scales: {torqes: 1}}",
             "rewards.scales.torqes: LeggedRobot has no reward 'torqes'; did you mean 'torques'",
@@ -107,19 +108,19 @@ def test_the_command_line_is_named(mine):
 def test_everyone_is_named_who_had_a_share_in_a_sum(mine):
     path = mine("terrain: {proportions: {gap: 0.2}}")
     message = error_of(("terrain.proportions.pit", 0.1))
-    assert message.startswith(f"{ANYMAL_C}, {path}, command line: terrain.proportions: must sum to 1, got 1.3")
+    assert message.startswith(f"{ROUGH}, {path}, command line: terrain.proportions: must sum to 1, got 1.3")
 
 
 def test_what_a_value_does_not_fit_is_named_too(mine):
-    """Levels up to 5 by default, in 4 rows; a default tile, with starts too far apart for it."""
+    """Levels up to 5 by default, in 4 rows; a tile with starts too far apart for it."""
     path = mine("terrain: {num_rows: 4}")
     assert error_of() == f"the default: terrain.max_init_terrain_level: must be below num_rows = 4 ({path}), got 5"
     message = error_of(("terrain.num_rows", 10), ("terrain.spawn_range", 4))
     assert message.startswith("command line: terrain.spawn_range: ")
-    assert message.endswith("(terrain_length = 8.0 (the default), terrain_width = 8.0 (the default))")
+    assert message.endswith(f"(terrain_length = 8.0 ({ROUGH}), terrain_width = 8.0 ({ROUGH}))")
     message = error_of(("terrain.num_rows", 10), ("terrain.terrain_width", 2.5))
     assert message.startswith("command line: terrain.terrain_width: a tile of 8 x 2.5 m")
-    assert message.endswith(f"(proportions.slope_up: {ANYMAL_C})")
+    assert message.endswith(f"(proportions.slope_up: {ROUGH})")
     assert "of num_cols = 1 (command line) columns" in error_of(("terrain.num_rows", 10), ("terrain.num_cols", 1))
 
 
@@ -133,7 +134,7 @@ def test_a_cpu_section_is_blamed_on_the_file_that_it_stands_in(mine):
     """anymal_c and the flat task below it have one, too."""
     path = mine("cpu: {terrain: {max_init_terrain_level: 9}}")
     message = error_of(on_cpu=True)
-    assert message == (f"{path}: cpu: terrain.max_init_terrain_level: must be below num_rows = 5 ({ANYMAL_C}: cpu), got 9")
+    assert message == (f"{path}: cpu: terrain.max_init_terrain_level: must be below num_rows = 5 ({ROUGH}: cpu), got 9")
     registry.task_config("mine")  # the section does not count on a GPU
     path = mine("cpu: {env: {num_env: 9}}")
     assert error_of().startswith(f"{path}: cpu: env.num_env: unknown key")
@@ -153,7 +154,7 @@ def test_a_robot_s_own_gains_are_blamed_on_its_file(robot, tmp_path):
     file = folder / "robot.yaml"
     file.write_text(file.read_text().replace("stiffness: {", "stiffness: {XYZ: 1.0, "))
     with pytest.raises(ConfigError, match=r"robot\.yaml: stiffness: pattern 'XYZ' matches nothing"):
-        registry.task_config(TASK, [("robot", str(folder))])
+        registry.task_config("anymal_c_flat", [("robot", str(folder))])
 
 
 def test_a_registered_mapping_is_named_with_its_task(monkeypatch):
@@ -164,8 +165,8 @@ def test_a_registered_mapping_is_named_with_its_task(monkeypatch):
 
 def test_a_run_s_configuration_is_named(tmp_path):
     path = tmp_path / "config.yaml"
-    path.write_text(f"task: {TASK}\nrobot: anymal_c\nrewards: {{scales: {{torqes: 1}}}}\n")
+    path.write_text("task: anymal_c_flat\nrobot: anymal_c\nrewards: {scales: {torqes: 1}}\n")
     cfg = run_config(tmp_path)
     with pytest.raises(ConfigError) as caught:
-        registry.task_class(TASK).check(override(cfg, [("env.num_envs", 3)]))
+        registry.task_class("anymal_c_flat").check(override(cfg, [("env.num_envs", 3)]))
     assert str(caught.value).startswith(f"{path}: rewards.scales.torqes: LeggedRobot has no reward")

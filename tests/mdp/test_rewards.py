@@ -10,7 +10,7 @@ from helpers import small_task
 from legged.envs import LeggedRobot
 from legged.registry import task_config
 
-# Names of the terms of legged_gym that exist on flat ground, as its users write them in a configuration.
+# Names of the terms of legged_gym that exist on flat ground, as its users write them in a configuration, and those of bipeds.
 TERMS = [
     "tracking_lin_vel",
     "tracking_ang_vel",
@@ -32,6 +32,10 @@ TERMS = [
     "stand_still",
     "feet_contact_forces",
     "no_fly",
+    "single_stance",
+    "feet_slide",
+    "feet_clearance",
+    "posture",
 ]
 
 
@@ -60,9 +64,13 @@ def task(built):
         built.commands,
         built.contact_forces,
         built.contacts.last_air_time,
+        built.contacts.air_time,
+        built.feet_pos,
+        built.feet_vel,
     ):
         tensor.zero_()
-    for flags in (built.terminated_buf, built.time_out_buf, built.is_moving, built.contacts.first_contact):
+    contacts = built.contacts
+    for flags in (built.terminated_buf, built.time_out_buf, built.is_moving, contacts.first_contact, contacts.in_contact):
         flags.fill_(False)
     built.dof_pos.copy_(built.default_dof_pos.expand(2, 12))
     built.projected_gravity.copy_(torch.tensor([0.0, 0.0, -1.0]).expand(2, 3))
@@ -80,7 +88,7 @@ def near(*values: float):
     return pytest.approx(list(values), rel=1e-5, abs=1e-7)
 
 
-def test_the_terms_are_those_of_legged_gym():
+def test_the_terms_are_those_that_are_tested_here():
     assert LeggedRobot.terms("_reward_") == set(TERMS)
 
 
@@ -242,6 +250,46 @@ def test_feet_contact_forces_measures_the_excess_over_the_allowed_force(task):
 def test_no_fly_is_exactly_one_foot_on_the_ground(task, vertical, expected):
     task.contact_forces[0, task.feet_indices, 2] = torch.tensor(vertical, dtype=torch.float32)
     assert value(task, "no_fly")[0] == expected
+
+
+def test_single_stance_pays_the_swing_while_the_other_foot_stands(task):
+    """Up to the target of 0.5 s; a robot with several feet on the ground, or with none, gets nothing, nor who may rest."""
+    task.contacts.air_time.copy_(torch.tensor([[0.0, 0.3, 0.2, 0.1], [0.0, 0.7, 0.1, 0.1]]))
+    task.is_moving.fill_(True)
+    task.contacts.in_contact[:, 0] = True
+    assert value(task, "single_stance") == near(0.3, 0.5)
+    task.is_moving[1] = False
+    task.contacts.in_contact[0, 1] = True
+    assert value(task, "single_stance") == near(0.0, 0.0)
+    task.contacts.in_contact.fill_(False)
+    task.is_moving.fill_(True)
+    assert value(task, "single_stance") == near(0.0, 0.0)
+
+
+def test_feet_slide_sees_feet_on_the_ground_only(task):
+    task.feet_vel[:, 0] = torch.tensor([0.3, 0.4, 9.0])
+    task.feet_vel[:, 1] = torch.tensor([1.0, 0.0, 0.0])
+    task.contacts.in_contact[0, :2] = True
+    task.contacts.in_contact[1, 1] = True
+    assert value(task, "feet_slide") == near(0.25 + 1.0, 1.0)
+
+
+def test_feet_clearance_is_about_feet_that_swing(task):
+    """The target is 0.1 m above the lowest foot: 0.06 m too low at 0.5 m/s, and 0.05 m too high at 2 m/s."""
+    task.feet_pos[:, :, 2] = torch.tensor([1.0, 1.04, 1.15, 1.0])
+    task.feet_vel[:, 1] = torch.tensor([0.3, 0.4, 9.0])
+    task.feet_vel[:, 2] = torch.tensor([0.0, 2.0, 9.0])
+    task.contacts.in_contact[:, 0] = True
+    task.contacts.in_contact[1, 2] = True
+    assert value(task, "feet_clearance") == near(0.06**2 * 0.5 + 0.05**2 * 2.0, 0.06**2 * 0.5)
+
+
+def test_posture_leaves_hips_and_knees_that_swing_alone(task):
+    """HAA spreads a leg; HFE and KFE swing it."""
+    names = task.robot.joint_names
+    for name, angle in (("LF_HAA", 0.3), ("RH_HAA", -0.4), ("LF_HFE", 1.0), ("LF_KFE", 1.0)):
+        task.dof_pos[0, names.index(name)] += angle
+    assert value(task, "posture") == near(0.25, 0.0)
 
 
 def test_the_reward_of_a_step_is_the_sum_of_the_terms_that_have_a_scale():

@@ -13,7 +13,8 @@ from legged.config.schema import LeggedControlConfig, SimConfig
 from legged.errors import ConfigError
 from legged.mdp.control import control_gains
 from legged.physics import RobotScene, make_physics
-from legged.robots.robot import Robot, load_robot, match_names, match_values
+from legged.robots.patterns import match_names, match_values
+from legged.robots.robot import Robot, load_robot
 
 # Sides by the leg's name: front legs are at +x, left legs at +y.
 FORE = {"LF": 1, "RF": 1, "LH": -1, "RH": -1}

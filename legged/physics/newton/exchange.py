@@ -161,7 +161,7 @@ class NewtonExchange(RobotExchange):
         ]
         tracked = np.full(simulation.model.shape_count, -1)
         worlds = tracked[: count * layout.num_shapes].reshape(count, layout.num_shapes)
-        worlds[:, layout.shapes] = np.arange(len(layout.shapes))
+        worlds[:, layout.shapes] = robot.contact_of_shape
         self._tracked = wp.array(tracked, dtype=int)
 
     def apply_torques(self) -> None:

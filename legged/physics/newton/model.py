@@ -27,7 +27,7 @@ class Layout:
     base: int
     """The floating body."""
     shapes: np.ndarray
-    """(B,) tracked shapes, in the robot's order."""
+    """(S,) collision shapes, in the robot's order."""
     root_q: int
     """First of the free joint's coordinates: position, then orientation (x, y, z, w)."""
     root_qd: int
@@ -52,7 +52,7 @@ class Layout:
             dofs=world.joint_dof_count,
             num_shapes=world.shape_count,
             base=bodies[robot.file.base],
-            shapes=np.array([shapes[name] for name in robot.contact_names]),
+            shapes=np.array([shapes[name] for name in robot.shape_names]),
             root_q=world.joint_q_start[root],
             root_qd=world.joint_qd_start[root],
             dof_q=np.array([world.joint_q_start[i] for i in hinges]),

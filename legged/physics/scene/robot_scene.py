@@ -23,7 +23,7 @@ def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
     """
     spec = robot_spec_of(robot.model_path)
     for geom in spec.geoms:
-        if geom.name in robot.contact_names:
+        if geom.name in robot.shape_names:
             geom.contype, geom.conaffinity = ROBOT, GROUND | ROBOT if self_collisions else GROUND
             if geom.priority < 1:  # else MuJoCo takes the larger friction of the two shapes
                 geom.priority, geom.condim = 1, max(geom.condim, 3)
@@ -53,8 +53,8 @@ def _contact_settings(geom: mujoco.MjsGeom) -> tuple[int, int, int, int]:
 
 def contact_sensor_columns(model: mujoco.MjModel, robot: Robot) -> tuple[int, int]:
     """First and past-the-last column of the contact sensors in sensordata; they lie side by side, 3 a shape."""
-    start = int(model.sensor(f"contact_{robot.contact_names[0]}").adr[0])
-    return start, start + 3 * len(robot.contact_names)
+    start = int(model.sensor(f"contact_{robot.shape_names[0]}").adr[0])
+    return start, start + 3 * len(robot.shape_names)
 
 
 class RobotScene(Scene):
@@ -86,7 +86,7 @@ class RobotScene(Scene):
             add_height_field(spec, terrain.height_map)
         else:
             add_terrain(spec, terrain)
-        for name in robot.contact_names if contact_sensors else ():
+        for name in robot.shape_names if contact_sensors else ():
             spec.add_sensor(
                 name=f"contact_{name}",
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
@@ -97,5 +97,5 @@ class RobotScene(Scene):
         return spec.compile()
 
     def shapes(self, model: mujoco.MjModel) -> np.ndarray:
-        """Return the robot's tracked shapes, in its order: their friction is that of its contacts with the ground."""
-        return np.array([model.geom(name).id for name in self.robot.contact_names])
+        """Return the robot's collision shapes, in its order: their friction is that of its contacts with the ground."""
+        return np.array([model.geom(name).id for name in self.robot.shape_names])

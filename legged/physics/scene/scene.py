@@ -29,7 +29,7 @@ class Scene(ABC):
 
         A terrain is made of height fields and boxes that are exactly its height map (`exact`), of one height field whose
         steps are ramps (`height_field`), or of a placeholder for a collider of our own (`none`). With `contact_sensors`,
-        every tracked shape of the robot gets a sensor `contact_<shape>`, the net force that the shape exerts, world frame
+        every collision shape of the robot gets a sensor `contact_<shape>`, the net force that the shape exerts, world frame
         [N].
 
         Raises:

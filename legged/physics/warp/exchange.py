@@ -94,7 +94,7 @@ def add_contact_forces(
     geom: wp.array[wp.vec2i],
     worldid: wp.array[int],
     force: wp.array[wp.spatial_vector],
-    shape_of_geom: wp.array[int],
+    contact_of_geom: wp.array[int],
     contact_forces: wp.array2d[wp.vec3],
 ):
     """One thread a contact: its force on the second shape, and the reaction on the first, world frame [N]."""
@@ -102,7 +102,7 @@ def add_contact_forces(
     if i >= nacon[0]:
         return
     on_second = wp.spatial_top(force[i])
-    first, second = shape_of_geom[geom[i][0]], shape_of_geom[geom[i][1]]
+    first, second = contact_of_geom[geom[i][0]], contact_of_geom[geom[i][1]]
     if first >= 0:
         wp.atomic_add(contact_forces, worldid[i], first, -on_second)
     if second >= 0:
@@ -244,9 +244,9 @@ class MujocoWarpExchange(RobotExchange):
         super().__init__(arrays_of(d), overflowed, model, robot, state)
         self._m, self._d = m, d
         shapes = [-1] * model.ngeom
-        for index, name in enumerate(robot.contact_names):
-            shapes[model.geom(name).id] = index
-        self._shape_of_geom = wp.array(shapes, dtype=int)
+        for name, contact in zip(robot.shape_names, robot.contact_of_shape, strict=True):
+            shapes[model.geom(name).id] = contact
+        self._contact_of_geom = wp.array(shapes, dtype=int)
         self._contact_ids = wp.array(range(d.naconmax), dtype=int)
         self._forces = wp.zeros(d.naconmax, dtype=wp.spatial_vector)
 
@@ -257,7 +257,7 @@ class MujocoWarpExchange(RobotExchange):
         wp.launch(
             add_contact_forces,
             dim=d.naconmax,
-            inputs=[d.nacon, d.contact.geom, d.contact.worldid, self._forces, self._shape_of_geom],
+            inputs=[d.nacon, d.contact.geom, d.contact.worldid, self._forces, self._contact_of_geom],
             outputs=[self._contact_forces],
         )
 

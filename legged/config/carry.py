@@ -1,0 +1,48 @@
+"""Numbers of a configuration that was written for one robot -> those that mean the same to another, by dynamic similarity.
+
+Which numbers these are is said by their fields: `carried` (bounds.py) gives a field the unit in which it grows with the
+robot; scales and noise of terms grow by the unit of the term, which its docstring ends with.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from legged.config.checks import hints_of
+
+Factor = Callable[[str], float]
+"""Unit -> by what a quantity of it grows from the one robot to the other."""
+UnitOf = Callable[[str], str]
+"""Name of a term's method, such as "_reward_torques" -> unit of what it returns."""
+DIGITS = 6
+"""Significant digits of a carried number: a configuration is there to be read."""
+
+
+def carry(data: Mapping[str, Any], schema: type, factor: Factor, unit_of: UnitOf) -> dict[str, Any]:
+    """Return the nested values `data`, which fit `schema`, with all numbers carried that have a unit to be carried by."""
+    fields = {f.name: f for f in dataclasses.fields(schema)}
+    hints = hints_of(schema)
+    carried: dict[str, Any] = {}
+    for key, value in data.items():
+        meta = fields[key].metadata
+        if dataclasses.is_dataclass(hints[key]):
+            carried[key] = carry(value, hints[key], factor, unit_of)  # type: ignore[arg-type]
+        elif "unit" in meta:
+            carried[key] = times(value, factor(meta["unit"]))
+        elif "unit_of" in meta:
+            prefix, power = meta["unit_of"]
+            carried[key] = {term: times(number, factor(unit_of(prefix + term)) ** power) for term, number in value.items()}
+        else:
+            carried[key] = value
+    return carried
+
+
+def times(value: Any, by: float) -> Any:
+    """Return a number, or all in a list or map, times a factor; a factor of 1 leaves them as they were written."""
+    if by == 1.0:
+        return value
+    if isinstance(value, Mapping):
+        return {key: times(item, by) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [times(item, by) for item in value]
+    return float(f"{value * by:.{DIGITS}g}")

@@ -1,0 +1,77 @@
+"""Gains of a robot that states none: from the inertia that each joint sees, and from the weight that it carries.
+
+Two inertias matter. With the robot in the air a joint moves what hangs on it, against the rest; with its feet on the ground
+the same joint moves the base as well. P gains come from the first, at a natural frequency that is the same for all robots in
+units of their own time sqrt(h / g), but so that no joint gives way under the robot's weight; D gains come from the geometric
+mean of both, at one damping ratio. For ANYmal C and Go2 this gives their makers' gains within a factor of two.
+"""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+FREQUENCY = 6.0
+"""Natural frequency of a joint in the air, times sqrt(h / g) [1]: 4 Hz for a robot that stands half a metre high."""
+RATIO = 0.5
+"""Damping ratio [1]."""
+SAG = 0.25
+"""How far a joint may give way under the robot's weight [rad]."""
+SHIFT = 0.1
+"""Least P gain of a leg's joint, in units of m g h: with less, an ankle could not shift the robot's weight [1/rad]."""
+LARGEST_TARGET = 0.3
+"""A target this far away must not ask for more than the motor's whole effort [rad]."""
+TIME_STEP = 0.005
+"""Physics step in which an explicit control law has to be stable [s]."""
+MARGIN = 1.0
+"""Largest eigenvalue of TIME_STEP M^-1 D; from 2 on the explicit law diverges."""
+
+
+def gains(
+    model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int], feet: Sequence[int], effort: np.ndarray, height: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return stiffness [N m/rad] and damping [N m s/rad] (D,) of the hinges `joints` (ids).
+
+    `qpos` is the pose in which the robot stands, `feet` are the shapes (ids) that it stands on, `effort` (D,) the limits of
+    its motors [N m], and `height` is that of its base above the ground [m].
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    inverse = np.linalg.inv(mass_matrix(model, data))
+    dofs = model.jnt_dofadr[list(joints)]
+    jacobian = np.vstack([_jacobian(model, data, foot) for foot in feet])
+    at_feet = jacobian @ inverse
+    held = inverse - at_feet.T @ np.linalg.pinv(at_feet @ jacobian.T) @ at_feet
+    in_air = 1.0 / inverse[dofs, dofs]
+    on_feet = 1.0 / np.maximum(held[dofs, dofs], 1e-6 / in_air)
+    weight = np.abs(_static_torques(data, jacobian)[dofs])
+    gravity = np.linalg.norm(model.opt.gravity)
+    leg = np.abs(jacobian[:, dofs]).max(axis=0) > 0.0
+    least = np.maximum(weight / SAG, SHIFT * model.body_mass.sum() * gravity * height * leg)
+    stiffness = np.minimum(np.maximum(in_air * FREQUENCY**2 * gravity / height, least), effort / LARGEST_TARGET)
+    damping = 2.0 * RATIO * np.sqrt(stiffness * np.sqrt(in_air * on_feet))
+    damping = np.minimum(damping, MARGIN * in_air / TIME_STEP)
+    fastest = TIME_STEP * np.abs(np.linalg.eigvals(inverse[np.ix_(dofs, dofs)] * damping)).max()
+    return stiffness, damping * min(1.0, MARGIN / fastest)
+
+
+def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Return the joint-space inertia, (V, V) for V degrees of freedom, of a state whose positions were computed."""
+    columns = np.zeros((model.nv, model.nv))
+    for i, unit in enumerate(np.eye(model.nv)):
+        mujoco.mj_mulM(model, data, columns[i], unit)
+    return columns
+
+
+def _jacobian(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
+    """Return (3, V) how the centre of a shape moves with the joints."""
+    found = np.zeros((3, model.nv))
+    mujoco.mj_jac(model, data, found, None, data.geom_xpos[geom], model.geom_bodyid[geom])
+    return found
+
+
+def _static_torques(data: mujoco.MjData, jacobian: np.ndarray) -> np.ndarray:
+    """Return (V,) the forces that hold the robot at rest, where feet carry the base with the smallest forces that do."""
+    forces = np.linalg.lstsq(jacobian[:, :6].T, data.qfrc_bias[:6], rcond=None)[0]
+    return np.asarray(data.qfrc_bias - jacobian.T @ forces)

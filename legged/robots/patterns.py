@@ -1,0 +1,33 @@
+"""Patterns of robot.yaml and of tasks: parts of names."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from legged.errors import ConfigError, suggest
+
+
+def match_names(patterns: Sequence[str], names: Sequence[str], where: str) -> tuple[int, ...]:
+    """Return the indices of the names that contain any of the patterns, in the order of `names`."""
+    for pattern in patterns:
+        if not pattern:
+            raise ConfigError(f"{where}: an empty pattern would match everything{suggest(pattern, names, 'names')}")
+        if not any(pattern in name for name in names):
+            raise ConfigError(f"{where}: pattern '{pattern}' matches nothing{suggest(pattern, names, 'names')}")
+    return tuple(i for i, name in enumerate(names) if any(pattern in name for pattern in patterns))
+
+
+def match_values(table: Mapping[str, float], names: Sequence[str], where: str) -> np.ndarray:
+    """Return the value of the longest pattern that each name contains, (len(names),).
+
+    Raises:
+        ConfigError: a pattern that no name contains, or a name without pattern.
+    """
+    match_names(tuple(table), names, where)
+    values = np.zeros(len(names))
+    for i, name in enumerate(names):
+        matching = [pattern for pattern in table if pattern in name]
+        if not matching:
+            raise ConfigError(f"{where}: no pattern matches joint '{name}' (patterns: {', '.join(table) or 'none'})")
+        values[i] = table[max(matching, key=len)]
+    return values

@@ -1,0 +1,66 @@
+"""A robot in its default pose: how high it stands, and which joints swing its legs forward."""
+
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+
+ALONG = 0.7
+"""Least component along the base's y axis of the axis of a joint that swings a leg forward: within 45 degrees."""
+
+
+def stance(model: mujoco.MjModel, angles: Mapping[str, float]) -> mujoco.MjData:
+    """Return the model with its base level at the origin, and its joints at `angles` [rad], poses computed."""
+    data = mujoco.MjData(model)
+    data.qpos[:7] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+    for name, angle in angles.items():
+        data.joint(name).qpos[0] = angle
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    return data
+
+
+def lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
+    """Return the height of the lowest point of a shape, world frame [m]."""
+    size, kind = model.geom_size[geom], model.geom_type[geom]
+    down = data.geom_xmat[geom].reshape(3, 3)[2]  # the world's vertical in the frame of the shape
+    types = mujoco.mjtGeom
+    if kind == types.mjGEOM_SPHERE:
+        below = size[0]
+    elif kind == types.mjGEOM_CAPSULE:
+        below = size[0] + abs(down[2]) * size[1]
+    elif kind == types.mjGEOM_CYLINDER:
+        below = np.hypot(down[0], down[1]) * size[0] + abs(down[2]) * size[1]
+    elif kind == types.mjGEOM_ELLIPSOID:
+        below = np.linalg.norm(down * size)
+    elif kind == types.mjGEOM_MESH:
+        mesh = model.geom_dataid[geom]
+        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        below = -float((model.mesh_vert[first : first + count] @ down).min())
+    else:  # a box, and what is enclosed by one
+        below = np.abs(down) @ size
+    return float(data.geom_xpos[geom, 2] - below)
+
+
+def standing_height(model: mujoco.MjModel, base: str, angles: Mapping[str, float]) -> float:
+    """Return how far the base is above the lowest point of the collision shapes [m], level, at joint `angles` [rad]."""
+    data = stance(model, angles)
+    shapes = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
+    return float(data.body(base).xpos[2] - min(lowest_point(model, data, int(i)) for i in shapes))
+
+
+def swinging_joints(
+    model: mujoco.MjModel, angles: Mapping[str, float], joints: Sequence[int], feet: Sequence[int]
+) -> np.ndarray:
+    """Return (D,) which of the hinges `joints` (ids) swing a leg forward and back: those between the base and one of the
+    shapes `feet` (ids) whose axes point sideways in the default pose, such as hip pitch, knee and ankle pitch.
+    """
+    data = stance(model, angles)
+    on_leg = set()
+    for foot in feet:
+        body = model.geom_bodyid[foot]
+        while body:
+            on_leg.add(int(body))
+            body = model.body_parentid[body]
+    sideways = np.abs(data.xaxis[list(joints), 1]) > ALONG
+    return sideways & np.array([int(model.jnt_bodyid[i]) in on_leg for i in joints])

@@ -1,0 +1,128 @@
+"""Numbers that are written for one robot, carried to another: units, fields, terms, and what is never carried."""
+
+import pytest
+import yaml
+
+from legged.config.carry import carry
+from legged.config.legged import LeggedConfig
+from legged.config.units import exponents, factor, unit_in
+from legged.envs.legged_robot import LeggedRobot
+from legged.errors import ConfigError
+from legged.registry import register, task_config
+
+BY_HAND = [
+    ("m", (0, 1, 0)),
+    ("kg", (1, 0, 0)),
+    ("m^2/s^2", (0, 2, -2)),
+    ("rad^2/s^4", (0, 0, -4)),
+    ("N m", (1, 2, -2)),
+    ("N^2 m^2", (2, 4, -4)),
+    ("m/s, m/s, rad/s", (0, 1, -1)),
+    ("1", (0, 0, 0)),
+    ("0 to 1", (0, 0, 0)),
+    ("", (0, 0, 0)),
+]
+
+
+@pytest.mark.parametrize(("unit", "expected"), BY_HAND)
+def test_exponents_of_mass_length_and_time(unit, expected):
+    assert exponents(unit) == expected
+
+
+def test_a_robot_twice_as_high_and_eight_times_as_heavy():
+    """Speeds grow by sqrt(2), torques by 8 * 2, times by sqrt(2), all with gravity as it is."""
+    scale = {"kg": 8.0, "m": 2.0, "s": 2.0**0.5}
+    assert factor("m/s", scale) == pytest.approx(2.0**0.5)
+    assert factor("N m", scale) == pytest.approx(16.0)
+    assert factor("m/s^2", scale) == pytest.approx(1.0)
+    assert factor("rad", scale) == 1.0
+
+
+def test_the_unit_of_a_term_ends_the_first_paragraph_of_its_docstring():
+    assert unit_in("Squared torques [N^2 m^2].\n\nSee [1].") == "N^2 m^2"
+    assert unit_in("Speed\n    of the base [m/s]") == "m/s"
+    assert unit_in("Number of shapes.") is None
+    assert unit_in(None) is None
+
+
+def test_fields_grow_by_their_unit_and_scales_of_terms_against_it():
+    data = {
+        "rewards": {"base_height_target": 0.5, "tracking_sigma": 0.25, "scales": {"torques": -1e-5, "collision": -1.0}},
+        "domain_rand": {"added_mass_range": [-5.0, 5.0]},
+        "terrain": {"proportions": {"flat": 1.0}, "measured_points_x": [-0.1, 0.1]},
+        "observations": {"scales": {"heights": 5.0}, "noise": {"heights": 0.1}},
+    }
+    units = {"_reward_torques": "N^2 m^2", "_reward_collision": "1", "_obs_heights": "m"}
+    grown = carry(data, LeggedConfig, lambda unit: factor(unit, {"kg": 0.5, "m": 0.25, "s": 0.5}), units.__getitem__)
+    assert grown == {
+        "rewards": {"base_height_target": 0.125, "tracking_sigma": 0.25, "scales": {"torques": -0.00064, "collision": -1.0}},
+        "domain_rand": {"added_mass_range": [-2.5, 2.5]},
+        "terrain": {"proportions": {"flat": 1.0}, "measured_points_x": [-0.025, 0.025]},
+        "observations": {"scales": {"heights": 20.0}, "noise": {"heights": 0.025}},
+    }
+
+
+@pytest.mark.parametrize("name", sorted(LeggedConfig().rewards.scales))
+def test_rewards_whose_unit_is_not_one_say_so(name):
+    """A reward of our own that measures something physical must be carried: its docstring has to end with the unit."""
+    unit = unit_in(getattr(LeggedRobot, f"_reward_{name}").__doc__)
+    counted = ("tracking_lin_vel", "tracking_ang_vel", "collision", "action_rate")
+    assert (unit is None) == (name in counted)
+
+
+@pytest.fixture
+def tasks(tmp_path):
+    def add(name, text):
+        path = tmp_path / f"{name}.yaml"
+        path.write_text(yaml.safe_dump(text))
+        register(name, path)
+        return path
+
+    return add
+
+
+def test_the_robot_it_was_written_for_has_the_numbers_as_they_are(tasks):
+    tasks("carry_same", {"written_for": "anymal_c", "robot": "anymal_c", "rewards": {"base_height_target": 0.123456789}})
+    assert task_config("carry_same").rewards.base_height_target == 0.123456789
+
+
+def test_what_is_set_over_it_is_taken_as_it_stands(tasks):
+    """By a file that extends it, by another one of its own kind, and by the command line."""
+    parent = {"written_for": "anymal_c", "rewards": {"base_height_target": 0.5, "max_contact_force": 350.0}}
+    tasks("carry_parent", {**parent, "domain_rand": {"max_push_vel_xy": 1.0}, "cpu": {"terrain": {"spawn_range": 2.0}}})
+    tasks("carry_child", {"extends": "carry_parent", "robot": "go2", "rewards": {"max_contact_force": 99.0}})
+    cfg = task_config("carry_child", [("domain_rand.max_push_vel_xy", 0.25)], on_cpu=True)
+    height = 0.3235036 / 0.5488202  # of the two bases above their feet, in their default poses
+    assert cfg.rewards.base_height_target == pytest.approx(0.5 * height, rel=1e-5)
+    assert cfg.terrain.spawn_range == pytest.approx(2.0 * height, rel=1e-5)
+    assert cfg.rewards.max_contact_force == 99.0
+    assert cfg.domain_rand.max_push_vel_xy == 0.25
+    assert "carry_parent.yaml (written for anymal_c)" in cfg.origins.of("rewards.base_height_target")
+    assert "carry_child.yaml" in cfg.origins.of("rewards.max_contact_force")
+
+
+def test_the_robot_of_the_command_line_counts(tasks):
+    tasks("carry_robot", {"written_for": "anymal_c", "robot": "anymal_c", "rewards": {"max_contact_force": 350.0}})
+    cfg = task_config("carry_robot", [("robot", "go2")])
+    assert cfg.rewards.max_contact_force == pytest.approx(350.0 * 15.019 / 52.13485, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("written_for", "message"),
+    [
+        ("anymal_z", "written_for: there is no robot 'anymal_z'; did you mean 'anymal_c'"),
+        (3, "written_for: expected the name"),
+    ],
+)
+def test_a_robot_that_is_none(tasks, written_for, message):
+    tasks("carry_wrong", {"written_for": written_for, "robot": "go2"})
+    with pytest.raises(ConfigError) as error:
+        task_config("carry_wrong")
+    assert message in str(error.value)
+    assert "carry_wrong.yaml" in str(error.value)
+
+
+def test_a_task_without_a_robot_has_nobody_to_carry_to(tasks):
+    tasks("carry_nobody", {"extends": "half_cheetah", "written_for": "anymal_c"})
+    with pytest.raises(ConfigError, match="written_for: a task of HalfCheetah has no robot"):
+        task_config("carry_nobody")
