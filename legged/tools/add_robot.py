@@ -9,7 +9,7 @@ from pathlib import Path
 
 from legged.commandline.command import run_main
 from legged.config.checks import PLAIN, is_plain_name, shown
-from legged.errors import ConfigError
+from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, exists, make_folder, ready_to_write, relative, write_text
 from legged.registry import register_file, task_config
 from legged.robots.importing.folder import Guesses, task_yaml, write_folder
@@ -49,6 +49,8 @@ def _main(argv: list[str] | None) -> int:
     if not args.force and (exists(folder) or exists(task)):
         taken = folder if exists(folder) else task
         raise ConfigError(f"--name: there is {relative(taken)} already; another name, or --force to write over it")
+    if args.extends is not None:
+        _check_task(args.extends, task)
     ready_to_write(folder, ROOM_MB)
     tree = read_robot(path, [root.resolve() for root in args.packages])
     tree.name = name
@@ -86,6 +88,14 @@ def _source(given: str) -> tuple[Path, str, str]:
         raise ConfigError(f"{shown(given)}: there is no such file; a URDF, an MJCF file, or {PREFIX}NAME is wanted")
     beside = [other.name for folder in (path.parent, path.parent.parent) for other in sorted(folder.glob("LICENSE*"))]
     return path.absolute(), path.name, f"see {beside[0]} beside the source" if beside else "that of the source; look it up"
+
+
+def _check_task(name: str, beside: Path) -> None:
+    """Look whether there is a task that the new one, in the file `beside` it, can extend."""
+    folders = (data_folder("cfg"), beside.parent)
+    if not any(exists(folder / f"{name.removesuffix('.yaml')}.yaml") for folder in folders):
+        names = {path.relative_to(folders[0]).with_suffix("").as_posix() for path in folders[0].rglob("*.yaml")}
+        raise ConfigError(f"--extends: there is no task {shown(name)}{suggest(name[:100], names, 'tasks')}")
 
 
 def _places(name: str, out: Path | None) -> tuple[Path, Path]:

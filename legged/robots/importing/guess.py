@@ -6,16 +6,17 @@ from pathlib import Path
 import mujoco
 
 from legged.errors import ConfigError
+from legged.robots.importing.actuation import guess_efforts, speed_limits, take_gains
 from legged.robots.importing.folder import Guesses
-from legged.robots.importing.gains import guess_efforts, guess_speeds, take_gains
+from legged.robots.importing.inverse_kinematics import GOOD, standing_angles
 from legged.robots.importing.legs import Leg, Poser, face_forward, find_legs
 from legged.robots.importing.mend import mend
 from legged.robots.importing.mjcf import read_mjcf
 from legged.robots.importing.shapes import fit_meshes, free_name, name_shapes
-from legged.robots.importing.stance import GOOD, height_above_ground, stance
 from legged.robots.importing.text import mjcf_of
 from legged.robots.importing.tree import Shape, Tree
 from legged.robots.importing.urdf import read_urdf
+from legged.robots.stance import standing_height
 
 LIGHT = 0.002
 """Joints that move a smaller part of the mass are none that walking needs: fingers, sensors."""
@@ -53,7 +54,7 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
     _name_feet(tree, legs)
     _draw_what_is_bare(tree)
     angles, origin = _default_pose(tree, legs)
-    height = height_above_ground(tree, angles)
+    height = standing_height(Poser(tree).model, tree.links[0].name, angles)
     guess_efforts(tree, legs, height)
     if gains is None:
         stiffness, damping = take_gains(tree, angles)
@@ -78,7 +79,7 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
         terminating=_exact(tree, base),
         stiffness=stiffness,
         damping=damping,
-        velocity=guess_speeds(tree, height),
+        velocity=speed_limits(tree),
         kind=kind,
     )
 
@@ -133,7 +134,7 @@ def _default_pose(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], str]:
             tree.say(f"the default pose is that of the keyframe '{tree.home_name}'")
             return {name: round(angle, 4) + 0.0 for name, angle in angles.items()}, origin
         tree.say(f"the keyframe '{tree.home_name}' is no stance (its feet are not level, or a joint is beyond its range)")
-    angles, miss = stance(tree, legs)
+    angles, miss = standing_angles(tree, legs)
     tree.say("guess: the default pose is a stance by inverse kinematics: base level, feet under the hips, knees bent")
     if miss > GOOD:
         tree.say(f"guess: in that pose a foot is {miss:.0%} of a leg's length from where it should be; look at it")

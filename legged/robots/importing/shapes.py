@@ -2,8 +2,6 @@
 
 import re
 
-import numpy as np
-
 from legged.robots.importing.meshes import MeshProblem, fitted
 from legged.robots.importing.tree import Shape, Tree
 from legged.robots.robot_model import TAKEN
@@ -60,18 +58,3 @@ def free_name(wanted: str, taken: set[str]) -> str:
         number += 1
         name = f"{wanted}_{number}"
     return name
-
-
-def lowest(shape: Shape, turn: np.ndarray) -> float:
-    """Return how far a primitive reaches below its centre [m], where `turn` (3, 3) is its orientation in the world."""
-    down = turn[2]  # the world's vertical in the frame of the shape
-    a, b, _ = shape.size
-    if shape.kind == "sphere":
-        return float(a)
-    if shape.kind == "capsule":
-        return float(a + b * abs(down[2]))
-    if shape.kind == "cylinder":
-        return float(a * np.hypot(down[0], down[1]) + b * abs(down[2]))
-    if shape.kind == "ellipsoid":
-        return float(np.linalg.norm(shape.size * down))
-    return float(np.abs(down) @ shape.size)

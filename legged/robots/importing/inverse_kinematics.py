@@ -9,8 +9,7 @@ import mujoco
 import numpy as np
 
 from legged.robots.importing.legs import ANKLE, SAMPLES, Leg, Poser
-from legged.robots.importing.shapes import lowest
-from legged.robots.importing.tree import Tree, Vector, matrix
+from legged.robots.importing.tree import Tree, Vector
 
 STRETCH = {4: 0.8, 2: 0.96}
 """Distance from hip to foot by the number of legs, in that of a stretched leg."""
@@ -49,7 +48,7 @@ class _Limb:
     """(3,) the direction in the foot's frame that is up at zero angles."""
 
 
-def stance(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], float]:
+def standing_angles(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], float]:
     """Return joint angles [rad] by the names of the hinges, and how far the worst foot is from where it should be, in the
     length of a leg.
     """
@@ -190,17 +189,3 @@ def _stretched(poser: Poser, limb: _Limb) -> float:
         foot = poser.point(limb.leg.end, limb.leg.tip)
         farthest = max(farthest, float(np.linalg.norm(foot - poser.data.xanchor[hip])))
     return farthest
-
-
-def height_above_ground(tree: Tree, angles: dict[str, float]) -> float:
-    """Return how far the base is above the lowest point of what collides, at joint `angles` [m]."""
-    poser = Poser(tree)
-    poser.pose(angles)
-    depth = 0.0
-    for i, link in enumerate(tree.links):
-        frame = poser.data.xmat[poser.ids[i]].reshape(3, 3)
-        for shape in link.shapes:
-            if shape.collides:
-                at = poser.point(i, shape.pos)
-                depth = max(depth, lowest(shape, frame @ matrix(shape.quat)) - float(at[2]))
-    return depth

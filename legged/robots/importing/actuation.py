@@ -3,15 +3,13 @@
 import mujoco
 import numpy as np
 
+from legged.robots.gains import TIME_STEP, mass_matrix
 from legged.robots.importing.legs import Leg, Poser
 from legged.robots.importing.tree import Tree
+from legged.robots.robot import VELOCITY_LIMIT
 
-STEP = 0.005
-"""Physics step of the tasks [s]."""
 SHARE, ELSEWHERE = 0.4, 0.1
 """Guess of a torque limit, in weight times height of the base: of a leg, of other joints."""
-SPEED = 4.7
-"""Guess of a speed limit, in sqrt(g / h): 20 rad/s for an ANYmal."""
 GRAVITY = 9.81
 
 
@@ -28,13 +26,14 @@ def guess_efforts(tree: Tree, legs: list[Leg], height: float) -> None:
             tree.say(f"guess: torque limits that the file lacks are {share:g} m g h", f"{hinge.name} {hinge.effort:g} N m")
 
 
-def guess_speeds(tree: Tree, height: float) -> dict[str, float]:
-    """Return the speed limits of all hinges [rad/s]: the file's, else one by the height of the base [m]."""
-    guess = round(SPEED * float(np.sqrt(GRAVITY / height)), 1)
+def speed_limits(tree: Tree) -> dict[str, float]:
+    """Return the speed limits of all hinges [rad/s], where the file states any; what it leaves out is as elsewhere."""
+    if not any(hinge.velocity for hinge in tree.hinges):
+        return {}
     for hinge in tree.hinges:
         if hinge.velocity is None:
-            tree.say(f"guess: speed limits that the file lacks are {SPEED:g} sqrt(g / h), {guess:g} rad/s", hinge.name)
-    return {hinge.name: hinge.velocity or guess for hinge in tree.hinges}
+            tree.say(f"guess: speed limits that the file lacks are {VELOCITY_LIMIT:g} rad/s", hinge.name)
+    return {hinge.name: hinge.velocity or VELOCITY_LIMIT for hinge in tree.hinges}
 
 
 def take_gains(tree: Tree, angles: dict[str, float]) -> tuple[dict[str, float], dict[str, float]]:
@@ -55,8 +54,8 @@ def take_gains(tree: Tree, angles: dict[str, float]) -> tuple[dict[str, float], 
     growth = _growth(tree, angles, stiffness, damping)
     if growth > 1.0:
         tree.say(
-            f"gains of the file's position actuators are left out: at steps of {STEP * 1000:g} ms an explicit law with them"
-            f" grows by {growth:.3g} a step"
+            f"gains of the file's position actuators are left out: at steps of {TIME_STEP * 1000:g} ms an explicit law with"
+            f" them makes deviations grow by {growth:.3g} a step"
         )
         return {}, {}
     for hinge in driven:
@@ -74,14 +73,13 @@ def _growth(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], d
     poser = Poser(tree)
     data = poser.pose(angles)
     mujoco.mj_forward(poser.model, data)
-    inertia = np.zeros((poser.model.nv, poser.model.nv))
-    mujoco.mj_fullM(poser.model, data, inertia)
+    inertia = mass_matrix(poser.model, data)
     dofs = [int(poser.model.joint(name).dofadr[0]) for name in stiffness]
     own = poser.model.dof_damping[dofs]
     mobility = np.linalg.inv(inertia)[np.ix_(dofs, dofs)]
     k = mobility @ np.diag(list(stiffness.values()))
     d = mobility @ (np.diag(list(damping.values())) + np.diag(own * [damping[name] == 0.0 for name in stiffness]))
     eye = np.eye(len(dofs))
-    rates = np.hstack([-STEP * k, eye - STEP * d])
-    step = np.vstack([np.hstack([eye, np.zeros_like(eye)]) + STEP * rates, rates])
+    rates = np.hstack([-TIME_STEP * k, eye - TIME_STEP * d])
+    step = np.vstack([np.hstack([eye, np.zeros_like(eye)]) + TIME_STEP * rates, rates])
     return float(np.abs(np.linalg.eigvals(step)).max())
