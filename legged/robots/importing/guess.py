@@ -18,8 +18,8 @@ from legged.robots.importing.tree import Shape, Tree
 from legged.robots.importing.urdf import read_urdf
 from legged.robots.stance import standing_height
 
-LIGHT = 0.002
-"""Joints that move a smaller part of the mass are none that walking needs: fingers, sensors."""
+LIGHT = 0.005
+"""Fingers that move a smaller part of the mass are held."""
 ABOVE = 1.03
 """Spawn height, in that of the standing base."""
 LOST = 1e-6

@@ -23,6 +23,10 @@ LEAST_SHARE = 0.01
 """Part of a link's mass that a massless one before it is given."""
 LEAST_MOMENT = 1e-3
 """Smallest principal moment of inertia, in those of the largest, where a file has one that is not above 0."""
+LARGEST = 1e6
+"""Of masses [kg], inertias [kg m^2] and lengths [m]: beyond it somebody has made a mistake."""
+FINGERS = re.compile(r"hand|finger|thumb|index|middle|ring|pinky|little|gripper|palm|eye|ear|jaw|antenna", re.IGNORECASE)
+"""In the names of joints and links that walking does not need."""
 ROUNDING = 1e-6
 """How far moments are kept from the limit A + B = C, in the largest one."""
 TINY = 1e-12
@@ -30,20 +34,35 @@ TINY = 1e-12
 
 
 def mend(tree: Tree, hold: Sequence[str] = (), light: float = 0.0) -> None:
-    """Put a tree right in place: hold the joints whose names contain one of `hold`, and those that move at most the part
-    `light` of the mass, weld what carries no mass, merge welded links, mend inertias.
+    """Put a tree right in place: hold the joints whose names contain one of `hold`, and those of fingers that move at most
+    the part `light` of the mass, weld what carries no mass, merge welded links, mend inertias.
 
     Raises:
         ConfigError: a pattern of `hold` matches no joint, or there is no mass.
     """
+    _check_numbers(tree)
     _hold(tree, hold)
     _hold_what_is_light(tree, light)
     merge_welded(tree)
-    if not tree.links[0].mass + sum(link.mass for link in tree.links) > 0.0:
-        raise ConfigError(f"{tree.source}: no link has a mass")
+    if len(tree.links) == 1:
+        raise ConfigError(f"{tree.source}: nothing in it turns: no joint is a hinge that moves a mass")
     _give_mass(tree)
     for link in tree.links:
         _mend_inertia(link, tree)
+
+
+def _check_numbers(tree: Tree) -> None:
+    """Look whether masses and places are such that their squares are numbers too.
+
+    Raises:
+        ConfigError: they are not.
+    """
+    for link in tree.links:
+        values = np.hstack([link.mass, link.com, link.inertia.ravel(), link.pos, link.quat])
+        sizes = [np.hstack([shape.size, shape.pos, shape.quat]) for shape in link.shapes]
+        numbers = np.abs(np.hstack([values, *sizes]))
+        if not (numbers <= LARGEST).all():
+            raise ConfigError(f"{tree.source}: link '{link.name}': its numbers must be finite and at most {LARGEST:g}")
 
 
 def _hold(tree: Tree, hold: Sequence[str]) -> None:
@@ -67,7 +86,7 @@ def fix(link: Link, hinge: Hinge, angle: float) -> None:
 
 
 def _hold_what_is_light(tree: Tree, light: float) -> None:
-    """Hold joints that move no mass, their own link's or another's, or nearly none of the robot's, as those of fingers do."""
+    """Hold joints that move no mass, their own link's or another's, and those of fingers, by name and mass."""
     moved = [link.mass for link in tree.links]
     for i in reversed(range(1, len(tree.links))):
         moved[tree.links[i].parent] += moved[i]
@@ -76,9 +95,9 @@ def _hold_what_is_light(tree: Tree, light: float) -> None:
             if moved[i] <= TINY:
                 tree.say("joints that move no mass are held", hinge.name)
                 fix(link, hinge, 0.0)
-            elif moved[i] < light * moved[0]:
+            elif moved[i] < light * moved[0] and FINGERS.search(f"{link.name} {hinge.name}"):
                 angle = rest_angle(tree, hinge)
-                tree.say(f"joints that move less than {light:.1%} of the mass are held", f"{hinge.name} at {angle:.3g} rad")
+                tree.say("fingers and the like are held", f"{hinge.name} at {angle:.3g} rad")
                 fix(link, hinge, angle)
 
 

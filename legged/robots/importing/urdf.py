@@ -8,11 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from legged.config.checks import shown
 from legged.errors import ConfigError, suggest
 from legged.robots.importing import meshes
 from legged.robots.importing.meshes import MeshProblem
 from legged.robots.importing.tree import Hinge, Link, Shape, Tree, Vector, matrix, quat_about, quat_of_rpy, quat_product
 
+MOST_TURNS = 1e3
+"""Limits of more than this both ways are none [rad]."""
 HINGES = ("revolute", "continuous")
 NO_HINGES = {"prismatic": "slide", "planar": "slide in a plane", "floating": "float"}
 KINDS = (*HINGES, *NO_HINGES, "fixed")
@@ -151,8 +154,8 @@ class _Joint:
             hinge.velocity = velocity if velocity and 0.0 < velocity < 1e3 else None
         if self.kind == "revolute":
             low, high = (0.0 if limit is None else _number(limit, key, self.path, 0.0) for key in ("lower", "upper"))
-            if low < high:
-                hinge.range = (low, high)
+            if low < high and not (low < -MOST_TURNS and high > MOST_TURNS):
+                hinge.range = (max(low, -MOST_TURNS), min(high, MOST_TURNS))
             else:
                 tree.say("joints whose limits are no range, and which have none here", self.name)
         dynamics = self.element.find("dynamics")
@@ -177,6 +180,8 @@ def _inertial(element: ET.Element, link: Link, tree: Tree) -> None:
     if given is not None and link.mass > 0.0:
         xx, xy, xz, yy, yz, zz = (_number(given, f"i{k}", tree.source, 0.0) for k in ("xx", "xy", "xz", "yy", "yz", "zz"))
         turn = matrix(quat)
+        if not np.isfinite([xx, xy, xz, yy, yz, zz]).all():
+            raise ConfigError(f"{tree.source}: link '{link.name}': inertia: expected finite numbers")
         link.inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
 
 
@@ -275,7 +280,7 @@ def _numbers(element: ET.Element, key: str, count: int, path: Path) -> Vector:
 
 
 def _number(element: ET.Element, key: str, path: Path, default: float | None = None) -> float:
-    """Return the number of an attribute, or `default` where it is missing."""
+    """Return the number of an attribute, or `default` where it is missing; it may be infinite, as limits are."""
     text = element.get(key)
     if text is None and default is not None:
         return default
@@ -283,6 +288,6 @@ def _number(element: ET.Element, key: str, path: Path, default: float | None = N
         value = float(text or "")
     except ValueError:
         value = math.nan
-    if (not math.isfinite(value) and default is None) or math.isnan(value):
-        raise ConfigError(f"{path}: <{element.tag}>: {key}: expected a number, got {text!r}")
+    if math.isnan(value):
+        raise ConfigError(f"{path}: <{element.tag}>: {key}: expected a number, got {shown(text)}")
     return value
