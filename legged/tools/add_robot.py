@@ -116,8 +116,8 @@ def _report(tree: Tree, guesses: Guesses, folder: Path, task: Path, megabytes: f
     print(f"{tree.name}: a {guesses.kind} of {mass:.4g} kg, {counts}")
     for line in tree.said:
         print(f"  {line}")
-    for title, names in (("feet", guesses.feet), ("penalised", guesses.penalized), ("ends an episode", guesses.terminating)):
-        print(f"  guess: {title}: {', '.join(names)}")
+    for title, names in (("is penalised", guesses.penalized), ("ends an episode", guesses.terminating)):
+        print(f"  guess: contact that {title}: {', '.join(names) or 'none'}")
     print(f"  guess: spawn height {guesses.spawn_height:g} m")
     angles = ", ".join(f"{name} {angle:g}" for name, angle in guesses.angles.items() if angle)
     print(f"  default pose [rad]: {angles or 'all 0'}")

@@ -8,6 +8,7 @@ import mujoco
 from legged.errors import ConfigError
 from legged.robots.importing.guess import read_robot
 from legged.robots.importing.mend import mend
+from legged.robots.importing.mjcf import drop_what_is_drawn
 from legged.robots.importing.shapes import fit_meshes, name_shapes
 from legged.robots.importing.text import mjcf_of
 
@@ -26,6 +27,8 @@ def robot_spec_of(path: Path, drawn: bool = False) -> mujoco.MjSpec:
     if path.suffix.lower() != URDF:
         spec = mujoco.MjSpec.from_file(str(path))
         if is_plain(spec):
+            if not drawn:
+                drop_what_is_drawn(spec, path)
             return spec
     stamp = path.stat()
     return mujoco.MjSpec.from_string(_adapted(path, (stamp.st_mtime_ns, stamp.st_size), drawn))

@@ -102,8 +102,8 @@ def robot_yaml(tree: Tree, guesses: Guesses) -> str:
         lines += _table("velocity_limit", g.velocity, "rad/s; torque limits are the motors' forcerange in the model")
     lines += [
         f"feet: {_list(g.feet)}  # guess: shapes at the ends of the legs",
-        f"penalize_contacts_on: {_list(g.penalized)}  # guess: thighs and shanks",
-        f"terminate_after_contacts_on: {_list(g.terminating)}  # guess: shapes of the base",
+        f"penalize_contacts_on: {_list(g.penalized)}  # guess: thighs, shanks, hands",
+        f"terminate_after_contacts_on: {_list(g.terminating)}  # guess: base and trunk",
     ]
     return "\n".join([*lines, ""])
 

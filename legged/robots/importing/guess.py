@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from legged.errors import ConfigError
 from legged.robots.importing.actuation import guess_efforts, speed_limits, take_gains
@@ -20,6 +21,8 @@ from legged.robots.stance import standing_height
 
 LIGHT = 0.005
 """Fingers that move a smaller part of the mass are held."""
+MIDDLE = 0.01
+"""How far from the middle plane a link may begin that belongs to the trunk [m]."""
 ABOVE = 1.03
 """Spawn height, in that of the standing base."""
 LOST = 1e-6
@@ -64,11 +67,9 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
     feet = [shape.name for leg in legs for shape in leg.feet]
     kind = "quadruped" if len(legs) > 2 else "biped"
     tree.say(f"guess: a {kind} with feet", ", ".join(feet))
-    base = [shape.name for shape in tree.links[0].shapes if shape.collides]
-    limbs = [shape.name for leg in legs for i in leg.links[-3:] for shape in tree.links[i].shapes if shape.collides]
-    penalized = [name for name in dict.fromkeys(limbs) if name not in feet and not _is_hip(tree, legs, name)]
-    if not base:
-        tree.say("guess: the base has no shape, so nothing ends an episode by its contact")
+    ending, penalized = _roles(tree, legs, feet)
+    if not ending:
+        tree.say("guess: neither base nor trunk has a shape, so no contact ends an episode")
     return Guesses(
         base=tree.links[0].name,
         spawn_height=round(ABOVE * height, 3),
@@ -76,7 +77,7 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
         angles_from=origin,
         feet=_exact(tree, feet),
         penalized=_exact(tree, penalized),
-        terminating=_exact(tree, base),
+        terminating=_exact(tree, ending),
         stiffness=stiffness,
         damping=damping,
         velocity=speed_limits(tree),
@@ -106,10 +107,22 @@ def _exact(tree: Tree, names: Sequence[str]) -> list[str]:
     return [name for name in names if name in kept]
 
 
-def _is_hip(tree: Tree, legs: list[Leg], name: str) -> bool:
-    """Return whether a shape is on a hip of a leg of three links or more: hips are next to the base, and hardly touch."""
-    hips = {leg.links[0] for leg in legs if len(leg.links) > 2}
-    return any(shape.name == name for i in hips for shape in tree.links[i].shapes)
+def _roles(tree: Tree, legs: list[Leg], feet: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the shapes whose contact ends an episode, those of the base and of what carries arms and a head, and those whose
+    contact is penalised: thighs, shanks, and what arms end in. Hips are next to the base, and hardly touch.
+    """
+    poser = Poser(tree)
+    poser.pose({})
+    of_legs = {i for leg in legs for i in leg.links}
+    in_the_middle = [i for i in range(len(tree.links)) if i not in of_legs and abs(poser.point(i, np.zeros(3))[1]) < MIDDLE]
+    ends = [i for i in range(1, len(tree.links)) if not tree.children(i) and i not in of_legs and i not in in_the_middle]
+    limbs = [i for leg in legs for i in (leg.links[1:] if len(leg.links) > 2 else leg.links)[-3:]]
+    found = []
+    for links in (in_the_middle, limbs + ends):
+        shapes = [shape for i in dict.fromkeys(links) for shape in tree.links[i].shapes if shape.collides]
+        found.append([shape.name for shape in shapes if shape.name not in feet])
+    ending, penalized = found
+    return ending, penalized
 
 
 def _draw_what_is_bare(tree: Tree) -> None:

@@ -228,7 +228,7 @@ def _add_ball(tree: Tree, leg: Leg, shapes: list[Shape]) -> Shape:
             shape.size[slot] -= radius / 2.0
             shape.pos = shape.pos - sign * along * radius / 2.0
     ball = Shape("sphere", np.array([radius, 0.0, 0.0]), leg.tip.copy(), np.array(IDENTITY), True, link.name)
-    ball.name = f"{link.name}_foot"
+    ball.name = f"{FOOT.sub('', link.name).strip('_-. ') or link.name}_foot"
     link.shapes.append(ball)
     tree.say("legs end in rods without a foot: a ball is added at the end of", link.name)
     return ball

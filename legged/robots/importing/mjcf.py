@@ -82,17 +82,17 @@ def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoc
             spec.delete(element)
     spec.compiler.discardvisual = False
     folder = path.parent / (spec.meshdir or "")
-    missing = {mesh.name for mesh in spec.meshes if mesh.file and not (folder / mesh.file).is_file()}
+    missing = {mesh_name(mesh) for mesh in spec.meshes if mesh.file and not (folder / mesh.file).is_file()}
     for geom in list(spec.geoms):
-        lost = geom.type == mujoco.mjtGeom.mjGEOM_MESH and geom.meshname in missing
-        seen_only = not (geom.contype or geom.conaffinity)
-        if lost or (seen_only and not drawn and geom.parent.explicitinertial):
+        if geom.type == mujoco.mjtGeom.mjGEOM_MESH and geom.meshname in missing:
             spec.delete(geom)
     if missing:
         tree.say(f"{len(missing)} meshes are not beside the file and left out: {', '.join(sorted(missing))[:200]}")
+    if not drawn:
+        drop_what_is_drawn(spec, path)
     used = {geom.meshname for geom in spec.geoms if geom.meshname}
     for mesh in list(spec.meshes):
-        if mesh.name in missing or (mesh.name and mesh.name not in used):
+        if mesh_name(mesh) in missing or mesh_name(mesh) not in used:
             spec.delete(mesh)
     try:
         return spec.compile()
@@ -103,6 +103,28 @@ def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoc
             return spec.compile()
         except Exception:
             raise ConfigError(f"{path}: MuJoCo refuses it: {' '.join(str(error).split())}") from error
+
+
+def drop_what_is_drawn(spec: mujoco.MjSpec, path: Path) -> None:
+    """Take the meshes from a spec, read from `path`, that are only seen, and are there, where no mass comes from them: reading
+    them takes most of the time.
+    """
+    folder = path.parent / (spec.meshdir or "")
+    there = {mesh_name(mesh) for mesh in spec.meshes if mesh.file and (folder / mesh.file).is_file()}
+    dropped = set()
+    for geom in list(spec.geoms if there else ()):
+        seen_only = not (geom.contype or geom.conaffinity) and geom.type == mujoco.mjtGeom.mjGEOM_MESH
+        if seen_only and geom.meshname in there and geom.parent.explicitinertial:
+            dropped.add(geom.meshname)
+            spec.delete(geom)
+    for mesh in list(spec.meshes):
+        if mesh_name(mesh) in dropped - {geom.meshname for geom in spec.geoms}:
+            spec.delete(mesh)
+
+
+def mesh_name(mesh: mujoco.MjsMesh) -> str:
+    """Return the name of a mesh; that of its file, without ending, where it has none of its own."""
+    return str(mesh.name or Path(mesh.file).stem)
 
 
 def _root(model: mujoco.MjModel, path: Path, tree: Tree) -> int:
@@ -255,7 +277,7 @@ def _meshes(spec: mujoco.MjSpec, model: mujoco.MjModel, path: Path) -> dict[int,
     """Return the meshes of a model by their numbers: files, or vertices of those that the file holds itself."""
     found: dict[int, Mesh] = {}
     for mesh in spec.meshes:
-        number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MESH, mesh.name or Path(mesh.file).stem)
+        number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MESH, mesh_name(mesh))
         if number < 0:
             continue
         name = model.mesh(number).name
