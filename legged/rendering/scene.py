@@ -8,6 +8,7 @@ import mujoco
 from legged.errors import RunError
 from legged.rendering.paint import add_horizon, add_painted_terrain
 from legged.rendering.window import draw_without_window
+from legged.robots.importing.adapted import robot_spec_of
 from legged.robots.robot import Robot
 from legged.terrain import Terrain
 
@@ -49,7 +50,7 @@ def add_robots(scene: mujoco.MjSpec, robot: Robot, count: int) -> None:
     """Add copies of the robot, whose names begin with 0/, 1/, ..."""
     for i in range(count):
         frame = scene.worldbody.add_frame()
-        scene.attach(mujoco.MjSpec.from_file(str(robot.model_path)), prefix=f"{i}/", frame=frame)
+        scene.attach(robot_spec_of(robot.model_path, drawn=True), prefix=f"{i}/", frame=frame)
 
 
 def make_renderer(model: mujoco.MjModel, width: int, height: int, instead: str = "") -> mujoco.Renderer:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from legged.robots.importing.adapted import robot_spec_of
 from legged.robots.robot import Robot
 
 
@@ -20,8 +21,7 @@ class RobotSize:
 
 def size_of(robot: Robot) -> RobotSize:
     """Measure the shapes of a robot, seen or touched."""
-    model = mujoco.MjModel.from_xml_path(str(robot.model_path))
-    return size_of_model(model, robot.default_qpos)
+    return size_of_model(robot_spec_of(robot.model_path).compile(), robot.default_qpos)
 
 
 def size_of_model(model: mujoco.MjModel, qpos: np.ndarray) -> RobotSize:

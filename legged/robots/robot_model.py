@@ -28,6 +28,8 @@ def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
     Raises:
         ConfigError: there is no such file, MuJoCo refuses it, or it holds numbers that are not finite.
     """
+    from legged.robots.importing.adapted import robot_spec_of  # which needs the names above
+
     path = folder / file
     if not exists(path) or not path.is_file():
         raise ConfigError(f"{where}: model: there is no file '{file}' in {folder}")
@@ -35,7 +37,9 @@ def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
     warnings: list[str] = []
     try:
         with _warnings_to(warnings):
-            model = mujoco.MjModel.from_xml_path(str(path))
+            model = robot_spec_of(path).compile()
+    except ConfigError as error:
+        raise ConfigError(f"{where}: model: {error}") from error
     except Exception as error:  # its errors have no class of their own
         raise ConfigError(f"{at}: MuJoCo refuses it: {' '.join(str(error).split())}") from error
     if warnings:

@@ -7,6 +7,7 @@ from legged.config.schema import SimConfig
 from legged.physics.scene.mesh_shapes import fit_meshes
 from legged.physics.scene.scene import GroundShapes, Scene, set_options
 from legged.physics.scene.terrain_geoms import add_height_field, add_terrain
+from legged.robots.importing.adapted import is_plain_file, robot_spec_of
 from legged.robots.robot import Robot
 from legged.robots.robot_model import FLOOR
 from legged.terrain import Terrain
@@ -21,7 +22,7 @@ def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
     """The robot alone. Whatever its file says, its shapes meet the ground, and each other only with `self_collisions`, except
     those of neighbouring bodies; and contacts take the friction of the robot, which is what randomisation changes.
     """
-    spec = mujoco.MjSpec.from_file(str(robot.model_path))
+    spec = robot_spec_of(robot.model_path)
     for geom in spec.geoms:
         if geom.name in robot.shape_names:
             geom.contype, geom.conaffinity = ROBOT, GROUND | ROBOT if self_collisions else GROUND
@@ -36,10 +37,11 @@ def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
 
 def robot_source(robot: Robot, self_collisions: bool) -> str:
     """The robot as MJCF for an engine that reads it by itself: the file, or a text where `robot_spec` changes it."""
-    own = mujoco.MjSpec.from_file(str(robot.model_path))
+    own = robot_spec_of(robot.model_path)
     before = {geom.name: _contact_settings(geom) for geom in own.geoms}
     spec = robot_spec(robot, self_collisions)
-    if all(before[geom.name] == _contact_settings(geom) for geom in spec.geoms) and len(own.pairs) == len(spec.pairs):
+    same = all(before[geom.name] == _contact_settings(geom) for geom in spec.geoms) and len(own.pairs) == len(spec.pairs)
+    if same and is_plain_file(robot.model_path):
         return str(robot.model_path)
     for folder in ("meshdir", "texturedir"):
         setattr(spec, folder, str((robot.model_path.parent / getattr(spec, folder)).resolve()))

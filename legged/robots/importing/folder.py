@@ -1,0 +1,162 @@
+"""A robot folder out of a Tree: MJCF, meshes, robot.yaml, PROVENANCE.md, and a task that trains it."""
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import yaml
+
+from legged.process.paths import make_folder, write_text
+from legged.robots.importing import meshes
+from legged.robots.importing.mend import plain
+from legged.robots.importing.shapes import free_name
+from legged.robots.importing.text import mjcf_of
+from legged.robots.importing.tree import Mesh, Tree
+
+
+@dataclass
+class Guesses:
+    """What robot.yaml says beside the model."""
+
+    base: str
+    spawn_height: float
+    """[m]"""
+    angles: dict[str, float]
+    """[rad]"""
+    angles_from: str
+    """Where they come from, for a comment."""
+    feet: Sequence[str]
+    penalized: Sequence[str]
+    terminating: Sequence[str]
+    stiffness: dict[str, float]
+    damping: dict[str, float]
+    velocity: dict[str, float]
+    kind: str
+    """quadruped or biped."""
+
+
+def write_folder(folder: Path, tree: Tree, guesses: Guesses, source: str, licence: str) -> float:
+    """Write model, meshes, robot.yaml and PROVENANCE.md; return the size of the meshes [MiB].
+
+    Raises:
+        ConfigError: there is a file in place of the folder.
+        RunError: it can't be written.
+    """
+    make_folder(folder)
+    files = _write_meshes(folder / "meshes", tree)
+    remarks = [f"Written by legged.tools.add_robot from {source}: see PROVENANCE.md. Metres, kilograms, radians."]
+    names = {name: path.relative_to(folder) for name, path in files.items()}
+    write_text(folder / f"{tree.name}.xml", mjcf_of(tree, names, guesses.spawn_height, remarks))
+    write_text(folder / "robot.yaml", robot_yaml(tree, guesses))
+    write_text(folder / "PROVENANCE.md", _provenance(tree, source, licence))
+    return sum(path.stat().st_size for path in files.values()) / 2**20
+
+
+def _write_meshes(folder: Path, tree: Tree) -> dict[str, Path]:
+    """Give the drawn meshes names of their own and write their files; return those by the names."""
+    known: dict[object, Mesh] = {}
+    taken: set[str] = set()
+    for link in tree.links:
+        for i, shape in enumerate(link.shapes):
+            if shape.collides or shape.mesh is None:
+                continue
+            mesh = shape.mesh
+            key = (mesh.file, tuple(mesh.scale)) if mesh.file else id(mesh.vertices)
+            if key not in known:
+                known[key] = replace(mesh, name=free_name(plain(mesh.name), taken))
+                taken.add(known[key].name)
+            link.shapes[i] = replace(shape, mesh=known[key])
+    files: dict[str, Path] = {}
+    if known:
+        make_folder(folder)
+    for mesh in known.values():
+        ending = mesh.file.suffix.lower() if mesh.file else ".stl"
+        files[mesh.name] = folder / f"{mesh.name}{ending}"
+        if mesh.file:
+            shutil.copyfile(mesh.file, files[mesh.name])
+        else:
+            meshes.write_stl(files[mesh.name], mesh)
+    return files
+
+
+def robot_yaml(tree: Tree, guesses: Guesses) -> str:
+    """Return the text of robot.yaml, with what was guessed in comments."""
+    g = guesses
+    lines = [
+        f"# {tree.name}: how the task uses {tree.name}.xml. Written by legged.tools.add_robot; sources: PROVENANCE.md.",
+        "# Lines marked 'guess' were not in the file: look at them. Patterns are parts of names; the longest match wins.",
+        *(f"# {line}" for line in tree.said),
+        f"model: {tree.name}.xml",
+        f"base: {_name(g.base)}",
+        f"spawn_height: {g.spawn_height:g}  # m; guess: the lowest point of the default pose, and a little more",
+        f"default_joint_angles:  # rad; {g.angles_from}",
+        *(f"  {_name(name)}: {angle:g}" for name, angle in _compact(g.angles).items()),
+    ]
+    if g.stiffness:
+        lines += _table("stiffness", g.stiffness, "N m/rad")
+        lines += _table("damping", g.damping, "N m s/rad")
+    else:
+        lines.append("# stiffness and damping are not in the file: a rule chooses them by the inertia that a joint sees")
+    if g.velocity:
+        lines += _table("velocity_limit", g.velocity, "rad/s; torque limits are the motors' forcerange in the model")
+    lines += [
+        f"feet: {_list(g.feet)}  # guess: shapes at the ends of the legs",
+        f"penalize_contacts_on: {_list(g.penalized)}  # guess: thighs, shanks, hands",
+        f"terminate_after_contacts_on: {_list(g.terminating)}  # guess: base and trunk",
+    ]
+    return "\n".join([*lines, ""])
+
+
+def _table(key: str, values: dict[str, float], unit: str) -> list[str]:
+    return [f"{key}:  # {unit}", *(f"  {_name(name)}: {value:.6g}" for name, value in _compact(values).items())]
+
+
+def _compact(values: dict[str, float]) -> dict[str, float]:
+    """Return a table by what the names of several joints share after their first part, where that says the same."""
+    parts = {name: name.partition("_")[2] or name for name in values}
+    table = {parts[name]: value for name, value in values.items()}
+    for name, value in values.items():
+        matching = [part for part in table if part in name]
+        if table[max(matching, key=len)] != value:
+            return values
+    return table
+
+
+def _name(text: str) -> str:
+    """Return a text as YAML, in quotes where it would be something else without."""
+    return yaml.safe_dump(text, default_flow_style=True, width=10_000).split("\n", 1)[0]
+
+
+def _list(names: Sequence[str]) -> str:
+    return "[" + ", ".join(_name(name) for name in names) + "]"
+
+
+def _provenance(tree: Tree, source: str, licence: str) -> str:
+    """Return the text of PROVENANCE.md."""
+    mass = sum(link.mass for link in tree.links)
+    return "\n".join(
+        [
+            f"# Where the numbers of {tree.name} come from",
+            "",
+            f"`{tree.name}.xml` and the meshes were written by `python -m legged.tools.add_robot` from `{source}`.",
+            f"Licence: {licence}. What was done to the numbers:",
+            "",
+            *(f"- {line}" for line in tree.said),
+            "",
+            f"The links of the source weigh {tree.mass:.6g} kg together, those of the model {mass:.6g} kg.",
+            "",
+        ]
+    )
+
+
+def task_yaml(name: str, robot: str, extends: str, symmetric: bool) -> str:
+    """Return the text of a task on flat ground; `robot` is a name, or a path relative to the task's file."""
+    lines = [
+        f"# {name} follows velocity commands on flat ground. Written by legged.tools.add_robot.",
+        f"extends: {extends}",
+        f"robot: {robot}",
+    ]
+    if not symmetric:
+        lines += ["# Its left side is not the mirror image of its right one.", "train: {algorithm: {symmetry: false}}"]
+    return "\n".join([*lines, ""])

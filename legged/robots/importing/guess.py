@@ -1,0 +1,169 @@
+"""A Tree that was read -> one that is ready, with everything that robot.yaml says, each guess named."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from legged.errors import ConfigError
+from legged.robots.importing.actuation import guess_efforts, speed_limits, take_gains
+from legged.robots.importing.folder import Guesses
+from legged.robots.importing.inverse_kinematics import GOOD, standing_angles
+from legged.robots.importing.legs import Leg, Poser, face_forward, find_legs
+from legged.robots.importing.mend import mend
+from legged.robots.importing.mjcf import read_mjcf
+from legged.robots.importing.shapes import fit_meshes, free_name, name_shapes
+from legged.robots.importing.text import mjcf_of
+from legged.robots.importing.tree import Shape, Tree
+from legged.robots.importing.urdf import read_urdf
+from legged.robots.stance import standing_height
+
+LIGHT = 0.005
+"""Fingers that move a smaller part of the mass are held."""
+MIDDLE = 0.01
+"""How far from the middle plane a link may begin that belongs to the trunk [m]."""
+ABOVE = 1.03
+"""Spawn height, in that of the standing base."""
+LOST = 1e-6
+"""Largest part of a robot's mass that rounding may lose."""
+
+
+def read_robot(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tree:
+    """Return the robot in a URDF or MJCF file as it is there.
+
+    Raises:
+        ConfigError: it is neither, or has no robot.
+    """
+    if path.suffix.lower() == ".urdf":
+        return read_urdf(path, roots, drawn)
+    if path.suffix.lower() in (".xml", ".mjcf"):
+        head = path.read_bytes()[:20_000]
+        return read_urdf(path, roots, drawn) if b"<robot" in head and b"<mujoco" not in head else read_mjcf(path, drawn)
+    raise ConfigError(f"{path}: expected a URDF (.urdf) or an MJCF file (.xml)")
+
+
+def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] | None = None) -> Guesses:
+    """Put a tree right, in place, and guess what it does not say. `gains` [N m/rad], [N m s/rad] replace those of the file.
+
+    Raises:
+        ConfigError: there is no robot with legs in it, or mass was lost.
+    """
+    fit_meshes(tree)
+    mend(tree, hold, LIGHT)
+    face_forward(tree)
+    legs = find_legs(tree)
+    name_shapes(tree)
+    _name_feet(tree, legs)
+    _draw_what_is_bare(tree)
+    angles, origin = _default_pose(tree, legs)
+    height = standing_height(Poser(tree).model, tree.links[0].name, angles)
+    guess_efforts(tree, legs, height)
+    if gains is None:
+        stiffness, damping = take_gains(tree, angles)
+    else:
+        stiffness, damping = ({hinge.name: gain for hinge in tree.hinges if hinge.driven} for gain in gains)
+    _check_mass(tree)
+    feet = [shape.name for leg in legs for shape in leg.feet]
+    kind = "quadruped" if len(legs) > 2 else "biped"
+    tree.say(f"guess: a {kind} with feet", ", ".join(feet))
+    ending, penalized = _roles(tree, legs, feet)
+    if not ending:
+        tree.say("guess: neither base nor trunk has a shape, so no contact ends an episode")
+    return Guesses(
+        base=tree.links[0].name,
+        spawn_height=round(ABOVE * height, 3),
+        angles=angles,
+        angles_from=origin,
+        feet=_exact(tree, feet),
+        penalized=_exact(tree, penalized),
+        terminating=_exact(tree, ending),
+        stiffness=stiffness,
+        damping=damping,
+        velocity=speed_limits(tree),
+        kind=kind,
+    )
+
+
+def _name_feet(tree: Tree, legs: list[Leg]) -> None:
+    """Give feet names that are parts of no other shape's: patterns of robot.yaml are parts of names."""
+    for leg in legs:
+        for shape in leg.feet:
+            others = {other.name for other in tree.shapes if other is not shape}
+            if any(shape.name in name for name in others - {s.name for s in leg.feet}):
+                shape.name = free_name(f"{shape.name}_foot", others)
+
+
+def _exact(tree: Tree, names: Sequence[str]) -> list[str]:
+    """Return patterns that match these shapes and no others: a part that all have alone, else the names."""
+    others = [shape.name for shape in tree.shapes if shape.name not in names]
+    for word in ("foot", "FOOT", "Foot", "toe", "calf", "shank"):
+        if names and all(word in name for name in names) and not any(word in name for name in others):
+            return [word]
+    kept: list[str] = []
+    for name in sorted(names, key=len):
+        if not any(name in other for other in others) and not any(short in name for short in kept):
+            kept.append(name)
+    return [name for name in names if name in kept]
+
+
+def _roles(tree: Tree, legs: list[Leg], feet: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the shapes whose contact ends an episode, those of the base and of what carries arms and a head, and those whose
+    contact is penalised: thighs, shanks, and what arms end in. Hips are next to the base, and hardly touch.
+    """
+    poser = Poser(tree)
+    poser.pose({})
+    of_legs = {i for leg in legs for i in leg.links}
+    in_the_middle = [i for i in range(len(tree.links)) if i not in of_legs and abs(poser.point(i, np.zeros(3))[1]) < MIDDLE]
+    ends = [i for i in range(1, len(tree.links)) if not tree.children(i) and i not in of_legs and i not in in_the_middle]
+    limbs = [i for leg in legs for i in (leg.links[1:] if len(leg.links) > 2 else leg.links)[-3:]]
+    found = []
+    for links in (in_the_middle, limbs + ends):
+        shapes = [shape for i in dict.fromkeys(links) for shape in tree.links[i].shapes if shape.collides]
+        found.append([shape.name for shape in shapes if shape.name not in feet])
+    ending, penalized = found
+    return ending, penalized
+
+
+def _draw_what_is_bare(tree: Tree) -> None:
+    """Draw the colliding shapes of links without a drawn one, where others have some."""
+    if not any(not shape.collides for link in tree.links for shape in link.shapes):
+        return
+    for link in tree.links:
+        if all(shape.collides for shape in link.shapes):
+            link.shapes += [Shape(s.kind, s.size.copy(), s.pos.copy(), s.quat.copy(), False, s.link) for s in link.shapes]
+
+
+def _default_pose(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], str]:
+    """Return joint angles to stand in, and where they come from."""
+    if tree.home is not None:
+        angles = {hinge.name: tree.home.get(hinge.name, 0.0) for hinge in tree.hinges}
+        within = all(h.range is None or h.range[0] - 1e-6 <= angles[h.name] <= h.range[1] + 1e-6 for h in tree.hinges)
+        poser = Poser(tree)
+        poser.pose(angles)
+        low = [float(poser.point(leg.end, leg.tip)[2]) for leg in legs]
+        if within and max(low) < 0.0 and max(low) - min(low) < GOOD * -min(low):
+            origin = f"of the keyframe '{tree.home_name}'"
+            tree.say(f"the default pose is that of the keyframe '{tree.home_name}'")
+            return {name: round(angle, 4) + 0.0 for name, angle in angles.items()}, origin
+        tree.say(f"the keyframe '{tree.home_name}' is no stance (its feet are not level, or a joint is beyond its range)")
+    angles, miss = standing_angles(tree, legs)
+    tree.say("guess: the default pose is a stance by inverse kinematics: base level, feet under the hips, knees bent")
+    if miss > GOOD:
+        tree.say(f"guess: in that pose a foot is {miss:.0%} of a leg's length from where it should be; look at it")
+    return angles, "guess: a stance by inverse kinematics"
+
+
+def _check_mass(tree: Tree) -> None:
+    """Compare the mass of the model with that of the file.
+
+    Raises:
+        ConfigError: they differ.
+    """
+    model = mujoco.MjModel.from_xml_string(mjcf_of(tree))
+    mass = float(model.body_mass.sum())
+    if abs(mass - tree.mass) > LOST * max(1.0, tree.mass):
+        raise ConfigError(
+            f"{tree.source}: its links weigh {tree.mass:.6g} kg, the model {mass:.6g} kg: mass was lost on the way"
+        )
+    tree.say(f"mass: {tree.mass:.6g} kg in the links of the file, {mass:.6g} kg in the model")

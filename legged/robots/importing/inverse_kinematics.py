@@ -1,0 +1,191 @@
+"""A stance found by inverse kinematics: base level, feet under the hips, knees bent, within all limits, the same left and
+right, and the centre of mass over the feet.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from legged.robots.importing.legs import ANKLE, SAMPLES, Leg, Poser
+from legged.robots.importing.tree import Tree, Vector
+
+STRETCH = {4: 0.8, 2: 0.96}
+"""Distance from hip to foot by the number of legs, in that of a stretched leg."""
+MARGIN = 0.05
+"""Part of a joint's range that is kept free at each end."""
+TRIES, ROUNDS = 24, 60
+STEP = 1e-5
+"""For derivatives [rad]."""
+GOOD = 0.05
+"""Largest distance of a foot from where it should stand, in the length of a leg."""
+KNEES = 0.002
+"""What a knee to the wrong side costs, in squared errors: less than turning joints farther than needed."""
+LATERAL = 0.7
+"""A hinge bends a leg forward if its axis points so much along y."""
+
+
+@dataclass
+class _Limb:
+    """A leg, and its partner on the other side."""
+
+    leg: Leg
+    partner: Leg | None
+    signs: Vector
+    """Of the partner's angles."""
+    hip_name: str
+    """The first hinge that bends it forward."""
+    hip: Vector
+    """(3,) where that is at zero angles [m]."""
+    side: float
+    """Where its foot is at zero angles, along y [m]."""
+    knee: int
+    """Index among the links of the next one."""
+    length: float
+    """From there to the foot, stretched [m]."""
+    level: Vector
+    """(3,) the direction in the foot's frame that is up at zero angles."""
+
+
+def standing_angles(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], float]:
+    """Return joint angles [rad] by the names of the hinges, and how far the worst foot is from where it should be, in the
+    length of a leg.
+    """
+    poser = Poser(tree)
+    limbs = _limbs(tree, legs, poser)
+    free = [(limb, k) for limb in limbs for k in range(len(limb.leg.hinges))]
+    lows, highs = np.array([_kept(poser, limb.leg.hinges[k]) for limb, k in free]).T
+    rest = {hinge.name: float(np.clip(0.0, *_kept(poser, hinge.name))) for hinge in tree.hinges}
+    stretch = STRETCH[2 if len(legs) < 4 else 4]
+
+    def angles(x: Vector) -> dict[str, float]:
+        found = dict(rest)
+        for value, (limb, k) in zip(x, free, strict=True):
+            found[limb.leg.hinges[k]] = float(value)
+            if limb.partner is not None:
+                found[limb.partner.hinges[k]] = float(value * limb.signs[k])
+        return found
+
+    middle = np.clip(0.0, lows, highs)
+
+    def errors(x: Vector) -> Vector:
+        poser.pose(angles(x))
+        mujoco.mj_comPos(poser.model, poser.data)
+        centre = poser.data.subtree_com[1]
+        found, feet = [], []
+        for limb in limbs:
+            foot = poser.point(limb.leg.end, limb.leg.tip)
+            feet.append(foot)
+            goal = np.array([limb.hip[0], limb.side, limb.hip[2] - stretch * limb.length])
+            weights = np.array([1.0, 1.0, 3.0]) if len(legs) >= 4 else np.array([0.1, 1.0, 3.0])
+            found += list(weights * (foot - goal) / limb.length)
+            if len(limb.leg.hinges) >= ANKLE and len(legs) < 4:
+                up = poser.data.xmat[poser.ids[limb.leg.end]].reshape(3, 3) @ limb.level
+                found += list(up[:2])
+        over = np.mean([foot[0] for foot in feet]) - centre[0]
+        found.append((1.0 if len(legs) < 4 else 0.2) * over / limbs[0].length)
+        return np.array([*found, *(0.02 * (x - middle))])
+
+    best, least = middle, np.inf
+    random = np.random.default_rng(0)
+    for k in range(TRIES):
+        x = _solved(errors, middle if k == 0 else random.uniform(lows, highs), lows, highs)
+        cost = float(np.sum(errors(x) ** 2)) + _wrong_knees(poser, limbs, forward=len(legs) < 4)
+        if cost < least - 1e-9:
+            best, least = x, cost
+    found = {name: round(angle, 3) + 0.0 for name, angle in angles(best).items()}
+    poser.pose(found)
+    miss = [_miss(poser, limb, stretch) for limb in limbs]
+    return found, max(miss)
+
+
+def _miss(poser: Poser, limb: _Limb, stretch: float) -> float:
+    foot = poser.point(limb.leg.end, limb.leg.tip)
+    goal = np.array([limb.side, limb.hip[2] - stretch * limb.length])
+    return float(np.linalg.norm(foot[1:] - goal) / limb.length)
+
+
+def _solved(errors: Callable[[Vector], Vector], x: Vector, lows: Vector, highs: Vector) -> Vector:
+    """Return the angles (n,) nearest to `x` where the sum of squared errors is least, by damped Gauss-Newton steps."""
+    damping, before = 1e-2, errors(x)
+    for _ in range(ROUNDS):
+        slopes = np.stack([(errors(x + step) - before) / STEP for step in STEP * np.eye(len(x))], axis=1)
+        normal = slopes.T @ slopes + damping * np.eye(len(x))
+        tried = np.clip(x - np.linalg.solve(normal, slopes.T @ before), lows, highs)
+        after = errors(tried)
+        if after @ after < before @ before:
+            done = before @ before - after @ after < 1e-10
+            x, before, damping = tried, after, max(1e-6, damping / 3.0)
+            if done:
+                break
+        else:
+            damping *= 5.0
+            if damping > 1e6:
+                break
+    return x
+
+
+def _wrong_knees(poser: Poser, limbs: list[_Limb], forward: bool) -> float:
+    """Return a cost for knees that bend like nobody's: those of four legs point backward, those of two forward."""
+    cost = 0.0
+    for limb in limbs:
+        body = poser.ids[limb.knee]
+        ahead = float(poser.data.xpos[body][0] - limb.hip[0]) / limb.length
+        cost += KNEES * max(0.0, -ahead if forward else ahead)
+    return cost
+
+
+def _kept(poser: Poser, name: str) -> tuple[float, float]:
+    low, high = poser.limits(name)
+    margin = MARGIN * (high - low)
+    return low + margin, high - margin
+
+
+def _limbs(tree: Tree, legs: list[Leg], poser: Poser) -> list[_Limb]:
+    """Return one of each pair of legs, with what is mirrored in the other; a leg without partner stands for itself."""
+    poser.pose({})
+    data = poser.data
+    joints = {name: int(poser.model.joint(name).id) for name in poser.places}
+    starts = [data.xanchor[joints[leg.hinges[0]]].copy() for leg in legs]
+    limbs, taken = [], set()
+    for i, leg in enumerate(legs):
+        if i in taken:
+            continue
+        apart = [np.linalg.norm(start * [1, -1, 1] - starts[i]) for start in starts]
+        partner = next((j for j in np.argsort(apart) if j != i and j not in taken and apart[j] < 0.02), None)
+        if partner is not None and (len(legs[partner].hinges) != len(leg.hinges) or abs(starts[i][1]) < 1e-3):
+            partner = None
+        axes = np.array([data.xaxis[joints[name]] for name in leg.hinges])
+        signs = np.ones(len(axes))
+        other = None
+        if partner is not None:
+            other = legs[partner]
+            theirs = np.array([data.xaxis[joints[name]] for name in other.hinges])
+            signs = np.sign((axes * [-1.0, 1.0, -1.0] * theirs).sum(axis=1))
+            taken.add(int(partner))
+        bends = [k for k, axis in enumerate(axes) if abs(axis[1]) > LATERAL] or list(range(len(axes)))
+        hip_name = leg.hinges[bends[0]]
+        hip = data.xanchor[joints[hip_name]].copy()
+        knee_hinge = leg.hinges[bends[1] if len(bends) > 1 else bends[0]]
+        knee = next(j for j in leg.links if any(hinge.name == knee_hinge for hinge in tree.links[j].hinges))
+        side = float(poser.point(leg.end, leg.tip)[1])
+        level = data.xmat[poser.ids[leg.end]].reshape(3, 3).T[:, 2].copy()
+        limbs.append(_Limb(leg, other, signs, hip_name, hip, side, knee, 1.0, level))
+    for limb in limbs:
+        limb.length = _stretched(poser, limb)
+    return limbs
+
+
+def _stretched(poser: Poser, limb: _Limb) -> float:
+    """Return how far the foot gets from the hip [m], by random angles within the limits."""
+    random = np.random.default_rng(1)
+    lows, highs = np.array([_kept(poser, name) for name in limb.leg.hinges]).T
+    hip = int(poser.model.joint(limb.hip_name).id)
+    farthest = 0.0
+    for k in range(SAMPLES):
+        values = np.clip(0.0, lows, highs) if k == 0 else random.uniform(lows, highs)
+        poser.pose(dict(zip(limb.leg.hinges, values, strict=True)))
+        foot = poser.point(limb.leg.end, limb.leg.tip)
+        farthest = max(farthest, float(np.linalg.norm(foot - poser.data.xanchor[hip])))
+    return farthest

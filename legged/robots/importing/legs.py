@@ -1,0 +1,234 @@
+"""Guesses about a robot: which way it looks, which links are its feet, and which parts are its thighs and shanks."""
+
+import re
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from legged.errors import ConfigError
+from legged.robots.importing.mend import half_lengths
+from legged.robots.importing.meshes import refitted, rounded
+from legged.robots.importing.text import mjcf_of
+from legged.robots.importing.tree import IDENTITY, Shape, Tree, Vector, matrix, quat_about, rotate
+
+FOOT = re.compile(r"foot|feet|toe|sole|heel|ankle|shank|calf|tarsus|lower_?leg|wheel", re.IGNORECASE)
+"""In the names of links and shapes that may be at the end of a leg."""
+TIP = re.compile(r"foot|feet|toe|sole|heel|contact|wheel|rail", re.IGNORECASE)
+"""In the names of shapes that stand on the ground."""
+HAND = re.compile(r"hand|wrist|finger|thumb|gripper|elbow|arm|shoulder|head|neck|camera|tail|palm", re.IGNORECASE)
+LEFT = ("l", "left", "fl", "hl", "bl", "lf", "lh", "lb")
+RIGHT = ("r", "right", "fr", "hr", "br", "rf", "rh", "rb")
+ANKLE = 4
+"""A leg of at least so many hinges has an ankle, and a sole."""
+SAMPLES = 300
+NEARLY = 0.7
+"""Feet reach at least so far down, in what the lowest one does."""
+
+
+@dataclass
+class Leg:
+    """A chain of hinges that ends in a foot."""
+
+    links: list[int]
+    """Links of the tree from the base's child to the foot."""
+    hinges: list[str]
+    """Names of the hinges along them."""
+    tip: Vector
+    """(3,) where it stands, in the frame of its last link."""
+    feet: list[Shape]
+    """Shapes of its last link that stand on the ground."""
+
+    @property
+    def end(self) -> int:
+        return self.links[-1]
+
+
+class Poser:
+    """Poses a tree at joint angles, with the base level at the origin."""
+
+    def __init__(self, tree: Tree) -> None:
+        """Compile the tree."""
+        self.tree = tree
+        self.model = mujoco.MjModel.from_xml_string(mjcf_of(tree))
+        self.data = mujoco.MjData(self.model)
+        self.places = {hinge.name: int(self.model.joint(hinge.name).qposadr[0]) for hinge in tree.hinges}
+        self.ids = [int(self.model.body(link.name).id) for link in tree.links]
+
+    def pose(self, angles: dict[str, float]) -> mujoco.MjData:
+        """Return the data at joint `angles` [rad]; hinges that are not named are at 0."""
+        self.data.qpos[:] = 0.0
+        self.data.qpos[3] = 1.0
+        for name, angle in angles.items():
+            self.data.qpos[self.places[name]] = angle
+        mujoco.mj_kinematics(self.model, self.data)
+        return self.data
+
+    def point(self, link: int, point: Vector) -> Vector:
+        """Return where a point (3,) of a link is now, in the frame of the base [m]."""
+        body = self.ids[link]
+        return self.data.xpos[body] + self.data.xmat[body].reshape(3, 3) @ point
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Return the range of a hinge [rad]; a turn for one without end."""
+        hinge = next(hinge for hinge in self.tree.hinges if hinge.name == name)
+        return hinge.range or (-np.pi, np.pi)
+
+
+def face_forward(tree: Tree) -> None:
+    """Turn a robot so that z points up and its left side to +y, as far as its legs and names tell."""
+    poser = Poser(tree)
+    poser.pose({})
+    ends = [i for i, link in enumerate(tree.links) if not tree.children(i) and not HAND.search(link.name)]
+    tips = np.array([poser.point(i, _tip(tree, i)) for i in ends])
+    if len(tips) >= 2:
+        mean = tips.mean(axis=0)
+        axis = int(np.abs(mean).argmax())
+        if axis == 1 and abs(mean[1]) > 3.0 * abs(mean[2]):  # it stands along y
+            turn = quat_about(np.array([1.0, 0.0, 0.0]), -np.sign(mean[1]) * np.pi / 2.0)
+            tree.turn(turn)
+            tree.say("the file's vertical axis is y: the robot is turned upright")
+            tips = rotate(turn, tips)
+    sides = np.array([side_of(tree.links[i].name) for i in ends])
+    if (sides > 0).any() and (sides < 0).any():
+        left = tips[sides > 0].mean(axis=0) - tips[sides < 0].mean(axis=0)
+        quarters = round(float(np.arctan2(left[1], left[0]) / (np.pi / 2.0)))
+        if np.hypot(left[0], left[1]) > 0.02 and quarters % 4 != 1:
+            tree.turn(quat_about(np.array([0.0, 0.0, 1.0]), (1 - quarters) * np.pi / 2.0))
+            tree.say(f"by its names its left side is not at +y: it is turned by {(1 - quarters) * 90 % 360} degrees")
+
+
+def side_of(name: str) -> int:
+    """Return 1 if a name says left, -1 for right, 0 if it says neither, or both."""
+    words = [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)]
+    joined = name.lower()
+    left = "left" in joined or any(word in LEFT for word in words)
+    right = "right" in joined or any(word in RIGHT for word in words)
+    return int(left) - int(right)
+
+
+def find_legs(tree: Tree) -> list[Leg]:
+    """Return the legs, the foremost left one first as the file has them: chains whose ends reach lowest, by their names if
+    these tell.
+
+    Raises:
+        ConfigError: nothing reaches below the base.
+    """
+    poser = Poser(tree)
+    ends = [i for i in range(1, len(tree.links)) if not tree.children(i)]
+    chains = {i: _chain(tree, i) for i in ends}
+    names = {i: " ".join([tree.links[i].name, *(s.link + " " + s.name for s in tree.links[i].shapes)]) for i in ends}
+    reach = _reach(poser, ends)
+    named = [i for i in ends if FOOT.search(names[i]) and not HAND.search(tree.links[i].name)]
+    if len(named) < 2 or len(named) % 2:
+        named = [i for i in ends if not any(HAND.search(tree.links[j].name) for j in chains[i])] or ends
+    lowest = max(reach[i] for i in named)
+    if lowest <= 0.0:
+        raise ConfigError(f"{tree.source}: no chain of hinges reaches below the base, link '{tree.links[0].name}'")
+    found = [i for i in named if reach[i] >= NEARLY * lowest]
+    legs = []
+    for i in found:
+        hinges = [hinge.name for j in chains[i] for hinge in tree.links[j].hinges]
+        legs.append(Leg(chains[i], hinges, _tip(tree, i), []))
+    for leg in legs:
+        leg.feet = _feet(tree, leg, flat=len(legs) == 2 and len(leg.hinges) >= ANKLE)
+        leg.tip = np.mean([shape.pos for shape in leg.feet], axis=0) if leg.feet else leg.tip
+    return legs
+
+
+def _chain(tree: Tree, end: int) -> list[int]:
+    """Return the links from the base's child to `end`."""
+    chain = [end]
+    while tree.links[chain[0]].parent > 0:
+        chain.insert(0, tree.links[chain[0]].parent)
+    return chain
+
+
+def _reach(poser: Poser, ends: list[int]) -> dict[int, float]:
+    """Return how far each end gets below the base within the limits [m], by random poses."""
+    random = np.random.default_rng(0)
+    lows, highs = np.array([poser.limits(name) for name in poser.places]).T
+    deepest = dict.fromkeys(ends, -np.inf)
+    tips = {i: _tip(poser.tree, i) for i in ends}
+    for k in range(SAMPLES):
+        angles = np.clip(0.0, lows, highs) if k == 0 else random.uniform(lows, highs)
+        poser.pose(dict(zip(poser.places, angles, strict=True)))
+        for i in ends:
+            deepest[i] = max(deepest[i], -float(poser.point(i, tips[i])[2]))
+    return deepest
+
+
+def _tip(tree: Tree, i: int) -> Vector:
+    """Return the point (3,) of a link that is farthest from its hinge, along the middle of its shapes; its centre of mass
+    where it has none.
+    """
+    link = tree.links[i]
+    anchor = link.hinges[0].anchor if link.hinges else np.zeros(3)
+    shapes = [shape for shape in link.shapes if shape.collides]
+    tips = [shape for shape in shapes if TIP.search(f"{shape.link} {shape.name}")]
+    points = [end for shape in tips or shapes for end in _ends(shape)]
+    return max(points, key=lambda point: float(np.linalg.norm(point - anchor)), default=link.com)
+
+
+def _ends(shape: Shape) -> list[Vector]:
+    """Return the middle of a shape, and for a long one those of its ends."""
+    half = half_lengths(shape)
+    if half is None or shape.kind == "sphere":
+        return [shape.pos]
+    axis = int(half.argmax())
+    thick = float(np.sort(half)[1])
+    along = matrix(shape.quat)[:, axis] * max(0.0, float(half[axis]) - thick)
+    return [shape.pos + along, shape.pos - along]
+
+
+def _feet(tree: Tree, leg: Leg, flat: bool) -> list[Shape]:
+    """Return the shapes of a leg's last link that stand on the ground; for a leg that ends in a rod, a ball at its end, which
+    is added.
+    """
+    link = tree.links[leg.end]
+    shapes = [shape for shape in link.shapes if shape.collides]
+    for i, shape in enumerate(link.shapes):
+        if flat and shape.fits and _is_low(shape, leg, shapes):
+            link.shapes[i] = refitted(shape, "box")  # two feet stand on their soles
+        elif shape.fits and TIP.search(f"{shape.link} {shape.name}"):
+            link.shapes[i] = rounded(shape)
+    shapes = [shape for shape in link.shapes if shape.collides]
+    named = [shape for shape in shapes if TIP.search(f"{shape.link} {shape.name}")]
+    balls = [shape for shape in named if shape.kind == "sphere"]
+    if named and (len(named) < len(shapes) or len(named) == 1 or flat):
+        return balls if balls and not flat else named
+    low = [shape for shape in shapes if _is_low(shape, leg, shapes)]
+    balls = [shape for shape in low if shape.kind == "sphere"]
+    if balls or flat:
+        return low if flat else balls
+    return [_add_ball(tree, leg, low)]
+
+
+def _is_low(shape: Shape, leg: Leg, shapes: list[Shape]) -> bool:
+    """Return whether a shape is at the tip of a leg as much as any other one is."""
+    nearest = min(float(np.linalg.norm(point - leg.tip)) for other in shapes for point in _ends(other))
+    own = min(float(np.linalg.norm(point - leg.tip)) for point in _ends(shape))
+    return own <= nearest + 0.03
+
+
+def _add_ball(tree: Tree, leg: Leg, shapes: list[Shape]) -> Shape:
+    """Add a ball to the end of a leg that is a rod, whose end is drawn back by as much."""
+    link = tree.links[leg.end]
+    radius = 0.02 * float(np.linalg.norm(leg.tip)) + 1e-3
+    for shape in shapes:
+        half = half_lengths(shape)
+        if half is None:
+            continue
+        radius = float(np.sort(half)[1])
+        axis, along = int(half.argmax()), matrix(shape.quat)[:, int(half.argmax())]
+        sign = np.sign(along @ (leg.tip - shape.pos)) or 1.0
+        if half[axis] > 2.0 * radius and shape.kind in ("box", "capsule", "cylinder"):
+            slot = 1 if shape.kind in ("capsule", "cylinder") else axis
+            shape.size = shape.size.copy()
+            shape.size[slot] -= radius / 2.0
+            shape.pos = shape.pos - sign * along * radius / 2.0
+    ball = Shape("sphere", np.array([radius, 0.0, 0.0]), leg.tip.copy(), np.array(IDENTITY), True, link.name)
+    ball.name = f"{FOOT.sub('', link.name).strip('_-. ') or link.name}_foot"
+    link.shapes.append(ball)
+    tree.say("legs end in rods without a foot: a ball is added at the end of", link.name)
+    return ball

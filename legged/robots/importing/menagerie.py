@@ -1,0 +1,31 @@
+"""Models of MuJoCo Menagerie, through its own package, which downloads each on first use and keeps it."""
+
+from pathlib import Path
+
+from legged.errors import ConfigError, RunError, suggest
+
+PREFIX = "menagerie:"
+
+
+def menagerie_model(name: str) -> tuple[Path, str]:
+    """Return the MJCF file of the robot `name`, without a scene around it, and its licence.
+
+    Raises:
+        ConfigError: the package is missing, or has no such robot.
+        RunError: the robot can't be downloaded.
+    """
+    try:
+        import mujoco_menagerie
+    except ImportError as error:
+        raise ConfigError(f"{PREFIX}{name}: needs a package of MuJoCo's: pip install mujoco-menagerie") from error
+    names = mujoco_menagerie.names()
+    if name not in names:
+        raise ConfigError(f"{PREFIX}{name}: Menagerie has no such robot{suggest(name[:100], names, 'robots')}")
+    robot = mujoco_menagerie.get(name)
+    try:
+        path = robot.xml(robot.default_model)
+    except (mujoco_menagerie.MenagerieError, OSError) as error:
+        raise RunError(f"{PREFIX}{name}: {' '.join(str(error).split())}") from error
+    if not path.is_file():
+        raise RunError(f"{PREFIX}{name}: {path} is missing; a download may have been cut off (python -m mujoco_menagerie)")
+    return path, robot.license

@@ -1,0 +1,232 @@
+"""What is put right in a Tree before it becomes a model: welded links are merged, impossible masses and inertias mended."""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from legged.errors import ConfigError, suggest
+from legged.robots.importing.tree import (
+    Hinge,
+    Link,
+    Shape,
+    Tree,
+    Vector,
+    add_mass,
+    matrix,
+    quat_about,
+    quat_product,
+    rotate,
+)
+
+LEAST_SHARE = 0.01
+"""Part of a link's mass that a massless one before it is given."""
+LEAST_MOMENT = 1e-3
+"""Smallest principal moment of inertia, in those of the largest, where a file has one that is not above 0."""
+LARGEST = 1e6
+"""Of masses [kg], inertias [kg m^2] and lengths [m]: beyond it somebody has made a mistake."""
+FINGERS = re.compile(r"hand|finger|thumb|index|middle|ring|pinky|little|gripper|palm|eye|ear|jaw|antenna", re.IGNORECASE)
+"""In the names of joints and links that walking does not need."""
+ROUNDING = 1e-6
+"""How far moments are kept from the limit A + B = C, in the largest one."""
+TINY = 1e-12
+"""Principal moments [kg m^2] and masses [kg] below this are none."""
+
+
+def mend(tree: Tree, hold: Sequence[str] = (), light: float = 0.0) -> None:
+    """Put a tree right in place: hold the joints whose names contain one of `hold`, and those of fingers that move at most
+    the part `light` of the mass, weld what carries no mass, merge welded links, mend inertias.
+
+    Raises:
+        ConfigError: a pattern of `hold` matches no joint, or there is no mass.
+    """
+    _check_numbers(tree)
+    _hold(tree, hold)
+    _hold_what_is_light(tree, light)
+    merge_welded(tree)
+    if len(tree.links) == 1:
+        raise ConfigError(f"{tree.source}: nothing in it turns: no joint is a hinge that moves a mass")
+    _give_mass(tree)
+    for link in tree.links:
+        _mend_inertia(link, tree)
+
+
+def _check_numbers(tree: Tree) -> None:
+    """Look whether masses and places are such that their squares are numbers too.
+
+    Raises:
+        ConfigError: they are not.
+    """
+    for link in tree.links:
+        values = np.hstack([link.mass, link.com, link.inertia.ravel(), link.pos, link.quat])
+        sizes = [np.hstack([shape.size, shape.pos, shape.quat]) for shape in link.shapes]
+        numbers = np.abs(np.hstack([values, *sizes]))
+        if not (numbers <= LARGEST).all():
+            raise ConfigError(f"{tree.source}: link '{link.name}': its numbers must be finite and at most {LARGEST:g}")
+
+
+def _hold(tree: Tree, hold: Sequence[str]) -> None:
+    names = [hinge.name for hinge in tree.hinges]
+    for pattern in hold:
+        if not any(pattern in name for name in names):
+            raise ConfigError(f"--hold: '{pattern}' is in no joint's name{suggest(pattern, names, 'joints')}")
+    for link in tree.links:
+        for hinge in [hinge for hinge in link.hinges if any(pattern in hinge.name for pattern in hold)]:
+            angle = float(np.clip((tree.home or {}).get(hinge.name, 0.0), *(hinge.range or (-np.inf, np.inf))))
+            fix(link, hinge, angle)
+            tree.say("joints are held as asked", f"{hinge.name} at {angle:.3g} rad")
+
+
+def fix(link: Link, hinge: Hinge, angle: float) -> None:
+    """Take a hinge from its link, turned by `angle` [rad]."""
+    turn = quat_about(hinge.axis, angle)
+    link.pos = link.pos + rotate(link.quat, hinge.anchor - rotate(turn, hinge.anchor))
+    link.quat = quat_product(link.quat, turn)
+    link.hinges = [other for other in link.hinges if other is not hinge]
+
+
+def _hold_what_is_light(tree: Tree, light: float) -> None:
+    """Hold joints that move no mass, their own link's or another's, and those of fingers, by name and mass."""
+    moved = [link.mass for link in tree.links]
+    for i in reversed(range(1, len(tree.links))):
+        moved[tree.links[i].parent] += moved[i]
+    for i, link in enumerate(tree.links):
+        for hinge in list(link.hinges):
+            if moved[i] <= TINY:
+                tree.say("joints that move no mass are held", hinge.name)
+                fix(link, hinge, 0.0)
+            elif moved[i] < light * moved[0] and FINGERS.search(f"{link.name} {hinge.name}"):
+                angle = rest_angle(tree, hinge)
+                tree.say("fingers and the like are held", f"{hinge.name} at {angle:.3g} rad")
+                fix(link, hinge, angle)
+
+
+def rest_angle(tree: Tree, hinge: Hinge) -> float:
+    """Return the angle [rad] at which a joint is held: that of the keyframe, else the nearest to 0."""
+    return float(np.clip((tree.home or {}).get(hinge.name, 0.0), *(hinge.range or (-np.inf, np.inf))))
+
+
+def merge_welded(tree: Tree) -> None:
+    """Merge every link without a hinge into its parent: mass, centre, inertia, and shapes, which keep its name."""
+    merged = 0
+    for i in reversed(range(1, len(tree.links))):
+        link = tree.links[i]
+        if link.hinges:
+            continue
+        parent, turn = tree.links[link.parent], matrix(link.quat)
+        add_mass(parent, link.mass, link.pos + turn @ link.com, turn @ link.inertia @ turn.T)
+        for shape in link.shapes:
+            shape.move(link.pos, link.quat)
+        parent.shapes += link.shapes
+        for child in tree.links:
+            if child.parent == i:
+                child.pos, child.quat = link.pos + turn @ child.pos, quat_product(link.quat, child.quat)
+                child.parent = link.parent
+        for loop in tree.loops:
+            _move_loop(loop, link, parent)
+        del tree.links[i]
+        for child in tree.links:
+            child.parent -= child.parent > i
+        merged += 1
+    if merged:
+        tree.say(f"{merged} welded links are merged into the links that carry them, with their masses")
+    _parents_first(tree)
+
+
+def _move_loop(loop: dict[str, str], link: Link, parent: Link) -> None:
+    """Let a constraint on `link` act on `parent`, which it was merged into."""
+    if loop["tag"] == "connect" and loop["body1"] == link.name:
+        anchor = np.array([float(x) for x in loop["anchor"].split()])
+        loop["anchor"] = " ".join(f"{x:.9g}" for x in link.pos + rotate(link.quat, anchor))
+    for key in ("body1", "body2"):
+        if loop.get(key) == link.name:
+            loop[key] = parent.name
+
+
+def _parents_first(tree: Tree) -> None:
+    """Order links depth first."""
+    order: list[int] = []
+
+    def visit(i: int) -> None:
+        order.append(i)
+        for child in tree.children(i):
+            visit(child)
+
+    visit(0)
+    places = {old: new for new, old in enumerate(order)}
+    tree.links = [tree.links[i] for i in order]
+    for link in tree.links:
+        link.parent = places.get(link.parent, -1)
+
+
+def _give_mass(tree: Tree) -> None:
+    """Give links without mass that carry others a part of their heaviest child's; the sum stays what it is."""
+    for i in reversed(range(1, len(tree.links))):
+        link = tree.links[i]
+        if link.mass > TINY:
+            continue
+        child = max((tree.links[j] for j in tree.children(i)), key=lambda other: other.mass)
+        mass, inertia = LEAST_SHARE * child.mass, LEAST_SHARE * np.eye(3) * np.trace(child.inertia) / 3.0
+        what = f"links that move and have no mass are given {LEAST_SHARE:.0%} of that of the next one"
+        tree.say(what, f"{link.name} {mass:.3g} kg of {child.name}")
+        add_mass(link, mass, child.pos, inertia)
+        child.mass, child.inertia = child.mass - mass, (1.0 - LEAST_SHARE) * child.inertia
+    base = tree.links[0]
+    if base.mass <= TINY:
+        raise ConfigError(f"{tree.source}: the base, link '{base.name}', has no mass, and nothing is welded to it that has")
+
+
+def _mend_inertia(link: Link, tree: Tree) -> None:
+    """Let the principal moments of a link be positive, and none larger than the sum of the others, as of any real body."""
+    if np.abs(link.inertia).max() < TINY * max(1.0, link.mass):
+        sides = _extent(link.shapes)
+        if sides is None:
+            link.inertia = 0.4 * link.mass * _radius(link.mass) ** 2 * np.eye(3)
+        else:
+            link.inertia = link.mass / 12.0 * np.diag((sides**2).sum() - sides**2)
+        what = "box around their shapes" if sides is not None else "ball of water"
+        tree.say(f"links with a mass and no inertia are given that of a {what} of their mass", link.name)
+        return
+    moments, axes = np.linalg.eigh((link.inertia + link.inertia.T) / 2.0)
+    wanted = np.maximum(moments, LEAST_MOMENT * np.abs(moments).max())
+    excess = max(0.0, wanted[2] - wanted[0] - wanted[1])
+    if moments[0] > 0.0 and wanted[0] + wanted[1] >= wanted[2] * (1.0 + ROUNDING):
+        return
+    if excess < ROUNDING * wanted[2] and moments[0] > 0.0:  # flat things: only what is written, rounded, would break it
+        link.inertia = axes @ np.diag(wanted + np.array([1.0, 1.0, 0.0]) * ROUNDING * wanted[2]) @ axes.T
+        return
+    said = ", ".join(f"{moment:.3g}" for moment in moments)
+    why = "is not above 0" if moments[0] <= 0.0 else f"breaks A + B >= C by {excess / wanted[2]:.1%}"
+    wanted[:2] += excess / 2.0 + ROUNDING * wanted[2]
+    link.inertia = axes @ np.diag(wanted) @ axes.T
+    now = ", ".join(f"{moment:.3g}" for moment in wanted)
+    tree.say("impossible inertias, whose smaller principal moments are raised", f"{link.name} {why} ({said} -> {now} kg m^2)")
+
+
+def _radius(mass: float) -> float:
+    """Return the radius of a ball of water [m]."""
+    return float((3.0 * mass / (4000.0 * np.pi)) ** (1 / 3))
+
+
+def _extent(shapes: Sequence[Shape]) -> Vector | None:
+    """Return the sides (3,) of the box around shapes [m], in the frame of their link; None if they have no size."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for shape in shapes:
+        half = half_lengths(shape)
+        if half is not None:
+            reach = np.abs(matrix(shape.quat)) @ half
+            low, high = np.minimum(low, shape.pos - reach), np.maximum(high, shape.pos + reach)
+    return high - low if (high > low).all() else None
+
+
+def half_lengths(shape: Shape) -> Vector | None:
+    """Return half the sides (3,) of a primitive's box, in its own frame [m]; None for a mesh."""
+    a, b, _ = shape.size
+    boxes = {"sphere": [a, a, a], "capsule": [a, a, a + b], "cylinder": [a, a, b], "mesh": None}
+    half = boxes.get(shape.kind, shape.size)
+    return None if half is None else np.asarray(half, dtype=float)
+
+
+def plain(name: str) -> str:
+    """Return a name that can be a part of MJCF and YAML without quotes."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("_") or "unnamed"

@@ -1,0 +1,196 @@
+"""Mesh files: found where a URDF means them, read or converted, and the primitive that fits each best."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import mujoco
+import numpy as np
+
+from legged.robots.importing.tree import Mesh, Shape, Vector, quat_product, rotate
+
+READ = (".stl", ".obj", ".msh")
+"""Files that MuJoCo reads."""
+MOST_FACES = 200_000
+"""Of an STL file, by MuJoCo's decoder."""
+ENOUGH_FACES = 50_000
+"""Of one that had too many."""
+FINEST = 600
+"""Cells along the longest side of a mesh that is thinned, at first."""
+STL_HEADER, STL_FACE = 84, 50
+"""[bytes]"""
+
+
+class MeshProblem(Exception):
+    """A mesh can't be used; its text says why."""
+
+
+def find(name: str, folder: Path, roots: Sequence[Path]) -> Path:
+    """Return the file that a URDF in `folder` means by `name`: a path, `file://` or `package://`; a package is looked for in
+    the folders above, and in `roots`.
+
+    Raises:
+        MeshProblem: there is none.
+    """
+    path = re.sub(r"^(package|file|model):/*", lambda m: "/" if m[1] == "file" else "", unquote(name.strip()))
+    parts = [part for part in Path(path).parts if part not in ("/", "\\")]
+    places = [folder, *folder.parents, *roots]
+    tails = [parts[i:] for i in range(len(parts))]  # the last ones drop the package, or somebody's home
+    options = [Path(path)] if Path(path).is_absolute() else [folder / path]
+    options += [place.joinpath(*tail) for tail in tails[:2] for place in places]
+    options += [place.joinpath(*tail) for tail in tails[2:] for place in places[:3]]
+    for option in options:
+        if option.is_file():
+            return option.resolve()
+    raise MeshProblem(f"mesh '{name}' is not to be found beside {folder.name}/ or above it")
+
+
+def read(path: Path, scale: Vector) -> list[tuple[Mesh, Vector | None]]:
+    """Return the meshes that MuJoCo can be given for a file, each with its colour (4,) or None.
+
+    Raises:
+        MeshProblem: MuJoCo does not read it, and it can't be converted.
+    """
+    if path.suffix.lower() == ".stl":
+        with path.open("rb") as file:
+            head = file.read(STL_HEADER)
+        faces = int.from_bytes(head[80:84], "little")
+        if path.stat().st_size == STL_HEADER + STL_FACE * faces and faces <= MOST_FACES:
+            return [(Mesh(path.stem, path, scale), None)]
+    elif path.suffix.lower() in READ:
+        return [(Mesh(path.stem, path, scale), None)]
+    parts = [(*_thinned(vertices, faces), rgba) for vertices, faces, rgba in _converted(path)]
+    return [(Mesh(path.stem, None, scale, vertices * scale, faces), rgba) for vertices, faces, rgba in parts]
+
+
+def _thinned(vertices: Vector, faces: Vector) -> tuple[Vector, Vector]:
+    """Return vertices (V, 3) and faces (T, 3) of a mesh that MuJoCo reads: of one with too many faces, vertices that are near
+    each other become one.
+    """
+    cells = FINEST
+    low, extent = vertices.min(axis=0), max(float(np.ptp(vertices, axis=0).max()), 1e-9)
+    points, corners = vertices, faces
+    if len(faces) <= MOST_FACES:
+        return vertices, faces
+    while len(corners) > ENOUGH_FACES and cells > 1:
+        places, which = np.unique(np.round((vertices - low) / extent * cells).astype(int), axis=0, return_inverse=True)
+        points, corners = low + places * extent / cells, which.reshape(-1)[faces]
+        a, b, c = corners.T
+        corners = corners[(a != b) & (b != c) & (a != c)]
+        cells = cells * 2 // 3
+    return points, corners
+
+
+@cache
+def _converted(path: Path) -> list[tuple[Vector, Vector, Vector | None]]:
+    """Return vertices (V, 3), faces (T, 3) and colour of each part of a file, through trimesh."""
+    try:
+        import trimesh
+    except ImportError as error:
+        raise MeshProblem(f"{path.name}: MuJoCo does not read {path.suffix}; pip install trimesh pycollada") from error
+    try:
+        scene = trimesh.load_scene(path)
+        parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    except Exception as error:  # of whichever reader it calls
+        raise MeshProblem(f"{path.name}: can't be converted ({type(error).__name__}: {error})"[:200]) from error
+    if not parts:
+        raise MeshProblem(f"{path.name}: has no faces")
+    return [(np.array(part.vertices, dtype=float), np.array(part.faces), _colour(part)) for part in parts]
+
+
+def _colour(part: Any) -> Vector | None:
+    """Return the one colour (4,) of a part, or None."""
+    try:
+        rgba = np.array(part.visual.to_color().main_color, dtype=float) / 255.0
+    except Exception:  # textures that are missing, and the like
+        return None
+    return rgba if rgba.shape == (4,) and rgba[3] > 0.0 else None
+
+
+def write_stl(path: Path, mesh: Mesh) -> None:
+    """Write vertices and faces as a binary STL file."""
+    assert mesh.vertices is not None
+    assert mesh.faces is not None
+    corners = mesh.vertices[mesh.faces].astype("<f4")
+    record = np.zeros(len(corners), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    record["corners"] = corners
+    path.write_bytes(bytes(80) + len(corners).to_bytes(4, "little") + record.tobytes())
+
+
+FITS = {
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+}
+ROUND = 1.25
+"""A mesh is like a ball if no extent of it is larger than its smallest by this factor."""
+
+
+def fitted(shape: Shape) -> Shape:
+    """Return the primitive around the mesh of a shape: of those that MuJoCo fits to its bounding box, the smallest; a ball
+    only for what is round.
+
+    Raises:
+        MeshProblem: MuJoCo refuses the mesh.
+    """
+    assert shape.mesh is not None
+    found = _fits(shape.mesh)
+    extent = found["box"][0]
+    for kind, (size, pos, quat) in found.items():
+        found[kind] = (size, shape.pos + rotate(shape.quat, pos), quat_product(shape.quat, quat))
+    fair = [kind for kind in found if kind != "sphere" or extent.max() <= ROUND * extent.min()]
+    best = min(fair, key=lambda kind: _volume(kind, found[kind][0]))
+    return refitted(Shape(best, *found[best], True, shape.link, shape.name, friction=shape.friction, fits=found), best)
+
+
+def rounded(shape: Shape) -> Shape:
+    """Return a primitive that stands for a mesh as a ball or capsule, where there is one: feet of a point roll."""
+    options = [kind for kind in ("capsule", "sphere") if kind in shape.fits]
+    return refitted(shape, min(options, key=lambda kind: _volume(kind, shape.fits[kind][0]), default=shape.kind))
+
+
+def refitted(shape: Shape, kind: str) -> Shape:
+    """Return a primitive that stands for a mesh as one of another kind, where there is one."""
+    size, pos, quat = shape.fits.get(kind, (shape.size, shape.pos, shape.quat))
+    kind = kind if kind in shape.fits else shape.kind
+    return replace(shape, kind=kind, size=size.copy(), pos=pos.copy(), quat=quat.copy())
+
+
+def _fits(mesh: Mesh) -> dict[str, tuple[Vector, Vector, Vector]]:
+    """Return what MuJoCo fits to a mesh: size, position and orientation (3,), (3,), (4,) by the kind of shape; a flat thing
+    has no capsule.
+    """
+    found: dict[str, tuple[Vector, Vector, Vector]] = {}
+    problem: Exception | None = None
+    for inertia in (mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX, mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL):
+        for name, kind in FITS.items():
+            spec = mujoco.MjSpec()
+            spec.compiler.fitaabb = True
+            added = spec.add_mesh(name="mesh", inertia=inertia, scale=mesh.scale if mesh.file else [1, 1, 1])
+            if mesh.file is not None:
+                added.file = str(mesh.file)
+            else:
+                assert mesh.vertices is not None
+                assert mesh.faces is not None
+                added.uservert, added.userface = mesh.vertices.ravel(), mesh.faces.ravel()
+            spec.worldbody.add_geom(name="fit", type=kind, meshname="mesh")
+            try:
+                geom = spec.compile().geom("fit")
+            except Exception as error:  # its errors have no class of their own
+                problem = error
+                continue
+            found[name] = (geom.size.copy(), geom.pos.copy(), geom.quat.copy())
+        if "box" in found:
+            return found
+    raise MeshProblem(f"mesh '{mesh.name}': MuJoCo refuses it: {' '.join(str(problem).split())}")
+
+
+def _volume(kind: str, size: Vector) -> float:
+    """Return the volume of a shape [m^3]."""
+    if kind == "box":
+        return float(8.0 * size.prod())
+    return float(np.pi * size[0] ** 2 * (4 / 3 * size[0] + (2.0 * size[1] if kind == "capsule" else 0.0)))

@@ -1,0 +1,137 @@
+"""Tree -> MJCF that a person can read and engines rely on: one free base, hinges with a motor each in their order, shapes
+with names, drawn shapes apart.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from legged.robots.importing.tree import IDENTITY, Hinge, Link, Mesh, Shape, Tree, Vector
+
+DRAWN_GROUP, TOUCHED_GROUP = 2, 3
+"""Groups of geoms: pictures show the first only."""
+GREY = "0.7 0.7 0.72 1"
+
+
+def mjcf_of(tree: Tree, files: Mapping[str, Path] | None = None, height: float = 0.0, remarks: Sequence[str] = ()) -> str:
+    """Return a tree as MJCF. `files` says where the drawn meshes lie, by their names; without it, or where a name is missing
+    in it, meshes are not drawn. The base is drawn at `height` [m]; `remarks` stand at the top.
+    """
+    files = files or {}
+    drawn = [s for link in tree.links for s in link.shapes if not s.collides and (s.mesh is None or s.mesh.name in files)]
+    group = TOUCHED_GROUP if drawn else 0
+    lines = [f"<mujoco model={quoteattr(tree.name)}>"]
+    for remark in remarks:
+        lines.append(f"  <!-- {remark.replace('--', '- -')} -->")
+    lines += [
+        '  <compiler angle="radian" autolimits="true"/>',
+        "",
+        "  <default>",
+        '    <default class="collision">',
+        f'      <geom group="{group}" contype="1" conaffinity="2" condim="3" priority="1"{_touched_colour(group)}/>',
+        "    </default>",
+        '    <default class="visual">',
+        f'      <geom group="{DRAWN_GROUP}" contype="0" conaffinity="0" mass="0" rgba="{GREY}"/>',
+        "    </default>",
+        "  </default>",
+        "",
+    ]
+    meshes = {shape.mesh.name: shape.mesh for shape in drawn if shape.mesh is not None}
+    if meshes:
+        lines += ["  <asset>", *(_mesh(mesh, files[name]) for name, mesh in meshes.items()), "  </asset>", ""]
+    lines.append("  <worldbody>")
+    lines += _body(tree, 0, {id(shape) for shape in drawn}, height)
+    lines += [
+        "  </worldbody>",
+        "",
+        "  <actuator>",
+        *(_motor(hinge) for hinge in tree.hinges if hinge.driven),
+        "  </actuator>",
+    ]
+    if tree.loops:
+        lines += ["", "  <equality>", *(_loop(loop) for loop in tree.loops), "  </equality>"]
+    return "\n".join([*lines, "</mujoco>", ""])
+
+
+def numbers(values: Vector) -> str:
+    """Return numbers as MJCF has them, nine digits each."""
+    return " ".join(f"{value:.9g}" for value in np.where(np.abs(values) < 1e-12, 0.0, values))
+
+
+def _touched_colour(group: int) -> str:
+    return ' rgba="0.9 0.6 0.2 0.5"' if group == TOUCHED_GROUP else f' rgba="{GREY}"'
+
+
+def _mesh(mesh: Mesh, file: Path) -> str:
+    scale = "" if mesh.file is None or np.allclose(mesh.scale, 1.0) else f' scale="{numbers(mesh.scale)}"'
+    # Drawn meshes weigh nothing; as a shell, even one without a volume is taken.
+    return f'    <mesh name={quoteattr(mesh.name)} file={quoteattr(file.as_posix())}{scale} inertia="shell"/>'
+
+
+def _body(tree: Tree, i: int, drawn: set[int], height: float, depth: int = 2) -> list[str]:
+    link, pad = tree.links[i], "  " * depth
+    pose = f' pos="0 0 {height:.9g}"' if i == 0 else _pose(link.pos, link.quat)
+    lines = [f"{pad}<body name={quoteattr(link.name)}{pose}>"]
+    if i == 0:
+        lines.append(f'{pad}  <freejoint name="root"/>')
+    lines.append(pad + "  " + _inertial(link))
+    lines += [pad + "  " + _hinge(hinge) for hinge in link.hinges]
+    lines += [pad + "  " + _geom(shape) for shape in link.shapes if shape.collides]
+    lines += [pad + "  " + _geom(shape) for shape in link.shapes if id(shape) in drawn]
+    for child in tree.children(i):
+        lines += _body(tree, child, drawn, height, depth + 1)
+    return [*lines, f"{pad}</body>"]
+
+
+def _pose(pos: Vector, quat: Vector) -> str:
+    text = f' pos="{numbers(pos)}"' if np.abs(pos).max() > 1e-12 else ""
+    same = np.allclose(np.abs(quat), IDENTITY, atol=1e-9)
+    return text + ("" if same else f' quat="{numbers(quat)}"')
+
+
+def _inertial(link: Link) -> str:
+    i = link.inertia
+    full = numbers(np.array([i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]]))
+    return f'<inertial pos="{numbers(link.com)}" mass="{link.mass:.9g}" fullinertia="{full}"/>'
+
+
+def _hinge(hinge: Hinge) -> str:
+    parts = [f'<joint name={quoteattr(hinge.name)} axis="{numbers(hinge.axis)}"']
+    if np.abs(hinge.anchor).max() > 1e-12:
+        parts.append(f'pos="{numbers(hinge.anchor)}"')
+    if hinge.range is not None:
+        parts.append(f'range="{numbers(np.array(hinge.range))}"')
+    parts += [f'{key}="{value:.9g}"' for key, value in hinge.passive.items()]
+    return " ".join(parts) + "/>"
+
+
+def _geom(shape: Shape) -> str:
+    parts = [f'<geom class="{"collision" if shape.collides else "visual"}"']
+    if shape.collides:
+        parts.append(f"name={quoteattr(shape.name)}")
+    if shape.mesh is not None:
+        parts.append(f'type="mesh" mesh={quoteattr(shape.mesh.name)}')
+    else:
+        count = {"sphere": 1, "capsule": 2, "cylinder": 2}.get(shape.kind, 3)
+        parts.append(f'type="{shape.kind}" size="{numbers(shape.size[:count])}"')
+    if shape.collides and shape.friction is not None:
+        parts.append(f'friction="{numbers(shape.friction)}"')
+    if not shape.collides and shape.rgba is not None:
+        parts.append(f'rgba="{numbers(np.round(shape.rgba, 3))}"')
+    return " ".join(parts) + _pose(shape.pos, shape.quat) + "/>"
+
+
+def _motor(hinge: Hinge) -> str:
+    name = quoteattr(hinge.name)
+    if hinge.effort is None:
+        return f"    <motor name={name} joint={name}/>"
+    limit = f"-{hinge.effort:.9g} {hinge.effort:.9g}"
+    return f'    <motor name={name} joint={name} ctrlrange="{limit}" forcerange="{limit}"/>'
+
+
+def _loop(loop: Mapping[str, str]) -> str:
+    return (
+        f"    <{loop['tag']} " + " ".join(f"{key}={quoteattr(value)}" for key, value in loop.items() if key != "tag") + "/>"
+    )

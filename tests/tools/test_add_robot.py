@@ -1,0 +1,201 @@
+"""The command that brings a robot: what it writes trains at once, and it says what it guessed."""
+
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import yaml
+from helpers import ENGINE, call
+from importing_fixtures import urdf
+
+from legged.registry import make_task, register_file, task_config
+from legged.robots.importing.folder import _compact
+from legged.robots.robot import load_robot
+from legged.tools import add_robot
+
+pytestmark = pytest.mark.usefixtures("workplace")
+
+
+@pytest.fixture
+def added(tmp_path, capsys):
+    """added(text, *flags): what the command prints for a file of that text; its robot is ./mine/<name>."""
+
+    def added(text: str, *flags: str, file: str = "toy.urdf") -> str:
+        (tmp_path / file).write_text(text)
+        assert call(add_robot.main, [file, "--out", "mine", *flags]) == 0, capsys.readouterr().err
+        return capsys.readouterr().out
+
+    return added
+
+
+def test_a_urdf_becomes_a_robot_whose_task_steps(added):
+    out = added(urdf(), "--name", "first_toy")
+    assert "first_toy: a quadruped of 13 kg, 12 hinges, 12 motors, 13 shapes" in out
+    assert "mass: 13 kg in the links of the file, 13 kg in the model" in out
+    assert "guess: the default pose is a stance by inverse kinematics" in out
+    assert "train it: python train.py --task mine/first_toy_flat.yaml" in out
+    robot = load_robot("mine/first_toy")
+    assert robot.mass == pytest.approx(13.0)
+    assert robot.feet_names == ("fl_foot", "fr_foot", "hl_foot", "hr_foot")
+    names = np.array(robot.contact_names)
+    assert set(names[list(robot.termination_indices)]) == {"trunk"}
+    rods = {f"{leg}_{part}" for leg in ("fl", "fr", "hl", "hr") for part in ("thigh", "calf")}
+    assert set(names[list(robot.penalised_indices)]) == rods
+    task = register_file("mine/first_toy_flat.yaml")
+    built = make_task(task_config(task, [("env.num_envs", 4), ("domain_rand.push_robots", False), *ENGINE], on_cpu=True))
+    for _ in range(50):
+        observations, _, _, _ = built.step(torch.zeros(4, 12))
+    assert torch.isfinite(observations["actor"]).all()
+    assert built.base_pos[:, 2].median() > 0.6 * robot.height
+    assert "written by `python -m legged.tools.add_robot` from `toy.urdf`" in Path("mine/first_toy/PROVENANCE.md").read_text()
+
+
+def test_the_stance_is_that_of_a_two_link_leg(added):
+    """Thigh and shank of 0.2 m. The knee keeps 5 % of its range from -0.5 rad away: stretched, it is at -0.61 rad, and the
+    foot 0.4 cos(0.305) = 0.3815 m from the hip; a stance has 0.8 of that, 0.305 m: the knee at -2 acos(0.763) = -1.405 rad,
+    and the thigh at half of that the other way.
+    """
+    added(urdf(), "--name", "second_toy")
+    robot = load_robot("mine/second_toy")
+    angles = dict(zip(robot.joint_names, robot.default_dof_pos, strict=True))
+    assert angles["fl_calf"] == pytest.approx(-1.405, abs=0.03)
+    assert angles["fl_thigh"] == pytest.approx(0.703, abs=0.03)
+    assert robot.height == pytest.approx(0.305 + 0.02, abs=0.004)
+    assert robot.file.spawn_height == pytest.approx(1.03 * robot.height, abs=1e-3)
+    for joint in ("hip", "thigh", "calf"):
+        for front in "fh":
+            sign = -1.0 if joint == "hip" else 1.0
+            assert angles[f"{front}l_{joint}"] == pytest.approx(sign * angles[f"{front}r_{joint}"], abs=1e-9)
+    limits = robot.dof_pos_limits
+    assert ((limits[:, 0] < robot.default_dof_pos) & (robot.default_dof_pos < limits[:, 1])).all()
+    model = mujoco.MjModel.from_xml_path(str(robot.model_path))
+    data = mujoco.MjData(model)
+    data.qpos[7:] = robot.default_dof_pos
+    mujoco.mj_kinematics(model, data)
+    for leg, x, y in (("fl", 0.2, 0.15), ("hr", -0.2, -0.15)):
+        np.testing.assert_allclose(data.geom(f"{leg}_foot").xpos[:2], [x, y], atol=0.005)
+
+
+def test_what_a_file_does_not_say_is_guessed_and_named(added):
+    """Torque limits: 0.4 m g h. A robot.yaml holds every guess as a comment."""
+    out = added(urdf().replace('effort="30"', 'effort="0"'), "--name", "third_toy")
+    robot = load_robot("mine/third_toy")
+    np.testing.assert_allclose(robot.torque_limits, 0.4 * 13.0 * 9.81 * robot.height, atol=0.06)
+    assert "guess: torque limits that the file lacks are 0.4 m g h: fl_hip" in out
+    text = Path("mine/third_toy/robot.yaml").read_text()
+    for line in (line.strip() for line in out.splitlines() if line.startswith("  guess: t")):
+        assert f"# {line}" in text
+    assert "stiffness" not in yaml.safe_load(text)
+
+
+def test_gains_may_be_given_and_joints_held(added):
+    limit, inertia = '<limit lower="1" upper="2" effort="1" velocity="1"/>', 'ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"'
+    arm = f'<joint name="arm" type="revolute"><parent link="trunk"/><child link="arm_link"/>{limit}</joint>'
+    arm += f'<link name="arm_link"><inertial><mass value="1"/><inertia {inertia}/></inertial></link>'
+    out = added(urdf(arm), "--name", "fourth_toy", "--stiffness", "40", "--damping", "1", "--hold", "arm")
+    robot = load_robot("mine/fourth_toy")
+    assert (robot.num_dof, robot.mass) == (12, pytest.approx(14.0))
+    assert set(robot.stiffness) == {40.0}
+    assert "joints are held as asked: arm at 1 rad" in out
+
+
+def test_a_lopsided_robot_learns_without_mirror_images(added):
+    added(urdf().replace('xyz="0.2 0.1 0"', 'xyz="0.25 0.1 0"'), "--name", "fifth_toy")
+    task = yaml.safe_load(Path("mine/fifth_toy_flat.yaml").read_text())
+    assert task["train"]["algorithm"]["symmetry"] is False
+    task_config(register_file("mine/fifth_toy_flat.yaml"), on_cpu=True)
+
+
+def test_a_robot_that_looks_along_y_is_turned(added):
+    """Its left legs are at -x: a quarter turn clockwise brings them to +y."""
+    places = {"fl": (-0.1, 0.2), "fr": (0.1, 0.2), "hl": (-0.1, -0.2), "hr": (0.1, -0.2)}
+    text = urdf()
+    for (x, y), (old_x, old_y) in zip(places.values(), ((0.2, 0.1), (0.2, -0.1), (-0.2, 0.1), (-0.2, -0.1)), strict=True):
+        text = text.replace(f'xyz="{old_x} {old_y} 0"', f'xyz="{x} {y} 0.0"')
+    out = added(text, "--name", "sixth_toy")
+    assert "by its names its left side is not at +y: it is turned by 270 degrees" in out
+    model = mujoco.MjModel.from_xml_path("mine/sixth_toy/sixth_toy.xml")
+    np.testing.assert_allclose(model.body("fl_hip").pos, [0.2, 0.1, 0.0], atol=1e-9)
+
+
+def test_meshes_are_copied_and_drawn(added, tmp_path):
+    """Beside the MJCF, under names of their own."""
+    pytest.importorskip("trimesh")
+    import trimesh
+
+    (tmp_path / "shell.dae").write_bytes(trimesh.exchange.dae.export_collada(trimesh.creation.box((0.4, 0.2, 0.1))))
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "cube.stl")
+    meshes = "".join(f'<visual><geometry><mesh filename="{name}"/></geometry></visual>' for name in ("shell.dae", "cube.stl"))
+    out = added(urdf().replace("</inertial>", f"</inertial>{meshes}", 1), "--name", "seventh_toy")
+    assert {path.name for path in Path("mine/seventh_toy/meshes").iterdir()} == {"shell.stl", "cube.stl"}
+    assert "MiB of meshes" in out
+    model = mujoco.MjModel.from_xml_path("mine/seventh_toy/seventh_toy.xml")
+    assert model.nmesh == 2
+    assert model.body_mass.sum() == pytest.approx(13.0)
+    drawn = model.geom_bodyid[model.geom_contype + model.geom_conaffinity == 0]
+    assert set(drawn) == set(range(1, 14)) - {i for i in range(1, 14) if model.body(i).name.endswith("_hip")}  # bare ones too
+
+
+def test_a_model_of_menagerie(added, tmp_path, monkeypatch, capsys):
+    """Through its own package, from a folder that stands in for what it would download."""
+    menagerie = pytest.importorskip("mujoco_menagerie")
+    monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path / "menagerie"))
+    robot = menagerie.get("unitree_go2")
+    (tmp_path / "menagerie" / "unitree_go2").mkdir(parents=True)
+    added(urdf(), "--name", "eighth_toy")
+    model = Path("mine/eighth_toy/eighth_toy.xml").read_text()
+    (tmp_path / "menagerie" / "unitree_go2" / robot.entry(robot.default_model).file).write_text(model)
+    assert call(add_robot.main, ["menagerie:unitree_go2", "--out", "theirs"]) == 0
+    assert load_robot("theirs/unitree_go2").mass == pytest.approx(13.0)
+    assert f"Licence: {robot.license}" in Path("theirs/unitree_go2/PROVENANCE.md").read_text()
+    assert call(add_robot.main, ["menagerie:unitree_go22"]) == 2
+    assert "Menagerie has no such robot; did you mean 'unitree_go2'?" in capsys.readouterr().err
+    assert call(add_robot.main, ["menagerie:unitree_go1"]) == 1
+    assert "error: menagerie:unitree_go1: 'unitree_go1' not found under MENAGERIE_ROOT" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "mujoco_menagerie", None)
+    assert call(add_robot.main, ["menagerie:unitree_go2"]) == 2
+    assert "pip install mujoco-menagerie" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere.urdf"], "'nowhere.urdf': there is no such file"),
+        (["toy.txt"], "toy.txt: expected a URDF (.urdf) or an MJCF file (.xml)"),
+        (["toy.urdf", "--name", "../toy"], "--name: the name of a robot must be a plain name"),
+        (["toy.urdf", "--stiffness", "40"], "--stiffness and --damping: give both or neither"),
+        (["toy.urdf", "--stiffness", "-1", "--damping", "1"], "--stiffness: must be between 0 and 1e6, got -1"),
+        (["toy.urdf", "--hold", "arm"], "--hold: 'arm' is in no joint's name"),
+        (["toy.urdf", "--extends", "nothing"], "--extends: there is no task 'nothing'"),
+        (["broken.urdf"], "broken.urdf: is not well-formed XML"),
+    ],
+)
+def test_a_wrong_call_ends_with_one_line(tmp_path, capsys, arguments, message):
+    (tmp_path / "toy.urdf").write_text(urdf())
+    (tmp_path / "toy.txt").write_text("hello")
+    (tmp_path / "broken.urdf").write_text(urdf()[:-3])
+    assert call(add_robot.main, [*arguments, "--out", "mine"]) == 2
+    err = capsys.readouterr().err
+    assert message in err
+    assert err.count("\n") == 1
+    assert not Path("mine").exists()
+
+
+def test_nothing_is_written_over_unless_asked(added, capsys):
+    added(urdf(), "--name", "ninth_toy")
+    assert call(add_robot.main, ["toy.urdf", "--name", "ninth_toy", "--out", "mine"]) == 2
+    assert "there is mine/ninth_toy already; another name, or --force" in capsys.readouterr().err
+    assert "ninth_toy" in added(urdf(), "--name", "ninth_toy", "--force")
+
+
+def test_tables_are_shortened_only_where_they_say_the_same():
+    assert _compact({"fl_hip": 1.0, "fr_hip": 1.0, "fl_knee": 2.0}) == {"hip": 1.0, "knee": 2.0}
+    different = {"fl_hip": 1.0, "fr_hip": 2.0}
+    assert _compact(different) == different
+    inside = {"l_ab": 1.0, "r_b": 2.0}  # 'b' is a part of 'ab' too, which is the longer match
+    assert _compact(inside) == {"ab": 1.0, "b": 2.0}
+    different = {"a_b": 1.0, "c_ab": 1.0, "x_a_b": 3.0}
+    assert _compact(different) == different
