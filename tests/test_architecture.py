@@ -69,7 +69,7 @@ FLOORS = [  # from the ground up; each part imports from the floors below it onl
     {"user_modules", "gymnasium_ids"},
     {"registry"},
     {"commandline"},
-    {"learning", "migration", "rendering"},
+    {"learning", "rendering"},
     {"policies", "gymnasium_envs"},
     {"play", "benchmarks"},
     {"evaluation"},

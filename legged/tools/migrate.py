@@ -15,15 +15,15 @@ from legged.commandline.command import run_main
 from legged.config.checks import PLAIN, is_plain_name, shown
 from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError
-from legged.migration.choice import Choice, choose
-from legged.migration.mapping import map_settings
-from legged.migration.modules import Tree
-from legged.migration.robot_entries import asset_of, map_robot, names_of
-from legged.migration.translation import Lost, Translation
-from legged.migration.writer import robot_yaml, task_yaml
 from legged.process.paths import data_folder, exists, make_folder, ready_to_write, relative, write_text
 from legged.registry import register_file, task_config
 from legged.robots.robot import Robot, load_robot
+from legged.tools.migration.choice import Choice, choose
+from legged.tools.migration.mapping import map_settings
+from legged.tools.migration.modules import Tree
+from legged.tools.migration.robot_entries import asset_of, map_robot, names_of
+from legged.tools.migration.translation import Lost, Translation
+from legged.tools.migration.writer import robot_yaml, task_yaml
 
 
 def main(argv: list[str] | None = None) -> int:

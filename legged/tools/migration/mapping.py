@@ -6,9 +6,10 @@ from typing import Any
 
 from legged.config.schema import STATE_TERMS
 from legged.envs import LeggedRobot
-from legged.migration.found import Found, Place
-from legged.migration.legged_gym_defaults import LEFT_OUT
-from legged.migration.settings import (
+from legged.terrain import TERRAIN_TYPES
+from legged.tools.migration.found import Found, Place
+from legged.tools.migration.legged_gym_defaults import LEFT_OUT
+from legged.tools.migration.settings import (
     ELSEWHERE,
     OF_HEIGHTS,
     OF_LEARNING,
@@ -20,8 +21,7 @@ from legged.migration.settings import (
     SECTIONS_ELSEWHERE,
     TERRAINS,
 )
-from legged.migration.translation import DEFAULTS, Translation, flat, is_number
-from legged.terrain import TERRAIN_TYPES
+from legged.tools.migration.translation import DEFAULTS, Translation, flat, is_number
 
 LONGEST_HISTORY = 20
 """Steps of observations that are looked for."""

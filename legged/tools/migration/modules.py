@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from legged.errors import ConfigError
-from legged.migration.expressions import BUILTINS, ROOT, CannotEvaluateError, Evaluator, Numbers
-from legged.migration.found import MEMBER_OF, Found, Place
-from legged.migration.legged_gym_defaults import known_class
 from legged.process.paths import exists, relative
+from legged.tools.migration.expressions import BUILTINS, ROOT, CannotEvaluateError, Evaluator, Numbers
+from legged.tools.migration.found import MEMBER_OF, Found, Place
+from legged.tools.migration.legged_gym_defaults import known_class
 
 MOST_BYTES = 2_000_000
 NUMERIC = ("math", "numpy")

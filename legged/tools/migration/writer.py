@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from legged.config.schema import LeggedConfig
-from legged.migration.translation import DEFAULTS, Lost
+from legged.tools.migration.translation import DEFAULTS, Lost
 
 WIDTH = 120
 FIRST = ("robot", "env", "terrain", "commands", "init_state", "control")

@@ -7,8 +7,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from legged.migration.translation import Translation
 from legged.robots.robot import Robot
+from legged.tools.migration.translation import Translation
 
 FOOT, PENALISED, ENDING = "asset.foot_name", "asset.penalize_contacts_on", "asset.terminate_after_contacts_on"
 POSE, POSITION, ROTATION = "init_state.default_joint_angles", "init_state.pos", "init_state.rot"

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from legged.config.checks import shown
 from legged.errors import ConfigError, suggest
-from legged.migration.expressions import CannotEvaluateError
-from legged.migration.found import place_of
-from legged.migration.modules import Module, Tree
 from legged.process.paths import exists, relative
+from legged.tools.migration.expressions import CannotEvaluateError
+from legged.tools.migration.found import place_of
+from legged.tools.migration.modules import Module, Tree
 
 SECTIONS = {
     "env",

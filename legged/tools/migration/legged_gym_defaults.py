@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from legged.migration.found import MEMBER_OF, Found, Place
+from legged.tools.migration.found import MEMBER_OF, Found, Place
 
 GRID_X = [round(0.1 * i - 0.8, 1) for i in range(17)]
 GRID_Y = [round(0.1 * i - 0.5, 1) for i in range(11)]
