@@ -201,6 +201,7 @@ ABSENT = {
     "init_done": "_init_buffers() and what it calls run before the first step, everything else after them",
 }
 """Name that is not there -> what takes its place."""
+NAMES = {*PLAIN, *COMPUTED, *CONSTANT, *KEPT, *ABSENT}
 
 
 class LeggedGymNames:
@@ -216,10 +217,15 @@ class LeggedGymNames:
     if not TYPE_CHECKING:  # a type checker should go on seeing what is not there
 
         def __getattr__(self, name: str) -> Any:
-            try:
-                return self._by_their_name(name)
-            except AttributeError as error:
-                raise AttributeError(f"self.{name}: {error}") from None
+            if name in NAMES:
+                try:
+                    return self._by_their_name(name)
+                except AttributeError as error:
+                    raise AttributeError(f"self.{name}: {error}") from None
+            known = [] if name.startswith("_") else [*NAMES, *vars(self)]
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0.75)
+            hint = f"; did you mean '{near[0]}'?" if near else ""
+            raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'{hint}")
 
     def _by_their_name(self, name: str) -> Any:
         """Return what the task has under that name of legged_gym's.
@@ -247,13 +253,7 @@ class LeggedGymNames:
             vars(self)[name] = kept
             vars(self).setdefault("_kept_names", []).append(name)
             return kept
-        if name in ABSENT:
-            raise AttributeError(f"is not there; {ABSENT[name]}")
-        known = [*PLAIN, *COMPUTED, *CONSTANT, *KEPT, *vars(self)] if not name.startswith("_") else []
-        near = difflib.get_close_matches(name, known, n=1, cutoff=0.75)
-        raise AttributeError(
-            f"{type(self).__name__} has no such attribute" + (f"; did you mean '{near[0]}'?" if near else "")
-        )
+        raise AttributeError(f"is not there; {ABSENT[name]}")
 
     def remember(self) -> None:
         """Keep what was asked for of this step, before the task itself overwrites what it keeps."""

@@ -101,7 +101,9 @@ def test_a_name_that_is_not_there_says_what_is(task, name):
 
 
 def test_a_slip_of_the_pen_has_its_nearest_name(task):
-    with pytest.raises(AttributeError, match="LeggedRobot has no such attribute; did you mean 'base_lin_vel'"):
+    with pytest.raises(
+        AttributeError, match="'LeggedRobot' object has no attribute 'base_lin_velo'; did you mean 'base_lin_vel'"
+    ):
         task.base_lin_velo  # noqa: B018
     with pytest.raises(AttributeError, match="the ground is a plane"):
         task.terrain_levels  # noqa: B018
