@@ -84,7 +84,13 @@ def solver_constants(
     nv = len(tree.parent)
     sizes = {"NV": nv, "ROWS": rows, "STRIDE": row_length(nv), "ENTRIES": entries}
     sizes["KEPT_ROWS"] = min(rows, KEPT_BYTES // (4 * sizes["STRIDE"]))
-    kinds = {"DAMPED": damped, "FRICTION": friction, "DRY": friction and dry, "ELLIPTIC": elliptic, "ELLIPTIC_ROW": ELLIPTIC_ROW}
+    kinds = {
+        "DAMPED": damped,
+        "FRICTION": friction,
+        "DRY": friction and dry,
+        "ELLIPTIC": elliptic,
+        "ELLIPTIC_ROW": ELLIPTIC_ROW,
+    }
     return {**sizes, **kinds, **tree.constants()}
 
 
