@@ -165,6 +165,16 @@ def test_what_it_does_not_know_is_refused(make_physics, sim, reason):
     assert re.search(reason, make_physics("mujoco_warp", num_envs=1, **sim).why_library)
 
 
+def test_what_a_robot_has_not_is_left_out_of_its_kernel(make_physics):
+    solver = make_physics("mujoco_warp")._fused_step._solver
+    assert {name: solver.constants[name] for name in ("DAMPED", "FRICTION", "ELLIPTIC", "SPLIT")} == {
+        "DAMPED": False,
+        "FRICTION": False,
+        "ELLIPTIC": False,
+        "SPLIT": True,
+    }
+
+
 def test_a_wrong_name_says_which_are_right(capsys):
     arguments = ["--task", "anymal_c_flat", "sim.step=fuse", "--show"]
     assert call(main, arguments) == 2
