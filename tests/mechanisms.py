@@ -62,7 +62,7 @@ EVERY_JOINT = f"""
         <joint name="swing" type="hinge" axis="0 1 .2" stiffness="3" springref=".3" damping=".4" ref=".1"/>
         <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass=".8"/>
         <body name="bob" pos=".3 0 0">
-          <joint name="bob" type="ball" damping=".03" pos=".01 .02 0"/>
+          <joint name="bob" type="ball" damping=".03" stiffness="2" pos=".01 .02 0"/>
           <geom type="box" size=".1 .04 .03" mass=".5" pos=".1 0 0"/>
           <body name="rod" pos=".1 0 .1">
             <joint name="rod" type="slide" axis="1 0 1" damping=".6" stiffness="20"/>
@@ -82,7 +82,7 @@ EVERY_JOINT = f"""
       </body>
     </body>
     <body name="flyer" pos="0 -1 1">
-      <joint name="flyer" type="free" damping=".3"/>
+      <joint name="flyer" type="free" damping=".3" stiffness="1.5"/>
       <geom type="box" size=".1 .2 .05" mass="1"/>
       <body name="wing" pos="0 .2 0">
         <joint name="wing" type="hinge" axis="1 0 0"/><geom type="box" size=".1 .2 .01" pos="0 .2 0" mass=".2"/>

@@ -51,7 +51,9 @@ def random_robot(seed: int, hinges: int, extras: Collection[str] = ()) -> mujoco
         parent = base if k < chains else made[int(rng.integers(0, len(made)))] if branch else made[k - chains]
         turn = 2.0 * np.pi * (k % chains) / chains
         step = [apart * np.cos(turn), apart * np.sin(turn), 0.0] if parent is base else [0.02, 0.01, -0.28 * chains / hinges]
-        body = parent.add_body(name=f"limb{k}", pos=np.array(step) + rng.normal(0.0, 0.01, 3), quat=[1, *rng.normal(0, 0.1, 3)])
+        body = parent.add_body(
+            name=f"limb{k}", pos=np.array(step) + rng.normal(0.0, 0.01, 3), quat=[1, *rng.normal(0, 0.1, 3)]
+        )
         made.append(body)
         ends = [end for end in ends if end is not parent] + [body]
         body.add_geom(
@@ -63,7 +65,9 @@ def random_robot(seed: int, hinges: int, extras: Collection[str] = ()) -> mujoco
             conaffinity=0,
         )
         axis = np.eye(3)[k % 3] + rng.normal(0.0, 0.1, 3)
-        joint = body.add_joint(name=f"hinge{k}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis, armature=rng.uniform(0.01, 0.05))
+        joint = body.add_joint(
+            name=f"hinge{k}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis, armature=rng.uniform(0.01, 0.05)
+        )
         _furnish(spec, joint, rng, extras)
     directions = (1, 3, 4, 6) if "elliptic" in extras else (3,)
     for n, end in enumerate(ends):
@@ -126,8 +130,8 @@ def _close(spec: Any, model: mujoco.MjModel, ends: list[Any]) -> None:
 
 
 def rollout(model: mujoco.MjModel, seed: int, steps: int, every: int, most: float = 1.0) -> list[dict[str, Any]]:
-    """Return each `every`th of `steps` states that C MuJoCo passes under random controls, in numbers of float32, with what one
-    step makes of it.
+    """Return each `every`th of `steps` states that C MuJoCo passes under random controls, in numbers of float32, with what
+    one step makes of it.
     """
     rng, data = np.random.default_rng(seed), mujoco.MjData(model)
     data.qvel[:] = 0.3 * rng.normal(size=model.nv)
@@ -140,7 +144,7 @@ def rollout(model: mujoco.MjModel, seed: int, steps: int, every: int, most: floa
         state = {name: getattr(data, name).copy() for name in ("qpos", "qvel", "ctrl")}
         mujoco.mj_step(model, data)
         if k % every == every - 1:
-            names = ("qacc", "qfrc_constraint", "qfrc_smooth")
-            after = {"qpos after": data.qpos.copy(), "qvel after": data.qvel.copy(), "rows": data.nefc, "touching": data.ncon > 0}
-            passed.append(state | {name: getattr(data, name).copy() for name in names} | after)
+            made = {name: getattr(data, name).copy() for name in ("qacc", "qfrc_constraint", "qfrc_smooth")}
+            made |= {f"{name} after": getattr(data, name).copy() for name in ("qpos", "qvel")}
+            passed.append({**state, **made, "rows": data.nefc, "touching": data.ncon > 0})
     return passed

@@ -45,8 +45,8 @@ class SimConfig:
     step: Literal["auto", "fused", "library"] = "auto"
     """How mujoco_warp makes a step: `library`, by its own launches, dozens of them; `fused`, by one launch for all that comes
     before contacts, one for contacts, one for their forces and one for integration, or there is an error that says what of
-    the model keeps it off; `auto`, `fused` where the model fits, else contact forces alone where they fit (pyramidal cones,
-    32 degrees of freedom)."""
+    the model keeps it off; `auto`, `fused` where the model fits, else contact forces alone where they fit (60 degrees of
+    freedom)."""
     nconmax: int = field(default=24, metadata=between(1, 10_000))
     """Contacts for which each robot has room in mujoco_warp and newton. Where their own launches find contacts, robots share
     that room, and pairs of shapes that might touch take of it too."""

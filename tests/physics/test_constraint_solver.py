@@ -45,6 +45,7 @@ def solved(model: mujoco.MjModel, datas: list[mujoco.MjData], device: str) -> tu
     """Of worlds in the states of `datas`: acceleration, constraint force and rounds, by the one-launch solver."""
     with wp.ScopedDevice(device):
         m = mjw.put_model(model)
+        m.opt.tolerance.fill_(1e-9)  # C MuJoCo's may be, and with elliptic cones is what ends the rounds
         d = mjw.make_data(model, nworld=len(datas), nconmax=16, njmax=64)
         d.qpos.assign(np.stack([data.qpos for data in datas]))
         d.qvel.assign(np.stack([data.qvel for data in datas]))
@@ -70,17 +71,24 @@ def states_of_every_row(model: mujoco.MjModel, count: int) -> list[mujoco.MjData
     return datas
 
 
-def test_every_kind_of_row_pushes_as_in_c_mujoco(device):
-    model = mujoco.MjModel.from_xml_string(EVERY_ROW)
+TENDON = """
+  <tendon>
+    <fixed name="dry" frictionloss="0.5"><joint joint="dry" coef="1"/><joint joint="limited" coef="-.6"/></fixed>
+  </tendon>
+</mujoco>"""
+
+
+@pytest.mark.parametrize("tendon", [False, True])
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_every_kind_of_row_pushes_as_in_c_mujoco(device, cone, tendon):
+    text = EVERY_ROW.replace("</mujoco>", TENDON) if tendon else EVERY_ROW
+    model = mujoco.MjModel.from_xml_string(text.replace('cone="pyramidal"', f'cone="{cone}"'))
     datas = states_of_every_row(model, 30)
     kinds = np.concatenate([data.efc_type for data in datas])
     t = mujoco.mjtConstraint
-    assert {int(k) for k in kinds} == {
-        int(t.mjCNSTR_EQUALITY),
-        int(t.mjCNSTR_FRICTION_DOF),
-        int(t.mjCNSTR_LIMIT_JOINT),
-        int(t.mjCNSTR_CONTACT_PYRAMIDAL),
-    }
+    expected = {int(t.mjCNSTR_EQUALITY), int(t.mjCNSTR_FRICTION_DOF), int(t.mjCNSTR_LIMIT_JOINT)}
+    expected.add(int(t.mjCNSTR_CONTACT_ELLIPTIC if cone == "elliptic" else t.mjCNSTR_CONTACT_PYRAMIDAL))
+    assert {int(k) for k in kinds} == expected | ({int(t.mjCNSTR_FRICTION_TENDON)} if tendon else set())
     # Dry friction is met on both sides and in between: sliding either way, and sticking.
     sides = np.concatenate([data.efc_state[data.efc_type == t.mjCNSTR_FRICTION_DOF] for data in datas])
     s = mujoco.mjtConstraintState
@@ -155,6 +163,16 @@ def test_what_it_does_not_know_is_refused(make_physics, sim, reason):
     with pytest.raises(ConfigError, match=f"sim.step=fused: .*{reason}"):
         make_physics("mujoco_warp", num_envs=1, step="fused", **sim)
     assert re.search(reason, make_physics("mujoco_warp", num_envs=1, **sim).why_library)
+
+
+def test_what_a_robot_has_not_is_left_out_of_its_kernel(make_physics):
+    solver = make_physics("mujoco_warp")._fused_step._solver
+    assert {name: solver.constants[name] for name in ("DAMPED", "FRICTION", "ELLIPTIC", "SPLIT")} == {
+        "DAMPED": False,
+        "FRICTION": False,
+        "ELLIPTIC": False,
+        "SPLIT": True,
+    }
 
 
 def test_a_wrong_name_says_which_are_right(capsys):

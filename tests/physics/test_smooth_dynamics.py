@@ -117,7 +117,8 @@ def test_a_shipped_robot_takes_one_launch_unless_asked_for_others(make_physics, 
 REFUSED = {
     "equality constraints of tendons": (
         "<actuator>",
-        "<tendon><fixed name='t'><joint joint='tail' coef='1'/></fixed></tendon><equality><tendon tendon1='t'/></equality><actuator>",
+        "<tendon><fixed name='t'><joint joint='tail' coef='1'/></fixed></tendon>"
+        "<equality><tendon tendon1='t'/></equality><actuator>",
     ),
     "compensation of gravity": ('<body name="tail"', '<body name="tail" gravcomp="1"'),
     "dampers or armature of actuators": ('<motor joint="tail"', '<motor joint="tail" armature="0.1"'),

@@ -84,8 +84,14 @@ def solver_constants(
     nv = len(tree.parent)
     sizes = {"NV": nv, "ROWS": rows, "STRIDE": row_length(nv), "ENTRIES": entries}
     sizes["KEPT_ROWS"] = min(rows, KEPT_BYTES // (4 * sizes["STRIDE"]))
-    kinds = {"DAMPED": damped, "FRICTION": friction, "DRY": friction and dry, "ELLIPTIC": elliptic}
-    return {**sizes, **kinds, "ELLIPTIC_ROW": ELLIPTIC_ROW, **tree.constants()}
+    kinds = {
+        "DAMPED": damped,
+        "FRICTION": friction,
+        "DRY": friction and dry,
+        "ELLIPTIC": elliptic,
+        "ELLIPTIC_ROW": ELLIPTIC_ROW,
+    }
+    return {**sizes, **kinds, **tree.constants()}
 
 
 def blocks(constants: dict[str, int | bool]) -> int:

@@ -50,12 +50,11 @@ class Tree:
     @property
     def root(self) -> int:
         """How many of the first ones, up to `MOST_ROOT`, are above all that come after them."""
-        count = 0
-        while count < min(MOST_ROOT, len(self.parent)) and self.parent[count] == count - 1:
-            if count and (self.parent[count:] < count - 1).any():
-                break
-            count += 1
-        return count if (self.parent[count:] >= count - 1).all() else 0
+        most = min(MOST_ROOT, len(self.parent))
+        for count in range(most, 0, -1):
+            if (self.parent[:count] == np.arange(count) - 1).all() and (self.parent[count:] >= count - 1).all():
+                return count
+        return 0
 
     def path(self, i: int) -> list[int]:
         """Return those above `i`, from the first, and itself."""

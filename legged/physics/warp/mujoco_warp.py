@@ -91,8 +91,8 @@ class MujocoWarpPhysics(WarpPhysics):
             self._quantities = {
                 name: wp.to_torch(getattr(d, name)).view(num_envs, *getattr(sample, name).shape) for name in quantities
             }
-            self._choose_step(sim.step)
             self._m.opt.disableflags |= absent_stages(self.model, self._per_world)
+            self._choose_step(sim.step)
         exchanges = (self._exchange.kinematics, self._exchange.contact_forces, self.kernels.name_module)
         constants = (self._set_constants,) if any(FIELDS[name].derived for name in randomized) else ()
         compile_ahead(self._wp_device, (self._step, self._update_quantities, *exchanges, *constants))
