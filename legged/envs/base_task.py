@@ -31,6 +31,7 @@ from legged.mdp.terminations import Terminations
 from legged.mdp.uniform_numbers import UniformNumbers
 from legged.physics import Scene, check_ranges, make_physics
 from legged.process.ranks import Ranks
+from legged.process.startup import stage_ended
 
 
 class BaseTask(SavedTask, VecEnv):
@@ -69,6 +70,7 @@ class BaseTask(SavedTask, VecEnv):
         scene, fields = self.make_scene(), self.randomization.fields
         check_ranges(cfg.domain_rand.ranges, scene, cfg.sim, cfg.origins.where)
         self.physics = make_physics(scene, cfg.sim, n, device, fields, self.QUANTITIES, cfg.origins.where)
+        stage_ended("physics built")
         self.randomization.apply(self.physics)
         self.num_actions = self.physics.ctrl.shape[1]
         self._allocate()
@@ -261,9 +263,7 @@ class BaseTask(SavedTask, VecEnv):
 
     @abstractmethod
     def draw_reset(self) -> None:
-        """Draw a state for every environment to begin an episode with, into `reset_qpos` and `reset_qvel`; `numbers` are
-        fresh.
-        """
+        """Write a state for every environment to begin an episode with to `reset_qpos`, `reset_qvel`; `numbers` are fresh."""
 
     def sense(self) -> None:
         """Bring everything that follows from the physics' state up to date."""

@@ -36,7 +36,7 @@ from legged.physics import engine_name, resolve_physics
 from legged.process.cores import available_cores
 from legged.process.paths import full_disk_in, ready_to_write, reason, relative
 from legged.process.ranks import Ranks
-from legged.process.startup import STARTED_S, command_of_ours
+from legged.process.startup import STARTED_S, command_of_ours, stage_ended
 from legged.registry import make_task, task_config
 
 ROOM_MB = 16.0
@@ -50,6 +50,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _main(argv: list[str] | None) -> int:
     start = STARTED_S if argv is None else time.perf_counter()  # as a command, imports are part of it
+    stage_ended("imports")
     parser = argparse.ArgumentParser(prog="train.py", description="Train a legged robot.")
     add_task_arguments(parser)
     add_run_arguments(parser)
