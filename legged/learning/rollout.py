@@ -23,8 +23,11 @@ class Rollout:
         self._observations = {name: group.buffer for name, group in env.observation_groups.items()}
         self._cut_off = torch.zeros_like(st.rewards)
         """(T, N, 1) whether the step ended its episode by time."""
-        self._return = torch.zeros(env.num_envs, device=env.device)
-        self._length = torch.zeros(env.num_envs, device=env.device)
+        # Sums by robot, added up at the end of a rollout: so a step costs fewer launches.
+        self._so_far = torch.zeros(2, env.num_envs, device=env.device)
+        self._return, self._length = self._so_far.unbind()
+        self._ended = torch.zeros(3, env.num_envs, device=env.device)
+        self._zero = torch.zeros((), device=env.device)
         self.ended = torch.zeros(3, device=env.device)
         """(3,) of the episodes that ended in the last rollout: number, sum of returns, sum of lengths [steps]."""
 
@@ -35,15 +38,15 @@ class Rollout:
 
     def forget(self) -> None:
         """All episodes begin anew."""
-        self._return.zero_()
-        self._length.zero_()
+        self._so_far.zero_()
 
     @torch.no_grad()
     def collect(self, steps: int | None = None) -> None:
         """T steps into the storage, with returns and advantages; `steps`, to rehearse, takes fewer of them."""
-        self.ended.zero_()
+        self._ended.zero_()
         for t in range(steps or self.alg.storage.num_transitions_per_env):
             self._step(t)
+        torch.sum(self._ended, dim=1, out=self.ended)
         self._judge()
         self._returns()
 
@@ -80,11 +83,9 @@ class Rollout:
         env = self.env
         self._return.add_(env.rew_buf)
         self._length.add_(1.0)
-        done = env.reset_buf
-        counts = torch.stack([torch.ones_like(self._return), self._return, self._length])
-        self.ended.add_(torch.where(done, counts, 0.0).sum(dim=1))
-        self._return.masked_fill_(done, 0.0)
-        self._length.masked_fill_(done, 0.0)
+        self._ended[0].add_(env.reset_buf)
+        self._ended[1:].add_(torch.where(env.reset_buf, self._so_far, self._zero))
+        self._so_far.masked_fill_(env.reset_buf, 0.0)
 
     @staticmethod
     def _input(model: MLPModel, observations: Mapping[str, Tensor] | TensorDict) -> Tensor:
@@ -94,14 +95,14 @@ class Rollout:
     def _returns(self) -> None:
         """Generalised advantage estimation (Schulman et al., arXiv 1506.02438), backwards over the storage."""
         alg, st = self.alg, self.alg.storage
-        following = alg.critic.mlp(self._input(alg.critic, self._observations))
-        advantage = torch.zeros_like(following)
-        for t in reversed(range(st.num_transitions_per_env)):
-            alive = 1.0 - st.dones[t].float()
-            delta = st.rewards[t] + alive * alg.gamma * following - st.values[t]
-            advantage = delta + alive * (alg.gamma * alg.lam) * advantage
-            torch.add(advantage, st.values[t], out=st.returns[t])
-            following = st.values[t]
+        last = alg.critic.mlp(self._input(alg.critic, self._observations))
+        following = torch.cat([st.values[1:], last.unsqueeze(0)])
+        alive = 1.0 - st.dones.float()
+        sums = st.rewards + alive * alg.gamma * following - st.values  # temporal differences, to which later ones are added
+        decay = alive * (alg.gamma * alg.lam)
+        for t in reversed(range(len(sums) - 1)):
+            sums[t].add_(decay[t] * sums[t + 1])
+        torch.add(sums, st.values, out=st.returns)
         advantages = st.returns - st.values
         if not alg.normalize_advantage_per_mini_batch:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
