@@ -267,8 +267,8 @@ def test_a_follower_sees_the_faces_of_steps():
 # ---- robots of other sizes -------------------------------------------------------------------------------------------
 
 
-def scaled_robot(robot, tmp_path, factor: float):
-    """A robot of one box with legs of boxes, `factor` times as large as 1 m x 0.4 m x 0.5 m."""
+def scaled_robot(robot, tmp_path, factor: float, angle: float = 0.0):
+    """A robot of one box with legs of boxes at an angle, `factor` times as large as 1 m x 0.4 m x 0.5 m."""
     xml = f"""<mujoco><worldbody><body name="base" pos="0 0 {factor}"><freejoint/>
       <geom name="shell" type="box" size="{0.5 * factor} {0.2 * factor} {0.1 * factor}" mass="1"/>
       <body pos="0 0 {-0.1 * factor}"><joint name="hip" axis="0 1 0"/>
@@ -276,7 +276,7 @@ def scaled_robot(robot, tmp_path, factor: float):
       </body></worldbody></mujoco>"""
     (tmp_path / "small.xml").write_text(xml)
     file = replace(robot.file, model="small.xml", base="base")
-    return replace(robot, folder=tmp_path, file=file, joint_names=("hip",), default_dof_pos=np.zeros(1))
+    return replace(robot, folder=tmp_path, file=file, default_qpos=np.array([0, 0, 0, 1, 0, 0, 0, angle]))
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
@@ -284,7 +284,7 @@ def test_a_robot_is_as_large_as_the_box_around_it(robot, tmp_path, factor):
     size = size_of(scaled_robot(robot, tmp_path, factor))
     assert size.longest == pytest.approx(factor)
     assert size.height == pytest.approx(0.5 * factor)  # 0.2 of the shell, 0.3 of the leg
-    turned = replace(scaled_robot(robot, tmp_path, factor), default_dof_pos=np.array([np.pi / 2]))
+    turned = scaled_robot(robot, tmp_path, factor, np.pi / 2)
     assert size_of(turned).height == pytest.approx(factor * 0.2 + 0.01, abs=0.011)  # the leg points along x
 
 

@@ -1,0 +1,229 @@
+"""Policies that others trained, as ONNX files: a YAML file says what their observation consists of."""
+
+import ast
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+
+from legged.config.bounds import LARGEST, between, items, positive
+from legged.config.checks import build
+from legged.config.origins import Origins
+from legged.config.yaml_files import read_yaml
+from legged.errors import ConfigError, suggest
+from legged.process.paths import data_folder, exists
+from legged.robots.patterns import match_values
+from legged.robots.robot import Robot
+
+TERMS = {
+    "base_lin_vel": "linear velocity of the base, base frame [m/s]",
+    "base_ang_vel": "angular velocity of the base, base frame [rad/s]",
+    "projected_gravity": "unit vector along gravity, base frame",
+    "command_xy": "commanded vx and vy [m/s]",
+    "command_yaw": "commanded yaw rate [rad/s]",
+    "dof_pos": "joint angles less the default ones [rad]",
+    "dof_vel": "joint velocities [rad/s]",
+    "actions": "the policy's last output",
+    "phase_sin": "sine of each clock's phase",
+    "phase_cos": "cosine of each clock's phase",
+}
+"""What an observation may consist of."""
+JOINTS, STIFFNESS, DAMPING = (
+    ("dof_names", "joint_names"),
+    ("kp", "stiffness", "joint_stiffness"),
+    ("kd", "damping", "joint_damping"),
+)
+"""Keys of an ONNX file's metadata under which its joints, their order, and gains are found."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The schema of a layout: what a policy sees, and what its output means."""
+
+    observation: dict[str, float] = field(metadata=between(-LARGEST, LARGEST))
+    """Term -> its scale, in the order of the columns."""
+    action_scale: float | dict[str, float] = field(default=0.25, metadata=positive(LARGEST))
+    """Target = action_scale * action + default angle [rad]; one number, or joint-name pattern -> number."""
+    action_clip: float = field(default=100.0, metadata=positive(LARGEST))
+    """Largest action."""
+    joints: tuple[str, ...] = ()
+    """The policy's joints in its order; empty takes those that the ONNX file names, or else the robot's."""
+    default_joint_angles: dict[str, float] = field(default_factory=dict, metadata=between(-100, 100))
+    """Joint-name pattern -> angle at action 0 [rad]; empty takes the robot's."""
+    stiffness: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
+    """Joint-name pattern -> P gain [N m/rad]; empty takes the ONNX file's, or else the robot's."""
+    damping: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
+    """Joint-name pattern -> D gain [N m s/rad]; likewise."""
+    phase_offsets: tuple[float, ...] = field(default=(0.0,), metadata=items(16, between(-100, 100)))
+    """Phase of each clock at the start [rad]."""
+    phase_period_s: float = field(default=1.0, metadata=positive(1000))
+    """Length of a clock's turn [s]."""
+    phase_standing: float | None = field(default=None, metadata=between(-100, 100))
+    """Phase of all clocks while the command is zero [rad]; null lets them run on."""
+    control_dt: float = field(default=0.02, metadata=positive(1.0, low=1e-3))
+    """Time for which an action is held [s]."""
+
+
+def read_layout(name: str, where: str) -> Layout:
+    """Return the layout in the file `name`, or of that name under resources/layouts/; `where` says who asks for it.
+
+    Raises:
+        ConfigError: there is none, or it is none.
+    """
+    folder = data_folder("resources") / "layouts"
+    path = next(
+        (path for path in (Path(name), folder / f"{name}.yaml") if path.name and exists(path) and path.is_file()), None
+    )
+    if path is None:
+        known = suggest(name, [file.stem for file in folder.glob("*.yaml")])
+        raise ConfigError(f"{where}: there is no layout '{name}', neither as a file nor here{known}")
+    data = read_yaml(path)
+    if not data.get("observation"):
+        raise ConfigError(f"{path}: observation: must name at least one term (allowed: {', '.join(TERMS)})")
+    layout = build(Layout, data, "", Origins(), str(path))
+    for term in layout.observation:
+        if term not in TERMS:
+            raise ConfigError(f"{path}: observation: there is no term '{term}'{suggest(term, TERMS)}")
+    return layout
+
+
+class ForeignPolicy:
+    """A policy on one robot: D joints in the robot's order outside, the policy's own order inside."""
+
+    def __init__(self, path: Path, layout: Layout, robot: Robot) -> None:
+        """Load the ONNX file at `path`.
+
+        Raises:
+            ConfigError: it cannot be read, its joints are not the robot's, or its sizes are not the layout's.
+        """
+        self.layout, self._path = layout, path
+        try:
+            self._session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        except Exception as error:  # its errors have no class in common
+            raise ConfigError(f"{path}: onnxruntime cannot read it: {' '.join(str(error).split())}") from error
+        said = dict(self._session.get_modelmeta().custom_metadata_map)
+        joints = list(layout.joints or _listed(said, JOINTS, str(path)) or robot.joint_names)
+        for name in joints:
+            if name not in robot.joint_names:
+                raise ConfigError(f"{path}: joint '{name}' is none of '{robot.name}'{suggest(str(name), robot.joint_names)}")
+        if len(set(joints)) != len(joints) or len(joints) != robot.num_dof:
+            raise ConfigError(f"{path}: it names {len(set(joints))} joints, '{robot.name}' has {robot.num_dof}")
+        self._order = np.array([robot.joint_names.index(name) for name in joints])
+        self.default = robot.default_dof_pos
+        if layout.default_joint_angles:
+            self.default = match_values(layout.default_joint_angles, robot.joint_names, "layout: default_joint_angles")
+        self.stiffness = self._gains(layout.stiffness or robot.file.stiffness, bool(layout.stiffness), said, STIFFNESS, robot)
+        self.damping = self._gains(layout.damping or robot.file.damping, bool(layout.damping), said, DAMPING, robot)
+        scale = layout.action_scale
+        every = match_values(scale, robot.joint_names, "layout: action_scale") if isinstance(scale, dict) else np.array(scale)
+        self._scale = np.broadcast_to(every, (robot.num_dof,))
+        self._check_sizes(robot)
+        self.reset()
+
+    def _gains(
+        self, table: Mapping[str, float], own: bool, said: Mapping[str, str], keys: Sequence[str], robot: Robot
+    ) -> np.ndarray:
+        """Return gains in the robot's order, (D,): those of `table`, if it is the layout's own or the file's metadata have
+        none under `keys`.
+        """
+        listed = _listed(said, keys, str(self._path))
+        if own or listed is None:
+            return match_values(table, robot.joint_names, f"layout: {keys[1]}")
+        if len(listed) != robot.num_dof or not all(isinstance(value, int | float) for value in listed):
+            raise ConfigError(f"{self._path}: metadata {'/'.join(keys)}: expected {robot.num_dof} numbers")
+        gains = np.zeros(robot.num_dof)
+        gains[self._order] = listed
+        return gains
+
+    def _check_sizes(self, robot: Robot) -> None:
+        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
+        if len(inputs) != 1 or len(inputs[0].shape) != 2 or len(outputs[0].shape) != 2:
+            raise ConfigError(f"{self._path}: expected one input of shape (1, numbers), got {[i.shape for i in inputs]}")
+        self._input = inputs[0].name
+        self.reset()
+        nothing = np.zeros(3)
+        width = len(self._observe(nothing, nothing, nothing, nothing, self.default, self.default))
+        if isinstance(inputs[0].shape[1], int) and inputs[0].shape[1] != width:
+            raise ConfigError(f"{self._path}: takes {inputs[0].shape[1]} numbers, the layout's observation has {width}")
+        if isinstance(outputs[0].shape[1], int) and outputs[0].shape[1] != robot.num_dof:
+            raise ConfigError(f"{self._path}: gives {outputs[0].shape[1]} actions, '{robot.name}' has {robot.num_dof} joints")
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self._actions = np.zeros(len(self._order))
+        self._phase = np.array(self.layout.phase_offsets, dtype=float)
+
+    def act(
+        self,
+        command: np.ndarray,
+        lin_vel: np.ndarray,
+        ang_vel: np.ndarray,
+        gravity: np.ndarray,
+        dof_pos: np.ndarray,
+        dof_vel: np.ndarray,
+    ) -> np.ndarray:
+        """Return joint targets (D,) [rad] for the next `control_dt`.
+
+        Args:
+            command: vx, vy [m/s] and yaw rate [rad/s].
+            lin_vel: velocity of the base, base frame [m/s].
+            ang_vel: its angular velocity, base frame [rad/s].
+            gravity: unit vector along gravity, base frame.
+            dof_pos: joint angles (D,) [rad].
+            dof_vel: joint velocities (D,) [rad/s].
+        """
+        standing = self.layout.phase_standing
+        if standing is not None and not np.any(command):
+            self._phase[:] = standing
+        observation = self._observe(command, lin_vel, ang_vel, gravity, dof_pos, dof_vel)
+        actions = self._session.run(None, {self._input: observation[None].astype(np.float32)})[0][0]
+        self._actions = np.clip(actions, -self.layout.action_clip, self.layout.action_clip).astype(float)
+        self._phase += 2.0 * np.pi * self.layout.control_dt / self.layout.phase_period_s
+        targets = np.zeros(len(self._order))
+        targets[self._order] = self._actions
+        return targets * self._scale + self.default
+
+    def _observe(
+        self,
+        command: np.ndarray,
+        lin_vel: np.ndarray,
+        ang_vel: np.ndarray,
+        gravity: np.ndarray,
+        dof_pos: np.ndarray,
+        dof_vel: np.ndarray,
+    ) -> np.ndarray:
+        """Return the observation, (width,)."""
+        terms = {
+            "base_lin_vel": lin_vel,
+            "base_ang_vel": ang_vel,
+            "projected_gravity": gravity,
+            "command_xy": command[:2],
+            "command_yaw": command[2:],
+            "dof_pos": (dof_pos - self.default)[self._order],
+            "dof_vel": dof_vel[self._order],
+            "actions": self._actions,
+            "phase_sin": np.sin(self._phase),
+            "phase_cos": np.cos(self._phase),
+        }
+        return np.concatenate([scale * terms[name] for name, scale in self.layout.observation.items()])
+
+
+def _listed(said: Mapping[str, str], keys: Sequence[str], where: str) -> list[Any] | None:
+    """Return the list under the first of `keys` in an ONNX file's metadata; None if there is none.
+
+    Raises:
+        ConfigError: it is no list.
+    """
+    key = next((key for key in keys if key in said), None)
+    if key is None:
+        return None
+    try:
+        value = ast.literal_eval(said[key])
+    except (ValueError, SyntaxError):
+        value = [part.strip() for part in said[key].split(",")]
+    if not isinstance(value, list | tuple) or not value:
+        raise ConfigError(f"{where}: metadata {key}: expected a list")
+    return list(value)
