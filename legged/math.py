@@ -1,7 +1,11 @@
 """Quaternions (w, x, y, z) and in-place helpers, batched over the first dimension and free of host synchronisation."""
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import torch
 from torch import Tensor
+from torch.nn.functional import mse_loss
 
 
 def quat_rotate(quat: Tensor, vec: Tensor) -> Tensor:
@@ -35,6 +39,16 @@ def yaw_of(quat: Tensor) -> Tensor:
     return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
+def get_euler_xyz(quat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Roll, pitch and yaw [rad], (N,) each, of `quat` (N, 4), w first: the turns about the world's x, y and z axes, in this
+    order, that make up the rotation. Each lies in [-pi, pi] (Isaac Gym's are in [0, 2 pi), of quaternions with w last).
+    """
+    w, x, y, z = quat.unbind(dim=1)
+    roll = torch.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = torch.asin((2.0 * (w * y - z * x)).clamp(-1.0, 1.0))
+    return roll, pitch, yaw_of(quat)
+
+
 def wrap_to_pi(angle: Tensor) -> Tensor:
     """The same angle in [-pi, pi)."""
     return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi
@@ -55,3 +69,15 @@ def masked_set_(target: Tensor, mask: Tensor, value: Tensor | float) -> None:
         torch.where(rows, value, target, out=target)
     else:
         target.masked_fill_(rows, value)
+
+
+def squared_difference(a: Tensor, b: Tensor) -> Tensor:
+    """(a - b)^2 of two tensors of one shape, in one launch."""
+    return mse_loss(a, b, reduction="none")
+
+
+def evenly_spaced(indices: Sequence[int]) -> slice | None:
+    """Return the slice that picks `indices`, if they rise in equal steps: a slice is a view and costs no launch."""
+    steps = {after - before for before, after in pairwise(indices)} or {1}
+    step = min(steps)
+    return slice(indices[0], indices[-1] + 1, step) if indices and len(steps) == 1 and step > 0 else None

@@ -20,6 +20,7 @@ from legged.envs import BaseTask, LeggedRobot
 from legged.errors import ConfigError, suggest
 from legged.gymnasium_ids import add_ids
 from legged.process.paths import data_folder, exists
+from legged.process.startup import importing, stage_ended
 from legged.robots.similarity import grown, size_of
 from legged.terrain import Terrain
 from legged.user_modules import import_tasks
@@ -206,7 +207,9 @@ def make_task(cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool =
     """Build the task that a configuration describes, on its own terrain or on the one given: an instance of `task_class`."""
     other_ground = {} if terrain is None else {"terrain": terrain}  # a user's constructor may not know the argument
     kind: Any = task_class(cfg.task)
-    task = kind(cfg, device, graph, **other_ground)
+    with importing():
+        task = kind(cfg, device, graph, **other_ground)
+    stage_ended("step captured")
     if not hasattr(task, "observation_groups"):
         raise ConfigError(f"{kind.__module__}.{kind.__name__}: its constructor must call super().__init__ with its arguments")
     return task

@@ -11,7 +11,8 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from legged.physics.fused.constraint_solver import ConstraintSolver
+from legged.physics.fused.constraint_solver import ConstraintSolver, ask_for_dense_rows
+from legged.physics.fused.contact_stage import ContactStage
 from legged.physics.fused.torque_step import TorqueStep
 from legged.physics.warp.mujoco_warp import absent_stages
 
@@ -168,6 +169,7 @@ class FusedWorlds:
         """Build `count` worlds, which differ in the arrays `drawn` of the model, of one row a world."""
         drawn = drawn or {}
         self.model, self.device = model, device
+        ask_for_dense_rows(model)
         with wp.ScopedDevice(device):
             self.m = mjw.put_model(model, batch_sizes={name: count for name in drawn})
             for name, values in drawn.items():
@@ -179,6 +181,8 @@ class FusedWorlds:
             assert TorqueStep.why_not(model, drawn) == ""
             self.m.opt.disableflags |= absent_stages(model, drawn)
             self._step = TorqueStep(model, self.m, self.d, drawn)
+            own = not ContactStage.why_not(model, self.m, drawn)
+            self._contacts = ContactStage(model, self.m, self.d, drawn) if own else None
 
     def write(self, qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray) -> None:
         """Put the worlds into states, one row a world, with their controls."""
@@ -189,7 +193,9 @@ class FusedWorlds:
         """Make a step; without rows of constraints for a model that has none, since to make them takes many kernels."""
         with wp.ScopedDevice(self.device):
             self._step.begin()
-            if constrained:
+            if constrained and self._contacts is not None:
+                self._contacts.launch()
+            elif constrained:
                 mjw.collision(self.m, self.d)
                 mjw.make_constraint(self.m, self.d)
             self._step.finish()

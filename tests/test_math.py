@@ -5,7 +5,16 @@ import numpy as np
 import pytest
 import torch
 
-from legged.math import masked_set_, quat_rotate, quat_rotate_inverse, quat_to_matrix, uniform, wrap_to_pi, yaw_of
+from legged.math import (
+    evenly_spaced,
+    masked_set_,
+    quat_rotate,
+    quat_rotate_inverse,
+    quat_to_matrix,
+    uniform,
+    wrap_to_pi,
+    yaw_of,
+)
 
 QUARTER_TURN_ABOUT_Z = torch.tensor([[0.5**0.5, 0.0, 0.0, 0.5**0.5]])
 
@@ -131,3 +140,12 @@ def test_matrices_rotate_as_quaternions_do():
     torch.testing.assert_close(turned, quat_rotate(quats, vectors), atol=1e-6, rtol=0.0)
     around_z = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     torch.testing.assert_close(quat_to_matrix(QUARTER_TURN_ABOUT_Z)[0], around_z, atol=1e-6, rtol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("indices", "found"),
+    [((3, 6, 9, 12), slice(3, 13, 3)), ((0,), slice(0, 1, 1)), ((4, 5), slice(4, 6, 1)), ((1, 2, 4), None), ((), None)],
+)
+def test_evenly_spaced_indices_are_a_slice(indices, found):
+    assert evenly_spaced(indices) == found
+    assert found is None or tuple(range(20)[found]) == indices

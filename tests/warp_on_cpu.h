@@ -60,7 +60,7 @@ inline void __syncwarp() { warp_on_cpu::wait_at(warp_on_cpu::SYNC); }
 inline float __shfl_sync(unsigned, float value, int from) {
     warp_on_cpu::shown[threadIdx.x] = value;
     warp_on_cpu::wait_at(warp_on_cpu::SHUFFLE);
-    const float found = warp_on_cpu::shown[from];
+    const float found = warp_on_cpu::shown[from & 31];
     warp_on_cpu::wait_at(warp_on_cpu::SHUFFLE);
     return found;
 }
@@ -68,3 +68,16 @@ inline float __shfl_sync(unsigned, float value, int from) {
 inline float __shfl_xor_sync(unsigned mask, float value, int apart) {
     return __shfl_sync(mask, value, (int)threadIdx.x ^ apart);
 }
+
+inline unsigned __ballot_sync(unsigned, bool on) {
+    warp_on_cpu::shown[threadIdx.x] = on;
+    warp_on_cpu::wait_at(warp_on_cpu::SHUFFLE);
+    unsigned which = 0;
+    for (unsigned i = 0; i < warp_on_cpu::LANE_COUNT; ++i) which |= (warp_on_cpu::shown[i] != 0.0f) << i;
+    warp_on_cpu::wait_at(warp_on_cpu::SHUFFLE);
+    return which;
+}
+
+inline int __any_sync(unsigned mask, bool on) { return __ballot_sync(mask, on) != 0; }
+inline int __popc(unsigned x) { return __builtin_popcount(x); }
+inline float rsqrtf(float x) { return 1.0f / sqrtf(x); }

@@ -73,7 +73,7 @@ def _guarded(main: Callable[[list[str] | None], int], argv: list[str] | None) ->
             print("interrupted", file=sys.stderr, flush=True)
             return INTERRUPTED
         text = known_failure(error)
-        if text is None and is_of_a_module(traceback.extract_tb(error.__traceback__)[-1].filename):
+        if text is None and is_of_a_module(_file_of(error)):
             _say(f"{type(error).__name__}: {' '.join(str(error).split())}{line_of_user(error)}")
             return EXIT_WRONG_INPUT
         if text is None:
@@ -92,6 +92,14 @@ def line_of_user(error: BaseException) -> str:
                 found = f" ({frame.filename}, line {frame.lineno})"
         behind = behind.__cause__
     return found
+
+
+def _file_of(error: BaseException) -> str:
+    """Return the file in which an error came up; of a name that an object has not, where the name was used."""
+    frames = traceback.extract_tb(error.__traceback__)
+    while len(frames) > 1 and frames[-1].name == "__getattr__":
+        frames.pop()
+    return frames[-1].filename
 
 
 def _is_of_user(frame: traceback.FrameSummary) -> bool:

@@ -8,6 +8,7 @@ import torch
 
 from legged.config import TaskConfig, override
 from legged.envs import BaseTask, LeggedRobot
+from legged.mdp.control import action_scales
 from legged.registry import make_task
 
 ALONE = [("env.num_envs", 1), ("sim.physics", "mujoco"), ("sim.threads", 1), ("train.algorithm.num_mini_batches", 1)]
@@ -85,13 +86,14 @@ def _terminations(task: BaseTask) -> Iterator[str]:
 def _actions(task: BaseTask) -> Iterator[str]:
     model, clip = task.physics.model, task.cfg.control.clip_actions
     rows = [("action", "actuator", "what it does")]
-    for i in range(task.num_actions):
-        rows.append((str(i), model.actuator(i).name or f"({i})", _effect(task, i)))
+    acted = list(task.control.acted) if isinstance(task, LeggedRobot) else list(range(task.num_actions))
+    for i in range(model.nu):
+        rows.append((str(acted.index(i)) if i in acted else "-", model.actuator(i).name or f"({i})", _effect(task, i)))
     yield from _table(f"actions: {task.num_actions} numbers, clipped at +-{clip:g}", rows)
 
 
 def _effect(task: BaseTask, i: int) -> str:
-    """Say what action `i` does."""
+    """Say what actuator `i` does."""
     model = task.physics.model
     on_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
     gains = model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
@@ -108,10 +110,13 @@ def _effect(task: BaseTask, i: int) -> str:
         return f"{joint}: {offset}{float(task.control_reach[i]) * force:g} a [{'N' if slides else 'N m'}]"
     control, law = task.control, task.cfg.control
     p, d, limit = (float(values[i]) for values in (control.stiffness, control.damping, control.torque_limits))
-    if law.control_type == "P":
-        target = f"position {float(task.default_dof_pos[i]):g} + {law.action_scale:g} a [rad]"
+    scales = dict(zip(control.acted, action_scales(task.robot, law).tolist(), strict=True))
+    if i not in scales:
+        target = f"position {float(task.default_dof_pos[i]):g} [rad], held"
+    elif law.control_type == "P":
+        target = f"position {float(task.default_dof_pos[i]):g} + {scales[i]:g} a [rad]"
     else:
-        target = f"{'velocity' if law.control_type == 'V' else 'torque'} {law.action_scale:g} a"
+        target = f"{'velocity' if law.control_type == 'V' else 'torque'} {scales[i]:g} a"
     gains = "" if law.control_type == "T" else f", stiffness {p:g}, damping {d:g}"
     return f"{joint}: {target}{gains}, torque at most {limit:g} N m"
 

@@ -118,7 +118,11 @@ def _check(kind: Any, value: Any, path: str, origins: Origins, source: str) -> A
     if origin in (Union, types.UnionType):
         if value is None and type(None) in args:
             return None
-        return _check(next(a for a in args if a is not type(None)), value, path, origins, source)
+        kinds = [a for a in args if a is not type(None)]
+        maps = [a for a in kinds if typing.get_origin(a) is dict and isinstance(value, Mapping)]
+        if len(kinds) > 1 and not maps and not isinstance(value, int | float):
+            raise fail("a number, or a mapping from names to numbers")
+        return _check((maps or kinds)[0], value, path, origins, source)
     if origin is tuple:
         if not isinstance(value, list | tuple):
             raise fail("a list")

@@ -133,8 +133,10 @@ class LeggedControlConfig(ControlConfig):
     """Joint-name pattern -> P gain [N m/rad]; empty takes the robot's. A pattern is a part of the joint's name."""
     damping: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
     """Joint-name pattern -> D gain [N m s/rad]; empty takes the robot's."""
-    action_scale: float = field(default=0.5, metadata=positive(LARGEST))
-    """Target = action_scale * action + default angle (P) [rad]."""
+    action_scale: float | dict[str, float] = field(default=0.5, metadata=positive(LARGEST))
+    """Target = action_scale * action + default angle (P) [rad]; one number, or joint-name pattern -> number."""
+    held: tuple[str, ...] = field(default=(), metadata=TERMS)
+    """Patterns of joints that have no action (P): their motors hold the default angle with the gains that they have."""
 
 
 @dataclass(frozen=True)

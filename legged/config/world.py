@@ -44,11 +44,12 @@ class SimConfig:
     """Cap of line-search iterations per solver iteration."""
     step: Literal["auto", "fused", "library"] = "auto"
     """How mujoco_warp makes a step: `library`, by its own launches, dozens of them; `fused`, by one launch for all that comes
-    before contacts, one for their forces and one for integration, or there is an error that says what of the model keeps it
-    off; `auto`, `fused` where the model fits, else contact forces alone where they fit (pyramidal cones, 32 degrees of
-    freedom)."""
+    before contacts, one for contacts, one for their forces and one for integration, or there is an error that says what of
+    the model keeps it off; `auto`, `fused` where the model fits, else contact forces alone where they fit (pyramidal cones,
+    32 degrees of freedom)."""
     nconmax: int = field(default=24, metadata=between(1, 10_000))
-    """Contacts (and candidate pairs) allocated per robot in mujoco_warp and newton, in a pool all robots share."""
+    """Contacts for which each robot has room in mujoco_warp and newton. Where their own launches find contacts, robots share
+    that room, and pairs of shapes that might touch take of it too."""
     njmax: int = field(default=96, metadata=between(1, 10_000))
     """Constraint rows allocated per robot in mujoco_warp and in Newton's MuJoCo solver: 4 a contact in the pyramidal cone, 1
     a joint limit."""

@@ -28,8 +28,10 @@ from legged.mdp.observations import ObservationGroup, ObservationTerms
 from legged.mdp.randomization import Randomization
 from legged.mdp.rewards import Rewards
 from legged.mdp.terminations import Terminations
+from legged.mdp.uniform_numbers import UniformNumbers
 from legged.physics import Scene, check_ranges, make_physics
 from legged.process.ranks import Ranks
+from legged.process.startup import stage_ended
 
 
 class BaseTask(SavedTask, VecEnv):
@@ -68,6 +70,7 @@ class BaseTask(SavedTask, VecEnv):
         scene, fields = self.make_scene(), self.randomization.fields
         check_ranges(cfg.domain_rand.ranges, scene, cfg.sim, cfg.origins.where)
         self.physics = make_physics(scene, cfg.sim, n, device, fields, self.QUANTITIES, cfg.origins.where)
+        stage_ended("physics built")
         self.randomization.apply(self.physics)
         self.num_actions = self.physics.ctrl.shape[1]
         self._allocate()
@@ -75,6 +78,7 @@ class BaseTask(SavedTask, VecEnv):
         if not self._has_buffers:
             raise ConfigError(f"{type(self).__name__}._init_buffers must call super()._init_buffers()")
         self._collect_terms()
+        self.numbers.allocate()
         # An engine that no graph can hold runs eagerly on a GPU; on the CPU nothing is captured, only checked.
         self._build_graph(graph and (self.physics.capturable or device.type == "cpu"))
 
@@ -137,6 +141,8 @@ class BaseTask(SavedTask, VecEnv):
         self._clipped_actions = torch.zeros_like(self.actions)
         self._in_bounds = torch.ones_like(self.valid)
         self._beside = Branch(device)  # type: ignore[arg-type]
+        self.numbers = UniformNumbers(n, device)  # type: ignore[arg-type]
+        """What a step draws at random; subclasses ask it for theirs in `_init_buffers`."""
         self.final_step: FinalStep | None = None
         """What episodes ended with, where somebody asked for it (`final_step.keep_final_step`)."""
         self._steps_since_log = 0
@@ -148,11 +154,11 @@ class BaseTask(SavedTask, VecEnv):
 
     def _collect_terms(self) -> None:
         """Find the terms that the configuration names."""
-        cfg, device = self.cfg, self.device
+        cfg, device, kernels = self.cfg, self.device, self.physics.kernels
         scales = {name: scale for name, scale in cfg.rewards.scales.items() if scale != 0.0}
         unit = self.dt if cfg.rewards.times_dt else 1.0
         self.rewards = Rewards(
-            self._methods("_reward_", scales), scales, unit, cfg.rewards.only_positive_rewards, self.rew_buf
+            self._methods("_reward_", scales), scales, unit, cfg.rewards.only_positive_rewards, self.rew_buf, kernels
         )
         self.episode_sums = self.rewards.episode_sums
         failures, time_outs = self.active_terminations()
@@ -191,9 +197,8 @@ class BaseTask(SavedTask, VecEnv):
         group = cfg.groups[name]
         noisy = group.noise and cfg.add_noise
         noise = {term: half * cfg.noise_level for term, half in cfg.noise.items()} if noisy else {}
-        return ObservationGroup(
-            self.observation_terms, group.terms, self.observation_scales(), noise, cfg.clip, group.history
-        )
+        terms, scales = self.observation_terms, self.observation_scales()
+        return ObservationGroup(terms, group.terms, scales, noise, cfg.clip, group.history, self.numbers)
 
     def _build_graph(self, enabled: bool) -> None:
         """Capture the step (on a GPU) or check that it could be (on the CPU), then start all episodes anew."""
@@ -253,17 +258,12 @@ class BaseTask(SavedTask, VecEnv):
 
     def draw(self) -> None:
         """Draw random numbers for every environment, used by those that are reset, and noise. Runs beside the step."""
+        self.numbers.draw()
         self.draw_reset()
-        self.draw_noise()
 
     @abstractmethod
     def draw_reset(self) -> None:
-        """Draw a state for every environment to begin an episode with, into `reset_qpos` and `reset_qvel`."""
-
-    def draw_noise(self) -> None:
-        """Draw the noise of the observations."""
-        for group in self.observation_groups.values():
-            group.draw()
+        """Write a state for every environment to begin an episode with to `reset_qpos`, `reset_qvel`; `numbers` are fresh."""
 
     def sense(self) -> None:
         """Bring everything that follows from the physics' state up to date."""
@@ -279,7 +279,7 @@ class BaseTask(SavedTask, VecEnv):
         largest = torch.linalg.vector_norm(state, torch.inf, dim=1)
         torch.lt(largest, LARGEST_STATE, out=self._in_bounds)  # so is NaN not
         torch.logical_and(self._in_bounds, self.faults.sound, out=self.valid)
-        self.terminations.evaluate(~self.valid, self.episode_length_buf >= self.max_episode_length)
+        self.terminations.evaluate(self.valid, self.episode_length_buf >= self.max_episode_length)
 
     def measure(self) -> None:
         """Record metrics and faults of the step. Runs beside the rewards."""

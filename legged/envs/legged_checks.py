@@ -5,7 +5,8 @@ from typing import Any
 from legged.config.schema import LeggedConfig
 from legged.envs.checks import check_mirror_kinds
 from legged.errors import ConfigError
-from legged.mdp.control import control_gains
+from legged.mdp.control import acted_joints, action_scales, control_gains
+from legged.mdp.mirror_images import mirror_of_actions
 from legged.robots.robot import Robot
 from legged.terrain import check_terrain
 
@@ -22,6 +23,8 @@ def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     if cfg.train.algorithm.symmetry:
         check_symmetry(cls, cfg, robot)
     control_gains(robot, cfg.control, cfg.origins.where)
+    check_passive(cfg, robot)
+    action_scales(robot, cfg.control, cfg.origins.where)
     check_terrain(cfg.terrain, cfg.origins)
     check_base_mass(cfg, robot)
     check_points(cfg)
@@ -37,12 +40,28 @@ def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     where, otherwise = origins.where("train.algorithm.symmetry"), "false learns without mirror images"
     if robot.mirror is None:
         raise ConfigError(f"{where}: '{robot.name}' is lopsided (joints and feet at zero angles); {otherwise}")
+    if mirror_of_actions(robot.mirror, acted_joints(robot, cfg.control, origins.where)) is None:
+        raise ConfigError(f"{origins.where('control.held')}: joints are held on one side only; {otherwise} ({where})")
     used = [term for group in cfg.observations.groups.values() for term in group.terms]
     check_mirror_kinds(cls.__name__, cls.MIRRORED, used, where)
     y = cfg.terrain.measured_points_y
     if sorted(y) != sorted(-value for value in y):
         points = f"terrain.measured_points_y ({origins.of('terrain.measured_points_y')})"
         raise ConfigError(f"{where}: {points} are not the same left and right: {list(y)}")
+
+
+def check_passive(cfg: LeggedConfig, robot: Robot) -> None:
+    """Look whether observations of passive joints are of a robot that has some.
+
+    Raises:
+        ConfigError: it has none.
+    """
+    names = ("passive_pos", "passive_vel")
+    for group, terms in ((name, group.terms) for name, group in cfg.observations.groups.items()):
+        for term in terms:
+            if term in names and (robot.passive is None or not robot.passive.names):
+                where = cfg.origins.where(f"observations.groups.{group}.terms")
+                raise ConfigError(f"{where}: {term}: '{robot.name}' has no passive hinges or slides (passive_joints)")
 
 
 def check_base_mass(cfg: LeggedConfig, robot: Robot) -> None:

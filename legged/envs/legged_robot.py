@@ -9,13 +9,14 @@ from torch import Tensor
 from legged.config.schema import LeggedConfig, TaskConfig
 from legged.envs.base_task import BaseTask
 from legged.envs.legged_checks import check_legged
+from legged.envs.legged_gym_names import LeggedGymNames
 from legged.envs.overrides import check_overrides
 from legged.envs.terms import Terms
-from legged.math import quat_rotate
+from legged.math import evenly_spaced, quat_rotate
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts
-from legged.mdp.control import Control
+from legged.mdp.control import Control, acted_joints
 from legged.mdp.height_scan import HeightScan
 from legged.mdp.mirror_images import MirrorImages
 from legged.mdp.randomization import Pushes, RobotRandomization
@@ -24,8 +25,11 @@ from legged.physics import RobotScene, Scene
 from legged.robots.robot import Robot, load_robot
 from legged.terrain import Terrain
 
+POSES = 256
+"""Poses with closed loops that are drawn at the start."""
 
-class LeggedRobot(Terms, BaseTask):
+
+class LeggedRobot(Terms, LeggedGymNames, BaseTask):
     """A legged robot that follows velocity commands. Subclass it and add `_reward_<name>`, `_obs_<name>`, `_terminate_<name>`
     or `_metric_<name>` methods; the configuration names the ones that run. N robots, D joints, F feet, B tracked collision
     shapes.
@@ -77,10 +81,16 @@ class LeggedRobot(Terms, BaseTask):
         cfg = self.cfg.terrain
         return None if cfg.mesh_type == "plane" else Terrain.build(cfg, self.cfg.env.seed)
 
+    def _allocate(self) -> None:
+        """Leave out the actions of joints that are held."""
+        self.num_actions = len(acted_joints(self.robot, self.cfg.control))
+        super()._allocate()
+
     def _init_buffers(self) -> None:
         """Allocate what follows from the robot, its commands and its ground."""
         super()._init_buffers()
         cfg, robot, n, device = self.cfg, self.robot, self.num_envs, self.device
+        kernels = self.physics.kernels
         state = self.physics.robot_state
         assert state is not None
         self.base_pos, self.base_quat = state.base_pos, state.base_quat
@@ -91,34 +101,50 @@ class LeggedRobot(Terms, BaseTask):
         self.contact_forces = state.contact_forces
         self.last_dof_vel = torch.zeros_like(self.dof_vel)
 
-        self.pushes = Pushes(cfg.domain_rand, n, self.dt, device)
-        self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt)
+        self.pushes = Pushes(cfg.domain_rand, n, self.dt, device, kernels, self.numbers)
+        self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt, kernels)
         self.torques, self.default_dof_pos = self.control.torques, self.control.default_dof_pos
-        self.command_sampler = Commands(cfg.commands, n, self.dt, device)
+        self.command_sampler = Commands(cfg.commands, n, self.dt, device, kernels, self.numbers)
         self.commands, self.is_moving = self.command_sampler.commands, self.command_sampler.is_moving
-        self.contacts = FeetContacts(n, len(robot.feet_indices), self.dt, device)
+        self.contacts = FeetContacts(n, len(robot.feet_indices), self.dt, device, kernels)
         full_ranges = self.command_sampler.full_ranges
-        self.command_curriculum = CommandCurriculum(cfg.commands.curriculum, full_ranges, self.dt)
+        self.command_curriculum = CommandCurriculum(cfg.commands.curriculum, full_ranges, self.dt, kernels)
 
         self.feet_indices = torch.tensor(robot.feet_indices, device=device)
+        self._feet_shapes = evenly_spaced(robot.feet_indices) or self.feet_indices
         self.penalised_indices = torch.tensor(robot.penalised_indices, dtype=torch.long, device=device)
         self.termination_indices = torch.tensor(robot.termination_indices, dtype=torch.long, device=device)
+        self._terminating_shapes = evenly_spaced(robot.termination_indices) or self.termination_indices
         self.dof_vel_limits = torch.tensor(robot.dof_vel_limits, dtype=torch.float32, device=device)
         self.dof_pos_limits = self._soft_limits(robot)
         self.posture_joints = torch.tensor(~robot.swings, dtype=torch.float32, device=device)
-        self.height_scan = HeightScan(cfg.terrain, self.terrain, n, device)
+        self.height_scan = HeightScan(cfg.terrain, self.terrain, n, device, kernels)
         self.measured_heights = self.height_scan.heights
         self.terrain_curriculum: TerrainCurriculum | None = None
         self.env_origins = torch.zeros(n, 3, device=device)
         """(N, 3) where each robot starts, world frame [m]."""
         if self.terrain is not None:
-            self.terrain_curriculum = TerrainCurriculum(cfg.terrain, self.terrain, n, device)
+            self.terrain_curriculum = TerrainCurriculum(cfg.terrain, self.terrain, n, device, kernels)
             self.env_origins = self.terrain_curriculum.origins
-        self._spawn_offset = torch.zeros(n, 3, device=device)
-        self._spawn_offset[:, 2] = robot.file.spawn_height
-        self._reset_velocity = torch.zeros(2, n, 3, device=device)  # linear, angular, both in the base frame
-        self._spawn_yaw = torch.zeros(n, device=device)
+        reach, height = cfg.terrain.spawn_range if self.terrain is not None else 0.0, robot.file.spawn_height
+        self._spawn = self.numbers.between([-reach, -reach, height], [reach, reach, height], 3)
+        low, high = (factor * self.default_dof_pos for factor in cfg.init_state.dof_pos_factor)
+        self._reset_joints = self.numbers.between(low, high, robot.num_dof)
+        self._reset_velocity = self.numbers.between(*cfg.init_state.base_velocity, 6)  # linear, angular; base frame
+        self._reset_yaw = self.numbers.between(*cfg.init_state.yaw, 1)
         self.reset_qpos[:, 3] = 1.0
+        self._poses: Tensor | None = None
+        """(K, nq) poses with closed loops, of which resets take one, where there are passive joints."""
+        if robot.passive is not None:
+            where = cfg.origins.where("init_state.dof_pos_factor")
+            poses = robot.passive.draw(robot.default_qpos, cfg.init_state.dof_pos_factor, POSES, cfg.env.seed, where)
+            self._poses = torch.tensor(poses, dtype=torch.float32, device=device)[:, 7:]
+            self._pose_draw = self.numbers.between(0.0, float(len(poses)), 1)
+            self.passive_default_pos = torch.tensor(
+                robot.default_qpos[list(robot.passive.qpos_columns)], dtype=torch.float32, device=device
+            )
+            self.passive_qpos_columns = torch.tensor(robot.passive.qpos_columns, device=device)
+            self.passive_qvel_columns = torch.tensor(robot.passive.qvel_columns, device=device)
 
     def _soft_limits(self, robot: Robot) -> Tensor:
         """Return joint limits (D, 2), shrunk about their middle by `soft_dof_pos_limit` [rad]."""
@@ -149,8 +175,10 @@ class LeggedRobot(Terms, BaseTask):
         return scales
 
     def mirror_images(self) -> MirrorImages | None:
-        mirror, points, seen = self.robot.mirror, self.height_scan.points, (self.observation_groups, self.num_actions)
-        return None if mirror is None else MirrorImages(type(self).__name__, self.MIRRORED, *seen, mirror, points)
+        mirror, points = self.robot.mirror, self.height_scan.points
+        if mirror is None:
+            return None
+        return MirrorImages(type(self).__name__, self.MIRRORED, self.observation_groups, self.control.acted, mirror, points)
 
     # ---- one control step: what differs from every task's ------------------------------------------------------------
 
@@ -162,27 +190,26 @@ class LeggedRobot(Terms, BaseTask):
         self.control.compute(self.dof_pos, self.dof_vel)
 
     def draw(self) -> None:
-        self.draw_reset()
+        super().draw()
         self.command_sampler.draw()
-        self.pushes.draw()
-        self.draw_noise()
 
     def draw_reset(self) -> None:
-        """Draw joints near the default pose and a base at its spawn height, moving."""
-        cfg = self.cfg.init_state
-        self.reset_qpos[:, 7:].uniform_(*cfg.dof_pos_factor).mul_(self.default_dof_pos)
-        self._reset_velocity.uniform_(*cfg.base_velocity)
-        self._spawn_yaw.uniform_(*cfg.yaw)
+        """Draw joints near the default pose and a base at its spawn height, moving. Of a robot with passive joints, a pose is
+        one of those that were drawn at the start: loops must close.
+        """
         if self.terrain_curriculum is not None:
-            reach = self.cfg.terrain.spawn_range
-            self._spawn_offset[:, :2].uniform_(-reach, reach)
             self.terrain_curriculum.draw()
-        self.reset_qvel[:, :6].unflatten(1, (2, 3)).copy_(self._reset_velocity.transpose(0, 1))
-        if cfg.yaw != (0.0, 0.0):
-            torch.cos(0.5 * self._spawn_yaw, out=self.reset_qpos[:, 3])
-            torch.sin(0.5 * self._spawn_yaw, out=self.reset_qpos[:, 6])
+        if self._poses is None:
+            self.reset_qpos[:, 7:].copy_(self._reset_joints.values)
+        else:
+            self.reset_qpos[:, 7:].copy_(self._poses[self._pose_draw.values[:, 0].long().clamp_(max=len(self._poses) - 1)])
+        self.reset_qvel[:, :6].copy_(self._reset_velocity.values)
+        if self.cfg.init_state.yaw != (0.0, 0.0):
+            half_yaw = 0.5 * self._reset_yaw.values[:, 0]
+            torch.cos(half_yaw, out=self.reset_qpos[:, 3])
+            torch.sin(half_yaw, out=self.reset_qpos[:, 6])
             # MuJoCo has the linear velocity of a floating base in the world frame, the angular one in the base's.
-            self.reset_qvel[:, :3].copy_(quat_rotate(self.reset_qpos[:, 3:7], self._reset_velocity[0]))
+            self.reset_qvel[:, :3].copy_(quat_rotate(self.reset_qpos[:, 3:7], self._reset_velocity.values[:, :3]))
 
     def sense(self) -> None:
         super().sense()
@@ -190,21 +217,17 @@ class LeggedRobot(Terms, BaseTask):
 
     def advance(self) -> None:
         super().advance()
-        self.contacts.update(self.contact_forces[:, self.feet_indices])
-
-    def measure(self) -> None:
-        super().measure()
-        velocity = torch.cat([self.base_lin_vel[:, :2], self.base_ang_vel[:, 2:]], dim=1)
-        self.command_curriculum.update(self.commands[:, :3], velocity, self.valid)
-        self.command_curriculum.write_ranges(self.command_sampler.ranges)
+        self.contacts.update(self.contact_forces[:, self._feet_shapes])
 
     def update_curricula(self) -> None:
+        self.command_curriculum.update(self.commands[:, :3], self.base_lin_vel, self.base_ang_vel, self.valid)
+        self.command_curriculum.write_ranges(self.command_sampler.ranges)
         if self.terrain_curriculum is not None:
             asked = self.commands[:, :2].norm(dim=1) * self.cfg.env.episode_length_s
             self.terrain_curriculum.update(self.reset_buf & self.valid, self.base_pos, asked)
 
     def reset_idx(self, mask: Tensor) -> None:
-        torch.add(self.env_origins, self._spawn_offset, out=self.reset_qpos[:, :3])
+        torch.add(self.env_origins, self._spawn.values, out=self.reset_qpos[:, :3])
         super().reset_idx(mask)
         self.control.reset(mask)
         self.contacts.reset(mask)

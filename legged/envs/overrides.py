@@ -18,6 +18,7 @@ _START = (
 _BUILD = "the robot is its MJCF (robot: in the task's YAML), the ground is terrain: or what make_terrain() returns"
 _DRAWING = "nothing is drawn while training; play.py makes pictures (legged/rendering)"
 _TORQUES = "control.control_type, control.stiffness and control.damping choose the law; others go into legged/mdp/control.py"
+_RANDOM = "domain_rand.ranges names what is drawn for each robot (docs/tasks.md, Randomisation)"
 
 HOOKS = {
     # legged_gym and its forks
@@ -47,6 +48,19 @@ HOOKS = {
     "_create_trimesh": _BUILD,
     "_get_env_origins": "self.env_origins (N, 3) are the terrain's; terrain.spawn_range scatters robots around them",
     "create_sim": _BUILD,
+    "_reset_buffers": _STEP,
+    "_init_foot": "self.feet_pos and self.feet_vel (N, F, 3) are there; buffers of your own are made in _init_buffers()",
+    "update_feet_state": "self.feet_pos and self.feet_vel (N, F, 3) are current after every step",
+    "compute_self_observations": _OBSERVE,
+    "compute_termination_observations": "a task whose episodes end keeps what they ended with where somebody asks for it"
+    " (legged/envs/final_step.py)",
+    "_disturbance_robots": "domain_rand.push_robots pushes; others override disturb(mask), with self.physics.push",
+    "_step_contact_targets": "override advance(), call super().advance() and write your own tensors in place",
+    "_call_train_eval": _STEP,
+    "_randomize_dof_props": _RANDOM,
+    "_randomize_rigid_body_props": _RANDOM,
+    "_randomize_gravity": "gravity is the same for all robots: that of the MJCF",
+    "refresh_actor_rigid_shape_props": _RANDOM,
     "_draw_debug_vis": _DRAWING,
     "render": _DRAWING,
     "set_camera": _DRAWING,
@@ -60,13 +74,20 @@ HOOKS = {
     "_reset_idx": "override reset_idx(mask), with a bool a robot",
 }
 """Hook of another framework -> what takes its place here."""
+OUTSIDE = {
+    "step": "training runs _step() as a CUDA graph, without it; override the hooks of _step(), and call super()'s in them",
+    "get_observations": "training reads the groups' buffers, without it; " + _OBSERVE,
+}
+"""Method of a task that only play and evaluation call -> what is overridden in its place."""
 
 
 def check_overrides(cls: type) -> None:
-    """Look for hooks that `cls`, or a class between it and the class of this package that it extends, defines in vain.
+    """Look for hooks that `cls`, or a class between it and the class of this package that it extends, defines in vain, and
+    whether it can be made as tasks are made here.
 
     Raises:
-        ConfigError: there is one which that class does not have and no OWN_HELPERS names.
+        ConfigError: there is a hook which that class does not have, or which training does not call, and no OWN_HELPERS
+            names; or a constructor that wants other arguments.
     """
     base = next(part for part in cls.__mro__ if part.__module__.startswith("legged."))
     between = [part for part in cls.__mro__ if part not in base.__mro__]
@@ -76,11 +97,33 @@ def check_overrides(cls: type) -> None:
         helpers |= {own} if isinstance(own, str) else set(own)
     for part in between:
         for name in vars(part):
-            if name in HOOKS and name not in helpers and not hasattr(base, name):
-                raise ConfigError(
-                    f"{place(part, vars(part)[name])}: {part.__name__}.{name} would never be called: {HOOKS[name]}"
-                    f" (if your own code calls it: OWN_HELPERS = ('{name}',) in the class)"
-                )
+            if name in helpers or not (name in OUTSIDE or (name in HOOKS and not hasattr(base, name))):
+                continue
+            vain = f"would not act: {OUTSIDE[name]}" if name in OUTSIDE else f"would never be called: {HOOKS[name]}"
+            raise ConfigError(
+                f"{place(part, vars(part)[name])}: {part.__name__}.{name} {vain}"
+                f" (if your own code calls it: OWN_HELPERS = ('{name}',) in the class)"
+            )
+        if "__init__" in vars(part):
+            _check_constructor(part)
+
+
+def _check_constructor(part: type) -> None:
+    """Look whether a class can be made with what the registry gives it.
+
+    Raises:
+        ConfigError: it can't.
+    """
+    constructor = vars(part)["__init__"]
+    try:
+        inspect.signature(constructor).bind(None, None, "cpu", True)
+    except TypeError as error:
+        raise ConfigError(
+            f"{place(part, constructor)}: {part.__name__}.__init__ must take (self, cfg, device, graph), as tasks here do"
+            f" ({error}); Isaac Gym's arguments mean nothing here, and buffers are made in _init_buffers()"
+        ) from error
+    except ValueError:  # of something without a signature
+        return
 
 
 KINDS = {"_reward_": "reward", "_obs_": "observation", "_terminate_": "termination"}

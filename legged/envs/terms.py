@@ -7,11 +7,13 @@ import torch
 from torch import Tensor
 
 from legged.config.schema import LeggedConfig
+from legged.math import squared_difference
 from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
 from legged.mdp.height_scan import HeightScan
 from legged.mdp.mirror_images import MirrorKind
 from legged.mdp.tracking_error import velocity_error, yaw_rate_error
+from legged.physics import Physics
 from legged.terrain import Terrain
 
 TERMINATION_FORCE = 1.0
@@ -32,13 +34,16 @@ class Terms:
         "commands": "command",
         "dof_pos": "joints",
         "dof_vel": "joints",
-        "actions": "joints",
+        "actions": "actions",
         "heights": "heights",
+        "passive_pos": "passive",
+        "passive_vel": "passive",
     }
     """Observation term -> how its numbers change when left and right are exchanged; a subclass adds its own terms'."""
     cfg: LeggedConfig
     dt: float
     """Control step [s]."""
+    physics: Physics
     base_pos: Tensor
     """(N, 3) base in the world [m]; `base_quat` (N, 4) is its orientation (w, x, y, z)."""
     base_quat: Tensor
@@ -53,13 +58,18 @@ class Terms:
     last_dof_vel: Tensor
     default_dof_pos: Tensor
     """(D,) joint angles at action 0 [rad]."""
+    passive_default_pos: Tensor
+    """(P,) passive hinges [rad] and slides [m] at action 0; where they are among the generalised positions and velocities.
+    Only robots with passive joints have these three."""
+    passive_qpos_columns: Tensor
+    passive_qvel_columns: Tensor
     dof_pos_limits: Tensor
     """(D, 2) soft limits [rad]; `dof_vel_limits` (D,) [rad/s]."""
     dof_vel_limits: Tensor
     torques: Tensor
     """(N, D) [N m]."""
     actions: Tensor
-    """(N, D) of this step; `last_actions` of the step before."""
+    """(N, A) of this step, one for each joint that is not held; `last_actions` of the step before."""
     last_actions: Tensor
     commands: Tensor
     """(N, 4) vx, vy [m/s], yaw rate [rad/s], heading [rad]; `is_moving` (N,) whether any velocity is commanded."""
@@ -70,6 +80,10 @@ class Terms:
     contact_forces: Tensor
     """(N, B, 3) in the world [N]; `feet_indices` and `penalised_indices` pick among the shapes."""
     feet_indices: Tensor
+    _feet_shapes: slice | Tensor
+    """The feet among the shapes, and below the shapes that must not touch anything: a slice where they are evenly spaced,
+    which costs no launch."""
+    _terminating_shapes: slice | Tensor
     penalised_indices: Tensor
     posture_joints: Tensor
     """(D,) 1 for joints that do not swing a leg forward and back, else 0."""
@@ -111,6 +125,14 @@ class Terms:
     def _obs_dof_vel(self) -> Tensor:
         """Joint velocity, by joint [rad/s]."""
         return self.dof_vel
+
+    def _obs_passive_pos(self) -> Tensor:
+        """Angles of the passive joints, less those of the default pose: among them how far springs give way [rad]."""
+        return self.physics.qpos[:, self.passive_qpos_columns] - self.passive_default_pos
+
+    def _obs_passive_vel(self) -> Tensor:
+        """Velocities of the passive joints [rad/s]."""
+        return self.physics.qvel[:, self.passive_qvel_columns]
 
     def _obs_actions(self) -> Tensor:
         """The policy's last output within plus and minus action_clip, by joint; 0 at the start of an episode [1]."""
@@ -162,15 +184,15 @@ class Terms:
 
     def _reward_dof_acc(self) -> Tensor:
         """Squared joint accelerations over a control step [rad^2/s^4]."""
-        return ((self.last_dof_vel - self.dof_vel) / self.dt).square().sum(dim=1)
+        return squared_difference(self.last_dof_vel, self.dof_vel).sum(dim=1) / self.dt**2
 
     def _reward_action_rate(self) -> Tensor:
         """Squared change of the actions."""
-        return (self.last_actions - self.actions).square().sum(dim=1)
+        return squared_difference(self.last_actions, self.actions).sum(dim=1)
 
     def _reward_collision(self) -> Tensor:
         """Number of penalised shapes that touch something."""
-        return (self.contact_forces[:, self.penalised_indices].norm(dim=2) > PENALISED_FORCE).sum(dim=1).float()
+        return (self.contact_forces[:, self.penalised_indices].norm(dim=2) > PENALISED_FORCE).sum(dim=1, dtype=torch.float32)
 
     def _reward_termination(self) -> Tensor:
         """Failing; added after the clip at zero."""
@@ -247,7 +269,7 @@ class Terms:
 
     def _terminate_contact(self) -> Tensor:
         """A shape of the robot's `terminate_after_contacts_on` feels a force."""
-        return (self.contact_forces[:, self.termination_indices].norm(dim=2) > TERMINATION_FORCE).any(dim=1)
+        return (self.contact_forces[:, self._terminating_shapes].norm(dim=2) > TERMINATION_FORCE).any(dim=1)
 
     def _terminate_base_height(self) -> Tensor:
         """The base is too close to the ground under it."""

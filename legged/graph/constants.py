@@ -54,6 +54,20 @@ class Constants:
         finally:
             self.making = False
 
+    def pick(self, tensor: Tensor, index: Any) -> tuple[Tensor, Any]:
+        """Return a tensor and an index that give what `tensor[index]` does, where `index` has numbers that are tensors of its
+        device, as `forces[:, feet[0]]`: torch would read each on the host.
+        """
+        parts = index if isinstance(index, tuple) else (index,)
+        for place, part in enumerate(parts):
+            if _is_number(part) and part.device == tensor.device:
+                before, after = parts[:place], parts[place:]
+                from_behind = any(other is Ellipsis for other in before)
+                dim = tensor.dim() - sum(map(_dimensions, after)) if from_behind else sum(map(_dimensions, before))
+                tensor = tensor[(*[slice(None)] * dim, part.view(1))]
+                parts = (*before, 0, *after[1:])
+        return tensor, parts if isinstance(index, tuple) else parts[0]
+
     def index(self, tensor: Tensor, index: Any) -> Any:
         """Return an index of `tensor` that says the same without lists, arrays, or tensors of another device."""
         parts = index if isinstance(index, tuple) else (index,)
@@ -84,6 +98,20 @@ class Constants:
         positions = positions.astype(np.int64)
         key = ("index", positions.shape, positions.tobytes(), device)
         return self.get(key, lambda: torch.tensor(positions, device=device))
+
+
+def _is_number(part: Any) -> bool:
+    """Return whether a part of an index is a tensor of one whole number."""
+    kinds = (torch.int64, torch.int32, torch.int16, torch.int8)
+    return isinstance(part, Tensor) and part.dim() == 0 and part.dtype in kinds
+
+
+def _dimensions(part: Any) -> int:
+    """Return how many dimensions of a tensor a part of an index takes up."""
+    if part is None or part is Ellipsis or isinstance(part, bool):
+        return 0
+    is_mask = isinstance(part, Tensor | np.ndarray) and part.dtype in (torch.bool, torch.uint8, np.bool_)
+    return part.ndim if is_mask else 1
 
 
 def holds_tensors(data: Any) -> bool:

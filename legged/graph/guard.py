@@ -243,6 +243,8 @@ def default_device() -> torch.device | None:
 
 UNCHECKED = "looks on the host whether it succeeded (inv, solve); torch.linalg.inv_ex and the like do not"
 
+DECOMPOSED = "looks on the host whether it converged (svd, eigh, eig, and pinv, cond and matrix_rank, which use them)"
+
 
 class _Operators(TorchDispatchMode):
     """Sees every operator that runs, whoever calls it."""
@@ -252,6 +254,13 @@ class _Operators(TorchDispatchMode):
         aten.equal.default: "reads a value on the host (torch.equal)",
         aten._linalg_check_errors.default: UNCHECKED,
         aten.inverse.default: UNCHECKED,
+        aten.cholesky.default: UNCHECKED,
+        aten._linalg_svd.default: DECOMPOSED,
+        aten._linalg_eigh.default: DECOMPOSED,
+        aten.linalg_eig.default: DECOMPOSED,
+        aten.linalg_pinv.atol_rtol_tensor: DECOMPOSED,
+        aten.linalg_matrix_exp.default: "looks at the size of its matrices on the host (matrix_exp)",
+        aten._to_sparse.default: "has a result of unknown size (to_sparse)",
         aten.normal.Tensor_Tensor: "looks at its deviations on the host; mean + std * torch.randn_like(mean) does not",
         aten.normal.float_Tensor: "looks at its deviations on the host; mean + std * torch.randn_like(std) does not",
         aten.multinomial.default: "looks at its weights on the host (multinomial)",
@@ -310,6 +319,8 @@ class _Calls(TorchFunctionMode):
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs, guard = kwargs or {}, self._guard
+        if func is Tensor.__getitem__:
+            args = guard.constants.pick(*args)
         if func in (Tensor.__getitem__, Tensor.__setitem__):
             return func(args[0], guard.constants.index(args[0], args[1]), *args[2:])
         if func in self.REASONS:

@@ -17,6 +17,7 @@ from legged.learning.runner import Runner
 from legged.learning.update_threads import UpdateThreads
 from legged.process.cores import available_cores
 from legged.process.ranks import Ranks
+from legged.process.startup import stage_ended
 
 ROLLOUTS_TO_WARM_UP = 1
 """Steps have been warmed up when the task was built."""
@@ -51,7 +52,9 @@ class CapturedRunner(Runner):
         if self.is_distributed:
             self.alg.broadcast_parameters()
         self._rollout = rollout = Rollout(self.env, self.alg)
+        stage_ended("learner built")
         collect, update = self._capture(rollout)
+        stage_ended("training captured")
         if not self._go_on() and init_at_random_ep_len:
             length = self.env.episode_length_buf
             self.env.episode_length_buf = torch.randint_like(length, high=int(self.env.max_episode_length))
@@ -68,6 +71,8 @@ class CapturedRunner(Runner):
             clock.lap()
             self.current_learning_iteration = iteration
             self._log(iteration, first, total, rollout, clock)
+            if iteration == first:
+                stage_ended("first iteration")
             if self.logger.writer is not None and iteration % self.cfg["save_interval"] == 0:
                 self.save(str(Path(self.logger.log_dir) / f"model_{iteration}.pt"))
         if self.logger.writer is not None:

@@ -1,13 +1,21 @@
 """Velocity commands: sampling, holding, heading mode."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
 from legged.config.schema import CommandsConfig
-from legged.math import masked_set_, uniform, wrap_to_pi, yaw_of
+from legged.math import masked_set_, wrap_to_pi, yaw_of
+from legged.mdp.uniform_numbers import UniformNumbers
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
 
 MOVING = 0.1
 """Norm of (vx, vy, yaw rate) above which a robot is asked to move."""
+STANDING = 4
+"""The last kind of command."""
 HEADING_GAIN = 0.5
 """Yaw rate per heading error in heading mode [1/s]."""
 
@@ -17,9 +25,17 @@ class Commands:
 
     STATE = ("commands", "is_moving", "ranges", "time_left", "held", "steered", "standing")
 
-    def __init__(self, cfg: CommandsConfig, num_envs: int, dt: float, device: torch.device) -> None:
+    def __init__(
+        self,
+        cfg: CommandsConfig,
+        num_envs: int,
+        dt: float,
+        device: torch.device,
+        kernels: "TaskKernels | None" = None,
+        numbers: UniformNumbers | None = None,
+    ) -> None:
         """Start all commands at zero, due to be sampled at the first update; `dt` is the control step [s]."""
-        self.cfg, self.dt = cfg, dt
+        self.cfg, self.dt, self._kernels = cfg, dt, kernels
         ranges = (cfg.ranges.lin_vel_x, cfg.ranges.lin_vel_y, cfg.ranges.ang_vel_yaw)
         self.full_ranges = torch.tensor(ranges, device=device)
         self.ranges = self.full_ranges.clone()
@@ -38,28 +54,34 @@ class Commands:
         """(N,) robots that are asked to stand still, also in heading mode."""
         self._sample = torch.zeros(num_envs, 4, device=device)
         self._sample_standing = torch.zeros_like(self.standing)
+        self.numbers = numbers or UniformNumbers(num_envs, device)
+        self._velocity = self.numbers.between(0.0, 1.0, 3)
+        self._heading = self.numbers.between(*cfg.ranges.heading, 1)
+        self._chance = self.numbers.between(0.0, 1.0, 1)
+        # Kinds of commands: one axis only, of three, which a cube of random commands hardly contains; all axes; none.
+        single, standing = cfg.single_axis_share * (1.0 - cfg.standing_share) / 3.0, cfg.standing_share
+        self._up_to = torch.tensor([single, 2.0 * single, 3.0 * single, 1.0 - standing], device=device)
+        kept = torch.cat([torch.eye(3), torch.ones(1, 3), torch.zeros(1, 3)])
+        self._kept = torch.cat([kept, torch.ones(5, 1)], dim=1).to(device)  # a heading is kept by all kinds
 
     def draw(self) -> None:
-        """Draw a new command for every robot, for those that `update` finds due."""
-        cfg, device, n = self.cfg, self.commands.device, len(self.commands)
+        """Make a new command for every robot, for those that `update` finds due, of numbers just drawn."""
         low, high = self.ranges[:, 0], self.ranges[:, 1]
-        velocity = torch.addcmul(low, high - low, torch.rand(n, 3, device=device))
-        # One axis only, for a share of the robots: the cases a cube of random commands hardly contains.
-        axis = torch.randint(3, (n, 1), device=device)
-        chance = torch.rand(n, 2, device=device)
-        other = torch.arange(3, device=device) != axis
-        velocity = velocity.masked_fill((chance[:, :1] < cfg.single_axis_share) & other, 0.0)
-        small = velocity[:, :2].norm(dim=1, keepdim=True) < cfg.small_command
-        standing = chance[:, 1:] < cfg.standing_share
-        self._sample[:, :2].copy_(velocity[:, :2].masked_fill(small | standing, 0.0))
-        self._sample[:, 2:3].copy_(velocity[:, 2:].masked_fill(standing, 0.0))
-        self._sample_standing.copy_(standing[:, 0])
-        self._sample[:, 3].copy_(uniform(*cfg.ranges.heading, (n,), device))
+        torch.addcmul(low, high - low, self._velocity.values, out=self._sample[:, :3])
+        self._sample[:, 3:].copy_(self._heading.values)
+        kind = (self._chance.values >= self._up_to).sum(dim=1)
+        self._sample.mul_(self._kept.index_select(0, kind))
+        horizontal = self._sample[:, :2]
+        horizontal.masked_fill_(horizontal.norm(dim=1, keepdim=True) < self.cfg.small_command, 0.0)
+        torch.eq(kind, STANDING, out=self._sample_standing)
 
     def update(self, reset: Tensor, base_quat: Tensor) -> None:
         """Take the drawn command where an episode begins or the time is up, then steer towards the headings."""
+        if self._kernels is not None:
+            self._update_in_one_launch(reset, base_quat)
+            return
         self.time_left.sub_(self.dt)
-        due = (reset | (self.time_left <= 0.5 * self.dt)) & ~self.held
+        due = (reset | (self.time_left <= 0.5 * self.dt)) > self.held  # the one and not the other
         masked_set_(self.commands, due, self._sample)
         masked_set_(self.standing, due, self._sample_standing)
         masked_set_(self.time_left, due, self.cfg.resampling_time_s)
@@ -69,6 +91,15 @@ class Commands:
             steered = self.steered & ~self.standing
             self.commands[:, 2].copy_(torch.where(steered, (HEADING_GAIN * error).clamp(low, high), self.commands[:, 2]))
         torch.gt(self.commands[:, :3].norm(dim=1), MOVING, out=self.is_moving)
+
+    def _update_in_one_launch(self, reset: Tensor, base_quat: Tensor) -> None:
+        assert self._kernels is not None
+        masks = (reset, self.held, self.steered)
+        drawn = (self._sample, self._sample_standing)
+        times = (self.dt, 0.5 * self.dt, self.cfg.resampling_time_s)
+        steering = (HEADING_GAIN if self.cfg.heading_command else 0.0, *self.cfg.ranges.ang_vel_yaw)
+        written = (self.commands, self.standing, self.time_left, self.is_moving)
+        self._kernels.renew_commands(*masks, *drawn, base_quat, *times, *steering, MOVING, *written)
 
     def hold(self, commands: Tensor, heading: Tensor | None = None) -> None:
         """Give all robots fixed commands, (N, 3) or one (3,) for all, which are not sampled any more. With `heading` (N,)

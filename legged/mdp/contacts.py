@@ -1,9 +1,14 @@
 """Contact and swing times of the feet, kept whether or not a reward asks for them."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
 from legged.math import masked_set_
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
 
 CONTACT_FORCE = 1.0
 """Vertical force above which a foot counts as in contact [N]."""
@@ -16,9 +21,11 @@ class FeetContacts:
 
     STATE = ("_flags", "_times")
 
-    def __init__(self, num_envs: int, num_feet: int, dt: float, device: torch.device) -> None:
+    def __init__(
+        self, num_envs: int, num_feet: int, dt: float, device: torch.device, kernels: "TaskKernels | None" = None
+    ) -> None:
         """Start all feet on the ground, at rest; `dt` is the control step [s]."""
-        self.dt = dt
+        self.dt, self._kernels = dt, kernels
         # Views of two blocks, so that a reset is two launches.
         self._flags = torch.zeros(num_envs, 3, num_feet, dtype=torch.bool, device=device)
         self._times = torch.zeros(num_envs, 2, num_feet, device=device)
@@ -29,12 +36,17 @@ class FeetContacts:
 
     def update(self, feet_forces: Tensor) -> None:
         """Advance by one control step; `feet_forces` (N, F, 3) in the world frame [N]."""
+        if self._kernels is not None:
+            times = (self.air_time, self.last_air_time)
+            flags = (self.in_contact, self.first_contact, self._touching)
+            self._kernels.advance_feet(feet_forces, CONTACT_FORCE, self.dt, *flags, *times)
+            return
         touching = feet_forces[:, :, 2] > CONTACT_FORCE
         torch.logical_or(touching, self._touching, out=self.in_contact)
         self._touching.copy_(touching)
-        self.first_contact.copy_((self.air_time > 0.0) & self.in_contact)
+        torch.logical_and(self.air_time, self.in_contact, out=self.first_contact)  # it was in the air: a time above 0
         self.air_time.add_(self.dt)
-        self.last_air_time.copy_(torch.where(self.first_contact, self.air_time, self.last_air_time))
+        torch.where(self.first_contact, self.air_time, self.last_air_time, out=self.last_air_time)
         self.air_time.masked_fill_(self.in_contact, 0.0)
 
     def reset(self, mask: Tensor) -> None:

@@ -1,14 +1,20 @@
 """Action -> joint torque."""
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from legged.config.schema import LeggedControlConfig
+from legged.errors import ConfigError
 from legged.math import masked_set_
+from legged.robots.patterns import match_names, match_values
 from legged.robots.robot import Robot
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
 
 
 class Control:
@@ -17,22 +23,36 @@ class Control:
     P: stiffness * (action_scale * action + default - q) - damping * dq
     V: stiffness * (action_scale * action - dq) - damping * ddq, with ddq over one physics step
     T: action_scale * action
+
+    D joints, of which A have an action; for the others, which are held, the law has 0 in its place.
     """
 
     STATE = ("_last_dof_vel",)
 
-    def __init__(self, robot: Robot, cfg: LeggedControlConfig, torques: Tensor, sim_dt: float) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        cfg: LeggedControlConfig,
+        torques: Tensor,
+        sim_dt: float,
+        kernels: "TaskKernels | None" = None,
+    ) -> None:
         """Write torques to `torques` (N, D), the physics' own tensor, which takes their device along. Gains come
         from `cfg` if it names any, else from the robot.
 
         Raises:
-            ConfigError: a gain pattern that matches no joint, or a joint without a gain.
+            ConfigError: a pattern that matches no joint, a joint without a gain or scale, or joints held without P.
         """
 
         def tensor(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=torques.device)
 
-        self.control_type, self.action_scale, self.sim_dt = cfg.control_type, cfg.action_scale, sim_dt
+        self.control_type, self.sim_dt, self._kernels = cfg.control_type, sim_dt, kernels
+        self.acted = acted_joints(robot, cfg)
+        """(A,) the joint of each action."""
+        scales = action_scales(robot, cfg)
+        self.action_scale = cfg.action_scale if isinstance(cfg.action_scale, float) else tensor(scales)
+        """Of all actions, or (A,)."""
         stiffness, damping = control_gains(robot, cfg)
         self.stiffness, self.damping = tensor(stiffness), tensor(damping)
         """(D,) gains [N m/rad], [N m s/rad]."""
@@ -41,17 +61,30 @@ class Control:
         self._lowest_torques = -self.torque_limits
         self.torques = torques
         """(N, D) torques of the last physics step [N m]."""
+        self._zero = torch.zeros((), device=torques.device)
         self._target = torch.zeros_like(self.torques)  # joint angles, velocities or torques
+        self._columns = None if len(self.acted) == robot.num_dof else torch.tensor(self.acted, device=torques.device)
         self._last_dof_vel = torch.zeros_like(self.torques)
 
     def set_actions(self, actions: Tensor) -> None:
-        """Take the actions (N, D) that the following calls of `compute` realise."""
-        torch.mul(actions, self.action_scale, out=self._target)
-        if self.control_type == "P":
-            self._target.add_(self.default_dof_pos)
+        """Take the actions (N, A) that the following calls of `compute` realise."""
+        middle = self.default_dof_pos if self.control_type == "P" else self._zero
+        if self._columns is None and isinstance(self.action_scale, float):
+            torch.add(middle, actions, alpha=self.action_scale, out=self._target)
+            return
+        if self._columns is None:
+            torch.mul(actions, self.action_scale, out=self._target)
+        else:
+            self._target.zero_().index_copy_(1, self._columns, actions * self.action_scale)
+        self._target.add_(middle)
 
     def compute(self, dof_pos: Tensor, dof_vel: Tensor) -> Tensor:
         """Compute torques (N, D) [N m] at joint angles [rad] and velocities [rad/s], each (N, D), for one physics step."""
+        if self.control_type == "P" and self._kernels is not None:
+            gains = (self.stiffness, self.damping, self.torque_limits)
+            shape = tuple(self.torques.shape)
+            self._kernels.hold_joints(shape, self._target, dof_pos, dof_vel, *gains, self.torques)
+            return self.torques
         if self.control_type == "P":
             torques = torch.addcmul(self.stiffness * (self._target - dof_pos), self.damping, dof_vel, value=-1.0)
         elif self.control_type == "V":
@@ -77,3 +110,31 @@ def control_gains(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str],
         return robot.gains(own, where(f"control.{name}")) if own else of_robot
 
     return gains("stiffness", cfg.stiffness, robot.stiffness), gains("damping", cfg.damping, robot.damping)
+
+
+def acted_joints(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> tuple[int, ...]:
+    """Return the joints that have an action, (A,): all but those that are held. `where` is as for `control_gains`.
+
+    Raises:
+        ConfigError: a pattern that matches no joint, no joint left, or joints held by another law than P.
+    """
+    if not cfg.held:
+        return tuple(range(robot.num_dof))
+    held = match_names(cfg.held, robot.joint_names, where("control.held"))
+    if cfg.control_type != "P":
+        raise ConfigError(f"{where('control.held')}: joints are held by control_type P only, not {cfg.control_type}")
+    if len(held) == robot.num_dof:
+        raise ConfigError(f"{where('control.held')}: every joint of '{robot.name}' is held, so there is no action")
+    return tuple(i for i in range(robot.num_dof) if i not in held)
+
+
+def action_scales(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> np.ndarray:
+    """Return the scale of each action, (A,). `where` is as for `control_gains`.
+
+    Raises:
+        ConfigError: as `acted_joints`, a pattern that matches no joint with an action, or such a joint without a scale.
+    """
+    acted = acted_joints(robot, cfg, where)
+    if not isinstance(cfg.action_scale, dict):
+        return np.full(len(acted), cfg.action_scale)
+    return match_values(cfg.action_scale, [robot.joint_names[i] for i in acted], where("control.action_scale"))

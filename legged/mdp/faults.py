@@ -28,22 +28,24 @@ class Faults:
         """(N,) robots whose rewards and observations of the last step were numbers; the others end at the next one."""
         self._terms = observations
         self._names = ("physics", "action", *(f"reward_{n}" for n in rewards), *(f"obs_{n}" for n in observations.columns))
-        self._seen = torch.zeros(2 + len(rewards), num_envs, dtype=torch.bool, device=device)
-        self._physics, self._action, self._rewards = self._seen[0], self._seen[1], self._seen[2:]
+        self._now = torch.zeros(2, num_envs, dtype=torch.bool, device=device)  # physics, action
+        self._seen = torch.zeros_like(self._now)
+        self._rewards_whole = torch.ones(len(rewards), num_envs, dtype=torch.bool, device=device)
         # Of observations the largest number is kept, by column, which costs two launches a step; robots are counted later.
         self._largest = torch.zeros_like(observations.values)
 
     def check_state(self, in_bounds: Tensor, clipped_actions: Tensor) -> None:
         """Take in which robots' states and actions are numbers, (N,), and the actions (N, D), which are finite or NaN."""
-        broken = (clipped_actions != clipped_actions).any(dim=1)
-        self._action.logical_or_(broken)
-        self._physics.logical_or_(~(in_bounds | broken))
+        physics, action = self._now
+        torch.any(clipped_actions != clipped_actions, dim=1, out=action)
+        torch.eq(in_bounds, action, out=physics)  # neither: who has an action that is none is not in bounds
+        self._seen.logical_or_(self._now)
 
     def check_rewards(self, fine: Tensor, valid: Tensor) -> None:
         """Take in which rewards are numbers, (terms, N), of the robots that were sound before, (N,); the others end now."""
-        broken = valid & ~fine
-        torch.logical_not(broken.any(dim=0), out=self.sound)
-        self._rewards.logical_or_(broken)
+        whole = fine >= valid  # fine, or not valid
+        torch.all(whole, dim=0, out=self.sound)
+        self._rewards_whole.logical_and_(whole)
 
     def check_observations(self) -> None:
         """Look at the terms' values, before they are scaled and clipped; after `check_rewards`."""
@@ -56,8 +58,9 @@ class Faults:
         were none; then start anew.
         """
         broken = [~(self._largest[:, columns].amax(dim=1) < LARGEST) for columns in self._terms.columns.values()]
-        counts = torch.cat([self._seen, torch.stack(broken)]).sum(dim=1).float()
+        counts = torch.cat([self._seen, ~self._rewards_whole, torch.stack(broken)]).sum(dim=1).float()
         self._seen.zero_()
+        self._rewards_whole.fill_(True)
         self._largest.zero_()
         counts = torch.where(counts > 0.0, counts, torch.nan)  # NaN says "no value", and is not logged
         return {f"Faults/{name}": count for name, count in zip(self._names, counts.unbind(), strict=True)}

@@ -1,11 +1,16 @@
 """Heights of the ground around robots, by lookup in the height map."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
 from legged.config.schema import TerrainConfig
 from legged.math import yaw_of
 from legged.terrain.terrain import Terrain
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
 
 
 class HeightScan:
@@ -16,9 +21,16 @@ class HeightScan:
 
     STATE: tuple[str, ...] = ()  # heights follow from where the robots are
 
-    def __init__(self, cfg: TerrainConfig, terrain: Terrain | None, num_envs: int, device: torch.device) -> None:
+    def __init__(
+        self,
+        cfg: TerrainConfig,
+        terrain: Terrain | None,
+        num_envs: int,
+        device: torch.device,
+        kernels: "TaskKernels | None" = None,
+    ) -> None:
         """Scan at cfg.measured_points_x times cfg.measured_points_y, x changing slowest."""
-        self._on_plane = terrain is None
+        self._on_plane, self._kernels = terrain is None, kernels
         x = torch.tensor(cfg.measured_points_x, device=device)
         y = torch.tensor(cfg.measured_points_y, device=device)
         self.points = torch.cartesian_prod(x, y)
@@ -30,7 +42,7 @@ class HeightScan:
         if terrain is not None:
             ground = terrain.height_map
             lowest = torch.tensor(ground.scan_map(), device=device)
-            self._cell, self._columns = ground.cell, lowest.shape[1]
+            self._cell, (self._rows, self._columns) = ground.cell, lowest.shape
             self._origin = torch.tensor(ground.origin, dtype=torch.float32, device=device)
             self._last = [float(size - 1) for size in lowest.shape]
             self._map = lowest.flatten()
@@ -40,6 +52,10 @@ class HeightScan:
     def update(self, base_pos: Tensor, base_quat: Tensor) -> None:
         """Look up the heights for bases at (N, 3), (N, 4) in the world; outside the map, those at its border."""
         if self._on_plane:
+            return
+        if self._kernels is not None:
+            points, ground = (self._x, self._y), (self._map, self._origin, self._cell, self._rows, self._columns)
+            self._kernels.scan_heights(base_pos, base_quat, *points, *ground, self.heights, self.ground)
             return
         yaw = yaw_of(base_quat).nan_to_num().unsqueeze(1)
         cos, sin = torch.cos(yaw), torch.sin(yaw)

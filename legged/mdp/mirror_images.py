@@ -1,6 +1,6 @@
 """Observations and actions seen in a mirror: left legs for right ones, leftward for rightward."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import torch
@@ -10,10 +10,10 @@ from legged.errors import ConfigError
 from legged.mdp.observations import ObservationGroup
 from legged.robots.mirror import Mirror
 
-MirrorKind = Literal["same", "vector", "rotation", "command", "joints", "feet", "heights"]
+MirrorKind = Literal["same", "vector", "rotation", "command", "joints", "actions", "passive", "feet", "heights"]
 """How the numbers of an observation change. `vector`: (x, y, z) of a velocity or direction; `rotation`: of an angular
-velocity; `command`: (vx, vy, yaw rate); `joints`, `feet`: a number for each; `heights`: the height scan; `same`: numbers that
-know no side."""
+velocity; `command`: (vx, vy, yaw rate); `joints`, `actions`, `passive` (joints), `feet`: a number for each; `heights`: the
+height scan; `same`: numbers that know no side."""
 SIGNS = {"vector": (1.0, -1.0, 1.0), "rotation": (-1.0, 1.0, -1.0), "command": (1.0, -1.0, -1.0)}
 """Kind of term -> signs of its three numbers. A rotation is a pseudo-vector: it keeps its y."""
 
@@ -29,23 +29,24 @@ class MirrorImages:
         owner: str,
         kinds: Mapping[str, str],
         groups: Mapping[str, ObservationGroup],
-        num_actions: int,
+        acted: Sequence[int],
         mirror: Mirror,
         points: Tensor,
     ) -> None:
         """Mirror every observation group, and the actions as the term `actions`.
 
-        `kinds` says for each term how it is mirrored (`MirrorKind`), `owner` is the name of the task's
-        class, for errors. `points` (P, 2) are where heights are measured, in the yaw frame [m].
+        `kinds` says for each term how it is mirrored (`MirrorKind`), `owner` is the name of the task's class, for errors.
+        `acted` (A,) is the joint of each action. `points` (P, 2) are where heights are measured, in the yaw frame [m].
 
         Raises:
             ConfigError: a term has no kind, one that there is not, or not as many numbers as its kind.
         """
         self._owner, self._kinds, self._mirror, self._points = owner, kinds, mirror, points.cpu()
+        self._acted = acted
         device = next(iter(groups.values())).buffer.device
         self.groups = {name: self._group(group) for name, group in groups.items()}
         """Group -> its image, of all steps of its history."""
-        columns, signs = self._term("actions", num_actions)
+        columns, signs = self._term("actions", len(acted))
         self.actions: Image = (columns.to(device), signs.to(device))
         """Image of the actions."""
 
@@ -77,6 +78,13 @@ class MirrorImages:
             return torch.arange(len(SIGNS[kind])), torch.tensor(SIGNS[kind])
         if kind == "joints":
             return torch.tensor(self._mirror.joints), torch.tensor(self._mirror.signs)
+        if kind == "passive":
+            return torch.tensor(self._mirror.passive, dtype=torch.long), torch.tensor(self._mirror.passive_signs)
+        if kind == "actions":
+            image = mirror_of_actions(self._mirror, self._acted)
+            if image is None:
+                raise ConfigError(f"{self._owner}: control.held: joints are held on one side only, so actions have no image")
+            return torch.tensor(image[0]), torch.tensor(image[1])
         if kind == "same":
             columns = torch.arange(width)
         elif kind == "feet":
@@ -86,3 +94,13 @@ class MirrorImages:
         else:
             raise ConfigError(f"{self._owner}.MIRRORED: there is no way to mirror '{kind}'")
         return columns, torch.ones(len(columns))
+
+
+def mirror_of_actions(mirror: Mirror, acted: Sequence[int]) -> tuple[list[int], list[float]] | None:
+    """Return for each action, of the joints `acted`, the one whose place it takes over, and its sign; None where a joint has
+    an action and its partner has none.
+    """
+    number = {joint: i for i, joint in enumerate(acted)}
+    if any(mirror.joints[joint] not in number for joint in acted):
+        return None
+    return [number[mirror.joints[joint]] for joint in acted], [mirror.signs[joint] for joint in acted]

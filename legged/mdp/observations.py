@@ -8,6 +8,7 @@ from torch import Tensor
 
 from legged.graph.step_graph import calling
 from legged.math import masked_set_
+from legged.mdp.uniform_numbers import UniformNumbers
 
 
 class ObservationTerms:
@@ -71,6 +72,7 @@ class ObservationGroup:
         noise: Mapping[str, float],
         clip: float,
         history: int = 1,
+        numbers: UniformNumbers | None = None,
     ) -> None:
         """Make the group of the terms `names` of `source`, in that order. No noise where none is named."""
         self.clip, self.history = clip, history
@@ -95,13 +97,9 @@ class ObservationGroup:
         self._columns = None if together else torch.tensor(columns, device=device)
         self._scale = torch.cat([term.scale for term in self.terms])
         half = torch.cat([torch.full_like(term.scale, term.noise) for term in self.terms])
-        self._noise_width = half * self._scale if bool(half.any()) else None
-        self._noise = torch.zeros(num_envs, start, device=device)
-
-    def draw(self) -> None:
-        """Draw the noise of the next `compute`."""
-        if self._noise_width is not None:
-            self._noise.uniform_(-1.0, 1.0).mul_(self._noise_width)
+        width = half * self._scale
+        self.numbers = numbers or UniformNumbers(num_envs, device)
+        self._noise = self.numbers.between(-width, width, start) if bool(half.any()) else None
 
     def advance(self) -> None:
         """Make room for a new step, forgetting the oldest."""
@@ -124,7 +122,10 @@ class ObservationGroup:
     def _write(self, step: Tensor) -> None:
         """Write the terms' values, scaled, noised and clipped, into `step` (N, width)."""
         values = self._values if self._columns is None else self._values.index_select(1, self._columns)
-        torch.addcmul(self._noise, values, self._scale, out=step)
+        if self._noise is None:
+            torch.mul(values, self._scale, out=step)
+        else:
+            torch.addcmul(self._noise.values, values, self._scale, out=step)
         step.clamp_(-self.clip, self.clip)
 
     def restart(self, mask: Tensor) -> None:

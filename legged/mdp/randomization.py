@@ -1,13 +1,18 @@
 """What differs from world to world, and pushes."""
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from legged.config.schema import LeggedDomainRandConfig
 from legged.math import masked_set_, uniform
+from legged.mdp.uniform_numbers import UniformNumbers
 from legged.physics import Physics
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
 
 
 class Randomization:
@@ -70,23 +75,35 @@ class Pushes:
 
     STATE = ("push_time_left",)
 
-    def __init__(self, cfg: LeggedDomainRandConfig, num_envs: int, dt: float, device: torch.device) -> None:
+    def __init__(
+        self,
+        cfg: LeggedDomainRandConfig,
+        num_envs: int,
+        dt: float,
+        device: torch.device,
+        kernels: "TaskKernels | None" = None,
+        numbers: UniformNumbers | None = None,
+    ) -> None:
         """Spread the first pushes over a whole interval; `dt` is the control step [s]."""
-        self.cfg, self.dt = cfg, dt
+        self.cfg, self.dt, self._kernels = cfg, dt, kernels
         self.push_time_left = uniform(0.0, cfg.push_interval_s, (num_envs,), device)
         """(N,) time until the next push [s]."""
-        self._push_velocity = torch.zeros(num_envs, 2, device=device)
-
-    def draw(self) -> None:
-        """Draw a push for every robot, for those that `push` finds due."""
-        reach = self.cfg.max_push_vel_xy
-        self._push_velocity.uniform_(-reach, reach)
+        self.numbers = numbers or UniformNumbers(num_envs, device)
+        self._velocity = self.numbers.between(-cfg.max_push_vel_xy, cfg.max_push_vel_xy, 2)
+        self._due = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self._delta = torch.zeros(num_envs, 2, device=device)
 
     def push(self, physics: Physics, mask: Tensor) -> None:
-        """Set the base's horizontal velocity, world frame, of the robots in `mask` (N,) that are due."""
+        """Set the base's horizontal velocity, world frame, of the robots in `mask` (N,) that are due, to one just drawn."""
         if not self.cfg.push_robots:
+            return
+        if self._kernels is not None:
+            times = (self.dt, 0.5 * self.dt, self.cfg.push_interval_s)
+            found = (self.push_time_left, self._due, self._delta)
+            self._kernels.find_pushes(mask, self._velocity.values, physics.qvel, *times, *found)
+            physics.push(self._due, self._delta)
             return
         self.push_time_left.sub_(self.dt)
         due = (self.push_time_left <= 0.5 * self.dt) & mask
-        physics.push(due, self._push_velocity - physics.qvel[:, :2])
+        physics.push(due, self._velocity.values - physics.qvel[:, :2])
         masked_set_(self.push_time_left, due, self.cfg.push_interval_s)

@@ -1,6 +1,7 @@
 """Reward terms: scaled, summed, clipped and recorded per episode."""
 
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -8,6 +9,9 @@ from torch import Tensor
 from legged.graph.step_graph import calling
 from legged.math import masked_set_
 from legged.mdp.faults import LARGEST
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
 
 
 class Rewards:
@@ -22,9 +26,11 @@ class Rewards:
         dt: float,
         only_positive: bool,
         total: Tensor,
+        kernels: "TaskKernels | None" = None,
     ) -> None:
         """Take functions and scales by term; `dt` is the control step [s]; sums are written to `total` (N,)."""
         num_envs, device = len(total), total.device
+        self._kernels = kernels
         self.functions = dict(functions)
         self.names = tuple(functions)
         self.scales = {name: scales[name] * dt for name in self.names}
@@ -56,9 +62,17 @@ class Rewards:
         for name, function in self.functions.items():
             with calling(f"_reward_{name}"):
                 value = function()
+                if isinstance(value, int | float):  # the same for every robot, such as `return 1.0` for being alive
+                    value = torch.full_like(self.total, value)
+                if not isinstance(value, Tensor):
+                    raise ValueError(f"must return a tensor ({self.num_envs},), got {type(value).__name__}")
                 if value.shape != (self.num_envs,):
                     raise ValueError(f"must return a tensor ({self.num_envs},), got {tuple(value.shape)}")
             values.append(value)
+        if self._kernels is not None:
+            rule = (self._factors, self._before_clip, valid, LARGEST, self.only_positive)
+            self._kernels.add_rewards(torch.stack(values).float(), *rule, self.fine, self.last, self.sums, self.total)
+            return self.total
         # Stacked, so that scaling, masking and summing cost a launch each and not one a term.
         scaled = torch.stack(values) * self._factors
         torch.lt(scaled.abs(), LARGEST, out=self.fine)

@@ -1,6 +1,7 @@
 """Terms that end episodes, by name."""
 
 from collections.abc import Callable, Mapping
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -26,21 +27,17 @@ class Terminations:
         self.found: list[Tensor] = [torch.zeros_like(failed) for _ in self.names]
         """For each term the robots (N,) that it has ended at the last step."""
 
-    def evaluate(self, broken: Tensor, over: Tensor) -> None:
-        """Judge the step: the robots of `broken` (N,) have failed and those of `over` (N,) are out of time whatever the terms
-        say. Who has failed is not out of time as well.
+    def evaluate(self, valid: Tensor, over: Tensor) -> None:
+        """Judge the step: the robots outside `valid` (N,) have failed and those of `over` (N,) are out of time whatever the
+        terms say. Who has failed is not out of time as well.
         """
-        found = []
-        failed, timed_out = broken, over
-        for name, function in self._failures.items():
-            found.append(self._value(name, function))
-            failed = failed | found[-1]
-        for name, function in self._time_outs.items():
-            found.append(self._value(name, function))
-            timed_out = timed_out | found[-1]
-        self.found = found
-        self.failed.copy_(failed)
-        self.timed_out.copy_(timed_out & ~failed)
+        failures = [self._value(name, function) for name, function in self._failures.items()]
+        time_outs = [self._value(name, function) for name, function in self._time_outs.items()]
+        self.found = failures + time_outs
+        torch.logical_not(valid, out=self.failed)
+        for found in failures:
+            self.failed.logical_or_(found)
+        torch.gt(reduce(torch.logical_or, time_outs, over), self.failed, out=self.timed_out)  # the one and not the other
         torch.logical_or(self.failed, self.timed_out, out=self.ended)
 
     def _value(self, name: str, function: Callable[[], Tensor]) -> Tensor:

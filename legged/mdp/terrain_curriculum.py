@@ -1,10 +1,15 @@
 """The terrain curriculum: robots move to harder tiles while they get across, and back while they do not."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
 from legged.config.schema import TerrainConfig
 from legged.terrain.terrain import Terrain
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
 
 
 class TerrainCurriculum:
@@ -17,9 +22,16 @@ class TerrainCurriculum:
 
     STATE = ("levels", "columns", "origins", "_sums")
 
-    def __init__(self, cfg: TerrainConfig, terrain: Terrain, num_envs: int, device: torch.device) -> None:
+    def __init__(
+        self,
+        cfg: TerrainConfig,
+        terrain: Terrain,
+        num_envs: int,
+        device: torch.device,
+        kernels: "TaskKernels | None" = None,
+    ) -> None:
         """Spread robots evenly over the columns, at levels up to cfg.max_init_terrain_level."""
-        self.enabled = cfg.curriculum
+        self.enabled, self._kernels = cfg.curriculum, kernels
         self.rows, columns = terrain.origins.shape[:2]
         highest = cfg.max_init_terrain_level if cfg.curriculum else self.rows - 1
         self.levels = torch.randint(0, min(highest, self.rows - 1) + 1, (num_envs,), device=device)
@@ -54,6 +66,12 @@ class TerrainCurriculum:
         them to go in an episode (N,) [m].
         """
         if not self.enabled:
+            return
+        if self._kernels is not None:
+            judged = torch.empty(3, len(mask), device=mask.device)
+            tiles = (self.rows, self._count, self._random, self.columns, self._tiles)
+            self._kernels.move_levels(mask, base_pos, asked, self._far, *tiles, self.levels, self.origins, judged)
+            self._sums.add_(judged @ self._of_type.t())
             return
         walked = (base_pos[:, :2] - self.origins[:, :2]).norm(dim=1)
         up = mask & (walked > self._far)

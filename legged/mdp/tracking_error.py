@@ -2,6 +2,8 @@
 
 from torch import Tensor
 
+from legged.math import squared_difference
+
 
 def velocity_error(commands: Tensor, base_lin_vel: Tensor) -> Tensor:
     """Return the squared error of the horizontal velocity, (N,) [m^2/s^2].
@@ -9,7 +11,7 @@ def velocity_error(commands: Tensor, base_lin_vel: Tensor) -> Tensor:
     `commands` (N, 3 or more) are vx, vy [m/s] and yaw rate [rad/s], `base_lin_vel` (N, 3) is the base's velocity [m/s], both
     in the base frame.
     """
-    return (commands[:, :2] - base_lin_vel[:, :2]).square().sum(dim=1)
+    return squared_difference(commands[:, :2], base_lin_vel[:, :2]).sum(dim=1)
 
 
 def yaw_rate_error(commands: Tensor, base_ang_vel: Tensor) -> Tensor:
@@ -17,4 +19,4 @@ def yaw_rate_error(commands: Tensor, base_ang_vel: Tensor) -> Tensor:
 
     `commands` are as above, `base_ang_vel` (N, 3) is the base's angular velocity, base frame [rad/s].
     """
-    return (commands[:, 2] - base_ang_vel[:, 2]).square()
+    return squared_difference(commands[:, 2], base_ang_vel[:, 2])

@@ -82,6 +82,11 @@ def check_engine(
         raise ConfigError(
             f"{where('sim.physics')}: newton simulates robots with a floating base, not {scene.name}; {others} take any"
         )
+    if scene.robot.passive is not None:
+        raise ConfigError(
+            f"{where('sim.physics')}: newton does not simulate the joints of '{scene.robot.name}' that no motor drives"
+            f" (passive_joints), and their loops; {others} do"
+        )
     for field in randomized:
         if field not in NEWTONS_FIELDS:
             can = suggest(field, NEWTONS_FIELDS, "newton can")

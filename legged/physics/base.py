@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 import mujoco
 import torch
@@ -10,6 +11,9 @@ from torch import Tensor
 from legged.physics.quantities import found
 from legged.physics.robot_state import RobotState
 from legged.state import take
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
 
 
 class Physics(ABC):
@@ -39,8 +43,12 @@ class Physics(ABC):
     why_library: str = ""
     """Why some of a step are an engine's own launches, where ours could take their place; empty where they do, or where there
     are none."""
+    fitted: str = ""
+    """Which simple shapes stand for meshes, because the collider of the terrain knows none; empty if none do."""
     overflowed: Tensor
     """(N,) bool: worlds that lost contacts or constraint rows for want of memory since the last refresh."""
+    kernels: "TaskKernels | None" = None
+    """What parts of a task take in place of torch's launches, where an engine can launch its own."""
     library_step: Callable[[], None] | None = None
     """A physics step as the engine's library makes it by itself, to compare with, where ours is another one."""
     _quantities: dict[str, Tensor]

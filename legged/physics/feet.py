@@ -15,17 +15,19 @@ from legged.robots.robot import Robot
 
 @dataclass(frozen=True)
 class FootChains:
-    """The hinges between each foot and the base. Arrays are (levels, F, ...), from the foot's body up to the base's
-    child; lengths in metres, frames and axes in the body's own frame.
+    """The hinges between each foot and the base, driven or passive. Arrays are (levels, F, ...), from the foot up to the
+    base; lengths in metres. A hinge turns points about its axis, in a frame that stands fixed in the frame of the next one.
     """
 
     offset: np.ndarray
-    """(F, 3) mean of the centres of the foot's shapes, in their body."""
-    joint: np.ndarray
-    """(levels, F) index of the hinge among the robot's joints."""
+    """(F, 3) the foot in the frame of its first hinge: the mean of the centres of its shapes."""
+    position: np.ndarray
+    """(levels, F) where the hinge's angle is among MuJoCo's generalised positions, and its rate among the velocities."""
+    speed: np.ndarray
     axis: np.ndarray
     anchor: np.ndarray
     body_pos: np.ndarray
+    """(levels, F, 3) pose of the hinge's frame, at angle 0, in that of the next one; `body_quat` its orientation."""
     body_quat: np.ndarray
 
     @classmethod
@@ -33,33 +35,88 @@ class FootChains:
         """The chains of a robot.
 
         Raises:
-            ConfigError: feet at different depths, or a body in between without exactly one hinge.
+            ConfigError: feet on different numbers of hinges, or a joint in between that is no hinge.
         """
-        feet = [[model.geom(name) for name in shapes] for shapes in robot.feet_shapes]
         base = model.body(robot.file.base).id
-        bodies = [_chain(model, int(geoms[0].bodyid[0]), base) for geoms in feet]
-        if len({len(chain) for chain in bodies}) != 1:
-            raise ConfigError(f"{robot.folder}: feet: all feet must hang on the same number of bodies")
-        body = np.array(bodies, dtype=int).T
-        if (model.body_jntnum[body] != 1).any():
-            raise ConfigError(f"{robot.folder}: feet: every body between base and foot needs exactly one hinge")
-        joint = model.body_jntadr[body]
+        feet, offsets = [], []
+        for shapes in robot.feet_shapes:
+            geoms = [model.geom(name) for name in shapes]
+            offset = np.mean([geom.pos for geom in geoms], axis=0)
+            chain, offset = _hinges(model, int(geoms[0].bodyid[0]), base, offset, f"{robot.folder}: feet")
+            feet.append(chain)
+            offsets.append(offset)
+        if len({len(chain) for chain in feet}) != 1 or not feet[0]:
+            raise ConfigError(f"{robot.folder}: feet: all feet must hang on the same number of bodies that turn, one or more")
+        levels = list(zip(*feet, strict=True))
         return cls(
-            offset=np.array([np.mean([geom.pos for geom in geoms], axis=0) for geoms in feet]),
-            joint=model.jnt_dofadr[joint] - 6,
-            axis=model.jnt_axis[joint],
-            anchor=model.jnt_pos[joint],
-            body_pos=model.body_pos[body],
-            body_quat=model.body_quat[body],
+            offset=np.array(offsets),
+            position=np.array([[model.jnt_qposadr[hinge.joint] for hinge in level] for level in levels]),
+            speed=np.array([[model.jnt_dofadr[hinge.joint] for hinge in level] for level in levels]),
+            axis=np.array([[model.jnt_axis[hinge.joint] for hinge in level] for level in levels]),
+            anchor=np.array([[model.jnt_pos[hinge.joint] for hinge in level] for level in levels]),
+            body_pos=np.array([[hinge.pos for hinge in level] for level in levels]),
+            body_quat=np.array([[hinge.quat for hinge in level] for level in levels]),
         )
+
+
+@dataclass
+class _Hinge:
+    """A hinge, and the pose of its frame at angle 0 in that of the next one towards the base."""
+
+    joint: int
+    pos: np.ndarray
+    quat: np.ndarray
+
+
+def _hinges(model: mujoco.MjModel, body: int, base: int, offset: np.ndarray, where: str) -> tuple[list[_Hinge], np.ndarray]:
+    """Return the hinges from `body` up to `base`, and the point `offset` of the body in the frame of the first one. Bodies
+    that are welded to the next one have none; several hinges of one body follow each other.
+
+    Raises:
+        ConfigError: a joint is no hinge; `where` says who asks.
+    """
+    found: list[_Hinge] = []
+    while body not in (0, base):
+        for joint in reversed(range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])):
+            if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
+                raise ConfigError(f"{where}: joint '{model.joint(joint).name}' between base and foot is no hinge")
+            found.append(_Hinge(joint, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])))
+            if model.qpos0[model.jnt_qposadr[joint]] != 0.0:  # bodies are drawn at the reference angle
+                _turn_back(model, found[-1])
+        if found:
+            found[-1].pos, found[-1].quat = _moved(model, body, found[-1].pos, found[-1].quat)
+        else:
+            offset, _ = _moved(model, body, offset, np.array([1.0, 0.0, 0.0, 0.0]))
+        body = int(model.body_parentid[body])
+    return found, offset
+
+
+def _turn_back(model: mujoco.MjModel, hinge: _Hinge) -> None:
+    """Turn a hinge's frame from its reference angle to angle 0, about its anchor."""
+    anchor, turned = model.jnt_pos[hinge.joint], np.zeros(3)
+    reference = float(model.qpos0[model.jnt_qposadr[hinge.joint]])
+    mujoco.mju_axisAngle2Quat(hinge.quat, model.jnt_axis[hinge.joint], -reference)
+    mujoco.mju_rotVecQuat(turned, -anchor, hinge.quat)
+    hinge.pos = anchor + turned
+
+
+def _moved(model: mujoco.MjModel, body: int, pos: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a pose in a body as one in its parent, with the body as it is drawn; exactly the body's own, if it is none."""
+    if not pos.any() and quat[0] == 1.0:
+        return model.body_pos[body].copy(), model.body_quat[body].copy()
+    turned, both = np.zeros(3), np.zeros(4)
+    mujoco.mju_rotVecQuat(turned, pos, model.body_quat[body])
+    mujoco.mju_mulQuat(both, model.body_quat[body], quat)
+    return model.body_pos[body] + turned, both
 
 
 @dataclass(frozen=True)
 class _Level:
     """One hinge of each chain, as matrices on vectors in columns."""
 
-    joint: Tensor
-    """(F,) index of the hinge."""
+    position: Tensor
+    """(F,) where the angle is in the positions, and the rate in the velocities."""
+    speed: Tensor
     anchor: Tensor
     """(F, 3, 1) [m]"""
     along: Tensor
@@ -67,9 +124,9 @@ class _Level:
     across: Tensor
     """(F, 3, 3) cross product with it: a x."""
     mount: Tensor | None
-    """(F, 3, 3) orientation of the body in its parent; none if all frames are parallel."""
+    """(F, 3, 3) orientation of its frame in the next one; none if all frames are parallel."""
     pos: Tensor
-    """(F, 3, 1) place of the body in its parent [m]."""
+    """(F, 3, 1) place of its frame in the next one [m]."""
 
 
 class FeetKinematics:
@@ -79,7 +136,9 @@ class FeetKinematics:
     cost no engine call. Worlds are the last dimension, along which memory runs: with vectors last it takes twice as long.
     """
 
-    def __init__(self, model: mujoco.MjModel, robot: Robot) -> None:
+    def __init__(self, model: mujoco.MjModel, robot: Robot, qpos: Tensor, qvel: Tensor) -> None:
+        """For robots whose live coordinates are `qpos` (N, nq) and `qvel` (N, nv), MuJoCo's."""
+        self._qpos, self._qvel = qpos, qvel
         chains = FootChains.of(model, robot)
 
         def tensor(values: np.ndarray) -> Tensor:
@@ -89,30 +148,31 @@ class FeetKinematics:
         columns = np.eye(3)
         self._levels = [
             _Level(
-                joint=torch.tensor(joint),
+                position=torch.tensor(position),
+                speed=torch.tensor(speed),
                 anchor=tensor(anchor).unsqueeze(2),
                 along=tensor(axis[:, :, None] * axis[:, None, :]),
                 across=tensor(np.cross(axis[:, None, :], columns).transpose(0, 2, 1)),
                 mount=None if np.allclose(quat, [1.0, 0.0, 0.0, 0.0]) else quat_to_matrix(tensor(quat)),
                 pos=tensor(pos).unsqueeze(2),
             )
-            for joint, anchor, axis, quat, pos in zip(
-                chains.joint, chains.anchor, chains.axis, chains.body_quat, chains.body_pos, strict=True
+            for position, speed, anchor, axis, quat, pos in zip(
+                chains.position, chains.speed, chains.anchor, chains.axis, chains.body_quat, chains.body_pos, strict=True
             )
         ]
 
     def write(self, state: RobotState) -> None:
         """The live base and joint state -> state.feet_pos [m] and state.feet_vel [m/s], (N, F, 3), world frame."""
         feet, worlds = len(self._offset), len(state.base_pos)
-        angles, rates = state.dof_pos.t().contiguous(), state.dof_vel.t().contiguous()
+        angles, rates = self._qpos.t().contiguous(), self._qvel.t().contiguous()
         moved = torch.zeros(feet, 3, 2, worlds)  # points and their velocities, in the base frame at the end
         moved[:, :, 0] = self._offset
         for level in self._levels:
             moved[:, :, 0] -= level.anchor
-            angle = angles[level.joint].view(feet, 1, 1, worlds)
+            angle = angles[level.position].view(feet, 1, 1, worlds)
             along, across = (_apply(matrix, moved) for matrix in (level.along, level.across))
             moved = along + torch.cos(angle) * (moved - along) + torch.sin(angle) * across  # Rodrigues' formula
-            rate = rates[level.joint].unsqueeze(1)
+            rate = rates[level.speed].unsqueeze(1)
             moved[:, :, 1] += rate * (level.across @ moved[:, :, 0])
             moved[:, :, 0] += level.anchor
             if level.mount is not None:
@@ -131,12 +191,3 @@ class FeetKinematics:
 def _apply(matrix: Tensor, moved: Tensor) -> Tensor:
     """(F, 3, 3) on the second dimension of (F, 3, 2, N)."""
     return (matrix @ moved.flatten(2)).view_as(moved)
-
-
-def _chain(model: mujoco.MjModel, body: int, base: int) -> list[int]:
-    """Bodies from `body` up to the child of `base`."""
-    chain = []
-    while body not in (0, base):
-        chain.append(body)
-        body = int(model.body_parentid[body])
-    return chain

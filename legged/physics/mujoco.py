@@ -15,7 +15,7 @@ from legged.physics.engine_warnings import keep_out_of_files
 from legged.physics.feet import FeetKinematics
 from legged.physics.fields import FIELDS, RandomizedModel
 from legged.physics.quantities import LAST_STEP, STAGES, stage_of
-from legged.physics.robot_state import RobotState, robot_state
+from legged.physics.robot_state import DrivenJoints, RobotState, robot_state
 from legged.physics.scene import Scene
 from legged.physics.scene.robot_scene import contact_sensor_columns
 from legged.process.cores import available_cores
@@ -59,9 +59,11 @@ class MujocoPhysics(Physics):
             torch.from_numpy(self.batch.bind(name)) for name in names
         )
         self._robot: _RobotReader | None = None
+        self._joints: DrivenJoints | None = None
         if scene.robot is not None:
             self.robot_state = robot_state(self.qpos, self.qvel, scene.robot)
-            self._robot = _RobotReader(self.batch, self.robot_state, scene.robot)
+            self._joints = DrivenJoints(self.qpos, self.qvel, self.robot_state, scene.robot)
+            self._robot = _RobotReader(self.batch, self.robot_state, scene.robot, self.qpos, self.qvel)
         self._reader = _QuantityReader(self.batch, quantities)
         self._quantities = self._reader.values
         self._warnings = self.batch.warning[:, OVERFLOW, 1].copy()
@@ -87,6 +89,8 @@ class MujocoPhysics(Physics):
     def _read(self) -> None:
         self.qpos.copy_(self._qpos)
         self.qvel.copy_(self._qvel)
+        if self._joints is not None:
+            self._joints.read()
 
     def write(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         rows = mask.view(-1, 1)
@@ -128,14 +132,14 @@ class MujocoPhysics(Physics):
 class _RobotReader:
     """Fills the fields of RobotState that are no views of qpos and qvel."""
 
-    def __init__(self, batch: Batch, state: RobotState, robot: Robot) -> None:
-        """For the model of `batch`, which has contact sensors."""
+    def __init__(self, batch: Batch, state: RobotState, robot: Robot, qpos: Tensor, qvel: Tensor) -> None:
+        """For the model of `batch`, which has contact sensors, and the task's `qpos` (N, nq) and `qvel` (N, nv)."""
         self.stepped = False
         """Whether the sensors hold forces that `state` does not hold yet."""
         self._state = state
         start, end = contact_sensor_columns(batch.model, robot)
         self._forces = batch.bind("sensordata")[:, start:end]
-        self._feet = FeetKinematics(batch.model, robot)
+        self._feet = FeetKinematics(batch.model, robot, qpos, qvel)
         contacts = robot.contact_of_shape
         self._contacts = None if len(set(contacts)) == len(contacts) else torch.tensor(contacts)
         """Contact of each shape; none where each shape has its own."""

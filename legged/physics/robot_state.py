@@ -41,9 +41,29 @@ class RobotState:
     [N]; zero after a reset."""
 
 
+class DrivenJoints:
+    """Angles and velocities of the joints with a motor, copied out of the generalised coordinates where passive joints lie
+    between them. Where none does, RobotState has views, and there is nothing to copy.
+    """
+
+    def __init__(self, qpos: Tensor, qvel: Tensor, state: RobotState, robot: Robot) -> None:
+        """Copy from `qpos` (N, nq) and `qvel` (N, nv) into `state`, in place."""
+        pairs = ((qpos, state.dof_pos, robot.qpos_columns), (qvel, state.dof_vel, robot.qvel_columns))
+        self._pairs = [
+            (source, target, torch.tensor(columns, device=source.device))
+            for source, target, columns in pairs
+            if source.untyped_storage().data_ptr() != target.untyped_storage().data_ptr()
+        ]
+
+    def read(self) -> None:
+        """Bring them up to date."""
+        for source, target, columns in self._pairs:
+            torch.index_select(source, 1, columns, out=target)
+
+
 def robot_state(qpos: Tensor, qvel: Tensor, robot: Robot) -> RobotState:
-    """Return the state of robots whose generalised positions are `qpos` (N, 7 + D) and velocities `qvel` (N, 6 + D): views
-    of them where they hold a field, zeroed tensors elsewhere.
+    """Return the state of robots whose generalised positions are `qpos` (N, nq) and velocities `qvel` (N, nv): views of them
+    where they hold a field, zeroed tensors elsewhere.
     """
 
     def zeros(*shape: int) -> Tensor:
@@ -57,9 +77,17 @@ def robot_state(qpos: Tensor, qvel: Tensor, robot: Robot) -> RobotState:
         base_lin_vel_w=qvel[:, :3],
         base_ang_vel=qvel[:, 3:6],
         projected_gravity=zeros(3),
-        dof_pos=qpos[:, 7:],
-        dof_vel=qvel[:, 6:],
+        dof_pos=_view(qpos, robot.qpos_columns),
+        dof_vel=_view(qvel, robot.qvel_columns),
         feet_pos=zeros(feet, 3),
         feet_vel=zeros(feet, 3),
         contact_forces=zeros(shapes, 3),
     )
+
+
+def _view(array: Tensor, columns: tuple[int, ...]) -> Tensor:
+    """Return those columns of an array (N, K) as a view, if they lie side by side, else zeros of their shape."""
+    first, count = columns[0], len(columns)
+    if columns == tuple(range(first, first + count)):
+        return array[:, first : first + count]
+    return torch.zeros(len(array), count, device=array.device)

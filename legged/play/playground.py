@@ -87,6 +87,7 @@ class Playground:
             ("terrain.num_rows", len(self.rows)),
             ("terrain.num_cols", len(self.rows[0])),
             ("terrain.max_init_terrain_level", 0),
+            ("sim.nconmax", max(cfg.sim.nconmax, ROWS_NEEDED // 4)),
             ("sim.njmax", max(cfg.sim.njmax, ROWS_NEEDED)),
         ]
 

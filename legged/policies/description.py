@@ -39,14 +39,16 @@ def describe_robot(task: LeggedRobot) -> dict[str, Any]:
     """Return the robot of a task, its commands and its control law."""
     cfg, robot, control = task.cfg, task.robot, task.control
     low, high = task.command_sampler.full_ranges.t().tolist()
+    scale = control.action_scale
     return {
         "robot": robot.name,
         "conventions": conventions(task),
         "command_ranges": dict(zip(("vx", "vy", "yaw_rate"), zip(low, high, strict=True), strict=True)),
         "joint_names": list(robot.joint_names),
+        "action_joints": [robot.joint_names[i] for i in control.acted],
         "default_joint_angles": control.default_dof_pos.tolist(),
         "control_type": cfg.control.control_type,
-        "action_scale": cfg.control.action_scale,
+        "action_scale": scale if isinstance(scale, float) else scale.tolist(),
         "action_clip": cfg.control.clip_actions,
         "stiffness": control.stiffness.tolist(),
         "damping": control.damping.tolist(),
@@ -71,7 +73,8 @@ def conventions(task: LeggedRobot) -> dict[str, str]:
         " the first one",
         "observation_groups": "group by group side by side, each at its columns start to start + history * size, with as many"
         " observations of its own terms as its history says; start of a term is where it lies in the oldest of them",
-        "action": "actions = policy(observation), then clipped at plus and minus action_clip, one for each joint",
+        "action": "actions = policy(observation), then clipped at plus and minus action_clip, one for each of"
+        " action_joints; action_scale is one number, or one for each of them; a joint without action has 0 in its place",
         "torque": f"clip({law}, -torque_limits, torque_limits), anew every sim_dt",
         "time": "every control_dt: observe, run the policy, hold its action for control_dt",
     }

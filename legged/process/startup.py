@@ -12,6 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
+from legged.process.deferred_compiler import defer_compiler
+
 STARTED_S = time.perf_counter()
 """When this package was first imported, on the clock of `time.perf_counter` [s]."""
 INTERRUPTED = 128 + signal.SIGINT
@@ -26,10 +28,21 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
 
 
+STAGES_FILE = "LEGGED_STAGES"
+"""Environment variable: a file that is told when each stage of a start has ended, for the benchmark's --startup."""
+
+
+def stage_ended(name: str) -> None:
+    """Tell who wants to know that a stage of the start has ended."""
+    if STAGES_FILE in os.environ:
+        with open(os.environ[STAGES_FILE], "a", encoding="utf-8") as file:
+            file.write(f"{time.time():.6f} {name}\n")
+
+
 @contextmanager
 def importing() -> Iterator[None]:
-    """Import without garbage collection: imports make a million objects that stay, and looking through them time and again
-    takes a quarter of a start.
+    """Import without garbage collection, or build what stays as imports do: they make a million objects, and looking through
+    them time and again takes a quarter of a start.
     """
     enabled = gc.isenabled()
     gc.disable()
@@ -41,8 +54,11 @@ def importing() -> Iterator[None]:
 
 
 def is_a_command() -> None:
-    """Freeze garbage collection in a process that is one of our commands: imports stay, and nothing is collected at exit."""
+    """Freeze garbage collection in a process that is one of our commands: imports stay, what comes to be from here on is
+    collected, and nothing at exit.
+    """
     gc.freeze()
+    gc.enable()
     atexit.register(gc.freeze)
 
 
@@ -89,3 +105,5 @@ def raise_at_interrupts() -> None:
 
 if command_of_ours():
     leave_at_interrupts()
+    defer_compiler()
+    gc.disable()  # until `is_a_command`

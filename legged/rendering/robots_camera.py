@@ -67,7 +67,7 @@ class RobotsCamera(Camera):
 
     def picture(self, lines: Sequence[str] = ()) -> np.ndarray:
         """Return (height, width, 3) uint8: the robots now, arrows above them, and lines of text."""
-        size = 7 + self.task.num_actions
+        size = self.task.physics.model.nq
         drawn = slice(self.first, self.first + self.count)
         for i in range(self.count):
             self.task.physics.copy_to(self.first + i, self._single)

@@ -21,11 +21,7 @@ class RobotSize:
 
 def size_of(robot: Robot) -> RobotSize:
     """Measure the shapes of a robot, seen or touched."""
-    model = robot_spec_of(robot.model_path).compile()
-    qpos = np.zeros(model.nq)
-    qpos[3:7] = [1.0, 0.0, 0.0, 0.0]
-    qpos[7 : 7 + robot.num_dof] = robot.default_dof_pos
-    return size_of_model(model, qpos)
+    return size_of_model(robot_spec_of(robot.model_path).compile(), robot.default_qpos)
 
 
 def size_of_model(model: mujoco.MjModel, qpos: np.ndarray) -> RobotSize:

@@ -119,8 +119,8 @@ def _model(terrain: Terrain, places: Sequence[Place], robot: Robot, width: int, 
 
 def _pose(model: mujoco.MjModel, data: mujoco.MjData, terrain: Terrain, places: Sequence[Place], robot: Robot) -> None:
     """Put each robot on the middle of its tile, its lowest foot on the ground, facing the camera."""
-    states = data.qpos.reshape(len(places), 7 + robot.num_dof)
-    states[:, 7:] = robot.default_dof_pos
+    states = data.qpos.reshape(len(places), len(robot.default_qpos))
+    states[:] = robot.default_qpos
     for i, place in enumerate(places):
         states[i, :3] = terrain.origins[place.row, place.col]
         states[i, 3:7] = [np.cos(np.radians(110.0)), 0.0, 0.0, np.sin(np.radians(110.0))]

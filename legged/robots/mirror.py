@@ -22,26 +22,44 @@ class Mirror:
     """(D,) 1 or -1: that angle's sign."""
     feet: tuple[int, ...]
     """(F,) for each foot, the one whose place it takes over."""
+    passive: tuple[int, ...] = ()
+    """(P,) and (P,) signs: the same of passive hinges and slides; both empty if some have no partner."""
+    passive_signs: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, model: mujoco.MjModel, joints: Sequence[int], feet: Sequence[Sequence[str]]) -> "Mirror | None":
-        """Return the symmetry of a robot with the hinges `joints` (ids) and `feet` of those shapes, by where they are at zero
-        angles; None if some have no partner.
+    def of(
+        cls, model: mujoco.MjModel, joints: Sequence[int], feet: Sequence[Sequence[str]], passive: Sequence[int] = ()
+    ) -> "Mirror | None":
+        """Return the symmetry of a robot with the hinges `joints`, `feet` of those shapes, and the hinges and slides
+        `passive` (ids), by where they are at zero angles; None if some joints or feet have no partner.
         """
         data = mujoco.MjData(model)
         data.qpos[:] = 0.0
         data.qpos[3] = 1.0  # the base level at the origin
+        data.qpos[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_BALL]] = 1.0
         mujoco.mj_kinematics(model, data)
-        anchors, axes = data.xanchor[list(joints)], data.xaxis[list(joints)]
-        # Joints of a hip may share a point; a reflection keeps the sizes of an axis' components, which tells them apart.
-        partners = _partners(np.hstack([anchors, np.abs(axes)]), np.hstack([anchors * FLIP, np.abs(axes)]))
+        partners, signs = _joint_partners(model, data, joints)
         centres = np.array([np.mean([data.geom(name).xpos for name in shapes], axis=0) for shapes in feet])
         foot_partners = _partners(centres, centres * FLIP)
         if partners is None or foot_partners is None:
             return None
-        # An axis is a pseudo-vector: the reflection keeps its y and turns x and z around.
-        signs = np.sign((-FLIP * axes * axes[partners]).sum(axis=1))
-        return cls(tuple(partners), tuple(float(sign) for sign in signs), tuple(foot_partners))
+        others, their_signs = _joint_partners(model, data, passive)
+        return cls(tuple(partners), signs, tuple(foot_partners), tuple(others or ()), their_signs)
+
+
+def _joint_partners(
+    model: mujoco.MjModel, data: mujoco.MjData, joints: Sequence[int]
+) -> tuple[list[int] | None, tuple[float, ...]]:
+    """Return for each hinge or slide the one that lies where it is mirrored to, and the signs; None if one has none."""
+    anchors, axes = data.xanchor[list(joints)], data.xaxis[list(joints)]
+    # Joints of a hip may share a point; a reflection keeps the sizes of an axis' components, which tells them apart.
+    partners = _partners(np.hstack([anchors, np.abs(axes)]), np.hstack([anchors * FLIP, np.abs(axes)]))
+    if partners is None:
+        return None, ()
+    # A hinge's axis is a pseudo-vector: the reflection keeps its y and turns x and z around; a slide's is none.
+    hinge = model.jnt_type[list(joints)] == mujoco.mjtJoint.mjJNT_HINGE
+    signs = np.sign((np.where(hinge[:, None], -FLIP, FLIP) * axes * axes[partners]).sum(axis=1))
+    return partners, tuple(float(sign) for sign in signs)
 
 
 def _partners(places: np.ndarray, reflected: np.ndarray) -> list[int] | None:

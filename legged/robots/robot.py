@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from legged.config.bounds import LARGEST, NAMES, between, positive
+from legged.config.bounds import LARGEST, NAMES, TERMS, between, positive
 from legged.config.checks import build, shown
 from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
@@ -14,10 +14,11 @@ from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, exists
 from legged.robots.gains import gains
 from legged.robots.mirror import Mirror
+from legged.robots.passive_joints import PassiveJoints, default_qpos
 from legged.robots.patterns import match_values
-from legged.robots.robot_model import base_mass, check_model, hinges, read_model
+from legged.robots.robot_model import base_mass, check_model, driven_joints, passive_joints, read_model
 from legged.robots.shapes import Shapes
-from legged.robots.stance import stance, standing_height, swinging_joints
+from legged.robots.stance import standing_height, swinging_joints
 
 VELOCITY_LIMIT = 30.0
 """Largest speed of the joints of a robot that states none, as geared motors of legged robots have it [rad/s]."""
@@ -47,11 +48,14 @@ class RobotFile:
     """Patterns of the shapes whose contact the `collision` reward counts."""
     terminate_after_contacts_on: tuple[str, ...] = ()
     """Patterns of the shapes whose contact ends the episode."""
+    passive_joints: tuple[str, ...] = field(default=(), metadata=TERMS)
+    """Patterns of the joints that no motor drives: springs, rods, whatever closes a loop. They may be slides and balls."""
 
 
 @dataclass(frozen=True)
 class Robot:
-    """What the task needs to know of a robot. D joints in the order of the model, S collision shapes, F feet, B contacts.
+    """What the task needs to know of a robot. D joints with a motor, in the order of the model, P passive hinges and slides,
+    S collision shapes, F feet, B contacts. Where nothing else is said, a joint is one with a motor.
 
     A contact is what a contact force is stated for: a collision shape, or all shapes of a foot together.
     """
@@ -75,6 +79,14 @@ class Robot:
     """(D,) whether a joint swings a leg forward and back, in the default pose."""
     height: float
     """Base above the ground when the robot stands level in its default pose [m]."""
+    qpos_columns: tuple[int, ...]
+    """(D,) where each joint's angle is in MuJoCo's generalised positions; `qvel_columns` in the velocities."""
+    qvel_columns: tuple[int, ...]
+    passive: PassiveJoints | None
+    """Joints that no motor drives; none if every joint has one."""
+    default_qpos: np.ndarray
+    """(nq,) MuJoCo's generalised positions at action 0: the base level at the origin, passive joints where springs and loops
+    put them."""
     shape_names: tuple[str, ...]
     """Names of the S collision shapes, in the order of the model."""
     contact_of_shape: tuple[int, ...]
@@ -128,20 +140,22 @@ def load_robot(name: str, where: str = "robot") -> Robot:
         raise ConfigError(f"{path}: missing: {', '.join(missing)}")
     file = build(RobotFile, data, "", Origins(), str(path))
     model = read_model(folder, file.model, str(path))
-    check_model(model, file.base, str(path))
-    joints = [model.joint(i) for i in hinges(model)]
+    check_model(model, file.base, str(path), file.passive_joints)
+    undriven = passive_joints(model, file.passive_joints, str(path))
+    joints = [model.joint(i) for i in driven_joints(model, undriven)]
     names = tuple(joint.name for joint in joints)
-    ids = [joint.id for joint in joints]
+    default = match_values(file.default_joint_angles, names, f"{path}: default_joint_angles")
+    numbers = [joint.id for joint in joints]
+    passive = PassiveJoints.of(model, numbers, undriven) if undriven else None
     shapes = Shapes.of(model, file.feet, f"{path}: feet")
     foot_ids = [model.geom(name).id for foot in shapes.feet_shapes for name in foot]
-    default_dof_pos = match_values(file.default_joint_angles, names, f"{path}: default_joint_angles")
-    angles = dict(zip(names, map(float, default_dof_pos), strict=True))
-    height, torque_limits = standing_height(model, file.base, angles), model.actuator_forcerange[:, 1].copy()
+    qpos = default_qpos(model, numbers, default, passive, f"{path}: default_joint_angles")
+    height, torque_limits = standing_height(model, file.base, qpos), model.actuator_forcerange[:, 1].copy()
     if file.stiffness or file.damping:
         stiffness = match_values(file.stiffness, names, f"{path}: stiffness")
         damping = match_values(file.damping, names, f"{path}: damping")
     else:
-        stiffness, damping = gains(model, stance(model, angles).qpos, ids, foot_ids, torque_limits, height)
+        stiffness, damping = gains(model, qpos, numbers, foot_ids, torque_limits, height)
     if file.velocity_limit:
         velocity_limits = match_values(file.velocity_limit, names, f"{path}: velocity_limit")
     else:
@@ -151,14 +165,18 @@ def load_robot(name: str, where: str = "robot") -> Robot:
         folder=folder,
         file=file,
         joint_names=names,
-        default_dof_pos=default_dof_pos,
+        default_dof_pos=default,
         dof_pos_limits=np.array([j.range if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in joints], dtype=float),
         dof_vel_limits=velocity_limits,
         torque_limits=torque_limits,
         stiffness=stiffness,
         damping=damping,
-        swings=swinging_joints(model, angles, ids, foot_ids),
+        swings=swinging_joints(model, qpos, numbers, foot_ids),
         height=height,
+        qpos_columns=tuple(int(joint.qposadr[0]) for joint in joints),
+        qvel_columns=tuple(int(joint.dofadr[0]) for joint in joints),
+        passive=passive,
+        default_qpos=qpos,
         shape_names=shapes.names,
         contact_of_shape=shapes.contact,
         contact_names=shapes.contact_names,
@@ -168,7 +186,7 @@ def load_robot(name: str, where: str = "robot") -> Robot:
         termination_indices=shapes.contacts(file.terminate_after_contacts_on, f"{path}: terminate_after_contacts_on"),
         mass=float(model.body_mass.sum()),
         base_mass=base_mass(model, file.base),
-        mirror=Mirror.of(model, ids, shapes.feet_shapes),
+        mirror=Mirror.of(model, numbers, shapes.feet_shapes, passive.numbers if passive else ()),
     )
 
 

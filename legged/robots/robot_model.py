@@ -2,7 +2,7 @@
 
 import contextlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 import mujoco
@@ -10,6 +10,7 @@ import numpy as np
 
 from legged.errors import ConfigError, suggest
 from legged.process.paths import exists
+from legged.robots.patterns import match_names
 
 FLOOR = "floor"
 """Name of the ground's geom, where it is a plane or stands for a height map; no geom of a robot may have it."""
@@ -68,14 +69,16 @@ def _warnings_to(warnings: list[str]) -> Iterator[None]:
         mujoco.set_mju_user_warning(before)
 
 
-def check_model(model: mujoco.MjModel, base: str, where: str) -> None:
-    """Check what engines rely on: one free base, then the hinges; one motor a hinge, in the same order; named shapes.
+def check_model(model: mujoco.MjModel, base: str, where: str, passive: Sequence[str] = ()) -> None:
+    """Check what engines rely on: one free base, then the joints; one motor for each that is not named by the patterns
+    `passive`, in the same order, and these are hinges; named shapes.
 
     Raises:
         ConfigError: `where` and what is not so.
     """
-    _check_tree(model, base, where)
-    _check_motors(model, where)
+    undriven = passive_joints(model, passive, where)
+    _check_tree(model, base, undriven, where)
+    _check_motors(model, undriven, where)
     for i in range(model.ngeom):
         if not (model.geom_contype[i] or model.geom_conaffinity[i]):
             continue
@@ -98,20 +101,33 @@ def base_mass(model: mujoco.MjModel, base: str) -> float:
     return float(model.body(base).mass[0])
 
 
-def hinges(model: mujoco.MjModel) -> list[int]:
-    """Return the ids of the hinge joints."""
-    return [i for i in range(model.njnt) if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE]
+def passive_joints(model: mujoco.MjModel, patterns: Sequence[str], where: str) -> list[int]:
+    """Return the ids of the joints that the patterns name, which no motor drives; never that of the base.
+
+    Raises:
+        ConfigError: a pattern is in no joint's name; `where` says whose it is.
+    """
+    names = [model.joint(i).name for i in range(1, model.njnt)]
+    return [1 + i for i in match_names(patterns, names, f"{where}: passive_joints")]
 
 
-def _check_tree(model: mujoco.MjModel, base: str, where: str) -> None:
+def driven_joints(model: mujoco.MjModel, passive: Collection[int]) -> list[int]:
+    """Return the ids of the joints but the base's and `passive`."""
+    return [i for i in range(1, model.njnt) if i not in passive]
+
+
+def _check_tree(model: mujoco.MjModel, base: str, passive: Collection[int], where: str) -> None:
     bodies = [model.body(i).name for i in range(model.nbody)]
+    kinds = mujoco.mjtJoint
     if base not in bodies:
         raise ConfigError(f"{where}: base: the model has no body '{base}'{suggest(base, bodies)}")
-    joints = hinges(model)
-    if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE or model.njnt != len(joints) + 1:
-        raise ConfigError(f"{where}: model: needs one free joint, on the base, followed by hinges only")
+    joints = driven_joints(model, passive)
+    free = model.jnt_type == kinds.mjJNT_FREE
+    if model.njnt == 0 or not free[0] or free.sum() > 1 or (model.jnt_type[joints] != kinds.mjJNT_HINGE).any():
+        but = "; slides and balls may be named by passive_joints" if free.sum() == 1 and free[0] else ""
+        raise ConfigError(f"{where}: model: needs one free joint, on the base, followed by hinges only{but}")
     if not joints:
-        raise ConfigError(f"{where}: model: has no hinge, so nothing could move the robot")
+        raise ConfigError(f"{where}: model: has no hinge with a motor, so nothing could move the robot")
     if model.jnt_bodyid[0] != bodies.index(base):
         raise ConfigError(f"{where}: base: the free joint is on '{bodies[model.jnt_bodyid[0]]}', not on '{base}'")
     for i in joints:
@@ -119,13 +135,15 @@ def _check_tree(model: mujoco.MjModel, base: str, where: str) -> None:
             raise ConfigError(f"{where}: model: every hinge needs a name; one of '{bodies[model.jnt_bodyid[i]]}' has none")
 
 
-def _check_motors(model: mujoco.MjModel, where: str) -> None:
+def _check_motors(model: mujoco.MjModel, passive: Collection[int], where: str) -> None:
     """Check that actuators pass on torques as they are, because the task computes those of the joints."""
-    names = tuple(model.joint(i).name for i in hinges(model))
+    names = tuple(model.joint(i).name for i in driven_joints(model, passive))
     on_joints = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
     driven = tuple(model.joint(model.actuator_trnid[i, 0]).name if on_joints[i] else "no joint" for i in range(model.nu))
     if driven != names:
-        raise ConfigError(f"{where}: model: needs one motor per hinge in the same order; hinges {names}, motors {driven}")
+        extra = "; a joint that nothing drives belongs under passive_joints" if len(driven) < len(names) else ""
+        order = "needs one motor per hinge in the same order"
+        raise ConfigError(f"{where}: model: {order}; hinges {names}, motors {driven}{extra}")
     for i, joint in enumerate(names):
         problem = _why_no_torque_motor(model, i) or _why_no_torque_limit(model, i)
         if problem:

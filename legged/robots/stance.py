@@ -1,6 +1,6 @@
 """A robot in its default pose: how high it stands, and which joints swing its legs forward."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -9,14 +9,11 @@ ALONG = 0.7
 """Least component along the base's y axis of the axis of a joint that swings a leg forward: within 45 degrees."""
 
 
-def stance(model: mujoco.MjModel, angles: Mapping[str, float]) -> mujoco.MjData:
-    """Return the model with its base level at the origin, and its joints at `angles` [rad], poses computed."""
+def stance(model: mujoco.MjModel, qpos: np.ndarray) -> mujoco.MjData:
+    """Return the model at the generalised positions `qpos`, poses computed."""
     data = mujoco.MjData(model)
-    data.qpos[:7] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
-    for name, angle in angles.items():
-        data.joint(name).qpos[0] = angle
+    data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
     return data
 
 
@@ -42,20 +39,18 @@ def lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float
     return float(data.geom_xpos[geom, 2] - below)
 
 
-def standing_height(model: mujoco.MjModel, base: str, angles: Mapping[str, float]) -> float:
-    """Return how far the base is above the lowest point of the collision shapes [m], level, at joint `angles` [rad]."""
-    data = stance(model, angles)
+def standing_height(model: mujoco.MjModel, base: str, qpos: np.ndarray) -> float:
+    """Return how far the base is above the lowest point of the collision shapes [m], at `qpos`, where it is level."""
+    data = stance(model, qpos)
     shapes = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
     return float(data.body(base).xpos[2] - min(lowest_point(model, data, int(i)) for i in shapes))
 
 
-def swinging_joints(
-    model: mujoco.MjModel, angles: Mapping[str, float], joints: Sequence[int], feet: Sequence[int]
-) -> np.ndarray:
+def swinging_joints(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int], feet: Sequence[int]) -> np.ndarray:
     """Return (D,) which of the hinges `joints` (ids) swing a leg forward and back: those between the base and one of the
-    shapes `feet` (ids) whose axes point sideways in the default pose, such as hip pitch, knee and ankle pitch.
+    shapes `feet` (ids) whose axes point sideways at `qpos`, the base being level: hip pitch, knee and ankle pitch.
     """
-    data = stance(model, angles)
+    data = stance(model, qpos)
     on_leg = set()
     for foot in feet:
         body = model.geom_bodyid[foot]

@@ -2,7 +2,8 @@
 `python -m legged.tools.benchmark --task anymal_c [--num_envs 8192]`.
 
 With `--grounds` the task is timed on a plane, on its terrain met by our collider, and by mujoco-warp's general one; with
-`--scale 1024,4096,16384` with each of these numbers of robots, in a process of its own.
+`--scale 1024,4096,16384` with each of these numbers of robots, in a process of its own. With `--startup` nothing of this is
+timed, but the way to the first iteration of a training, beside `import torch`.
 
 On a GPU it also proves that the step never waits for the host: the timed steps run under torch's sync debug mode
 "error", which raises at any synchronisation.
@@ -21,6 +22,7 @@ from legged.benchmarks.iteration_times import LOOPS, time_iterations
 from legged.benchmarks.kernel_times import kernel_times, table
 from legged.benchmarks.report import report
 from legged.benchmarks.scale import scale
+from legged.benchmarks.start_times import start_report, time_start
 from legged.benchmarks.step_times import synchronize, time_steps
 from legged.commandline.arguments import add_task_arguments, overrides, pick_device, register_given, settle_on
 from legged.commandline.command import run_main
@@ -57,6 +59,7 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("--scale", help="numbers of robots to compare, e.g. 1024,4096,16384; runs one training loop")
     parser.add_argument("--runner", choices=list(LOOPS), help="time this training loop only (train.runner.loop)")
     parser.add_argument("--kernels", type=int, metavar="COUNT", help="also list this many kernels that take longest (GPU)")
+    parser.add_argument("--startup", action="store_true", help="time how a training begins, beside importing torch, instead")
     parser.add_argument("--json", type=Path, help="also write the result to this file")
     args = parser.parse_intermixed_args(argv)
     register_given(args)
@@ -70,6 +73,13 @@ def _main(argv: list[str] | None) -> int:
         ready_to_write_file("--json", args.json)
     if args.kernels is not None and device.type != "cuda":
         raise ConfigError(f"--kernels: needs a GPU, and the task is on {device}")
+    if args.startup:
+        start_times = time_start(sys.argv[1:] if argv is None else argv, args.repeats)
+        print(start_report(start_times), flush=True)
+        if args.json:
+            make_folder(args.json.parent)
+            write_text(args.json, json.dumps(start_times, indent=1))
+        return 0
     if args.scale is not None:
         # In processes of their own: this one must not take memory.
         return scale(args, sys.argv[1:] if argv is None else argv, cfg, device)

@@ -36,7 +36,7 @@ from legged.physics import engine_name, resolve_physics
 from legged.process.cores import available_cores
 from legged.process.paths import full_disk_in, ready_to_write, reason, relative
 from legged.process.ranks import Ranks
-from legged.process.startup import STARTED_S, command_of_ours
+from legged.process.startup import STARTED_S, command_of_ours, stage_ended
 from legged.registry import make_task, task_config
 
 ROOM_MB = 16.0
@@ -50,6 +50,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _main(argv: list[str] | None) -> int:
     start = STARTED_S if argv is None else time.perf_counter()  # as a command, imports are part of it
+    stage_ended("imports")
     parser = argparse.ArgumentParser(prog="train.py", description="Train a legged robot.")
     add_task_arguments(parser)
     add_run_arguments(parser)
@@ -107,6 +108,8 @@ def _train(
     task = make_task(cfg, device, graph=not args.no_graph)
     if first and task.physics.why_library:
         print(f"mujoco-warp's own launches: {task.physics.why_library}", flush=True)
+    if first and task.physics.fitted:
+        print(f"on the terrain, meshes are stood for, with their mean distance: {task.physics.fitted}", flush=True)
     with Display(cfg.task) if first else contextlib.nullcontext() as display:
         kind = CapturedRunner if cfg.train.runner.loop == "captured" else Runner
         runner = kind(task, None, str(rl_device), display)

@@ -110,7 +110,7 @@ def test_the_robot_of_the_command_line_counts(tasks):
 @pytest.mark.parametrize(
     ("written_for", "message"),
     [
-        ("anymal_z", "written_for: there is no robot 'anymal_z'; did you mean 'anymal_c'"),
+        ("anymal_z", "written_for: there is no robot 'anymal_z'; did you mean 'anymal_"),
         (3, "written_for: expected the name"),
     ],
 )

@@ -43,6 +43,20 @@ LEGGED_GYM = [
     "_create_trimesh",
     "_get_env_origins",
 ]
+FORKS = [
+    "_init_foot",
+    "update_feet_state",
+    "_reset_buffers",
+    "compute_self_observations",
+    "compute_termination_observations",
+    "_disturbance_robots",
+    "_step_contact_targets",
+    "_call_train_eval",
+    "_randomize_dof_props",
+    "_randomize_rigid_body_props",
+    "_randomize_gravity",
+    "refresh_actor_rigid_shape_props",
+]
 ISAAC_LAB = [
     "_setup_scene",
     "_pre_physics_step",
@@ -62,7 +76,7 @@ def hook(self, *args) -> None:
     """Something of a fork."""
 
 
-@pytest.mark.parametrize("name", [*LEGGED_GYM, *ISAAC_LAB])
+@pytest.mark.parametrize("name", [*LEGGED_GYM, *FORKS, *ISAAC_LAB])
 def test_a_hook_that_nobody_calls_is_refused_by_class_file_and_line(name):
     line = hook.__code__.co_firstlineno
     with pytest.raises(ConfigError) as error:
@@ -81,7 +95,7 @@ def test_no_hook_of_the_table_is_one_of_this_package():
 def test_what_the_table_names_is_there():
     """The methods, settings and files that take the place of a hook."""
     text = " ".join(HOOKS.values())
-    for method in ("_step", "advance", "compute_reward", "reset_idx", "remember", "make_terrain"):
+    for method in ("_step", "advance", "disturb", "compute_reward", "reset_idx", "remember", "make_terrain"):
         assert method in text
         assert callable(getattr(LeggedRobot, method))
     cfg = small_config()
@@ -99,6 +113,7 @@ def test_what_the_table_names_is_there():
         "commands.resampling_time_s",
         "commands.curriculum",
         "domain_rand.push_robots",
+        "domain_rand.ranges",
         "domain_rand.randomize_friction",
         "domain_rand.randomize_base_mass",
         "terrain.curriculum",

@@ -200,7 +200,7 @@ def test_the_log_comes_once_a_rollout_with_tensors_of_its_own():
             logs[step] = extras["log"]
     assert list(logs) == [6, 12, 18, 24]
     storages = [value.untyped_storage().data_ptr() for log in logs.values() for value in log.values()]
-    static = {task.metrics._steps.data_ptr(), task.metrics._episodes.data_ptr()}
+    static = {value.data_ptr() for value in vars(task.metrics).values() if isinstance(value, torch.Tensor)}
     assert not static & set(storages)
     assert all(value.shape == () for log in logs.values() for value in log.values())
     # One of five steps ends all episodes; the fourth rollout, steps 19 to 24, has one such step, after 5 steps of life.

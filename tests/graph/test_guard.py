@@ -13,6 +13,7 @@ from legged.graph.step_graph import StepGraph
 CPU = torch.device("cpu")
 NUMBERS = torch.tensor([1.0, -2.0, 3.0])
 GRID = torch.arange(12.0).view(3, 4)
+CUBE = torch.arange(24.0).view(2, 3, 4)
 MASK = NUMBERS > 0.0
 ONE, FIRST_AND_LAST, WITHIN = torch.tensor(1), torch.tensor([0, 2]), torch.tensor([0, 1])
 FIVE = torch.tensor([5.0, 6.0])
@@ -38,7 +39,7 @@ REFUSED = {
     "int": lambda: int(NUMBERS[0]),
     "if": branch_on_a_tensor,
     "is_nonzero": lambda: torch.is_nonzero(NUMBERS[0]),
-    "index by a number": lambda: NUMBERS[ONE],
+    "write by a number": lambda: NUMBERS.clone().__setitem__(ONE, 0.0),
     "nonzero": lambda: MASK.nonzero(),
     "where with one argument": lambda: torch.where(MASK),
     "argwhere": lambda: torch.argwhere(MASK),
@@ -52,6 +53,13 @@ REFUSED = {
     "allclose": lambda: torch.allclose(NUMBERS, NUMBERS),
     "inverse": lambda: torch.inverse(GRID[:, :3] + torch.eye(3, device=CPU)),
     "solve": lambda: torch.linalg.solve(torch.eye(3, device=CPU), NUMBERS),
+    "cholesky": lambda: torch.linalg.cholesky(torch.eye(3, device=CPU)),
+    "svd": lambda: torch.linalg.svd(GRID),
+    "pinv": lambda: torch.linalg.pinv(GRID),
+    "eigh": lambda: torch.linalg.eigh(GRID[:, :3]),
+    "eig": lambda: torch.linalg.eig(GRID[:, :3]),
+    "matrix_exp": lambda: torch.linalg.matrix_exp(GRID[:, :3]),
+    "to_sparse": lambda: NUMBERS.to_sparse(),
     "normal with tensors": lambda: torch.normal(NUMBERS, NUMBERS.abs()),
     "multinomial": lambda: torch.multinomial(GRID, 1),
     "max of Python": lambda: max(NUMBERS),
@@ -96,6 +104,14 @@ ALLOWED = {
     "where": lambda: torch.where(MASK, NUMBERS, 0.0),
     "masked_fill": lambda: NUMBERS.masked_fill(MASK, 0.0),
     "read by positions": lambda: NUMBERS[FIRST_AND_LAST],
+    "read by a number": lambda: (NUMBERS[ONE], GRID[ONE, 1:], GRID[:, ONE], GRID[..., ONE], GRID[None, ..., ONE, :]),
+    "read by numbers": lambda: (GRID[ONE, ONE + 1], GRID[1:, -ONE], GRID[ONE, [0, 2]], [GRID[:, i] for i in FIRST_AND_LAST]),
+    "read by a number and more": lambda: (
+        CUBE[ONE, :, [0, 2]],
+        CUBE[[0, 1], ..., ONE],
+        CUBE[:, ONE, None, 2],
+        CUBE[ONE][ONE],
+    ),
     "write by positions": lambda: NUMBERS.clone().index_put_((WITHIN,), FIVE),
     "slice and ellipsis": lambda: NUMBERS[None, ..., 1:],
     "draw in place": lambda: NUMBERS.clone().uniform_(),

@@ -78,6 +78,7 @@ def test_failures_and_time_outs_are_told_apart():
     env.reset(seed=0)
     env.task.episode_length_buf = torch.tensor([0, env.task.max_episode_length - 1, 0, 0])
     env.task.physics._qpos[2, 2:7] = torch.tensor([0.1, 0.0, 1.0, 0.0, 0.0], dtype=torch.float64)  # on its back
+    env.task.physics._qvel[2] = 0.0
     _, _, terminated, truncated, infos = env.step(np.zeros((4, 12)))
     assert truncated.tolist() == [False, True, False, False]
     assert terminated.tolist() == [False, False, True, False]

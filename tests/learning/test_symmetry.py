@@ -44,9 +44,9 @@ def test_a_lopsided_robot_has_no_mirror():
     )
     spec = f'<mujoco><worldbody><body><freejoint/><geom size="0.1"/>{legs}</body></worldbody></mujoco>'
     model = mujoco.MjModel.from_xml_string(spec)
-    assert Mirror.of(model, [1, 2], ["f0", "f1"]) is None
+    assert Mirror.of(model, [1, 2], [["f0"], ["f1"]]) is None
     level = mujoco.MjModel.from_xml_string(spec.replace("-0.25", "-0.2"))
-    assert Mirror.of(level, [1, 2], ["f0", "f1"]) == Mirror((1, 0), (1.0, 1.0), (1, 0))
+    assert Mirror.of(level, [1, 2], [["f0"], ["f1"]]) == Mirror((1, 0), (1.0, 1.0), (1, 0))
 
 
 def test_a_mirrored_world_goes_on_as_the_mirror_image(robot):
@@ -236,7 +236,7 @@ def test_what_no_kind_of_mirror_fits_is_refused(robot):
     task = small_task()
 
     def images(kinds):
-        return MirrorImages("Mine", kinds, task.observation_groups, 12, robot.mirror, task.height_scan.points)
+        return MirrorImages("Mine", kinds, task.observation_groups, range(12), robot.mirror, task.height_scan.points)
 
     assert images(LeggedRobot.MIRRORED).actions[0].tolist() == list(robot.mirror.joints)
     with pytest.raises(ConfigError, match=r"Mine\.MIRRORED: there is no way to mirror 'typo'"):

@@ -30,6 +30,7 @@ def commands(num_envs=MANY, **settings) -> Commands:
     """Commands without heading mode, sampled once for every robot."""
     cfg = CommandsConfig(**{"ranges": RANGES, "heading_command": False, "small_command": 0.0, **settings})
     sampler = Commands(cfg, num_envs, DT, CPU)
+    sampler.numbers.draw()
     sampler.draw()
     sampler.update(torch.ones(num_envs, dtype=torch.bool), UPRIGHT.expand(num_envs, 4))
     return sampler
@@ -58,6 +59,7 @@ def test_commands_fill_their_ranges_and_stay_inside():
 def test_ranges_that_a_curriculum_narrows_are_sampled():
     sampler = Commands(CommandsConfig(heading_command=False, small_command=0.0), MANY, DT, CPU)
     sampler.ranges.copy_(torch.tensor([[-0.1, 0.2], [0.0, 0.0], [0.3, 0.4]]))
+    sampler.numbers.draw()
     sampler.draw()
     sampler.update(torch.ones(MANY, dtype=torch.bool), UPRIGHT.expand(MANY, 4))
     vx, vy, yaw = sampler.commands[:, :3].unbind(dim=1)
@@ -104,6 +106,7 @@ def test_a_command_is_held_for_exactly_the_resampling_time():
     changes, before = [], sampler.commands.clone()
     for step in range(1, 451):
         # The second robot begins a new episode at step 130, and with it a new command and a full interval.
+        sampler.numbers.draw()
         sampler.draw()
         sampler.update(mask(False, step == 130, False) if step == 130 else never, quat)
         changed = (sampler.commands != before).any(dim=1)
@@ -130,6 +133,7 @@ def test_held_commands_are_neither_sampled_nor_steered(heading):
     wanted = torch.tensor([[0.5, -0.2, 0.3], [0.0, 0.0, 0.0]])
     sampler.hold(wanted)
     for _ in range(20):
+        sampler.numbers.draw()
         sampler.draw()
         sampler.update(mask(True, True), quat_of_yaw(1.0).expand(2, 4))
         assert torch.equal(sampler.commands[:, :3], wanted)
@@ -160,7 +164,7 @@ def run_window(
     found: CommandCurriculum, asked: torch.Tensor, reached: torch.Tensor, valid: torch.Tensor = EVERY
 ) -> list[float]:
     for _ in range(found.window_steps):
-        found.update(asked, reached, valid)
+        found.update(asked, reached, reached, valid)
     return found.share.tolist()
 
 
@@ -175,9 +179,9 @@ def test_the_axis_that_is_followed_widens_by_one_step_a_window_up_to_the_full_ra
     assert found.window_steps == 10
     following = ALL * torch.tensor([0.0, 0.8, 0.0])  # 80 % of what is asked sideways, nothing else
     for _ in range(9):
-        found.update(ALL, following, EVERY)
+        found.update(ALL, following, following, EVERY)
     assert found.share.tolist() == pytest.approx([0.3] * 3)  # not before the window is over
-    found.update(ALL, following, EVERY)
+    found.update(ALL, following, following, EVERY)
     assert found.share.tolist() == pytest.approx([0.3, 0.5, 0.3])
     shares = [run_window(found, ALL, following)[1] for _ in range(4)]
     assert shares == pytest.approx([0.7, 0.9, 1.0, 1.0])

@@ -64,7 +64,7 @@ def test_the_buffer_is_rewritten_in_place():
 
 def test_noise_is_uniform_centred_of_the_stated_half_width_before_scaling_and_new_at_every_draw():
     found = group(noise={"a": 0.1, "c": 0.5}, num_envs=20_000)
-    found.draw()
+    found.numbers.draw()
     found.compute()
     first = found.buffer.clone()
     noise = first - torch.tensor([2.0, 4.0, -3.0, 1.0, 4.0, 9.0])
@@ -73,14 +73,14 @@ def test_noise_is_uniform_centred_of_the_stated_half_width_before_scaling_and_ne
     assert torch.allclose(noise.abs().amax(dim=0), half, rtol=0.01, atol=1e-6)
     assert torch.allclose(noise.mean(dim=0), torch.zeros(6), atol=0.004)
     assert torch.allclose(noise.std(dim=0), half / math.sqrt(3.0), rtol=0.02, atol=1e-6)
-    found.draw()
+    found.numbers.draw()
     found.compute()
     assert not torch.equal(found.buffer[:, 0], first[:, 0])
 
 
 def test_a_group_without_noise_is_exact():
     found = group()
-    found.draw()
+    found.numbers.draw()
     found.compute()
     assert torch.equal(found.buffer[0], torch.tensor([1.0, 2.0, -3.0, 10.0, 20.0, 30.0]) * found._scale)
 
@@ -214,7 +214,9 @@ def test_a_flush_starts_anew_and_its_tensors_are_fresh():
     assert (first["rew_walk"].item(), second["rew_walk"].item()) == (pytest.approx(0.2), pytest.approx(0.45))
     assert all(value.shape == () for value in first.values())
     addresses = [value.untyped_storage().data_ptr() for log in (first, second) for value in log.values()]
-    assert not {metrics._steps.data_ptr(), metrics._episodes.data_ptr()} & set(addresses)
+    kept = {value.data_ptr() for value in vars(metrics).values() if isinstance(value, torch.Tensor)}
+    assert kept
+    assert not kept & set(addresses)
 
 
 # ---- terminations ----------------------------------------------------------------------------------------------------
@@ -226,7 +228,7 @@ def test_failures_and_time_outs_are_told_apart_and_a_failure_is_no_time_out():
     left = mask(False, True, False, True, False, False)
     terminations = Terminations({"fell": lambda: fell}, {"left": lambda: left}, failed, timed_out, ended)
     broken, over = mask(False, False, True, False, False, False), mask(True, False, True, False, True, False)
-    terminations.evaluate(broken, over)
+    terminations.evaluate(~broken, over)
     assert failed.tolist() == [True, False, True, True, False, False]
     assert timed_out.tolist() == [False, True, False, False, True, False]
     assert ended.tolist() == [True, True, True, True, True, False]
@@ -238,7 +240,7 @@ def test_failures_and_time_outs_are_told_apart_and_a_failure_is_no_time_out():
 def test_a_termination_that_gives_something_else_is_refused_by_name(value):
     buffers = (torch.zeros(2, dtype=torch.bool) for _ in range(3))
     with pytest.raises(TermError, match=r"_terminate_mine: must return a tensor \(2,\) of bool, got"):
-        Terminations({"mine": lambda: value}, {}, *buffers).evaluate(mask(False, False), mask(False, False))
+        Terminations({"mine": lambda: value}, {}, *buffers).evaluate(mask(True, True), mask(False, False))
 
 
 # ---- randomization ---------------------------------------------------------------------------------------------------
@@ -319,7 +321,7 @@ def push_steps(pushes: Pushes, physics: FakePhysics, steps: int, allowed: torch.
     """Steps at which each robot is pushed."""
     found: list[list[int]] = [[] for _ in range(len(allowed))]
     for step in range(1, steps + 1):
-        pushes.draw()
+        pushes.numbers.draw()
         pushes.push(physics, allowed)
         for robot in physics.due.nonzero().flatten().tolist():
             found[robot].append(step)
@@ -342,7 +344,7 @@ def test_each_robot_is_pushed_at_its_own_moments_exactly_one_interval_apart(inte
 def test_a_push_sets_the_horizontal_velocity_inside_its_range():
     pushes, physics = Pushes(LeggedDomainRandConfig(max_push_vel_xy=0.8), 2000, DT, CPU), FakePhysics(2000)
     pushes.push_time_left.fill_(0.0)
-    pushes.draw()
+    pushes.numbers.draw()
     pushes.push(physics, torch.ones(2000, dtype=torch.bool))
     assert physics.due.all()
     velocity = physics.change + physics.qvel[:, :2]

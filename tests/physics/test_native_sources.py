@@ -5,18 +5,26 @@ import math
 import re
 import shutil
 import subprocess
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import mujoco
+import mujoco_warp as mjw
 import numpy as np
 import pytest
 import warp as wp
 from mechanisms import EVERY_JOINT, FusedWorlds, packaged, random_motion, relative_error
+from random_robots import EXTRAS, random_robot, rollout
 
+from legged.physics.fused import constraint_solver, smooth_dynamics
 from legged.physics.fused.constraint_solver import SolverArrays, solver_constants, solver_kernel
+from legged.physics.fused.contact_kernel import SOURCE as CONTACT_SOURCE
+from legged.physics.fused.contact_kernel import StageArrays, stage_constants, stage_kernel
+from legged.physics.fused.contact_stage import ContactStage
 from legged.physics.fused.native import SOURCES, native_source
 from legged.physics.fused.smooth_dynamics import DynamicsArrays, dynamics_constants, dynamics_kernel
+from legged.physics.fused.tree import Tree
 
 ARCHITECTURE = 90
 """An H100's."""
@@ -27,20 +35,39 @@ template <typename T> struct array_of { T* data; int shape[4]; };
 template <int N> struct numbers { float x[N]; };
 """
 """What the sources know of Warp: arrays, with vectors and matrices as elements."""
-SCALARS = {wp.int32: "int", wp.float32: "float", wp.bool: "bool"}
+SCALARS = {wp.int32: "int", wp.float32: "float", wp.bool: "bool", wp.uint64: "unsigned long long"}
 SETTINGS = {
-    "constraint_solver.h": "int most_rounds, int most_searches, float tolerance, float ls_tolerance, ",
-    "smooth_dynamics.h": "",
+    "solver": "int most_rounds, int most_searches, float tolerance, float ls_tolerance, ",
+    "dynamics": "",
+    "contacts": "int found, ",
 }
-STRUCTS = {"constraint_solver.h": SolverArrays, "smooth_dynamics.h": DynamicsArrays}
+FILES = {"solver": constraint_solver.SOURCE, "dynamics": smooth_dynamics.SOURCE, "contacts": CONTACT_SOURCE}
+STRUCTS = {"solver": SolverArrays, "dynamics": DynamicsArrays, "contacts": StageArrays}
+GIVEN = {
+    "solver": "MOST, MOST, 1e-9f, 0.01f, ",
+    "dynamics": "",
+    "contacts": "counted(all, world), ",
+}
+"""What a world is called with, beside its number and the arrays."""
+COUNTED = """
+int counted(const Arrays* all, int world) {  // contacts of a world, by those slots that have rows
+    const int each = all->contact_dist.shape[0] / all->nefc.shape[0];
+    int count = 0;
+    for (int k = world * each; k < (world + 1) * each; ++k)
+        count += all->contact_efc_address.data[k * all->contact_efc_address.shape[1]] >= 0;
+    return count;
+}
+"""
 
 needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
 
 
 def constants_of(file: str, model: mujoco.MjModel) -> dict[str, int | bool]:
     """Return those that a model gives to a source."""
-    if file == "constraint_solver.h":
-        return solver_constants(model.nv, rows=40, damped=True)
+    if file == "solver":
+        return solver_constants(Tree.of(model), rows=40, entries=model.nM, damped=True, elliptic=True)
+    if file == "contacts":
+        return stage_constants(model, rows=40, slots=8, dim=6, frictions=True, limits=True)
     return dynamics_constants(model)
 
 
@@ -49,7 +76,7 @@ def program(file: str, constants: dict[str, Any], on_gpu: bool) -> str:
     types = {name: var.type.dtype for name, var in STRUCTS[file].vars.items()}
     elements = {name: SCALARS.get(kind) or f"numbers<{math.prod(kind._shape_)}>" for name, kind in types.items()}
     fields = "".join(f"array_of<{element}> {name};\n" for name, element in elements.items())
-    function = f"void compute_world(int world, {SETTINGS[file]}Arrays arrays) {{\n{native_source(file, constants)}}}\n"
+    function = f"void compute_world(int world, {SETTINGS[file]}Arrays arrays) {{\n{native_source(FILES[file], constants)}}}\n"
     return f"{WARP_ON_CPU.read_text() if on_gpu else ''}{SHIM}struct Arrays {{\n{fields}}};\n{function}"
 
 
@@ -60,7 +87,7 @@ def test_a_compiler_takes_the_source_without_a_warning(tmp_path, file, on_gpu):
     source = tmp_path / "source.cpp"
     source.write_text(program(file, constants_of(file, mujoco.MjModel.from_xml_string(EVERY_JOINT)), on_gpu))
     # Unrolling is asked for in the words of NVIDIA's compiler.
-    flags = ["-std=c++17", "-fsyntax-only", "-Wall", "-Werror", "-Wno-unknown-pragmas"]
+    flags = ["-std=c++17", "-fsyntax-only", "-Wall", "-Werror", "-Wno-unknown-pragmas", "-Wno-unused-variable"]
     done = subprocess.run(["g++", *flags, str(source)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
@@ -68,8 +95,11 @@ def test_a_compiler_takes_the_source_without_a_warning(tmp_path, file, on_gpu):
 @pytest.mark.parametrize("file", STRUCTS)
 def test_the_compiler_for_gpus_takes_the_kernel(tmp_path, file):
     """By NVIDIA's run-time compiler, which comes with Warp and needs no GPU."""
-    make = {"constraint_solver.h": solver_kernel, "smooth_dynamics.h": dynamics_kernel}[file]
-    kernel = make(constants_of(file, mujoco.MjModel.from_xml_string(EVERY_JOINT)))
+    constants = constants_of(file, mujoco.MjModel.from_xml_string(EVERY_JOINT))
+    if file == "contacts":
+        kernel = stage_kernel(constants, planes=True, pairs=True, ground=True)
+    else:
+        kernel = {"solver": solver_kernel, "dynamics": dynamics_kernel}[file](constants)
     try:
         (compiled,) = wp.compile_aot_module(kernel.module, arch=ARCHITECTURE, module_dir=tmp_path, use_ptx=True)
     except RuntimeError as error:
@@ -98,11 +128,12 @@ class ArrayOf(ctypes.Structure):
 
 def lanes_of(folder: Path, file: str, constants: dict[str, Any]) -> Any:
     """Compile the half for GPUs into a function of the number of worlds, the order of lanes and the struct's arrays."""
-    call = "compute_world(world, MOST, MOST, 1e-9f, 0.01f, *all)" if SETTINGS[file] else "compute_world(world, *all)"
+    call = f"compute_world(world, {GIVEN[file]}*all)"
     source = folder / f"{file}.cpp"
     source.write_text(
         program(file, constants, on_gpu=True)
         + "const int MOST = 50; int worlds;\n"
+        + (COUNTED if file == "contacts" else "")
         + f"void lane(void* with) {{ Arrays* all = (Arrays*)with; for (int world = 0; world < worlds; ++world) {call}; }}\n"
         + 'extern "C" bool compute(int count, bool backwards, Arrays* all) {\n'
         + "    worlds = count; return warp_on_cpu::run(lane, all, backwards);\n}\n"
@@ -135,34 +166,105 @@ def in_every_way(launch: Any, compute: Any, file: str, struct: Any, names: tuple
     return found
 
 
-@needs_compiler
-def test_lanes_find_what_one_thread_finds(tmp_path):
-    """The half for GPUs, on a warp of lanes that take turns. In which order they run between two meetings must not matter:
-    that it does not, to the bit, shows that none is missing.
-    """
+def half_cheetah() -> FusedWorlds:
+    """Six worlds from deep in the ground to above it."""
     model = packaged("half_cheetah.xml", timestep=0.01)
     fused = FusedWorlds(model, 6, rows=64)
     qpos, qvel, ctrl = random_motion(model, 6, seed=1)
-    qpos[:, 1], qpos[:, 2:] = np.linspace(-0.7, 0.2, 6), 0.3 * qpos[:, 2:]  # from deep in the ground to above it
+    qpos[:, 1], qpos[:, 2:] = np.linspace(-0.7, 0.2, 6), 0.3 * qpos[:, 2:]
     fused.write(qpos, qvel, ctrl)
+    return fused
+
+
+def of_two_each(*extras: str) -> FusedWorlds:
+    """Six worlds of a robot of so many degrees of freedom that lanes have two."""
+    model = random_robot(0, 29, extras)
+    states = rollout(model, seed=1, steps=300, every=50)
+    fused = FusedWorlds(model, len(states), rows=150)
+    fused.write(*(np.stack([state[name] for state in states]) for name in ("qpos", "qvel", "ctrl")))
+    return fused
+
+
+WORLDS = {
+    "half cheetah": half_cheetah,
+    "two degrees of freedom a lane": lambda: of_two_each("damping"),
+    "with everything": lambda: of_two_each(*EXTRAS),
+}
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", WORLDS)
+def test_lanes_find_what_one_thread_finds(tmp_path, name):
+    """The half for GPUs, on a warp of lanes that take turns. In which order they run between two meetings must not matter:
+    that it does not, to the bit, shows that none is missing.
+    """
+    fused = WORLDS[name]()
     dynamics, solver = fused._step._dynamics, fused._step._solver
-    compute = lanes_of(tmp_path, "smooth_dynamics.h", dynamics_constants(model))
+    compute = lanes_of(tmp_path, "dynamics", dynamics_constants(fused.model))
     names = ("geom_xpos", "geom_xmat", "cdof", "M", "qfrc_passive", "qfrc_actuator", "qfrc_smooth")
-    results = in_every_way(dynamics.launch, compute, "smooth_dynamics.h", dynamics._arrays, names)
+    if fused.model.neq:
+        names = (*names, "xpos", "xquat", "cvel", "cdof_dot")
+    results = in_every_way(dynamics.launch, compute, "dynamics", dynamics._arrays, names)
     compare(names, *results)
+
+    assert fused._contacts is not None
+    compare_stage(tmp_path, fused._contacts, lambda: fused.read("nefc"))
 
     fused.step()  # makes the rows of constraints
     rows = fused.read("nefc")
-    assert rows.min() < 8
-    assert rows.max() > 32  # a lane has two
-    compute = lanes_of(tmp_path, "constraint_solver.h", solver_constants(model.nv, rows=64, damped=True))
+    assert rows.min() < rows.max()
+    assert name != "half cheetah" or rows.max() > 32  # a lane has two
+    compute = lanes_of(tmp_path, "solver", solver.constants)
     names = ("qacc", "advance", "qfrc_constraint")
-    compare(names, *in_every_way(solver.solve, compute, "constraint_solver.h", solver._arrays, names))
+    compare(names, *in_every_way(solver.solve, compute, "solver", solver._arrays, names))
 
 
-def compare(
-    names: tuple[str, ...], serial: list[np.ndarray], forwards: list[np.ndarray], backwards: list[np.ndarray]
-) -> None:
+def compare_stage(folder: Path, stage: ContactStage, read_rows: Callable[[], np.ndarray]) -> None:
+    """Check that lanes make the rows that one thread makes, and as many as it counts."""
+    compute = lanes_of(folder, "contacts", stage.constants)
+    names = ("jacobian", "stiffness", "reference", "contact_friction")
+    stage.launch()
+    ways = in_every_way(stage.launch, compute, "contacts", stage._arrays, names)
+    for name, *found in zip(names, *ways, strict=True):  # what no row or contact needs stays as it was
+        made = np.isfinite(found[0])
+        assert all((np.isfinite(array) == made).all() for array in found), name
+        compare([name], *([np.where(made, array, 0.0)] for array in found))
+        if name == "stiffness":
+            np.testing.assert_array_equal(made.sum(axis=1), read_rows())
+
+
+@needs_compiler
+def test_lanes_make_rows_of_two_degrees_of_freedom_each(tmp_path):
+    """A chain of 40 hinges with limits and dry friction, each link a capsule, lying across the floor."""
+    link = (
+        '<body pos="0 0 .1"><joint axis="0 1 0" range="-.1 .1" frictionloss=".1"/>'
+        '<geom type="capsule" fromto="0 0 0 0 0 .1" size=".02"/>'
+    )
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><compiler angle="radian"/><option jacobian="dense"/><worldbody><geom type="plane" size="0 0 1" contype="2"/>'
+        + 40 * link.replace("<geom", '<geom contype="0" conaffinity="2"')
+        + 40 * "</body>"
+        + "</worldbody></mujoco>"
+    )
+    rng = np.random.default_rng(0)
+    with wp.ScopedDevice("cpu"):
+        m = mjw.put_model(model)
+        d = mjw.make_data(model, nworld=4, nconmax=40, njmax=240)
+        qpos = 0.08 * rng.normal(size=(4, 40))
+        qpos[:, 0] += np.linspace(1.5, 1.7, 4)
+        d.qpos.assign(np.float32(qpos))
+        d.qvel.assign(np.float32(rng.normal(size=(4, 40))))
+        for part in (mjw.kinematics, mjw.com_pos):
+            part(m, d)
+        assert ContactStage.why_not(model, m) == ""
+        stage = ContactStage(model, m, d)
+        compare_stage(tmp_path, stage, lambda: d.nefc.numpy())
+    assert (d.nf.numpy() == 40).all()
+    assert d.nl.numpy().min() > 0
+    assert (d.nefc.numpy() - d.nf.numpy() - d.nl.numpy()).max() > 40  # more than ten contacts
+
+
+def compare(names: Sequence[str], serial: list[np.ndarray], forwards: list[np.ndarray], backwards: list[np.ndarray]) -> None:
     """Check that lanes find the same in either order, and what one thread finds up to rounding."""
     for name, one, up, down in zip(names, serial, forwards, backwards, strict=True):
         assert np.isfinite(one).all(), name

@@ -115,7 +115,8 @@ def test_labels_give_sizes_in_the_units_of_the_types():
 
 
 def test_a_task_on_steps_has_the_constraint_rows_that_play_gives_to_others():
-    assert task_config("anymal_c").sim.njmax == ROWS_NEEDED
+    sim = task_config("anymal_c").sim
+    assert (sim.njmax, sim.nconmax) == (ROWS_NEEDED, ROWS_NEEDED // 4)  # a contact has four rows
 
 
 def test_robots_start_on_their_tiles_and_face_along_x():

@@ -250,4 +250,25 @@ FACTS = {
         armature={"hip": 0.1, "knee": 0.1, "ankle": 0.1, "torso": 0.1, "shoulder": 0.02, "elbow": 0.02},
         topples=1.81,
     ),
+    "cassie": Facts(
+        mass=33.312,
+        centre=(-0.017367, 0.000107, -0.12863),
+        base_inertia=(0.085821, 0.049222, 0.08626),
+        joints=legs("left right", "{}_hip_roll {}_hip_yaw {}_hip_pitch {}_knee {}_foot"),
+        effort={"hip_roll": 112.5, "hip_yaw": 112.5, "hip_pitch": 195.2, "knee": 195.2, "foot": 45.0},
+        speed={"hip_roll": 12.15, "hip_yaw": 12.15, "hip_pitch": 8.51, "knee": 8.51, "foot": 11.52},
+        ranges={
+            "left_hip_roll": (-0.2618, 0.3927),
+            "right_hip_roll": (-0.3927, 0.2618),
+            "hip_yaw": (-0.3927, 0.3927),
+            "hip_pitch": (-0.8727, 1.3963),
+            "knee": (-2.8623, -0.6458),
+            "foot": (-2.4435, -0.5236),
+        },
+        feet=mirrored(
+            {"left_foot": ((0.000136, 0.1305, -0.987554), (0.019609, 0.1305, -1.121903))}, {"left_foot": "right_foot"}
+        ),
+        armature={"hip_roll": 0.038125, "hip_yaw": 0.038125, "hip_pitch": 0.09344, "knee": 0.09344, "foot": 0.01225},
+        topples=1.0,
+    ),
 }

@@ -226,8 +226,8 @@ def test_a_folder_of_ones_own_is_a_robot(folder, robot):
 
 
 def test_misspelt_robot_is_an_error_that_suggests_the_right_name():
-    with pytest.raises(ConfigError, match=r"no robot 'anymal_x'; did you mean 'anymal_c'\?"):
-        load_robot("anymal_x")
+    with pytest.raises(ConfigError, match=r"no robot 'anymal_cc'; did you mean 'anymal_c'\?"):
+        load_robot("anymal_cc")
 
 
 @pytest.mark.parametrize(

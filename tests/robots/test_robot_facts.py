@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from reference import roll, standing
+from reference import roll
 from robot_facts import FACTS
 
 from legged.config.schema import LeggedControlConfig, SimConfig
@@ -31,11 +31,13 @@ def model(robot) -> mujoco.MjModel:
     return RobotScene(robot).model(SimConfig())
 
 
-def posed(model: mujoco.MjModel, angles: np.ndarray) -> mujoco.MjData:
-    """Base at the origin, level, so that world and base frame are the same."""
+def posed(model: mujoco.MjModel, robot: Robot, angles: np.ndarray) -> mujoco.MjData:
+    """Base at the origin, level, so that world and base frame are the same; passive joints as in the default pose."""
     data = mujoco.MjData(model)
-    data.qpos[:7] = [0, 0, 0, 1, 0, 0, 0]
-    data.qpos[7:] = angles
+    data.qpos[:] = robot.default_qpos
+    data.qpos[list(robot.qpos_columns)] = angles
+    if robot.passive is not None and not angles.any():
+        data.qpos[list(robot.passive.qpos_columns)] = 0.0
     mujoco.mj_forward(model, data)
     return data
 
@@ -44,7 +46,7 @@ def test_mass_centre_and_inertia(robot, facts, model):
     assert robot.mass == pytest.approx(facts.mass, abs=1e-4)
     assert model.body_mass.sum() == pytest.approx(facts.mass, abs=1e-4)
     base = model.body(robot.file.base)
-    centre = posed(model, robot.default_dof_pos).subtree_com[base.id]
+    centre = posed(model, robot, robot.default_dof_pos).subtree_com[base.id]
     np.testing.assert_allclose(centre, facts.centre, atol=1e-5)
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, base.iquat)
@@ -68,7 +70,7 @@ def test_joints_and_their_limits(robot, facts, model):
 @pytest.mark.parametrize("pose", ["default", "zero"])
 def test_feet_are_where_the_links_put_them(robot, facts, model, pose):
     angles = robot.default_dof_pos if pose == "default" else np.zeros(robot.num_dof)
-    data = posed(model, angles)
+    data = posed(model, robot, angles)
     assert robot.feet_names == tuple(sorted(facts.feet, key=robot.feet_names.index))
     for shapes, name in zip(robot.feet_shapes, robot.feet_names, strict=True):
         body = data.body(model.geom(shapes[0]).bodyid[0])
@@ -94,7 +96,7 @@ def test_left_and_right_are_mirror_images(robot, model):
     low, high = robot.dof_pos_limits.T
     np.testing.assert_allclose(np.where(signs > 0, low[partners], -high[partners]), low, atol=1e-9)
     angles = np.random.default_rng(0).uniform(low, high)
-    here, there = posed(model, angles), posed(model, angles[partners] * signs)
+    here, there = posed(model, robot, angles), posed(model, robot, angles[partners] * signs)
     for shapes, others in zip(robot.feet_shapes, (robot.feet_shapes[i] for i in mirror.feet), strict=True):
         place = np.mean([here.geom(name).xpos for name in shapes], axis=0)
         image = np.mean([there.geom(name).xpos for name in others], axis=0)
@@ -119,27 +121,30 @@ def test_standing_robot_keeps_its_height(robot, facts):
     """A robot that topples does so as stiffly as a statue: its joints stay where its gains hold them."""
     sim = SimConfig(physics="mujoco", **STIFF_CONTACTS)
     physics = make_physics(RobotScene(robot), sim, 1, torch.device("cpu"))
-    start = standing(robot, 1, 0.001 - lowest_foot(physics.model, robot))
-    start.write(physics)
+    start = torch.tensor(robot.default_qpos, dtype=torch.float32).unsqueeze(0)
+    start[:, 2] = 0.001 - lowest_foot(physics.model, robot)
+    physics.write(torch.ones(1, dtype=torch.bool), start, torch.zeros_like(physics.qvel))
+    physics.refresh()
+    targets = start[:, list(robot.qpos_columns)]
     own = facts.gains or map(torch.tensor, control_gains(robot, LeggedControlConfig()))
     gains = dict(zip(("stiffness", "damping"), own, strict=True))
     state = physics.robot_state
     if facts.standing is not None:
-        roll(physics, start.dof_pos, 400, **gains)
+        roll(physics, targets, 400, **gains)
         assert state.base_pos[0, 2].item() == pytest.approx(facts.standing, abs=0.005)
         assert state.projected_gravity[0, 2].item() < -0.999
         return
     for _ in range(400):
-        roll(physics, start.dof_pos, 1, **gains)
+        roll(physics, targets, 1, **gains)
         if state.projected_gravity[0, 2] > -np.cos(np.radians(30.0)):
             break
-        assert (state.dof_pos - start.dof_pos).abs().max() < 0.6
+        assert (state.dof_pos - targets).abs().max() < 0.6
     assert _ * physics.dt == pytest.approx(facts.topples, abs=0.15)
 
 
 def lowest_foot(model: mujoco.MjModel, robot: Robot) -> float:
     """Lowest point of the feet in the default pose, base at the origin; they are spheres and capsules."""
-    data = posed(model, robot.default_dof_pos)
+    data = posed(model, robot, robot.default_dof_pos)
     geoms = [model.geom(name).id for shapes in robot.feet_shapes for name in shapes]
     reach = model.geom_size[geoms, 0] + np.abs(data.geom_xmat[geoms, 8]) * model.geom_size[geoms, 1]
     return float((data.geom_xpos[geoms, 2] - reach).min())

@@ -65,11 +65,11 @@ def test_pattern_that_names_nothing_is_an_error(shapes, pattern):
 
 @pytest.mark.parametrize("engine", ["mujoco", "mujoco_warp"])
 def test_forces_and_places_of_feet_of_several_shapes(engine):
-    """G1 thrown on the ground, 10 steps, beside C MuJoCo, whose contacts are added up by hand."""
-    robot, sim = load_robot("g1"), SimConfig(physics=engine, nconmax=48, njmax=200, iterations=100, ls_iterations=50)
+    """H1 thrown on the ground, 10 steps, beside C MuJoCo, whose contacts are added up by hand."""
+    robot, sim = load_robot("h1"), SimConfig(physics=engine, nconmax=48, njmax=200, iterations=100, ls_iterations=50)
     assert robot.feet_names == ("left_foot", "right_foot")
     start = random_states(robot, 6, seed=0)
-    start.base_pos[:, 2] += 0.2
+    start.base_pos[:, 2] += 0.42
     physics, worlds = make_physics(RobotScene(robot), sim, 6, torch.device("cpu")), CWorlds(robot, sim, start)
     start.write(physics)
     for _ in range(10):

@@ -34,9 +34,9 @@ def pendulum():
 
 def test_standing_height_is_down_to_the_lowest_shape(pendulum):
     """By hand: 0.1 + 0.4 + 0.02 m straight down; with the leg level, the trunk's underside is lowest but for the foot."""
-    assert standing_height(pendulum, "base", {"hip": 0.0}) == pytest.approx(0.52, abs=1e-6)
-    assert standing_height(pendulum, "base", {"hip": np.pi / 3}) == pytest.approx(0.1 + 0.2 + 0.02, abs=1e-6)
-    assert standing_height(pendulum, "base", {"hip": np.pi}) == pytest.approx(0.05, abs=1e-6)
+    assert standing_height(pendulum, "base", [0, 0, 0, 1, 0, 0, 0, 0.0]) == pytest.approx(0.52, abs=1e-6)
+    assert standing_height(pendulum, "base", [0, 0, 0, 1, 0, 0, 0, np.pi / 3]) == pytest.approx(0.1 + 0.2 + 0.02, abs=1e-6)
+    assert standing_height(pendulum, "base", [0, 0, 0, 1, 0, 0, 0, np.pi]) == pytest.approx(0.05, abs=1e-6)
 
 
 SHAPES = {

@@ -199,3 +199,15 @@ def test_the_engine_of_a_scale_is_the_one_asked_for(capsys, monkeypatch):
     assert command[command.index("--physics") + 1] == "newton"
     assert command[command.index("--solver") + 1] == "xpbd"
     assert "--scale=4" not in command
+
+
+def test_a_start_is_timed_beside_importing_torch(tmp_path, capsys):
+    arguments = ["--startup", "--repeats", "1", "--json", str(tmp_path / "s.json"), "--task", "anymal_c_flat", *SMALL]
+    assert benchmark.main(arguments) == 0
+    times = json.loads((tmp_path / "s.json").read_text())
+    stages = list(times["stages"].values())
+    assert list(times["stages"])[-2:] == ["first iteration", "end"]
+    assert stages == sorted(stages)
+    assert times["ratio"] == pytest.approx(times["stages"]["first iteration"] / times["torch_s"])
+    assert times["ratio_without_capture"] < times["ratio"]
+    assert "x import torch" in capsys.readouterr().out

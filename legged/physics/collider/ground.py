@@ -1,8 +1,7 @@
 """A height map on the device, and what of it a sphere or a capsule can touch: Warp functions, geometry only.
 
-A shape is looked at as probes: spheres (a sphere, the ends of a capsule, the corners of a box with radius 0) and what lies
-between the ends of a capsule. Each looks at the few cells under it: the cell's surface below, the vertical faces and
-their rims beside it.
+A shape is looked at as probes (probes.py). Each looks at the few cells under it: the cell's surface below, the vertical
+faces and their rims beside it.
 """
 
 import numpy as np
@@ -209,49 +208,46 @@ def rim_or_ridge(ground: Ground, a: wp.vec3, b: wp.vec3, axis: int, line: int) -
     return hit
 
 
-MOST = 6
+MOST = wp.constant(6)
 """Contacts of one probe at most: the surfaces and faces around a sphere in a corner."""
-mat_hits = wp.types.matrix(shape=(MOST, 3), dtype=float)
-vec_hits = wp.types.vector(length=MOST, dtype=float)
 
 
 @wp.struct
 class Hits:
-    """Up to MOST contacts of a probe."""
+    """Room for MOST contacts of each probe of each world, a row for each: in registers they would crowd out all else."""
 
-    count: int
-    dist: vec_hits
-    normal: mat_hits
-    point: mat_hits
-
-
-@wp.func
-def add(hits: Hits, hit: Hit) -> Hits:
-    """One more, if there is room."""
-    k = hits.count
-    if k < MOST:
-        hits.dist[k] = hit.dist
-        for axis in range(3):
-            hits.normal[k, axis] = hit.normal[axis]
-            hits.point[k, axis] = hit.point[axis]
-        hits.count = k + 1
-    return hits
+    dist: wp.array2d[float]
+    normal: wp.array2d[wp.vec3]
+    point: wp.array2d[wp.vec3]
 
 
 @wp.func
-def around_point(ground: Ground, p: wp.vec3, near: float) -> Hits:
-    """What the ground offers to a sphere around `p` that reaches out to `near`."""
-    hits = Hits()
+def add(hits: Hits, row: int, count: int, hit: Hit) -> int:
+    """Add one more to the `count` of a row, if there is room; returns how many there are."""
+    if count >= MOST:
+        return count
+    hits.dist[row, count] = hit.dist
+    hits.normal[row, count] = hit.normal
+    hits.point[row, count] = hit.point
+    return count + 1
+
+
+@wp.func
+def around_point(ground: Ground, p: wp.vec3, near: float, faces_only: bool, hits: Hits, row: int) -> int:
+    """Find what the ground offers to a sphere around `p` that reaches out to `near`, or only its vertical faces with their
+    rims; returns how many hits are in the row.
+    """
+    count = wp.int32(0)
     cell = cell_of(ground, p[0], p[1])
     i, j = cell[0], cell[1]
     if p[2] - near > ground.ceiling[i, j]:
-        return hits
+        return count
     s = surface(ground, i, j, p[0], p[1])
     own = on_plane(p, wp.vec3(p[0], p[1], s[0]), s)
     if own.dist < 0.0:
         own = leave_sideways(ground, i, j, p, own)
-    if own.dist < near:
-        hits = add(hits, own)
+    if own.dist < near and not faces_only:
+        count = add(hits, row, count, own)
     crease = Hit()
     crease.dist = NOTHING
     for di in range(-ground.reach, ground.reach + 1):
@@ -263,22 +259,21 @@ def around_point(ground: Ground, p: wp.vec3, near: float) -> Hits:
             if (di != 0 or dj != 0) and dx * dx + dy * dy < near * near:
                 hit = beside(ground, i, j, i + di, j + dj, p)
                 if hit.face and hit.dist < near:
-                    hits = add(hits, hit)
+                    count = add(hits, row, count, hit)
                 elif hit.dist < crease.dist:
                     crease = hit
-    if crease.dist < near and wp.dot(crease.normal, own.normal) < SAME:
-        hits = add(hits, crease)
-    return hits
+    if crease.dist < near and not faces_only and wp.dot(crease.normal, own.normal) < SAME:
+        count = add(hits, row, count, crease)
+    return count
 
 
 @wp.func
-def between_ends(ground: Ground, a: wp.vec3, b: wp.vec3, near: float) -> Hits:
-    """What touches a capsule a-b between its ends: the nearest rim or ridge of each half."""
-    hits = Hits()
+def between_ends(ground: Ground, a: wp.vec3, b: wp.vec3, near: float, hits: Hits, row: int) -> int:
+    """Find what touches a capsule a-b between its ends: the nearest rim or ridge of each half; returns how many."""
     middle = 0.5 * (a + b)
     cell = cell_of(ground, middle[0], middle[1])
     if wp.min(a[2], b[2]) - near > ground.wide_ceiling[cell[0], cell[1]]:
-        return hits
+        return 0
     first = Hit()
     second = Hit()
     first.dist = NOTHING
@@ -297,10 +292,20 @@ def between_ends(ground: Ground, a: wp.vec3, b: wp.vec3, near: float) -> Hits:
                         first = hit
                 elif hit.dist < second.dist:
                     second = hit
+    count = wp.int32(0)
     if first.dist < near:
-        hits = add(hits, first)
+        count = add(hits, row, count, first)
     if second.dist < near:
-        hits = add(hits, second)
+        count = add(hits, row, count, second)
+    return count
+
+
+def room_for_hits(rows: int) -> Hits:
+    """Return room for the contacts of so many probes, on Warp's current device."""
+    hits = Hits()
+    hits.dist = wp.zeros((rows, int(MOST)), dtype=float)
+    hits.normal = wp.zeros((rows, int(MOST)), dtype=wp.vec3)
+    hits.point = wp.zeros((rows, int(MOST)), dtype=wp.vec3)
     return hits
 
 

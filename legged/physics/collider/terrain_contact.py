@@ -1,4 +1,4 @@
-"""Contacts of spheres, capsules and boxes with a height map, as one Warp kernel behind mujoco-warp's own collisions.
+"""Contacts of simple shapes with a height map, as one Warp kernel behind mujoco-warp's own collisions.
 
 mujoco-warp meets a height field with a general convex solver (GJK) on triangular prisms: ten times the cost of this,
 and a riser becomes a ramp one cell wide. Here a contact is a few lookups (ground.py).
@@ -8,20 +8,17 @@ contact point lies halfway between the two surfaces, as in MuJoCo. Friction dire
 where MuJoCo turns them along a capsule on a plane; the friction cone is the same.
 """
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from itertools import product
+from collections.abc import Iterable
 from typing import Any
 
 import mujoco
-import numpy as np
 import warp as wp
 from mujoco_warp._src.collision_core import contact_margin_gap, contact_material_params, write_contact
 from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import vec5
 
-from legged.errors import ConfigError
-from legged.physics.collider.ground import Ground, Hits, around_point, between_ends, ground_of
+from legged.physics.collider.ground import Ground, Hits, ground_of, room_for_hits
+from legged.physics.collider.probes import look, probes_of
 from legged.terrain import HeightMap
 
 MODEL_FIELDS = (
@@ -64,58 +61,16 @@ CONTACT_FIELDS = (
 """Of its contacts, in the kernel's order."""
 
 
-@dataclass(frozen=True)
-class Probe:
-    """A sphere, or with `start` and `end` apart what lies between the ends of a capsule; in its geom's frame [m]."""
-
-    geom: int
-    start: np.ndarray
-    end: np.ndarray
-    radius: float
-
-    @property
-    def long(self) -> bool:
-        """Whether it is the inside of a capsule."""
-        return bool((self.start != self.end).any())
-
-
-def probes_of(model: mujoco.MjModel, shapes: Iterable[int]) -> Iterator[Probe]:
-    """The probes of those geoms.
-
-    Raises:
-        ConfigError: a shape that is neither sphere, capsule nor box.
-    """
-    kinds = mujoco.mjtGeom
-    for i in shapes:
-        kind, size = model.geom_type[i], model.geom_size[i]
-        centre = np.zeros(3)
-        if kind == kinds.mjGEOM_SPHERE:
-            yield Probe(i, centre, centre, size[0])
-        elif kind == kinds.mjGEOM_CAPSULE:
-            end = np.array([0.0, 0.0, size[1]])
-            yield Probe(i, -end, -end, size[0])
-            yield Probe(i, end, end, size[0])
-            yield Probe(i, -end, end, size[0])
-        elif kind == kinds.mjGEOM_BOX:
-            for signs in product((-1.0, 1.0), repeat=3):
-                yield Probe(i, size * signs, size * signs, 0.0)
-        else:
-            name, of = model.geom(i).name, kinds(kind).name.removeprefix("mjGEOM_").lower()
-            raise ConfigError(
-                f"terrain: shape '{name}' is a {of}; sim.terrain_collider=cells knows spheres, capsules and boxes (their"
-                " corners). Use those, sim.terrain_collider=convex, or sim.physics=mujoco"
-            )
-
-
 @wp.kernel
 def touch_ground(
     ground: Ground,
+    hits: Hits,
     terrain: int,
     probe_geom: wp.array[int],
+    probe_kind: wp.array[int],
     probe_start: wp.array[wp.vec3],
     probe_end: wp.array[wp.vec3],
     probe_radius: wp.array[float],
-    probe_long: wp.array[wp.bool],
     geom_condim: wp.array[int],
     geom_priority: wp.array[int],
     geom_solmix: wp.array2d[float],
@@ -161,14 +116,9 @@ def touch_ground(
     margin, gap = contact_margin_gap(geom_margin, geom_gap, pair_margin, pair_gap, geoms, -1, world)
     near = radius + margin + gap
     position, turn = geom_xpos[world, geom], geom_xmat[world, geom]
-    a = position + turn * probe_start[probe]
-
-    hits = Hits()
-    if probe_long[probe]:
-        hits = between_ends(ground, a, position + turn * probe_end[probe], near)
-    else:
-        hits = around_point(ground, a, near)
-    if hits.count == 0:
+    row = world * probe_geom.shape[0] + probe
+    count = look(ground, probe_kind[probe], position, turn, probe_start[probe], probe_end[probe], near, hits, row)
+    if count == 0:
         return
     condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
         geom_condim,
@@ -188,10 +138,10 @@ def touch_ground(
         -1,
         world,
     )
-    for k in range(hits.count):
-        normal = wp.vec3(hits.normal[k, 0], hits.normal[k, 1], hits.normal[k, 2])
-        point = wp.vec3(hits.point[k, 0], hits.point[k, 1], hits.point[k, 2])
-        dist = hits.dist[k] - radius
+    for k in range(count):
+        normal = hits.normal[row, k]
+        point = hits.point[row, k]
+        dist = hits.dist[row, k] - radius
         write_contact(
             naconmax,
             k,
@@ -238,19 +188,23 @@ class TerrainContact:
         the geoms that meet it. Call with their device as Warp's current one.
 
         Raises:
-            ConfigError: a colliding shape that is neither sphere, capsule nor box.
+            ConfigError: a colliding shape that has no probes.
         """
-        probes = list(probes_of(model, shapes))
-        largest = max(probe.radius for probe in probes) + float((model.geom_margin + model.geom_gap).max())
-        longest = max(float(np.linalg.norm(probe.end - probe.start)) for probe in probes)
+        self.terrain = terrain
+        self.probes = probes = list(probes_of(model, shapes))
+        largest = max(probe.reach for probe in probes) + float((model.geom_margin + model.geom_gap).max())
+        longest = max(probe.length for probe in probes)
+        self.ground = ground_of(height_map, largest, longest)
+        self.hits = room_for_hits(d.nworld * len(probes))
         self._inputs = [
-            ground_of(height_map, largest, longest),
+            self.ground,
+            self.hits,
             terrain,
             wp.array([probe.geom for probe in probes], dtype=int),
+            wp.array([probe.kind for probe in probes], dtype=int),
             wp.array([probe.start for probe in probes], dtype=wp.vec3),
             wp.array([probe.end for probe in probes], dtype=wp.vec3),
             wp.array([probe.radius for probe in probes], dtype=float),
-            wp.array([probe.long for probe in probes], dtype=wp.bool),
             *(getattr(m, name) for name in MODEL_FIELDS),
             d.geom_xpos,
             d.geom_xmat,

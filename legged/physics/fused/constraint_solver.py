@@ -10,9 +10,20 @@ function with an exact line search ends where no row changes sides any more.
 from typing import Any
 
 import mujoco
+import numpy as np
 import warp as wp
 
-from legged.physics.fused.native import LANES, SHARED_BYTES, native_source
+from legged.physics.fused.native import LANES, native_source
+from legged.physics.fused.tree import MOST_DOFS, Tree
+
+SOURCE = ("constraint_rows.h", "elliptic_cones.h", "elimination.h", "constraint_solver.h")
+ELLIPTIC_ROW = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)
+MOST_ROWS = 512
+KEPT_BYTES = 3600
+"""Of a Jacobian in a block's shared memory: more rows are read from elsewhere, so that more worlds are computed at once."""
+MULTIPROCESSOR_BYTES, BYTES_OF_A_BLOCK = 228 * 1024, 1024
+"""Shared memory of a multiprocessor (an H100's), and what each block takes of it for itself."""
+Vector5 = wp.types.vector(length=5, dtype=wp.float32)
 
 
 def row_length(nv: int) -> int:
@@ -24,49 +35,80 @@ def row_length(nv: int) -> int:
 
 @wp.struct
 class SolverArrays:
-    """What the solver reads of mujoco-warp's model and data; from `qacc` to `rounds` what it writes; and what it reads and
-    writes besides where there are dampers.
+    """Tables of our own; what the solver reads of mujoco-warp's model and data; and what it writes: from `qacc` to `rounds`,
+    and where there are dampers `advance`.
     """
 
-    row_start: wp.array[int]
-    row_count: wp.array[int]
-    column: wp.array[int]
+    dof_depth: wp.array[int]
+    dof_place: wp.array[int]
+    dof_path: wp.array[int]
+    below: wp.array[int]
+    depth_width: wp.array[int]
+    path: wp.array[wp.uint64]
+    entry_row: wp.array[int]
+    entry_column: wp.array[int]
     inertia: wp.array2d[float]
     qfrc_smooth: wp.array2d[float]
     warmstart: wp.array2d[float]
     equalities: wp.array[int]
     frictions: wp.array[int]
+    limits: wp.array[int]
     nefc: wp.array[int]
+    type: wp.array2d[int]
+    id: wp.array2d[int]
     jacobian: wp.array3d[float]
     stiffness: wp.array2d[float]
     reference: wp.array2d[float]
     frictionloss: wp.array2d[float]
+    contact_dim: wp.array[int]
+    contact_row: wp.array2d[int]
+    friction: wp.array[Vector5]
+    impratio_invsqrt: wp.array[float]
+    timestep: wp.array[float]
+    damping: wp.array2d[float]
     qacc: wp.array2d[float]
     inertial: wp.array2d[float]
     qfrc_constraint: wp.array2d[float]
     efc_force: wp.array2d[float]
     rounds: wp.array[int]
-    timestep: wp.array[float]
-    damping: wp.array2d[float]
     advance: wp.array2d[float]
 
 
-def solver_constants(nv: int, rows: int, damped: bool = False) -> dict[str, int | bool]:
-    """Return what constraint_solver.h asks for, of models of `nv` degrees of freedom and at most `rows` constraint rows, with
-    dampers to integrate implicitly or without.
+def solver_constants(
+    tree: Tree, rows: int, entries: int, damped: bool = False, friction: bool = True, dry: bool = True, elliptic: bool = False
+) -> dict[str, int | bool]:
+    """Return what the sources ask for, of models of a tree, with at most `rows` constraint rows and `entries` of the mass
+    matrix, with dampers to integrate implicitly or without, with rows of dry friction, all of which are `dry` degrees of
+    freedom and none tendons, and with elliptic cones.
     """
-    return {"NV": nv, "ROWS": rows, "STRIDE": row_length(nv), "DAMPED": damped}
+    nv = len(tree.parent)
+    sizes = {"NV": nv, "ROWS": rows, "STRIDE": row_length(nv), "ENTRIES": entries}
+    sizes["KEPT_ROWS"] = min(rows, KEPT_BYTES // (4 * sizes["STRIDE"]))
+    kinds = {"DAMPED": damped, "FRICTION": friction, "DRY": friction and dry, "ELLIPTIC": elliptic}
+    return {**sizes, **kinds, "ELLIPTIC_ROW": ELLIPTIC_ROW, **tree.constants()}
+
+
+def blocks(constants: dict[str, int | bool]) -> int:
+    """Return how many worlds a multiprocessor shall hold at least, which bounds the registers of a lane: as many as have room
+    in its shared memory, the same for each of its four schedulers.
+    """
+    nv, rows, stride = constants["NV"], constants["ROWS"], constants["STRIDE"]
+    pitch, path = (4 * ((n + 4) // 4) for n in (constants["DEPTH"], nv))
+    board = max(constants["WIDTH"] * pitch, path if constants["SPLIT"] else 0)
+    floats = (constants["KEPT_ROWS"] + nv + 1) * stride + 2 * board + constants["CORNER"]
+    taken = 4 * floats + (20 + (13 if constants["ELLIPTIC"] else 0)) * rows + (19 * nv if constants["DRY"] else 0)
+    return max(4, min(32, MULTIPROCESSOR_BYTES // (taken + BYTES_OF_A_BLOCK) // 4 * 4))
 
 
 def solver_kernel(constants: dict[str, int | bool]) -> Any:
     """Return the kernel for some `solver_constants`; launched for (worlds, lanes)."""
 
-    @wp.func_native(native_source("constraint_solver.h", constants))
+    @wp.func_native(native_source(SOURCE, constants))
     def solve_world(
         world: int, most_rounds: int, most_searches: int, tolerance: float, ls_tolerance: float, arrays: SolverArrays
     ) -> None: ...
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(LANES, blocks(constants)))
     def solve_constraints(
         most_rounds: int, most_searches: int, tolerance: float, ls_tolerance: float, arrays: SolverArrays
     ) -> None:
@@ -76,17 +118,29 @@ def solver_kernel(constants: dict[str, int | bool]) -> Any:
     return solve_constraints
 
 
+def ask_for_dense_rows(model: mujoco.MjModel) -> None:
+    """Let mujoco-warp keep the Jacobian's rows whole, as this solver reads them; above 32 degrees of freedom it would not."""
+    if model.nv <= MOST_DOFS:
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+
+
 class ConstraintSolver:
     """Constraint forces and accelerations of all worlds, from what mujoco-warp has put into its data."""
 
     advance: wp.array2d
     """(worlds, nv) the accelerations that integrate velocities: `qacc`, or with dampers integrated implicitly another."""
 
-    def __init__(self, m: Any, d: Any, damped: bool = False) -> None:
-        """Prepare the launch for mujoco-warp's model and data, of which `why_not` says nothing; with `damped`, compute what
-        integrates dampers implicitly too. Call with their device as Warp's current one.
+    def __init__(self, model: mujoco.MjModel, m: Any, d: Any, damped: bool = False) -> None:
+        """Prepare the launch for mujoco-warp's `m` and `d` of a model, of which `why_not` says nothing; with `damped`,
+        compute what integrates dampers implicitly too. Call with their device as Warp's current one.
         """
-        self._kernel = solver_kernel(solver_constants(m.nv, d.njmax, damped))
+        tree, elliptic = Tree.of(model), m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+        friction = not m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
+        counts, columns = m.M_rownnz.numpy(), m.M_colind.numpy()
+        dry = not model.ntendon
+        rows = np.repeat(np.arange(m.nv), counts)
+        self.constants = solver_constants(tree, d.njmax, len(rows), damped, friction, dry, elliptic)
+        self._kernel = solver_kernel(self.constants)
         self._lanes = 1 if d.qacc.device.is_cpu else LANES
         efc, opt = d.efc, m.opt
         self._settings = [
@@ -96,11 +150,15 @@ class ConstraintSolver:
             float(opt.ls_tolerance.numpy()[0]),
         ]
         arrays = self._arrays = SolverArrays()
-        arrays.row_start, arrays.row_count, arrays.column, arrays.inertia = m.M_rowadr, m.M_rownnz, m.M_colind, d.M
-        arrays.qfrc_smooth, arrays.warmstart = d.qfrc_smooth, d.qacc_warmstart
-        arrays.equalities, arrays.frictions, arrays.nefc = d.ne, d.nf, d.nefc
-        arrays.jacobian, arrays.stiffness, arrays.reference = efc.J, efc.D, efc.aref
+        for name, table in tree.tables().items():
+            setattr(arrays, name, wp.array(table, dtype=wp.uint64 if name == "path" else int))
+        arrays.entry_row, arrays.entry_column = wp.array(rows, dtype=int), wp.array(columns[: len(rows)], dtype=int)
+        arrays.inertia, arrays.qfrc_smooth, arrays.warmstart = d.M, d.qfrc_smooth, d.qacc_warmstart
+        arrays.equalities, arrays.frictions, arrays.limits, arrays.nefc = d.ne, d.nf, d.nl, d.nefc
+        arrays.type, arrays.id, arrays.jacobian, arrays.stiffness, arrays.reference = efc.type, efc.id, efc.J, efc.D, efc.aref
         arrays.frictionloss = efc.frictionloss
+        arrays.contact_dim, arrays.contact_row, arrays.friction = d.contact.dim, d.contact.efc_address, d.contact.friction
+        arrays.impratio_invsqrt = opt.impratio_invsqrt
         arrays.qacc, arrays.inertial, arrays.qfrc_constraint = d.qacc, efc.Ma, d.qfrc_constraint
         arrays.efc_force, arrays.rounds = efc.force, d.solver_niter
         self.advance = wp.zeros_like(d.qacc) if damped else d.qacc
@@ -110,17 +168,14 @@ class ConstraintSolver:
     @staticmethod
     def why_not(m: Any, d: Any) -> str:
         """Return what of a model this solver does not know; empty if nothing."""
-        if not 1 <= m.nv <= LANES:
-            return f"it takes 1 to {LANES} degrees of freedom, the model has {m.nv}"
-        floats = (d.njmax + m.nv + 1) * row_length(m.nv) + 2 * d.njmax
-        if 4 * floats > SHARED_BYTES:
-            return f"{d.njmax} constraint rows (sim.njmax) of {m.nv} numbers do not fit a GPU's shared memory"
+        if not 1 <= m.nv <= MOST_DOFS:
+            return f"it takes 1 to {MOST_DOFS} degrees of freedom, the model has {m.nv}"
         if m.is_sparse:
-            return f"with {m.nv} degrees of freedom mujoco-warp keeps Jacobians sparse"
+            return "mujoco-warp keeps the model's Jacobians sparse"
+        if d.njmax > MOST_ROWS:
+            return f"{d.njmax} constraint rows (sim.njmax) are more than {MOST_ROWS}"
         if m.opt.solver != mujoco.mjtSolver.mjSOL_NEWTON:
             return "the model's solver is not Newton"
-        if m.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
-            return "friction cones are elliptic (sim.cone)"
         if m.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
             return "the model's integrator is not Euler"
         if m.opt.noslip_iterations:

@@ -14,11 +14,63 @@ const int LANES = 32, lane = threadIdx.x & 31;
     for (int apart = 16; apart > 0; apart >>= 1) x += __shfl_xor_sync(0xffffffffu, x, apart);
     return x;
 };
+// The sums of four numbers over all lanes: with each exchange a lane goes on with half as many of them, then passes its sum on.
+[[maybe_unused]] auto sum_four = [&](float* x) {
+    const bool upper = lane & 16, odd = lane & 8;
+    for (int k = 0; k < 2; ++k) {
+        const float given = __shfl_xor_sync(0xffffffffu, upper ? x[k] : x[2 + k], 16);
+        x[k] = (upper ? x[2 + k] : x[k]) + given;
+    }
+    float one = (odd ? x[1] : x[0]) + __shfl_xor_sync(0xffffffffu, odd ? x[0] : x[1], 8);
+    for (int apart = 4; apart > 0; apart >>= 1) one += __shfl_xor_sync(0xffffffffu, one, apart);
+    for (int k = 0; k < 4; ++k) x[k] = __shfl_sync(0xffffffffu, one, 8 * k);
+};
+// Whether any lane says so.
+[[maybe_unused]] auto any = [](bool x) { return __any_sync(0xffffffffu, x) != 0; };
+// How many lanes before this one are `on`, after the `count` that is in a list: its place there. Counts those that are on.
+[[maybe_unused]] auto rank = [&](bool on, int& count) {
+    const unsigned which = __ballot_sync(0xffffffffu, on);
+    const int place = count + __popc(which & ((1u << lane) - 1u));
+    count += __popc(which);
+    return place;
+};
+// 1 / x of a normal number, but for its last bit.
+[[maybe_unused]] auto inverse = [](float x) {
+#if defined(__CUDACC__)
+    float y;
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+#else
+    return 1.0f / x;
+#endif
+};
+#define UNROLLED _Pragma("unroll")
+#define BY_TWO _Pragma("unroll 2")
+#define BY_FOUR _Pragma("unroll 4")
+#define ROLLED _Pragma("unroll 1")
+// The sum of x over the lanes before this one.
+[[maybe_unused]] auto before = [&](float x) {
+    float total = x;
+    for (int apart = 1; apart < 32; apart <<= 1) {
+        const float other = __shfl_sync(0xffffffffu, total, lane < apart ? lane : lane - apart);
+        if (lane >= apart) total += other;
+    }
+    return total - x;
+};
 #else
 #define LEGGED_SHARED
 const int LANES = 1, lane = 0;
 [[maybe_unused]] auto meet = []() {};
 [[maybe_unused]] auto sum = [](float x) { return x; };
+[[maybe_unused]] auto sum_four = [](float*) {};
+[[maybe_unused]] auto any = [](bool x) { return x; };
+[[maybe_unused]] auto rank = [](bool on, int& count) { return on ? count++ : count; };
+[[maybe_unused]] auto inverse = [](float x) { return 1.0f / x; };
+#define UNROLLED
+#define BY_TWO
+#define BY_FOUR
+#define ROLLED
+[[maybe_unused]] auto before = [](float) { return 0.0f; };
 #endif
 // Deals `count` items out to the lanes.
 #define EACH(i, count) for (int i = lane; i < (count); i += LANES)

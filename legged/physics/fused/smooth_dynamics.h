@@ -1,7 +1,7 @@
 // Poses, inertias and forces but those of constraints, of one world: trees of free, ball, slide and hinge joints in any order.
 // Constants: NB, NV, NJ, NG, NT (bodies, degrees of freedom, joints, shapes, trees), DEPTH (levels of bodies below the world),
-// BALLS, SLIDES, ONE_MOTOR, SPRINGS, DAMPERS, GEARS, GAINS, AFFINE_BIAS, CONTROL_LIMITS, FORCE_LIMITS, JOINT_LIMITS (what there is of
-// them), FREE, BALL, SLIDE, AFFINE (MuJoCo's numbers of types), and for each array of the model VARIES_<array>: whether worlds
+// BALLS, SLIDES, ONE_MOTOR, SPRINGS, BALL_SPRINGS, DAMPERS, GEARS, GAINS, AFFINE_BIAS, CONTROL_LIMITS, FORCE_LIMITS,
+// JOINT_LIMITS, EQUALITIES, SITES (what there is of them; the latter two: bodies and sites that equality constraints hold), FREE, BALL, SLIDE, AFFINE (MuJoCo's numbers of types), and for each array of the model VARIES_<array>: whether worlds
 // may differ in it. What a model has not is left out by the compiler.
 
 LEGGED_SHARED float pos[NB * 3], quat[NB * 4], centre[NB * 3], inertia[NB * 10], carried[NB * 10];
@@ -102,6 +102,20 @@ EACH(g, NG) {
     multiply(quat + b * 4, ROW(geom_quat, NG * 4) + g * 4, q);
     to_matrix(q, reinterpret_cast<float*>(arrays.geom_xmat.data) + at * 9);
 }
+// What equality constraints are made of.
+if (EQUALITIES) EACH(b, NB) {
+    const long long at = (long long)world * NB + b;
+    for (int k = 0; k < 3; ++k) reinterpret_cast<float*>(arrays.xpos.data)[at * 3 + k] = pos[b * 3 + k];
+    for (int k = 0; k < 4; ++k) reinterpret_cast<float*>(arrays.xquat.data)[at * 4 + k] = quat[b * 4 + k];
+    to_matrix(quat + b * 4, reinterpret_cast<float*>(arrays.xmat.data) + at * 9);
+}
+EACH(n, SITES) {
+    const int b = arrays.site_bodyid.data[n];
+    float* out = reinterpret_cast<float*>(arrays.site_xpos.data) + ((long long)world * SITES + n) * 3;
+    float moved[3];
+    rotate(quat + b * 4, ROW(site_pos, SITES * 3) + n * 3, moved);
+    for (int k = 0; k < 3; ++k) out[k] = pos[b * 3 + k] + moved[k];
+}
 // Centres of mass of the trees: all lanes add up the same.
 EACH(b, NB) {
     float moved[3];
@@ -175,6 +189,8 @@ EACH(b, NB)
         for (int c = b; c < b + subtree[b]; ++c) total += inertia[c * 10 + k];
         carried[b * 10 + k] = total;
     }
+// How fast axes of motion turn, which equality constraints take into account.
+[[maybe_unused]] float* turning_axes = reinterpret_cast<float*>(arrays.cdof_dot.data) + (long long)world * NV * 6;
 // Velocities, and accelerations as if no joint accelerated, level by level.
 for (int level = 1; level <= DEPTH; ++level) {
     EACH(b, NB) if (levels[b] == level) {
@@ -187,6 +203,7 @@ for (int level = 1; level <= DEPTH; ++level) {
             int from = arrays.jnt_dofadr.data[j];
             if (type == FREE) {
                 for (int k = 0; k < 3; ++k) v[3 + k] += v_in[from + k];
+                if (EQUALITIES) for (int k = 0; k < 18; ++k) turning_axes[from * 6 + k] = 0.0f;
                 from += 3;
             }
             const int to = from + (type == FREE || (BALLS && type == BALL) ? 3 : 1);  // three turn at once
@@ -199,12 +216,17 @@ for (int level = 1; level <= DEPTH; ++level) {
                 cross(now + 3, s, d);
                 for (int k = 0; k < 3; ++k) a[3 + k] += (c[k] + d[k]) * v_in[i];
                 for (int k = 0; k < 6; ++k) v[k] += s[k] * v_in[i];
+                if (EQUALITIES) {
+                    cross(now, s, turning_axes + i * 6);
+                    for (int k = 0; k < 3; ++k) turning_axes[i * 6 + 3 + k] = c[k] + d[k];
+                }
             }
         }
         for (int k = 0; k < 6; ++k) { velocity[b * 6 + k] = v[k]; acceleration[b * 6 + k] = a[k]; }
     }
     meet();
 }
+if (EQUALITIES) EACH(k, 6 * NB) reinterpret_cast<float*>(arrays.cvel.data)[(long long)world * 6 * NB + k] = velocity[k];
 EACH(i, NV) {
     float f[6];
     momentum(carried + arrays.dof_bodyid.data[i] * 10, motion + i * 6, f);
@@ -260,8 +282,23 @@ EACH(i, NV) {
     total += driven;
     if (SPRINGS || DAMPERS) {
         float passive = 0.0f;
-        if (SPRINGS && type != FREE && type != BALL)
-            passive -= ROW(jnt_stiffness, NJ)[j] * (q_in[at] - ROW(qpos_spring, arrays.qpos0.shape[1])[at]);
+        if (SPRINGS) {
+            const float* rest = ROW(qpos_spring, arrays.qpos0.shape[1]) + at;
+            const int of_joint = packed >> 20, turning = type == FREE ? of_joint - 3 : type == BALL ? of_joint : -1;
+            float bent = q_in[at + (type == FREE && turning < 0 ? of_joint : 0)] - rest[type == FREE && turning < 0 ? of_joint : 0];
+            if (BALL_SPRINGS && turning >= 0) {  // the rotation vector from rest, in the frame of the body
+                const int first = type == FREE ? 3 : 0;
+                float now[4], back[4], turn[4];
+                for (int k = 0; k < 4; ++k) { now[k] = q_in[at + first + k]; back[k] = k == 0 ? rest[first] : -rest[first + k]; }
+                normalize(now);
+                multiply(back, now, turn);
+                const float length = sqrtf(turn[1] * turn[1] + turn[2] * turn[2] + turn[3] * turn[3]);
+                float angle = 2.0f * atan2f(length, turn[0]);
+                if (angle > 3.14159265f) angle -= 6.28318531f;
+                bent = length < 1e-15f ? 0.0f : turn[1 + turning] * (angle / length);
+            }
+            passive -= ROW(jnt_stiffness, NJ)[j] * bent;
+        }
         if (DAMPERS) passive -= ROW(dof_damping, NV)[i] * v_in[i];
         arrays.qfrc_passive.data[out] = passive;
         total += passive;

@@ -16,9 +16,11 @@ import numpy as np
 import warp as wp
 
 from legged.physics.fused.native import LANES, SHARED_BYTES, native_source
+from legged.physics.fused.tree import CONNECT, JOINT, SITE, WELD
 
 FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("FREE", "BALL", "SLIDE", "HINGE"))
 AFFINE = int(mujoco.mjtBias.mjBIAS_AFFINE)
+SOURCE = ("smooth_dynamics.h",)
 UNKNOWN = {
     "compensation of gravity": ("body_gravcomp",),
     "springs that are not linear": ("jnt_stiffnesspoly", "jnt_springyield"),
@@ -38,7 +40,6 @@ UNKNOWN = {
 }
 """What the launch does not compute, by the arrays of a model in which there is none of it if they are zero."""
 COUNTED = {
-    "neq": "equality constraints",
     "nflex": "flexes",
     "nmocap": "mocap bodies",
     "na": "actuators with a state",
@@ -76,6 +77,7 @@ class DynamicsArrays:
     jnt_actfrclimited: wp.array[bool]
     dof_bodyid: wp.array[int]
     geom_bodyid: wp.array[int]
+    site_bodyid: wp.array[int]
     actuator_ctrladr: wp.array[int]
     actuator_biastype: wp.array[int]
     actuator_ctrllimited: wp.array[bool]
@@ -100,6 +102,7 @@ class DynamicsArrays:
     dof_damping: wp.array2d[float]
     geom_pos: wp.array2d[wp.vec3]
     geom_quat: wp.array2d[wp.quat]
+    site_pos: wp.array2d[wp.vec3]
     actuator_gear: wp.array2d[wp.spatial_vector]
     actuator_gainprm: wp.array2d[Vector10]
     actuator_biasprm: wp.array2d[Vector10]
@@ -112,6 +115,12 @@ class DynamicsArrays:
     geom_xmat: wp.array2d[wp.mat33]
     subtree_com: wp.array2d[wp.vec3]
     cdof: wp.array2d[wp.spatial_vector]
+    xpos: wp.array2d[wp.vec3]
+    xquat: wp.array2d[wp.quat]
+    xmat: wp.array2d[wp.mat33]
+    site_xpos: wp.array2d[wp.vec3]
+    cvel: wp.array2d[wp.spatial_vector]
+    cdof_dot: wp.array2d[wp.spatial_vector]
     M: wp.array2d[float]
     qfrc_passive: wp.array2d[float]
     qfrc_actuator: wp.array2d[float]
@@ -119,7 +128,7 @@ class DynamicsArrays:
 
 
 OF_MODEL = (
-    *("gravity", "qpos0", "qpos_spring", "dof_armature", "dof_damping", "geom_pos", "geom_quat"),
+    *("gravity", "qpos0", "qpos_spring", "dof_armature", "dof_damping", "geom_pos", "geom_quat", "site_pos"),
     *("body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat"),
     *("jnt_pos", "jnt_axis", "jnt_stiffness", "jnt_actfrcrange", "actuator_gear", "actuator_gainprm", "actuator_biasprm"),
     *("actuator_ctrlrange", "actuator_forcerange"),
@@ -137,6 +146,8 @@ def dynamics_constants(model: mujoco.MjModel, randomized: Collection[str] = ()) 
         "SLIDES": bool(np.any(model.jnt_type == SLIDE)),
         "ONE_MOTOR": _one_motor(model),
         "SPRINGS": bool(np.any(model.jnt_stiffness)) or "jnt_stiffness" in randomized,
+        "BALL_SPRINGS": bool(np.any(model.jnt_stiffness[~_scalar(model)]))
+        or ("jnt_stiffness" in randomized and not _scalar(model).all()),
         "DAMPERS": has_dampers(model, randomized),
         "GEARS": bool(np.any(model.actuator_gear[:, 0] != 1.0)) or "actuator_gear" in randomized,
         "GAINS": bool(np.any(model.actuator_gainprm[:, 0] != 1.0)) or "actuator_gainprm" in randomized,
@@ -144,6 +155,8 @@ def dynamics_constants(model: mujoco.MjModel, randomized: Collection[str] = ()) 
         "CONTROL_LIMITS": bool(np.any(model.actuator_ctrllimited)),
         "FORCE_LIMITS": bool(np.any(model.actuator_forcelimited)),
         "JOINT_LIMITS": bool(np.any(model.jnt_actfrclimited)),
+        "EQUALITIES": bool(np.isin(model.eq_type, (CONNECT, WELD)).any()),
+        "SITES": model.nsite if bool(np.any(model.eq_objtype == SITE)) else 0,
         **{"FREE": FREE, "BALL": BALL, "SLIDE": SLIDE, "AFFINE": AFFINE},
         **{f"VARIES_{name}": name in randomized for name in OF_MODEL},
     }
@@ -152,7 +165,7 @@ def dynamics_constants(model: mujoco.MjModel, randomized: Collection[str] = ()) 
 def dynamics_kernel(constants: dict[str, int | bool]) -> Any:
     """Return the kernel for some `dynamics_constants`; launched for (worlds, lanes)."""
 
-    @wp.func_native(native_source("smooth_dynamics.h", constants))
+    @wp.func_native(native_source(SOURCE, constants))
     def move_world(world: int, arrays: DynamicsArrays) -> None: ...
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=(LANES, MOST_BLOCKS))
@@ -216,15 +229,19 @@ class SmoothDynamics:
             return f"it has {model.nbody} bodies and {model.njnt} joints"
         if 4 * (48 * model.nbody + 6 * model.njnt + 6 * model.nv) > SHARED_BYTES:
             return f"{model.nbody} bodies do not fit a GPU's shared memory"
-        scalar = (model.jnt_type == SLIDE) | (model.jnt_type == HINGE)
-        if np.any(model.jnt_stiffness[~scalar]):
-            return "a free or ball joint has a spring"
-        return _why_not_motors(model, scalar)
+        if not np.isin(model.eq_type, (CONNECT, WELD, JOINT)).all():
+            return "the model has equality constraints of tendons or flexes"
+        return _why_not_motors(model, _scalar(model))
 
     def launch(self) -> None:
         """Compute all that comes before collisions, once a step."""
         dim = (self._worlds, self._lanes)
         wp.launch(self._kernel, dim=dim, inputs=[self._arrays], block_dim=self._lanes)
+
+
+def _scalar(model: mujoco.MjModel) -> np.ndarray:
+    """Return (njnt,) which joints slide or hinge."""
+    return (model.jnt_type == SLIDE) | (model.jnt_type == HINGE)
 
 
 def _why_not_motors(model: mujoco.MjModel, scalar: np.ndarray) -> str:

@@ -88,7 +88,7 @@ class TorqueStep:
         current one.
         """
         self._dynamics = SmoothDynamics(model, m, d, randomized)
-        self._solver = ConstraintSolver(m, d, damped=has_dampers(model, randomized))
+        self._solver = ConstraintSolver(model, m, d, damped=has_dampers(model, randomized))
         joints = [m.jnt_type, m.jnt_qposadr, m.jnt_dofadr]
         counts = [d.nefc, d.nacon, d.ncollision, d.njmax, d.naconmax]
         inputs = [m.opt.timestep, *joints, self._solver.advance, d.qacc, *counts]

@@ -50,7 +50,8 @@ def read_kinematics(
     overflow: wp.array[int],
     lost: int,
     foot_offset: wp.array[wp.vec3],
-    joint: wp.array2d[int],
+    position: wp.array2d[int],
+    speed: wp.array2d[int],
     axis: wp.array2d[wp.vec3],
     anchor: wp.array2d[wp.vec3],
     body_pos: wp.array2d[wp.vec3],
@@ -70,12 +71,11 @@ def read_kinematics(
 
     point = foot_offset[foot]
     velocity = wp.vec3(0.0)
-    for level in range(joint.shape[0]):
-        j = joint[level, foot]
+    for level in range(position.shape[0]):
         a = axis[level, foot]
-        angle = qpos[world, 7 + j]
+        angle = qpos[world, position[level, foot]]
         point = turn(point - anchor[level, foot], a, angle)
-        velocity = turn(velocity, a, angle) + qvel[world, 6 + j] * wp.cross(a, point)
+        velocity = turn(velocity, a, angle) + qvel[world, speed[level, foot]] * wp.cross(a, point)
         point = rotate(body_quat[level, foot], point + anchor[level, foot]) + body_pos[level, foot]
         velocity = rotate(body_quat[level, foot], velocity)
     feet_pos[world, foot] = base + rotate(quat, point)
@@ -147,6 +147,15 @@ def write_states(
         contact_forces[world, i] = wp.vec3(0.0)
 
 
+@wp.kernel
+def add_velocities(mask: wp.array[wp.bool], delta: wp.array2d[float], qvel: wp.array2d[float]):
+    """One thread a world."""
+    world = wp.tid()
+    if mask[world]:
+        for i in range(delta.shape[1]):
+            qvel[world, i] = qvel[world, i] + delta[world, i]
+
+
 @dataclass(frozen=True)
 class EngineArrays:
     """What of an engine a write changes and a read takes, (N, ...) each; `qpos` and `qvel` in MuJoCo's layout."""
@@ -185,6 +194,11 @@ class StateExchange:
         outputs = [own.qpos, own.qvel, own.ctrl, own.act, own.warmstart, self._contact_forces]
         wp.launch(write_states, dim=len(mask), inputs=inputs, outputs=outputs)
 
+    def push(self, mask: torch.Tensor, delta: torch.Tensor, qvel: torch.Tensor) -> None:
+        """Add `delta` (N, K) to the first K of `qvel` in the worlds of `mask` (N,)."""
+        inputs = [wp.from_torch(mask), wp.from_torch(delta), wp.from_torch(qvel)]
+        wp.launch(add_velocities, dim=len(mask), inputs=inputs)
+
     def kinematics(self) -> None:
         """Read everything but forces; clears the overflow flags."""
         inputs = [self._arrays.overflow, self._arrays.lost]
@@ -211,7 +225,8 @@ class RobotExchange(StateExchange, ABC):
             arrays.overflow,
             arrays.lost,
             wp.array(chains.offset, dtype=wp.vec3),
-            wp.array(chains.joint, dtype=int),
+            wp.array(chains.position, dtype=int),
+            wp.array(chains.speed, dtype=int),
             wp.array(chains.axis, dtype=wp.vec3),
             wp.array(chains.anchor, dtype=wp.vec3),
             wp.array(chains.body_pos, dtype=wp.vec3),

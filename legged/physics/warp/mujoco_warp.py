@@ -14,10 +14,11 @@ from legged.config.schema import SimConfig
 from legged.errors import ConfigError
 from legged.physics.collider.terrain_contact import TerrainContact
 from legged.physics.fields import DERIVED, FIELDS, RandomizedModel, changed_arrays
-from legged.physics.fused.constraint_solver import ConstraintSolver
+from legged.physics.fused.constraint_solver import ConstraintSolver, ask_for_dense_rows
+from legged.physics.fused.contact_stage import ContactStage
 from legged.physics.fused.torque_step import TorqueStep
 from legged.physics.quantities import LAST_STEP, stage_of
-from legged.physics.robot_state import robot_state
+from legged.physics.robot_state import DrivenJoints, robot_state
 from legged.physics.scene import Scene
 from legged.physics.warp.compile import compile_ahead
 from legged.physics.warp.exchange import MujocoWarpExchange, StateExchange, arrays_of
@@ -63,6 +64,9 @@ class MujocoWarpPhysics(WarpPhysics):
         terrain = scene.terrain
         cells = terrain is not None and sim.terrain_collider == "cells"
         self.model = scene.model(sim, "none" if cells else "height_field")
+        if sim.step != "library":
+            ask_for_dense_rows(self.model)
+        self.fitted = scene.fitted
         self._randomized = RandomizedModel(scene, self.model, randomized, torch.float32, device)
         self._per_world = changed_arrays(randomized)
         """Names of the model's arrays that are given per world."""
@@ -70,16 +74,18 @@ class MujocoWarpPhysics(WarpPhysics):
             self._m = self._put_model(scene.name)
             self._m.opt.warn_overflow = 0  # counted in refresh instead of printed by each thread
             self._d = mjw.make_data(self.model, nworld=num_envs, nconmax=sim.nconmax, njmax=sim.njmax)
+            self._on_cells: TerrainContact | None = None
             if terrain is not None and cells:
                 of_robot = (self.model.geom_contype != 0) & (self.model.geom_bodyid != 0)
                 shapes, floor = np.flatnonzero(of_robot), self.model.geom(FLOOR).id
-                TerrainContact(self._m, self._d, self.model, floor, terrain.height_map, shapes)
+                self._on_cells = TerrainContact(self._m, self._d, self.model, floor, terrain.height_map, shapes)
             d = self._d
             self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
             if scene.robot is None:
                 self._exchange = StateExchange(arrays_of(d), self.overflowed)
             else:
                 self.robot_state = robot_state(self.qpos, self.qvel, scene.robot)
+                self._joints = DrivenJoints(self.qpos, self.qvel, self.robot_state, scene.robot)
                 self._exchange = MujocoWarpExchange(self._m, d, self.overflowed, self.model, scene.robot, self.robot_state)
             sample = mujoco.MjData(self.model)
             self._quantities = {
@@ -87,7 +93,7 @@ class MujocoWarpPhysics(WarpPhysics):
             }
             self._choose_step(sim.step)
             self._m.opt.disableflags |= absent_stages(self.model, self._per_world)
-        exchanges = (self._exchange.kinematics, self._exchange.contact_forces)
+        exchanges = (self._exchange.kinematics, self._exchange.contact_forces, self.kernels.name_module)
         constants = (self._set_constants,) if any(FIELDS[name].derived for name in randomized) else ()
         compile_ahead(self._wp_device, (self._step, self._update_quantities, *exchanges, *constants))
         self.library_step = self._library_step
@@ -131,8 +137,11 @@ class MujocoWarpPhysics(WarpPhysics):
         m, d = self._m, self._d
         if self._fused_step is not None:
             self._fused_step.begin()
-            mjw.collision(m, d)
-            mjw.make_constraint(m, d)
+            if self._contacts is not None:
+                self._contacts.launch()
+            else:
+                mjw.collision(m, d)
+                mjw.make_constraint(m, d)
             self._fused_step.finish()
         elif self._solver is not None:
             mjw.fwd_position(m, d, factorize=False)
@@ -149,6 +158,7 @@ class MujocoWarpPhysics(WarpPhysics):
         launches, or nothing, which leaves the step to mujoco-warp. Raises ConfigError where the model keeps `fused` off.
         """
         self._fused_step: TorqueStep | None = None
+        self._contacts: ContactStage | None = None
         self._solver: ConstraintSolver | None = None
         if step == "library":
             self.why_library = "sim.step=library"
@@ -162,9 +172,14 @@ class MujocoWarpPhysics(WarpPhysics):
             return
         self._m.opt.run_qacc_smooth = False  # our solver does not start from it
         if self.why_library:
-            self._solver = ConstraintSolver(self._m, self._d)
+            self._solver = ConstraintSolver(self.model, self._m, self._d)
         else:
             self._fused_step = TorqueStep(self.model, self._m, self._d, per_world)
+            no_contacts = ContactStage.why_not(self.model, self._m, per_world)
+            if no_contacts:
+                self.why_library = f"for contacts alone, {no_contacts}"
+            else:
+                self._contacts = ContactStage(self.model, self._m, self._d, per_world, self._on_cells)
 
     def _library_step(self) -> None:
         """Make a physics step as mujoco-warp does by itself."""

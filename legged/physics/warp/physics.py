@@ -11,9 +11,10 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from legged.math import masked_set_
 from legged.physics.base import Physics
+from legged.physics.robot_state import DrivenJoints
 from legged.physics.warp.exchange import StateExchange
+from legged.physics.warp.task_kernels import TaskKernels
 
 
 class WarpPhysics(Physics):
@@ -25,13 +26,16 @@ class WarpPhysics(Physics):
     """
 
     capturable = True
+    kernels: TaskKernels
     _exchange: StateExchange
+    _joints: DrivenJoints | None = None
 
     def __init__(self, num_envs: int, dt: float, device: torch.device) -> None:
         """Prepare the part that needs no engine."""
         self.num_envs, self.dt, self.device = num_envs, dt, device
         self.overflowed = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._wp_device = wp.device_from_torch(device)
+        self.kernels = TaskKernels(self._on_device)
         self._forces_read = False
         self._advance: Callable[[], Any] = self._step
 
@@ -65,10 +69,14 @@ class WarpPhysics(Physics):
     def step(self) -> None:
         with self._on_device():
             self._advance()
+            if self._joints is not None:
+                self._joints.read()
         self._forces_read = False
 
     def refresh(self) -> None:
         with self._on_device():
+            if self._joints is not None:
+                self._joints.read()
             self._exchange.kinematics()
             if not self._forces_read:  # once a step: a reset in between has cleared its worlds' forces
                 self._exchange.contact_forces()
@@ -79,8 +87,8 @@ class WarpPhysics(Physics):
             self._exchange.write(mask, qpos, qvel)
 
     def push(self, mask: Tensor, delta: Tensor) -> None:
-        pushed = self.qvel[:, : delta.shape[1]]
-        masked_set_(pushed, mask, pushed + delta)
+        with self._on_device():
+            self._exchange.push(mask, delta, self.qvel)
 
     def state_tensors(self) -> dict[str, Tensor]:
         state = {"qpos": self.qpos, "qvel": self.qvel}

@@ -58,8 +58,8 @@ def is_plain_file(path: Path) -> bool:
 
 
 def is_plain(spec: mujoco.MjSpec) -> bool:
-    """Return whether a spec is a robot alone, as engines rely on it: one body with a free joint on the world, hinges below
-    it, motors in their order, and shapes that collide with names, none of them a mesh.
+    """Return whether a spec is a robot alone, as engines rely on it: one body with a free joint on the world, named joints
+    below it, motors of hinges in their order, and shapes that collide with names, none of them a mesh.
     """
     world = spec.worldbody
     if len(world.bodies) != 1 or world.geoms:
@@ -68,7 +68,8 @@ def is_plain(spec: mujoco.MjSpec) -> bool:
     hinges = [joint for joint in joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE]
     if not hinges or len(world.bodies[0].joints) != 1 or world.bodies[0].joints[0].type != mujoco.mjtJoint.mjJNT_FREE:
         return False
-    if len(joints) != len(hinges) + 1 or not all(joint.name for joint in hinges):
+    below = [joint for joint in joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
+    if len(joints) != len(below) + 1 or not all(joint.name for joint in below):
         return False
     order = [joint.name for joint in hinges]
     driven = [actuator.target for actuator in spec.actuators if _is_motor(actuator)]

@@ -57,7 +57,8 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
     _name_feet(tree, legs)
     _draw_what_is_bare(tree)
     angles, origin = _default_pose(tree, legs)
-    height = standing_height(Poser(tree).model, tree.links[0].name, angles)
+    poser = Poser(tree)
+    height = standing_height(poser.model, tree.links[0].name, poser.pose(angles).qpos)
     guess_efforts(tree, legs, height)
     if gains is None:
         stiffness, damping = take_gains(tree, angles)

@@ -1,0 +1,85 @@
+"""How long a training takes to begin, beside what importing torch takes: both in fresh processes, one after the other."""
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from legged.errors import RunError
+from legged.process.startup import STAGES_FILE
+
+ENDS = "first iteration"
+CAPTURES = ("step captured", "training captured")
+"""Stages that end with a CUDA graph captured; on the CPU with the step checked."""
+
+
+def time_start(given: Sequence[str], repeats: int) -> dict[str, Any]:
+    """Return medians of `repeats` runs: `torch_s` of `import torch`; `stages` of a training under the arguments `given`, the
+    seconds since its process was started; `ratio` of the first iteration's end to `torch_s`, and `ratio_without_capture`. One
+    run of each before them fills caches.
+
+    Raises:
+        RunError: a process fails, in its own words.
+    """
+    torch_s, stages = [], []
+    for _ in range(repeats + 1):
+        torch_s.append(_run([sys.executable, "-c", "import torch"], {})["end"])
+        command = [sys.executable, "-m", "legged.tools.train", *without_own(given), "--max_iterations", "1"]
+        with tempfile.NamedTemporaryFile() as file:
+            stages.append(_run(command, {STAGES_FILE: file.name}))
+    found = {name: statistics.median(run[name] for run in stages[1:]) for name in stages[0]}
+    names = list(found)
+    capture_s = sum(found[name] - found[names[names.index(name) - 1]] for name in CAPTURES if name in found)
+    alone = statistics.median(torch_s[1:])
+    return {
+        "torch_s": alone,
+        "stages": found,
+        "capture_s": capture_s,
+        "ratio": found[ENDS] / alone,
+        "ratio_without_capture": (found[ENDS] - capture_s) / alone,
+    }
+
+
+def start_report(times: dict[str, Any]) -> str:
+    """Say them in lines."""
+    return "\n".join(
+        [
+            f"import torch: {times['torch_s']:.2f} s",
+            "a training, seconds since its process was started:",
+            *(f"  {seconds:7.2f}  {name}" for name, seconds in times["stages"].items()),
+            f"to the first iteration: {times['ratio']:.2f} x import torch; less {times['capture_s']:.2f} s of capturing"
+            f" graphs: {times['ratio_without_capture']:.2f} x",
+        ]
+    )
+
+
+def without_own(given: Sequence[str]) -> list[str]:
+    """Return a command line without the benchmark's own flags, abbreviated or not."""
+    own = argparse.ArgumentParser(add_help=False)
+    own.add_argument("--startup", action="store_true")
+    for flag in ("--json", "--repeats"):
+        own.add_argument(flag)
+    return own.parse_known_args(list(given))[1]
+
+
+def _run(command: list[str], environment: dict[str, str]) -> dict[str, float]:
+    """Run a process in an empty folder; return when each stage ended, the process itself as `end` [s]."""
+    # Where this package is not installed, the process finds it as this one did.
+    path = os.pathsep.join(str(Path(entry or ".").resolve()) for entry in sys.path)
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.time()
+        everything = {**os.environ, "PYTHONPATH": path, **environment}
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder, env=everything)
+        end = time.time()
+    if done.returncode:
+        said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+        raise RunError(f"--startup: {said[-1].removeprefix('error: ')}")
+    lines = Path(environment[STAGES_FILE]).read_text(encoding="utf-8").splitlines() if environment else []
+    stages = {name: float(when) - start for when, name in (text.split(" ", 1) for text in lines)}
+    return {**stages, "end": end - start}

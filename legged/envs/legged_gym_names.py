@@ -1,0 +1,262 @@
+"""Names under which environment classes of legged_gym and its forks know what a task here calls otherwise, or has not.
+
+They cost nothing until they are read. What a fork's class sets itself takes their place, as any attribute does.
+"""
+
+import difflib
+from collections.abc import Callable
+from types import MappingProxyType, SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from legged.math import get_euler_xyz, quat_rotate
+from legged.mdp.contacts import CONTACT_FORCE
+
+FORWARD, DOWN, LEVEL = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 0.0, 0.0, 1.0)
+"""The x axis, the direction of gravity, and the orientation (x, y, z, w) that turns nothing."""
+IN_PLACE = {f"__i{name}__" for name in ("add", "sub", "mul", "truediv", "floordiv", "mod", "pow", "and", "or", "xor")}
+
+
+class ReadOnly(Tensor):
+    """A tensor that is computed when it is read, so that writing into it, or into a part of it, would be lost: an error says
+    what is written instead. What is computed from it are ordinary tensors.
+    """
+
+    instead: str = ""
+
+    @classmethod
+    def of(cls, tensor: Tensor, instead: str) -> "ReadOnly":
+        """Return the same numbers; an attempt to write says `instead`."""
+        result = tensor.as_subclass(cls)
+        result.instead = instead
+        return result
+
+    @classmethod
+    def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        name = getattr(func, "__name__", "")
+        writes = name == "__setitem__" or name in IN_PLACE or (name.endswith("_") and not name.endswith("__"))
+        first = args[0] if args else None
+        for target in (first if writes else None, kwargs.get("out")):
+            if isinstance(target, cls):
+                raise AttributeError(target.instead)
+        with torch._C.DisableTorchFunctionSubclass():
+            result = func(*args, **kwargs)
+            if isinstance(first, cls) and type(result) is Tensor and _share(first, result):
+                return cls.of(result, first.instead)
+        return result
+
+
+def _share(one: Tensor, other: Tensor) -> bool:
+    """Return whether two tensors have the same memory."""
+    strided = one.layout is other.layout is torch.strided
+    return strided and one.untyped_storage()._cdata == other.untyped_storage()._cdata
+
+
+def _root_states(task: Any) -> Tensor:
+    """Return (N, 13) in Isaac Gym's layout."""
+    quat = task.base_quat
+    velocity = quat_rotate(quat, task.base_lin_vel)
+    return torch.cat([task.base_pos, quat[:, 1:], quat[:, :1], velocity, quat_rotate(quat, task.base_ang_vel)], dim=1)
+
+
+def _of_terrain(get: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return what reads the terrain's curriculum, where there is a terrain."""
+
+    def read(task: Any) -> Any:
+        if task.terrain_curriculum is None:
+            raise AttributeError("the ground is a plane (terrain.mesh_type), which has no tiles")
+        return get(task)
+
+    return read
+
+
+def _friction(task: Any) -> Tensor:
+    drawn = task.randomization.fields
+    if "friction" not in drawn:
+        raise AttributeError("friction is not drawn (domain_rand.randomize_friction)")
+    return drawn["friction"].view(-1, 1, 1)
+
+
+def _joint_pos_target(task: Any) -> Tensor:
+    if task.cfg.control.control_type != "P":
+        raise AttributeError("only control.control_type P has joint angles as targets")
+    return task.default_dof_pos + task.control.action_scale * task.actions
+
+
+def _obs_scales(task: Any) -> SimpleNamespace:
+    scales = task.observation_scales()
+    names = {"lin_vel": "base_lin_vel", "ang_vel": "base_ang_vel", "dof_pos": "dof_pos", "dof_vel": "dof_vel"}
+    names["height_measurements"] = "heights"
+    return SimpleNamespace(**{theirs: scales.get(ours, 1.0) for theirs, ours in names.items()})
+
+
+def _noise_scale_vec(task: Any) -> Tensor:
+    return torch.cat([term.scale * term.noise for term in task.observation_groups["actor"].terms])
+
+
+def _command_ranges(task: Any) -> dict[str, Any]:
+    says = "self.command_ranges cannot be written: commands.curriculum in the YAML says how ranges widen"
+    rows = zip(("lin_vel_x", "lin_vel_y", "ang_vel_yaw"), task.command_sampler.ranges, strict=True)
+    return {name: ReadOnly.of(row, says) for name, row in rows} | {"heading": list(task.cfg.commands.ranges.heading)}
+
+
+PLAIN: dict[str, Callable[[Any], Any]] = {
+    "num_dof": lambda task: task.robot.num_dof,
+    "num_dofs": lambda task: task.robot.num_dof,
+    "dof_names": lambda task: list(task.robot.joint_names),
+    "num_bodies": lambda task: task.physics.model.nbody - 1,
+    "feet_num": lambda task: len(task.feet_indices),
+    "feet_names": lambda task: list(task.robot.feet_names),
+    "num_obs": lambda task: task.observation_groups["actor"].buffer.shape[1],
+    "num_privileged_obs": lambda task: task.observation_groups["critic"].buffer.shape[1],
+    "num_height_points": lambda task: len(task.height_scan.points),
+    "max_episode_length_s": lambda task: task.cfg.env.episode_length_s,
+    "custom_origins": lambda task: task.terrain is not None,
+    "add_noise": lambda task: task.cfg.observations.add_noise,
+    "obs_scales": _obs_scales,
+    "command_ranges": _command_ranges,
+    "reward_scales": lambda task: MappingProxyType(task.rewards.scales),
+    "reward_names": lambda task: list(task.rewards.names),
+    "reward_functions": lambda task: list(task.rewards.functions.values()),
+    "obs_buf": lambda task: task.observation_groups["actor"].buffer,
+    "privileged_obs_buf": lambda task: task.observation_groups["critic"].buffer,
+    "p_gains": lambda task: task.control.stiffness,
+    "d_gains": lambda task: task.control.damping,
+    "torque_limits": lambda task: task.control.torque_limits,
+    "penalised_contact_indices": lambda task: task.penalised_indices,
+    "termination_contact_indices": lambda task: task.termination_indices,
+    "contact_filt": lambda task: task.contacts.in_contact,
+    "foot_positions": lambda task: task.feet_pos,
+    "foot_velocities": lambda task: task.feet_vel,
+    "friction_coeffs": _friction,
+    "max_terrain_level": _of_terrain(lambda task: task.terrain_curriculum.rows),
+    "terrain_levels": _of_terrain(lambda task: task.terrain_curriculum.levels),
+    "terrain_types": _of_terrain(lambda task: task.terrain_curriculum.columns),
+}
+"""Name -> what the task has under another one: numbers, texts, and tensors at their own addresses."""
+
+COMPUTED: dict[str, tuple[Callable[[Any], Tensor], str]] = {
+    "root_states": (_root_states, "a state is put in place in reset_idx(mask), by self.physics.write(mask, qpos, qvel)"),
+    "dof_state": (
+        lambda task: torch.stack([task.dof_pos, task.dof_vel], dim=2).view(-1, 2),
+        "a state is put in place in reset_idx(mask), by self.physics.write(mask, qpos, qvel)",
+    ),
+    "rpy": (lambda task: torch.stack(get_euler_xyz(task.base_quat), dim=1), "self.base_quat is the physics'"),
+    "feet_air_time": (
+        lambda task: torch.where(task.contacts.first_contact, task.contacts.last_air_time, task.contacts.air_time),
+        "self.contacts counts it, not a reward: (self.contacts.last_air_time - 0.5) * self.contacts.first_contact",
+    ),
+    "joint_pos_target": (_joint_pos_target, "self.control makes it of the actions"),
+}
+"""Name -> what is computed whenever it is read, and what is said to who writes into it."""
+
+CONSTANT: dict[str, Callable[[Any], Tensor]] = {
+    "gravity_vec": lambda task: torch.tensor([DOWN], device=task.device).repeat(task.num_envs, 1),
+    "forward_vec": lambda task: torch.tensor([FORWARD], device=task.device).repeat(task.num_envs, 1),
+    "base_init_state": lambda task: torch.tensor(
+        [0.0, 0.0, task.robot.file.spawn_height, *LEVEL, *(0.0,) * 6], device=task.device
+    ),
+    "commands_scale": lambda task: torch.tensor(task.observation_scales()["commands"], device=task.device),
+    "noise_scale_vec": _noise_scale_vec,
+    "height_points": lambda task: torch.nn.functional.pad(task.height_scan.points, (0, 1)).repeat(task.num_envs, 1, 1),
+    "terrain_origins": _of_terrain(lambda task: torch.tensor(task.terrain.origins, dtype=torch.float32, device=task.device)),
+}
+"""Name -> what is made once, when it is first read."""
+
+KEPT: dict[str, Callable[[Any], Tensor]] = {
+    "last_root_vel": lambda task: _root_states(task)[:, 7:],
+    "last_contacts": lambda task: task.contact_forces[:, task.feet_indices, 2] > CONTACT_FORCE,
+    "last_torques": lambda task: task.torques,
+    "last_dof_pos": lambda task: task.dof_pos,
+    "last_last_actions": lambda task: task.last_actions,
+}
+"""Name -> what is kept of each step for the next one, from the first time on that it is read."""
+
+_COUNT = "count in a tensor of your own, made in _init_buffers() and added to in place in advance()"
+_GYM = "there is no Isaac Gym: self.physics makes the steps, and the hooks of _step() are what a class overrides"
+_INDICES = (
+    "torch.tensor([i for i, name in enumerate(self.dof_names) if 'hip' in name], device=self.device) in _init_buffers()"
+)
+_BODIES = (
+    "self.feet_pos and self.feet_vel (N, F, 3) have the feet; QUANTITIES = ('xpos', 'xquat', 'cvel') asks for all bodies"
+)
+ABSENT = {
+    "common_step_counter": _COUNT,
+    "gym": _GYM,
+    "sim": _GYM,
+    "viewer": _GYM,
+    "envs": _GYM,
+    "actor_handles": _GYM,
+    "sim_params": "self.cfg.sim.dt is the physics step, self.dt the control step",
+    "extras": "what is logged beside the rewards is a method _metric_<name>; step() returns extras of its own",
+    "rigid_body_states": _BODIES,
+    "rigid_body_state": _BODIES,
+    "rigid_body_pos": _BODIES,
+    "height_samples": "self.measured_heights (N, P) are the heights around each robot, self.terrain.height_map all of them",
+    "hip_indices": _INDICES,
+    "command_counter": _COUNT,
+    "init_done": "_init_buffers() and what it calls run before the first step, everything else after them",
+}
+"""Name that is not there -> what takes its place."""
+NAMES = {*PLAIN, *COMPUTED, *CONSTANT, *KEPT, *ABSENT}
+
+
+class LeggedGymNames:
+    """The half of a legged robot's task that answers to legged_gym's names. N robots, D joints, F feet, P heights.
+
+    `root_states` (N, 13): position [m], orientation (x, y, z, w), linear and angular velocity, all in the world frame, as
+    Isaac Gym has them, where `base_quat` has w first and `base_lin_vel` and `base_ang_vel` are in the base frame. `dof_state`
+    (N * D, 2): angles and velocities. `feet_air_time` (N, F): swings that go on or end at this step [s]. `rpy` (N, 3): roll,
+    pitch, yaw [rad]. `friction_coeffs` (N, 1, 1), `height_points` (N, P, 3) in the yaw frame [m], `terrain_origins`
+    (rows, columns, 3), `noise_scale_vec` of the actor's columns; the others are as their counterparts here.
+    """
+
+    if not TYPE_CHECKING:  # a type checker should go on seeing what is not there
+
+        def __getattr__(self, name: str) -> Any:
+            if name in NAMES:
+                try:
+                    return self._by_their_name(name)
+                except AttributeError as error:
+                    raise AttributeError(f"self.{name}: {error}") from None
+            known = [] if name.startswith("_") else [*NAMES, *vars(self)]
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0.75)
+            hint = f"; did you mean '{near[0]}'?" if near else ""
+            raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'{hint}")
+
+    def _by_their_name(self, name: str) -> Any:
+        """Return what the task has under that name of legged_gym's.
+
+        Raises:
+            AttributeError: nothing, or not in this task; says what takes its place.
+        """
+        if name in PLAIN:
+            return PLAIN[name](self)
+        if name in COMPUTED:
+            compute, instead = COMPUTED[name]
+            return ReadOnly.of(compute(self), f"self.{name} is computed when it is read, and cannot be written: {instead}")
+        if name in CONSTANT:
+            made = vars(self).setdefault("_legged_gym", {})
+            if name not in made:
+                made[name] = CONSTANT[name](self)
+            return made[name]
+        if name in KEPT:
+            graph = vars(self).get("_graph")
+            if graph is not None and graph.captured:
+                raise AttributeError(
+                    "is kept from step to step only where a term reads it, which none did when the step began"
+                )
+            kept = torch.zeros_like(KEPT[name](self), memory_format=torch.contiguous_format)
+            vars(self)[name] = kept
+            vars(self).setdefault("_kept_names", []).append(name)
+            return kept
+        raise AttributeError(f"is not there; {ABSENT[name]}")
+
+    def remember(self) -> None:
+        """Keep what was asked for of this step, before the task itself overwrites what it keeps."""
+        for name in vars(self).get("_kept_names", ()):
+            vars(self)[name].copy_(KEPT[name](self))
+        super().remember()  # type: ignore[misc]

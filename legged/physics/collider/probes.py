@@ -1,0 +1,145 @@
+"""Shapes as probes of a height map: points with a radius, what lies between the ends of a capsule, discs.
+
+A sphere is one point, a capsule its ends and what is between them, a box its corners. A cylinder touches a surface in points
+of its rims, those in which it would rest on a plane as steep as the ground under its centre; vertical faces and their rims
+meet its discs at both ends, and what is between these is that of a capsule.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from legged.errors import ConfigError
+from legged.physics.collider.ground import NOTHING, Ground, Hits, around_point, between_ends, cell_of, surface
+from legged.physics.collider.shapes import rim_point
+from legged.physics.collider.touches import kind_of
+
+AT, BETWEEN, RIM, DISC = (wp.constant(k) for k in range(4))
+"""A sphere at `start`; what lies between `start` and `end`; the `end[0]`-th point of the rims of a cylinder of radius
+`start[0]` and half length `start[1]`; a disc at `start`, of radius `end[0]`, across the shape's z axis."""
+
+LENGTHWISE = wp.constant(0.1)
+"""Cosine between a rim and a cylinder's axis from which on the rim may pass through a disc at the cylinder's end."""
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What of a geom looks at the ground, in the geom's frame [m]."""
+
+    geom: int
+    kind: int
+    start: np.ndarray
+    end: np.ndarray
+    radius: float
+    """Around what is found; 0 for corners, rims and discs."""
+
+    @property
+    def reach(self) -> float:
+        """How far from its middle the ground may be that it touches [m]."""
+        return float(self.end[0]) if self.kind == DISC else self.radius
+
+    @property
+    def length(self) -> float:
+        """Distance between its ends [m]."""
+        return float(np.linalg.norm(self.end - self.start)) if self.kind == BETWEEN else 0.0
+
+
+def probes_of(model: mujoco.MjModel, shapes: Iterable[int]) -> Iterator[Probe]:
+    """Yield the probes of those geoms.
+
+    Raises:
+        ConfigError: a shape that has none.
+    """
+    kinds = mujoco.mjtGeom
+    for i in shapes:
+        kind, size = model.geom_type[i], model.geom_size[i]
+        centre, end = np.zeros(3), np.array([0.0, 0.0, size[1]])
+        if kind == kinds.mjGEOM_SPHERE:
+            yield Probe(i, AT, centre, centre, size[0])
+        elif kind == kinds.mjGEOM_CAPSULE:
+            yield Probe(i, AT, -end, -end, size[0])
+            yield Probe(i, AT, end, end, size[0])
+            yield Probe(i, BETWEEN, -end, end, size[0])
+        elif kind == kinds.mjGEOM_BOX:
+            for signs in product((-1.0, 1.0), repeat=3):
+                yield Probe(i, AT, size * signs, size * signs, 0.0)
+        elif kind == kinds.mjGEOM_CYLINDER:
+            for k in range(4):
+                yield Probe(i, RIM, np.array([size[0], size[1], 0.0]), np.array([float(k), 0.0, 0.0]), 0.0)
+            for centre in (-end, end):
+                yield Probe(i, DISC, centre, np.array([size[0], 0.0, 0.0]), 0.0)
+            yield Probe(i, BETWEEN, -end, end, size[0])
+        else:
+            raise ConfigError(
+                f"terrain: shape '{model.geom(i).name}' is of type {kind_of(model, i)}; sim.terrain_collider=cells knows"
+                " spheres, capsules, cylinders and boxes. Use those, sim.terrain_collider=convex, or sim.physics=mujoco"
+            )
+
+
+@wp.func
+def around_disc(ground: Ground, centre: wp.vec3, axis: wp.vec3, radius: float, margin: float, hits: Hits, row: int) -> int:
+    """Find vertical faces and their rims that a thin disc touches; returns how many hits are in the row."""
+    found = around_point(ground, centre, radius + margin, True, hits, row)
+    count = wp.int32(0)
+    for k in range(found):
+        normal = hits.normal[row, k]
+        across = normal - axis * wp.dot(normal, axis)
+        wide = wp.length(across)
+        point = centre
+        if wide > 1e-6:
+            point = centre - across * (radius / wide)
+        dist = hits.dist[row, k] - radius * wide
+        if normal[2] > 0.0 and (normal[0] == 0.0 or normal[1] == 0.0):
+            # A rim along x or y: where it passes through the disc's plane.
+            along = wp.where(normal[0] == 0.0, axis[0], axis[1])
+            to = -normal * hits.dist[row, k]
+            shift = -wp.dot(to, axis) / along
+            if normal[0] == 0.0:
+                to[0] = to[0] + shift
+            else:
+                to[1] = to[1] + shift
+            away = wp.length(to)
+            dist = NOTHING
+            if wp.abs(along) > LENGTHWISE and away > 1e-6:  # a rim across the axis is between the ends, or in no disc
+                normal = -to / away
+                point = centre - normal * radius
+                dist = away - radius
+        if dist < margin:
+            hits.dist[row, count] = dist
+            hits.normal[row, count] = normal
+            hits.point[row, count] = point
+            count += 1
+    return count
+
+
+@wp.func
+def look(
+    ground: Ground,
+    kind: int,
+    position: wp.vec3,
+    turn: wp.mat33,
+    start: wp.vec3,
+    end: wp.vec3,
+    near: float,
+    hits: Hits,
+    row: int,
+) -> int:
+    """Find what a probe of a geom touches, within `near` (its radius and the margin of contacts); returns how many hits are
+    in the row. A hit's distance is that of its point, not yet less the probe's radius.
+    """
+    if kind == BETWEEN:
+        return between_ends(ground, position + turn * start, position + turn * end, near, hits, row)
+    if kind == RIM:
+        cell = cell_of(ground, position[0], position[1])
+        slope = surface(ground, cell[0], cell[1], position[0], position[1])
+        up = wp.normalize(wp.vec3(-slope[1], -slope[2], 1.0))
+        offset = rim_point(up, turn, start[0], start[1], wp.int32(end[0]))
+        return around_point(ground, position + offset, near, False, hits, row)
+    if kind == DISC:
+        axis = wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])
+        return around_disc(ground, position + turn * start, axis, end[0], near, hits, row)
+    return around_point(ground, position + turn * start, near, False, hits, row)

@@ -1,0 +1,95 @@
+"""Where simple shapes touch a plane or each other: Warp functions, geometry only.
+
+As C MuJoCo has it. mujoco-warp differs in two ways: it keeps also those corners of a box that lie above its centre, and the
+friction of a capsule is along its axis only while it lies more than it stands.
+"""
+
+import warp as wp
+from mujoco_warp._src.collision_primitive_core import capsule_capsule, mat23f
+from mujoco_warp._src.math import make_frame
+
+from legged.physics.collider import touches
+
+POINT, END, CORNER = wp.constant(touches.POINT), wp.constant(touches.END), wp.constant(touches.CORNER)
+RIM = wp.constant(touches.RIM)
+FAR = wp.constant(1e6)
+"""Distance of what does not touch [m]."""
+
+
+@wp.struct
+class PlaneHit:
+    """A point of a shape and its contact with a plane."""
+
+    dist: float
+    """Negative in penetration [m]."""
+    pos: wp.vec3
+    """Halfway between shape and plane."""
+    frame: wp.mat33
+    """Rows are the plane's normal and two tangents."""
+
+
+@wp.func
+def rim_point(normal: wp.vec3, turn: wp.mat33, radius: float, half_length: float, k: int) -> wp.vec3:
+    """Return the k-th point, from the centre, in which a cylinder rests on a plane: the lowest of the near rim, the lowest of
+    the far rim, and two more of the near rim that make a triangle with the first.
+    """
+    axis = wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])
+    if wp.dot(normal, axis) > 0.0:
+        axis = -axis
+    down = axis * wp.dot(normal, axis) - normal
+    length = wp.length(down)
+    if length < 1e-6:  # it stands upright: any point of the rim is the lowest
+        down = wp.vec3(turn[0, 0], turn[1, 0], turn[2, 0])
+        length = 1.0
+    down = down * (radius / length)
+    axis = axis * half_length
+    if k == 0:
+        return down + axis
+    if k == 1:
+        return down - axis
+    sideways = wp.normalize(wp.cross(down, axis)) * (radius * 0.5 * wp.sqrt(3.0))
+    return wp.where(k == 2, sideways, -sideways) + axis - 0.5 * down
+
+
+@wp.func
+def on_plane(
+    plane: wp.vec3, normal: wp.vec3, position: wp.vec3, turn: wp.mat33, kind: int, place: wp.vec3, radius: float
+) -> PlaneHit:
+    """Return the contact of one of a shape's points (`touches.PlanePoint`) with the plane through `plane`."""
+    hit = PlaneHit()
+    around = radius
+    offset = turn * place
+    if kind == RIM:
+        offset = rim_point(normal, turn, place[0], place[1], wp.int32(radius))
+        around = 0.0
+    elif kind > RIM:  # an ellipsoid
+        stretched = wp.normalize(wp.cw_mul(wp.transpose(turn) * normal, place))
+        offset = -(turn * wp.cw_mul(stretched, place))
+    point = position + offset
+    hit.dist = wp.dot(point - plane, normal) - around
+    if kind == CORNER and wp.dot(normal, offset) > 0.0:
+        hit.dist = FAR
+    hit.pos = point - normal * (around + 0.5 * hit.dist)
+    hit.frame = make_frame(normal)
+    if kind == END:
+        axis = wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])
+        tangent = axis - normal * wp.dot(normal, axis)
+        length = wp.length(tangent)
+        if length > 1e-6:  # else it stands upright, and no direction is its own
+            tangent = tangent * (1.0 / length)
+            hit.frame = wp.matrix_from_rows(normal, tangent, wp.cross(normal, tangent))
+    return hit
+
+
+@wp.func
+def round_shapes(
+    first: wp.vec3, first_turn: wp.mat33, first_size: wp.vec2, second: wp.vec3, second_turn: wp.mat33, second_size: wp.vec2
+) -> tuple[wp.vec2, mat23f, mat23f]:
+    """Return distances, positions and normals of the contacts of two capsules (radius, half length), or spheres of length 0:
+    one, or two where they are parallel; beyond that distances are infinite.
+    """
+    first_axis = wp.vec3(first_turn[0, 2], first_turn[1, 2], first_turn[2, 2])
+    second_axis = wp.vec3(second_turn[0, 2], second_turn[1, 2], second_turn[2, 2])
+    return capsule_capsule(
+        first, first_axis, first_size[0], first_size[1], second, second_axis, second_size[0], second_size[1]
+    )

@@ -1,0 +1,163 @@
+"""Contacts and all rows of constraints in one launch: a warp of threads for each world.
+
+mujoco-warp takes some ten launches for it, and keeps the contacts of all worlds in one pool, in the order in which threads
+find room there. Here each world has slots of its own in mujoco-warp's arrays of contacts, filled in the order of the shapes;
+what reads them by a row's contact, or a contact's rows, finds what it knows.
+
+First, lanes look at points of shapes on planes, at pairs of spheres and capsules, and at what the ground of cells offers;
+then (contact_stage.h) they make rows of dry friction, joint limits and those contacts. Rows of equalities are
+mujoco-warp's own.
+"""
+
+from collections.abc import Collection
+from typing import Any
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+
+from legged.physics.collider import touches
+from legged.physics.collider.ground import Ground, Hits
+from legged.physics.collider.terrain_contact import TerrainContact
+from legged.physics.fused.contact_kernel import NAMES, Candidates, StageArrays, Vector5, stage_constants, stage_kernel
+from legged.physics.fused.native import LANES
+
+FIXED = (
+    *("geom_size", "geom_margin", "geom_priority", "geom_solmix", "geom_solref", "geom_solimp", "jnt_solref", "jnt_solimp"),
+    *("dof_solref", "dof_solimp", "pair_margin", "pair_friction", "pair_solref", "pair_solimp"),
+)
+"""Arrays of the model that are read once, in which worlds may not differ."""
+FLAGS, CONES = mujoco.mjtDisableBit, mujoco.mjtCone
+LIMITED = (mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
+
+
+class ContactStage:
+    """The collision stage and the rows of constraints of all worlds, from poses and velocities in mujoco-warp's data."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        m: Any,
+        d: Any,
+        randomized: Collection[str] = (),
+        on_cells: TerrainContact | None = None,
+    ) -> None:
+        """Prepare the launch for mujoco-warp's `m` and `d` of a `model` of which `why_not` says nothing, in whose arrays
+        `randomized` worlds differ, with the ground of cells that it stands on, if any. Call with their device as Warp's
+        current one.
+        """
+        self._m, self._d = m, d
+        flags = model.opt.disableflags
+        rubs = "dof_frictionloss" in randomized or bool(np.any(model.dof_frictionloss))
+        frictions = rubs and not flags & FLAGS.mjDSBL_FRICTIONLOSS
+        limited = np.array(model.jnt_limited, dtype=int) * (not flags & FLAGS.mjDSBL_LIMIT)
+        contacts = not flags & FLAGS.mjDSBL_CONTACT
+        self._equalities = model.neq > 0 and not flags & FLAGS.mjDSBL_EQUALITY
+        all_pairs = touches.pairs_of(m) if contacts else []
+        pairs = [touches.touch_of(model, *pair) for pair in all_pairs]
+        probes = on_cells.probes if on_cells is not None and contacts else []
+        met = {probe.geom: len(pairs) + k for k, probe in enumerate({p.geom: p for p in probes}.values())}
+        assert on_cells is not None or not met
+        ground = -1 if on_cells is None else on_cells.terrain
+        self.touches = [*pairs, *(touches.touch_of(model, ground, geom) for geom in met)]
+        """Pairs of shapes that may touch."""
+        on_planes = [model.geom_type[touch.geoms[0]] == touches.KINDS.mjGEOM_PLANE for touch in pairs]
+        points = [
+            point for k, touch in enumerate(pairs) if on_planes[k] for point in touches.plane_points(model, k, touch.geoms[1])
+        ]
+        round_pairs = [k for k in range(len(pairs)) if not on_planes[k]]
+
+        self._arrays = self._stage_arrays(model, m, d)
+        self._arrays.jnt_limited = wp.array(limited, dtype=int)
+        self._items = self._candidates(model, d, points, round_pairs, [(met[p.geom], p) for p in probes])
+        self._ground = (Ground(), Hits()) if on_cells is None else (on_cells.ground, on_cells.hits)
+        dim, slots = max((touch.dim for touch in self.touches), default=1), d.naconmax // d.nworld
+        self.constants = stage_constants(model, d.njmax, slots, dim, frictions, bool(limited.any()))
+        """What contact_stage.h was asked for."""
+        self._kernel = stage_kernel(self.constants, bool(points), bool(round_pairs), bool(probes))
+        self._lanes = 1 if d.qacc.device.is_cpu else LANES
+
+    @staticmethod
+    def why_not(model: mujoco.MjModel, m: Any, randomized: Collection[str] = ()) -> str:
+        """Return what of a model, and of mujoco-warp's `m` of it, has no rows here, where worlds differ in the arrays
+        `randomized`; empty if nothing.
+        """
+        if drawn := [name for name in FIXED if name in randomized]:
+            return f"{drawn[0]} differs between worlds"
+        if m.is_sparse:
+            return "mujoco-warp keeps Jacobians sparse"
+        if model.nflex or np.any(model.tendon_limited) or np.any(model.tendon_frictionloss):
+            return "the model has flexes, or tendons with limits or friction"
+        if np.any(model.geom_surfacevel) or np.any(model.geom_adhesion) or np.any(model.pair_adhesion):
+            return "the model has surfaces that move or stick"
+        if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
+            return "the model's integrator is not Euler"
+        if model.opt.disableflags & FLAGS.mjDSBL_CONSTRAINT:
+            return "the model disables constraints"
+        if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
+            return "the model overrides the parameters of contacts"
+        return touches.why_not(model, touches.pairs_of(m))
+
+    def launch(self) -> None:
+        """Find the contacts and make the rows, of where shapes are and how they move."""
+        if self._equalities:
+            opt = self._m.opt
+            flags = opt.disableflags
+            opt.disableflags |= FLAGS.mjDSBL_FRICTIONLOSS | FLAGS.mjDSBL_LIMIT | FLAGS.mjDSBL_CONTACT
+            mjw.make_constraint(self._m, self._d)
+            opt.disableflags = flags
+        inputs = [self._lanes, self._arrays, self._items, *self._ground]
+        wp.launch(self._kernel, dim=(self._d.nworld, self._lanes), inputs=inputs, block_dim=self._lanes)
+
+    def _stage_arrays(self, model: mujoco.MjModel, m: Any, d: Any) -> Any:
+        """Return what contact_stage.h reads and writes."""
+        arrays, every = StageArrays(), self.touches
+        timestep, safe = float(model.opt.timestep), touches.is_safe(model)
+
+        def spring(solref: np.ndarray, solimp: np.ndarray) -> np.ndarray:
+            return touches.spring_of(solref, solimp, timestep, safe)
+
+        def springs(solrefs: Any, solimps: Any) -> wp.array:
+            made = [spring(*pair) for pair in zip(solrefs, solimps, strict=True)]
+            return wp.array(np.reshape(made, (-1, touches.SPRING)), dtype=float)
+
+        sliding = [spring(t.solreffriction if t.solreffriction.any() else t.solref, t.solimp)[1] for t in every]
+        arrays.touch_geom = wp.array([t.geoms for t in every], dtype=wp.vec2i)
+        arrays.touch_margin = wp.array([t.margin for t in every], dtype=float)
+        arrays.touch_dim = wp.array([t.dim for t in every], dtype=int)
+        arrays.touch_rough = wp.array([t.rough for t in every], dtype=wp.vec2i)
+        arrays.touch_friction = wp.array([t.friction for t in every], dtype=Vector5)
+        arrays.touch_spring = springs([t.solref for t in every], [t.solimp for t in every])
+        arrays.touch_sliding = wp.array(sliding, dtype=float)
+        arrays.dof_spring = springs(model.dof_solref, model.dof_solimp)
+        arrays.joint_spring = springs(model.jnt_solref, model.jnt_solimp)
+        arrays.contact_touch = wp.zeros(d.naconmax, dtype=int)
+        arrays.impratio_invsqrt = m.opt.impratio_invsqrt
+        for name in StageArrays.vars:  # type: ignore[attr-defined]
+            if name in ("jnt_limited", "contact_touch", "impratio_invsqrt", "dof_spring", "joint_spring"):
+                continue
+            if name.startswith("touch_"):
+                continue
+            path = NAMES.get(name, name.replace("contact_", "contact.", 1))
+            owner, _, field = path.rpartition(".")
+            source = getattr(d, owner) if owner else m if hasattr(m, field) else d
+            setattr(arrays, name, getattr(source, field))
+        return arrays
+
+    def _candidates(self, model: mujoco.MjModel, d: Any, points: list, round_pairs: list[int], probes: list) -> Any:
+        """Return what the lanes look at."""
+        items = Candidates()
+        items.point_touch = wp.array([p.touch for p in points], dtype=int)
+        items.point_kind = wp.array([p.kind for p in points], dtype=int)
+        items.point_place = wp.array([p.place for p in points], dtype=wp.vec3)
+        items.point_radius = wp.array([p.radius for p in points], dtype=float)
+        items.pair_touch = wp.array(round_pairs, dtype=int)
+        items.probe_touch = wp.array([touch for touch, _ in probes], dtype=int)
+        items.probe_kind = wp.array([p.kind for _, p in probes], dtype=int)
+        items.probe_start = wp.array([p.start for _, p in probes], dtype=wp.vec3)
+        items.probe_end = wp.array([p.end for _, p in probes], dtype=wp.vec3)
+        items.probe_radius = wp.array([p.radius for _, p in probes], dtype=float)
+        items.geom_size = wp.array(model.geom_size, dtype=wp.vec3)
+        items.geom_xpos, items.geom_xmat = d.geom_xpos, d.geom_xmat
+        return items

@@ -1,0 +1,188 @@
+// One solution of a system H s = g of the degrees of freedom of a tree, by Cholesky's method from the leaves to the root
+// (Featherstone, Rigid Body Dynamics Algorithms, 2008, section 6.5). Where no constraint row couples branches, H has an entry
+// for a degree of freedom and those on its path to the root alone, so that a row of H is as short as the path, and all that
+// have the same depth are eliminated at once. Otherwise the tree is a path. Constants: ROOT (degrees of freedom that all
+// paths begin with, at most 6; each lane solves for them by itself), DEPTH (most on one path), WIDTH (most of the same depth
+// outside the root), SPLIT (whether there are branches), TRIANGLE (of the root's entries of H, that many) and CORNER (with
+// those of g).
+
+#if defined(__CUDA_ARCH__)
+#define EVERY_LIMB(i) UNROLLED for (int slot = 0; slot < LIMBS; ++slot) if (const int i = dof_at(slot); true)
+#define EACH_LIMB(i) EVERY_LIMB(i) if (i >= ROOT && i < NV)
+#define EACH_CORNER(n) if (const int n = lane; n < CORNER)
+#define OF_CORNER(values, n) values[0]
+const int LIMBS = NV > 32 && NV - ROOT > 32 ? 2 : 1, CORNERS = 1;
+// What the lane of a limb has.
+auto from_limb = [&](const float* values, int i) {
+    if (NV <= 32) return __shfl_sync(0xffffffffu, values[0], i);
+    const float one = __shfl_sync(0xffffffffu, values[0], (i - ROOT) & 31);
+    if (LIMBS == 1) return one;
+    const float other = __shfl_sync(0xffffffffu, values[LIMBS - 1], i & 31);
+    return i < ROOT + 32 ? one : other;
+};
+#else
+#define EVERY_LIMB(i) for (int i = ROOT; i < NV; ++i)
+#define EACH_LIMB(i) EVERY_LIMB(i)
+#define EACH_CORNER(n) for (int n = 0; n < CORNER; ++n)
+#define OF_CORNER(values, n) values[n]
+const int LIMBS = NV, CORNERS = CORNER > 0 ? CORNER : 1;
+auto from_limb = [&](const float* values, int i) { return values[i]; };
+#endif
+const int CHAIN = DEPTH > ROOT ? DEPTH - ROOT : 1, PITCH = 4 * ((DEPTH + 4) / 4), LONG_PITCH = 4 * ((NV + 4) / 4);
+const int BOARD = SPLIT && WIDTH * PITCH < LONG_PITCH ? LONG_PITCH : WIDTH * PITCH;
+LEGGED_SHARED float boards[2 * BOARD], corner[CORNER > 0 ? CORNER : 1];
+struct Branches { enum { value = 1 }; };
+struct Path { enum { value = 0 }; };
+
+// Of a limb: its depth; where it is among those of the same depth; and what is at each depth of its path.
+int depth_of[LIMBS] = {}, place_of[LIMBS] = {}, path_of[LIMBS][CHAIN] = {};
+EACH_LIMB(i) {
+    OF(depth_of, i) = SPLIT ? arrays.dof_depth.data[i] : i;
+    OF(place_of, i) = SPLIT ? arrays.dof_place.data[i] : 0;
+    UNROLLED for (int t = ROOT; t < DEPTH; ++t) OF(path_of, i)[t - ROOT] = SPLIT ? arrays.dof_path.data[t * NV + i] : t;
+}
+// Of an entry of the root: its row and column; the right-hand side has columns of its own.
+int row_of[CORNERS], column_of[CORNERS];
+EACH_CORNER(n) {
+    int i = 0;
+    while ((i + 1) * (i + 2) / 2 <= n) ++i;
+    OF_CORNER(row_of, n) = n < TRIANGLE ? i : n - TRIANGLE;
+    OF_CORNER(column_of, n) = n < TRIANGLE ? n - i * (i + 1) / 2 : -1;
+}
+
+bool several = false;  // whether one of them couples branches
+// With dampers, what follows the last round is the solution of another system by the same lines: the acceleration that moves
+// the world on, with dampers as they act at the end of the step (MuJoCo's Euler), (M + h D) a = all forces.
+bool advancing = false;
+// From the right-hand side in s and `shown`, the solution there, for all lanes to see.
+auto solve = [&](auto tree) {
+    constexpr bool branches = decltype(tree)::value;
+    constexpr int height = branches ? DEPTH : NV, pitch = branches ? PITCH : LONG_PITCH;
+    float H[LIMBS][height], over[LIMBS], C[CORNERS];
+    // Hessian M + J^T diag(curvature) J, or M + h D.
+    EACH_LIMB(i) {
+        UNROLLED for (int e = 0; e < height; ++e)
+            OF(H, i)[e] = M[i * STRIDE + (branches && e >= ROOT ? OF(path_of, i)[e - ROOT] : e)];
+    }
+    EACH_CORNER(n) {
+        const int i = OF_CORNER(row_of, n), j = OF_CORNER(column_of, n);
+        OF_CORNER(C, n) = j < 0 ? shown[i] : M[i * STRIDE + j];
+    }
+    if (!(DAMPED && advancing)) each_pushing([&](int r, const float* row) {
+        const float weight = curvature[r];
+        EACH_LIMB(i) {
+            const float part = weight * row[i];
+            UNROLLED for (int e = 0; e < height; ++e)
+                OF(H, i)[e] += part * row[branches && e >= ROOT ? OF(path_of, i)[e - ROOT] : e];
+        }
+        EACH_CORNER(n) {
+            const int i = OF_CORNER(row_of, n), j = OF_CORNER(column_of, n);
+            if (j >= 0) OF_CORNER(C, n) += weight * row[i] * row[j];
+        }
+        if (ELLIPTIC && directions[r] > 0 && bent[r] != 0.0f) {
+            EACH_LIMB(i) {
+                UNROLLED for (int e = 0; e < height; ++e)
+                    OF(H, i)[e] += bend_of(r, i, branches && e >= ROOT ? OF(path_of, i)[e - ROOT] : e);
+            }
+            EACH_CORNER(n) {
+                const int i = OF_CORNER(row_of, n), j = OF_CORNER(column_of, n);
+                if (j >= 0) OF_CORNER(C, n) += bend_of(r, i, j);
+            }
+        }
+    });
+    if (DRY && !(DAMPED && advancing)) {
+        EACH_LIMB(i) {
+            UNROLLED for (int e = ROOT; e < height; ++e)
+                OF(H, i)[e] += e == (branches ? OF(depth_of, i) : i) ? dry_curvature[i] : 0.0f;
+        }
+        EACH_CORNER(n) {
+            const int i = OF_CORNER(row_of, n);
+            if (i == OF_CORNER(column_of, n)) OF_CORNER(C, n) += dry_curvature[i];
+        }
+    }
+    if (DAMPED && advancing) {
+        const float h = arrays.timestep.data[world % arrays.timestep.shape[0]];
+        const float* damping = arrays.damping.data + (long long)(world % arrays.damping.shape[0]) * NV;
+        EACH_LIMB(i) {
+            UNROLLED for (int e = ROOT; e < height; ++e)
+                OF(H, i)[e] += e == (branches ? OF(depth_of, i) : i) ? h * damping[i] : 0.0f;
+        }
+        EACH_CORNER(n) {
+            const int i = OF_CORNER(row_of, n);
+            if (i == OF_CORNER(column_of, n)) OF_CORNER(C, n) += h * damping[i];
+        }
+    }
+    // Limbs, from the leaves to the root: H = L^T diag(1 / over) L. A row of the board is the right-hand side, `over`, and H.
+    UNROLLED for (int t = height - 1; t >= ROOT; --t) {
+        float* board = boards + (t & 1) * BOARD;
+        EACH_LIMB(i) {
+            const float pivot = OF(H, i)[t];  // read by all: the compiler takes it for H[depth] else, no longer in a register
+            if ((branches ? OF(depth_of, i) : i) == t) {
+                float* row = board + (branches ? OF(place_of, i) * pitch : 0);
+                row[0] = OF(s, i);
+                row[1] = OF(over, i) = inverse(most(pivot, TINY));
+                UNROLLED for (int e = 0; e < height; ++e) if (e < t) row[2 + e] = OF(H, i)[e];
+            }
+        }
+        meet();
+        EACH_LIMB(i) {
+            const int own = branches ? OF(depth_of, i) : i;
+            if (own < t) {
+                int from = 0, to = 1;
+                if (branches) {
+                    const int packed = arrays.below.data[t * NV + i];  // those of this depth that hang on it
+                    from = packed & 0xff, to = packed >> 8;
+                }
+                ROLLED for (int n = from; n < to; ++n) {
+                    const float* row = board + n * pitch;
+                    const float part = row[2 + own] * row[1];
+                    UNROLLED for (int e = 0; e < height; ++e) if (e < t) OF(H, i)[e] -= part * row[2 + e];
+                    OF(s, i) -= part * row[0];
+                }
+            }
+        }
+        EACH_CORNER(n) {
+            const int i = OF_CORNER(row_of, n), j = OF_CORNER(column_of, n), count = branches ? arrays.depth_width.data[t] : 1;
+            BY_TWO for (int k = 0; k < count; ++k) {
+                const float* row = board + k * pitch;
+                OF_CORNER(C, n) -= row[1] * row[2 + i] * row[j < 0 ? 0 : 2 + j];
+            }
+        }
+    }
+    // The root: every lane does the same, without a word to others.
+    EACH_CORNER(n) corner[n] = OF_CORNER(C, n);
+    meet();
+    float R[CORNER > 0 ? CORNER : 1], root[ROOT > 0 ? ROOT : 1], root_over[ROOT > 0 ? ROOT : 1];
+    UNROLLED for (int n = 0; n < CORNER; ++n) R[n] = corner[n];
+    UNROLLED for (int k = ROOT - 1; k >= 0; --k) {
+        const float* row = R + k * (k + 1) / 2;
+        root_over[k] = inverse(most(row[k], TINY));
+        UNROLLED for (int i = 0; i < ROOT; ++i) if (i < k) {
+            const float part = row[i] * root_over[k];
+            R[TRIANGLE + i] -= part * R[TRIANGLE + k];
+            UNROLLED for (int j = 0; j < ROOT; ++j) if (j <= i) R[i * (i + 1) / 2 + j] -= part * row[j];
+        }
+    }
+    UNROLLED for (int k = 0; k < ROOT; ++k) {
+        root[k] = R[TRIANGLE + k];
+        UNROLLED for (int j = 0; j < ROOT; ++j) if (j < k) root[k] -= R[k * (k + 1) / 2 + j] * root[j];
+        root[k] *= root_over[k];
+        if (lane == 0) shown[k] = root[k];
+    }
+    // Back from the root to the leaves.
+    EACH_LIMB(i) {
+        UNROLLED for (int e = 0; e < ROOT; ++e) OF(s, i) -= OF(H, i)[e] * root[e];
+    }
+    UNROLLED for (int t = ROOT; t < height; ++t) {
+        EACH_LIMB(i) {
+            if ((branches ? OF(depth_of, i) : i) == t) OF(s, i) *= OF(over, i);
+        }
+        EVERY_LIMB(i) {
+            const float known = from_limb(s, branches ? OF(path_of, i)[t - ROOT] : t);
+            if (i >= ROOT && i < NV && (branches ? OF(depth_of, i) : i) > t) OF(s, i) -= OF(H, i)[t] * known;
+        }
+    }
+    EACH_LIMB(i) shown[i] = OF(s, i);
+    meet();
+    EACH_DOF(i) OF(s, i) = shown[i];
+};

@@ -1,0 +1,342 @@
+"""The parts of a task whose formula is fixed, in one launch each where torch takes six to twenty.
+
+Each stands beside the same formula in torch, in `legged/mdp/`, which the C engine runs; a test compares both bit by bit.
+"""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+PI = wp.constant(wp.float32(torch.pi))
+
+
+@wp.kernel
+def hold_joints(
+    target: wp.array2d[float],
+    dof_pos: wp.array2d[float],
+    dof_vel: wp.array2d[float],
+    stiffness: wp.array[float],
+    damping: wp.array[float],
+    limit: wp.array[float],
+    torques: wp.array2d[float],
+):
+    """One thread a robot and joint: a torque that is no number stays none."""
+    robot, joint = wp.tid()
+    spring = stiffness[joint] * (target[robot, joint] - dof_pos[robot, joint])
+    torque = spring - damping[joint] * dof_vel[robot, joint]
+    if torque > limit[joint]:
+        torque = limit[joint]
+    if torque < -limit[joint]:
+        torque = -limit[joint]
+    torques[robot, joint] = torque
+
+
+@wp.kernel
+def advance_feet(
+    forces: wp.array2d[wp.vec3],
+    threshold: float,
+    dt: float,
+    in_contact: wp.array2d[wp.bool],
+    first_contact: wp.array2d[wp.bool],
+    touched: wp.array2d[wp.bool],
+    air_time: wp.array2d[float],
+    last_air_time: wp.array2d[float],
+):
+    """One thread a robot and foot."""
+    robot, foot = wp.tid()
+    touching = forces[robot, foot][2] > threshold
+    contact = touching or touched[robot, foot]
+    air = air_time[robot, foot]
+    first = contact and air > 0.0
+    air += dt
+    if first:
+        last_air_time[robot, foot] = air
+    if contact:
+        air = 0.0
+    in_contact[robot, foot] = contact
+    first_contact[robot, foot] = first
+    touched[robot, foot] = touching
+    air_time[robot, foot] = air
+
+
+@wp.kernel
+def renew_commands(
+    reset: wp.array[wp.bool],
+    held: wp.array[wp.bool],
+    steered: wp.array[wp.bool],
+    sample: wp.array2d[float],
+    sample_standing: wp.array[wp.bool],
+    quat: wp.array2d[float],
+    dt: float,
+    last_moment: float,
+    resampling_time: float,
+    heading_gain: float,
+    lowest_rate: float,
+    highest_rate: float,
+    moving: float,
+    commands: wp.array2d[float],
+    standing: wp.array[wp.bool],
+    time_left: wp.array[float],
+    is_moving: wp.array[wp.bool],
+):
+    """One thread a robot; with a gain of 0 headings are not followed."""
+    robot = wp.tid()
+    left = time_left[robot] - dt
+    if (reset[robot] or left <= last_moment) and not held[robot]:
+        for i in range(4):
+            commands[robot, i] = sample[robot, i]
+        standing[robot] = sample_standing[robot]
+        left = resampling_time
+    time_left[robot] = left
+    if heading_gain > 0.0 and steered[robot] and not standing[robot]:
+        w, x, y, z = quat[robot, 0], quat[robot, 1], quat[robot, 2], quat[robot, 3]
+        yaw = wp.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        turned = commands[robot, 3] - yaw + PI
+        error = turned - 2.0 * PI * wp.floor(turned / (2.0 * PI)) - PI
+        commands[robot, 2] = wp.clamp(heading_gain * error, lowest_rate, highest_rate)
+    velocity = wp.vec3(commands[robot, 0], commands[robot, 1], commands[robot, 2])
+    is_moving[robot] = wp.length(velocity) > moving
+
+
+@wp.kernel
+def find_pushes(
+    mask: wp.array[wp.bool],
+    velocity: wp.array2d[float],
+    qvel: wp.array2d[float],
+    dt: float,
+    last_moment: float,
+    interval: float,
+    time_left: wp.array[float],
+    due: wp.array[wp.bool],
+    delta: wp.array2d[float],
+):
+    """One thread a robot."""
+    robot = wp.tid()
+    left = time_left[robot] - dt
+    now = left <= last_moment and mask[robot]
+    if now:
+        left = interval
+    time_left[robot] = left
+    due[robot] = now
+    for i in range(2):
+        delta[robot, i] = velocity[robot, i] - qvel[robot, i]
+
+
+@wp.kernel
+def follow_commands(
+    commands: wp.array2d[float],
+    lin_vel: wp.array2d[float],
+    ang_vel: wp.array2d[float],
+    valid: wp.array[wp.bool],
+    half_limit: wp.array[float],
+    share: wp.array[float],
+    reached: wp.array3d[float],
+):
+    """One thread a robot and axis: what of a command counts, and what of it was reached."""
+    robot, axis = wp.tid()
+    command = commands[robot, axis]
+    size = wp.abs(command)
+    if size > half_limit[axis] * share[axis] and valid[robot]:
+        velocity = lin_vel[robot, axis]
+        if axis == 2:
+            velocity = ang_vel[robot, axis]
+        reached[0, robot, axis] = velocity * wp.sign(command)
+        reached[1, robot, axis] = size
+    else:
+        reached[0, robot, axis] = 0.0
+        reached[1, robot, axis] = 0.0
+
+
+@wp.kernel
+def widen_commands(
+    totals: wp.array2d[float],
+    window_steps: float,
+    threshold: float,
+    step: float,
+    sums: wp.array2d[float],
+    steps: wp.array[float],
+    share: wp.array[float],
+):
+    """One thread for all three axes: they share a clock."""
+    count = steps[0] + 1.0
+    due = count >= window_steps
+    for axis in range(3):
+        reached = sums[0, axis] + totals[0, axis]
+        asked = sums[1, axis] + totals[1, axis]
+        if due:
+            if reached > threshold * asked:
+                share[axis] = wp.min(share[axis] + step, 1.0)
+            reached = wp.float32(0.0)
+            asked = wp.float32(0.0)
+        sums[0, axis] = reached
+        sums[1, axis] = asked
+    if due:
+        count = wp.float32(0.0)
+    steps[0] = count
+
+
+@wp.kernel
+def scan_heights(
+    base_pos: wp.array2d[float],
+    base_quat: wp.array2d[float],
+    points_x: wp.array[float],
+    points_y: wp.array[float],
+    cells: wp.array[float],
+    origin: wp.array[float],
+    cell: float,
+    rows: int,
+    columns: int,
+    heights: wp.array2d[float],
+    ground: wp.array[float],
+):
+    """One thread a robot and point; the last point is the base's own place."""
+    robot, point = wp.tid()
+    w, x, y, z = base_quat[robot, 0], base_quat[robot, 1], base_quat[robot, 2], base_quat[robot, 3]
+    yaw = wp.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    if wp.isnan(yaw):
+        yaw = wp.float32(0.0)
+    row, column = (base_pos[robot, 0] - origin[0]) / cell, (base_pos[robot, 1] - origin[1]) / cell
+    if wp.isnan(row):
+        row = wp.float32(0.0)
+    if wp.isnan(column):
+        column = wp.float32(0.0)
+    c, s = wp.cos(yaw), wp.sin(yaw)
+    row += c * points_x[point] - s * points_y[point]
+    column += s * points_x[point] + c * points_y[point]
+    i = int(wp.clamp(row, 0.0, float(rows - 1)))
+    j = int(wp.clamp(column, 0.0, float(columns - 1)))
+    height = cells[i * columns + j]
+    if point < heights.shape[1]:
+        heights[robot, point] = height
+    else:
+        ground[robot] = height
+
+
+@wp.kernel
+def move_levels(
+    mask: wp.array[wp.bool],
+    base_pos: wp.array2d[float],
+    asked: wp.array[float],
+    far: float,
+    rows: int,
+    columns: int,
+    random: wp.array[wp.int64],
+    column: wp.array[wp.int64],
+    tiles: wp.array2d[float],
+    levels: wp.array[wp.int64],
+    origins: wp.array2d[float],
+    judged: wp.array2d[float],
+):
+    """One thread a robot."""
+    robot = wp.tid()
+    over_x, over_y = base_pos[robot, 0] - origins[robot, 0], base_pos[robot, 1] - origins[robot, 1]
+    walked = wp.sqrt(over_x * over_x + over_y * over_y)
+    up = mask[robot] and walked > far
+    down = mask[robot] and walked < 0.5 * asked[robot] and not up
+    level = int(levels[robot]) + wp.where(up, 1, 0) - wp.where(down, 1, 0)
+    level = wp.max(level, 0)
+    if level >= rows:
+        level = int(random[robot])
+    levels[robot] = wp.int64(level)
+    tile = level * columns + int(column[robot])
+    for i in range(3):
+        origins[robot, i] = tiles[tile, i]
+    judged[0, robot] = wp.where(mask[robot], 1.0, 0.0)
+    judged[1, robot] = wp.where(up, 1.0, 0.0)
+    judged[2, robot] = wp.where(down, 1.0, 0.0)
+
+
+@wp.kernel
+def add_rewards(
+    values: wp.array2d[float],
+    factors: wp.array2d[float],
+    before_clip: wp.array2d[float],
+    valid: wp.array[wp.bool],
+    largest: float,
+    only_positive: bool,
+    fine: wp.array2d[wp.bool],
+    last: wp.array2d[float],
+    sums: wp.array2d[float],
+    total: wp.array[float],
+):
+    """One thread a robot; rows are terms."""
+    robot = wp.tid()
+    clipped, whole = wp.float32(0.0), wp.float32(0.0)
+    for term in range(values.shape[0]):
+        value = values[term, robot] * factors[term, 0]
+        number = wp.abs(value) < largest
+        fine[term, robot] = number
+        if not (number and valid[robot]):
+            value = 0.0
+        last[term, robot] = value
+        sums[term, robot] = sums[term, robot] + value
+        if only_positive:
+            clipped += value * before_clip[term, 0]
+            whole += value * (1.0 - before_clip[term, 0])
+        else:
+            whole += value
+    total[robot] = wp.max(clipped, 0.0) + whole
+
+
+class TaskKernels:
+    """Launches them on an engine's device, on the stream that torch uses now. All arguments are torch's tensors."""
+
+    def __init__(self, on_device: Callable[[], AbstractContextManager[Any]]) -> None:
+        """Launch within `on_device`."""
+        self._on_device = on_device
+
+    def name_module(self) -> None:
+        """Launch one of them, for a dry run that asks which modules are needed: they are all in one."""
+        wp.launch(hold_joints, dim=1)
+
+    def hold_joints(self, dim: tuple[int, ...], *arguments: Tensor) -> None:
+        """As `Control.compute` of joints that are held by P gains: the last argument is written."""
+        self._launch(hold_joints, dim, arguments)
+
+    def advance_feet(self, forces: Tensor, *arguments: Tensor | float) -> None:
+        """As `FeetContacts.update`."""
+        with self._on_device():
+            inputs = [wp.from_torch(forces, dtype=wp.vec3), *map(of_torch, arguments)]
+            wp.launch(advance_feet, dim=tuple(forces.shape[:2]), inputs=inputs)
+
+    def renew_commands(self, *arguments: Tensor | float) -> None:
+        """As `Commands.update`."""
+        self._launch(renew_commands, len(arguments[0]), arguments)  # type: ignore[arg-type]
+
+    def find_pushes(self, *arguments: Tensor | float) -> None:
+        """As the first half of `Pushes.push`."""
+        self._launch(find_pushes, len(arguments[0]), arguments)  # type: ignore[arg-type]
+
+    def follow_commands(self, commands: Tensor, *arguments: Tensor) -> None:
+        """As the first half of `CommandCurriculum.update`."""
+        self._launch(follow_commands, tuple(commands.shape), (commands, *arguments))
+
+    def widen_commands(self, *arguments: Tensor | float) -> None:
+        """As its second half."""
+        self._launch(widen_commands, 1, arguments)
+
+    def scan_heights(self, base_pos: Tensor, base_quat: Tensor, points_x: Tensor, *arguments: Tensor | float) -> None:
+        """As `HeightScan.update`."""
+        dim = (len(base_pos), len(points_x))
+        self._launch(scan_heights, dim, (base_pos, base_quat, points_x, *arguments))
+
+    def move_levels(self, *arguments: Tensor | float) -> None:
+        """As `TerrainCurriculum.update`, but for the sums over robots."""
+        self._launch(move_levels, len(arguments[0]), arguments)  # type: ignore[arg-type]
+
+    def add_rewards(self, values: Tensor, *arguments: Tensor | float) -> None:
+        """As `Rewards.compute`, once the terms are known."""
+        self._launch(add_rewards, values.shape[1], (values, *arguments))
+
+    def _launch(self, kernel: Any, dim: int | tuple[int, ...], arguments: tuple[Tensor | float, ...]) -> None:
+        with self._on_device():
+            wp.launch(kernel, dim=dim, inputs=[of_torch(argument) for argument in arguments])
+
+
+def of_torch(argument: Tensor | float) -> Any:
+    """Return what a kernel takes of an argument."""
+    return wp.from_torch(argument) if isinstance(argument, Tensor) else argument

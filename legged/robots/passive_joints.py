@@ -1,0 +1,157 @@
+"""Joints that no motor drives: where springs and closed loops put them, for given angles of the joints that have one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from legged.errors import ConfigError
+
+STEPS = 8
+"""Parts in which driven joints are moved, so that loops are never far from closed."""
+ITERATIONS = 30
+"""Newton's method per part."""
+LARGEST_STEP = 0.3
+"""Of a coordinate in one iteration [rad] or [m]."""
+CLOSED = 1e-6
+"""How far a closed loop may be open [m] or [rad]."""
+LEAST_STIFFNESS = 1e-3
+"""Of joints without a spring, as a share of the stiffest: they stay near where they were, if nothing says otherwise."""
+TRIES = 20
+"""Poses tried for each that is wanted."""
+
+
+@dataclass(frozen=True)
+class PassiveJoints:
+    """The passive joints of a robot with D driven ones; P of them are hinges and slides, the others balls."""
+
+    model: mujoco.MjModel
+    driven: tuple[int, ...]
+    """(D,) ids of the driven joints."""
+    numbers: tuple[int, ...]
+    """(P,) ids of the passive hinges and slides, whose coordinates can be observed."""
+    names: tuple[str, ...]
+    """(P,) their names."""
+    qpos_columns: tuple[int, ...]
+    """(P,) where they are in the generalised positions; `qvel_columns` in the velocities."""
+    qvel_columns: tuple[int, ...]
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, driven: Sequence[int], passive: Sequence[int]) -> "PassiveJoints":
+        """Return those of a model whose joints `driven` and `passive` (ids) are all but the base's."""
+        simple = [i for i in passive if model.jnt_type[i] != mujoco.mjtJoint.mjJNT_BALL]
+        return cls(
+            model=model,
+            driven=tuple(driven),
+            numbers=tuple(simple),
+            names=tuple(model.joint(i).name for i in simple),
+            qpos_columns=tuple(int(model.jnt_qposadr[i]) for i in simple),
+            qvel_columns=tuple(int(model.jnt_dofadr[i]) for i in simple),
+        )
+
+    def settle(self, angles: np.ndarray, start: np.ndarray) -> np.ndarray | None:
+        """Return generalised positions (nq,) with the driven joints at `angles` (D,), all loops closed, and the least energy
+        in springs, near `start` (nq,), from which joints are moved there; None if the loops do not close there.
+
+        Springs and constraints are solved as one: of K the stiffness, g its forces, J and c the constraints' Jacobian and
+        errors, [K J'; J 0] [dq; l] = [-g; -c] is repeated. Gravity is left out.
+        """
+        model, data = self.model, mujoco.MjData(self.model)
+        columns = model.jnt_qposadr[list(self.driven)]
+        dofs = np.setdiff1d(np.arange(6, model.nv), model.jnt_dofadr[list(self.driven)])
+        stiffness = model.jnt_stiffness[model.dof_jntid[dofs]]
+        least = LEAST_STIFFNESS * max(float(stiffness.max(initial=0.0)), 1.0)
+        hessian = np.diag(np.maximum(stiffness, least))
+        qpos, first = start.copy(), start[columns].copy()
+        for part in range(1, STEPS + 1):
+            qpos[columns] = first + (angles - first) * (part / STEPS)
+            for _ in range(ITERATIONS):
+                errors, jacobian = self._loops(data, qpos)
+                away = np.zeros(model.nv)
+                mujoco.mj_differentiatePos(model, away, 1.0, model.qpos_spring, qpos)
+                rows = len(errors)
+                system = np.block([[hessian, jacobian[:, dofs].T], [jacobian[:, dofs], np.zeros((rows, rows))]])
+                step = np.linalg.lstsq(system, -np.concatenate([stiffness * away[dofs], errors]), rcond=1e-9)[0][: len(dofs)]
+                largest = float(np.abs(step).max(initial=0.0))
+                move = np.zeros(model.nv)
+                move[dofs] = step * min(1.0, LARGEST_STEP / max(largest, 1e-12))
+                mujoco.mj_integratePos(model, qpos, move, 1.0)
+                if largest < 1e-8:
+                    break
+        errors, _ = self._loops(data, qpos)
+        return qpos if np.abs(errors).max(initial=0.0) < CLOSED else None
+
+    def _loops(self, data: mujoco.MjData, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return by how much each equality constraint is violated, (rows,), and the Jacobian (rows, nv)."""
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, data)
+        mujoco.mj_comPos(self.model, data)
+        mujoco.mj_makeConstraint(self.model, data)  # of contacts there are none: nobody has looked for them
+        rows = np.flatnonzero(np.asarray(data.efc_type) == mujoco.mjtConstraint.mjCNSTR_EQUALITY)
+        jacobian = np.zeros((data.nefc, self.model.nv))
+        if len(rows):
+            jacobian[:] = self._dense(data)
+        return np.asarray(data.efc_pos)[rows], jacobian[rows]
+
+    def _dense(self, data: mujoco.MjData) -> np.ndarray:
+        """Return the Jacobian of all constraints, (nefc, nv)."""
+        if not mujoco.mj_isSparse(self.model):
+            return np.asarray(data.efc_J).reshape(data.nefc, self.model.nv)
+        dense = np.zeros((data.nefc, self.model.nv))
+        for row, (start, count) in enumerate(zip(data.efc_J_rowadr, data.efc_J_rownnz, strict=True)):
+            dense[row, data.efc_J_colind[start : start + count]] = data.efc_J[start : start + count]
+        return dense
+
+    def beyond(self, qpos: np.ndarray) -> list[str]:
+        """Return the names of the passive hinges and slides that are beyond their ranges at `qpos` (nq,)."""
+        model = self.model
+        found = []
+        for number, column, name in zip(self.numbers, self.qpos_columns, self.names, strict=True):
+            low, high = model.jnt_range[number]
+            if model.jnt_limited[number] and not low <= qpos[column] <= high:
+                found.append(name)
+        return found
+
+    def draw(self, default: np.ndarray, factor: tuple[float, float], count: int, seed: int, where: str) -> np.ndarray:
+        """Return (count, nq) poses with driven joints at the angles of `default` (nq,) times numbers drawn from `factor`, and
+        loops closed. A pose that they do not allow, or in which a passive joint is beyond its range, is drawn again.
+
+        Raises:
+            ConfigError: there are too few; `where` says whose `factor` it is.
+        """
+        random, columns = np.random.default_rng(seed), self.model.jnt_qposadr[list(self.driven)]
+        poses: list[np.ndarray] = []
+        for _ in range(TRIES * count):
+            pose = self.settle(default[columns] * random.uniform(*factor, size=len(columns)), default)
+            if pose is not None and not self.beyond(pose):
+                poses.append(pose)
+            if len(poses) == count:
+                return np.array(poses)
+        raise ConfigError(f"{where}: the robot's loops close in {len(poses)} of {TRIES * count} poses drawn, too few")
+
+
+def default_qpos(
+    model: mujoco.MjModel, driven: Sequence[int], angles: np.ndarray, passive: PassiveJoints | None, where: str
+) -> np.ndarray:
+    """Return generalised positions (nq,): the base level at the origin, the joints `driven` (ids) at `angles`, and passive
+    ones where springs and loops put them.
+
+    Raises:
+        ConfigError: the loops do not close at those angles; `where` says whose they are.
+    """
+    qpos = model.qpos0.copy()
+    qpos[:7] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+    if passive is None:
+        qpos[model.jnt_qposadr[list(driven)]] = angles
+        return qpos
+    for i in (*driven, *passive.numbers):  # a linkage may have two ways to close; ranges tell which one is meant
+        if model.jnt_limited[i]:
+            qpos[model.jnt_qposadr[i]] = np.clip(qpos[model.jnt_qposadr[i]], *model.jnt_range[i])
+    settled = passive.settle(angles, qpos)
+    if settled is None:
+        raise ConfigError(f"{where}: the loops of the model's equality constraints do not close at these angles")
+    beyond = passive.beyond(settled)
+    if beyond:
+        raise ConfigError(f"{where}: at these angles the passive joints {', '.join(beyond)} would be beyond their ranges")
+    return settled

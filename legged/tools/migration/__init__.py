@@ -1,0 +1,1 @@
+"""Configuration classes of legged_gym and its forks -> tasks here. Their files are read, never run."""

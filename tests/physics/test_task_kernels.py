@@ -1,0 +1,185 @@
+"""Kernels of the task do what the same formula does in torch, bit by bit."""
+
+from contextlib import nullcontext
+from dataclasses import replace
+
+import pytest
+import torch
+
+from legged.config.legged import (
+    CommandCurriculumConfig,
+    CommandsConfig,
+    LeggedControlConfig,
+    LeggedDomainRandConfig,
+    TerrainConfig,
+)
+from legged.mdp.command_curriculum import CommandCurriculum
+from legged.mdp.commands import Commands
+from legged.mdp.contacts import FeetContacts
+from legged.mdp.control import Control
+from legged.mdp.height_scan import HeightScan
+from legged.mdp.randomization import Pushes
+from legged.mdp.rewards import Rewards
+from legged.mdp.terrain_curriculum import TerrainCurriculum
+from legged.physics.warp.task_kernels import TaskKernels
+from legged.robots.robot import load_robot
+from legged.state import state_of
+from legged.terrain import Terrain
+
+N, DT, CPU = 64, 0.02, torch.device("cpu")
+
+
+def pair(make):
+    """The part of a task without and with kernels, each made from the same random numbers."""
+    parts = []
+    for kernels in (None, TaskKernels(nullcontext)):
+        torch.manual_seed(3)
+        parts.append(make(kernels))
+    return parts
+
+
+def assert_same(parts) -> None:
+    for one, other in zip(*(state_of(part).values() for part in parts), strict=True):
+        torch.testing.assert_close(one, other, rtol=0.0, atol=0.0, equal_nan=True)
+
+
+def chance(share: float, *shape: int) -> torch.Tensor:
+    return torch.rand(*shape) < share
+
+
+def test_joints_are_held_alike_at_their_limits_too():
+    robot = load_robot("anymal_c")
+    laws = pair(lambda kernels: Control(robot, LeggedControlConfig(), torch.zeros(N, 12), 0.005, kernels))
+    actions, state = torch.randn(N, 12), torch.randn(2, N, 30)
+    state[0, 3, 10] = torch.nan
+    torques = []
+    for law in laws:
+        law.set_actions(actions)
+        torques.append(law.compute(state[0, :, 7:19], 5.0 * state[1, :, 6:18]))
+    assert torques[1] is laws[1].torques
+    torch.testing.assert_close(*torques, rtol=0.0, atol=0.0, equal_nan=True)
+    assert (torques[0].abs() == 80.0).any()
+    assert torques[0].isnan().sum() == 1
+
+
+def test_feet_swing_and_stand_alike():
+    parts = pair(lambda kernels: FeetContacts(N, 4, DT, CPU, kernels))
+    shapes = torch.zeros(N, 13, 3)
+    for step in range(40):
+        shapes[:, :, 2] = 2.0 * torch.rand(N, 13) * chance(0.5, N, 13)
+        for part in parts:
+            part.update(shapes[:, 3:13:3])
+            part.reset(torch.arange(N) == step)
+        assert_same(parts)
+    assert parts[0].last_air_time.unique().numel() > 5
+
+
+@pytest.mark.parametrize("heading", [False, True])
+def test_commands_are_renewed_and_steered_alike(heading):
+    cfg = CommandsConfig(heading_command=heading, resampling_time_s=0.2, standing_share=0.3, single_axis_share=0.3)
+    parts = pair(lambda kernels: Commands(cfg, N, DT, CPU, kernels))
+    for step in range(30):
+        quat = torch.nn.functional.normalize(torch.randn(N, 4), dim=1)
+        reset = chance(0.1, N)
+        for part in parts:
+            torch.manual_seed(step)
+            part.numbers.draw()
+            part.draw()
+            part.held.copy_(torch.arange(N) % 7 == 0)
+            part.steered.copy_(torch.arange(N) % 5 > 0)
+            part.update(reset, quat)
+        for one, other in zip(*(state_of(part).values() for part in parts), strict=True):
+            # Sines of the two libraries differ in the last place, and what is below a rate of 0.1 with them hardly ever.
+            torch.testing.assert_close(one, other, rtol=0.0, atol=1e-5 if heading and one.is_floating_point() else 0.0)
+    assert parts[0].is_moving.any()
+    assert not parts[0].is_moving.all()
+
+
+def test_command_ranges_widen_alike():
+    cfg = CommandCurriculumConfig(enabled=True, start=0.3, window_s=0.1)
+    full = torch.tensor([[-1.0, 1.0], [-0.5, 0.5], [-0.6, 1.2]])
+    parts = pair(lambda kernels: CommandCurriculum(cfg, full, DT, kernels))
+    seen = set()
+    for _ in range(30):
+        commands = 2.0 * torch.rand(N, 3) - 1.0
+        velocity, valid = commands * (0.6 + 0.4 * torch.rand(N, 3)), chance(0.9, N)
+        velocity[~valid] = torch.nan
+        for part in parts:
+            part.update(commands, velocity, 2.0 * velocity, valid)
+        assert_same(parts)
+        seen.add(tuple(parts[0].share.tolist()))
+    assert len(seen) > 3
+
+
+def ground() -> Terrain:
+    names = {name: 0.25 for name in ("rough_slope_up", "stairs_up", "stairs_down", "obstacles")}
+    return Terrain.build(replace(TerrainConfig(), mesh_type="height_map", proportions=names, num_rows=4, num_cols=8), 1)
+
+
+def test_the_ground_is_scanned_alike_on_it_beyond_it_and_nowhere():
+    terrain = ground()
+    parts = pair(lambda kernels: HeightScan(TerrainConfig(), terrain, N, CPU, kernels))
+    base_pos, base_quat = 100.0 * torch.rand(N, 3) - 30.0, torch.nn.functional.normalize(torch.randn(N, 4), dim=1)
+    base_pos[1, 0], base_pos[2, 1], base_quat[3] = torch.nan, torch.inf, torch.nan
+    for part in parts:
+        part.update(base_pos, base_quat)
+    # Where a point lies on the border of two cells, sines of two libraries may put it into either.
+    same = torch.cat([parts[0].heights == parts[1].heights, (parts[0].ground == parts[1].ground).unsqueeze(1)], dim=1)
+    assert same.float().mean() > 0.999
+    assert parts[0].heights.unique().numel() > 50
+
+
+def test_robots_move_between_levels_alike():
+    terrain = ground()
+    parts = pair(lambda kernels: TerrainCurriculum(TerrainConfig(max_init_terrain_level=3), terrain, N, CPU, kernels))
+    for step in range(8):
+        mask, away, asked = chance(0.7, N), 6.0 * torch.rand(N, 3), 8.0 * torch.rand(N)
+        for part in parts:
+            torch.manual_seed(step)
+            part.draw()
+            part.update(mask, part.origins + away, asked)
+        assert_same(parts)
+    assert parts[0]._sums[1:].sum(dim=1).min() > 10.0
+
+
+class Velocities:
+    """The part of a physics engine that is pushed."""
+
+    def __init__(self) -> None:
+        self.qvel = torch.full((N, 18), 0.3)
+
+    def push(self, mask: torch.Tensor, delta: torch.Tensor) -> None:
+        self.qvel[:, :2] += torch.where(mask.view(-1, 1), delta, 0.0)
+
+
+def test_robots_are_pushed_alike():
+    cfg = replace(LeggedDomainRandConfig(), push_interval_s=0.3)
+    parts, worlds = pair(lambda kernels: Pushes(cfg, N, DT, CPU, kernels)), (Velocities(), Velocities())
+    for step in range(40):
+        mask = chance(0.9, N)
+        for part, world in zip(parts, worlds, strict=True):
+            torch.manual_seed(step)
+            part.numbers.draw()
+            part.push(world, mask)
+        assert_same(parts)
+        assert worlds[0].qvel.equal(worlds[1].qvel)
+    assert worlds[0].qvel.unique().numel() > N
+
+
+@pytest.mark.parametrize("only_positive", [False, True])
+def test_rewards_are_added_alike(only_positive):
+    terms = torch.zeros(4, N)
+    functions = {name: lambda i=i: terms[i] for i, name in enumerate(("walk", "rest", "termination", "broken"))}
+    scales = {"walk": 1.0, "rest": -2.0, "termination": -50.0, "broken": 3.0}
+    parts = pair(lambda kernels: Rewards(functions, scales, DT, only_positive, torch.zeros(N), kernels))
+    for _ in range(5):
+        terms.copy_(torch.randn(4, N))
+        terms[3, :4] = torch.tensor([torch.nan, torch.inf, 1e12, -torch.inf])
+        valid = chance(0.8, N)
+        for part in parts:
+            part.compute(valid)
+        assert_same(parts)
+        assert parts[0].fine.equal(parts[1].fine)
+        assert parts[0].last.equal(parts[1].last)
+        torch.testing.assert_close(parts[0].total, parts[1].total, rtol=1e-6, atol=1e-6)
+    assert not parts[0].fine[3, :4].any()

@@ -1,0 +1,71 @@
+"""torch's compiler is imported by who compiles, is then the real one, and knows what it would have known."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import legged
+
+TRAIN = str(Path(legged.__file__).parents[1] / "train.py")
+AS_A_COMMAND = f"import sys\nsys.argv = [{TRAIN!r}]\n"
+DEFERRED = "'torch._dynamo.utils' not in sys.modules"
+
+
+def run(code: str, *arguments: str, cwd: Path | None = None) -> str:
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False, cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_a_training_does_without_the_compiler(tmp_path):
+    settings = ["--task", "anymal_c_flat", "--sim_device", "cpu", "--num_envs", "2", "--max_iterations", "1", "sim.threads=1"]
+    code = (
+        f"{AS_A_COMMAND}sys.argv += {settings!r}\n"
+        "from legged.tools.train import main\n"
+        "assert main() == 0\n"
+        "print([name for name in ('torch._dynamo.utils', 'torch._inductor', 'sympy') if name in sys.modules])\n"
+    )
+    assert run(code, cwd=tmp_path).splitlines()[-1] == "[]"
+
+
+def test_who_compiles_gets_the_real_one_and_it_knows_of_all_marks():
+    code = f"""{AS_A_COMMAND}
+import legged, torch, inspect
+optimizer = torch.optim.Adam([torch.nn.Parameter(torch.ones(2))])
+optimizer.zero_grad()
+optimizer.step()
+inspect.getmodule(run := lambda: 0)  # it looks at all modules
+assert {DEFERRED}
+stand_in = sys.modules["torch._dynamo"]
+marked = [function for name, function in stand_in._marks if name == "allow_in_graph"]
+assert marked and stand_in._not_disabled
+double = torch.compile(lambda x: 2.0 * x, backend="eager")
+assert double(torch.ones(3)).tolist() == [2.0, 2.0, 2.0]
+real = sys.modules["torch._dynamo"]
+assert real is torch._dynamo is not stand_in and real.optimize is stand_in.optimize
+from torch._dynamo import trace_rules
+assert all(id(function) in trace_rules._allowed_callable_ids for function in marked)
+assert not any("__dynamo_disable" in vars(function) for function in stand_in._not_disabled)
+optimizer.zero_grad()
+assert torch.optim.Optimizer.zero_grad.__wrapped__.__dynamo_disable is not torch.optim.Optimizer.zero_grad.__wrapped__
+"""
+    run(code)
+
+
+def test_modules_inside_it_are_imported_once():
+    for ask in ("import torch._dynamo.config as found", "from torch._dynamo import config as found"):
+        code = f"""{AS_A_COMMAND}
+import legged, torch
+assert {DEFERRED}
+{ask}
+assert found is sys.modules["torch._dynamo.config"] is sys.modules["torch._dynamo"].config
+assert found.__spec__.name == "torch._dynamo.config" and found.__spec__.origin.endswith("config.py")
+from torch._dynamo.testing import CompileCounter  # which importing the package does not import
+assert CompileCounter().frame_count == 0
+"""
+        run(code)
+
+
+def test_who_only_imports_legged_has_the_real_one():
+    finders = "[type(finder).__name__ for finder in sys.meta_path]"
+    run(f"import sys, legged, torch\nassert not ({DEFERRED})\nassert '_Submodules' not in {finders}")

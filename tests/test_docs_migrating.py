@@ -1,0 +1,91 @@
+"""What docs/migrating.md shows works: its module trains, and the names, terms and settings that it gives are there."""
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+from helpers import ENGINE, call, small_task
+from test_docs_tasks import fenced, named
+
+from legged import math as legged_math
+from legged import registry, user_modules
+from legged.config.loader import to_dict
+from legged.config.schema import LeggedConfig
+from legged.envs import LeggedRobot
+from legged.envs.legged_gym_names import COMPUTED, CONSTANT, KEPT, PLAIN
+from legged.tools import train
+
+PAGE = (Path(__file__).resolve().parents[1] / "docs" / "migrating.md").read_text(encoding="utf-8")
+FILES = dict(named(PAGE))
+ISAAC = PAGE[PAGE.index("## From Isaac Lab") :]
+
+
+def column(text: str, index: int) -> set[str]:
+    """Return what the rows of a text's tables have in backquotes in a column."""
+    rows = [row.split("|") for row in text.splitlines() if row.startswith("| ")]
+    return {name for row in rows for name in re.findall(r"`([^`]+)`", row[index])}
+
+
+@pytest.fixture
+def files(workplace, tmp_path, monkeypatch):
+    """Write the page's files into the working directory; forget the tasks afterwards."""
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    monkeypatch.setattr(user_modules, "_IMPORTED", set())
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    before = set(sys.modules)
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    yield
+    for name in set(sys.modules) - before:
+        del sys.modules[name]
+
+
+@pytest.mark.usefixtures("files")
+def test_the_class_that_was_ported_trains():
+    (command,) = [text.strip() for language, text in fenced(PAGE) if not language and "trot" in text]
+    arguments = command.removeprefix("python train.py ").split()
+    settings = [f"{key}={value}" for key, value in ENGINE]
+    tiny = ["--num_envs", "8", "--max_iterations", "1", "--sim_device", "cpu", "train.runner.num_steps_per_env=4"]
+    assert call(train.main, [*arguments, *tiny, *settings]) == 0
+
+
+def test_rewards_are_the_same_lines_before_and_after():
+    before, after = [text for language, text in fenced(PAGE) if language == "python"]
+
+    def rewards(text: str) -> list[str]:
+        return re.findall(r"    def _reward_\w+\(self\):\n(?:        .*\n)+", text)
+
+    assert len(rewards(before)) == 4
+    assert rewards(before) == rewards(after)
+
+
+def test_names_of_legged_gym_are_all_of_them():
+    text = PAGE[PAGE.index("### What needs no change") : PAGE.index("### What does")]
+    assert column(text, 1) == {*PLAIN, *COMPUTED, *CONSTANT, *KEPT}
+
+
+def test_functions_of_mathematics_are_there():
+    (line,) = re.findall(r"`from legged\.math import ([^`]+)`", PAGE)
+    assert all(callable(getattr(legged_math, name)) for name in line.split(", "))
+
+
+def test_terms_and_settings_beside_isaac_labs_are_there():
+    terms = {name for prefix in ("_reward_", "_obs_", "_terminate_") for name in LeggedRobot.terms(prefix)}
+    settings = set()
+
+    def collect(data: dict) -> None:
+        for key, value in data.items():
+            settings.add(key)
+            collect(value) if isinstance(value, dict) else None
+
+    collect(to_dict(LeggedConfig()))
+    settings |= {"robot", "link_mass", "terminate_after_contacts_on", "dof_names", "_init_buffers", "std"}
+    named_here = {part for name in column(ISAAC, 2) for part in re.findall(r"\w+", name)} - {"self"}
+    assert named_here <= terms | settings
+
+
+@pytest.mark.parametrize("name", ["last_air_time", "first_contact", "in_contact"])
+def test_contacts_have_what_the_page_says(name):
+    assert f"`.{name}`" in PAGE
+    assert hasattr(small_task(num_envs=1).contacts, name)
