@@ -1,5 +1,6 @@
 """The command that brings a robot: what it writes trains at once, and it says what it guessed."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 import torch
 import yaml
 from helpers import ENGINE, call
-from importing_fixtures import urdf
+from importing_fixtures import URDF_LEG, urdf
 
 from legged.registry import make_task, register_file, task_config
 from legged.robots.importing.folder import _compact
@@ -109,6 +110,16 @@ def test_a_lopsided_robot_learns_without_mirror_images(added):
     task_config(register_file("mine/fifth_toy_flat.yaml"), on_cpu=True)
 
 
+def test_legs_that_nothing_touches_get_feet(added):
+    """A ball at the centre of mass of the last link: of a calf of 0.2 kg at -0.1 and a foot of 0.05 kg at -0.2, at -0.12."""
+    text = re.sub(r"<collision>.*?</collision>", "", urdf().replace('<box size="0.5 0.16 0.1"/>', ""), flags=re.DOTALL)
+    out = added(text, "--name", "twelfth_toy")
+    assert "legs end in links that nothing touches, without a foot: a ball is added at the end of: fl_calf, fr_calf" in out
+    assert "neither base nor trunk has a shape" in out
+    model = mujoco.MjModel.from_xml_path("mine/twelfth_toy/twelfth_toy.xml")
+    np.testing.assert_allclose(model.geom("fl_foot").pos, [0, 0, -0.12], atol=1e-9)
+
+
 def test_a_robot_that_looks_along_y_is_turned(added):
     """Its left legs are at -x: a quarter turn clockwise brings them to +y."""
     places = {"fl": (-0.1, 0.2), "fr": (0.1, 0.2), "hl": (-0.1, -0.2), "hr": (0.1, -0.2)}
@@ -170,12 +181,14 @@ def test_a_model_of_menagerie(added, tmp_path, monkeypatch, capsys):
         (["toy.urdf", "--stiffness", "-1", "--damping", "1"], "--stiffness: must be between 0 and 1e6, got -1"),
         (["toy.urdf", "--hold", "arm"], "--hold: 'arm' is in no joint's name"),
         (["toy.urdf", "--extends", "nothing"], "--extends: there is no task 'nothing'"),
+        (["arm.urdf"], "only one chain of hinges reaches down, to link 'fl_calf'; a robot that walks has two legs or more"),
         (["broken.urdf"], "broken.urdf: is not well-formed XML"),
     ],
 )
 def test_a_wrong_call_ends_with_one_line(tmp_path, capsys, arguments, message):
     (tmp_path / "toy.urdf").write_text(urdf())
     (tmp_path / "toy.txt").write_text("hello")
+    (tmp_path / "arm.urdf").write_text(urdf(legs=URDF_LEG.format(n="fl", x=0.2, y=0.1, side=0.05)))
     (tmp_path / "broken.urdf").write_text(urdf()[:-3])
     assert call(add_robot.main, [*arguments, "--out", "mine"]) == 2
     err = capsys.readouterr().err

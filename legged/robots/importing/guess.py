@@ -167,4 +167,4 @@ def _check_mass(tree: Tree) -> None:
         raise ConfigError(
             f"{tree.source}: its links weigh {tree.mass:.6g} kg, the model {mass:.6g} kg: mass was lost on the way"
         )
-    tree.say(f"mass: {tree.mass:.6g} kg in the links of the file, {mass:.6g} kg in the model")
+    tree.say(f"mass: {tree.mass:.9g} kg in the links of the file, {mass:.9g} kg in the model")

@@ -112,7 +112,7 @@ def find_legs(tree: Tree) -> list[Leg]:
     these tell.
 
     Raises:
-        ConfigError: nothing reaches below the base.
+        ConfigError: nothing, or only one of them, reaches below the base.
     """
     poser = Poser(tree)
     ends = [i for i in range(1, len(tree.links)) if not tree.children(i)]
@@ -126,6 +126,10 @@ def find_legs(tree: Tree) -> list[Leg]:
     if lowest <= 0.0:
         raise ConfigError(f"{tree.source}: no chain of hinges reaches below the base, link '{tree.links[0].name}'")
     found = [i for i in named if reach[i] >= NEARLY * lowest]
+    if len(found) < 2:
+        end = tree.links[found[0]].name
+        why = f"only one chain of hinges reaches down, to link '{end}'; a robot that walks has two legs or more"
+        raise ConfigError(f"{tree.source}: {why}")
     legs = []
     for i in found:
         hinges = [hinge.name for j in chains[i] for hinge in tree.links[j].hinges]
@@ -199,7 +203,7 @@ def _feet(tree: Tree, leg: Leg, flat: bool) -> list[Shape]:
         return balls if balls and not flat else named
     low = [shape for shape in shapes if _is_low(shape, leg, shapes)]
     balls = [shape for shape in low if shape.kind == "sphere"]
-    if balls or flat:
+    if balls or (flat and low):
         return low if flat else balls
     return [_add_ball(tree, leg, low)]
 
@@ -230,5 +234,6 @@ def _add_ball(tree: Tree, leg: Leg, shapes: list[Shape]) -> Shape:
     ball = Shape("sphere", np.array([radius, 0.0, 0.0]), leg.tip.copy(), np.array(IDENTITY), True, link.name)
     ball.name = f"{FOOT.sub('', link.name).strip('_-. ') or link.name}_foot"
     link.shapes.append(ball)
-    tree.say("legs end in rods without a foot: a ball is added at the end of", link.name)
+    what = "rods" if shapes else "links that nothing touches"
+    tree.say(f"legs end in {what}, without a foot: a ball is added at the end of", link.name)
     return ball

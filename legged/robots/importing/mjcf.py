@@ -106,8 +106,8 @@ def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoc
 
 
 def drop_what_is_drawn(spec: mujoco.MjSpec, path: Path) -> None:
-    """Take the meshes from a spec, read from `path`, that are only seen, and are there, where no mass comes from them: reading
-    them takes most of the time.
+    """Take the meshes from a spec, read from `path`, that are only seen, where their files are there and no mass comes from
+    them: reading them takes most of the time.
     """
     folder = path.parent / (spec.meshdir or "")
     there = {mesh_name(mesh) for mesh in spec.meshes if mesh.file and (folder / mesh.file).is_file()}
