@@ -9,7 +9,7 @@ from legged.errors import ConfigError
 
 
 def commands() -> dict[str, str]:
-    """Module -> the first line of what it says about itself, of all modules that can be run as `python -m`."""
+    """Return module -> the first line of what it says about itself, of all modules that can be run as `python -m`."""
     found = {}
     for path in sorted(Path(next(iter(legged.tools.__path__))).glob("*.py")):
         text = path.read_text(encoding="utf-8")
@@ -20,7 +20,7 @@ def commands() -> dict[str, str]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """The command; returns its exit code."""
+    """Run the command; return its exit code."""
     return run_main(_main, argv)
 
 

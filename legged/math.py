@@ -40,8 +40,8 @@ def yaw_of(quat: Tensor) -> Tensor:
 
 
 def get_euler_xyz(quat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Roll, pitch and yaw [rad], (N,) each, of `quat` (N, 4), w first: the turns about the world's x, y and z axes, in this
-    order, that make up the rotation. Each lies in [-pi, pi] (Isaac Gym's are in [0, 2 pi), of quaternions with w last).
+    """Return roll, pitch and yaw [rad], (N,) each, of `quat` (N, 4), w first: the turns about the world's x, y and z axes,
+    in this order, that make up the rotation. Each lies in [-pi, pi] (Isaac Gym's are in [0, 2 pi), of quaternions with w last).
     """
     w, x, y, z = quat.unbind(dim=1)
     roll = torch.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
@@ -50,7 +50,7 @@ def get_euler_xyz(quat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def wrap_to_pi(angle: Tensor) -> Tensor:
-    """The same angle in [-pi, pi)."""
+    """Return the same angle in [-pi, pi)."""
     return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi
 
 

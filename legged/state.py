@@ -11,7 +11,7 @@ class StateError(ValueError):
 
 
 def state_of(owner: Any) -> dict[str, Tensor]:
-    """Copies of the tensors that `owner.STATE` names."""
+    """Return copies of the tensors that `owner.STATE` names."""
     return {name: getattr(owner, name).clone() for name in owner.STATE}
 
 

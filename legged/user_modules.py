@@ -65,7 +65,7 @@ def _run(path: Path) -> None:
 
 
 def _described(name: str, is_file: bool, folder: str, error: BaseException) -> ConfigError:
-    """What went wrong in the module `name`, or that there is none."""
+    """Return what went wrong in the module `name`, or that there is none."""
     if isinstance(error, ModuleNotFoundError) and not is_file and f"{name}.".startswith(f"{error.name}."):
         return ConfigError(f"--import: there is no module {shown(name)} (a module name, or a path that ends in .py)")
     text = " ".join(str(error.msg if isinstance(error, SyntaxError) else error).split())

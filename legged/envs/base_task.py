@@ -254,7 +254,7 @@ class BaseTask(SavedTask, VecEnv):
         torch.addcmul(self.control_middle, self.control_reach, self.actions, out=self.physics.ctrl)
 
     def apply_control(self) -> None:
-        """Hook before each physics step: compute `physics.ctrl` anew, for a control law that is faster than the policy."""
+        """Compute `physics.ctrl` anew before each physics step: a hook for control laws that are faster than the policy."""
 
     def draw(self) -> None:
         """Draw random numbers for every environment, used by those that are reset, and noise. Runs beside the step."""
@@ -292,7 +292,7 @@ class BaseTask(SavedTask, VecEnv):
         self.metrics.add_episodes(self.reset_buf, self.terminated_buf, self.episode_length_buf, self.rewards.sums)
 
     def update_curricula(self) -> None:
-        """Hook: judge the episodes that end (`reset_buf`), for what becomes harder."""
+        """Judge the episodes that end (`reset_buf`), for what becomes harder: a hook."""
 
     def reset_idx(self, mask: Tensor) -> None:
         """Begin new episodes in the environments of `mask` (N,), in the states that were drawn."""
@@ -302,10 +302,10 @@ class BaseTask(SavedTask, VecEnv):
         masked_set_(self.episode_length_buf, mask, 0)
 
     def disturb(self, mask: Tensor) -> None:
-        """Hook: disturb the environments of `mask` (N,), whose episodes go on."""
+        """Disturb the environments of `mask` (N,), whose episodes go on: a hook."""
 
     def ask(self) -> None:
-        """Hook: renew what is asked of the robots; `reset_buf` says whose episodes have just begun."""
+        """Renew what is asked of the robots; `reset_buf` says whose episodes have just begun: a hook."""
 
     def observe(self) -> None:
         """Write the observation groups."""

@@ -11,7 +11,7 @@ class RandomStream:
     """States of torch's generators, of the CPU and of one GPU, that are in force only inside `used`."""
 
     def __init__(self, device: torch.device) -> None:
-        """The stream goes on from where torch's generators stand when it is first used."""
+        """Go on from where torch's generators stand when it is first used."""
         self._device = device
         self._states: list[Tensor] | None = None
 

@@ -132,7 +132,7 @@ class CapturedRunner(Runner):
 
 @torch.no_grad()
 def copies(tensors: Iterable[Tensor]) -> list[Tensor]:
-    """Copies outside autograd: one that knew its parameter would keep the node that accumulates the parameter's gradient,
+    """Copy outside autograd: a copy that knew its parameter would keep the node that accumulates the parameter's gradient,
     and with it the stream the copy was made on, which no capture on another stream may wait for.
     """
     return [tensor.clone() for tensor in tensors]
@@ -142,7 +142,7 @@ class Clock:
     """Times of laps on a device; on a GPU measured there, without making anything wait."""
 
     def __init__(self, device: torch.device) -> None:
-        """Starts at once."""
+        """Start at once."""
         self._cuda = device.type == "cuda"
         self._marks: list[Any] = []
         self.lap()

@@ -34,7 +34,7 @@ def write_checkpoint(path: Path, saved: Saved) -> None:
 
 
 def load_plain(path: Path, device: str = "cpu") -> Any:
-    """What a file of torch holds, if that is plain data: numbers, text, tensors, lists and dictionaries. Runs nothing.
+    """Return what a file of torch holds, if that is plain data: numbers, text, tensors, lists, dictionaries. Run nothing.
 
     Raises:
         ConfigError: the file can't be read, is none of torch, or holds something else.
@@ -60,7 +60,7 @@ def _first_line(error: Exception) -> str:
 
 
 def read_checkpoint(path: Path, device: str = "cpu") -> Saved:
-    """The content of a checkpoint, whose parts are of the right kind and whose weights are finite.
+    """Return the content of a checkpoint, whose parts are of the right kind and whose weights are finite.
 
     Raises:
         ConfigError: the file is missing, no checkpoint, of a newer format, or damaged.
@@ -150,8 +150,8 @@ def check_weights(state: dict[str, Any], where: str) -> None:
 
 
 def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str) -> dict[str, Any]:
-    """The state of an optimiser from a checkpoint, with the moments checked and everything but the learning rate as it is
-    set up here.
+    """Return the state of an optimiser from a checkpoint, with the moments checked and everything but the learning rate
+    as it is set up here.
 
     Raises:
         ConfigError: it is not that of an optimiser of these parameters; begins with `where`.
@@ -317,7 +317,7 @@ def check_optimizer(path: Path, saved: Saved, cfg: TaskConfig) -> None:
 
 
 def describe_mismatch(path: Path, saved: Saved, wanted: dict[str, Any], task: str) -> str:
-    """What differs between a checkpoint's policy and the one that the built task needs."""
+    """Return what differs between a checkpoint's policy and the one that the built task needs."""
     found = saved["actor_state_dict"]
     text = f"{relative(path)}: made for another task than '{task}'"
     for name in dict.fromkeys([*wanted, *found]):

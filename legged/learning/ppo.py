@@ -133,7 +133,7 @@ class DevicePPO(ScaledRewards):
 
     @torch.no_grad()
     def _mini_batches(self) -> list[tuple[Tensor, ...]]:
-        """The rollout, shuffled: for each mini-batch of n samples the networks' inputs, actions (n, D), old
+        """Yield the rollout, shuffled: for each mini-batch of n samples the networks' inputs, actions (n, D), old
         log-probabilities, advantages, old values, returns (n,) each, and the old Gaussian's mean (n, D) and std (n, D).
 
         With symmetry, each but the last two also holds the mirror images, after the samples: 2 n.
@@ -162,7 +162,7 @@ class DevicePPO(ScaledRewards):
         return list(zip(*shuffled, strict=True))
 
     def _order(self, count: int) -> Tensor:
-        """A random permutation of `count` samples; by sorting, which a graph can hold."""
+        """Return a random permutation of `count` samples; by sorting, which a graph can hold."""
         return torch.rand(count, device=self.device).argsort()
 
     def _step(
@@ -236,8 +236,8 @@ class DevicePPO(ScaledRewards):
         return norms.sum()
 
     def _output(self, model: MLPModel, inputs: Tensor) -> Tensor:
-        """What a network makes of its inputs (n, width): (n, outputs), float32. With mixed precision its layers compute in
-        bfloat16.
+        """Return what a network makes of its inputs (n, width): (n, outputs), float32. With mixed precision its layers
+        compute in bfloat16.
         """
         kind, enabled = inputs.device.type, self.use_mixed_precision
         # A graph must cast the weights anew at every replay, so none may come from autocast's cache.
@@ -297,7 +297,7 @@ class SharedGradients:
     """
 
     def __init__(self, parameters: list[torch.nn.Parameter], count: int) -> None:
-        """Makes the parameters' gradients views of the buffer; there are `count` processes."""
+        """Make the parameters' gradients views of the buffer; there are `count` processes."""
         self._count = count
         self._buffer = torch.zeros(sum(p.numel() for p in parameters) + 1, device=parameters[0].device)
         pieces = self._buffer[:-1].split([p.numel() for p in parameters])

@@ -67,7 +67,7 @@ class Rollout:
         self._count()
 
     def _judge(self) -> None:
-        """What acting did not need, for all steps at once: log-probabilities, values, and what they add to rewards."""
+        """Compute what acting did not need, for all steps at once: log-probabilities, values, what they add to rewards."""
         alg, st = self.alg, self.alg.storage
         std = alg.action_std()
         st.distribution_params[1].copy_(std.expand_as(st.actions))
@@ -79,7 +79,7 @@ class Rollout:
         st.rewards.add_(alg.gamma * self._cut_off * st.values)
 
     def _count(self) -> None:
-        """Returns and lengths of episodes, for the log."""
+        """Record returns and lengths of episodes, for the log."""
         env = self.env
         self._return.add_(env.rew_buf)
         self._length.add_(1.0)
@@ -89,7 +89,7 @@ class Rollout:
 
     @staticmethod
     def _input(model: MLPModel, observations: Mapping[str, Tensor] | TensorDict) -> Tensor:
-        """What a network is given of `observations` by group (..., width): its groups side by side, normalised."""
+        """Return what a network is given of `observations` by group (..., width): its groups side by side, normalised."""
         return model.obs_normalizer(torch.cat([observations[name] for name in model.obs_groups], dim=-1))
 
     def _returns(self) -> None:

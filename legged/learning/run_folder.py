@@ -30,8 +30,8 @@ def experiment_folder(cfg: TaskConfig) -> Path:
 
 
 def create_run(cfg: TaskConfig) -> Path:
-    """A new run folder with the resolved configuration and the state of the code. It is nobody else's, also where several
-    processes make theirs in the same second.
+    """Make a new run folder with the resolved configuration and the state of the code. It is nobody else's, also where
+    several processes make theirs in the same second.
 
     Raises:
         ConfigError: the folder's name can't be one.
@@ -54,7 +54,7 @@ def create_run(cfg: TaskConfig) -> Path:
 
 
 def stamped(cfg: TaskConfig) -> str:
-    """The name of a run that begins now: date, time and, if it has one, its own name."""
+    """Return the name of a run that begins now: date, time and, if it has one, its own name."""
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     return f"{stamp}_{cfg.train.runner.run_name}" if cfg.train.runner.run_name else stamp
 
@@ -98,7 +98,7 @@ def code_state() -> str:
 
 
 def _git(folder: Path, *args: str) -> str:
-    """What git says about the repository that a folder lies in, whatever the environment names."""
+    """Return what git says about the repository that a folder lies in, whatever the environment names."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     command = ["git", "-C", str(folder), *args]
     result = subprocess.run(command, capture_output=True, check=True, timeout=GIT_S, env=environment)
@@ -106,7 +106,7 @@ def _git(folder: Path, *args: str) -> str:
 
 
 def _version() -> str:
-    """The version of this package as it is installed."""
+    """Return the version of this package as it is installed."""
     try:
         return metadata.version("legged")
     except metadata.PackageNotFoundError:
@@ -114,7 +114,7 @@ def _version() -> str:
 
 
 def find_run(cfg: TaskConfig, load_run: str | None) -> Path:
-    """The run folder that `load_run` names (a name in the task's experiment, a path, or nothing for the newest).
+    """Return the run folder that `load_run` names (a name in the task's experiment, a path, or nothing for the newest).
 
     Raises:
         ConfigError: there is none.
@@ -156,7 +156,7 @@ def find_run_of_any_task(cfg: TaskConfig, load_run: str) -> Path:
 
 
 def find_checkpoint(folder: Path, checkpoint: int | None) -> Path:
-    """The checkpoint of that iteration in a run folder, or the latest.
+    """Return the checkpoint of that iteration in a run folder, or the latest.
 
     Raises:
         ConfigError: there is none.
@@ -173,13 +173,13 @@ def find_checkpoint(folder: Path, checkpoint: int | None) -> Path:
 
 
 def shipped_policy(task: str) -> Path | None:
-    """The folder of the policy that comes with this package for a task, if there is one."""
+    """Return the folder of the policy that comes with this package for a task, if there is one."""
     folder = data_folder("resources") / "policies" / task
     return folder if (folder / SHIPPED_MODEL).is_file() else None
 
 
 def run_config(folder: Path) -> TaskConfig:
-    """The configuration that a run was trained with.
+    """Return the configuration that a run was trained with.
 
     Raises:
         ConfigError: the folder has none, or it no longer fits the schema.

@@ -102,7 +102,7 @@ class Runner(OnPolicyRunner):
         )
 
     def _left_out(self) -> float:
-        """The share of the last update's mini-batches that changed nothing, because their gradients were no numbers."""
+        """Return the share of the last update's mini-batches that changed nothing: their gradients were no numbers."""
         return self.alg.left_out if self._guard is None else self._guard.flush()
 
     def stop(self) -> None:

@@ -21,7 +21,7 @@ class StepGuard:
             optimizer.zero_grad(set_to_none=True)  # a parameter without a gradient is passed over
 
     def flush(self) -> float:
-        """The share of steps that were left out since the last flush."""
+        """Return the share of steps that were left out since the last flush."""
         share = self._left_out / max(self._steps, 1)
         self._steps, self._left_out = 0, 0
         return share

@@ -7,6 +7,7 @@ and lists what has no counterpart, each with its file and line.
 
 import argparse
 import os
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -104,7 +105,7 @@ def _robot_setting(robot: Robot | None, with_folder: bool, task: str, result: Tr
     if with_folder:
         return f"robots/{task}"
     if robot is None:
-        return f"robots/{next(iter(names_of(result)), task)}"
+        return f"robots/{next(filter(is_plain_name, names_of(result)), task)}"
     ours = data_folder("resources") / "robots" / robot.name
     return robot.name if ours.resolve() == robot.folder else str(robot.folder)
 
@@ -117,17 +118,26 @@ def _robot_text(robot: Robot, entries: dict[str, Any], folder: Path, source: Pat
     return robot_yaml([f"The model of {robot.name} as {relative(source)} has it: {changed} are that file's."], data)
 
 
+def _asset(file: Path, result: Translation) -> str:
+    """Return the path of the robot's file, as far as it is found above a configuration; else as that names it."""
+    asset = asset_of(result)
+    found = (relative(folder / asset) for folder in file.resolve().parents if asset and exists(folder / asset))
+    return next(found, asset or "FILE.urdf")
+
+
 def _report(args: argparse.Namespace, path: Path, result: Translation, lost: list[Lost], robot: Robot | None) -> None:
     print(f"written: {relative(path)}, {len(result.settings)} settings that differ from the defaults")
     for entry in lost:
         print(f"not mapped: {entry}")
     if robot is None:
-        asset = asset_of(result)
+        folder = args.out / result.settings["robot"]
+        add = ["add_robot", _asset(args.file, result), "--name", folder.name, "--out", str(folder.parent)]
+        again = ["migrate", str(args.file), "--robot", str(folder), "--out", str(args.out), "--force"]
+        again += ["--task", args.task] if args.task else []
         print(
-            "the robot is still missing:\n"
-            f"  python -m legged.tools.add_robot {asset or 'FILE.urdf'}\n"
-            f"  python -m legged.tools.migrate {args.file} --robot FOLDER --out {args.out} --force"
-            + (f" --task {args.task}" if args.task else "")
+            "the robot is still missing:",
+            *(f"  python -m legged.tools.{shlex.join(words)}" for words in (add, again)),
+            sep="\n",
         )
         return
     try:

@@ -44,7 +44,7 @@ ROOM_MB = 16.0
 
 
 def main(argv: list[str] | None = None) -> int:
-    """The command; returns its exit code."""
+    """Run the command; return its exit code."""
     return run_main(_main, argv)
 
 
@@ -184,7 +184,7 @@ def describe(cfg: TaskConfig, device: torch.device) -> str:
 
 
 def play_command(args: argparse.Namespace, cfg: TaskConfig, folder: Path) -> str:
-    """The command that shows the policy of a run, as it can be pasted into the shell that this training was started from."""
+    """Return the command that shows the policy of a run, as it can be pasted into the shell that this was started from."""
     words = [*play_program(), "--task", args.given_task]
     if args.module:
         words += ["--import", args.module]

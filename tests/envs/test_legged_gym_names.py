@@ -358,16 +358,30 @@ class Fork(LeggedRobot):
 REWARDS = sorted(Fork.terms("_reward_") - LeggedRobot.terms("_reward_"))
 
 
-@pytest.fixture(scope="module")
-def fork() -> Fork:
+def with_all_rewards(device: str, *overrides) -> Fork:
     """All of these rewards, in a task that the guard has let pass, after ten steps."""
-    cfg = small_config(("rewards.only_positive_rewards", False))
+    cfg = small_config(("rewards.only_positive_rewards", False), *overrides)
     cfg.rewards.scales.update(dict.fromkeys(REWARDS, 1.0))
-    task = Fork(cfg)
+    task = Fork(cfg, device)
     torch.manual_seed(1)
     for _ in range(10):
         task.step(torch.randn(ROBOTS, JOINTS))
     return task
+
+
+@pytest.fixture(scope="module")
+def fork() -> Fork:
+    return with_all_rewards("cpu")
+
+
+@pytest.mark.gpu
+def test_all_rewards_are_captured_on_a_gpu():
+    task = with_all_rewards("cuda", ("sim.physics", "mujoco_warp"))
+    assert task.captured
+    assert task.rewards.last.isfinite().all()
+    assert task.rewards.last.abs().sum(dim=1)[[task.rewards.names.index("alive"), task.rewards.names.index("hip_pos")]].all()
+    with pytest.raises(AttributeError, match="only where a term reads it"):
+        task.last_dof_pos  # noqa: B018
 
 
 def test_there_are_many_rewards():

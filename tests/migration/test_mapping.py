@@ -110,8 +110,14 @@ def test_legged_gyms_own_settings_that_mean_nothing_here_are_not_listed(migrated
 def test_a_robot_that_is_not_here_is_said_with_its_commands(migrated):
     text = GO2.replace("'FOOT'", "'foot'")
     result = migrated(text, "--out", "there")
-    assert "python -m legged.tools.add_robot resources/robots/go2/urdf/go2.urdf" in result.out
-    assert "python -m legged.tools.migrate fork_config.py --robot FOLDER --out there --force" in result.out
+    assert (
+        "  python -m legged.tools.add_robot resources/robots/go2/urdf/go2.urdf --name go2_of_somebody --out there/robots\n"
+        in result.out
+    )
+    assert (
+        "  python -m legged.tools.migrate fork_config.py --robot there/robots/go2_of_somebody --out there --force\n"
+        in result.out
+    )
     assert result.data["robot"] == "robots/go2_of_somebody"
     assert result.data["control"]["stiffness"] == {"H": 40.0, "KFE": 80.0, "wheel": 1.0}
     assert "#   feet: [foot]" in result.text
