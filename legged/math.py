@@ -41,7 +41,8 @@ def yaw_of(quat: Tensor) -> Tensor:
 
 def get_euler_xyz(quat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return roll, pitch and yaw [rad], (N,) each, of `quat` (N, 4), w first: the turns about the world's x, y and z axes,
-    in this order, that make up the rotation. Each lies in [-pi, pi]; Isaac Gym's lie in [0, 2 pi), its quaternions have w last.
+    in this order, that make up the rotation. Each lies in [-pi, pi]. Isaac Gym's lie in [0, 2 pi), and its quaternions have
+    w last.
     """
     w, x, y, z = quat.unbind(dim=1)
     roll = torch.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))

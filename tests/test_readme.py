@@ -48,7 +48,7 @@ def test_the_readme_is_short_and_its_tree_names_every_folder():
 def test_the_readme_names_every_task():
     first_cells = re.findall(r"^\| (`\w+`(?:, `\w+`)*) \| ", README, flags=re.MULTILINE)
     named = [name for cell in first_cells for name in re.findall(r"`(\w+)`", cell)]
-    assert sorted(name for name in named if name in TASKS) == sorted(TASKS)
+    assert set(TASKS) <= set(named)
 
 
 @pytest.mark.parametrize(
