@@ -61,6 +61,7 @@ if (FRICTIONS) {
         if (!is) continue;
         const float* spring = arrays.dof_spring.data + i * SPRING;
         put(start + place, stiffness_of(dof_weights[i], impedance(spring, 0.0f)), -spring[1] * v_in[i], losses[i]);
+        if (start + place < ROWS) *at_row(arrays.row_id, start + place) = i;  // by which the solver knows whose friction it is
         entry_dof[place] = i;
         for (int k = 0; k < 3; ++k) entry[3 * place + k] = k == 0 ? 1.0f : 0.0f;
     }
