@@ -110,6 +110,8 @@ def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any]) 
     if isinstance(task, LeggedRobot) and term.name == "heights":
         points = [[round(value, 6) for value in point] for point in task.height_scan.points.tolist()]
         entry |= {"points": points, "offset": HEIGHTS_OFFSET, "limit": HEIGHTS_LIMIT}
+    if isinstance(task, LeggedRobot) and term.name in ("passive_pos", "passive_vel") and task.robot.passive is not None:
+        entry |= {"joints": list(task.robot.passive.names), "default": task.passive_default_pos.tolist()}
     return entry
 
 
