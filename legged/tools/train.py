@@ -108,8 +108,8 @@ def _train(
     task = make_task(cfg, device, graph=not args.no_graph)
     if first and task.physics.why_library:
         print(f"mujoco-warp's own launches: {task.physics.why_library}", flush=True)
-    if first and task.physics.fitted:
-        print(f"on the terrain, meshes are stood for, with their mean distance: {task.physics.fitted}", flush=True)
+    for line in task.robot.adaptations if first and task.physics.robot_state is not None else ():
+        print(f"{task.robot.file.model}: {line}", flush=True)
     with Display(cfg.task) if first else contextlib.nullcontext() as display:
         kind = CapturedRunner if cfg.train.runner.loop == "captured" else Runner
         runner = kind(task, None, str(rl_device), display)

@@ -66,7 +66,6 @@ class MujocoWarpPhysics(WarpPhysics):
         self.model = scene.model(sim, "none" if cells else "height_field")
         if sim.step != "library":
             ask_for_dense_rows(self.model)
-        self.fitted = scene.fitted
         self._randomized = RandomizedModel(scene, self.model, randomized, torch.float32, device)
         self._per_world = changed_arrays(randomized)
         """Names of the model's arrays that are given per world."""
