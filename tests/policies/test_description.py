@@ -180,8 +180,10 @@ def test_every_shipped_term_has_a_formula_and_a_unit():
     assert terms["passive_pos"]["joints"][:2] == ["left_shin", "left_tarsus"]
     assert terms["passive_pos"]["default"][:2] == pytest.approx([0.0, 1.4214], abs=1e-3)
     heights = terms["heights"]
-    assert (heights["offset"], heights["limit"], len(heights["points"])) == (0.5, 1.0, 187)
-    assert heights["points"][:3] == [[-0.8, -0.5], [-0.8, -0.4], [-0.8, -0.3]]
+    larger = 1.008025 / 0.548820  # than ANYmal C, for which the task is written
+    assert (heights["offset"], heights["limit"]) == pytest.approx((0.5 * larger, 1.0 * larger), rel=1e-4)
+    assert len(heights["points"]) == 187
+    assert heights["points"][1] == pytest.approx([-0.8 * larger, -0.4 * larger], rel=1e-4)
     assert "(0, 0, -1) when the base is level" in terms["projected_gravity"]["formula"]
 
 
