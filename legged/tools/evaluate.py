@@ -99,6 +99,19 @@ def _device(args: argparse.Namespace) -> torch.device:
     return device
 
 
+def check_points(given: int | None, full: bool) -> int:
+    """Return the robots for each size of a terrain type: those `given` by --robots-per-point, or the usual number.
+
+    Raises:
+        ConfigError: they are none, or more than any machine holds.
+    """
+    a_point = given if given is not None else (256 if full else 32)
+    if not 1 <= a_point <= MOST_ROBOTS // MOST_SIZES:
+        limit = "at least 1" if a_point < 1 else f"at most {MOST_ROBOTS // MOST_SIZES:,}"
+        raise ConfigError(f"--robots-per-point: must be {limit}, got {a_point:,}")
+    return a_point
+
+
 def _follow_commands(args: argparse.Namespace) -> int:
     """Evaluate a task whose robots follow commands; return the exit code."""
     _refuse(args, OF_EPISODES, f"'{args.task}' follows commands; it is measured by how well")
@@ -106,10 +119,7 @@ def _follow_commands(args: argparse.Namespace) -> int:
         raise ConfigError("--num_envs: the grid says how many robots there are; --robots sets those of a cell")
     texts = {axis: getattr(args, axis) for axis in AXES}
     given = {axis: axis_values(f"--{axis}", text) for axis, text in texts.items() if text is not None}
-    a_point = args.robots_per_point if args.robots_per_point is not None else (256 if args.full else 32)
-    if not 1 <= a_point <= MOST_ROBOTS // MOST_SIZES:
-        limit = "at least 1" if a_point < 1 else f"at most {MOST_ROBOTS // MOST_SIZES:,}"
-        raise ConfigError(f"--robots-per-point: must be {limit}, got {a_point:,}")
+    a_point = check_points(args.robots_per_point, args.full)
     everywhere = args.physics == EVERYWHERE
     if args.all_checkpoints:
         _refuse(args, ("checkpoint", "types"), "--all-checkpoints tracks commands with every checkpoint; leave it out")
