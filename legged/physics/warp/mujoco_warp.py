@@ -94,7 +94,7 @@ class MujocoWarpPhysics(WarpPhysics):
             self._choose_step(sim.step)
         exchanges = (self._exchange.kinematics, self._exchange.contact_forces, self.kernels.name_module)
         constants = (self._set_constants,) if any(FIELDS[name].derived for name in randomized) else ()
-        compile_ahead(self._wp_device, (self._step, self._update_quantities, *exchanges, *constants))
+        self.compiled = compile_ahead(self._wp_device, (self._step, self._update_quantities, *exchanges, *constants))
         self.library_step = self._library_step
         if self._wp_device.is_cpu:
             self._advance = self._captured_step()
