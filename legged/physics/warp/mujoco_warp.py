@@ -174,7 +174,7 @@ class MujocoWarpPhysics(WarpPhysics):
             self._solver = ConstraintSolver(self.model, self._m, self._d)
         else:
             self._fused_step = TorqueStep(self.model, self._m, self._d, per_world)
-            no_contacts = ContactStage.why_not(self.model, self._m, per_world)
+            no_contacts = ContactStage.why_not(self.model, self._m, self._d, per_world)
             if no_contacts:
                 self.why_library = f"for contacts alone, {no_contacts}"
             else:
