@@ -19,10 +19,11 @@ from legged.config.units import unit_in
 from legged.envs import BaseTask, LeggedRobot
 from legged.errors import ConfigError, suggest
 from legged.gymnasium_ids import add_ids
+from legged.physics.fields import FIELDS
 from legged.process.paths import data_folder, exists
 from legged.process.startup import importing, stage_ended
 from legged.robots.similarity import grown, size_of
-from legged.terrain import Terrain
+from legged.terrain import TERRAIN_TYPES, Terrain
 from legged.user_modules import import_tasks
 
 __all__ = [
@@ -183,8 +184,13 @@ def task_config(name: str, overrides: Iterable[tuple[str, Any]] = (), on_cpu: bo
 def _carrier(kind: type[BaseTask], schema: type[TaskConfig]) -> Carry:
     """Return what carries the numbers of a configuration from the robot that they are written for to another one."""
 
-    def unit_of(method: str) -> str:
-        return unit_in(inspect.getdoc(getattr(kind, method, None))) or "1"
+    def unit_of(name: str) -> str:
+        section, _, entry = name.rpartition(".")
+        if section == "terrain.sizes":
+            return TERRAIN_TYPES[entry].unit if entry in TERRAIN_TYPES else "1"
+        if section == "domain_rand.ranges":
+            return FIELDS[entry].unit.partition(" or ")[0] if entry in FIELDS else "1"
+        return unit_in(inspect.getdoc(getattr(kind, name, None))) or "1"
 
     def carry_layer(data: Mapping[str, Any], written_for: str, robot: str, where: str) -> Mapping[str, Any]:
         if not issubclass(kind, LeggedRobot):

@@ -42,6 +42,11 @@ def carried_by_term(prefix: str, power: int, bounds: Bounds) -> Bounds:
     return {**bounds, "unit_of": (prefix, power)}
 
 
+def carried_by_entry(path: str, bounds: Bounds) -> Bounds:
+    """Return metadata: for each entry of the map at the dotted `path` numbers that grow with the entry's unit."""
+    return {**bounds, "unit_of": (f"{path}.", 1)}
+
+
 UNIT = between(0, 1)
 NAME: Bounds = {"name": True}
 """Text that becomes the name of a folder; it may be empty."""

@@ -1,7 +1,8 @@
 """Numbers of a configuration that was written for one robot -> those that mean the same to another, by dynamic similarity.
 
 Which numbers these are is said by their fields: `carried` (bounds.py) gives a field the unit in which it grows with the
-robot; scales and noise of terms grow by the unit of the term, which its docstring ends with.
+robot; scales and noise of terms grow by the unit of the term, which its docstring ends with; sizes of terrain types, and
+ranges of what is randomised, by the unit of each.
 """
 
 import dataclasses
@@ -13,7 +14,8 @@ from legged.config.checks import hints_of
 Factor = Callable[[str], float]
 """Unit -> by what a quantity of it grows from the one robot to the other."""
 UnitOf = Callable[[str], str]
-"""Name of a term's method, such as "_reward_torques" -> unit of what it returns."""
+"""Name of a term's method, such as "_reward_torques" -> unit of what it returns; dotted path of an entry, such as
+"terrain.sizes.step" -> its unit."""
 DIGITS = 6
 """Significant digits of a carried number: a configuration is there to be read."""
 

@@ -6,7 +6,18 @@ Defaults are legged_gym's (v1.0.2, arXiv 2109.11978) where it has the field.
 from dataclasses import dataclass, field
 from typing import Literal
 
-from legged.config.bounds import LARGEST, LONGEST_S, TERMS, UNIT, between, carried, carried_by_term, items, positive
+from legged.config.bounds import (
+    LARGEST,
+    LONGEST_S,
+    TERMS,
+    UNIT,
+    between,
+    carried,
+    carried_by_entry,
+    carried_by_term,
+    items,
+    positive,
+)
 from legged.config.mdp import (
     ControlConfig,
     DomainRandConfig,
@@ -40,7 +51,7 @@ class TerrainConfig:
     """Factor on all lengths that the types are made of, treads and sizes alike; 1 suits a robot half a metre high."""
     proportions: dict[str, float] = field(default_factory=dict, metadata=UNIT)
     """Terrain type -> share of the columns; sums to 1. Types: legged/terrain/generators.py, TERRAIN_TYPES."""
-    sizes: dict[str, float] = field(default_factory=dict, metadata=positive(100))
+    sizes: dict[str, float] = field(default_factory=dict, metadata=carried_by_entry("terrain.sizes", positive(100)))
     """Terrain type -> size of all its tiles, in its unit, in place of sizes that grow from row to row."""
     num_rows: int = field(default=10, metadata=between(1, 1000))
     """Levels of difficulty: row / num_rows."""

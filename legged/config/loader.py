@@ -174,7 +174,9 @@ def _merged(
             where = f"{name}: written_for"
             if not isinstance(layer.written_for, str):
                 raise ConfigError(f"{where}: expected the name of a robot, got {shown(layer.written_for)}")
-            carried = data if carry is None else carry(data, robot_path(layer.written_for, layer.folder), robot, where)
+            carried: Mapping[str, Any] = data
+            if carry is not None and isinstance(robot, str):  # what is no name is found where the command line is checked
+                carried = carry(data, robot_path(layer.written_for, layer.folder), robot, where)
             if carried is not data:
                 data, name = dict(carried), f"{name} (written for {Path(layer.written_for).name})"
         merge(merged, data, name, origins)

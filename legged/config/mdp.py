@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from legged.config.bounds import LARGEST, NAMES, TERMS, between, positive
+from legged.config.bounds import LARGEST, NAMES, TERMS, between, carried_by_entry, positive
 
 Range = tuple[float, float]
 
@@ -31,7 +31,9 @@ class TerminationsConfig:
 class DomainRandConfig:
     """What differs from robot to robot."""
 
-    ranges: dict[str, Range] = field(default_factory=dict, metadata=between(-LARGEST, LARGEST))
+    ranges: dict[str, Range] = field(
+        default_factory=dict, metadata=carried_by_entry("domain_rand.ranges", between(-LARGEST, LARGEST))
+    )
     """Property of the model -> range from which each robot's is drawn, evenly. Properties: legged/physics/fields.py."""
 
 

@@ -5,33 +5,56 @@ from collections.abc import Mapping
 
 BASE = {
     "m": (0, 1, 0),
+    "cm": (0, 1, 0),
+    "mm": (0, 1, 0),
     "kg": (1, 0, 0),
     "s": (0, 0, 1),
     "N": (1, 1, -2),
+    "Nm": (1, 2, -2),
     "J": (1, 2, -2),
     "W": (1, 2, -3),
     "Hz": (0, 0, -1),
     "rad": (0, 0, 0),
+    "deg": (0, 0, 0),
     "1": (0, 0, 0),
 }
 """Unit -> exponents of mass, length and time; an angle is a ratio of lengths."""
 Exponents = tuple[int, int, int]
+SPELLINGS = {"**": "^", "*": " ", "·": " ", "²": "^2", "³": "^3", "⁴": "^4", "⁻": "^-", "^-^": "^-", "¹": "1"}
+"""How else powers and products are written -> how they are read here."""
+TOKENS = re.compile(r"[A-Za-z]+|\^-?\d+|\S")
 
 
 def exponents(unit: str) -> Exponents:
-    """Return the exponents of mass, length and time of a unit such as "N^2 m^2" or "rad/s^2"; of several, separated by
-    commas, those of the first. What is no unit has none: (0, 0, 0).
+    """Return the exponents of mass, length and time of a unit such as "N^2 m^2", "rad/s^2" or "(m/s)^2"; of several,
+    separated by commas, those of the first. What is no unit has none: (0, 0, 0).
     """
-    first = unit.partition(",")[0].strip()
-    total = [0, 0, 0]
-    for i, part in enumerate(first.split("/")):
-        for word in part.split():
-            match = re.fullmatch(r"([A-Za-z1]+)(?:\^(\d+))?", word)
-            if match is None or match.group(1) not in BASE:
-                return (0, 0, 0)
-            power = int(match.group(2) or 1) * (1 if i == 0 else -1)
-            total = [t + power * e for t, e in zip(total, BASE[match.group(1)], strict=True)]
-    return (total[0], total[1], total[2])
+    text = unit.partition(",")[0]
+    for theirs, ours in SPELLINGS.items():
+        text = text.replace(theirs, ours)
+    words = TOKENS.findall(text)
+    found = _product(words)
+    return (0, 0, 0) if found is None or words else found
+
+
+def _product(words: list[str]) -> Exponents | None:
+    """Take a product off the front of `words`, up to a closing bracket, and return its exponents; None if it is none. What
+    follows a slash is all divided by.
+    """
+    mass, length, time, sign = 0, 0, 0, 1
+    while words and words[0] != ")":
+        word = words.pop(0)
+        if word == "/":
+            sign = -1
+            continue
+        part = _product(words) if word == "(" else BASE.get(word)
+        if part is None or (word == "(" and not words):
+            return None
+        if word == "(":
+            words.pop(0)
+        power = sign * (int(words.pop(0)[1:]) if words and words[0][0] == "^" and words[0] != "^" else 1)
+        mass, length, time = mass + power * part[0], length + power * part[1], time + power * part[2]
+    return mass, length, time
 
 
 def unit_in(docstring: str | None) -> str | None:

@@ -217,6 +217,8 @@ class LeggedGymNames:
     if not TYPE_CHECKING:  # a type checker should go on seeing what is not there
 
         def __getattr__(self, name: str) -> Any:
+            if hasattr(type(self), name):  # a property that failed: asked again, it says what it did not find itself
+                return object.__getattribute__(self, name)
             if name in NAMES:
                 try:
                     return self._by_their_name(name)

@@ -106,12 +106,12 @@ def wilson(successes: int, trials: int, z: float = Z95) -> tuple[float, float]:
 
 
 def sizes_of(name: str, full: bool, scale: float = 1.0) -> tuple[float, ...]:
-    """Return the sizes of a type that are measured on ground of that scale, growing, in its unit; lengths to a millimetre."""
+    """Return the sizes of a type that are measured on ground of that scale, growing, in its unit."""
     kind = TERRAIN_TYPES[name]
     found = SIZES.get(name) if full else FEWER.get(name, SIZES.get(name))
     # Of a type that is not listed, what training could hold and one step more.
     found = found or tuple(sorted(kind.size(d) for d in (0.2, 0.4, 0.6, 0.8, 1.0, 1.2)))
-    return found if kind.unit != METRES or scale == 1.0 else tuple(round(size * scale, 3) for size in found)
+    return found if kind.unit != METRES or scale == 1.0 else tuple(round(size * scale, 6) for size in found)
 
 
 def chosen_types(cfg: LeggedConfig, asked: str | None) -> list[str]:

@@ -40,7 +40,7 @@ def print_success(success: dict[str, Any]) -> None:
             time_s = point["mean_time_s"]
             table.add_row(
                 escape(name) if i == 0 else "",
-                f"{point['size']:g} {entry['unit']}{' *' if mark else '  '}",
+                f"{point['size']:.3g} {entry['unit']}{' *' if mark else '  '}",
                 f"{point['successes']}/{point['robots']} = {100 * point['share']:.0f} %",
                 f"{100 * point['low']:.0f} to {100 * point['high']:.0f} %",
                 str(point["fell"]),

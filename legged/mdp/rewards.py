@@ -69,12 +69,13 @@ class Rewards:
                 if value.shape != (self.num_envs,):
                     raise ValueError(f"must return a tensor ({self.num_envs},), got {tuple(value.shape)}")
             values.append(value)
+        # Stacked, so that scaling, masking and summing cost a launch each and not one a term.
+        stacked = torch.stack(values).float()
         if self._kernels is not None:
             rule = (self._factors, self._before_clip, valid, LARGEST, self.only_positive)
-            self._kernels.add_rewards(torch.stack(values).float(), *rule, self.fine, self.last, self.sums, self.total)
+            self._kernels.add_rewards(stacked, *rule, self.fine, self.last, self.sums, self.total)
             return self.total
-        # Stacked, so that scaling, masking and summing cost a launch each and not one a term.
-        scaled = torch.stack(values) * self._factors
+        scaled = stacked * self._factors
         torch.lt(scaled.abs(), LARGEST, out=self.fine)
         scaled = torch.where(self.fine & valid, scaled, self._zero, out=self.last)
         self.sums.add_(scaled)

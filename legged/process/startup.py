@@ -64,9 +64,13 @@ def is_a_command() -> None:
 
 def command_of_ours() -> str | None:
     """Return how this process was started, if as one of our commands: 'script' (train.py, play.py), 'module' (python -m
-    legged...) or 'installed' (legged-train, legged-play).
+    legged...) or 'installed' (legged-train, legged-play). What such a process starts by multiprocessing is no command, though
+    Python gives it the same arguments.
     """
     given = sys.orig_argv
+    processes = sys.modules.get("multiprocessing.process")
+    if processes is not None and processes.parent_process() is not None:
+        return None
     if "-m" in given[:-1]:
         name = given[given.index("-m") + 1]
         return "module" if name == "legged" or name.startswith("legged.") else None

@@ -46,8 +46,10 @@ class Tile:
     """Factor on the lengths that its type is made of."""
 
     def cells(self, metres: float) -> int:
-        """Return a length, times the tile's scale, in whole cells."""
-        return int(metres * self.scale / self.cell + 1e-6)
+        """Return a length, times the tile's scale, in whole cells. Scales and cells have six digits, so that a hair of a cell
+        may be missing.
+        """
+        return int(metres * self.scale / self.cell + 1e-3)
 
     def from_centre(self) -> np.ndarray:
         """Return (length, width) the distance of each cell's centre from the tile's, as the larger of |x| and |y| [m]."""

@@ -18,8 +18,20 @@ BY_HAND = [
     ("N m", (1, 2, -2)),
     ("N^2 m^2", (2, 4, -4)),
     ("m/s, m/s, rad/s", (0, 1, -1)),
+    ("(m/s)^2", (0, 2, -2)),
+    ("N/(kg m)", (0, 0, -2)),
+    ("m s^-1", (0, 1, -1)),
+    ("m²·s⁻²", (0, 2, -2)),
+    ("N*m", (1, 2, -2)),
+    ("Nm", (1, 2, -2)),
+    ("N**2 m**2", (2, 4, -4)),
+    ("1/s", (0, 0, -1)),
     ("1", (0, 0, 0)),
     ("0 to 1", (0, 0, 0)),
+    ("(m", (0, 0, 0)),
+    ("m)", (0, 0, 0)),
+    ("m^", (0, 0, 0)),
+    ("m apart", (0, 0, 0)),
     ("", (0, 0, 0)),
 ]
 
@@ -105,6 +117,26 @@ def test_the_robot_of_the_command_line_counts(tasks):
     tasks("carry_robot", {"written_for": "anymal_c", "robot": "anymal_c", "rewards": {"max_contact_force": 350.0}})
     cfg = task_config("carry_robot", [("robot", "go2")])
     assert cfg.rewards.max_contact_force == pytest.approx(350.0 * 15.019 / 52.13485, rel=1e-4)
+
+
+def test_sizes_of_tiles_and_ranges_of_properties_grow_by_the_unit_of_each(tasks):
+    """Heights of steps and added masses do, angles of slopes and factors do not."""
+    ranges = {"added_base_mass": [-1.0, 2.0], "link_mass": [0.9, 1.1], "joint_friction": [0.0, 0.5]}
+    sizes = {"step": 0.15, "slope_up": 20.0}
+    tasks("carry_entries", {"written_for": "anymal_c", "domain_rand": {"ranges": ranges}, "terrain": {"sizes": sizes}})
+    tasks("carry_entries_go2", {"extends": "carry_entries", "robot": "go2"})
+    cfg = task_config("carry_entries_go2")
+    mass, height = 15.019 / 52.13485, 0.3235036 / 0.5488202
+    assert cfg.terrain.sizes == {"step": pytest.approx(0.15 * height, rel=1e-4), "slope_up": 20.0}
+    assert cfg.domain_rand.ranges["added_base_mass"] == pytest.approx((-mass, 2.0 * mass), rel=1e-4)
+    assert cfg.domain_rand.ranges["link_mass"] == (0.9, 1.1)
+    assert cfg.domain_rand.ranges["joint_friction"] == pytest.approx((0.0, 0.5 * mass * height), rel=1e-4)
+
+
+@pytest.mark.parametrize("robot", [3, [1], {"a": 1}])
+def test_a_robot_of_the_command_line_that_is_no_name(robot):
+    with pytest.raises(ConfigError, match=r"^command line: robot: expected text, got "):
+        task_config("go2_flat", [("robot", robot)])
 
 
 @pytest.mark.parametrize(

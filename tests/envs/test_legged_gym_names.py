@@ -110,6 +110,26 @@ def test_a_slip_of_the_pen_has_its_nearest_name(task):
     assert not hasattr(task, "nothing_like_it")
 
 
+class Mistaken(LeggedRobot):
+    @property
+    def slip(self) -> Tensor:
+        return self.feet_vell[:, :, 0].sum(dim=1)
+
+    @property
+    def rpy(self) -> Tensor:  # of a name that would be there
+        return self.base_quad
+
+
+def test_a_property_that_fails_says_what_is_missing_and_not_that_it_is():
+    task = object.__new__(Mistaken)
+    task.feet_vel = torch.zeros(1, 4, 3)
+    with pytest.raises(AttributeError, match="has no attribute 'feet_vell'; did you mean 'feet_vel'"):
+        task.slip  # noqa: B018
+    with pytest.raises(AttributeError, match="has no attribute 'base_quad'"):
+        task.rpy  # noqa: B018
+    assert not hasattr(task, "slip")
+
+
 WRITES = {
     "a part": lambda task: task.root_states.__setitem__((slice(None), slice(7, 9)), 1.0),
     "a slice in place": lambda task: task.root_states[:, 7:9].uniform_(-1.0, 1.0),

@@ -170,6 +170,7 @@ def test_robots_are_pushed_alike():
 def test_rewards_are_added_alike(only_positive):
     terms = torch.zeros(4, N)
     functions = {name: lambda i=i: terms[i] for i, name in enumerate(("walk", "rest", "termination", "broken"))}
+    functions["rest"] = lambda: terms[1].double()  # a term of numbers of another kind
     scales = {"walk": 1.0, "rest": -2.0, "termination": -50.0, "broken": 3.0}
     parts = pair(lambda kernels: Rewards(functions, scales, DT, only_positive, torch.zeros(N), kernels))
     for _ in range(5):

@@ -44,6 +44,16 @@ def on(ground: Playground, cfg: TaskConfig, num_envs: int) -> LeggedRobot:
     return task
 
 
+@pytest.mark.parametrize("name", ["a1_flat", "h1_flat"])
+def test_flat_tasks_of_small_and_large_robots_have_ground_of_every_type(name):
+    """Cells and tiles grow with what the types are made of: gaps between stones, platforms."""
+    cfg = task_config(name)
+    for kind in TERRAIN_TYPES:
+        ground = playground(cfg, kind)
+        built = ground.build(override(cfg, [*SETTING, *ground.changes(cfg)]))
+        assert built.tile_size == pytest.approx((cfg.terrain.terrain_length, cfg.terrain.terrain_width), rel=1e-3)
+
+
 # ---- the ground ------------------------------------------------------------------------------------------------------
 
 

@@ -69,3 +69,24 @@ assert CompileCounter().frame_count == 0
 def test_who_only_imports_legged_has_the_real_one():
     finders = "[type(finder).__name__ for finder in sys.meta_path]"
     run(f"import sys, legged, torch\nassert not ({DEFERRED})\nassert '_Submodules' not in {finders}")
+
+
+def test_a_process_that_a_command_starts_collects_garbage_and_has_the_real_one(tmp_path):
+    """It has the command's arguments, and nobody ends its start."""
+    worker = tmp_path / "worker.py"
+    worker.write_text(
+        "import gc, sys\n"
+        "def work(told):\n"
+        "    import legged, torch\n"
+        "    told.put((gc.isenabled(), 'torch._dynamo.utils' in sys.modules))\n"
+    )
+    code = (
+        f"{AS_A_COMMAND}sys.path.insert(0, {str(tmp_path)!r})\n"
+        "import multiprocessing, legged, worker\n"
+        "context = multiprocessing.get_context('spawn')\n"
+        "told = context.Queue()\n"
+        "process = context.Process(target=worker.work, args=(told,))\n"
+        "process.start()\n"
+        "print(told.get(timeout=100))\n"
+    )
+    assert run(code) == "(True, True)\n"

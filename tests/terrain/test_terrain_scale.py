@@ -7,7 +7,9 @@ from legged.config.origins import Origins
 from legged.config.schema import TerrainConfig
 from legged.errors import ConfigError
 from legged.evaluation.success import sizes_of
+from legged.registry import task_config
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, check_terrain, tile_size
+from legged.terrain.generators import Tile
 
 LENGTHS = ("scale", "terrain_length", "terrain_width", "border_size", "horizontal_scale")
 
@@ -43,6 +45,28 @@ def test_what_is_measured_grows_too():
     assert sizes_of("stairs_up", False) == (0.05, 0.1, 0.15, 0.2, 0.25, 0.3)
     assert sizes_of("stairs_up", False, 0.5) == (0.025, 0.05, 0.075, 0.1, 0.125, 0.15)
     assert sizes_of("slope_up", False, 0.5) == sizes_of("slope_up", False)
+
+
+@pytest.mark.parametrize("name", ["gap", "stepping_stones"])
+@pytest.mark.parametrize("task", ["a1", "anymal_b", "go2", "go2_flat"])
+def test_what_is_measured_is_as_many_cells_wide_as_on_ground_of_scale_1(name, task):
+    """Gaps and stones are cut to whole cells: where half a millimetre of their size is missing, so is a cell."""
+    cfg = task_config(task).terrain
+    for whole, carried in zip(sizes_of(name, True), sizes_of(name, True, cfg.scale), strict=True):
+        expected = Terrain.of_tiles([[TileSpec(name, whole)]], TerrainConfig(), np.random.default_rng(3))
+        found = Terrain.of_tiles([[TileSpec(name, carried)]], cfg, np.random.default_rng(3))
+        border = [round(tile_cfg.border_size / tile_cfg.horizontal_scale) for tile_cfg in (TerrainConfig(), cfg)]
+        rows = [
+            tile.height_map.heights[n : n + 80, n : n + 80] < -0.1 for tile, n in zip((expected, found), border, strict=True)
+        ]
+        assert (rows[0] == rows[1]).all(), (whole, carried)
+
+
+@pytest.mark.parametrize("cell", [0.136623, 0.05893, 0.0905214])
+def test_cells_are_counted_though_their_edge_is_rounded(cell):
+    """A scale that is 15 cells, each rounded to six digits, makes a platform of 3 m 45 cells wide."""
+    tile = Tile(np.zeros((100, 100)), cell, np.random.default_rng(1), float(f"{15 * cell:.6g}"))
+    assert tile.cells(3.0) == 45
 
 
 def test_cells_and_tiles_are_held_against_the_scaled_parts():
