@@ -181,7 +181,7 @@ class FusedWorlds:
             assert TorqueStep.why_not(model, drawn) == ""
             self.m.opt.disableflags |= absent_stages(model, drawn)
             self._step = TorqueStep(model, self.m, self.d, drawn)
-            own = not ContactStage.why_not(model, self.m, drawn)
+            own = not ContactStage.why_not(model, self.m, self.d, drawn)
             self._contacts = ContactStage(model, self.m, self.d, drawn) if own else None
 
     def write(self, qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray) -> None:

@@ -32,6 +32,11 @@ from legged.config.task import TaskConfig
 MOTION = between(-100, 100)
 """Bounds of velocities [m/s] or [rad/s], of angles [rad] and of factors on them."""
 MEASURED = carried("m", items(500, between(-100, 100)))
+FASTEST = 20.0
+"""A command that is judged, at most [m/s, rad/s]: the ground that fast robots need grows with the square of it."""
+Axis = tuple[float, float, float]
+"""Lowest value, highest value, and the step between two."""
+AXIS = between(-FASTEST, FASTEST)
 
 
 @dataclass(frozen=True)
@@ -264,6 +269,21 @@ class LeggedObservationsConfig(ObservationsConfig):
 
 
 @dataclass(frozen=True)
+class EvaluationConfig:
+    """What policies of the task are judged by; training does not read it."""
+
+    vx: Axis = field(default=(-1.0, 1.0, 0.5), metadata=AXIS)
+    """Forward velocities of the command grid: lowest, highest, step [m/s]."""
+    vy: Axis = field(default=(-1.0, 1.0, 0.5), metadata=AXIS)
+    """Leftward velocities of the command grid: lowest, highest, step [m/s]."""
+    yaw: Axis = field(default=(-1.0, 1.0, 0.5), metadata=AXIS)
+    """Yaw rates of the command grid: lowest, highest, step [rad/s]."""
+    stairs: float = field(default=0.36, metadata=positive(10))
+    """Steps, as a share of rewards.base_height_target, whose success a table of several tasks states; of the sizes that were
+    measured it is the next larger one."""
+
+
+@dataclass(frozen=True)
 class LeggedConfig(TaskConfig):
     """A robot that follows velocity commands: what its task has beside every task's sections."""
 
@@ -285,3 +305,5 @@ class LeggedConfig(TaskConfig):
     """Reward terms and their numbers."""
     observations: LeggedObservationsConfig = field(default_factory=LeggedObservationsConfig)
     """What policy and value function see."""
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    """What its policies are judged by."""

@@ -28,6 +28,7 @@ def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     check_terrain(cfg.terrain, cfg.origins)
     check_base_mass(cfg, robot)
     check_points(cfg)
+    check_grid(cfg)
 
 
 def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
@@ -91,3 +92,16 @@ def check_points(cfg: LeggedConfig) -> None:
             f"{cfg.origins.where('terrain.measured_points_x')}: with measured_points_y they are {points:,} points, more than"
             f" {MOST_POINTS:,}"
         )
+
+
+def check_grid(cfg: LeggedConfig) -> None:
+    """Look whether the axes of the command grid that policies are judged on go from low to high in steps.
+
+    Raises:
+        ConfigError: one of them does not.
+    """
+    for axis in ("vx", "vy", "yaw"):
+        low, high, step = getattr(cfg.evaluation, axis)
+        if low > high or step <= 0.0:
+            where = cfg.origins.where(f"evaluation.{axis}")
+            raise ConfigError(f"{where}: expected [low, high, step] with low <= high and step > 0, got {[low, high, step]}")

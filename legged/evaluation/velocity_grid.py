@@ -6,6 +6,9 @@ from itertools import product
 
 import numpy as np
 
+from legged.config import LeggedConfig
+from legged.config.legged import FASTEST
+from legged.envs.legged_checks import check_grid
 from legged.errors import ConfigError
 
 AXES = {"vx": "m/s", "vy": "m/s", "yaw": "rad/s"}
@@ -14,8 +17,6 @@ MOST_ROBOTS = 2**20
 """More are not simulated at once."""
 MOST_VALUES = 10_000
 """Commands on an axis, at most."""
-FASTEST = 20.0
-"""A command, at most [m/s, rad/s]: the ground that fast robots need grows with the square of it."""
 
 
 @dataclass(frozen=True)
@@ -75,11 +76,26 @@ def axis_values(flag: str, text: str) -> list[float]:
         return parts
     if len(parts) != 3 or not finite or parts[2] <= 0 or parts[1] < parts[0]:
         raise ConfigError(f"{flag}: '{text}' is not of the form low:high:step, e.g. {flag}=-1:1:0.5")
-    low, high, step = parts
+    return _values(flag, text, *parts)
+
+
+def axes_of(cfg: LeggedConfig) -> dict[str, list[float]]:
+    """Return the values of each axis, by its name, of the grid on which a task is judged.
+
+    Raises:
+        ConfigError: an axis is none, or has too many.
+    """
+    check_grid(cfg)
+    given = {axis: getattr(cfg.evaluation, axis) for axis in AXES}
+    return {axis: _values(f"evaluation.{axis}", str(list(values)), *values) for axis, values in given.items()}
+
+
+def _values(where: str, given: str, low: float, high: float, step: float) -> list[float]:
+    """Return the values of an axis; `where` and `given` are what an error says of it."""
     count = (high - low) / step + 1.0
     if count > MOST_VALUES:
         raise ConfigError(
-            f"{flag}: '{text}' makes {count:,.0f} cells of this axis alone; at most {MOST_VALUES:,} are possible"
+            f"{where}: '{given}' makes {count:,.0f} cells of this axis alone; at most {MOST_VALUES:,} are possible"
         )
     return [round(float(value), 6) for value in np.arange(low, high + 0.5 * step, step)]
 

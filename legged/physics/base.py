@@ -43,8 +43,8 @@ class Physics(ABC):
     why_library: str = ""
     """Why some of a step are an engine's own launches, where ours could take their place; empty where they do, or where there
     are none."""
-    fitted: str = ""
-    """Which simple shapes stand for meshes, because the collider of the terrain knows none; empty if none do."""
+    compiled: int = 0
+    """Modules of kernels that were compiled when it was built, because the cache lacked them."""
     overflowed: Tensor
     """(N,) bool: worlds that lost contacts or constraint rows for want of memory since the last refresh."""
     kernels: "TaskKernels | None" = None

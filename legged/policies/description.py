@@ -110,6 +110,8 @@ def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any]) 
         points = [[round(value, 6) for value in point] for point in task.height_scan.points.tolist()]
         cfg = task.cfg.observations
         entry |= {"points": points, "offset": cfg.heights_offset, "limit": cfg.heights_limit}
+    if isinstance(task, LeggedRobot) and term.name in ("passive_pos", "passive_vel") and task.robot.passive is not None:
+        entry |= {"joints": list(task.robot.passive.names), "default": task.passive_default_pos.tolist()}
     return entry
 
 

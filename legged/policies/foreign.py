@@ -115,8 +115,8 @@ class ForeignPolicy:
         self.default = robot.default_dof_pos
         if layout.default_joint_angles:
             self.default = match_values(layout.default_joint_angles, robot.joint_names, "layout: default_joint_angles")
-        self.stiffness = self._gains(layout.stiffness or robot.file.stiffness, bool(layout.stiffness), said, STIFFNESS, robot)
-        self.damping = self._gains(layout.damping or robot.file.damping, bool(layout.damping), said, DAMPING, robot)
+        self.stiffness = self._gains(layout.stiffness, robot.stiffness, said, STIFFNESS, robot)
+        self.damping = self._gains(layout.damping, robot.damping, said, DAMPING, robot)
         scale = layout.action_scale
         every = match_values(scale, robot.joint_names, "layout: action_scale") if isinstance(scale, dict) else np.array(scale)
         self._scale = np.broadcast_to(every, (robot.num_dof,))
@@ -124,14 +124,16 @@ class ForeignPolicy:
         self.reset()
 
     def _gains(
-        self, table: Mapping[str, float], own: bool, said: Mapping[str, str], keys: Sequence[str], robot: Robot
+        self, table: Mapping[str, float], of_robot: np.ndarray, said: Mapping[str, str], keys: Sequence[str], robot: Robot
     ) -> np.ndarray:
-        """Return gains in the robot's order, (D,): those of `table`, if it is the layout's own or the file's metadata have
-        none under `keys`.
+        """Return gains in the robot's order, (D,): those of the layout's `table`, or else of the file's metadata under
+        `keys`, or else `of_robot`.
         """
-        listed = _listed(said, keys, str(self._path))
-        if own or listed is None:
+        if table:
             return match_values(table, robot.joint_names, f"layout: {keys[1]}")
+        listed = _listed(said, keys, str(self._path))
+        if listed is None:
+            return of_robot
         if len(listed) != robot.num_dof or not all(isinstance(value, int | float) for value in listed):
             raise ConfigError(f"{self._path}: metadata {'/'.join(keys)}: expected {robot.num_dof} numbers")
         gains = np.zeros(robot.num_dof)

@@ -26,6 +26,9 @@ TIME_STEP = 0.005
 MARGIN = 1.0
 """Largest eigenvalue of TIME_STEP M^-1 D; from 2 on the explicit law diverges."""
 
+VELOCITY_LIMIT = 30.0
+"""Largest speed of the joints of a robot that states none, as geared motors of legged robots have it [rad/s]."""
+
 
 def gains(
     model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int], feet: Sequence[int], effort: np.ndarray, height: float

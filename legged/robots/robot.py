@@ -12,16 +12,14 @@ from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, exists
-from legged.robots.gains import gains
+from legged.robots.gains import VELOCITY_LIMIT, gains
+from legged.robots.importing.adapted import adaptations
 from legged.robots.mirror import Mirror
 from legged.robots.passive_joints import PassiveJoints, default_qpos
 from legged.robots.patterns import match_values
 from legged.robots.robot_model import base_mass, check_model, driven_joints, passive_joints, read_model
 from legged.robots.shapes import Shapes
 from legged.robots.stance import standing_height, swinging_joints
-
-VELOCITY_LIMIT = 30.0
-"""Largest speed of the joints of a robot that states none, as geared motors of legged robots have it [rad/s]."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +101,8 @@ class Robot:
     """Total mass [kg]."""
     base_mass: float
     """Mass of the floating body [kg]."""
+    adaptations: tuple[str, ...]
+    """What was done to the file of the model so that engines can rely on it, a line each."""
     mirror: Mirror | None
     """Which joints and feet are each other's left and right; None if the robot is not symmetric."""
 
@@ -186,6 +186,7 @@ def load_robot(name: str, where: str = "robot") -> Robot:
         termination_indices=shapes.contacts(file.terminate_after_contacts_on, f"{path}: terminate_after_contacts_on"),
         mass=float(model.body_mass.sum()),
         base_mass=base_mass(model, file.base),
+        adaptations=adaptations(folder / file.model),
         mirror=Mirror.of(model, numbers, shapes.feet_shapes, passive.numbers if passive else ()),
     )
 

@@ -25,6 +25,7 @@ from legged.commandline.arguments import (
     settle_on,
 )
 from legged.commandline.command import run_main
+from legged.config import LeggedConfig, override
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
 from legged.evaluation.all_checkpoints import WALKING_FALLS, WALKING_RMSE, check_limits, evaluate_all_checkpoints
@@ -33,15 +34,13 @@ from legged.evaluation.episodes import MOST_EPISODES, evaluate_episodes
 from legged.evaluation.following import evaluate_following
 from legged.evaluation.gymnasium_episodes import EPISODES, environment_of, evaluate_in_gymnasium
 from legged.evaluation.success import chosen_types
-from legged.evaluation.velocity_grid import AXES, MOST_ROBOTS, Grid, axis_values, check_size
+from legged.evaluation.velocity_grid import AXES, MOST_ROBOTS, Grid, axes_of, axis_values, check_size
 from legged.policies.restore import find_policy
 from legged.process.paths import ready_to_write
 from legged.registry import task_class
 
 MOST_SIZES = 16
 """Sizes of a terrain type, at most, that are measured at once."""
-AXIS = "-1:1:0.5"
-"""Commands of an axis of which nothing is said."""
 ROBOTS = 16
 """Robots a cell, if nobody says how many."""
 ENVIRONMENTS = 256
@@ -62,7 +61,7 @@ def _main(argv: list[str] | None) -> int:
     add_task_arguments(parser)
     add_run_arguments(parser)
     for axis, unit in AXES.items():
-        parser.add_argument(f"--{axis}", help=f"low:high:step of the command grid [{unit}]; {AXIS}")
+        parser.add_argument(f"--{axis}", help=f"low:high:step of the command grid [{unit}]; evaluation.{axis} by default")
     parser.add_argument("--robots", type=int, help=f"robots a cell; {ROBOTS}")
     parser.add_argument("--types", help="terrain types to cross, e.g. stairs_up,pit; those of the training by default")
     parser.add_argument("--full", action="store_true", help="all sizes of a type, 256 robots each")
@@ -100,19 +99,27 @@ def _device(args: argparse.Namespace) -> torch.device:
     return device
 
 
+def check_points(given: int | None, full: bool) -> int:
+    """Return the robots for each size of a terrain type: those `given` by --robots-per-point, or the usual number.
+
+    Raises:
+        ConfigError: they are none, or more than any machine holds.
+    """
+    a_point = given if given is not None else (256 if full else 32)
+    if not 1 <= a_point <= MOST_ROBOTS // MOST_SIZES:
+        limit = "at least 1" if a_point < 1 else f"at most {MOST_ROBOTS // MOST_SIZES:,}"
+        raise ConfigError(f"--robots-per-point: must be {limit}, got {a_point:,}")
+    return a_point
+
+
 def _follow_commands(args: argparse.Namespace) -> int:
     """Evaluate a task whose robots follow commands; return the exit code."""
     _refuse(args, OF_EPISODES, f"'{args.task}' follows commands; it is measured by how well")
     if args.num_envs is not None:
         raise ConfigError("--num_envs: the grid says how many robots there are; --robots sets those of a cell")
-    given = {axis: AXIS if getattr(args, axis) is None else getattr(args, axis) for axis in AXES}
-    vx, vy, yaw = (axis_values(f"--{axis}", text) for axis, text in given.items())
-    grid = Grid(vx, vy, yaw, ROBOTS if args.robots is None else args.robots)
-    check_size(grid)
-    a_point = args.robots_per_point if args.robots_per_point is not None else (256 if args.full else 32)
-    if not 1 <= a_point <= MOST_ROBOTS // MOST_SIZES:
-        limit = "at least 1" if a_point < 1 else f"at most {MOST_ROBOTS // MOST_SIZES:,}"
-        raise ConfigError(f"--robots-per-point: must be {limit}, got {a_point:,}")
+    texts = {axis: getattr(args, axis) for axis in AXES}
+    given = {axis: axis_values(f"--{axis}", text) for axis, text in texts.items() if text is not None}
+    a_point = check_points(args.robots_per_point, args.full)
     everywhere = args.physics == EVERYWHERE
     if args.all_checkpoints:
         _refuse(args, ("checkpoint", "types"), "--all-checkpoints tracks commands with every checkpoint; leave it out")
@@ -129,6 +136,10 @@ def _follow_commands(args: argparse.Namespace) -> int:
         _refuse(args, ("solver", "types", "robots_per_point"), only)
         args.physics = None
     policy = find_policy(args)
+    judged: LeggedConfig = override(policy.cfg, policy_overrides(args))  # type: ignore[assignment]
+    axes = {**axes_of(judged), **given}
+    grid = Grid(axes["vx"], axes["vy"], axes["yaw"], ROBOTS if args.robots is None else args.robots)
+    check_size(grid)
     folder, graph = args.out or policy.output("evaluate"), not args.no_graph
     ready_to_write(folder)
     if everywhere:

@@ -31,6 +31,7 @@ from legged.learning.distributed import RankLost, check_reachable
 from legged.learning.resume import resumed
 from legged.learning.run_folder import create_run, discard_run, experiment_folder, find_run
 from legged.learning.runner import Runner
+from legged.learning.timing import Timing, write_timing
 from legged.learning.transfer import transferred
 from legged.physics import engine_name, resolve_physics
 from legged.process.cores import available_cores
@@ -108,8 +109,8 @@ def _train(
     task = make_task(cfg, device, graph=not args.no_graph)
     if first and task.physics.why_library:
         print(f"mujoco-warp's own launches: {task.physics.why_library}", flush=True)
-    if first and task.physics.fitted:
-        print(f"on the terrain, meshes are stood for, with their mean distance: {task.physics.fitted}", flush=True)
+    for line in task.robot.adaptations if first and task.physics.robot_state is not None else ():
+        print(f"{task.robot.file.model}: {line}", flush=True)
     with Display(cfg.task) if first else contextlib.nullcontext() as display:
         kind = CapturedRunner if cfg.train.runner.loop == "captured" else Runner
         runner = kind(task, None, str(rl_device), display)
@@ -132,7 +133,10 @@ def _train(
                 print("interrupted", file=sys.stderr, flush=True)
                 return 128 + stopped_by[-1]
     if folder:
-        _summary(runner, folder, ready - start, finished, play_command(args, cfg, folder))
+        resumed = checkpoint is not None and not args.transfer
+        timing = _timing(runner, device, ready - start, time.perf_counter() - start, finished, resumed)
+        _summary(runner, folder, timing, play_command(args, cfg, folder))
+        write_timing(folder, timing)
     if finished:
         return 0
     # Without a signal of its own it is the output that went away, or another process that was asked to stop.
@@ -206,13 +210,29 @@ def play_program() -> list[str]:
     return ["python", str(Path(sys.argv[0]).with_name("play.py")) if how == "script" else "play.py"]
 
 
-def _summary(runner: Runner, folder: Path, start_up_s: float, finished: bool, play: str) -> None:
+def _timing(runner: Runner, device: torch.device, start_up_s: float, wall_s: float, finished: bool, resumed: bool) -> Timing:
+    """Return how long the training took, and what."""
     steps = runner.logger.tot_timesteps
-    loop = runner.logger.loop_s
+    return Timing(
+        task=runner.env.cfg.task,
+        finished=finished,
+        robots=runner.env.num_envs * Ranks.now().count,
+        iterations=steps // runner.logger.steps_per_iteration,
+        resumed=resumed,
+        steps=steps,
+        start_up_s=start_up_s,
+        loop_s=runner.logger.loop_s,
+        wall_s=wall_s,
+        device=torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+        kernels_compiled=runner.env.physics.compiled,
+    )
+
+
+def _summary(runner: Runner, folder: Path, timing: Timing, play: str) -> None:
     print(
-        f"{'finished' if finished else 'stopped'} after {runner.current_learning_iteration + 1} iterations: "
-        f"{steps:,} steps in {loop:.1f} s of training loop ({steps / max(loop, 1e-9):,.0f} steps/s), "
-        f"{start_up_s:.1f} s of start-up, imports and kernel compilation included\n"
+        f"{'finished' if timing.finished else 'stopped'} after {runner.current_learning_iteration + 1} iterations: "
+        f"{timing.steps:,} steps in {timing.loop_s:.1f} s of training loop ({timing.steps_per_s:,.0f} steps/s), "
+        f"{timing.start_up_s:.1f} s of start-up, imports and kernel compilation included\n"
         f"checkpoint in {relative(folder)}; see it walk: {play}",
         flush=True,
     )

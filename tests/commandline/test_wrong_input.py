@@ -116,7 +116,7 @@ def test_a_missing_task_and_an_unknown_flag(fails, main):
         ("observations.groups.actor.terms=[]", ("observations.groups.actor.terms",)),
         ("control.stiffness.XYZ=1", ("command line: control.stiffness", "'XYZ'", "LF_HAA")),
         ("control.stiffness.HAA=1", ("control.stiffness", "LF_HFE")),  # then no pattern is left for the other joints
-        ("robot=anymal_x", ("command line: robot", "'anymal_x'", "did you mean 'anymal_c'?")),
+        ("robot=anymal_cc", ("command line: robot", "'anymal_cc'", "did you mean 'anymal_c'?")),
         ("sim.physics=physx", ("sim.physics", "'physx'", "mujoco_warp")),
         ("train.policy.activation=eluu", ("train.policy.activation", "'eluu'", "elu")),
         ("train.policy.actor_hidden_dims=[0]", ("train.policy.actor_hidden_dims",)),

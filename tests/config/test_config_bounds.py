@@ -14,6 +14,7 @@ from legged.config import LeggedConfig, load_config, override
 from legged.config.bounds import FLOAT32_MAX
 from legged.config.loader import nest
 from legged.errors import ConfigError
+from legged.registry import task_config
 from legged.robots.robot import RobotFile
 
 LIMIT = {"min": -1, "max": 1}
@@ -52,7 +53,7 @@ def holding(kind: typing.Any, number: float) -> tuple[str, typing.Any]:
         return f".torques{at}", {"torques": value}
     if origin is tuple:
         items = typing.get_args(kind)
-        return "[0]", [number] if items[1] is Ellipsis else [number, number]
+        return "[0]", [number] if items[1] is Ellipsis else [number] * len(items)
     return "", number
 
 
@@ -268,3 +269,11 @@ def test_sections_inside_each_other_end_somewhere():
     endless["a"] = endless
     with pytest.raises(ConfigError, match="inside each other"):
         load_config({"extends": TASK, "custom": endless}, "mine")
+
+
+@pytest.mark.parametrize("axis", [[1.0, -1.0, 0.5], [-1.0, 1.0, 0.0], [-1.0, 1.0, -0.5]])
+def test_an_axis_of_the_command_grid_goes_from_low_to_high_in_steps(axis):
+    with pytest.raises(ConfigError) as error:
+        task_config(TASK, [("evaluation.vy", axis)])
+    expected = "expected [low, high, step] with low <= high and step > 0"
+    assert str(error.value) == f"command line: evaluation.vy: {expected}, got {axis}"

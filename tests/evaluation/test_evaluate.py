@@ -12,10 +12,11 @@ from legged import make_task
 from legged.config import override
 from legged.errors import RunError
 from legged.evaluation import crossing, following
-from legged.evaluation.velocity_grid import Grid, axis_values
+from legged.evaluation.velocity_grid import Grid, axes_of, axis_values
 from legged.evaluation.velocity_tracking import measure_tracking
 from legged.play import schedule
 from legged.policies.restore import TrainedPolicy, undisturbed
+from legged.registry import task_config
 from legged.tools import evaluate, play
 
 pytestmark = pytest.mark.usefixtures("workplace")
@@ -141,6 +142,27 @@ def test_evaluate_writes_json_and_picture_beside_the_checkpoint(run, capsys):
     assert not list(run.glob(".*"))  # nothing half written
     for words in ("velocity RMSE, mean", f"{result['rmse_lin']['mean']:.3f} m/s", "falls", "evaluation_mujoco.json"):
         assert words in out
+
+
+def test_the_grid_is_that_of_the_task_where_no_flag_says_otherwise(run, tmp_path):
+    judged = ["evaluation.vx=[-0.5,1,1.5]", "evaluation.vy=[0.3,0.3,1]", "evaluation.yaw=[0,0,1]"]
+    arguments = ["--task", TASK, "--physics", "mujoco", "--robots", "1", "--yaw=-0.2", "--out", str(tmp_path)]
+    assert call(evaluate.main, [*arguments, *judged, "sim.threads=1"]) == 0
+    result = json.loads((tmp_path / "evaluation_mujoco.json").read_text())
+    assert result["grid"] == {"vx": [-0.5, 1.0], "vy": [0.3], "yaw": [-0.2]}
+
+
+@pytest.mark.parametrize(
+    ("task", "axes"),
+    [
+        ("go2_flat", {"vx": [-1.0, -0.5, 0.0, 0.5, 1.0], "vy": [-1.0, -0.5, 0.0, 0.5, 1.0]}),
+        ("h1_flat", {"vx": [-0.5, 0.0, 0.5, 1.0], "vy": [-0.3, 0.0, 0.3], "yaw": [-0.8, 0.0, 0.8]}),
+    ],
+)
+def test_grids_of_quadrupeds_and_bipeds(task, axes):
+    """They are the same for every robot of a kind: what is carried over by its size is not what is asked of it."""
+    found = axes_of(task_config(task))
+    assert {axis: found[axis] for axis in axes} == axes
 
 
 def test_evaluate_writes_elsewhere_if_asked(run, tmp_path):

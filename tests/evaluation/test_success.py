@@ -155,7 +155,8 @@ def test_it_stops_when_everyone_is_done():
         return stand(observations)
 
     (entry,), _ = success.measure_success(task, carry, [0.0], 2)
-    assert (entry["successes"], steps) == (2, 4)
+    assert entry["successes"] == 2
+    assert steps in (4, 5)  # 4 m, from up to 0.1 m before or behind the middle
 
 
 # ---- where robots stand, and what they are asked ---------------------------------------------------------------------

@@ -90,8 +90,8 @@ class Go2RoughCfg(LeggedRobotCfg):
             ang_vel_yaw = [-np.pi / 2, np.pi / 2]
             body_pitch = [-0.1, 0.1]
     class asset(LeggedRobotCfg.asset):
-        file = '{LEGGED_GYM_ROOT_DIR}/resources/robots/go2/urdf/go2.urdf'
-        name = 'go2_of_somebody'
+        file = '{LEGGED_GYM_ROOT_DIR}/resources/robots/hound/urdf/hound.urdf'
+        name = 'hound_of_somebody'
         foot_name = 'FOOT'
         penalize_contacts_on = ['THIGH', 'tail']
         terminate_after_contacts_on = ['base']

@@ -260,7 +260,7 @@ def test_lanes_make_rows_of_two_degrees_of_freedom_each(tmp_path):
         d.qvel.assign(np.float32(rng.normal(size=(4, 40))))
         for part in (mjw.kinematics, mjw.com_pos):
             part(m, d)
-        assert ContactStage.why_not(model, m) == ""
+        assert ContactStage.why_not(model, m, d) == ""
         stage = ContactStage(model, m, d)
         compare_stage(tmp_path, stage, lambda: d.nefc.numpy())
     assert (d.nf.numpy() == 40).all()

@@ -152,7 +152,9 @@ def test_a_controller_that_reads_only_the_exported_files_does_the_same(name, tmp
 
 
 def test_every_shipped_term_has_a_formula_and_a_unit():
-    task = make_task(task_config("anymal_c", [("env.num_envs", 1), *ENGINE, *SMALL_TERRAIN], on_cpu=True))
+    """Of a robot that has something to say for each of them."""
+    every = [("robot", "cassie"), ("observations.groups.actor.terms", sorted(LeggedRobot.terms("_obs_")))]
+    task = make_task(task_config("anymal_c", [("env.num_envs", 1), *ENGINE, *SMALL_TERRAIN, *every], on_cpu=True))
     terms = {term["name"]: term for term in describe(task)["observation"]}
     assert set(terms) == LeggedRobot.terms("_obs_")
     units = {name: term["unit"] for name, term in terms.items()}
@@ -165,17 +167,23 @@ def test_every_shipped_term_has_a_formula_and_a_unit():
         "dof_vel": "rad/s",
         "actions": "1",
         "heights": "m",
+        "passive_pos": "rad",
+        "passive_vel": "rad/s",
     }
     frames = {name: term["frame"] for name, term in terms.items()}
     assert frames == {
         **dict.fromkeys(("base_lin_vel", "base_ang_vel", "projected_gravity", "commands"), "base frame"),
-        **dict.fromkeys(("dof_pos", "dof_vel", "actions"), None),
+        **dict.fromkeys(("dof_pos", "dof_vel", "actions", "passive_pos", "passive_vel"), None),
         "heights": "yaw frame",
     }
     assert all(term["formula"].endswith(f"[{term['unit']}].") for term in terms.values())
+    assert terms["passive_pos"]["joints"][:2] == ["left_shin", "left_tarsus"]
+    assert terms["passive_pos"]["default"][:2] == pytest.approx([0.0, 1.4214], abs=1e-3)
     heights = terms["heights"]
-    assert (heights["offset"], heights["limit"], len(heights["points"])) == (0.5, 1.0, 187)
-    assert heights["points"][:3] == [[-0.8, -0.5], [-0.8, -0.4], [-0.8, -0.3]]
+    larger = 1.008025 / 0.548820  # than ANYmal C, for which the task is written
+    assert (heights["offset"], heights["limit"]) == pytest.approx((0.5 * larger, 1.0 * larger), rel=1e-4)
+    assert len(heights["points"]) == 187
+    assert heights["points"][1] == pytest.approx([-0.8 * larger, -0.4 * larger], rel=1e-4)
     assert "(0, 0, -1) when the base is level" in terms["projected_gravity"]["formula"]
 
 

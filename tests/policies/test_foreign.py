@@ -57,6 +57,23 @@ def test_columns_orders_and_scales_by_hand(policy_file):
     np.testing.assert_allclose(targets, robot.default_dof_pos + 0.25 * 2.0 * 0.05 * rates, atol=1e-6)
 
 
+def test_gains_that_nobody_states_are_the_robots_which_a_rule_may_choose(policy_file, tmp_path):
+    stated = load_robot("anymal_c")
+    (tmp_path / "dog").mkdir()
+    (tmp_path / "dog" / stated.file.model).write_text(stated.model_path.read_text())
+    lines = (stated.folder / "robot.yaml").read_text().splitlines()
+    own = "\n".join(line for line in lines if not line.startswith(("stiffness", "damping")))
+    (tmp_path / "dog" / "robot.yaml").write_text(own)
+    by_rule = load_robot(str(tmp_path / "dog"))
+    assert not by_rule.file.stiffness
+    for robot in (stated, by_rule):
+        path = policy_file(np.zeros((WIDTH, 12)), np.zeros(12))
+        policy = ForeignPolicy(path, read_layout("holosoma", "--layout"), robot)
+        np.testing.assert_array_equal(policy.stiffness, robot.stiffness)
+        np.testing.assert_array_equal(policy.damping, robot.damping)
+    assert by_rule.stiffness.min() > 0.0
+
+
 def test_every_term_is_where_the_layout_has_it(policy_file):
     robot = load_robot("anymal_c")
     layout = Layout(

@@ -84,3 +84,43 @@ def test_forces_and_places_of_feet_of_several_shapes(engine):
         np.testing.assert_allclose(getattr(physics.robot_state, name).cpu(), expected[name], atol=limit)
     forces = physics.robot_state.contact_forces.cpu().numpy()
     np.testing.assert_allclose(forces, expected["contact_forces"], atol=1e-2 * np.abs(expected["contact_forces"]).max())
+
+
+BIPED = """
+<mujoco><compiler angle="radian"/><worldbody>
+<body name="trunk"><freejoint/><geom name="trunk" size="0.1"/>{legs}</body>
+</worldbody><actuator>{motors}</actuator></mujoco>
+"""
+LIMB = """
+<body name="{n}_mount" pos="0.02 {y} -0.1" quat="0.9 0.1 -0.2 0.3">
+  <body name="{n}_leg" pos="0 0 -0.05" quat="0.8 0 0.3 0.1">
+    <joint name="{n}_a" axis="1 0 0.2" pos="0.01 0 0.02"/><joint name="{n}_b" axis="0 1 0" pos="0 0.03 0" ref="0.4"/>
+    <geom name="{n}_leg" size="0.02" mass="1"/>
+    <body name="{n}_ankle" pos="0.05 0 -0.2"><body name="{n}_sole" pos="0 0.01 -0.03" quat="0.7 0.1 0 0.2">
+      <geom name="{n}_toe" size="0.02" pos="0.05 0 0" mass="0.1"/>
+      <geom name="{n}_heel" size="0.02" pos="-0.03 0.01 0" mass="0.1"/>
+    </body></body>
+  </body>
+</body>
+"""
+
+
+def test_feet_on_welded_bodies_and_behind_two_hinges_of_one_body(tmp_path):
+    """A hinge with a reference angle among them; places and velocities as MuJoCo has them."""
+    legs = "".join(LIMB.format(n=n, y=y) for n, y in (("l", 0.1), ("r", -0.1)))
+    motors = "".join(f'<motor joint="{n}_{joint}" forcerange="-9 9"/>' for n in "lr" for joint in "ab")
+    (tmp_path / "biped.xml").write_text(BIPED.format(legs=legs, motors=motors))
+    tables = "".join(
+        f"{name}: {{_a: 0.1, _b: 0.2}}\n" for name in ("default_joint_angles", "stiffness", "damping", "velocity_limit")
+    )
+    (tmp_path / "robot.yaml").write_text(f"model: biped.xml\nbase: trunk\nspawn_height: 0.5\n{tables}feet: [_sole]\n")
+    robot = load_robot(str(tmp_path))
+    assert robot.feet_shapes == (("l_toe", "l_heel"), ("r_toe", "r_heel"))
+    sim = SimConfig(physics="mujoco")
+    start = random_states(robot, 4, seed=3)
+    start.base_pos[:, 2] += 1.0
+    physics, worlds = make_physics(RobotScene(robot), sim, 4, torch.device("cpu")), CWorlds(robot, sim, start)
+    start.write(physics)
+    expected = worlds.observe()
+    np.testing.assert_allclose(physics.robot_state.feet_pos, expected["feet_pos"], atol=1e-5)
+    np.testing.assert_allclose(physics.robot_state.feet_vel, expected["feet_vel"], atol=1e-4)

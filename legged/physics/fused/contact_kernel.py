@@ -234,6 +234,11 @@ def stage_kernel(constants: dict[str, int | bool], planes: bool, pairs: bool, gr
     return contact_stage
 
 
+def shared_bytes(constants: dict[str, int | bool]) -> int:
+    """Return what contact_stage.h takes of a block's shared memory for some `stage_constants`."""
+    return 112 * constants["SLOTS"] + 16 * constants["PLAIN"]
+
+
 def stage_constants(
     model: mujoco.MjModel, rows: int, slots: int, dim: int, frictions: bool, limits: bool
 ) -> dict[str, int | bool]:

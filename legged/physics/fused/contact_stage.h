@@ -164,7 +164,8 @@ for (int from = 0; from < contacts; from += LANES) {
     arrays.contact_type.data[slot] = CONSTRAINT;
     arrays.contact_adhesion.data[slot] = 0.0f;
     int* addresses = arrays.contact_efc_address.data + slot * arrays.contact_efc_address.shape[1];
-    for (int k = 0; k < needed; ++k) addresses[k] = row + k < ROWS ? row + k : -1;
+    // Beyond the last row: readers ask for that, but at the first one, which says whether there are any, for a negative number.
+    for (int k = 0; k < needed; ++k) addresses[k] = k > 0 || row < ROWS ? row + k : -1;
 }
 for (int c = contacts + lane; c < SLOTS; c += LANES)
     arrays.contact_efc_address.data[((long long)world * SLOTS + c) * arrays.contact_efc_address.shape[1]] = -1;

@@ -20,8 +20,16 @@ import warp as wp
 from legged.physics.collider import touches
 from legged.physics.collider.ground import Ground, Hits
 from legged.physics.collider.terrain_contact import TerrainContact
-from legged.physics.fused.contact_kernel import NAMES, Candidates, StageArrays, Vector5, stage_constants, stage_kernel
-from legged.physics.fused.native import LANES
+from legged.physics.fused.contact_kernel import (
+    NAMES,
+    Candidates,
+    StageArrays,
+    Vector5,
+    shared_bytes,
+    stage_constants,
+    stage_kernel,
+)
+from legged.physics.fused.native import LANES, SHARED_BYTES
 
 FIXED = (
     *("geom_size", "geom_margin", "geom_priority", "geom_solmix", "geom_solref", "geom_solimp", "jnt_solref", "jnt_solimp"),
@@ -79,8 +87,8 @@ class ContactStage:
         self._lanes = 1 if d.qacc.device.is_cpu else LANES
 
     @staticmethod
-    def why_not(model: mujoco.MjModel, m: Any, randomized: Collection[str] = ()) -> str:
-        """Return what of a model, and of mujoco-warp's `m` of it, has no rows here, where worlds differ in the arrays
+    def why_not(model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = ()) -> str:
+        """Return what of a model, and of mujoco-warp's `m` and `d` of it, has no rows here, where worlds differ in the arrays
         `randomized`; empty if nothing.
         """
         if drawn := [name for name in FIXED if name in randomized]:
@@ -97,6 +105,9 @@ class ContactStage:
             return "the model disables constraints"
         if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
             return "the model overrides the parameters of contacts"
+        slots = d.naconmax // d.nworld
+        if shared_bytes(stage_constants(model, d.njmax, slots, dim=6, frictions=True, limits=True)) > SHARED_BYTES:
+            return f"{slots} contacts a world (sim.nconmax) do not fit a GPU's shared memory"
         return touches.why_not(model, touches.pairs_of(m))
 
     def launch(self) -> None:

@@ -52,7 +52,7 @@ class NewtonPhysics(WarpPhysics):
             self._exchange.read()
             start = self.qpos.clone()
         exchanges = (self._exchange.kinematics, self._exchange.contact_forces, self.kernels.name_module)
-        compile_ahead(self._wp_device, (self._step, self._put, self._forget, *exchanges))
+        self.compiled = compile_ahead(self._wp_device, (self._step, self._put, self._forget, *exchanges))
         if self._wp_device.is_cpu:
             self._advance = self._record_step()
         with wp.ScopedDevice(self._wp_device):  # what was tried left its traces

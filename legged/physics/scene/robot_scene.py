@@ -4,7 +4,6 @@ import mujoco
 import numpy as np
 
 from legged.config.schema import SimConfig
-from legged.physics.scene.mesh_shapes import fit_meshes
 from legged.physics.scene.scene import GroundShapes, Scene, set_options
 from legged.physics.scene.terrain_geoms import add_height_field, add_terrain
 from legged.robots.importing.adapted import is_plain_file, robot_spec_of
@@ -72,7 +71,6 @@ class RobotScene(Scene):
         spec = robot_spec(robot, sim.self_collisions)
         spec.compiler.discardvisual = True  # pictures have a model of their own
         set_options(spec.option, sim)
-        self.fitted = fit_meshes(spec) if terrain is not None and ground == "none" else ""
         # Contacts with the ground need no condim above the robot's own 3; friction is the robot's (its shapes have priority).
         if terrain is None or ground == "none":
             touches = terrain is None

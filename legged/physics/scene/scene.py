@@ -22,8 +22,6 @@ class Scene(ABC):
     """The robot with a floating base and feet, where there is one."""
     terrain: Terrain | None = None
     """The ground, where it is no plane."""
-    fitted: str = ""
-    """Which simple shapes stand for meshes in the model that was made last, for a collider that knows none."""
 
     @abstractmethod
     def model(self, sim: SimConfig, ground: GroundShapes = "exact", contact_sensors: bool = False) -> mujoco.MjModel:

@@ -66,7 +66,6 @@ class MujocoWarpPhysics(WarpPhysics):
         self.model = scene.model(sim, "none" if cells else "height_field")
         if sim.step != "library":
             ask_for_dense_rows(self.model)
-        self.fitted = scene.fitted
         self._randomized = RandomizedModel(scene, self.model, randomized, torch.float32, device)
         self._per_world = changed_arrays(randomized)
         """Names of the model's arrays that are given per world."""
@@ -95,7 +94,7 @@ class MujocoWarpPhysics(WarpPhysics):
             self._choose_step(sim.step)
         exchanges = (self._exchange.kinematics, self._exchange.contact_forces, self.kernels.name_module)
         constants = (self._set_constants,) if any(FIELDS[name].derived for name in randomized) else ()
-        compile_ahead(self._wp_device, (self._step, self._update_quantities, *exchanges, *constants))
+        self.compiled = compile_ahead(self._wp_device, (self._step, self._update_quantities, *exchanges, *constants))
         self.library_step = self._library_step
         if self._wp_device.is_cpu:
             self._advance = self._captured_step()
@@ -175,7 +174,7 @@ class MujocoWarpPhysics(WarpPhysics):
             self._solver = ConstraintSolver(self.model, self._m, self._d)
         else:
             self._fused_step = TorqueStep(self.model, self._m, self._d, per_world)
-            no_contacts = ContactStage.why_not(self.model, self._m, per_world)
+            no_contacts = ContactStage.why_not(self.model, self._m, self._d, per_world)
             if no_contacts:
                 self.why_library = f"for contacts alone, {no_contacts}"
             else:

@@ -3,10 +3,9 @@
 import mujoco
 import numpy as np
 
-from legged.robots.gains import TIME_STEP, mass_matrix
+from legged.robots.gains import TIME_STEP, VELOCITY_LIMIT, mass_matrix
 from legged.robots.importing.legs import Leg, Poser
 from legged.robots.importing.tree import Tree
-from legged.robots.robot import VELOCITY_LIMIT
 
 SHARE, ELSEWHERE = 0.4, 0.1
 """Guess of a torque limit, in weight times height of the base: of a leg, of other joints."""

@@ -30,13 +30,25 @@ def robot_spec_of(path: Path, drawn: bool = False) -> mujoco.MjSpec:
             if not drawn:
                 drop_what_is_drawn(spec, path)
             return spec
-    stamp = path.stat()
-    return mujoco.MjSpec.from_string(_adapted(path, (stamp.st_mtime_ns, stamp.st_size), drawn))
+    return mujoco.MjSpec.from_string(_adapted(path, _stamp(path), drawn)[0])
+
+
+def adaptations(path: Path) -> tuple[str, ...]:
+    """Return what was done to a robot's file so that engines can rely on it, a line each; none for one that is used as it is.
+    Raises as `robot_spec_of`.
+    """
+    return () if is_plain_file(path) else _adapted(path, _stamp(path), False)[1]
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    """Return what tells the states of a file apart."""
+    found = path.stat()
+    return found.st_mtime_ns, found.st_size
 
 
 @lru_cache(maxsize=16)
-def _adapted(path: Path, _stamp: tuple[int, int], drawn: bool) -> str:
-    """Return the MJCF of a file that is adapted, once for each state of it."""
+def _adapted(path: Path, _stamp: tuple[int, int], drawn: bool) -> tuple[str, tuple[str, ...]]:
+    """Return the MJCF of a file that is adapted, and what was done to it, once for each state of it."""
     tree = read_robot(path, drawn=drawn)
     fit_meshes(tree)
     mend(tree)
@@ -47,7 +59,7 @@ def _adapted(path: Path, _stamp: tuple[int, int], drawn: bool) -> str:
             shape.mesh.name = f"mesh_{i}"
             files[shape.mesh.name] = shape.mesh.file
     try:
-        return mjcf_of(tree, files)
+        return mjcf_of(tree, files), tuple(tree.said)
     except (ValueError, ArithmeticError) as error:
         raise ConfigError(f"{path}: can't be adapted: {error}") from error
 

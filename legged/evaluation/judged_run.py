@@ -1,0 +1,103 @@
+"""A training and what its policy was found to be worth, read from its run folder or from the folder of a shipped policy."""
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from legged.config import LeggedConfig
+from legged.errors import ConfigError
+from legged.evaluation.engines import ENGINES
+from legged.evaluation.result_file import file_name, read_results
+from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL, checkpoints, run_config
+from legged.learning.timing import Timing, read_timing
+from legged.process.paths import relative
+
+DEEPEST = 3
+"""Folders inside each other in which runs are looked for: logs, tasks, runs."""
+SEED_FOLDER = re.compile(r"seed_(\d+)", re.ASCII)
+"""What the folders of other seeds are called beside a shipped policy."""
+
+
+@dataclass(frozen=True)
+class JudgedRun:
+    """One training. Where it failed, there may be neither folder nor times nor results."""
+
+    cfg: LeggedConfig
+    seed: int
+    folder: Path | None = None
+    timing: Timing | None = None
+    results: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Engine -> what `evaluate` has written, of the engines that we know."""
+    failure: str = ""
+    """Why there is no finished policy; empty where there is one."""
+    notes: tuple[str, ...] = ()
+    """What else went wrong."""
+
+
+def read_run(folder: Path) -> JudgedRun:
+    """Read a run folder, or that of a shipped policy.
+
+    Raises:
+        ConfigError: it is none, its task follows no commands, or a file in it is damaged.
+    """
+    cfg = run_config(folder)
+    if not isinstance(cfg, LeggedConfig):
+        raise ConfigError(f"{relative(folder)}: '{cfg.task}' follows no commands; the table is of tasks that do")
+    timing = read_timing(folder)
+    notes = ("it was resumed, and its times are those of the last part",) if timing and timing.resumed else ()
+    return JudgedRun(cfg, cfg.env.seed, folder, timing, results_in(folder), why_unfinished(folder, cfg, timing), notes)
+
+
+def results_in(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return engine -> result of the evaluations in a folder.
+
+    Raises:
+        ConfigError: one of them is damaged, or of something else than commands.
+    """
+    found = {}
+    for engine in ENGINES:
+        path = folder / file_name(engine)
+        if path.is_file():
+            (found[engine],) = read_results([path])
+            if "episodes" in found[engine]:
+                raise ConfigError(f"{relative(path)}: is of episodes; the table is of tasks that follow commands")
+    return found
+
+
+def why_unfinished(folder: Path, cfg: LeggedConfig, timing: Timing | None) -> str:
+    """Say why a folder holds no policy that was trained to the end; nothing if it does."""
+    there = checkpoints(folder)
+    if not there:
+        return "it left no checkpoint"
+    last, wanted = max(there) + 1, cfg.train.runner.max_iterations
+    if there[last - 1].name == SHIPPED_MODEL or (last >= wanted if timing is None else timing.finished):
+        return ""
+    return f"stopped after {last} of {wanted} iterations"
+
+
+def find_runs(paths: Iterable[Path]) -> list[JudgedRun]:
+    """Read the runs in some folders: a run folder itself, what lies in logs/ or logs/<task>/, or the folder of a shipped
+    policy with those of its other seeds.
+
+    Raises:
+        ConfigError: a folder holds no run, or something in one is damaged.
+    """
+    found: list[JudgedRun] = []
+    for path in paths:
+        levels = [sorted(path.glob("/".join(["*"] * depth + [CONFIG_FILE]))) for depth in range(DEEPEST)]
+        folders = [file.parent for level in levels for file in level]
+        if not folders:
+            raise ConfigError(f"{path}: holds no run folder (there is no {CONFIG_FILE} in it)")
+        for folder in folders:
+            found += [read_run(folder), *_other_seeds(folder)]
+    return found
+
+
+def _other_seeds(folder: Path) -> list[JudgedRun]:
+    """Read what is kept of the other seeds of a shipped policy: evaluations and times."""
+    cfg = run_config(folder)
+    assert isinstance(cfg, LeggedConfig), "its own seed was read before"
+    numbers = {int(match[1]): path for path in folder.iterdir() if (match := SEED_FOLDER.fullmatch(path.name))}
+    return [JudgedRun(cfg, seed, path, read_timing(path), results_in(path)) for seed, path in sorted(numbers.items())]

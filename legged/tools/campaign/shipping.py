@@ -1,0 +1,75 @@
+"""A policy as it comes with the package: small, with its configuration, its times and its evaluations."""
+
+import io
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from legged.errors import RunError
+from legged.evaluation.judged_run import JudgedRun
+from legged.evaluation.result_file import file_name
+from legged.learning.checkpoint import read_checkpoint
+from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL, checkpoints, find_checkpoint
+from legged.learning.timing import TIMING_FILE
+from legged.process.paths import make_folder, reason, relative, write_bytes
+
+LARGEST = 700_000
+"""A file with the critic, at most [bytes]: a larger one holds the actor alone, which is enough to act."""
+ACTOR = ("actor_state_dict", "iter", "infos")
+BOTH = ("actor_state_dict", "critic_state_dict", "iter", "infos")
+
+
+def ship(runs: Sequence[JudgedRun], folder: Path) -> list[str]:
+    """Write `folder`/<task>/ for each task: the policy of the lowest seed that has finished, with configuration, times and
+    evaluations, and in seed_<number>/ times and evaluations of the others. Of several runs of a seed the last counts. Return
+    a line on each.
+
+    Raises:
+        ConfigError: a checkpoint can't be read.
+        RunError: a file can't be written.
+    """
+    finished = [run for run in runs if run.folder is not None and not run.failure]
+    lines = []
+    for task in dict.fromkeys(run.cfg.task for run in finished):
+        by_seed = {run.seed: run for run in finished if run.cfg.task == task}
+        seeds = [by_seed[seed] for seed in sorted(by_seed)]
+        first = next((run for run in seeds if run.folder is not None and checkpoints(run.folder)), None)
+        if first is None or first.folder is None:
+            continue
+        others = [run for run in seeds if run is not first]
+        size = _ship_model(find_checkpoint(first.folder, None), folder / task / SHIPPED_MODEL)
+        _copy(first, folder / task, (CONFIG_FILE,))
+        for other in others:
+            _copy(other, folder / task / f"seed_{other.seed}")
+        more = "".join(f", evaluations of seed {other.seed}" for other in others)
+        lines.append(f"{relative(folder / task)}: policy of seed {first.seed}, {size / 1e6:.2f} MB{more}")
+    return lines
+
+
+def _ship_model(checkpoint: Path, path: Path) -> int:
+    """Write a checkpoint without what only a resumed training needs, and without the critic if it is large; return its size
+    [bytes].
+    """
+    saved = read_checkpoint(checkpoint)
+    for parts in (BOTH, ACTOR):
+        buffer = io.BytesIO()
+        torch.save({part: saved[part] for part in parts if part in saved}, buffer)
+        if buffer.tell() <= LARGEST:
+            break
+    make_folder(path.parent)
+    write_bytes(path, buffer.getbuffer())
+    return buffer.tell()
+
+
+def _copy(run: JudgedRun, folder: Path, more: tuple[str, ...] = ()) -> None:
+    """Copy evaluations and times of a run, and some `more` of its files."""
+    assert run.folder is not None, "those without one were left out"
+    make_folder(folder)
+    for name in (TIMING_FILE, *more, *map(file_name, run.results)):
+        if (run.folder / name).is_file():
+            try:
+                shutil.copyfile(run.folder / name, folder / name)
+            except OSError as error:
+                raise RunError(f"{relative(folder / name)}: {reason(error)}") from error
