@@ -111,8 +111,8 @@ def test_a_robot_that_is_not_here_is_said_with_its_commands(migrated):
     text = GO2.replace("'FOOT'", "'foot'")
     result = migrated(text, "--out", "there")
     assert (
-        "  python -m legged.tools.add_robot resources/robots/hound/urdf/hound.urdf --name hound_of_somebody --out there/robots\n"
-        in result.out
+        "  python -m legged.tools.add_robot resources/robots/hound/urdf/hound.urdf --name hound_of_somebody"
+        " --out there/robots\n" in result.out
     )
     assert (
         "  python -m legged.tools.migrate fork_config.py --robot there/robots/hound_of_somebody --out there --force\n"
