@@ -64,16 +64,8 @@ def test_a_seed_a_line_and_their_mean_with_the_worst_cell_of_all():
     assert head[:8] == ["task", "seed", "robots", "iterations", "loop [s]", "start-up [s]", "in all [s]", "steps/s"]
     assert head[8:10] == ["velocity RMSE [m/s], mujoco-warp", "velocity RMSE [m/s], C MuJoCo"]
     assert of_all[1:8] == ["mean of 2", "4,096", "300", "25.0", "6.0", "27.0", "83,333"]
-    assert first[1:] == [
-        "1",
-        "4,096",
-        "300",
-        "20.0",
-        "5.0",
-        "27.0",
-        "100,000",
-        *("0.040 (0.100)", "0.060 (0.200)", "0.030 (0.080)", "0.030 (0.080)", "0.10", "0.10"),
-    ]
+    assert first[1:8] == ["1", "4,096", "300", "20.0", "5.0", "27.0", "100,000"]
+    assert first[8:] == ["0.040 (0.100)", "0.060 (0.200)", "0.030 (0.080)", "0.030 (0.080)", "0.10", "0.10"]
     assert second[8:] == ["0.060 (0.150)", "-", "0.050 (0.060)", "-", "0.30", "-"]
     assert "Trained on NVIDIA H200. Errors:" in text
     assert "stairs" not in " ".join(head)
