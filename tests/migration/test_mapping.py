@@ -10,11 +10,13 @@ from legged.config import from_dict
 from legged.config.loader import to_dict
 from legged.config.schema import LeggedConfig
 from legged.config.yaml_files import parse
+from legged.envs import LeggedRobot
 from legged.robots.robot import load_robot
 from legged.tools.migration.found import Found, Place
 from legged.tools.migration.legged_gym_defaults import ENVIRONMENT, LEARNING
 from legged.tools.migration.mapping import map_settings
 from legged.tools.migration.robot_entries import map_robot
+from legged.tools.migration.settings import SAME_REWARDS
 from legged.tools.migration.writer import robot_yaml, task_yaml
 
 pytestmark = pytest.mark.usefixtures("workplace", "own_registry")
@@ -47,6 +49,21 @@ def test_a_setting_goes_where_it_means_the_same(migrated, section, line, path, v
         data = data[key]
     assert data == value
     assert found.lost == []
+
+
+def test_a_reward_of_the_forks_own_is_not_taken_for_ours_of_that_name(migrated):
+    """legged_gym has no feet_clearance: it is set, and said."""
+    found = migrated(
+        sections(rewards="class scales(LeggedRobotCfg.rewards.scales):\n    feet_clearance = -2.0\n    stumble = -1.0")
+    )
+    assert found.data["rewards"]["scales"]["feet_clearance"] == -2.0
+    (line,) = found.lost
+    assert "rewards.scales.feet_clearance = -2.0: is ours of that name" in line
+    assert "_reward_feet_clearance" in line
+
+
+def test_rewards_of_legged_gym_are_all_here():
+    assert LeggedRobot.terms("_reward_") >= SAME_REWARDS
 
 
 NESTED = [

@@ -18,6 +18,7 @@ from legged.tools.migration.settings import (
     OF_THE_ROBOT,
     REWARDS,
     SAME,
+    SAME_REWARDS,
     SECTIONS_ELSEWHERE,
     TERRAINS,
 )
@@ -181,6 +182,8 @@ def _rewards(result: Translation) -> None:
         elif ours in known:
             if found.value or ours in DEFAULTS["rewards"]["scales"]:
                 result.put(f"rewards.scales.{ours}", float(found.value or 0.0), path)
+            if found.value and ours not in SAME_REWARDS:
+                result.lose(path, f"is ours of that name, whose formula may be another; yours is a method _reward_{name}")
         elif found.value:
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
             hint = f"; the nearest is {near[0]}" if near else ""

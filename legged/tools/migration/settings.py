@@ -115,6 +115,12 @@ TERRAINS: tuple[dict[str, float], ...] = (
 
 REWARDS = {"feet_stumble": "stumble"}
 """Scale of legged_gym whose reward has another name here (and there: the scale acts on no method)."""
+SAME_REWARDS = {
+    *("action_rate", "ang_vel_xy", "base_height", "collision", "dof_acc", "dof_pos_limits", "dof_vel", "dof_vel_limits"),
+    *("feet_air_time", "feet_contact_forces", "lin_vel_z", "no_fly", "orientation", "stand_still", "stumble", "termination"),
+    *("torque_limits", "torques", "tracking_ang_vel", "tracking_lin_vel"),
+}
+"""Rewards of legged_gym (v1.0.2) that are here; a fork's reward of another name is a formula of the fork's own."""
 
 _DRAWING = "play.py and its window have a camera of their own"
 _PHYSX = "PhysX's own; the contact solver's settings here are sim.iterations, sim.cone, sim.impratio and the like"
