@@ -160,8 +160,8 @@ class LeggedTerminationsConfig(TerminationsConfig):
     """What ends an episode early."""
 
     failures: tuple[str, ...] = field(default=("contact", "base_height", "tilt"), metadata=TERMS)
-    """`contact`: one of the robot's `terminate_after_contacts_on` shapes feels more than 1 N; `base_height` and `tilt` have
-    their limits below."""
+    """`contact`: one of the robot's `terminate_after_contacts_on` shapes feels more than 1 N, or 1 % of a weight below
+    100 N; `base_height` and `tilt` have their limits below."""
     time_outs: tuple[str, ...] = field(default=("left_terrain",), metadata=TERMS)
     """`left_terrain`: a robot that walked off the map is not judged for it."""
     min_base_height: float = field(default=0.0, metadata=carried("m", between(0, 100)))

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from legged.math import get_euler_xyz, quat_rotate
-from legged.mdp.contacts import CONTACT_FORCE
 
 FORWARD, DOWN, LEVEL = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 0.0, 0.0, 1.0)
 """The x axis, the direction of gravity, and the orientation (x, y, z, w) that turns nothing."""
@@ -168,7 +167,7 @@ CONSTANT: dict[str, Callable[[Any], Tensor]] = {
 
 KEPT: dict[str, Callable[[Any], Tensor]] = {
     "last_root_vel": lambda task: _root_states(task)[:, 7:],
-    "last_contacts": lambda task: task.contact_forces[:, task.feet_indices, 2] > CONTACT_FORCE,
+    "last_contacts": lambda task: task.contact_forces[:, task.feet_indices, 2] > task.contacts.force,
     "last_torques": lambda task: task.torques,
     "last_dof_pos": lambda task: task.dof_pos,
     "last_last_actions": lambda task: task.last_actions,

@@ -15,7 +15,7 @@ from legged.envs.terms import Terms
 from legged.math import evenly_spaced, quat_rotate
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
-from legged.mdp.contacts import FeetContacts
+from legged.mdp.contacts import FeetContacts, contact_force
 from legged.mdp.control import Control, acted_joints
 from legged.mdp.height_scan import HeightScan
 from legged.mdp.mirror_images import MirrorImages
@@ -106,7 +106,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.torques, self.default_dof_pos = self.control.torques, self.control.default_dof_pos
         self.command_sampler = Commands(cfg.commands, n, self.dt, device, kernels, self.numbers)
         self.commands, self.is_moving = self.command_sampler.commands, self.command_sampler.is_moving
-        self.contacts = FeetContacts(n, len(robot.feet_indices), self.dt, device, kernels)
+        self.contacts = FeetContacts(n, len(robot.feet_indices), self.dt, device, kernels, contact_force(robot.mass))
         full_ranges = self.command_sampler.full_ranges
         self.command_curriculum = CommandCurriculum(cfg.commands.curriculum, full_ranges, self.dt, kernels)
 

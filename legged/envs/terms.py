@@ -17,9 +17,10 @@ from legged.physics import Physics
 from legged.terrain import Terrain
 
 TERMINATION_FORCE = 1.0
-"""Contact force on a terminating shape that ends the episode [N]."""
+"""Contact force on a terminating shape that ends the episode, in units of what counts as a contact of a foot: 1 N, of light
+robots 1 % of their weight."""
 PENALISED_FORCE = 0.1
-"""Contact force on a penalised shape that counts as a collision [N]."""
+"""Contact force on a penalised shape that counts as a collision, in the same units."""
 
 
 class Terms:
@@ -145,6 +146,10 @@ class Terms:
         offset, limit = self.cfg.observations.heights_offset, self.cfg.observations.heights_limit
         return (self.base_pos[:, 2:3] - offset - self.measured_heights).clamp(-limit, limit)
 
+    def _force(self, units: float) -> float:
+        """Return a force in units of what counts as a contact of this robot's feet [N]."""
+        return units * self.contacts.force
+
     # ---- rewards: (N,) each, times scale and control step ------------------------------------------------------------
 
     def _reward_tracking_lin_vel(self) -> Tensor:
@@ -192,7 +197,9 @@ class Terms:
 
     def _reward_collision(self) -> Tensor:
         """Number of penalised shapes that touch something."""
-        return (self.contact_forces[:, self.penalised_indices].norm(dim=2) > PENALISED_FORCE).sum(dim=1, dtype=torch.float32)
+        return (self.contact_forces[:, self.penalised_indices].norm(dim=2) > self._force(PENALISED_FORCE)).sum(
+            dim=1, dtype=torch.float32
+        )
 
     def _reward_termination(self) -> Tensor:
         """Failing; added after the clip at zero."""
@@ -262,14 +269,14 @@ class Terms:
 
     def _reward_no_fly(self) -> Tensor:
         """Exactly one foot on the ground, the walk of a biped."""
-        touching = self.contact_forces[:, self.feet_indices, 2] > PENALISED_FORCE
+        touching = self.contact_forces[:, self.feet_indices, 2] > self._force(PENALISED_FORCE)
         return (touching.sum(dim=1) == 1).float()
 
     # ---- terminations: (N,) bool each ----------------------------------------------------------------------------------
 
     def _terminate_contact(self) -> Tensor:
         """A shape of the robot's `terminate_after_contacts_on` feels a force."""
-        return (self.contact_forces[:, self._terminating_shapes].norm(dim=2) > TERMINATION_FORCE).any(dim=1)
+        return (self.contact_forces[:, self._terminating_shapes].norm(dim=2) > self._force(TERMINATION_FORCE)).any(dim=1)
 
     def _terminate_base_height(self) -> Tensor:
         """The base is too close to the ground under it."""

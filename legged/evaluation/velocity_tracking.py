@@ -13,7 +13,6 @@ from legged.envs import LeggedRobot
 from legged.evaluation.overflows import Overflows
 from legged.evaluation.tiles import ROUGH_SPAWN, on_terrain, rough_ground, rough_side
 from legged.evaluation.velocity_grid import Grid
-from legged.mdp.contacts import CONTACT_FORCE
 from legged.mdp.tracking_error import velocity_error, yaw_rate_error
 from legged.policies.actor import Actor
 from legged.policies.restore import TrainedPolicy, restore, undisturbed
@@ -82,7 +81,7 @@ class _Sums:
 
     def add(self, task: LeggedRobot, alive: Tensor) -> None:
         power = task.torques * task.dof_vel
-        collision = task.contact_forces[:, task.penalised_indices].norm(dim=2) > CONTACT_FORCE
+        collision = task.contact_forces[:, task.penalised_indices].norm(dim=2) > task.contacts.force
         now = {
             "steps": torch.ones_like(alive, dtype=torch.float32),
             "lin": velocity_error(task.commands, task.base_lin_vel),
@@ -92,7 +91,7 @@ class _Sums:
             "speed": task.base_lin_vel[:, :2].norm(dim=1),
             "height": task.base_pos[:, 2] - task.height_scan.ground,
             "collision": collision.any(dim=1).float(),
-            "stance": (task.contact_forces[:, task.feet_indices, 2] > CONTACT_FORCE).float(),
+            "stance": (task.contact_forces[:, task.feet_indices, 2] > task.contacts.force).float(),
             "touch_downs": task.contacts.first_contact.float(),
         }
         for name, value in now.items():

@@ -11,7 +11,16 @@ if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
 
 CONTACT_FORCE = 1.0
-"""Vertical force above which a foot counts as in contact [N]."""
+"""Vertical force above which a foot counts as in contact, of robots that weigh more than 100 N [N]."""
+SHARE_OF_WEIGHT = 0.01
+"""The same of lighter robots, of their weight: a foot of a robot of 400 g would never feel 1 N."""
+GRAVITY = 9.81
+"""Acceleration by which mass is weight [m/s^2]."""
+
+
+def contact_force(mass: float) -> float:
+    """Return the vertical force above which a foot of a robot of that mass [kg] counts as in contact [N]."""
+    return min(CONTACT_FORCE, SHARE_OF_WEIGHT * GRAVITY * mass)
 
 
 class FeetContacts:
@@ -22,10 +31,16 @@ class FeetContacts:
     STATE = ("_flags", "_times")
 
     def __init__(
-        self, num_envs: int, num_feet: int, dt: float, device: torch.device, kernels: "TaskKernels | None" = None
+        self,
+        num_envs: int,
+        num_feet: int,
+        dt: float,
+        device: torch.device,
+        kernels: "TaskKernels | None" = None,
+        force: float = CONTACT_FORCE,
     ) -> None:
-        """Start all feet on the ground, at rest; `dt` is the control step [s]."""
-        self.dt, self._kernels = dt, kernels
+        """Start all feet on the ground, at rest; `dt` is the control step [s], `force` what counts as a contact [N]."""
+        self.dt, self._kernels, self.force = dt, kernels, force
         # Views of two blocks, so that a reset is two launches.
         self._flags = torch.zeros(num_envs, 3, num_feet, dtype=torch.bool, device=device)
         self._times = torch.zeros(num_envs, 2, num_feet, device=device)
@@ -39,9 +54,9 @@ class FeetContacts:
         if self._kernels is not None:
             times = (self.air_time, self.last_air_time)
             flags = (self.in_contact, self.first_contact, self._touching)
-            self._kernels.advance_feet(feet_forces, CONTACT_FORCE, self.dt, *flags, *times)
+            self._kernels.advance_feet(feet_forces, self.force, self.dt, *flags, *times)
             return
-        touching = feet_forces[:, :, 2] > CONTACT_FORCE
+        touching = feet_forces[:, :, 2] > self.force
         torch.logical_or(touching, self._touching, out=self.in_contact)
         self._touching.copy_(touching)
         torch.logical_and(self.air_time, self.in_contact, out=self.first_contact)  # it was in the air: a time above 0
