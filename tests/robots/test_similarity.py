@@ -100,7 +100,7 @@ def test_gains_of_a_leg_on_a_heavy_base(pendulum):
     assert stiffness == pytest.approx(1.5 / LARGEST_TARGET)
 
 
-def test_gains_of_known_robots_are_those_of_their_makers_within_a_factor_of_two():
+def test_p_gains_of_known_robots_are_those_of_their_makers_within_a_factor_of_two_and_d_gains_nearly():
     """ANYmal C 90 N m/rad and 4 N m s/rad; Go2 20 and 0.5, whose D gain is known as small."""
     for name, most in (("anymal_c", 2.5), ("go2", 3.8)):
         robot = load_robot(name)
