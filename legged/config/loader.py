@@ -20,6 +20,8 @@ from legged.process.paths import data_folder, exists
 
 LONGEST_CHAIN = 20
 """Files that extend each other."""
+OF_FILES = ("extends", "class", "written_for", "cpu")
+"""Keys of a file that are no fields of the schema."""
 
 
 @dataclass(frozen=True)
@@ -197,6 +199,11 @@ def _check_layer(data: Mapping[str, Any], name: str, schema: type[TaskConfig]) -
     Raises:
         ConfigError: it does not.
     """
+    known = {*OF_FILES, *(field.name for field in dataclasses.fields(schema) if field.compare)}
+    for key in data:
+        if key not in known:
+            key_text = plain_path(key)
+            raise ConfigError(f"{name}: {key_text}: unknown key {shown(key)}{suggest(key_text, known)}")
     build(schema, {key: value for key, value in data.items() if key != "cpu"}, "", Origins(), name)
     if "cpu" in data:
         cpu = data["cpu"]

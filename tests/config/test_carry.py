@@ -154,6 +154,14 @@ def test_a_robot_that_is_none(tasks, written_for, message):
     assert "carry_wrong.yaml" in str(error.value)
 
 
+@pytest.mark.parametrize("wrong", ["writen_for", "extend", "clas", "cpus"])
+def test_a_key_of_files_that_is_misspelt_has_its_nearest_name(tasks, wrong):
+    right = {"writen_for": "written_for", "extend": "extends", "clas": "class", "cpus": "cpu"}[wrong]
+    tasks("carry_misspelt", {"robot": "go2", wrong: "anymal_c"})
+    with pytest.raises(ConfigError, match=f"carry_misspelt.yaml: {wrong}: unknown key '{wrong}'; did you mean '{right}'"):
+        task_config("carry_misspelt")
+
+
 def test_a_task_without_a_robot_has_nobody_to_carry_to(tasks):
     tasks("carry_nobody", {"extends": "half_cheetah", "written_for": "anymal_c"})
     with pytest.raises(ConfigError, match="written_for: a task of HalfCheetah has no robot"):
