@@ -14,6 +14,7 @@ from legged.physics import RobotScene
 from legged.physics.scene.robot_scene import robot_source
 from legged.registry import make_task, task_config
 from legged.rendering.scene import display_model
+from legged.rendering.size import size_of
 from legged.robots.importing.adapted import is_plain_file, robot_spec_of
 from legged.robots.importing.guess import make_ready, read_robot
 from legged.robots.importing.mjcf import read_mjcf
@@ -237,6 +238,25 @@ def test_collision_meshes_become_primitives_and_keep_their_place(dog, tmp_path):
     mujoco.mju_quat2Mat(turn, box.quat)
     np.testing.assert_allclose(np.abs(turn.reshape(3, 3) @ box.size), [0.2, 0.1, 0.3], atol=1e-6)
     assert robot.mass == pytest.approx(12.0)
+
+
+@pytest.mark.parametrize("plain", [True, False])
+def test_a_camera_sees_what_is_only_drawn(dog, tmp_path, plain):
+    """A flag of 1.5 m above the trunk, whose mesh is read for pictures alone: from the feet, 0.43 m below the trunk's origin
+    less what bent legs take, to 1.5 m above it.
+    """
+    (tmp_path / "flag.obj").write_text("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 1.5\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
+    asset, flag = '<mesh name="flag" file="flag.obj"/></asset>', '<geom type="mesh" mesh="flag" contype="0" conaffinity="0"/>'
+    text = scene().replace("</asset>", asset).replace('<site name="imu"/>', f'<site name="imu"/>{flag}')
+    text = text.replace(
+        '<geom type="box" size="0.25', '<inertial pos="0 0 0" mass="6" diaginertia=".03 .08 .1"/><geom type="box" size="0.25'
+    )
+    robot = dog(text)
+    if plain:
+        spec = robot_spec_of(robot.model_path, drawn=True)
+        robot = dog(spec.to_xml(), model="plain.xml")
+    assert is_plain_file(robot.model_path) is plain
+    assert 1.5 + 0.3 < size_of(robot).height < 1.5 + 0.43
 
 
 def test_loops_and_springs_are_kept(read, tmp_path):
