@@ -38,7 +38,13 @@ def robot_spec_of(path: Path, drawn: bool = False) -> mujoco.MjSpec:
 def _adapted(path: Path, _stamp: tuple[int, int], drawn: bool) -> str:
     """Return the MJCF of a file that is adapted, once for each state of it."""
     tree = read_robot(path, drawn=drawn)
+    bare = not tree.shapes
+    if bare and not drawn:  # what is drawn will collide
+        tree = read_robot(path)
     fit_meshes(tree)
+    if bare and not drawn:
+        for link in tree.links:
+            link.shapes = [shape for shape in link.shapes if shape.collides]
     mend(tree)
     name_shapes(tree)
     files: dict[str, Path] = {}

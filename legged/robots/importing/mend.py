@@ -180,7 +180,7 @@ def _give_mass(tree: Tree) -> None:
 def _mend_inertia(link: Link, tree: Tree) -> None:
     """Let the principal moments of a link be positive, and none larger than the sum of the others, as of any real body."""
     if np.abs(link.inertia).max() < TINY * max(1.0, link.mass):
-        sides = _extent(link.shapes)
+        sides = _extent([shape for shape in link.shapes if shape.collides] or link.shapes)
         if sides is None:
             link.inertia = 0.4 * link.mass * _radius(link.mass) ** 2 * np.eye(3)
         else:
