@@ -71,7 +71,7 @@ def _hold(tree: Tree, hold: Sequence[str]) -> None:
             raise ConfigError(f"--hold: '{pattern}' is in no joint's name{suggest(pattern, names, 'joints')}")
     for link in tree.links:
         for hinge in [hinge for hinge in link.hinges if any(pattern in hinge.name for pattern in hold)]:
-            angle = float(np.clip((tree.home or {}).get(hinge.name, 0.0), *(hinge.range or (-np.inf, np.inf))))
+            angle = rest_angle(tree, hinge)
             fix(link, hinge, angle)
             tree.say("joints are held as asked", f"{hinge.name} at {angle:.3g} rad")
 
