@@ -9,6 +9,7 @@ import torch
 from helpers import ENGINE
 from importing_fixtures import LEGS, urdf
 
+from legged.config.schema import SimConfig
 from legged.errors import ConfigError
 from legged.physics import RobotScene
 from legged.physics.scene.robot_scene import robot_source
@@ -289,6 +290,16 @@ def test_several_hinges_of_a_body_without_names_have_one_each(read):
     tree = read(scene(actuators="").replace('<joint name="fl_hip" ', '<joint axis="1 0 0"/><joint '))
     assert [hinge.name for hinge in tree.hinges][:3] == ["fl_thigh_joint", "fl_thigh_joint_2", "fl_knee"]
     assert "fl_thigh_joint_2" in mjcf_of(tree)
+
+
+def test_links_that_are_kept_apart_stay_so(dog):
+    """A shank and the other shank's foot, which was merged into it; and a crate, which is left out."""
+    pairs = (("fl_shank", "fr_foot"), ("fl_shank", "fl_foot"), ("crate", "trunk"))
+    excludes = "".join(f'<exclude body1="{one}" body2="{other}"/>' for one, other in pairs)
+    robot = dog(scene(extra=f"<contact>{excludes}</contact>"))
+    model = RobotScene(robot).model(SimConfig(self_collisions=True))
+    shanks = [model.body(name).id for name in ("fl_shank", "fr_shank")]
+    assert model.exclude_signature.tolist() == [(shanks[0] << 16) + shanks[1]]
 
 
 def test_loops_and_springs_are_kept(read, tmp_path):

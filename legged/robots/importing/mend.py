@@ -120,6 +120,7 @@ def merge_welded(tree: Tree) -> None:
                 child.pos, child.quat = link.pos + turn @ child.pos, quat_product(link.quat, child.quat)
                 child.parent = link.parent
         tree.move_loops(link.name, parent.name, link.pos, link.quat)
+        tree.apart = {pair for pair in (_with(pair, link.name, parent.name) for pair in tree.apart) if len(set(pair)) == 2}
         del tree.links[i]
         for child in tree.links:
             child.parent -= child.parent > i
@@ -128,6 +129,12 @@ def merge_welded(tree: Tree) -> None:
         tree.say(f"{merged} welded links are merged into the links that carry them, with their masses")
     _drop_loops(tree)
     _parents_first(tree)
+
+
+def _with(pair: tuple[str, str], old: str, new: str) -> tuple[str, str]:
+    """Return a pair with one name for another."""
+    first, second = (new if name == old else name for name in pair)
+    return first, second
 
 
 def _drop_loops(tree: Tree) -> None:

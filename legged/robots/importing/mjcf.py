@@ -68,6 +68,7 @@ def tree_of(spec: mujoco.MjSpec, path: Path, drawn: bool = True) -> Tree:
     _read_links(model, root, tree, _meshes(spec, model, path), drawn)
     read_motors(model, tree)
     _read_loops(model, tree)
+    _read_apart(model, tree)
     _read_home(model, tree, path)
     tree.mass = float(model.body_subtreemass[root])
     return tree
@@ -338,6 +339,15 @@ def _read_loops(model: mujoco.MjModel, tree: Tree) -> None:
                 )
                 continue
         tree.say(f"a constraint ({kind.name[5:].lower()}) is left out: engines here know connect and joint between hinges")
+
+
+def _read_apart(model: mujoco.MjModel, tree: Tree) -> None:
+    """Take over which links do not touch each other."""
+    links = {link.name for link in tree.links}
+    for signature in model.exclude_signature:
+        pair = (_name(model, int(signature) >> 16), _name(model, int(signature) & 0xFFFF))
+        if set(pair) <= links:
+            tree.apart.add(pair)
 
 
 def _coupling(factors: np.ndarray, first: float, second: float = 0.0) -> np.ndarray:

@@ -55,6 +55,9 @@ def mjcf_of(tree: Tree, files: Mapping[str, Path] | None = None, height: float =
         *(_motor(hinge) for hinge in tree.hinges if hinge.driven),
         "  </actuator>",
     ]
+    if tree.apart:
+        pairs = [f"    <exclude body1={quoteattr(one)} body2={quoteattr(other)}/>" for one, other in sorted(tree.apart)]
+        lines += ["", "  <contact>", *pairs, "  </contact>"]
     if tree.loops:
         lines += ["", "  <equality>", *(_loop(i, loop, ends) for i, loop in enumerate(tree.loops)), "  </equality>"]
     return "\n".join([*lines, "</mujoco>", ""])
