@@ -23,7 +23,7 @@ class RobotSize:
 
 def size_of(robot: Robot) -> RobotSize:
     """Measure the shapes of a robot, seen or touched."""
-    return size_of_model(robot_spec_of(robot.model_path).compile(), robot.default_qpos)
+    return size_of_model(robot_spec_of(robot.model_path, drawn=True).compile(), robot.default_qpos)
 
 
 def size_of_model(model: mujoco.MjModel, qpos: np.ndarray) -> RobotSize:

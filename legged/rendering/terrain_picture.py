@@ -14,6 +14,7 @@ from legged.rendering.paint import SHOWN_DEPTH, add_painted_terrain
 from legged.rendering.scene import add_robots, add_sky
 from legged.rendering.text import labels
 from legged.robots.robot import Robot, load_robot
+from legged.robots.stance import lowest_point
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, tile_size
 
 MARGIN = 2.0
@@ -127,16 +128,8 @@ def _pose(model: mujoco.MjModel, data: mujoco.MjData, terrain: Terrain, places: 
     mujoco.mj_kinematics(model, data)
     for i in range(len(places)):
         feet = [model.geom(f"{i}/{name}").id for shapes in robot.feet_shapes for name in shapes]
-        low = min(_lowest(model, data, foot) for foot in feet)
+        low = min(lowest_point(model, data, foot) for foot in feet)
         states[i, 2] += terrain.origins[places[i].row, places[i].col, 2] - low
-
-
-def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
-    """Return the height of the lowest point of a sphere, capsule or box [m]; of any other shape, of the box around it."""
-    size, up = model.geom_size[geom], np.abs(data.geom_xmat[geom][6:])
-    if model.geom_type[geom] in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
-        return float(data.geom_xpos[geom, 2] - size[0] - up[2] * size[1])
-    return float(data.geom_xpos[geom, 2] - up @ model.geom_aabb[geom, 3:])
 
 
 def _outline(terrain: Terrain) -> np.ndarray:

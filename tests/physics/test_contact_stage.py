@@ -13,7 +13,7 @@ from reference import heaps, random_states, roll
 
 from legged.config.schema import TerrainConfig
 from legged.physics import RobotScene
-from legged.physics.collider.touches import spring_of
+from legged.physics.collider.touches import spring_of, touch_of
 from legged.physics.fused.contact_stage import ContactStage
 from legged.terrain import Terrain, TileSpec
 
@@ -311,6 +311,22 @@ def test_what_it_does_not_make_is_said(geoms, reason):
     )
     with wp.ScopedDevice("cpu"):
         assert re.search(reason, ContactStage.why_not(model, mjw.put_model(model), mjw.make_data(model, njmax=20)))
+
+
+@pytest.mark.parametrize("priority", [0, 1, 2])
+@pytest.mark.parametrize("solrefs", [(".05 1", "-1000 -50"), ("-1000 -50", ".02 1"), (".05 1", ".01 .5")])
+def test_springs_of_two_shapes_are_mixed_as_in_c_mujoco(priority, solrefs):
+    """Of equal priority, and where one of them counts alone; a solref may be a time constant or a stiffness."""
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><geom type="plane" size="0 0 1" solref="{solrefs[1]}" solimp=".5 .6 .01" priority="1"/>'
+        f'<body pos="0 0 .09"><freejoint/><geom size=".1" solref="{solrefs[0]}" priority="{priority}"/></body>'
+        "</worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    touch = touch_of(model, 0, 1)
+    np.testing.assert_allclose(touch.solref, data.contact[0].solref, rtol=1e-12)
+    np.testing.assert_allclose(touch.solimp, data.contact[0].solimp, rtol=1e-12)
 
 
 def test_impedance_and_spring_are_worked_by_hand():

@@ -9,14 +9,17 @@ import torch
 from helpers import ENGINE
 from importing_fixtures import LEGS, urdf
 
+from legged.config.schema import SimConfig
 from legged.errors import ConfigError
 from legged.physics import RobotScene
 from legged.physics.scene.robot_scene import robot_source
 from legged.registry import make_task, task_config
 from legged.rendering.scene import display_model
+from legged.rendering.size import size_of
 from legged.robots.importing.adapted import is_plain_file, robot_spec_of
 from legged.robots.importing.guess import make_ready, read_robot
 from legged.robots.importing.mjcf import read_mjcf
+from legged.robots.importing.text import mjcf_of
 from legged.robots.importing.tree import Tree, rotate
 from legged.robots.robot import Robot, load_robot
 
@@ -237,6 +240,66 @@ def test_collision_meshes_become_primitives_and_keep_their_place(dog, tmp_path):
     mujoco.mju_quat2Mat(turn, box.quat)
     np.testing.assert_allclose(np.abs(turn.reshape(3, 3) @ box.size), [0.2, 0.1, 0.3], atol=1e-6)
     assert robot.mass == pytest.approx(12.0)
+
+
+@pytest.mark.parametrize("plain", [True, False])
+def test_a_camera_sees_what_is_only_drawn(dog, tmp_path, plain):
+    """A flag of 1.5 m above the trunk, whose mesh is read for pictures alone: from the feet, 0.43 m below the trunk's origin
+    less what bent legs take, to 1.5 m above it.
+    """
+    (tmp_path / "flag.obj").write_text("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 1.5\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
+    asset, flag = '<mesh name="flag" file="flag.obj"/></asset>', '<geom type="mesh" mesh="flag" contype="0" conaffinity="0"/>'
+    text = scene().replace("</asset>", asset).replace('<site name="imu"/>', f'<site name="imu"/>{flag}')
+    text = text.replace(
+        '<geom type="box" size="0.25', '<inertial pos="0 0 0" mass="6" diaginertia=".03 .08 .1"/><geom type="box" size="0.25'
+    )
+    robot = dog(text)
+    if plain:
+        spec = robot_spec_of(robot.model_path, drawn=True)
+        robot = dog(spec.to_xml(), model="plain.xml")
+    assert is_plain_file(robot.model_path) is plain
+    assert 1.5 + 0.3 < size_of(robot).height < 1.5 + 0.43
+
+
+@pytest.mark.parametrize("file", ["toy.urdf", "scene.xml"])
+def test_what_is_drawn_collides_where_nothing_else_does(dog, file):
+    """As named in the file, in the engines as in pictures."""
+    if file == "toy.urdf":
+        robot = dog(urdf().replace("collision>", "visual>").replace("_foot", "_tip"), file, "hip: 0, thigh: 0.7, calf: -1.4")
+        assert len(robot.shape_names) == 13
+    else:
+        robot = dog(scene().replace("<asset>", '<default><geom contype="0" conaffinity="0"/></default><asset>'))
+        assert len(robot.shape_names) == 18
+    assert robot.feet_names == tuple(f"{n}_tip" for n in LEGS)
+    drawn, touched = (robot_spec_of(robot.model_path, drawn).compile() for drawn in (True, False))
+    assert touched.ngeom == len(robot.shape_names) == drawn.ngeom // 2
+    np.testing.assert_allclose(drawn.body_inertia, touched.body_inertia, rtol=1e-6)
+
+
+def test_a_mass_without_inertia_has_that_of_what_collides(dog):
+    """6 kg in a box of 0.5 x 0.16 x 0.1, whatever is drawn around it: 6 / 12 (0.16^2 + 0.1^2) = 0.0178 about x."""
+    bare = '<inertia ixx="0.03" iyy="0.08" izz="0.1" ixy="0" ixz="0" iyz="0"/>'
+    cover = '<link name="trunk"><visual><geometry><box size="1 1 1"/></geometry></visual>'
+    text = urdf().replace(bare, "").replace('<link name="trunk">', cover).replace("_foot", "_tip")
+    robot = dog(text, "toy.urdf", "hip: 0, thigh: 0.7, calf: -1.4")
+    for drawn in (True, False):
+        assert robot_spec_of(robot.model_path, drawn).compile().body("trunk").inertia.min() == pytest.approx(0.0178)
+
+
+def test_several_hinges_of_a_body_without_names_have_one_each(read):
+    tree = read(scene(actuators="").replace('<joint name="fl_hip" ', '<joint axis="1 0 0"/><joint '))
+    assert [hinge.name for hinge in tree.hinges][:3] == ["fl_thigh_joint", "fl_thigh_joint_2", "fl_knee"]
+    assert "fl_thigh_joint_2" in mjcf_of(tree)
+
+
+def test_links_that_are_kept_apart_stay_so(dog):
+    """A shank and the other shank's foot, which was merged into it; and a crate, which is left out."""
+    pairs = (("fl_shank", "fr_foot"), ("fl_shank", "fl_foot"), ("crate", "trunk"))
+    excludes = "".join(f'<exclude body1="{one}" body2="{other}"/>' for one, other in pairs)
+    robot = dog(scene(extra=f"<contact>{excludes}</contact>"))
+    model = RobotScene(robot).model(SimConfig(self_collisions=True))
+    shanks = [model.body(name).id for name in ("fl_shank", "fr_shank")]
+    assert model.exclude_signature.tolist() == [(shanks[0] << 16) + shanks[1]]
 
 
 def test_loops_and_springs_are_kept(read, tmp_path):

@@ -54,6 +54,15 @@ def test_a_urdf_becomes_a_robot_whose_task_steps(added):
     assert "written by `python -m legged.tools.add_robot` from `toy.urdf`" in Path("mine/first_toy/PROVENANCE.md").read_text()
 
 
+def test_a_file_of_which_no_model_can_be_made_is_refused_in_one_line(tmp_path, capsys):
+    (tmp_path / "toy.urdf").write_text(urdf().replace('joint name="fr_hip"', 'joint name="fl_hip"'))
+    assert call(add_robot.main, ["toy.urdf", "--out", "mine"]) == 2
+    error = capsys.readouterr().err
+    assert "toy.urdf: MuJoCo refuses what becomes of it: " in error
+    assert "repeated name 'fl_hip'" in error
+    assert error.count("\n") == 1
+
+
 def test_the_stance_is_that_of_a_two_link_leg(added):
     """Thigh and shank of 0.2 m. The knee keeps 5 % of its range from -0.5 rad away: stretched, it is at -0.61 rad, and the
     foot 0.4 cos(0.305) = 0.3815 m from the hip; a stance has 0.8 of that, 0.305 m: the knee at -2 acos(0.763) = -1.405 rad,

@@ -44,7 +44,8 @@ class Touch:
 def touch_of(model: mujoco.MjModel, first: int, second: int, pair: int = -1) -> Touch:
     """Return how two geoms touch, as MuJoCo mixes their contacts, or as one of its explicit `pair`s says.
 
-    Source: MuJoCo documentation, "Computation", contact parameters.
+    Source: MuJoCo documentation, "Computation", contact parameters. (mujoco-warp takes the smaller solref of two shapes of
+    different priority too, if one is a stiffness.)
     """
     if pair >= 0:
         friction = np.maximum(model.pair_friction[pair], LEAST_FRICTION)
@@ -62,7 +63,8 @@ def touch_of(model: mujoco.MjModel, first: int, second: int, pair: int = -1) -> 
         share = float(mixes[0] / mixes.sum()) if mixes.min() >= TINY else float(mixes[0] >= TINY)
     weights = np.array([share, 1.0 - share])
     solref = model.geom_solref[both]
-    mixed = weights @ solref if (solref[:, 0] > 0.0).all() else solref.min(axis=0)
+    alike = priority[0] != priority[1] or (solref[:, 0] > 0.0).all()  # one alone counts, or both are time constants
+    mixed = weights @ solref if alike else solref.min(axis=0)
     margin = float(model.geom_margin[both].sum())
     return Touch((first, second), margin, dim, rough, np.zeros(5), mixed, np.zeros(2), weights @ model.geom_solimp[both])
 

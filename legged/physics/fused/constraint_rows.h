@@ -1,6 +1,7 @@
 // The constraint rows of one world, and who holds what. Constants: NV (degrees of freedom, at most 64), ROWS (most constraint
-// rows), KEPT_ROWS (of the Jacobian in shared memory), STRIDE (from one row of a matrix to the next), ENTRIES (of the mass matrix that are not zero), FRICTION (whether there
-// may be rows of dry friction), DRY (whether they are all of degrees of freedom), SPLIT (whether there are branches), ROOT (degrees of freedom before the first branch).
+// rows), KEPT_ROWS (of the Jacobian in shared memory), STRIDE (from one row of a matrix to the next), ENTRIES (of the mass
+// matrix that are not zero), FRICTION (whether there may be rows of dry friction), DRY (whether they are all of degrees of
+// freedom), SPLIT (whether there are branches), ROOT (degrees of freedom before the first branch).
 //
 // On a GPU each lane holds what belongs to one degree of freedom or two (a row of a matrix too), in registers; what all lanes
 // read often, and what belongs to constraint rows, is in shared memory. On the CPU one thread holds everything, and the same

@@ -36,8 +36,7 @@ FIXED = (
     *("dof_solref", "dof_solimp", "pair_margin", "pair_friction", "pair_solref", "pair_solimp"),
 )
 """Arrays of the model that are read once, in which worlds may not differ."""
-FLAGS, CONES = mujoco.mjtDisableBit, mujoco.mjtCone
-LIMITED = (mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
+FLAGS = mujoco.mjtDisableBit
 
 
 class ContactStage:

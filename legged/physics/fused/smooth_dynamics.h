@@ -1,8 +1,9 @@
 // Poses, inertias and forces but those of constraints, of one world: trees of free, ball, slide and hinge joints in any order.
 // Constants: NB, NV, NJ, NG, NT (bodies, degrees of freedom, joints, shapes, trees), DEPTH (levels of bodies below the world),
 // BALLS, SLIDES, ONE_MOTOR, SPRINGS, BALL_SPRINGS, DAMPERS, GEARS, GAINS, AFFINE_BIAS, CONTROL_LIMITS, FORCE_LIMITS,
-// JOINT_LIMITS, EQUALITIES, SITES (what there is of them; the latter two: bodies and sites that equality constraints hold), FREE, BALL, SLIDE, AFFINE (MuJoCo's numbers of types), and for each array of the model VARIES_<array>: whether worlds
-// may differ in it. What a model has not is left out by the compiler.
+// JOINT_LIMITS, EQUALITIES, SITES (what there is of them; the latter two: bodies and sites that equality constraints hold),
+// FREE, BALL, SLIDE, AFFINE (MuJoCo's numbers of types), and for each array of the model VARIES_<array>: whether worlds may
+// differ in it. What a model has not is left out by the compiler.
 
 LEGGED_SHARED float pos[NB * 3], quat[NB * 4], centre[NB * 3], inertia[NB * 10], carried[NB * 10];
 LEGGED_SHARED float anchor[NJ * 3], axis[NJ * 3], motion[NV * 6];

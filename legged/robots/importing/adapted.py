@@ -50,7 +50,13 @@ def _stamp(path: Path) -> tuple[int, int]:
 def _adapted(path: Path, _stamp: tuple[int, int], drawn: bool) -> tuple[str, tuple[str, ...]]:
     """Return the MJCF of a file that is adapted, and what was done to it, once for each state of it."""
     tree = read_robot(path, drawn=drawn)
+    bare = not tree.shapes
+    if bare and not drawn:  # what is drawn will collide
+        tree = read_robot(path)
     fit_meshes(tree)
+    if bare and not drawn:
+        for link in tree.links:
+            link.shapes = [shape for shape in link.shapes if shape.collides]
     mend(tree)
     name_shapes(tree)
     files: dict[str, Path] = {}

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
 from legged.errors import ConfigError
@@ -14,7 +13,7 @@ from legged.robots.importing.legs import Leg, Poser, face_forward, find_legs
 from legged.robots.importing.mend import mend
 from legged.robots.importing.mjcf import read_mjcf
 from legged.robots.importing.shapes import fit_meshes, free_name, name_shapes
-from legged.robots.importing.text import mjcf_of
+from legged.robots.importing.text import model_of
 from legged.robots.importing.tree import Shape, Tree
 from legged.robots.importing.urdf import read_urdf
 from legged.robots.stance import standing_height
@@ -179,8 +178,7 @@ def _check_mass(tree: Tree) -> None:
     Raises:
         ConfigError: they differ.
     """
-    model = mujoco.MjModel.from_xml_string(mjcf_of(tree))
-    mass = float(model.body_mass.sum())
+    mass = float(model_of(tree).body_mass.sum())
     if abs(mass - tree.mass) > LOST * max(1.0, tree.mass):
         raise ConfigError(
             f"{tree.source}: its links weigh {tree.mass:.6g} kg, the model {mass:.6g} kg: mass was lost on the way"

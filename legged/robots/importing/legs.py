@@ -9,7 +9,7 @@ import numpy as np
 from legged.errors import ConfigError
 from legged.robots.importing.mend import half_lengths
 from legged.robots.importing.meshes import refitted, rounded
-from legged.robots.importing.text import mjcf_of
+from legged.robots.importing.text import model_of
 from legged.robots.importing.tree import IDENTITY, Shape, Tree, Vector, matrix, quat_about, rotate
 
 FOOT = re.compile(r"foot|feet|toe|sole|heel|ankle|shank|calf|tarsus|lower_?leg|wheel", re.IGNORECASE)
@@ -48,9 +48,9 @@ class Poser:
     """Poses a tree at joint angles, with the base level at the origin."""
 
     def __init__(self, tree: Tree) -> None:
-        """Compile the tree."""
+        """Compile the tree; raises ConfigError where MuJoCo refuses it."""
         self.tree = tree
-        self.model = mujoco.MjModel.from_xml_string(mjcf_of(tree))
+        self.model = model_of(tree)
         self.data = mujoco.MjData(self.model)
         self.places = {hinge.name: int(self.model.joint(hinge.name).qposadr[0]) for hinge in tree.hinges}
         self.ids = [int(self.model.body(link.name).id) for link in tree.links]

@@ -71,7 +71,7 @@ def _hold(tree: Tree, hold: Sequence[str]) -> None:
             raise ConfigError(f"--hold: '{pattern}' is in no joint's name{suggest(pattern, names, 'joints')}")
     for link in tree.links:
         for hinge in [hinge for hinge in link.hinges if any(pattern in hinge.name for pattern in hold)]:
-            angle = float(np.clip((tree.home or {}).get(hinge.name, 0.0), *(hinge.range or (-np.inf, np.inf))))
+            angle = rest_angle(tree, hinge)
             fix(link, hinge, angle)
             tree.say("joints are held as asked", f"{hinge.name} at {angle:.3g} rad")
 
@@ -120,6 +120,7 @@ def merge_welded(tree: Tree) -> None:
                 child.pos, child.quat = link.pos + turn @ child.pos, quat_product(link.quat, child.quat)
                 child.parent = link.parent
         tree.move_loops(link.name, parent.name, link.pos, link.quat)
+        tree.apart = {pair for pair in (_with(pair, link.name, parent.name) for pair in tree.apart) if len(set(pair)) == 2}
         del tree.links[i]
         for child in tree.links:
             child.parent -= child.parent > i
@@ -128,6 +129,12 @@ def merge_welded(tree: Tree) -> None:
         tree.say(f"{merged} welded links are merged into the links that carry them, with their masses")
     _drop_loops(tree)
     _parents_first(tree)
+
+
+def _with(pair: tuple[str, str], old: str, new: str) -> tuple[str, str]:
+    """Return a pair with one name for another."""
+    first, second = (new if name == old else name for name in pair)
+    return first, second
 
 
 def _drop_loops(tree: Tree) -> None:
@@ -180,7 +187,7 @@ def _give_mass(tree: Tree) -> None:
 def _mend_inertia(link: Link, tree: Tree) -> None:
     """Let the principal moments of a link be positive, and none larger than the sum of the others, as of any real body."""
     if np.abs(link.inertia).max() < TINY * max(1.0, link.mass):
-        sides = _extent(link.shapes)
+        sides = _extent([shape for shape in link.shapes if shape.collides] or link.shapes)
         if sides is None:
             link.inertia = 0.4 * link.mass * _radius(link.mass) ** 2 * np.eye(3)
         else:

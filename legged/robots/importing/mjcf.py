@@ -7,6 +7,7 @@ import numpy as np
 
 from legged.errors import ConfigError
 from legged.robots.importing.mjcf_motors import read_motors
+from legged.robots.importing.shapes import free_name
 from legged.robots.importing.tree import (
     IDENTITY,
     Hinge,
@@ -67,6 +68,7 @@ def tree_of(spec: mujoco.MjSpec, path: Path, drawn: bool = True) -> Tree:
     _read_links(model, root, tree, _meshes(spec, model, path), drawn)
     read_motors(model, tree)
     _read_loops(model, tree)
+    _read_apart(model, tree)
     _read_home(model, tree, path)
     tree.mass = float(model.body_subtreemass[root])
     return tree
@@ -74,6 +76,7 @@ def tree_of(spec: mujoco.MjSpec, path: Path, drawn: bool = True) -> Tree:
 
 def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoco.MjModel:
     """Compile what matters here. A fragment may refer to what another file brings: sensors and pairs go first."""
+    _name_joints(spec)
     paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     for geom in spec.geoms:
         if geom.name and geom.name in paired:  # it touches whatever its types are
@@ -104,6 +107,15 @@ def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoc
             return spec.compile()
         except Exception:
             raise ConfigError(f"{path}: MuJoCo refuses it: {' '.join(str(error).split())}") from error
+
+
+def _name_joints(spec: mujoco.MjSpec) -> None:
+    """Give joints without a name one where a body has several: the first one is called as its body."""
+    taken = {joint.name for joint in spec.joints}
+    for body in spec.bodies[1:]:
+        for joint in [joint for joint in body.joints if not joint.name][1:]:
+            joint.name = free_name(f"{body.name or 'link'}_joint", {f"{body.name}_joint", *taken})
+            taken.add(joint.name)
 
 
 def drop_what_is_drawn(spec: mujoco.MjSpec, path: Path) -> None:
@@ -327,6 +339,15 @@ def _read_loops(model: mujoco.MjModel, tree: Tree) -> None:
                 )
                 continue
         tree.say(f"a constraint ({kind.name[5:].lower()}) is left out: engines here know connect and joint between hinges")
+
+
+def _read_apart(model: mujoco.MjModel, tree: Tree) -> None:
+    """Take over which links do not touch each other."""
+    links = {link.name for link in tree.links}
+    for signature in model.exclude_signature:
+        pair = (_name(model, int(signature) >> 16), _name(model, int(signature) & 0xFFFF))
+        if set(pair) <= links:
+            tree.apart.add(pair)
 
 
 def _coupling(factors: np.ndarray, first: float, second: float = 0.0) -> np.ndarray:

@@ -34,7 +34,8 @@ def _let_the_drawn_collide(tree: Tree) -> None:
     tree.say("no shape collides: those that are drawn do")
     for link in tree.links:
         link.shapes += [
-            Shape(s.kind, s.size.copy(), s.pos.copy(), s.quat.copy(), True, s.link, mesh=s.mesh) for s in link.shapes
+            Shape(s.kind, s.size.copy(), s.pos.copy(), s.quat.copy(), True, s.link, s.name, s.mesh, friction=s.friction)
+            for s in link.shapes
         ]
 
 

@@ -6,8 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
+import mujoco
 import numpy as np
 
+from legged.errors import ConfigError
 from legged.robots.importing.tree import IDENTITY, Hinge, Link, Mesh, Shape, Tree, Vector, quat_product, rotate, vector_of
 
 DRAWN_GROUP, TOUCHED_GROUP = 2, 3
@@ -53,9 +55,24 @@ def mjcf_of(tree: Tree, files: Mapping[str, Path] | None = None, height: float =
         *(_motor(hinge) for hinge in tree.hinges if hinge.driven),
         "  </actuator>",
     ]
+    if tree.apart:
+        pairs = [f"    <exclude body1={quoteattr(one)} body2={quoteattr(other)}/>" for one, other in sorted(tree.apart)]
+        lines += ["", "  <contact>", *pairs, "  </contact>"]
     if tree.loops:
         lines += ["", "  <equality>", *(_loop(i, loop, ends) for i, loop in enumerate(tree.loops)), "  </equality>"]
     return "\n".join([*lines, "</mujoco>", ""])
+
+
+def model_of(tree: Tree) -> mujoco.MjModel:
+    """Return a tree as a model, in which meshes are not drawn.
+
+    Raises:
+        ConfigError: MuJoCo refuses it.
+    """
+    try:
+        return mujoco.MjModel.from_xml_string(mjcf_of(tree))
+    except ValueError as error:
+        raise ConfigError(f"{tree.source}: MuJoCo refuses what becomes of it: {' '.join(str(error).split())}") from error
 
 
 def numbers(values: Vector) -> str:

@@ -110,6 +110,8 @@ class Tree:
     """Equality constraints: their kind, as `tag`, and their MJCF attributes; a `connect` has `anchor2` too, which is where
     `anchor` is tied to, in the frame of body2 [m].
     """
+    apart: set[tuple[str, str]] = field(default_factory=set)
+    """Pairs of links that do not touch each other, whatever their shapes do."""
     _said: dict[str, list[str]] = field(default_factory=dict)
 
     def say(self, line: str, about: str = "") -> None:
