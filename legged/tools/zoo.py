@@ -46,6 +46,7 @@ from legged.tools.campaign.shipping import ship
 from legged.tools.evaluate import ROBOTS, check_points
 
 OUT = Path("logs") / "zoo"
+VANISHED = "it ended, and there is no finished run of its configuration"
 MOST_EVALUATIONS = 4
 """Evaluations of a kind side by side, if nobody says how many."""
 
@@ -58,7 +59,7 @@ def main(argv: list[str] | None = None) -> int:
 def _main(argv: list[str] | None) -> int:
     parser = argparse.ArgumentParser(prog="zoo", description=__doc__)
     parser.add_argument("tasks", nargs="*", metavar="TASK | key=value", help="tasks, and any field of all of them")
-    parser.add_argument("--seeds", default="1", help="random seeds, e.g. 1,2,3; the policy of the first is shipped")
+    parser.add_argument("--seeds", default="1", help="random seeds, e.g. 1,2,3; 1 by default")
     parser.add_argument("--jobs", type=int, default=1, help="trainings side by side; 1, so that their times are their own")
     parser.add_argument("--evaluations", type=int, help=f"evaluations side by side, of a kind; at most {MOST_EVALUATIONS}")
     parser.add_argument("--engines", default="mujoco_warp,mujoco", help="engines to judge in; mujoco_warp,mujoco by default")
@@ -162,7 +163,7 @@ class _Campaign:
         def done(job: Job, code: int) -> list[Job]:
             training.folder = finished_run(training.cfg) if code == 0 else None
             if training.folder is None:
-                training.failure = "stopped" if self.crew.stopped else why_failed(job, code)
+                training.failure = "stopped" if self.crew.stopped else why_failed(job, code) if code else VANISHED
                 self._say(f"{training.label}: training failed: {training.failure}; {relative(job.output)}")
                 return self._written([])
             timing = read_timing(training.folder)

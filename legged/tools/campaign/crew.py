@@ -59,10 +59,13 @@ class Job:
         """Start the process, in a session of its own: Ctrl-C reaches it through us alone."""
         make_folder(self.output.parent)
         self.stages.unlink(missing_ok=True)
-        # Where this package is not installed, the process finds it as this one did.
-        package = str(Path(legged.__file__).resolve().parents[1])
-        path = os.pathsep.join(filter(None, (package, os.environ.get("PYTHONPATH"))))
-        environment = {**os.environ, "PYTHONPATH": path, STAGES_FILE: str(self.stages)}
+        environment = {**os.environ, STAGES_FILE: str(self.stages)}
+        top = Path(legged.__file__).resolve().parents[1]
+        if top.name not in (
+            "site-packages",
+            "dist-packages",
+        ):  # it is not installed there: the process finds it as this one did
+            environment["PYTHONPATH"] = os.pathsep.join(filter(None, (str(top), os.environ.get("PYTHONPATH"))))
         with self.output.open("wb") as output:
             self.process = subprocess.Popen(
                 self.command,
