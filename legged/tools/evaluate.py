@@ -33,15 +33,13 @@ from legged.evaluation.episodes import MOST_EPISODES, evaluate_episodes
 from legged.evaluation.following import evaluate_following
 from legged.evaluation.gymnasium_episodes import EPISODES, environment_of, evaluate_in_gymnasium
 from legged.evaluation.success import chosen_types
-from legged.evaluation.velocity_grid import AXES, MOST_ROBOTS, Grid, axis_values, check_size
+from legged.evaluation.velocity_grid import AXES, AXIS, MOST_ROBOTS, Grid, axis_values, check_size
 from legged.policies.restore import find_policy
 from legged.process.paths import ready_to_write
 from legged.registry import task_class
 
 MOST_SIZES = 16
 """Sizes of a terrain type, at most, that are measured at once."""
-AXIS = "-1:1:0.5"
-"""Commands of an axis of which nothing is said."""
 ROBOTS = 16
 """Robots a cell, if nobody says how many."""
 ENVIRONMENTS = 256
