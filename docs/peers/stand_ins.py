@@ -8,7 +8,8 @@ from types import ModuleType
 from typing import Any
 from unittest.mock import MagicMock
 
-UNNEEDED = "OpenGL git glfw imageio_ffmpeg mediapy mjviser prettytable torchrunx torchvision trimesh tyro viser wandb".split()
+UNNEEDED = ("OpenGL", "git", "glfw", "imageio_ffmpeg", "mediapy", "mjviser", "prettytable", "torchrunx", "torchvision")
+UNNEEDED += ("trimesh", "tyro", "viser", "wandb")
 """Packages for pictures, windows, command lines and logging on the web."""
 
 
@@ -22,7 +23,9 @@ class _Module(ModuleType):
             raise AttributeError(name)
         if (self.__name__, name) == ("git", "Repo"):  # rsl-rl leaves out a repository that cannot be opened
             return MagicMock(side_effect=OSError("git is not installed"))
-        return MagicMock(name=name)
+        found = MagicMock(name=name)
+        found.return_value.get_string.return_value = ""  # what mjlab prints as tables
+        return found
 
 
 class _Finder(MetaPathFinder, Loader):
@@ -32,7 +35,7 @@ class _Finder(MetaPathFinder, Loader):
         self._missing = missing
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
-        missing = fullname in self._missing or fullname.partition(".")[0] in self._missing
+        missing = any(fullname == name or fullname.startswith(f"{name}.") for name in self._missing)
         return ModuleSpec(fullname, self, is_package=True) if missing else None
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
@@ -47,5 +50,7 @@ def stand_in() -> list[str]:
     missing = [name for name in UNNEEDED if importlib.util.find_spec(name) is None]
     if "glfw" in missing:
         missing.append("mujoco.viewer")  # needs a window of glfw while it is imported
+    if "mjviser" in missing:
+        missing.append("mjlab.viewer.viser")  # derives classes from it
     sys.meta_path.insert(0, _Finder(missing))
     return missing
