@@ -1,18 +1,20 @@
-"""What a foreign policy does in C MuJoCo: one robot on a plane, one command after the other."""
+"""What a policy does in C MuJoCo: one robot on a plane, one command after the other."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from legged.config.schema import SimConfig
+from legged.evaluation.velocity_grid import Grid, mean_and_worst, number_or_null
 from legged.physics import RobotScene
 from legged.policies.foreign import ForeignPolicy
 from legged.robots.robot import Robot
 
 SETTLING_S = 2.0
-"""Time after which velocities are measured [s]."""
+"""Time after which velocities are measured, of single commands [s]."""
 FALLEN = 1.0
 """Lean of the base beyond which a robot has fallen [rad]."""
 SOLVER = SimConfig(physics="mujoco", iterations=50, ls_iterations=20)
@@ -33,14 +35,120 @@ class Played:
     """When it fell [s]; None if it did not."""
 
 
+@dataclass(frozen=True)
+class Moment:
+    """A robot at the end of a control step."""
+
+    time: float
+    """Since the start [s]."""
+    velocity: np.ndarray
+    """(3,) vx, vy [m/s] and yaw rate [rad/s], base frame."""
+    height: float
+    """Of the base above the ground [m]."""
+    fallen: bool
+
+
+class Stage:
+    """A robot on a plane, driven by a policy as its layout says."""
+
+    def __init__(self, robot: Robot, policy: ForeignPolicy, friction: float) -> None:
+        """Build the model, with that friction between robot and ground."""
+        self.robot, self.policy = robot, policy
+        self.model = RobotScene(robot).model(replace(SOLVER, dt=policy.layout.sim_dt))
+        self.model.geom_friction[[self.model.geom(name).id for name in robot.shape_names], 0] = friction
+        if policy.layout.implicit_gains:
+            _make_servos(self.model, policy)
+        self._start = _standing(self.model, robot, policy)
+
+    def walk(self, command: np.ndarray, seconds: float) -> Iterator[Moment]:
+        """Yield each control step of a walk of so long [s] from the default pose with the feet on the ground; a fall ends it.
+        `command` (3,) is vx, vy [m/s], yaw rate [rad/s].
+        """
+        model, policy, data = self.model, self.policy, mujoco.MjData(self.model)
+        data.qpos[:] = self._start
+        positions, rates = list(self.robot.qpos_columns), list(self.robot.qvel_columns)
+        limits, servos = policy.torque_limits, policy.layout.implicit_gains
+        policy.reset()
+        steps = max(1, round(policy.layout.control_dt / model.opt.timestep))
+        state = _base(data)
+        fallen = False
+        while data.time < seconds - 1e-9 and not fallen:
+            targets = policy.act(command, *state, data.qpos[positions], data.qvel[rates])
+            for _ in range(steps):
+                if servos:
+                    data.ctrl[:] = targets
+                else:
+                    torques = policy.stiffness * (targets - data.qpos[positions]) - policy.damping * data.qvel[rates]
+                    data.ctrl[:] = np.clip(torques, -limits, limits)
+                mujoco.mj_step(model, data)
+            state = lin_vel, ang_vel, gravity = _base(data)
+            fallen = not np.arccos(np.clip(-gravity[2], -1.0, 1.0)) <= FALLEN  # NaN is a fall
+            yield Moment(float(data.time), np.array([*lin_vel[:2], ang_vel[2]]), float(data.qpos[2]), fallen)
+
+
 def play(
     robot: Robot, policy: ForeignPolicy, commands: Sequence[Sequence[float]], seconds: float, friction: float
 ) -> list[Played]:
     """Play every command for so long [s], from the default pose with the feet on the ground, at that friction."""
-    model = RobotScene(robot).model(SOLVER)
-    model.geom_friction[[model.geom(name).id for name in robot.shape_names], 0] = friction
-    start = _standing(model, robot, policy)
-    return [_play(model, robot, policy, start, np.array(command, dtype=float), seconds) for command in commands]
+    stage = Stage(robot, policy, friction)
+    return [_play(stage, np.array(command, dtype=float), seconds) for command in commands]
+
+
+def _play(stage: Stage, command: np.ndarray, seconds: float) -> Played:
+    measured, lowest, fell_after = [], np.inf, None
+    for moment in stage.walk(command, seconds):
+        if moment.time > SETTLING_S:
+            measured.append(moment.velocity)
+            lowest = min(lowest, moment.height)
+        if moment.fallen:
+            fell_after = moment.time
+    velocity = np.mean(measured, axis=0) if measured and fell_after is None else np.full(3, np.nan)
+    return Played(tuple(command.tolist()), tuple(velocity.tolist()), lowest, fell_after)
+
+
+def follow(robot: Robot, policy: ForeignPolicy, grid: Grid, friction: float) -> dict[str, Any]:
+    """Return how well the grid's commands are followed, one robot each: root mean squares over the control steps after
+    `grid.settle_s`, up to a fall, of the horizontal velocity's error [m/s] and the yaw rate's [rad/s], mean and worst cell;
+    the share of falls; and in "cells" the same by command.
+    """
+    stage, cells, rows = Stage(robot, policy, friction), grid.cells, []
+    for command in cells:
+        errors, fell = [], False
+        for moment in stage.walk(command, grid.hold_s):
+            fell = moment.fallen
+            if moment.time > grid.settle_s + 1e-9 and not fell:
+                errors.append(moment.velocity - command)
+        squares = np.mean(np.square(errors), axis=0) if errors else np.full(3, np.nan)
+        rows.append((np.sqrt(squares[:2].sum()), np.sqrt(squares[2]), float(fell)))
+    lin, ang, falls = np.array(rows).T
+    return {
+        "rmse_lin": mean_and_worst(lin, cells),
+        "rmse_ang": mean_and_worst(ang, cells),
+        "falls": float(falls.mean()),
+        "cells": [
+            {"command": cell, "rmse_lin": number_or_null(row[0]), "rmse_ang": number_or_null(row[1]), "fell": bool(row[2])}
+            for cell, row in zip(cells.tolist(), rows, strict=True)
+        ],
+    }
+
+
+def _base(data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return linear and angular velocity [m/s, rad/s] and the unit vector along gravity, all in the base frame."""
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, data.qpos[3:7])
+    to_world = turn.reshape(3, 3)
+    return to_world.T @ data.qvel[:3], data.qvel[3:6].copy(), -to_world[2]
+
+
+def _make_servos(model: mujoco.MjModel, policy: ForeignPolicy) -> None:
+    """Turn the motors of a model, in place, into position actuators whose gains the integrator takes into account."""
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    model.actuator_biastype[:] = mujoco.mjtBias.mjBIAS_AFFINE
+    model.actuator_gainprm[:, 0] = policy.stiffness
+    model.actuator_biasprm[:, 1], model.actuator_biasprm[:, 2] = -policy.stiffness, -policy.damping
+    model.actuator_ctrllimited[:] = 0
+    model.actuator_forcelimited[:] = 1
+    model.actuator_forcerange[:] = np.stack([-policy.torque_limits, policy.torque_limits], axis=1)
 
 
 def _standing(model: mujoco.MjModel, robot: Robot, policy: ForeignPolicy) -> np.ndarray:
@@ -56,31 +164,3 @@ def _standing(model: mujoco.MjModel, robot: Robot, policy: ForeignPolicy) -> np.
         low, high = (data.qpos[2], high) if data.ncon else (low, data.qpos[2])
     data.qpos[2] = high + 1e-3
     return data.qpos.copy()
-
-
-def _play(
-    model: mujoco.MjModel, robot: Robot, policy: ForeignPolicy, start: np.ndarray, command: np.ndarray, seconds: float
-) -> Played:
-    data = mujoco.MjData(model)
-    data.qpos[:] = start
-    positions, rates = list(robot.qpos_columns), list(robot.qvel_columns)
-    policy.reset()
-    steps = max(1, round(policy.layout.control_dt / model.opt.timestep))
-    turn, measured, lowest = np.zeros(9), [], np.inf
-    fell_after = None
-    while data.time < seconds - 1e-9 and fell_after is None:
-        mujoco.mju_quat2Mat(turn, data.qpos[3:7])
-        to_world = turn.reshape(3, 3)
-        lin_vel, ang_vel, gravity = to_world.T @ data.qvel[:3], data.qvel[3:6].copy(), -to_world[2]
-        targets = policy.act(command, lin_vel, ang_vel, gravity, data.qpos[positions], data.qvel[rates])
-        for _ in range(steps):
-            torques = policy.stiffness * (targets - data.qpos[positions]) - policy.damping * data.qvel[rates]
-            data.ctrl[:] = np.clip(torques, -robot.torque_limits, robot.torque_limits)
-            mujoco.mj_step(model, data)
-        if data.time > SETTLING_S:
-            measured.append([*lin_vel[:2], ang_vel[2]])
-            lowest = min(lowest, float(data.qpos[2]))
-        if not (np.arccos(np.clip(-gravity[2], -1.0, 1.0)) <= FALLEN):
-            fell_after = float(data.time)
-    velocity = np.mean(measured, axis=0) if measured and fell_after is None else np.full(3, np.nan)
-    return Played(tuple(command.tolist()), tuple(velocity.tolist()), lowest, fell_after)

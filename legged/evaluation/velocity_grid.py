@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from legged.errors import ConfigError
 
 AXES = {"vx": "m/s", "vy": "m/s", "yaw": "rad/s"}
 """Commands and their units."""
+AXIS = "-1:1:0.5"
+"""Commands of an axis of which nothing is said."""
 MOST_ROBOTS = 2**20
 """More are not simulated at once."""
 MOST_VALUES = 10_000
@@ -113,3 +116,16 @@ def check_size(grid: Grid) -> None:
             f"--vx, --vy, --yaw, --robots: {grid.num_cells:,} cells x {grid.robots:,} robots are {grid.num_envs:,} robots; at"
             f" most {MOST_ROBOTS:,} are possible"
         )
+
+
+def mean_and_worst(values: np.ndarray, cells: np.ndarray) -> dict[str, Any]:
+    """Return both of `values` (C,) over the `cells` (C, 3) that have one, which is not NaN; null if none has."""
+    if np.isnan(values).all():
+        return {"mean": None, "worst": None, "worst_cell": None}
+    worst = int(np.nanargmax(values))
+    return {"mean": float(np.nanmean(values)), "worst": float(values[worst]), "worst_cell": cells[worst].tolist()}
+
+
+def number_or_null(value: float) -> float | None:
+    """Return a float that JSON can hold; what is not defined is null."""
+    return float(value) if np.isfinite(value) else None

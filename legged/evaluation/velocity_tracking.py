@@ -12,7 +12,7 @@ from legged.config import LeggedConfig, override
 from legged.envs import LeggedRobot
 from legged.evaluation.overflows import Overflows
 from legged.evaluation.tiles import ROUGH_SPAWN, on_terrain, rough_ground, rough_side
-from legged.evaluation.velocity_grid import Grid
+from legged.evaluation.velocity_grid import Grid, mean_and_worst, number_or_null
 from legged.mdp.tracking_error import velocity_error, yaw_rate_error
 from legged.policies.actor import Actor
 from legged.policies.restore import TrainedPolicy, restore, undisturbed
@@ -133,7 +133,7 @@ def summarize(
         "speed": speed,
     }
     rows = [
-        {"command": cells[i].tolist(), **{name: _number(column[i]) for name, column in columns.items()}}
+        {"command": cells[i].tolist(), **{name: number_or_null(column[i]) for name, column in columns.items()}}
         for i in range(len(cells))
     ]
     reference = int(np.argmin(np.linalg.norm(cells - [0.5, 0.0, 0.0], axis=1)))
@@ -142,23 +142,10 @@ def summarize(
         "robots_per_cell": grid.robots,
         "hold_s": grid.hold_s,
         "measured_s": measured_s,
-        "rmse_lin": _mean_and_worst(lin, cells),
-        "rmse_ang": _mean_and_worst(ang, cells),
+        "rmse_lin": mean_and_worst(lin, cells),
+        "rmse_ang": mean_and_worst(ang, cells),
         "falls": float(falls.mean()),
-        **{name: _number(float(np.nanmean(values))) if moving.any() else None for name, values in transport.items()},
+        **{name: number_or_null(float(np.nanmean(values))) if moving.any() else None for name, values in transport.items()},
         "gait": rows[reference],
         "cells": rows,
     }
-
-
-def _mean_and_worst(values: np.ndarray, cells: np.ndarray) -> dict[str, Any]:
-    """Return both over the cells that have a value; null if none has."""
-    if np.isnan(values).all():
-        return {"mean": None, "worst": None, "worst_cell": None}
-    worst = int(np.nanargmax(values))
-    return {"mean": float(np.nanmean(values)), "worst": float(values[worst]), "worst_cell": cells[worst].tolist()}
-
-
-def _number(value: float) -> float | None:
-    """Return a float that JSON can hold; what is not defined is null."""
-    return float(value) if np.isfinite(value) else None

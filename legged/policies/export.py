@@ -3,6 +3,7 @@
 import io
 import json
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,20 +34,20 @@ class ExportError(RunError):
     """An exported policy does not compute what the policy does."""
 
 
-def export(task: BaseTask, policy: Any, folder: Path) -> dict[str, float]:
+def export(task: BaseTask, policy: Any, folder: Path, training: Mapping[str, Any] | None = None) -> dict[str, float]:
     """Write `policy`, rsl-rl's network of the actor, as policy.pt (TorchScript) and policy.onnx to `folder`; return the
     largest difference of each to it.
 
     Both take one flat observation (batch, width) and give actions (batch, joints), without noise: the groups that the policy
     reads side by side, and of each with a history of H steps H times its layout, oldest step first. Of a recurrent policy
     the TorchScript keeps the hidden state of a batch of 1 inside, until its reset(); the ONNX takes it and gives it back. The
-    metadata is in the ONNX file and beside it in policy.json.
+    metadata is in the ONNX file and beside it in policy.json, with what is said of its `training`.
 
     Raises:
         ExportError: a file computes something else.
         RunError: a file can't be written.
     """
-    metadata = describe(task)
+    metadata = {**describe(task), **(training or {})}
     device = next(policy.parameters()).device
     widths = {name: task.observation_groups[name].buffer.shape[1] for name in policy.obs_groups}
     # A sequence of batches; only a policy with a memory cares which comes first.

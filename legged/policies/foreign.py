@@ -14,6 +14,7 @@ from legged.config.checks import build
 from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError, suggest
+from legged.policies.own_layout import read_description
 from legged.process.paths import data_folder, exists
 from legged.robots.patterns import match_values
 from legged.robots.robot import Robot
@@ -51,12 +52,22 @@ class Layout:
     """Largest action."""
     joints: tuple[str, ...] = ()
     """The policy's joints in its order; empty takes those that the ONNX file names, or else the robot's."""
+    action_joints: tuple[str, ...] = ()
+    """Those of them that have an action, in its order; the others stay at their default angles. Empty takes all."""
     default_joint_angles: dict[str, float] = field(default_factory=dict, metadata=between(-100, 100))
     """Joint-name pattern -> angle at action 0 [rad]; empty takes the robot's."""
     stiffness: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
     """Joint-name pattern -> P gain [N m/rad]; empty takes the ONNX file's, or else the robot's."""
     damping: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
     """Joint-name pattern -> D gain [N m s/rad]; likewise."""
+    torque_limits: dict[str, float] = field(default_factory=dict, metadata=positive(LARGEST))
+    """Joint-name pattern -> largest torque [N m]; empty takes the robot's."""
+    implicit_gains: bool = False
+    """Gains belong to MuJoCo's position actuators and its implicitfast integrator, not to an explicit control law."""
+    observation_clip: float = field(default=LARGEST, metadata=positive(LARGEST))
+    """Scaled observations are clipped at plus and minus this."""
+    velocity_point: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), metadata=between(-100, 100))
+    """Point of the base whose velocity `base_lin_vel` is, as that of an IMU, base frame [m]."""
     phase_offsets: tuple[float, ...] = field(default=(0.0,), metadata=items(16, between(-100, 100)))
     """Phase of each clock at the start [rad]."""
     phase_period_s: float = field(default=1.0, metadata=positive(1000))
@@ -65,10 +76,13 @@ class Layout:
     """Phase of all clocks while the command is zero [rad]; null lets them run on."""
     control_dt: float = field(default=0.02, metadata=positive(1.0, low=1e-3))
     """Time for which an action is held [s]."""
+    sim_dt: float = field(default=0.005, metadata=positive(0.1, low=1e-5))
+    """Physics step [s]."""
 
 
 def read_layout(name: str, where: str) -> Layout:
-    """Return the layout in the file `name`, or of that name under resources/layouts/; `where` says who asks for it.
+    """Return the layout in the file `name`, or of that name under resources/layouts/; `where` says who asks for it. A file
+    that ends in .json is the policy.json of one of our own policies.
 
     Raises:
         ConfigError: there is none, or it is none.
@@ -80,7 +94,7 @@ def read_layout(name: str, where: str) -> Layout:
     if path is None:
         known = suggest(name, [file.stem for file in folder.glob("*.yaml")])
         raise ConfigError(f"{where}: there is no layout '{name}', neither as a file nor here{known}")
-    data = read_yaml(path)
+    data = read_description(path) if path.suffix == ".json" else read_yaml(path)
     if not data.get("observation"):
         raise ConfigError(f"{path}: observation: must name at least one term (allowed: {', '.join(TERMS)})")
     layout = build(Layout, data, "", Origins(), str(path))
@@ -94,32 +108,41 @@ class ForeignPolicy:
     """A policy on one robot: D joints in the robot's order outside, the policy's own order inside."""
 
     def __init__(self, path: Path, layout: Layout, robot: Robot) -> None:
-        """Load the ONNX file at `path`.
+        """Load the ONNX file at `path`; its metadata, texts by name, are in `metadata`.
 
         Raises:
             ConfigError: it cannot be read, its joints are not the robot's, or its sizes are not the layout's.
         """
         self.layout, self._path = layout, path
         try:
-            self._session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+            options = onnxruntime.SessionOptions()
+            options.intra_op_num_threads = 1  # a policy of one robot is too small to be shared out
+            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # its errors have no class in common
             raise ConfigError(f"{path}: onnxruntime cannot read it: {' '.join(str(error).split())}") from error
-        said = dict(self._session.get_modelmeta().custom_metadata_map)
+        self.metadata = said = dict(self._session.get_modelmeta().custom_metadata_map)
         joints = list(layout.joints or _listed(said, JOINTS, str(path)) or robot.joint_names)
-        for name in joints:
+        for name in (*joints, *layout.action_joints):
             if name not in robot.joint_names:
                 raise ConfigError(f"{path}: joint '{name}' is none of '{robot.name}'{suggest(str(name), robot.joint_names)}")
         if len(set(joints)) != len(joints) or len(joints) != robot.num_dof:
             raise ConfigError(f"{path}: it names {len(set(joints))} joints, '{robot.name}' has {robot.num_dof}")
+        acted = list(layout.action_joints) or joints
+        if len(set(acted)) != len(acted):
+            raise ConfigError(f"{path}: action_joints: names a joint twice")
         self._order = np.array([robot.joint_names.index(name) for name in joints])
+        self._acted = np.array([robot.joint_names.index(name) for name in acted])
         self.default = robot.default_dof_pos
         if layout.default_joint_angles:
             self.default = match_values(layout.default_joint_angles, robot.joint_names, "layout: default_joint_angles")
+        self.torque_limits = robot.torque_limits
+        if layout.torque_limits:
+            self.torque_limits = match_values(layout.torque_limits, robot.joint_names, "layout: torque_limits")
         self.stiffness = self._gains(layout.stiffness, robot.stiffness, said, STIFFNESS, robot)
         self.damping = self._gains(layout.damping, robot.damping, said, DAMPING, robot)
         scale = layout.action_scale
-        every = match_values(scale, robot.joint_names, "layout: action_scale") if isinstance(scale, dict) else np.array(scale)
-        self._scale = np.broadcast_to(every, (robot.num_dof,))
+        every = match_values(scale, acted, "layout: action_scale") if isinstance(scale, dict) else np.array(scale)
+        self._scale = np.broadcast_to(every, (len(acted),))
         self._check_sizes(robot)
         self.reset()
 
@@ -150,12 +173,13 @@ class ForeignPolicy:
         width = len(self._observe(nothing, nothing, nothing, nothing, self.default, self.default))
         if isinstance(inputs[0].shape[1], int) and inputs[0].shape[1] != width:
             raise ConfigError(f"{self._path}: takes {inputs[0].shape[1]} numbers, the layout's observation has {width}")
-        if isinstance(outputs[0].shape[1], int) and outputs[0].shape[1] != robot.num_dof:
-            raise ConfigError(f"{self._path}: gives {outputs[0].shape[1]} actions, '{robot.name}' has {robot.num_dof} joints")
+        count = len(self._acted)
+        if isinstance(outputs[0].shape[1], int) and outputs[0].shape[1] != count:
+            raise ConfigError(f"{self._path}: gives {outputs[0].shape[1]} actions, '{robot.name}' has {count} joints")
 
     def reset(self) -> None:
         """Begin an episode."""
-        self._actions = np.zeros(len(self._order))
+        self._actions = np.zeros(len(self._acted))
         self._phase = np.array(self.layout.phase_offsets, dtype=float)
 
     def act(
@@ -171,7 +195,7 @@ class ForeignPolicy:
 
         Args:
             command: vx, vy [m/s] and yaw rate [rad/s].
-            lin_vel: velocity of the base, base frame [m/s].
+            lin_vel: velocity of the base's origin, base frame [m/s].
             ang_vel: its angular velocity, base frame [rad/s].
             gravity: unit vector along gravity, base frame.
             dof_pos: joint angles (D,) [rad].
@@ -184,9 +208,9 @@ class ForeignPolicy:
         actions = self._session.run(None, {self._input: observation[None].astype(np.float32)})[0][0]
         self._actions = np.clip(actions, -self.layout.action_clip, self.layout.action_clip).astype(float)
         self._phase += 2.0 * np.pi * self.layout.control_dt / self.layout.phase_period_s
-        targets = np.zeros(len(self._order))
-        targets[self._order] = self._actions
-        return targets * self._scale + self.default
+        targets = self.default.copy()
+        targets[self._acted] += self._scale * self._actions
+        return targets
 
     def _observe(
         self,
@@ -199,7 +223,7 @@ class ForeignPolicy:
     ) -> np.ndarray:
         """Return the observation, (width,)."""
         terms = {
-            "base_lin_vel": lin_vel,
+            "base_lin_vel": lin_vel + np.cross(ang_vel, self.layout.velocity_point),
             "base_ang_vel": ang_vel,
             "projected_gravity": gravity,
             "command_xy": command[:2],
@@ -210,7 +234,8 @@ class ForeignPolicy:
             "phase_sin": np.sin(self._phase),
             "phase_cos": np.cos(self._phase),
         }
-        return np.concatenate([scale * terms[name] for name, scale in self.layout.observation.items()])
+        columns = np.concatenate([scale * terms[name] for name, scale in self.layout.observation.items()])
+        return np.clip(columns, -self.layout.observation_clip, self.layout.observation_clip)
 
 
 def _listed(said: Mapping[str, str], keys: Sequence[str], where: str) -> list[Any] | None:

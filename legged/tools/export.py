@@ -1,0 +1,64 @@
+"""Export all checkpoints of a run: `python -m legged.tools.export --task go1_flat [--load_run RUN] [--out FOLDER]`.
+
+Each becomes FOLDER/<iterations>/policy.onnx, policy.pt and policy.json, whose metadata say after how many iterations and
+after how many seconds from the start of its process (`wall_s`) it was written. FOLDER is exported/ in the run folder
+by default. play.py exports one policy; this is for `legged.tools.playback`, which says when a training had one that walks.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import torch
+
+from legged.commandline.arguments import add_run_arguments, add_task_arguments, policy_overrides, register_given, settle_on
+from legged.commandline.command import run_main
+from legged.errors import ConfigError
+from legged.learning.checkpoint import read_checkpoint
+from legged.learning.run_folder import checkpoints
+from legged.policies.export import EXPORTED, export
+from legged.policies.restore import find_policy, restore, undisturbed
+from legged.process.paths import ready_to_write, relative
+
+MEGABYTES = 4.0
+"""What the files of one policy need at most [MiB]."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def _main(argv: list[str] | None) -> int:
+    parser = argparse.ArgumentParser(prog="export", description=__doc__)
+    add_task_arguments(parser)
+    add_run_arguments(parser)
+    parser.add_argument("--out", type=Path, help="folder for the folders; exported/ in the run folder by default")
+    args = parser.parse_intermixed_args(argv)
+    register_given(args)
+    if args.checkpoint is not None:
+        raise ConfigError("--checkpoint: all checkpoints of the run are exported; leave it out")
+    device = torch.device("cpu")
+    settle_on(device)
+    policy = find_policy(args)
+    paths = checkpoints(policy.folder)
+    if not paths:
+        raise ConfigError(f"--load_run: {relative(policy.folder)} has no checkpoints of a training")
+    folder = args.out or policy.folder / EXPORTED
+    ready_to_write(folder, MEGABYTES * len(paths))
+    # The C engine needs no compiler, and one robot is enough: nothing is simulated.
+    changes = [*undisturbed(1, 1.0), ("sim.physics", "mujoco"), *policy_overrides(args)]
+    task, act = restore(policy, changes, device, graph=False)
+    for path in paths.values():
+        iterations = act.load(path)
+        training: dict[str, float] = {"iterations": iterations}
+        seconds = (read_checkpoint(path).get("infos") or {}).get("wall_s")
+        if isinstance(seconds, int | float):
+            training["wall_s"] = seconds
+        export(task, act.network, folder / f"{iterations:05d}", training)
+    print(f"exported {len(paths)} checkpoints to {relative(folder)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
