@@ -172,8 +172,8 @@ class CWorlds:
     def steep_capsules(self) -> np.ndarray:
         """(N,) whether a capsule steeper than 60 degrees touched the ground in the last step.
 
-        There mujoco-warp turns the friction pyramid another way than C MuJoCo (it gives up aligning it with the
-        capsule; see plane_capsule), so that sliding differs by what the pyramid's orientation makes.
+        There mujoco-warp's own launches turn the friction pyramid another way than C MuJoCo and our contact stage (they give
+        up aligning it with the capsule), so that sliding differs by what the pyramid's orientation makes.
         """
         found = []
         for data in self.worlds:

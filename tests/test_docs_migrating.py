@@ -85,6 +85,13 @@ def test_terms_and_settings_beside_isaac_labs_are_there():
     assert named_here <= terms | settings
 
 
+def test_what_has_to_be_written_is_not_there():
+    (row,) = [line for line in ISAAC.splitlines() if "| write them" in line]
+    names = column(row, 1)
+    assert names
+    assert not names & LeggedRobot.terms("_reward_")
+
+
 @pytest.mark.parametrize("name", ["last_air_time", "first_contact", "in_contact"])
 def test_contacts_have_what_the_page_says(name):
     assert f"`.{name}`" in PAGE

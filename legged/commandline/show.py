@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import mujoco
 import torch
@@ -10,6 +11,7 @@ from legged.config import TaskConfig, override
 from legged.envs import BaseTask, LeggedRobot
 from legged.mdp.control import action_scales
 from legged.registry import make_task
+from legged.robots.similarity import Size, growth, size_of
 
 ALONE = [("env.num_envs", 1), ("sim.physics", "mujoco"), ("sim.threads", 1), ("train.algorithm.num_mini_batches", 1)]
 """What is changed to build a task of one robot on any machine."""
@@ -26,7 +28,7 @@ def summary(cfg: TaskConfig) -> list[str]:
     if torch.get_num_threads() > 1:
         torch.set_num_threads(1)
     task = make_task(override(cfg, ALONE), "cpu", graph=False)
-    lines = [line for part in (_observations, _rewards, _terminations, _actions, _joints) for line in part(task)]
+    lines = [line for part in (_robot, _observations, _rewards, _terminations, _actions, _joints) for line in part(task)]
     return [f"# {line}".rstrip() for line in lines]
 
 
@@ -47,6 +49,23 @@ def _table(title: str, rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
 
 def _number(value: float) -> str:
     return f"{value:.6g}"
+
+
+def _robot(task: BaseTask) -> Iterator[str]:
+    """Yield how large a legged robot is, and by what numbers have been carried to it from those they were written for."""
+    if not isinstance(task, LeggedRobot):
+        return
+    size = Size(task.robot.mass, task.robot.height)
+    line = f"robot: {task.robot.name}, {size.mass:.4g} kg, {size.height:.3g} m high"
+    for name in task.cfg.origins.written_for:
+        by = growth(size_of(name), size)
+        if set(by.values()) == {1.0}:
+            line += "; numbers are written for it"
+            continue
+        factors = f"masses x {by['kg']:.3g}, lengths x {by['m']:.3g}, times x {by['s']:.3g}"
+        line += f"; numbers written for {Path(name).name} are carried: {factors}"
+    yield ""
+    yield line
 
 
 def _observations(task: BaseTask) -> Iterator[str]:

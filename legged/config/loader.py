@@ -176,7 +176,9 @@ def _merged(
                 raise ConfigError(f"{where}: expected the name of a robot, got {shown(layer.written_for)}")
             carried: Mapping[str, Any] = data
             if carry is not None and isinstance(robot, str):  # what is no name is found where the command line is checked
-                carried = carry(data, robot_path(layer.written_for, layer.folder), robot, where)
+                reference = robot_path(layer.written_for, layer.folder)
+                carried = carry(data, reference, robot, where)
+                origins.written_for = tuple(dict.fromkeys([*origins.written_for, reference]))
             if carried is not data:
                 data, name = dict(carried), f"{name} (written for {Path(layer.written_for).name})"
         merge(merged, data, name, origins)
@@ -298,6 +300,7 @@ def from_dict(
         merge({}, data, source, origins)
     cfg = build(schema, data, "", origins, source)
     cfg.origins.update(origins)
+    cfg.origins.written_for = origins.written_for
     return cfg
 
 

@@ -1,8 +1,16 @@
 """Who set which field of a configuration, for errors that name a file."""
 
+from collections.abc import Mapping
+
 
 class Origins(dict[str, str]):
     """Dotted path -> who set it: 'cfg/mine.yaml', 'cfg/mine.yaml: cpu', 'command line'."""
+
+    def __init__(self, other: Mapping[str, str] | None = None) -> None:
+        """Copy another one, or begin with nothing."""
+        super().__init__(other or {})
+        self.written_for: tuple[str, ...] = other.written_for if isinstance(other, Origins) else ()
+        """Robots for which files say that their numbers are written, each once."""
 
     def note(self, path: str, source: str) -> None:
         """Note that `source` set `path`, and forget what it replaces, above and below."""

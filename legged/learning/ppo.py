@@ -134,7 +134,7 @@ class DevicePPO(ScaledRewards):
 
     @torch.no_grad()
     def _mini_batches(self) -> list[tuple[Tensor, ...]]:
-        """Yield the rollout, shuffled: for each mini-batch of n samples the networks' inputs, actions (n, D), old
+        """Return the rollout, shuffled: for each mini-batch of n samples the networks' inputs, actions (n, D), old
         log-probabilities, advantages, old values, returns (n,) each, and the old Gaussian's mean (n, D) and std (n, D).
 
         With symmetry, each but the last two also holds the mirror images, after the samples: 2 n.

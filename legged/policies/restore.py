@@ -12,9 +12,9 @@ from legged.commandline.arguments import overrides
 from legged.config import TaskConfig, override
 from legged.errors import ConfigError
 from legged.learning.checkpoint import check_fits, read_checkpoint
-from legged.learning.run_folder import find_checkpoint, find_run, run_config, shipped_policy
+from legged.learning.run_folder import CONFIG_FILE, find_checkpoint, find_run, run_config, shipped_policy
 from legged.policies.actor import Actor
-from legged.process.paths import relative
+from legged.process.paths import exists, relative
 from legged.registry import make_task, task_class, task_config
 from legged.terrain import Terrain
 
@@ -46,20 +46,45 @@ def find_policy(args: argparse.Namespace) -> TrainedPolicy:
     """
     flags = [(key, value) for key, value in overrides(args) if key == "train.runner.experiment_name"]
     task = task_config(args.task, flags)
-    folder: Path | None = None
-    if args.load_run is None and args.checkpoint is None:
-        try:
-            folder = find_run(task, None)
-        except ConfigError:
-            folder = shipped_policy(args.task)
-            if folder is None:
-                raise
-    else:
-        folder = find_run(task, args.load_run)
+    folder = _newest(task) if args.load_run is None and args.checkpoint is None else find_run(task, args.load_run)
     cfg = run_config(folder)
     if cfg.task != args.task:
         raise ConfigError(f"--load_run: {relative(folder)} was trained on '{cfg.task}', not on '{args.task}'")
     return TrainedPolicy(cfg, find_checkpoint(folder, args.checkpoint))
+
+
+def policy_of(name: str) -> TrainedPolicy:
+    """Return the policy in the run folder `name`, or that of a shipped policy; else of the task of that name: of its newest
+    run, or the one that is shipped.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    folder = Path(name)
+    if not exists(folder / CONFIG_FILE):
+        task = task_config(name)
+        try:
+            folder = _newest(task)
+        except ConfigError as error:
+            raise ConfigError(
+                f"'{name}': there is neither a run nor a shipped policy of this task; train one first"
+            ) from error
+    return TrainedPolicy(run_config(folder), find_checkpoint(folder, None))
+
+
+def _newest(task: TaskConfig) -> Path:
+    """Return the folder of a task's newest run, or else of the policy that is shipped for it.
+
+    Raises:
+        ConfigError: there is neither.
+    """
+    try:
+        return find_run(task, None)
+    except ConfigError:
+        folder = shipped_policy(task.task)
+        if folder is None:
+            raise
+        return folder
 
 
 def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:

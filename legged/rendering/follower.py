@@ -28,6 +28,8 @@ class Follower:
 
     def __init__(self, ground: HeightMap, distance: float = 3.6) -> None:
         self.ground, self.distance = ground, distance
+        self.glide = SMOOTH
+        """(3,) share of the way to the robot that is made up in a picture."""
         self.azimuth = BEHIND
         self.lookat: np.ndarray | None = None
         """(3,) point in the middle of the picture, world frame [m]."""
@@ -41,7 +43,7 @@ class Follower:
             self.azimuth = FRONT if ahead < here - DROP else BEHIND
             self.elevation = self._free_elevation()
             return
-        self.lookat = self.lookat + SMOOTH * (target - self.lookat)
+        self.lookat = self.lookat + self.glide * (target - self.lookat)
         self.elevation += 0.05 * (self._free_elevation() - self.elevation)
 
     def aim(self, view: mujoco.MjvCamera) -> None:

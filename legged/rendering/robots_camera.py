@@ -1,6 +1,7 @@
 """Pictures of several legged robots in one scene, with commanded and actual velocity drawn in."""
 
 from collections.abc import Sequence
+from itertools import product
 
 import mujoco
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from legged.envs import LeggedRobot
 from legged.rendering.camera import Camera
 from legged.rendering.follower import Follower
+from legged.rendering.framing import frame
 from legged.rendering.scene import display_model
 from legged.rendering.size import size_of
 from legged.rendering.text import caption
@@ -24,6 +26,8 @@ NEAR, FARTHER = 1.92, 1.05
 """Distance of the camera on a plane, and what it adds with the root of the number of robots, in lengths of a robot."""
 ABOVE, APART = 0.335, 0.086
 """Height of the lower arrow above the base, and of the upper above it, in lengths of a robot."""
+GLIDE = 0.1
+"""Share of the way to the robots that the camera on a plane makes up in a picture: steps must not shake it."""
 SPOT, LIFTED = 0.086, 0.38
 """Radius of the spot below a foot on the ground, and height at which it is smallest, in lengths of a robot."""
 
@@ -33,20 +37,33 @@ class RobotsCamera(Camera):
     that follows them all; on terrain where they are, from one that follows the robot `followed` of them.
     """
 
-    def __init__(self, task: LeggedRobot, count: int, width: int = 960, height: int = 540) -> None:
+    def __init__(
+        self,
+        task: LeggedRobot,
+        count: int,
+        width: int = 960,
+        height: int = 540,
+        instead: str = ", or play with --no-video",
+    ) -> None:
         """Build the scene and its renderer.
 
         Raises:
-            RunError: nothing can be rendered.
+            RunError: nothing can be rendered; `instead` is what the user might do then.
         """
         model = display_model(task.robot, count, width, height, task.terrain)
-        super().__init__(model, width, height, ", or play with --no-video")
+        super().__init__(model, width, height, instead)
         self.task, self.count = task, count
         self.first, self.followed = 0, 0
         self.size = size_of(task.robot)
         length = self.size.longest
         self.view.azimuth, self.view.elevation = 130.0, -18.0
         self.view.distance = length * (NEAR + FARTHER * count**0.5)
+        self.centre = np.array([0.0, 0.0, 0.5 * self.size.height])
+        """(3,) where the camera on a plane looks at: from the ground below the middle of the robots [m]."""
+        self.glide = GLIDE
+        """Share of the way to robots on a plane that the camera makes up in a picture."""
+        self.arrows = True
+        """Whether velocities are drawn in."""
         self.offsets = np.zeros((count, 3))
         self._follower: Follower | None = None
         if task.terrain is None:
@@ -57,6 +74,18 @@ class RobotsCamera(Camera):
             self._follower = Follower(task.terrain.height_map, FOLLOWED_FROM * length)
         self._single = mujoco.MjData(task.physics.model)
         self._lookat: np.ndarray | None = None
+
+    def come_near(self, fill: float, glide: float) -> None:
+        """Go so near that the box around a robot in its default pose fills the share `fill` of the picture's width or height,
+        and stay with it: make up the share `glide` of the way to it in a picture, also over terrain. No arrows are drawn.
+        """
+        up = fill * np.tan(np.radians(0.5 * self.model.vis.global_.fovy))
+        corners = 0.5 * np.array(self.size.sides) * np.array(list(product((-1.0, 1.0), repeat=3)))
+        lookat, distance, _ = frame(corners, (up * self.width / self.height, up), self.view.azimuth, self.view.elevation)
+        self.view.distance, self.glide, self.arrows = distance, glide, False
+        self.centre = self.centre + lookat
+        if self._follower is not None:
+            self._follower.distance, self._follower.glide = distance, np.full(3, glide)
 
     def turn_to(self, first: int) -> None:
         """Draw the robots from number `first` on; the camera is with them at once."""
@@ -79,7 +108,7 @@ class RobotsCamera(Camera):
         self._shade_feet(None if self.task.terrain is None else self.task.terrain.height_map)
         commands = self.task.commands[drawn, :2].cpu().numpy()
         actual = self.task.base_lin_vel[drawn, :2].cpu().numpy()
-        for i in range(self.count):
+        for i in range(self.count if self.arrows else 0):
             matrix = self.data.body(f"{i}/{self.task.robot.file.base}").xmat.reshape(3, 3)
             yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
             turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
@@ -94,8 +123,8 @@ class RobotsCamera(Camera):
             self._follower.update(bases[self.followed])
             self._follower.aim(self.view)
             return
-        centre = np.array([*bases[:, :2].mean(axis=0), 0.5 * self.size.height])
-        self._lookat = centre if self._lookat is None else 0.9 * self._lookat + 0.1 * centre  # no shaking
+        centre = np.array([*bases[:, :2].mean(axis=0), 0.0]) + self.centre
+        self._lookat = centre if self._lookat is None else self._lookat + self.glide * (centre - self._lookat)
         self.view.lookat[:] = self._lookat
 
     def _shade_feet(self, ground: HeightMap | None) -> None:

@@ -17,6 +17,8 @@ class RobotSize:
     """Its longest side [m]."""
     height: float
     """[m]."""
+    sides: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Along x, y and z [m]."""
 
 
 def size_of(robot: Robot) -> RobotSize:
@@ -36,4 +38,4 @@ def size_of_model(model: mujoco.MjModel, qpos: np.ndarray) -> RobotSize:
         for i in own
     ]
     sides = np.ptp(np.concatenate(points), axis=0)
-    return RobotSize(float(sides.max()), float(sides[2]))
+    return RobotSize(float(sides.max()), float(sides[2]), tuple(sides.tolist()))

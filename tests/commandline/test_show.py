@@ -5,7 +5,7 @@ import yaml
 from helpers import TASK, call, small_config
 
 from legged.commandline.show import summary
-from legged.config import from_dict
+from legged.config import from_dict, to_yaml
 from legged.registry import task_config
 from legged.tools import train
 
@@ -60,6 +60,28 @@ def test_rewards_terminations_actions_and_joints_of_a_legged_robot():
     joints = rows(lines, "joints: 19 positions, 18 velocities")
     assert joints[0] == ["root", "free", "0:7", "0:6", "-"]
     assert joints[1] == ["LF_HAA", "hinge", "7:8", "6:7", "-0.72 to 0.49"]
+
+
+@pytest.mark.parametrize(
+    ("task", "expected"),
+    [
+        (
+            "go2_flat",
+            "# robot: go2, 15.02 kg, 0.324 m high; numbers written for anymal_c are carried: masses x 0.288, lengths x 0.589,"
+            " times x 0.768",
+        ),
+        ("anymal_c", "# robot: anymal_c, 52.13 kg, 0.549 m high; numbers are written for it"),
+    ],
+)
+def test_by_what_numbers_were_carried_to_the_robot(task, expected):
+    """By hand: 15.02 / 52.13, 0.3235 / 0.5488 and the root of that; of two files that say so, once."""
+    assert summary(task_config(task, on_cpu=True))[1] == expected
+
+
+def test_numbers_that_are_nobodys_are_not_said_to_be():
+    """Those of a run's configuration, which has been carried already, and of a task that says nothing of it."""
+    cfg = task_config("go2_flat", on_cpu=True)
+    assert summary(from_dict(yaml.safe_load(to_yaml(cfg))))[1] == "# robot: go2, 15.02 kg, 0.324 m high"
 
 
 @pytest.mark.parametrize(("law", "effect"), [("V", "velocity 0.5 a, stiffness 90"), ("T", "torque 0.5 a, torque at most")])

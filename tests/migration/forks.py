@@ -91,7 +91,7 @@ class Go2RoughCfg(LeggedRobotCfg):
             body_pitch = [-0.1, 0.1]
     class asset(LeggedRobotCfg.asset):
         file = '{LEGGED_GYM_ROOT_DIR}/resources/robots/hound/urdf/hound.urdf'
-        name = 'hound_of_somebody'
+        name = 'hound_of_them'
         foot_name = 'FOOT'
         penalize_contacts_on = ['THIGH', 'tail']
         terminate_after_contacts_on = ['base']

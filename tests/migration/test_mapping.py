@@ -111,14 +111,14 @@ def test_a_robot_that_is_not_here_is_said_with_its_commands(migrated):
     text = GO2.replace("'FOOT'", "'foot'")
     result = migrated(text, "--out", "there")
     assert (
-        "  python -m legged.tools.add_robot resources/robots/hound/urdf/hound.urdf --name hound_of_somebody --out there/robots\n"
+        "  python -m legged.tools.add_robot resources/robots/hound/urdf/hound.urdf --name hound_of_them --out there/robots\n"
         in result.out
     )
     assert (
-        "  python -m legged.tools.migrate fork_config.py --robot there/robots/hound_of_somebody --out there --force\n"
+        "  python -m legged.tools.migrate fork_config.py --robot there/robots/hound_of_them --out there --force\n"
         in result.out
     )
-    assert result.data["robot"] == "robots/hound_of_somebody"
+    assert result.data["robot"] == "robots/hound_of_them"
     assert result.data["control"]["stiffness"] == {"H": 40.0, "KFE": 80.0, "wheel": 1.0}
     assert "#   feet: [foot]" in result.text
     assert "#   spawn_height: 0.62" in result.text

@@ -6,11 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from devices import build
+from devices import build, engine_of
 from reference import FIELDS, TOUCHING, CWorlds, States, heaps, pd, random_states, roll, standing
 
 from legged.config.schema import SimConfig
 from legged.physics import RobotScene
+from legged.physics.mujoco import MujocoPhysics
 from legged.robots.robot import load_robot
 
 GRAVITY = 9.81
@@ -51,7 +52,8 @@ def test_state_is_that_of_c_mujoco(physics, robot, start):
     for _ in range(5):
         physics.step()
         reference.step(torques)
-        comparable &= ~reference.steep_capsules()
+        if not as_in_c(physics):
+            comparable &= ~reference.steep_capsules()
     physics.refresh()
     touching = (reference.observe()["contact_forces"][comparable] != 0.0).any(axis=2)
     assert touching.any(axis=1).sum() >= 4
@@ -61,6 +63,12 @@ def test_state_is_that_of_c_mujoco(physics, robot, start):
         tolerance = {"contact_forces": 0.05, "dof_vel": 1e-3, "feet_vel": 1e-3}.get(name, 5e-5)
         actual, expected = getattr(physics.robot_state, name)[comparable], observed[name][comparable]
         np.testing.assert_allclose(actual, expected, atol=tolerance, rtol=1e-5, err_msg=name)
+
+
+def as_in_c(physics) -> bool:
+    """Whether a capsule that stands on the ground has friction along the directions that C MuJoCo gives it."""
+    engine = engine_of(physics)
+    return isinstance(engine, MujocoPhysics) or getattr(engine, "_contacts", None) is not None
 
 
 def drift(physics, robot, sim: SimConfig) -> dict[str, float]:

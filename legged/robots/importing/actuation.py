@@ -26,13 +26,16 @@ def guess_efforts(tree: Tree, legs: list[Leg], height: float) -> None:
 
 
 def speed_limits(tree: Tree) -> dict[str, float]:
-    """Return the speed limits of all hinges [rad/s], where the file states any; what it leaves out is as elsewhere."""
-    if not any(hinge.velocity for hinge in tree.hinges):
+    """Return the speed limits of all hinges with a motor [rad/s], where the file states any; what it leaves out is as
+    elsewhere.
+    """
+    driven = [hinge for hinge in tree.hinges if hinge.driven]
+    if not any(hinge.velocity for hinge in driven):
         return {}
-    for hinge in tree.hinges:
+    for hinge in driven:
         if hinge.velocity is None:
             tree.say(f"guess: speed limits that the file lacks are {VELOCITY_LIMIT:g} rad/s", hinge.name)
-    return {hinge.name: hinge.velocity or VELOCITY_LIMIT for hinge in tree.hinges}
+    return {hinge.name: hinge.velocity or VELOCITY_LIMIT for hinge in driven}
 
 
 def take_gains(tree: Tree, angles: dict[str, float]) -> tuple[dict[str, float], dict[str, float]]:

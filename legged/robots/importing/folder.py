@@ -23,9 +23,11 @@ class Guesses:
     spawn_height: float
     """[m]"""
     angles: dict[str, float]
-    """[rad]"""
+    """Of the hinges that have a motor [rad]."""
     angles_from: str
     """Where they come from, for a comment."""
+    passive: Sequence[str]
+    """Hinges without a motor."""
     feet: Sequence[str]
     penalized: Sequence[str]
     terminating: Sequence[str]
@@ -90,6 +92,7 @@ def robot_yaml(tree: Tree, guesses: Guesses) -> str:
         f"model: {tree.name}.xml",
         f"base: {_name(g.base)}",
         f"spawn_height: {g.spawn_height:g}  # m; guess: the lowest point of the default pose, and a little more",
+        *([f"passive_joints: {_list(g.passive)}  # no motor; where they are follows"] if g.passive else []),
         f"default_joint_angles:  # rad; {g.angles_from}",
         *(f"  {_name(name)}: {angle:g}" for name, angle in _compact(g.angles).items()),
     ]

@@ -55,6 +55,7 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
     legs = find_legs(tree)
     name_shapes(tree)
     _name_feet(tree, legs)
+    _name_passive(tree, legs)
     _draw_what_is_bare(tree)
     angles, origin = _default_pose(tree, legs)
     poser = Poser(tree)
@@ -74,8 +75,9 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
     return Guesses(
         base=tree.links[0].name,
         spawn_height=round(ABOVE * height, 3),
-        angles=angles,
+        angles={hinge.name: angles[hinge.name] for hinge in tree.hinges if hinge.driven},
         angles_from=origin,
+        passive=[hinge.name for hinge in tree.hinges if not hinge.driven],
         feet=_exact(tree, feet),
         penalized=_exact(tree, penalized),
         terminating=_exact(tree, ending),
@@ -93,6 +95,22 @@ def _name_feet(tree: Tree, legs: list[Leg]) -> None:
             others = {other.name for other in tree.shapes if other is not shape}
             if any(shape.name in name for name in others - {s.name for s in leg.feet}):
                 shape.name = free_name(f"{shape.name}_foot", others)
+
+
+def _name_passive(tree: Tree, legs: list[Leg]) -> None:
+    """Give hinges without a motor names that are parts of no other hinge's, for the same reason."""
+    driven = [hinge.name for hinge in tree.hinges if hinge.driven]
+    for hinge in tree.hinges:
+        if hinge.driven or not any(hinge.name in name for name in driven):
+            continue
+        old, hinge.name = hinge.name, free_name(f"{hinge.name}_passive", {other.name for other in tree.hinges})
+        tree.say("hinges without a motor whose names are parts of others' are called differently", f"{old} -> {hinge.name}")
+        for leg in legs:
+            leg.hinges = [hinge.name if name == old else name for name in leg.hinges]
+        for loop in tree.loops:
+            loop.update({key: hinge.name for key in ("joint1", "joint2") if loop.get(key) == old})
+        if tree.home is not None and old in tree.home:
+            tree.home[hinge.name] = tree.home.pop(old)
 
 
 def _exact(tree: Tree, names: Sequence[str]) -> list[str]:

@@ -14,9 +14,8 @@ from legged.robots.importing.tree import (
     Vector,
     add_mass,
     matrix,
-    quat_about,
     quat_product,
-    rotate,
+    turn_link,
 )
 
 LEAST_SHARE = 0.01
@@ -79,9 +78,7 @@ def _hold(tree: Tree, hold: Sequence[str]) -> None:
 
 def fix(link: Link, hinge: Hinge, angle: float) -> None:
     """Take a hinge from its link, turned by `angle` [rad]."""
-    turn = quat_about(hinge.axis, angle)
-    link.pos = link.pos + rotate(link.quat, hinge.anchor - rotate(turn, hinge.anchor))
-    link.quat = quat_product(link.quat, turn)
+    turn_link(link, hinge, angle)
     link.hinges = [other for other in link.hinges if other is not hinge]
 
 
@@ -122,25 +119,29 @@ def merge_welded(tree: Tree) -> None:
             if child.parent == i:
                 child.pos, child.quat = link.pos + turn @ child.pos, quat_product(link.quat, child.quat)
                 child.parent = link.parent
-        for loop in tree.loops:
-            _move_loop(loop, link, parent)
+        tree.move_loops(link.name, parent.name, link.pos, link.quat)
         del tree.links[i]
         for child in tree.links:
             child.parent -= child.parent > i
         merged += 1
     if merged:
         tree.say(f"{merged} welded links are merged into the links that carry them, with their masses")
+    _drop_loops(tree)
     _parents_first(tree)
 
 
-def _move_loop(loop: dict[str, str], link: Link, parent: Link) -> None:
-    """Let a constraint on `link` act on `parent`, which it was merged into."""
-    if loop["tag"] == "connect" and loop["body1"] == link.name:
-        anchor = np.array([float(x) for x in loop["anchor"].split()])
-        loop["anchor"] = " ".join(f"{x:.9g}" for x in link.pos + rotate(link.quat, anchor))
-    for key in ("body1", "body2"):
-        if loop.get(key) == link.name:
-            loop[key] = parent.name
+def _drop_loops(tree: Tree) -> None:
+    """Leave out constraints of hinges that are held, and between links that are one."""
+    hinges = {hinge.name for hinge in tree.hinges}
+    for loop in list(tree.loops):
+        ends = [loop[key] for key in ("body1", "body2", "joint1", "joint2") if key in loop]
+        if loop["tag"] == "connect" and len(set(ends)) == 1:
+            tree.say("constraints between links that are welded to each other are left out, of link", ends[0])
+        elif loop["tag"] == "joint" and not set(ends) <= hinges:
+            tree.say("constraints of joints that are held are left out, of", " and ".join(ends))
+        else:
+            continue
+        tree.loops.remove(loop)
 
 
 def _parents_first(tree: Tree) -> None:

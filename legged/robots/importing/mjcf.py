@@ -16,9 +16,10 @@ from legged.robots.importing.tree import (
     Tree,
     inverse,
     matrix,
-    quat_about,
     quat_product,
     rotate,
+    text_of,
+    turn_link,
 )
 
 KINDS = {
@@ -202,9 +203,7 @@ def _read_hinges(model: mujoco.MjModel, body: int, link: Link, tree: Tree) -> No
         dof, drawn_at = int(model.jnt_dofadr[i]), float(model.qpos0[model.jnt_qposadr[i]])
         hinge = Hinge(name, model.jnt_axis[i].copy(), model.jnt_pos[i].copy(), driven=False)
         if drawn_at:  # MuJoCo draws a joint with a `ref` at that angle
-            turn = quat_about(hinge.axis, -drawn_at)
-            link.pos = link.pos + rotate(link.quat, hinge.anchor - rotate(turn, hinge.anchor))
-            link.quat = quat_product(link.quat, turn)
+            turn_link(link, hinge, -drawn_at)
         if model.jnt_limited[i]:
             hinge.range = (float(model.jnt_range[i, 0]), float(model.jnt_range[i, 1]))
         if model.jnt_actfrclimited[i]:
@@ -303,30 +302,39 @@ def _read_loops(model: mujoco.MjModel, tree: Tree) -> None:
         if not model.eq_active0[i]:
             continue
         kind, data = mujoco.mjtEq(int(model.eq_type[i])), model.eq_data[i]
-        solver = {"solref": _text(model.eq_solref[i]), "solimp": _text(model.eq_solimp[i])}
+        solver = {"solref": text_of(model.eq_solref[i]), "solimp": text_of(model.eq_solimp[i])}
         ids = (int(model.eq_obj1id[i]), int(model.eq_obj2id[i]))
         if kind == mujoco.mjtEq.mjEQ_CONNECT:
             sites = model.eq_objtype[i] == mujoco.mjtObj.mjOBJ_SITE
             bodies = [int(model.site_bodyid[j]) if sites else j for j in ids]
-            anchor = model.site_pos[ids[0]] if sites else data[:3]
+            anchors = model.site_pos[list(ids)] if sites else data[:6].reshape(2, 3)
             names = [_name(model, body) for body in bodies]
             if set(names) <= links:
-                if names[0] == tree.links[0].name:
-                    anchor = rotate(model.body_quat[bodies[0]], anchor)  # that frame was turned upright
-                ends = {"body1": names[0], "body2": names[1], "anchor": _text(anchor)}
+                turned = [  # the frame of the base was turned upright
+                    rotate(model.body_quat[body], anchor) if name == tree.links[0].name else anchor
+                    for body, name, anchor in zip(bodies, names, anchors, strict=True)
+                ]
+                ends = {"body1": names[0], "body2": names[1], "anchor": text_of(turned[0]), "anchor2": text_of(turned[1])}
                 tree.loops.append({"tag": "connect", **ends, **solver})
                 continue
         elif kind == mujoco.mjtEq.mjEQ_JOINT:
             names = [model.joint(j).name for j in ids if j >= 0]
             if set(names) <= hinges:
                 ends = dict(zip(("joint1", "joint2"), names, strict=False))
-                tree.loops.append({"tag": "joint", **ends, "polycoef": _text(data[:5]), **solver})
+                first, *second = (float(model.qpos0[model.jnt_qposadr[j]]) for j in ids if j >= 0)
+                tree.loops.append(
+                    {"tag": "joint", **ends, "polycoef": text_of(_coupling(data[:5], first, *second)), **solver}
+                )
                 continue
         tree.say(f"a constraint ({kind.name[5:].lower()}) is left out: engines here know connect and joint between hinges")
 
 
-def _text(values: np.ndarray) -> str:
-    return " ".join(f"{x:.9g}" for x in values)
+def _coupling(factors: np.ndarray, first: float, second: float = 0.0) -> np.ndarray:
+    """Return the polynomial (5,) of the second hinge's angle that the first one has, where MuJoCo's is of angles that are
+    counted from where these two are drawn [rad].
+    """
+    polynomial = first + np.polynomial.Polynomial(factors)(np.polynomial.Polynomial([-second, 1.0]))
+    return np.pad(polynomial.coef, (0, 5 - len(polynomial.coef)))
 
 
 def _read_home(model: mujoco.MjModel, tree: Tree, path: Path) -> None:

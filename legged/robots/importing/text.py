@@ -8,11 +8,13 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from legged.robots.importing.tree import IDENTITY, Hinge, Link, Mesh, Shape, Tree, Vector
+from legged.robots.importing.tree import IDENTITY, Hinge, Link, Mesh, Shape, Tree, Vector, quat_product, rotate, vector_of
 
 DRAWN_GROUP, TOUCHED_GROUP = 2, 3
 """Groups of geoms: pictures show the first only."""
 GREY = "0.7 0.7 0.72 1"
+DRAWN_APART = 1e-6
+"""How far two points that are tied together may be from each other as links are drawn [m]."""
 
 
 def mjcf_of(tree: Tree, files: Mapping[str, Path] | None = None, height: float = 0.0, remarks: Sequence[str] = ()) -> str:
@@ -41,8 +43,9 @@ def mjcf_of(tree: Tree, files: Mapping[str, Path] | None = None, height: float =
     meshes = {shape.mesh.name: shape.mesh for shape in drawn if shape.mesh is not None}
     if meshes:
         lines += ["  <asset>", *(_mesh(mesh, files[name]) for name, mesh in meshes.items()), "  </asset>", ""]
+    ends = _loop_ends(tree)
     lines.append("  <worldbody>")
-    lines += _body(tree, 0, {id(shape) for shape in drawn}, height)
+    lines += _body(tree, 0, {id(shape) for shape in drawn}, ends, height)
     lines += [
         "  </worldbody>",
         "",
@@ -51,7 +54,7 @@ def mjcf_of(tree: Tree, files: Mapping[str, Path] | None = None, height: float =
         "  </actuator>",
     ]
     if tree.loops:
-        lines += ["", "  <equality>", *(_loop(loop) for loop in tree.loops), "  </equality>"]
+        lines += ["", "  <equality>", *(_loop(i, loop, ends) for i, loop in enumerate(tree.loops)), "  </equality>"]
     return "\n".join([*lines, "</mujoco>", ""])
 
 
@@ -70,7 +73,31 @@ def _mesh(mesh: Mesh, file: Path) -> str:
     return f'    <mesh name={quoteattr(mesh.name)} file={quoteattr(file.as_posix())}{scale} inertia="shell"/>'
 
 
-def _body(tree: Tree, i: int, drawn: set[int], height: float, depth: int = 2) -> list[str]:
+def _loop_ends(tree: Tree) -> dict[str, list[tuple[str, str]]]:
+    """Return the sites, name and place, that each link needs for what it is tied to: where MuJoCo, which ties bodies together
+    as they are drawn, would not find the place on the other link.
+    """
+    places: list[tuple[Vector, Vector]] = []
+    for link in tree.links:
+        pos, quat = (np.zeros(3), np.array(IDENTITY)) if link.parent < 0 else places[link.parent]
+        root = link.parent < 0
+        places.append((pos, quat) if root else (pos + rotate(quat, link.pos), quat_product(quat, link.quat)))
+    at = {link.name: place for link, place in zip(tree.links, places, strict=True)}
+    ends: dict[str, list[tuple[str, str]]] = {}
+    for i, loop in enumerate(tree.loops):
+        if loop["tag"] != "connect":
+            continue
+        both = [(loop["body1"], loop["anchor"]), (loop["body2"], loop["anchor2"])]
+        first, second = (at[name][0] + rotate(at[name][1], vector_of(anchor)) for name, anchor in both)
+        if np.abs(first - second).max() > DRAWN_APART:
+            for k, (name, anchor) in enumerate(both):
+                ends.setdefault(name, []).append((f"loop_{i}_{k}", anchor))
+    return ends
+
+
+def _body(
+    tree: Tree, i: int, drawn: set[int], ends: Mapping[str, Sequence[tuple[str, str]]], height: float, depth: int = 2
+) -> list[str]:
     link, pad = tree.links[i], "  " * depth
     pose = f' pos="0 0 {height:.9g}"' if i == 0 else _pose(link.pos, link.quat)
     lines = [f"{pad}<body name={quoteattr(link.name)}{pose}>"]
@@ -80,8 +107,9 @@ def _body(tree: Tree, i: int, drawn: set[int], height: float, depth: int = 2) ->
     lines += [pad + "  " + _hinge(hinge) for hinge in link.hinges]
     lines += [pad + "  " + _geom(shape) for shape in link.shapes if shape.collides]
     lines += [pad + "  " + _geom(shape) for shape in link.shapes if id(shape) in drawn]
+    lines += [f'{pad}  <site name="{name}" pos="{place}"/>' for name, place in ends.get(link.name, ())]
     for child in tree.children(i):
-        lines += _body(tree, child, drawn, height, depth + 1)
+        lines += _body(tree, child, drawn, ends, height, depth + 1)
     return [*lines, f"{pad}</body>"]
 
 
@@ -131,7 +159,10 @@ def _motor(hinge: Hinge) -> str:
     return f'    <motor name={name} joint={name} ctrlrange="{limit}" forcerange="{limit}"/>'
 
 
-def _loop(loop: Mapping[str, str]) -> str:
-    return (
-        f"    <{loop['tag']} " + " ".join(f"{key}={quoteattr(value)}" for key, value in loop.items() if key != "tag") + "/>"
-    )
+def _loop(i: int, loop: Mapping[str, str], ends: Mapping[str, Sequence[tuple[str, str]]]) -> str:
+    said = {key: value for key, value in loop.items() if key not in ("tag", "anchor2")}
+    if any(name == f"loop_{i}_0" for sites in ends.values() for name, _ in sites):
+        for key in ("body1", "body2", "anchor"):
+            del said[key]
+        said = {"site1": f"loop_{i}_0", "site2": f"loop_{i}_1", **said}
+    return f"    <{loop['tag']} " + " ".join(f"{key}={quoteattr(value)}" for key, value in said.items()) + "/>"

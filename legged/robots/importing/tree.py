@@ -107,7 +107,9 @@ class Tree:
     home_name: str = ""
     """Its name."""
     loops: list[dict[str, str]] = field(default_factory=list)
-    """Equality constraints: their kind, as `tag`, and their MJCF attributes."""
+    """Equality constraints: their kind, as `tag`, and their MJCF attributes; a `connect` has `anchor2` too, which is where
+    `anchor` is tied to, in the frame of body2 [m].
+    """
     _said: dict[str, list[str]] = field(default_factory=dict)
 
     def say(self, line: str, about: str = "") -> None:
@@ -130,10 +132,15 @@ class Tree:
         for child in self.children(0):
             link = self.links[child]
             link.pos, link.quat = turn @ link.pos, quat_product(quat, link.quat)
+        self.move_loops(base.name, base.name, np.zeros(3), quat)
+
+    def move_loops(self, old: str, new: str, pos: Vector, quat: Vector) -> None:
+        """Let constraints on the link `old` act on `new`, in whose frame it is at `pos` (3,) [m], turned by `quat` (4,)."""
         for loop in self.loops:
-            if loop["tag"] == "connect" and loop["body1"] == base.name:
-                anchor = turn @ [float(x) for x in loop["anchor"].split()]
-                loop["anchor"] = " ".join(f"{x:.9g}" for x in anchor)
+            for body, anchor in (("body1", "anchor"), ("body2", "anchor2")):
+                if loop.get(body) == old:
+                    loop[body] = new
+                    loop[anchor] = text_of(pos + rotate(quat, vector_of(loop[anchor])))
 
     @property
     def hinges(self) -> list[Hinge]:
@@ -148,6 +155,30 @@ class Tree:
     def children(self, parent: int) -> list[int]:
         """Return the links that hang on `parent`."""
         return [i for i, link in enumerate(self.links) if link.parent == parent]
+
+
+def turn_link(link: Link, hinge: Hinge, angle: float) -> None:
+    """Let a link be drawn where `hinge` has turned it by `angle` [rad]; hinges that it has before that one, which are in the
+    frame of the link, stay where they are.
+    """
+    turn = quat_about(hinge.axis, angle)
+    shift, back = hinge.anchor - rotate(turn, hinge.anchor), inverse(turn)
+    link.pos = link.pos + rotate(link.quat, shift)
+    link.quat = quat_product(link.quat, turn)
+    for other in link.hinges:
+        if other is hinge:
+            break
+        other.axis, other.anchor = rotate(back, other.axis), rotate(back, other.anchor - shift)
+
+
+def text_of(values: Vector) -> str:
+    """Return numbers as an attribute of MJCF."""
+    return " ".join(f"{value:.9g}" for value in values)
+
+
+def vector_of(text: str) -> Vector:
+    """Return the numbers of an attribute."""
+    return np.array([float(value) for value in text.split()])
 
 
 def listed(names: list[str]) -> str:

@@ -1,0 +1,68 @@
+"""Many robots walking, in one picture: `python -m legged.tools.contact_sheet go2_flat h1_flat --out robots.gif`.
+
+Each is shown with the policy of the newest run of its task, else with the one that is shipped; a run folder in place of a
+task names another. They walk in C MuJoCo on the CPU. A GIF shows them for four seconds and has at most 2 MB, a PNG is a
+picture.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import torch
+
+from legged.commandline.command import run_main
+from legged.config import LeggedConfig
+from legged.errors import ConfigError
+from legged.play.contact_sheet import film, sheet, write_sheet
+from legged.policies.restore import policy_of
+from legged.process.paths import ready_to_write_file
+from legged.registry import import_tasks
+
+SIDE = 176
+"""Width and height of a tile, if nobody says how large it is to be [pixels]."""
+SMALLEST, LARGEST = 32, 1000
+"""Of a tile, as it may be asked for [pixels]."""
+ENDINGS = (".gif", ".png")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def _main(argv: list[str] | None) -> int:
+    parser = argparse.ArgumentParser(prog="contact_sheet", description=__doc__)
+    parser.add_argument("robots", nargs="+", metavar="TASK | RUN", help="tasks, run folders, folders of shipped policies")
+    parser.add_argument("--out", type=Path, required=True, help="the file, .gif or .png")
+    parser.add_argument("--columns", type=int, help="tiles side by side; so many that the sheet is twice as wide as high")
+    parser.add_argument("--side", type=int, default=SIDE, help=f"width and height of a tile [pixels]; {SIDE}")
+    parser.add_argument("--import", dest="module", help="module or .py file that registers tasks of your own")
+    args = parser.parse_args(argv)
+    if args.out.suffix not in ENDINGS:
+        raise ConfigError(f"--out: '{args.out.name}' ends neither with .gif nor with .png")
+    if args.columns is not None and args.columns < 1:
+        raise ConfigError(f"--columns: must be at least 1, got {args.columns}")
+    if not SMALLEST <= args.side <= LARGEST:
+        raise ConfigError(f"--side: must be between {SMALLEST} and {LARGEST}, got {args.side}")
+    ready_to_write_file("--out", args.out, 4.0)
+    if args.module:
+        import_tasks(args.module)
+    policies = [policy_of(name) for name in args.robots]
+    torch.set_num_threads(1)
+    tiles = []
+    for policy in policies:
+        tiles.append(film(policy, args.side))
+        print(f"{policy.cfg.task}: {len(tiles[-1])} pictures", flush=True)
+    print(write_sheet(sheet(tiles, names_of([policy.cfg for policy in policies]), args.columns), args.out))
+    return 0
+
+
+def names_of(configs: list) -> list[str]:
+    """Return what is written below the tiles: the robot, or the task where the robot comes twice."""
+    robots = [Path(cfg.robot).name if isinstance(cfg, LeggedConfig) else "" for cfg in configs]
+    return [robot if robots.count(robot) == 1 else cfg.task for robot, cfg in zip(robots, configs, strict=True)]
+
+
+if __name__ == "__main__":
+    sys.exit(main())
