@@ -95,15 +95,16 @@ def call(main: Any, arguments: Sequence[str]) -> int:
 
 @contextlib.contextmanager
 def kept_global_state() -> Iterator[None]:
-    """Put back what a command changes for its whole process: thread count and signal handlers."""
+    """Put back what a command changes for its whole process: thread count, signal handlers, how matrices are multiplied."""
     import signal
 
-    threads = torch.get_num_threads()
+    threads, precision = torch.get_num_threads(), torch.backends.mkldnn.matmul.fp32_precision
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
         yield
     finally:
         torch.set_num_threads(threads)
+        torch.backends.mkldnn.matmul.fp32_precision = precision
         for number, handler in handlers.items():
             signal.signal(number, handler)
 

@@ -98,7 +98,8 @@ class RunnerConfig:
     """`captured`: rsl-rl's arithmetic without the host in between, on a GPU as CUDA graphs; it falls back to `stock` where
     networks or algorithm need that, and says why. `stock`: rsl-rl's own training loop."""
     matmul: Literal["float32", "tf32"] = "tf32"
-    """Matrix products of the networks on a GPU while training; `tf32` keeps 10 of the factors' 23 bits and is faster."""
+    """Matrix products of the networks while training. On a GPU `tf32` keeps 10 of the factors' 23 bits, which is faster; on a
+    CPU it takes the fastest library that keeps them all."""
     experiment_name: str = field(default="", metadata=NAME)
     """Folder under logs/; the task's name when empty."""
     run_name: str = field(default="", metadata=NAME)

@@ -26,8 +26,8 @@ class SimConfig:
     """Physics time step, engine and contact solver."""
 
     physics: Literal["auto", "mujoco_warp", "mujoco", "newton"] = "auto"
-    """Engine: `mujoco_warp` (GPU, or Warp's CPU device), `mujoco` (C engine, all CPU cores), `newton` (GPU, or Warp's CPU
-    device), `auto` by device."""
+    """Engine: `mujoco_warp` (GPU, or all CPU cores), `mujoco` (C engine, all CPU cores), `newton` (GPU, or one core), or
+    `auto`: mujoco_warp on a GPU, and without one for 256 robots or more that its fused step takes; else the C engine."""
     solver: NewtonSolver = "mujoco"
     """Solver of `newton`; the other engines have their own. Each comes with settings under which a quadruped stands:
     legged/physics/newton/solvers.py."""
@@ -59,4 +59,4 @@ class SimConfig:
     """How mujoco_warp and Newton's MuJoCo solver meet a height map: `cells`, our own kernel with vertical faces; `convex`,
     the general collider on one height field, ten times slower and with ramps for steps, for shapes unknown to `cells`."""
     threads: int = field(default=0, metadata=between(0, 1024))
-    """Threads of the C engine; 0 takes all cores."""
+    """Threads of the C engine, and of mujoco_warp's fused step on a CPU; 0 takes all cores."""

@@ -8,6 +8,7 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.modules.normalization import EmpiricalNormalization
 from torch import Tensor
 
+from legged.learning.activations import ExponentialUnit
 from legged.learning.distributed import sum_over_ranks_
 from legged.learning.networks import action_std
 from legged.learning.scaled_rewards import ScaledRewards
@@ -242,7 +243,12 @@ class DevicePPO(ScaledRewards):
         kind, enabled = inputs.device.type, self.use_mixed_precision
         # A graph must cast the weights anew at every replay, so none may come from autocast's cache.
         with torch.autocast(kind, torch.bfloat16, enabled, cache_enabled=False):
-            return model.mlp(model.obs_normalizer(inputs)).float()
+            x = model.obs_normalizer(inputs)
+            if kind == "cpu" and not enabled:
+                for layer in model.mlp:
+                    x = ExponentialUnit.apply(x) if type(layer) is torch.nn.ELU and layer.alpha == 1.0 else layer(x)
+                return x
+            return model.mlp(x).float()
 
     def action_std(self) -> Tensor:
         """Return the standard deviation (D,) of the actions."""

@@ -17,6 +17,7 @@ from legged.process.startup import importing
 
 __all__ = [
     "FIELDS",
+    "MANY_WORLDS",
     "ModelScene",
     "Physics",
     "RobotScene",
@@ -31,14 +32,22 @@ __all__ = [
 ]
 
 
-def resolve_physics(name: str, device: torch.device, where: str = "sim.physics") -> str:
-    """Return the engine that `auto` means on a device: mujoco_warp on a GPU, the C engine without one. `where` says who asks.
+MANY_WORLDS = 256
+"""So many worlds, and more, are a training: without a GPU, too, it is worth compiling kernels for it."""
+
+
+def resolve_physics(name: str, device: torch.device, where: str = "sim.physics", num_envs: int = 1) -> str:
+    """Return the engine that `auto` means on a device: mujoco_warp on a GPU, and without one for many worlds, else the C
+    engine. `where` says who asks.
+
+    Without a GPU it is mujoco_warp's fused step that is meant: `make_physics` takes the C engine for a model that it does not
+    fit.
 
     Raises:
         ConfigError: the C engine was asked for on a GPU, or an engine that is not installed.
     """
     if name == "auto":
-        return "mujoco_warp" if device.type == "cuda" else "mujoco"
+        return "mujoco_warp" if device.type == "cuda" or num_envs >= MANY_WORLDS else "mujoco"
     if name == "mujoco" and device.type != "cpu":
         raise ConfigError(f"{where}: 'mujoco' is the C engine and runs on the CPU; add --sim_device cpu (got {device})")
     if name == "newton" and find_spec("newton") is None:
@@ -46,9 +55,9 @@ def resolve_physics(name: str, device: torch.device, where: str = "sim.physics")
     return name
 
 
-def engine_name(sim: SimConfig, device: torch.device, where: str = "sim.physics") -> str:
+def engine_name(sim: SimConfig, device: torch.device, where: str = "sim.physics", num_envs: int = 1) -> str:
     """What files and tables call the engine: mujoco, mujoco_warp, or newton_<solver>. Raises as `resolve_physics`."""
-    engine = resolve_physics(sim.physics, device, where)
+    engine = resolve_physics(sim.physics, device, where, num_envs)
     return f"newton_{sim.solver}" if engine == "newton" else engine
 
 
@@ -121,7 +130,8 @@ def make_physics(
         ConfigError, ValueError: as `check_engine`.
     """
     check_engine(scene, sim, device, where, randomized, quantities)
-    engine = resolve_physics(sim.physics, device)
+    engine = resolve_physics(sim.physics, device, num_envs=num_envs)
+    why_c_engine = ""
     if engine == "newton":
         with importing():
             from legged.physics.newton.physics import NewtonPhysics
@@ -130,12 +140,19 @@ def make_physics(
         return NewtonPhysics(scene, sim, num_envs, device, randomized)
     if engine == "mujoco_warp":
         with importing():
-            from legged.physics.warp.mujoco_warp import MujocoWarpPhysics
+            from legged.physics.warp.mujoco_warp import MujocoWarpPhysics, NoBlocks
 
-        return MujocoWarpPhysics(scene, sim, num_envs, device, randomized, quantities)
+        if sim.physics == "mujoco_warp" or device.type == "cuda":
+            return MujocoWarpPhysics(scene, sim, num_envs, device, randomized, quantities)
+        try:
+            return MujocoWarpPhysics(scene, sim, num_envs, device, randomized, quantities, only_blocks=True)
+        except (NoBlocks, ConfigError) as reason:
+            why_c_engine = str(reason)
     from legged.physics.mujoco import MujocoPhysics
 
-    return MujocoPhysics(scene, sim, num_envs, device, randomized, quantities)
+    physics = MujocoPhysics(scene, sim, num_envs, device, randomized, quantities)
+    physics.why_c_engine = why_c_engine
+    return physics
 
 
 def kernel_cache() -> Path:

@@ -43,6 +43,10 @@ class Physics(ABC):
     why_library: str = ""
     """Why some of a step are an engine's own launches, where ours could take their place; empty where they do, or where there
     are none."""
+    why_c_engine: str = ""
+    """Why it is the C engine, where `auto` would take our own step for so many worlds; empty elsewhere."""
+    fitted: str = ""
+    """Which simple shapes stand for meshes, because the collider of the terrain knows none; empty if none do."""
     compiled: int = 0
     """Modules of kernels that were compiled when it was built, because the cache lacked them."""
     overflowed: Tensor

@@ -84,7 +84,10 @@ def _main(argv: list[str] | None) -> int:
         # In processes of their own: this one must not take memory.
         return scale(args, sys.argv[1:] if argv is None else argv, cfg, device)
     settle_on(device)
-    if args.grounds and resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics")) != "mujoco_warp":
+    if (
+        args.grounds
+        and resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics"), cfg.env.num_envs) != "mujoco_warp"
+    ):
         raise ConfigError("--grounds: compares colliders of mujoco_warp; add sim.physics=mujoco_warp")
     if args.grounds and (not isinstance(cfg, LeggedConfig) or cfg.terrain.mesh_type == "plane"):
         raise ConfigError(f"--grounds: the task '{cfg.task}' has no terrain")

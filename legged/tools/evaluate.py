@@ -35,6 +35,7 @@ from legged.evaluation.following import evaluate_following
 from legged.evaluation.gymnasium_episodes import EPISODES, environment_of, evaluate_in_gymnasium
 from legged.evaluation.success import chosen_types
 from legged.evaluation.velocity_grid import AXES, MOST_ROBOTS, Grid, axes_of, axis_values, check_size
+from legged.physics import resolve_physics
 from legged.policies.restore import find_policy
 from legged.process.paths import ready_to_write
 from legged.registry import task_class
@@ -145,7 +146,7 @@ def _follow_commands(args: argparse.Namespace) -> int:
     if everywhere:
         return cross(policy, grid, policy_overrides(args), device, graph, folder)
     # The engine is that of the device, not that of the training.
-    asked = [("sim.physics", "auto"), *policy_overrides(args)]
+    asked = [("sim.physics", resolve_physics("auto", device)), *policy_overrides(args)]
     if args.all_checkpoints:
         return evaluate_all_checkpoints(policy, grid, asked, device, graph, folder, rmse, falls)
     types = chosen_types(policy.cfg, args.types)  # type: ignore[arg-type]
@@ -173,7 +174,7 @@ def _run_episodes(args: argparse.Namespace) -> int:
     ready_to_write(folder)
     if args.gymnasium:
         return evaluate_in_gymnasium(policy, episodes, policy_overrides(args), folder)
-    asked = [("sim.physics", "auto"), *policy_overrides(args)]
+    asked = [("sim.physics", resolve_physics("auto", device)), *policy_overrides(args)]
     where = "--physics" if args.physics else "sim.physics"
     return evaluate_episodes(policy, episodes, asked, device, not args.no_graph, folder, where)
 

@@ -107,6 +107,8 @@ def _train(
         ready_to_write(experiment_folder(cfg), ROOM_MB)
         print(describe(cfg, device), flush=True)
     task = make_task(cfg, device, graph=not args.no_graph)
+    if first and task.physics.why_c_engine:
+        print(f"C MuJoCo instead, which is faster here: {task.physics.why_c_engine}", flush=True)
     if first and task.physics.why_library:
         print(f"mujoco-warp's own launches: {task.physics.why_library}", flush=True)
     for line in task.robot.adaptations if first and task.physics.robot_state is not None else ():
@@ -173,11 +175,10 @@ def _learn(runner: Runner, cfg: TaskConfig, display: Display | None) -> tuple[Pa
 def describe(cfg: TaskConfig, device: torch.device) -> str:
     """One line on what is about to run where."""
     if device.type == "cpu":
-        engines = {
-            "mujoco_warp": "mujoco-warp on the CPU",
-            "mujoco": f"C MuJoCo on {cfg.sim.threads or available_cores()} cores",
-        }
-        engine = engines.get(engine_name(cfg.sim, device), f"Newton's {cfg.sim.solver} solver on the CPU")
+        cores = cfg.sim.threads or available_cores()
+        engines = {"mujoco_warp": f"mujoco-warp on {cores} cores", "mujoco": f"C MuJoCo on {cores} cores"}
+        name = engine_name(cfg.sim, device, num_envs=cfg.env.num_envs)
+        engine = engines.get(name, f"Newton's {cfg.sim.solver} solver on the CPU")
         where = f"no GPU in use: {engine}, settings of the task's cpu section"
     else:
         where = torch.cuda.get_device_name(device)

@@ -28,7 +28,7 @@ def _main(argv: list[str] | None) -> int:
     register_given(args)
     device = pick_device(args.sim_device)
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
-    if resolve_physics(cfg.sim.physics, device) == "mujoco":
+    if resolve_physics(cfg.sim.physics, device, num_envs=cfg.env.num_envs) == "mujoco":
         print(f"{cfg.task}: nothing to do, C MuJoCo compiles no kernels")
         return 0
     settle_on(device)

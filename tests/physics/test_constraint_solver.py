@@ -166,7 +166,7 @@ def test_what_it_does_not_know_is_refused(make_physics, sim, reason):
 
 
 def test_what_a_robot_has_not_is_left_out_of_its_kernel(make_physics):
-    solver = make_physics("mujoco_warp")._fused_step._solver
+    solver = make_physics("mujoco_warp")._fused_step.solver
     assert {name: solver.constants[name] for name in ("DAMPED", "FRICTION", "ELLIPTIC", "SPLIT")} == {
         "DAMPED": False,
         "FRICTION": False,

@@ -18,12 +18,13 @@ from mechanisms import EVERY_JOINT, FusedWorlds, packaged, random_motion, relati
 from random_robots import EXTRAS, random_robot, rollout
 
 from legged.physics.fused import constraint_solver, smooth_dynamics
-from legged.physics.fused.constraint_solver import SolverArrays, solver_constants, solver_kernel
+from legged.physics.fused.constraint_solver import solver_constants, solver_kernel
 from legged.physics.fused.contact_kernel import SOURCE as CONTACT_SOURCE
 from legged.physics.fused.contact_kernel import StageArrays, stage_constants, stage_kernel
 from legged.physics.fused.contact_stage import ContactStage
 from legged.physics.fused.native import SOURCES, native_source
 from legged.physics.fused.smooth_dynamics import DynamicsArrays, dynamics_constants, dynamics_kernel
+from legged.physics.fused.solver_arrays import SolverArrays
 from legged.physics.fused.tree import Tree
 
 ARCHITECTURE = 90
@@ -199,12 +200,12 @@ def test_lanes_find_what_one_thread_finds(tmp_path, name):
     that it does not, to the bit, shows that none is missing.
     """
     fused = WORLDS[name]()
-    dynamics, solver = fused._step._dynamics, fused._step._solver
+    dynamics, solver = fused._step.dynamics, fused._step.solver
     compute = lanes_of(tmp_path, "dynamics", dynamics_constants(fused.model))
     names = ("geom_xpos", "geom_xmat", "cdof", "M", "qfrc_passive", "qfrc_actuator", "qfrc_smooth")
     if fused.model.neq:
         names = (*names, "xpos", "xquat", "cvel", "cdof_dot")
-    results = in_every_way(dynamics.launch, compute, "dynamics", dynamics._arrays, names)
+    results = in_every_way(dynamics.launch, compute, "dynamics", dynamics.arrays, names)
     compare(names, *results)
 
     assert fused._contacts is not None
@@ -216,7 +217,7 @@ def test_lanes_find_what_one_thread_finds(tmp_path, name):
     assert name != "half cheetah" or rows.max() > 32  # a lane has two
     compute = lanes_of(tmp_path, "solver", solver.constants)
     names = ("qacc", "advance", "qfrc_constraint")
-    compare(names, *in_every_way(solver.solve, compute, "solver", solver._arrays, names))
+    compare(names, *in_every_way(solver.solve, compute, "solver", solver.arrays, names))
 
 
 def compare_stage(folder: Path, stage: ContactStage, read_rows: Callable[[], np.ndarray]) -> None:

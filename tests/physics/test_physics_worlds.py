@@ -11,7 +11,7 @@ from reference import FIELDS, TOUCHING, CWorlds, States, assert_same, bits, heap
 
 from legged.config.schema import SimConfig
 from legged.errors import ConfigError
-from legged.physics import RobotScene, resolve_physics
+from legged.physics import MANY_WORLDS, RobotScene, resolve_physics
 from legged.physics.mujoco import MujocoPhysics
 from legged.physics.warp.mujoco_warp import absent_stages
 
@@ -226,8 +226,9 @@ def test_default_memory_holds_robots_lying_in_a_heap(make_physics, backend, robo
 # ---- choosing a back-end -------------------------------------------------------------------------------------------------
 
 
-def test_auto_is_the_c_engine_without_a_gpu_and_mujoco_warp_on_one():
+def test_auto_is_the_c_engine_for_few_worlds_without_a_gpu_and_mujoco_warp_on_one():
     assert resolve_physics("auto", torch.device("cpu")) == "mujoco"
+    assert resolve_physics("auto", torch.device("cpu"), num_envs=MANY_WORLDS) == "mujoco_warp"
     assert resolve_physics("auto", torch.device("cuda:0")) == "mujoco_warp"
 
 

@@ -13,8 +13,10 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from legged.physics.fused.native import LANES, native_source
+from legged.physics.fused.native import LANES, Constant, native_source
+from legged.physics.fused.solver_arrays import SolverArrays
 from legged.physics.fused.tree import MOST_DOFS, Tree
+from legged.physics.fused.wide_solver import WIDE, fits_wide, wide_constants, wide_kernel
 
 SOURCE = ("constraint_rows.h", "elliptic_cones.h", "elimination.h", "constraint_solver.h")
 ELLIPTIC_ROW = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)
@@ -23,7 +25,6 @@ KEPT_BYTES = 3600
 """Of a Jacobian in a block's shared memory: more rows are read from elsewhere, so that more worlds are computed at once."""
 MULTIPROCESSOR_BYTES, BYTES_OF_A_BLOCK = 228 * 1024, 1024
 """Shared memory of a multiprocessor (an H100's), and what each block takes of it for itself."""
-Vector5 = wp.types.vector(length=5, dtype=wp.float32)
 
 
 def row_length(nv: int) -> int:
@@ -31,47 +32,6 @@ def row_length(nv: int) -> int:
     lanes that read rows side by side meet different banks.
     """
     return 4 * (-(-nv // 4) | 1)
-
-
-@wp.struct
-class SolverArrays:
-    """Tables of our own; what the solver reads of mujoco-warp's model and data; and what it writes: from `qacc` to `rounds`,
-    and where there are dampers `advance`.
-    """
-
-    dof_depth: wp.array[int]
-    dof_place: wp.array[int]
-    dof_path: wp.array[int]
-    below: wp.array[int]
-    depth_width: wp.array[int]
-    path: wp.array[wp.uint64]
-    entry_row: wp.array[int]
-    entry_column: wp.array[int]
-    inertia: wp.array2d[float]
-    qfrc_smooth: wp.array2d[float]
-    warmstart: wp.array2d[float]
-    equalities: wp.array[int]
-    frictions: wp.array[int]
-    limits: wp.array[int]
-    nefc: wp.array[int]
-    type: wp.array2d[int]
-    id: wp.array2d[int]
-    jacobian: wp.array3d[float]
-    stiffness: wp.array2d[float]
-    reference: wp.array2d[float]
-    frictionloss: wp.array2d[float]
-    contact_dim: wp.array[int]
-    contact_row: wp.array2d[int]
-    friction: wp.array[Vector5]
-    impratio_invsqrt: wp.array[float]
-    timestep: wp.array[float]
-    damping: wp.array2d[float]
-    qacc: wp.array2d[float]
-    inertial: wp.array2d[float]
-    qfrc_constraint: wp.array2d[float]
-    efc_force: wp.array2d[float]
-    rounds: wp.array[int]
-    advance: wp.array2d[float]
 
 
 def solver_constants(
@@ -146,16 +106,20 @@ class ConstraintSolver:
         dry = not model.ntendon
         rows = np.repeat(np.arange(m.nv), counts)
         self.constants = solver_constants(tree, d.njmax, len(rows), damped, friction, dry, elliptic)
-        self._kernel = solver_kernel(self.constants)
+        self.wide: dict[str, Constant] | None = None
+        """What wide_solver.h was asked for, where it is what solves: on a CPU."""
+        if d.qacc.device.is_cpu and not elliptic and fits_wide(m.nv, d.njmax):
+            self.wide = wide_constants(tree, (rows, columns[: len(rows)]), d.njmax, damped, friction)
+        self._kernel = solver_kernel(self.constants) if self.wide is None else wide_kernel(self.wide)
         self._lanes = 1 if d.qacc.device.is_cpu else LANES
         efc, opt = d.efc, m.opt
-        self._settings = [
+        self.settings = [
             opt.iterations,
             opt.ls_iterations,
             float(opt.tolerance.numpy()[0]),
             float(opt.ls_tolerance.numpy()[0]),
         ]
-        arrays = self._arrays = SolverArrays()
+        arrays = self.arrays = SolverArrays()
         for name, table in tree.tables().items():
             setattr(arrays, name, wp.array(table, dtype=wp.uint64 if name == "path" else int))
         arrays.entry_row, arrays.entry_column = wp.array(rows, dtype=int), wp.array(columns[: len(rows)], dtype=int)
@@ -194,6 +158,8 @@ class ConstraintSolver:
 
     def solve(self) -> None:
         """Compute qacc, qfrc_constraint and efc.force from M, qfrc_smooth, the constraint rows and the last acceleration."""
-        dim = (self._worlds, self._lanes)
-        inputs = [*self._settings, self._arrays]
-        wp.launch(self._kernel, dim=dim, inputs=inputs, block_dim=self._lanes)
+        inputs = [*self.settings, self.arrays]
+        if self.wide is not None:
+            wp.launch(self._kernel, dim=-(-self._worlds // WIDE), inputs=[0, self._worlds, *inputs])
+        else:
+            wp.launch(self._kernel, dim=(self._worlds, self._lanes), inputs=inputs, block_dim=self._lanes)

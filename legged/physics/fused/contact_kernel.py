@@ -125,6 +125,18 @@ def keep(
 
 def stage_kernel(constants: dict[str, int | bool], planes: bool, pairs: bool, ground: bool) -> Any:
     """Return the kernel for some `stage_constants`, of models of which these may touch; launched for (worlds, lanes)."""
+    contacts_of_world = stage_function(constants, planes, pairs, ground)
+
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(LANES, 32))
+    def contact_stage(lanes: int, arrays: StageArrays, items: Candidates, cells: Ground, hits: Hits) -> None:
+        world, lane = wp.tid()  # type: ignore[misc]
+        contacts_of_world(world, lane, lanes, arrays, items, cells, hits)
+
+    return contact_stage
+
+
+def stage_function(constants: dict[str, int | bool], planes: bool, pairs: bool, ground: bool) -> Any:
+    """Return what the kernel does for one world, by one of so many lanes."""
     most = int(constants["SLOTS"])
 
     @wp.func_native(native_source(("deal.h",), {}))
@@ -134,9 +146,10 @@ def stage_kernel(constants: dict[str, int | bool], planes: bool, pairs: bool, gr
     @wp.func_native(native_source(SOURCE, constants))
     def make_rows(world: int, found: int, arrays: StageArrays) -> None: ...
 
-    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(LANES, 32))
-    def contact_stage(lanes: int, arrays: StageArrays, items: Candidates, cells: Ground, hits: Hits) -> None:
-        world, lane = wp.tid()  # type: ignore[misc]
+    @wp.func
+    def contacts_of_world(
+        world: int, lane: int, lanes: int, arrays: StageArrays, items: Candidates, cells: Ground, hits: Hits
+    ) -> None:
         found = wp.int32(0)
         if wp.static(planes):
             for start in range(0, items.point_touch.shape[0], lanes):
@@ -231,7 +244,7 @@ def stage_kernel(constants: dict[str, int | bool], planes: bool, pairs: bool, gr
                 found += dealt >> 16
         make_rows(world, found, arrays)
 
-    return contact_stage
+    return contacts_of_world
 
 
 def shared_bytes(constants: dict[str, int | bool]) -> int:

@@ -60,7 +60,7 @@ class ContactStage:
         frictions = rubs and not flags & FLAGS.mjDSBL_FRICTIONLOSS
         limited = np.array(model.jnt_limited, dtype=int) * (not flags & FLAGS.mjDSBL_LIMIT)
         contacts = not flags & FLAGS.mjDSBL_CONTACT
-        self._equalities = model.neq > 0 and not flags & FLAGS.mjDSBL_EQUALITY
+        self.equalities = model.neq > 0 and not flags & FLAGS.mjDSBL_EQUALITY
         all_pairs = touches.pairs_of(m) if contacts else []
         pairs = [touches.touch_of(model, *pair) for pair in all_pairs]
         probes = on_cells.probes if on_cells is not None and contacts else []
@@ -77,12 +77,16 @@ class ContactStage:
 
         self._arrays = self._stage_arrays(model, m, d)
         self._arrays.jnt_limited = wp.array(limited, dtype=int)
-        self._items = self._candidates(model, d, points, round_pairs, [(met[p.geom], p) for p in probes])
-        self._ground = (Ground(), Hits()) if on_cells is None else (on_cells.ground, on_cells.hits)
+        items = self._candidates(model, d, points, round_pairs, [(met[p.geom], p) for p in probes])
+        ground_of = (Ground(), Hits()) if on_cells is None else (on_cells.ground, on_cells.hits)
+        self.inputs = [self._arrays, items, *ground_of]
+        """What the launch takes, beside the number of lanes."""
         dim, slots = max((touch.dim for touch in self.touches), default=1), d.naconmax // d.nworld
         self.constants = stage_constants(model, d.njmax, slots, dim, frictions, bool(limited.any()))
         """What contact_stage.h was asked for."""
-        self._kernel = stage_kernel(self.constants, bool(points), bool(round_pairs), bool(probes))
+        self.kinds = bool(points), bool(round_pairs), bool(probes)
+        """Whether points on planes, pairs of round shapes and probes of the ground may touch."""
+        self._kernel = stage_kernel(self.constants, *self.kinds)
         self._lanes = 1 if d.qacc.device.is_cpu else LANES
 
     @staticmethod
@@ -111,14 +115,18 @@ class ContactStage:
 
     def launch(self) -> None:
         """Find the contacts and make the rows, of where shapes are and how they move."""
-        if self._equalities:
-            opt = self._m.opt
-            flags = opt.disableflags
-            opt.disableflags |= FLAGS.mjDSBL_FRICTIONLOSS | FLAGS.mjDSBL_LIMIT | FLAGS.mjDSBL_CONTACT
-            mjw.make_constraint(self._m, self._d)
-            opt.disableflags = flags
-        inputs = [self._lanes, self._arrays, self._items, *self._ground]
+        if self.equalities:
+            self.launch_equalities()
+        inputs = [self._lanes, *self.inputs]
         wp.launch(self._kernel, dim=(self._d.nworld, self._lanes), inputs=inputs, block_dim=self._lanes)
+
+    def launch_equalities(self) -> None:
+        """Make the rows of equality constraints, which come before all others."""
+        opt = self._m.opt
+        flags = opt.disableflags
+        opt.disableflags |= FLAGS.mjDSBL_FRICTIONLOSS | FLAGS.mjDSBL_LIMIT | FLAGS.mjDSBL_CONTACT
+        mjw.make_constraint(self._m, self._d)
+        opt.disableflags = flags
 
     def _stage_arrays(self, model: mujoco.MjModel, m: Any, d: Any) -> Any:
         """Return what contact_stage.h reads and writes."""

@@ -164,9 +164,7 @@ def dynamics_constants(model: mujoco.MjModel, randomized: Collection[str] = ()) 
 
 def dynamics_kernel(constants: dict[str, int | bool]) -> Any:
     """Return the kernel for some `dynamics_constants`; launched for (worlds, lanes)."""
-
-    @wp.func_native(native_source(SOURCE, constants))
-    def move_world(world: int, arrays: DynamicsArrays) -> None: ...
+    move_world = dynamics_function(constants)
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=(LANES, MOST_BLOCKS))
     def smooth_dynamics(arrays: DynamicsArrays) -> None:
@@ -174,6 +172,15 @@ def dynamics_kernel(constants: dict[str, int | bool]) -> Any:
         move_world(world, arrays)
 
     return smooth_dynamics
+
+
+def dynamics_function(constants: dict[str, int | bool]) -> Any:
+    """Return what the kernel does for one world."""
+
+    @wp.func_native(native_source(SOURCE, constants))
+    def move_world(world: int, arrays: DynamicsArrays) -> None: ...
+
+    return move_world
 
 
 def has_dampers(model: mujoco.MjModel, randomized: Collection[str] = ()) -> bool:
@@ -190,7 +197,7 @@ class SmoothDynamics:
         """Prepare the launch for mujoco-warp's `m` and `d` of a `model` of which `why_not` says nothing, in whose arrays
         `randomized` worlds differ. Call with their device as Warp's current one.
         """
-        arrays = self._arrays = DynamicsArrays()
+        arrays = self.arrays = DynamicsArrays()
         tables = _trees(model) | _motors(model) | _dofs(model)
         for name in DynamicsArrays.vars:  # type: ignore[attr-defined]
             if name in tables:
@@ -198,7 +205,9 @@ class SmoothDynamics:
             else:
                 value = getattr(m.opt if name == "gravity" else m if hasattr(m, name) else d, name)
             setattr(arrays, name, value)
-        self._kernel = dynamics_kernel(dynamics_constants(model, randomized))
+        self.constants = dynamics_constants(model, randomized)
+        """What smooth_dynamics.h was asked for."""
+        self._kernel = dynamics_kernel(self.constants)
         self._lanes = 1 if d.qacc.device.is_cpu else LANES
         self._worlds = d.nworld
 
@@ -236,7 +245,7 @@ class SmoothDynamics:
     def launch(self) -> None:
         """Compute all that comes before collisions, once a step."""
         dim = (self._worlds, self._lanes)
-        wp.launch(self._kernel, dim=dim, inputs=[self._arrays], block_dim=self._lanes)
+        wp.launch(self._kernel, dim=dim, inputs=[self.arrays], block_dim=self._lanes)
 
 
 def _scalar(model: mujoco.MjModel) -> np.ndarray:

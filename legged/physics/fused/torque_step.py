@@ -33,50 +33,61 @@ def turned_by(quat: wp.vec4, rotation: wp.vec3) -> wp.vec4:
     return wp.normalize(wp.vec4(quat[0] * w - wp.dot(old, xyz), new[0], new[1], new[2]))
 
 
-@wp.kernel
-def integrate(
-    timestep: wp.array[float],
-    jnt_type: wp.array[int],
-    jnt_qposadr: wp.array[int],
-    jnt_dofadr: wp.array[int],
-    advance: wp.array2d[float],
-    qacc: wp.array2d[float],
-    nefc: wp.array[int],
-    nacon: wp.array[int],
-    ncollision: wp.array[int],
-    most_rows: int,
-    most_contacts: int,
-    qpos: wp.array2d[float],
-    qvel: wp.array2d[float],
-    warmstart: wp.array2d[float],
-    overflow: wp.array[int],
-):
-    """One thread a world and joint: semi-implicit Euler; the first also sets the flags of what found no room."""
-    world, joint = wp.tid()
-    h = timestep[world % timestep.shape[0]]
-    at, dof = jnt_qposadr[joint], jnt_dofadr[joint]
-    kind = jnt_type[joint]
+@wp.struct
+class StateArrays:
+    """What integration reads of mujoco-warp's model and data, and from `qpos` on what it writes."""
+
+    timestep: wp.array[float]
+    jnt_type: wp.array[int]
+    jnt_qposadr: wp.array[int]
+    jnt_dofadr: wp.array[int]
+    advance: wp.array2d[float]
+    qacc: wp.array2d[float]
+    nefc: wp.array[int]
+    nacon: wp.array[int]
+    ncollision: wp.array[int]
+    most_rows: int
+    most_contacts: int
+    qpos: wp.array2d[float]
+    qvel: wp.array2d[float]
+    warmstart: wp.array2d[float]
+    overflow: wp.array[int]
+
+
+@wp.func
+def integrate_joint(world: int, joint: int, of: StateArrays) -> None:
+    """Move one joint on by semi-implicit Euler; with a world's first, set the flags of what found no room."""
+    h = of.timestep[world % of.timestep.shape[0]]
+    at, dof = of.jnt_qposadr[joint], of.jnt_dofadr[joint]
+    kind = of.jnt_type[joint]
     moving = wp.where(kind == FREE_JOINT, 3, wp.where(kind == BALL_JOINT, 0, 1))  # numbers in qpos, before any quaternion
     turning = wp.where(moving == 1, 0, 3)  # degrees of freedom of the quaternion
     for k in range(dof, dof + moving + turning):
-        qvel[world, k] += h * advance[world, k]
-        warmstart[world, k] = qacc[world, k]
+        of.qvel[world, k] += h * of.advance[world, k]
+        of.warmstart[world, k] = of.qacc[world, k]
     for k in range(moving):
-        qpos[world, at + k] += h * qvel[world, dof + k]
+        of.qpos[world, at + k] += h * of.qvel[world, dof + k]
     if turning > 0:
         i, v = at + moving, dof + moving
-        quat = wp.vec4(qpos[world, i], qpos[world, i + 1], qpos[world, i + 2], qpos[world, i + 3])
-        quat = turned_by(quat, h * wp.vec3(qvel[world, v], qvel[world, v + 1], qvel[world, v + 2]))
+        quat = wp.vec4(of.qpos[world, i], of.qpos[world, i + 1], of.qpos[world, i + 2], of.qpos[world, i + 3])
+        quat = turned_by(quat, h * wp.vec3(of.qvel[world, v], of.qvel[world, v + 1], of.qvel[world, v + 2]))
         for k in range(4):
-            qpos[world, i + k] = quat[k]
+            of.qpos[world, i + k] = quat[k]
     if joint > 0:
         return
-    if nefc[world] > most_rows:
-        overflow[world] |= NEFC
-    if ncollision[0] > most_contacts:
-        overflow[world] |= BROADPHASE
-    if nacon[0] > most_contacts:
-        overflow[world] |= NARROWPHASE
+    if of.nefc[world] > of.most_rows:
+        of.overflow[world] |= NEFC
+    if of.ncollision[0] > of.most_contacts:
+        of.overflow[world] |= BROADPHASE
+    if of.nacon[0] > of.most_contacts:
+        of.overflow[world] |= NARROWPHASE
+
+
+@wp.kernel
+def integrate(of: StateArrays):
+    """One thread a world and joint."""
+    world, joint = wp.tid()
+    integrate_joint(world, joint, of)
 
 
 class TorqueStep:
@@ -87,12 +98,14 @@ class TorqueStep:
         `ConstraintSolver` says anything, in whose arrays `randomized` worlds differ. Call with their device as Warp's
         current one.
         """
-        self._dynamics = SmoothDynamics(model, m, d, randomized)
-        self._solver = ConstraintSolver(model, m, d, damped=has_dampers(model, randomized))
-        joints = [m.jnt_type, m.jnt_qposadr, m.jnt_dofadr]
-        counts = [d.nefc, d.nacon, d.ncollision, d.njmax, d.naconmax]
-        inputs = [m.opt.timestep, *joints, self._solver.advance, d.qacc, *counts]
-        self._integration = (d.nworld, m.njnt), inputs, [d.qpos, d.qvel, d.qacc_warmstart, d.overflow]
+        self.dynamics = SmoothDynamics(model, m, d, randomized)
+        self.solver = ConstraintSolver(model, m, d, damped=has_dampers(model, randomized))
+        of = self.state = StateArrays()
+        of.timestep, of.jnt_type, of.jnt_qposadr, of.jnt_dofadr = m.opt.timestep, m.jnt_type, m.jnt_qposadr, m.jnt_dofadr
+        of.advance, of.qacc = self.solver.advance, d.qacc
+        of.nefc, of.nacon, of.ncollision, of.most_rows, of.most_contacts = d.nefc, d.nacon, d.ncollision, d.njmax, d.naconmax
+        of.qpos, of.qvel, of.warmstart, of.overflow = d.qpos, d.qvel, d.qacc_warmstart, d.overflow
+        self.worlds, self.joints = d.nworld, m.njnt
 
     @staticmethod
     def why_not(model: mujoco.MjModel, randomized: Collection[str] = ()) -> str:
@@ -105,10 +118,9 @@ class TorqueStep:
 
     def begin(self) -> None:
         """Compute from qpos, qvel and ctrl where shapes are, what contacts need to know, and all other forces."""
-        self._dynamics.launch()
+        self.dynamics.launch()
 
     def finish(self) -> None:
         """Compute, with the rows of constraints made, their forces, the next state and warm start, and overflow flags."""
-        self._solver.solve()
-        dim, inputs, outputs = self._integration
-        wp.launch(integrate, dim=dim, inputs=inputs, outputs=outputs)
+        self.solver.solve()
+        wp.launch(integrate, dim=(self.worlds, self.joints), inputs=[self.state])

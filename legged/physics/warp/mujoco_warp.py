@@ -14,6 +14,7 @@ from legged.config.schema import SimConfig
 from legged.errors import ConfigError
 from legged.physics.collider.terrain_contact import TerrainContact
 from legged.physics.fields import DERIVED, FIELDS, RandomizedModel, changed_arrays
+from legged.physics.fused.block_step import BlockStep
 from legged.physics.fused.constraint_solver import ConstraintSolver, ask_for_dense_rows
 from legged.physics.fused.contact_stage import ContactStage
 from legged.physics.fused.torque_step import TorqueStep
@@ -23,6 +24,8 @@ from legged.physics.scene import Scene
 from legged.physics.warp.compile import compile_ahead
 from legged.physics.warp.exchange import MujocoWarpExchange, StateExchange, arrays_of
 from legged.physics.warp.physics import WarpPhysics
+from legged.process.cores import available_cores
+from legged.process.ranks import Ranks
 from legged.robots.robot_model import FLOOR
 
 PER_WORLD = ("geom_friction", "body_mass", *DERIVED)
@@ -45,6 +48,10 @@ def absent_stages(model: mujoco.MjModel, randomized: Collection[str] = ()) -> in
     return flags
 
 
+class NoBlocks(Exception):
+    """A model's step is not made in blocks of worlds, which alone is faster on a CPU than the C engine."""
+
+
 class MujocoWarpPhysics(WarpPhysics):
     """N worlds in mujoco-warp, whose own arrays are the state."""
 
@@ -56,9 +63,14 @@ class MujocoWarpPhysics(WarpPhysics):
         device: torch.device,
         randomized: Collection[str] = (),
         quantities: Collection[str] = (),
+        only_blocks: bool = False,
     ) -> None:
         """Build the scene on `device` and place all worlds at the model's initial state; compiles on first use, for
         `randomized` fields too.
+
+        Raises:
+            ConfigError: mujoco-warp cannot simulate the model, or `sim.step` asks for what does not fit it.
+            NoBlocks: with `only_blocks`, a step is not made in blocks on several threads.
         """
         super().__init__(num_envs, sim.dt, device)
         terrain = scene.terrain
@@ -91,12 +103,17 @@ class MujocoWarpPhysics(WarpPhysics):
                 name: wp.to_torch(getattr(d, name)).view(num_envs, *getattr(sample, name).shape) for name in quantities
             }
             self._m.opt.disableflags |= absent_stages(self.model, self._per_world)
-            self._choose_step(sim.step)
+            self._choose_step(sim.step, sim.threads or max(1, available_cores() // Ranks.now().local_count))
+            if only_blocks and (self._blocks is None or quantities):
+                raise NoBlocks(self._why_no_blocks(quantities))
         exchanges = (self._exchange.kinematics, self._exchange.contact_forces, self.kernels.name_module)
         constants = (self._set_constants,) if any(FIELDS[name].derived for name in randomized) else ()
         self.compiled = compile_ahead(self._wp_device, (self._step, self._update_quantities, *exchanges, *constants))
         self.library_step = self._library_step
-        if self._wp_device.is_cpu:
+        if self._blocks is not None:
+            with self._on_device():
+                self._advance = self._blocks.recorded()
+        elif self._wp_device.is_cpu:
             self._advance = self._captured_step()
         self.refresh()
 
@@ -134,7 +151,9 @@ class MujocoWarpPhysics(WarpPhysics):
 
     def _step(self) -> None:
         m, d = self._m, self._d
-        if self._fused_step is not None:
+        if self._blocks is not None:
+            self._blocks.launch()
+        elif self._fused_step is not None:
             self._fused_step.begin()
             if self._contacts is not None:
                 self._contacts.launch()
@@ -152,12 +171,13 @@ class MujocoWarpPhysics(WarpPhysics):
         else:
             mjw.step(m, d)
 
-    def _choose_step(self, step: str) -> None:
+    def _choose_step(self, step: str, threads: int) -> None:
         """Prepare what `sim.step` asks for: our launches for the whole step, our constraint solver within mujoco-warp's
         launches, or nothing, which leaves the step to mujoco-warp. Raises ConfigError where the model keeps `fused` off.
         """
         self._fused_step: TorqueStep | None = None
         self._contacts: ContactStage | None = None
+        self._blocks: BlockStep | None = None
         self._solver: ConstraintSolver | None = None
         if step == "library":
             self.why_library = "sim.step=library"
@@ -179,6 +199,16 @@ class MujocoWarpPhysics(WarpPhysics):
                 self.why_library = f"for contacts alone, {no_contacts}"
             else:
                 self._contacts = ContactStage(self.model, self._m, self._d, per_world, self._on_cells)
+                if BlockStep.fits(self._fused_step):
+                    self._blocks = BlockStep(self._fused_step, self._contacts, threads)
+
+    def _why_no_blocks(self, quantities: Collection[str]) -> str:
+        """Return what keeps a step from being made in blocks of worlds, or what would take longer than it gains."""
+        if self.why_library:
+            return self.why_library
+        if quantities:
+            return f"mujoco-warp's own launches compute {', '.join(quantities)}"
+        return "its constraint rows take more than a thread's stack, or friction cones are elliptic"
 
     def _library_step(self) -> None:
         """Make a physics step as mujoco-warp does by itself."""

@@ -282,12 +282,18 @@ def add_rewards(
     total[robot] = wp.max(clipped, 0.0) + whole
 
 
+MOST_PREPARED = 200
+"""Launches that are kept for one task."""
+
+
 class TaskKernels:
     """Launches them on an engine's device, on the stream that torch uses now. All arguments are torch's tensors."""
 
     def __init__(self, on_device: Callable[[], AbstractContextManager[Any]]) -> None:
         """Launch within `on_device`."""
         self._on_device = on_device
+        self._prepared: dict[tuple[Any, ...], Any] = {}
+        """Launches on a CPU by what they are of, ready to be made again."""
 
     def name_module(self) -> None:
         """Launch one of them, for a dry run that asks which modules are needed: they are all in one."""
@@ -299,9 +305,7 @@ class TaskKernels:
 
     def advance_feet(self, forces: Tensor, *arguments: Tensor | float) -> None:
         """As `FeetContacts.update`."""
-        with self._on_device():
-            inputs = [wp.from_torch(forces, dtype=wp.vec3), *map(of_torch, arguments)]
-            wp.launch(advance_feet, dim=tuple(forces.shape[:2]), inputs=inputs)
+        self._launch(advance_feet, tuple(forces.shape[:2]), (forces, *arguments), vectors=1)
 
     def renew_commands(self, *arguments: Tensor | float) -> None:
         """As `Commands.update`."""
@@ -332,11 +336,37 @@ class TaskKernels:
         """As `Rewards.compute`, once the terms are known."""
         self._launch(add_rewards, values.shape[1], (values, *arguments))
 
-    def _launch(self, kernel: Any, dim: int | tuple[int, ...], arguments: tuple[Tensor | float, ...]) -> None:
+    def _launch(
+        self, kernel: Any, dim: int | tuple[int, ...], arguments: tuple[Tensor | float, ...], vectors: int = 0
+    ) -> None:
+        """Launch a kernel, of whose arguments the first `vectors` are arrays of vectors (..., 3).
+
+        On a CPU the launch is kept for the next step, whose tensors are the same: to prepare it takes longer than to make it.
+        """
         with self._on_device():
-            wp.launch(kernel, dim=dim, inputs=[of_torch(argument) for argument in arguments])
+            key = None
+            if wp.get_device().is_cpu:
+                key = (kernel, dim, *(_identity(a) for a in arguments))
+                if prepared := self._prepared.get(key):
+                    prepared.launch()
+                    return
+            inputs = [_of_torch(argument, k < vectors) for k, argument in enumerate(arguments)]
+            wp.launch(kernel, dim=dim, inputs=inputs)
+            if key is not None and (prepared := wp.launch(kernel, dim=dim, inputs=inputs, record_cmd=True)):
+                if len(self._prepared) >= MOST_PREPARED:  # of tensors that are made anew in each step
+                    self._prepared.clear()
+                self._prepared[key] = prepared
 
 
-def of_torch(argument: Tensor | float) -> Any:
+def _identity(argument: Tensor | float) -> Any:
+    """Return by what a kernel would know an argument."""
+    if isinstance(argument, Tensor):
+        return argument.data_ptr(), argument.shape, argument.stride(), argument.dtype
+    return argument
+
+
+def _of_torch(argument: Tensor | float, vectors: bool) -> Any:
     """Return what a kernel takes of an argument."""
-    return wp.from_torch(argument) if isinstance(argument, Tensor) else argument
+    if not isinstance(argument, Tensor):
+        return argument
+    return wp.from_torch(argument, dtype=wp.vec3) if vectors else wp.from_torch(argument)

@@ -1,0 +1,46 @@
+"""What the constraint solver reads and writes."""
+
+import warp as wp
+
+Vector5 = wp.types.vector(length=5, dtype=wp.float32)
+
+
+@wp.struct
+class SolverArrays:
+    """Tables of our own; what the solver reads of mujoco-warp's model and data; and what it writes: from `qacc` to `rounds`,
+    and where there are dampers `advance`.
+    """
+
+    dof_depth: wp.array[int]
+    dof_place: wp.array[int]
+    dof_path: wp.array[int]
+    below: wp.array[int]
+    depth_width: wp.array[int]
+    path: wp.array[wp.uint64]
+    entry_row: wp.array[int]
+    entry_column: wp.array[int]
+    inertia: wp.array2d[float]
+    qfrc_smooth: wp.array2d[float]
+    warmstart: wp.array2d[float]
+    equalities: wp.array[int]
+    frictions: wp.array[int]
+    limits: wp.array[int]
+    nefc: wp.array[int]
+    type: wp.array2d[int]
+    id: wp.array2d[int]
+    jacobian: wp.array3d[float]
+    stiffness: wp.array2d[float]
+    reference: wp.array2d[float]
+    frictionloss: wp.array2d[float]
+    contact_dim: wp.array[int]
+    contact_row: wp.array2d[int]
+    friction: wp.array[Vector5]
+    impratio_invsqrt: wp.array[float]
+    timestep: wp.array[float]
+    damping: wp.array2d[float]
+    qacc: wp.array2d[float]
+    inertial: wp.array2d[float]
+    qfrc_constraint: wp.array2d[float]
+    efc_force: wp.array2d[float]
+    rounds: wp.array[int]
+    advance: wp.array2d[float]
