@@ -88,6 +88,7 @@ class StepGraph:
     def _capture(self, device: torch.device) -> "torch.cuda.CUDAGraph":
         import warp as wp
 
+        wp.init()  # a step that launches nothing of Warp's may be the first to ask for it
         stream = torch.cuda.Stream(device)
         stream.wait_stream(torch.cuda.current_stream(device))
         # Warp looks up a device at its first use, and a stream when it first sees it: within a capture that would break it.

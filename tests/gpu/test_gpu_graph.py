@@ -137,7 +137,7 @@ class InTheAir(LeggedRobot):
 
     def _init_buffers(self) -> None:
         super()._init_buffers()
-        self._spawn_offset[:, 2] = 50.0
+        self._spawn = self.numbers.between([0.0, 0.0, 50.0], [0.0, 0.0, 50.0], 3)
 
     def _reward_mine(self) -> torch.Tensor:
         weights = torch.tensor([1.0, 0.5], device=self.device)

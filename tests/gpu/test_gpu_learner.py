@@ -87,7 +87,7 @@ class InTheAir(LeggedRobot):
 
     def _init_buffers(self) -> None:
         super()._init_buffers()
-        self._spawn_offset[:, 2] = 50.0
+        self._spawn = self.numbers.between([0.0, 0.0, 50.0], [0.0, 0.0, 50.0], 3)
 
 
 def test_captured_iterations_are_the_eager_ones():
