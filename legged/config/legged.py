@@ -216,7 +216,7 @@ class LeggedRewardsConfig(RewardsConfig):
     tracking_sigma: float = field(default=0.25, metadata=positive(LARGEST, low=1e-6))
     """Tracking reward = exp(-error^2 / sigma)."""
     air_time_target_s: float = field(default=0.5, metadata=carried("s", between(0, 100)))
-    """Swings longer than this are rewarded by feet_air_time, shorter ones punished; single_stance pays up to it [s]."""
+    """Swings longer than this are rewarded by feet_air_time, shorter ones punished; single_stance pays them most [s]."""
     feet_clearance_target: float = field(default=0.1, metadata=carried("m", between(0, 100)))
     """Height of a swinging foot above the lowest foot that feet_clearance wants [m]."""
     base_height_target: float = field(default=0.5, metadata=carried("m", positive(100)))

@@ -243,11 +243,14 @@ class Terms:
         return (force - self.cfg.rewards.max_contact_force).clamp(min=0.0).sum(dim=1)
 
     def _reward_single_stance(self) -> Tensor:
-        """Swings of a biped: how long a foot has been in the air while exactly the other one stands, up to the target, while
-        any velocity is commanded [s].
+        """Swings of a biped: how long a foot has been in the air while exactly the other one stands, up to the target, and
+        beyond it the less the longer, down to nothing; while any velocity is commanded [s].
+
+        Paid for any long swing, robots take one step a second, and can't turn or be steered in between.
         """
         alone = (self.contacts.in_contact.sum(dim=1) == 1) & self.is_moving
-        return self.contacts.air_time.amax(dim=1).clamp(max=self.cfg.rewards.air_time_target_s) * alone
+        target = self.cfg.rewards.air_time_target_s
+        return (target - (self.contacts.air_time.amax(dim=1) - target).abs()).clamp(min=0.0) * alone
 
     def _reward_feet_slide(self) -> Tensor:
         """Squared horizontal speed of feet on the ground [m^2/s^2]."""
