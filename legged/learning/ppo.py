@@ -8,7 +8,7 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.modules.normalization import EmpiricalNormalization
 from torch import Tensor
 
-from legged.learning.activations import ExponentialUnit
+from legged.learning.cpu_layers import apply_layers
 from legged.learning.distributed import sum_over_ranks_
 from legged.learning.networks import action_std
 from legged.learning.scaled_rewards import ScaledRewards
@@ -245,9 +245,7 @@ class DevicePPO(ScaledRewards):
         with torch.autocast(kind, torch.bfloat16, enabled, cache_enabled=False):
             x = model.obs_normalizer(inputs)
             if kind == "cpu" and not enabled:
-                for layer in model.mlp:
-                    x = ExponentialUnit.apply(x) if type(layer) is torch.nn.ELU and layer.alpha == 1.0 else layer(x)
-                return x
+                return apply_layers(model.mlp, x)
             return model.mlp(x).float()
 
     def action_std(self) -> Tensor:

@@ -126,7 +126,7 @@ def test_warmup_leaves_nothing_to_compile(tmp_path, monkeypatch, capsys):
 
 
 def test_warmup_has_nothing_to_do_for_the_c_engine(capsys):
-    assert warmup.main(["--task", "anymal_c_flat", "--sim_device", "cpu"]) == 0
+    assert warmup.main(["--task", "anymal_c_flat", "--sim_device", "cpu", "sim.physics=mujoco"]) == 0
     assert "nothing to do" in capsys.readouterr().out
 
 

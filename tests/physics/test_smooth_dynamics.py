@@ -108,9 +108,9 @@ def test_dampers_and_springs_that_only_some_worlds_have_are_felt(device):
 def test_a_shipped_robot_takes_one_launch_unless_asked_for_others(make_physics, sim, one_launch):
     physics = make_physics("mujoco_warp", **sim)
     modules = " ".join(build.module.name for build in launched(wp.get_device("cpu"), (physics._step,)))
-    assert ("dynamics_kernel" in modules) == one_launch
+    assert ("block_kernel" in modules) == one_launch
     assert ("mujoco_warp._src.smooth" in modules) != one_launch
-    assert ("solver_kernel" in modules) == (sim.get("step") != "library")
+    assert ("wide_kernel" in modules) == (sim.get("tag") == "stages")
     assert (physics.why_library == "") == one_launch
 
 

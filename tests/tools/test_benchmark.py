@@ -71,7 +71,10 @@ def test_iterations_are_counted_without_the_first(kind):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--task", "anymal_c", "--grounds", "--sim_device", "cpu"], "compares colliders of mujoco_warp"),
+        (
+            ["--task", "anymal_c", "--grounds", "--sim_device", "cpu", "sim.physics=mujoco"],
+            "colliders of mujoco_warp",
+        ),
         (["--task", "anymal_c_flat", "--grounds", "--sim_device", "cpu", "sim.physics=mujoco_warp"], "has no terrain"),
     ],
 )

@@ -1,4 +1,6 @@
-"""What makes an update fast on a CPU: an activation of our own, and another library for products of matrices."""
+"""What makes an update fast on a CPU, and the same with any number of threads: layers of our own, and another library for
+products of matrices.
+"""
 
 from dataclasses import replace
 
@@ -6,7 +8,7 @@ import pytest
 import torch
 from helpers import small_config
 
-from legged.learning.activations import ExponentialUnit
+from legged.learning.cpu_layers import Affine, ExponentialUnit, apply_layers
 from legged.learning.networks import use_matmul
 
 
@@ -38,3 +40,24 @@ def test_matrices_are_multiplied_in_float32_on_a_cpu(matmul):
     generator = torch.Generator().manual_seed(1)
     a, b = (torch.randn(300, 300, generator=generator) for _ in range(2))
     torch.testing.assert_close((a @ b).double(), a.double() @ b.double(), atol=2e-4, rtol=0.0)
+
+
+@pytest.mark.parametrize("rows", [3, 8, 21])
+def test_the_gradients_of_a_linear_layer_are_its_slopes(rows):
+    generator = torch.Generator().manual_seed(rows)
+    factors = [torch.randn(*size, generator=generator, dtype=torch.float64) for size in ((rows, 5), (4, 5), (4,))]
+    assert torch.autograd.gradcheck(Affine.apply, [factor.requires_grad_() for factor in factors])
+
+
+def test_layers_are_those_of_torch():
+    torch.manual_seed(0)
+    layers = torch.nn.Sequential(
+        torch.nn.Linear(6, 5), torch.nn.ELU(), torch.nn.Linear(5, 4, bias=False), torch.nn.Tanh(), torch.nn.Linear(4, 2)
+    )
+    x = torch.randn(19, 6)
+    found = []
+    for apply in (layers, lambda x: apply_layers(layers, x)):
+        y = apply(x)
+        found.append([y, *torch.autograd.grad(y.square().mean(), list(layers.parameters()))])
+    for theirs, ours in zip(*found, strict=True):
+        torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=1e-5)
