@@ -1,6 +1,7 @@
 """The parser that every command has: its help keeps the paragraphs of the description and ends with examples."""
 
 import argparse
+import shlex
 import textwrap
 from typing import Any
 
@@ -24,11 +25,13 @@ class CommandParser(argparse.ArgumentParser):
         super().__init__(prog=prog, description=description, epilog=shown, formatter_class=Paragraphs, **options)
 
     @staticmethod
-    def arguments_of(example: str) -> str:
-        """Return an example without the program it calls: `python x.py`, `python -m module` or an installed command."""
-        words = example.split(maxsplit=3)
-        skipped = 1 if words[0] != "python" else 3 if words[1] == "-m" else 2
-        return example.split(maxsplit=skipped)[skipped]
+    def arguments_of(example: str) -> list[str]:
+        """Return an example's words without the program it calls (`python x.py`, `python -m module` or an installed command)
+        and without what the shell does with its output.
+        """
+        words = shlex.split(example)
+        end = next((i for i, word in enumerate(words) if word in (">", "|")), len(words))
+        return words[1 if words[0] != "python" else 3 if words[1] == "-m" else 2 : end]
 
 
 class Paragraphs(argparse.HelpFormatter):

@@ -1,4 +1,4 @@
-"""The schema as text: each field with its dotted path, type, default, unit, bounds and meaning, for reference and completion."""
+"""The schema as text: every field with path, type, default, unit, bounds and meaning, for reference and completion."""
 
 import ast
 import dataclasses
@@ -34,6 +34,8 @@ class FieldText:
     """What its numbers must be; empty where they may be any."""
     meaning: str
     """Its docstring, on one line."""
+    choices: tuple[str, ...] = ()
+    """The values that it may have, where they can be counted."""
     is_section: bool = False
     """Whether it has fields of its own, which follow it."""
 
@@ -55,7 +57,11 @@ def fields(schema: type, defaults: Any = None, prefix: str = "") -> Iterator[Fie
             yield FieldText(f"{path}.<name>", "a section", None, "", "", meaning, is_section=True)
             yield from fields(typing.cast(type, of_entries), None, f"{path}.<name>.")
         else:
-            yield FieldText(path, kind_of(hint), to_dict(value), unit_of(meaning), bounds_of(field.metadata), meaning)
+            choices = (
+                ("true", "false") if hint is bool else typing.get_args(hint) if typing.get_origin(hint) is Literal else ()
+            )
+            unit, bounds = unit_of(meaning), bounds_of(field.metadata)
+            yield FieldText(path, kind_of(hint), to_dict(value), unit, bounds, meaning, choices)
 
 
 @functools.cache
@@ -109,7 +115,7 @@ def bounds_of(metadata: Mapping[str, Any]) -> str:
     """Say in words what the bounds of a field allow."""
     low, high = metadata.get("min"), metadata.get("max")
     parts = []
-    if "above" in metadata:
+    if "above" in metadata and high is not None:
         least = f"above {metadata['above']}" if low is None or low <= SMALLEST else f"at least {_number(low)}"
         parts.append(f"{least}, at most {_number(high)}")
     elif low is not None and high is not None:
