@@ -126,7 +126,7 @@ def commands_page() -> str:
 def _arguments(parser: argparse.ArgumentParser) -> Iterator[str]:
     """Yield rows of a table of a parser's arguments."""
     for action in parser._actions:
-        if isinstance(action, argparse._HelpAction):
+        if isinstance(action, argparse._HelpAction) or action.help == argparse.SUPPRESS:
             continue
         named = ", ".join(action.option_strings) or action.metavar or action.dest
         choices = f": {', '.join(map(str, action.choices))}" if action.choices else ""

@@ -47,7 +47,7 @@ def words_of(parser: argparse.ArgumentParser, choices: Mapping[str, tuple[str, .
     values: dict[str, tuple[str, ...]] = {}
     for action in parser._actions:
         for name in action.option_strings:
-            if name.startswith("--"):
+            if name.startswith("--") and action.help != argparse.SUPPRESS:
                 flags.append(name)
                 known = tuple(map(str, action.choices)) if action.choices else of_flags.get(name, ())
                 values |= {name: known} if known else {}

@@ -1,5 +1,6 @@
 """Completion in bash and zsh: what the shells' own functions offer after the beginning of a command line."""
 
+import argparse
 import contextlib
 import io
 import shutil
@@ -7,6 +8,7 @@ import subprocess
 
 import pytest
 
+from legged.commandline.completion import words_of
 from legged.commandline.listing import robots, tasks
 from legged.tools import completion
 
@@ -103,6 +105,19 @@ def test_a_task_that_has_come_later_is_offered(tmp_path, monkeypatch):
         for name in names:
             (folder / f"{name}.yaml").touch()
         assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.split() == names
+
+
+def test_words_of_a_parser():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("names", nargs="*", metavar="TASK | key=value")
+    parser.add_argument("--task")
+    parser.add_argument("-s", "--side", choices=[1, 2], type=int)
+    parser.add_argument("--again", action="store_true")
+    parser.add_argument("--worker", help=argparse.SUPPRESS)  # for the command's own use
+    words = words_of(parser, {"sim.physics": (), "sim.solver": ()})
+    assert words.flags == ("--help", "--task", "--side", "--again")
+    assert words.values == {"--task": ("@tasks",), "--side": ("1", "2")}
+    assert (words.tasks, words.keys) == (True, True)
 
 
 def test_another_shell_is_a_wrong_flag(capsys):
