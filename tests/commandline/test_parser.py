@@ -30,7 +30,7 @@ def test_help_of_a_command_shows_two_examples_that_it_can_read(tool, capsys):
         args = parser.parse_intermixed_args(CommandParser.arguments_of(example))
         task = getattr(args, "task", None)
         assert task is None or task in tasks() or tool == "legged.tools.migrate"  # its tasks are those of legged_gym
-        if hasattr(args, "overrides"):
+        if task is not None and hasattr(args, "overrides"):
             task_config(task, overrides(args))  # its settings are ones of that task
 
 
