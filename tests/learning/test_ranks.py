@@ -64,6 +64,9 @@ def torchrun(output: str, *arguments: str, **environment: str):
     try:
         yield process
     finally:
+        with contextlib.suppress(OSError):  # it is a zombie by now, or there is no /proc
+            for child in children(process):  # torchrun gives each a session of its own
+                os.kill(child, signal.SIGKILL)
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
