@@ -18,6 +18,7 @@ from legged.commandline.arguments import (
     settle_on,
 )
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.config import LeggedConfig, override
 from legged.envs import BaseTask, LeggedRobot
 from legged.errors import ConfigError, RunError
@@ -48,8 +49,14 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="play.py", description="See what a policy does, and export it.")
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "play.py",
+        "See what a policy does, and export it.",
+        "python play.py --task anymal_c --terrain stairs_up --difficulty 0.8",
+        "python play.py --task anymal_c_flat --load_run 2026-11-22_05-38-19 --headless --gif",
+    )
     add_task_arguments(parser)
     add_run_arguments(parser)
     parser.add_argument("--terrain", metavar="TYPE", help="type of the tiles, e.g. stairs_up; the task's own by default")
@@ -58,7 +65,11 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("--gif", action="store_true", help="also write a GIF")
     parser.add_argument("--no-video", action="store_true", help="export and measure only")
     parser.add_argument("--out", type=Path, help="folder for video and exported/; the run folder by default")
-    args = parser.parse_intermixed_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_intermixed_args(argv)
     register_given(args)
     device = pick_device(args.sim_device)
     settle_on(device)

@@ -21,6 +21,7 @@ from legged.commandline.arguments import (
 )
 from legged.commandline.command import EXIT_FAILED, run_main
 from legged.commandline.output import when_output_is_lost
+from legged.commandline.parser import CommandParser
 from legged.commandline.show import summary
 from legged.commandline.stopping import quiet_writers, stopping_on_signals
 from legged.config import TaskConfig, to_yaml
@@ -49,10 +50,15 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    start = STARTED_S if argv is None else time.perf_counter()  # as a command, imports are part of it
-    stage_ended("imports")
-    parser = argparse.ArgumentParser(prog="train.py", description="Train a legged robot.")
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "train.py",
+        "Train a legged robot.",
+        "python train.py --task anymal_c_flat",
+        "python train.py --task anymal_c --num_envs 8192 --seed 3 rewards.scales.torques=-1e-4",
+        "python train.py --task anymal_c --resume",
+    )
     add_task_arguments(parser)
     add_run_arguments(parser)
     parser.add_argument("--resume", action="store_true", help="go on from a checkpoint, in a new run folder")
@@ -65,7 +71,13 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument(
         "--show", action="store_true", help="print the full configuration, terms, actions and joints, and stop"
     )
-    args = parser.parse_intermixed_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    start = STARTED_S if argv is None else time.perf_counter()  # as a command, imports are part of it
+    stage_ended("imports")
+    args = build_parser().parse_intermixed_args(argv)
 
     register_given(args)
     device = pick_device(args.sim_device)

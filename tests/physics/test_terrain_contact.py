@@ -281,7 +281,7 @@ def test_c_mujoco_s_height_fields_lean_at_seams_and_ours_follow_the_slope():
     spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{free_body('foot')}</worldbody></mujoco>")
     add_terrain(spec, ground)
     theirs = leans(c_contacts(spec.compile(), qpos))
-    # A bracket around the figure in docs/results.md and decisions.md: outside it MuJoCo has changed, and both must, too.
+    # A bracket around the figure in docs/results.md and engines.md: outside it MuJoCo has changed, and both must, too.
     assert 0.2 < (theirs > 10.0).mean() < 0.32
     assert theirs.max() < 25.0
 
