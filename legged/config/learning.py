@@ -107,7 +107,7 @@ class RunnerConfig:
     report: bool = True
     """Write report.html and report.md into the run folder when a training ends."""
     film: bool = True
-    """Film the last policy for the report of a training that came to its end, where pictures can be drawn: some ten seconds."""
+    """Film the last policy for the report of a training that came to its end, if pictures can be drawn: some ten seconds."""
 
 
 @dataclass(frozen=True)
