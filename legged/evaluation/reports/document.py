@@ -44,7 +44,7 @@ class Heading:
 
 @dataclass(frozen=True)
 class Paragraph:
-    """Sentences; a short `badge` may stand before them."""
+    """Sentences, in which code stands between backticks; a short `badge` may stand before them."""
 
     text: str
     badge: str = ""
@@ -110,7 +110,7 @@ def _html(part: Part) -> str:
             return f"<h2>{escape(text)}</h2>"
         case Paragraph(text, badge):
             mark = f'<span class="badge {escape(badge.split()[0])}">{escape(badge)}</span> ' if badge else ""
-            return f"<p>{mark}{escape(text)}</p>"
+            return f"<p>{mark}{_html_text(text)}</p>"
         case Table():
             return _html_table(part)
         case Figures(_, drawings, _):
@@ -125,15 +125,19 @@ def _html(part: Part) -> str:
             return f"<details><summary>{escape(title)}</summary><pre>{escape(text)}</pre></details>"
 
 
+def _html_text(text: str) -> str:
+    """Return sentences with their code set as such; a backtick that closes nothing is one."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
+
+
 def _html_table(table: Table) -> str:
     numeric = [all(isinstance(row[i], Number) for row in table.rows) for i in range(len(table.head))]
     marks = [' class="n"' if one else "" for one in numeric]
     texts = [f'<button type="button">{escape(text)}</button>' if table.wide else escape(text) for text in table.head]
     head = "".join(f"<th{mark}>{text}</th>" for mark, text in zip(marks, texts, strict=True))
+    head = f"<thead><tr>{head}</tr></thead>\n" if any(table.head) else ""
     rows = "\n".join("<tr>" + "".join(map(_html_cell, row)) + "</tr>" for row in table.rows)
-    found = (
-        f"<table{' class=wide' if table.wide else ''}>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>"
-    )
+    found = f"<table{' class=wide' if table.wide else ''}>\n{head}<tbody>\n{rows}\n</tbody>\n</table>"
     search = '<p><input type="search" placeholder="filter" aria-label="filter the rows"> <span class="count"></span></p>\n'
     return f'{search if table.wide else ""}<div class="scroll">{found}</div>'
 
@@ -162,7 +166,7 @@ def _markdown(part: Part, pictures: str) -> str:
         case Heading(text):
             return f"## {_plain(text)}"
         case Paragraph(text, badge):
-            return f"**{_plain(badge)}**: {_plain(text)}" if badge else _plain(text)
+            return f"**{_plain(badge)}**: {_markdown_text(text)}" if badge else _markdown_text(text)
         case Table(head, rows):
             numeric = [bool(rows) and all(isinstance(row[i], Number) for row in rows) for i in range(len(head))]
             lines = [[_plain(text) for text in head], ["---:" if one else "---" for one in numeric]]
@@ -189,6 +193,16 @@ def _markdown_cell(cell: Cell) -> str:
     return _plain(cell)
 
 
+def _markdown_text(text: str) -> str:
+    """Return sentences in which nothing but their code means anything to Markdown."""
+    pieces = re.split(r"(`[^`]+`)", " ".join(text.split()))
+    return "".join(piece if i % 2 else _escaped(piece) for i, piece in enumerate(pieces))
+
+
 def _plain(text: str) -> str:
-    """Return a text in which no letter means anything to Markdown."""
-    return re.sub(r"([\\`*_\[\]<>|#])", r"\\\1", " ".join(text.split()))
+    """Return a text on one line in which no letter means anything to Markdown."""
+    return _escaped(" ".join(text.split()))
+
+
+def _escaped(text: str) -> str:
+    return re.sub(r"([\\`*_\[\]<>|#])", r"\\\1", text)

@@ -21,7 +21,7 @@ table { border-collapse: collapse; font-size: .92em; }
 th, td { border-bottom: 1px solid var(--line); padding: 4px 10px; text-align: left; vertical-align: top; }
 th { background: var(--soft); }
 td { max-width: 56ch; overflow-wrap: anywhere; }
-td:has(code), td:first-child { min-width: 9em; }
+td:first-child code { white-space: nowrap; }
 .n { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
 th button { all: unset; cursor: pointer; font-weight: inherit; }
 th button:focus-visible { outline: 2px solid var(--link); }
@@ -38,6 +38,8 @@ input[type=search] { font: inherit; padding: 4px 8px; width: min(28em, 100%); bo
 figure { margin: 0; border: 1px solid var(--line); border-radius: 6px; padding: 6px; background: #fff; }
 figure svg { display: block; width: 100%; height: auto; touch-action: pan-y; }
 .film { max-width: 100%; height: auto; border: 1px solid var(--line); border-radius: 6px; }
+.scroll + .figures { margin-top: 12px; }
+@media (min-width: 900px) { .film { float: right; max-width: 38%; margin: 0 0 12px 24px; } h2 { overflow: hidden; } }
 details { border: 1px solid var(--line); border-radius: 6px; padding: 6px 12px; }
 pre { overflow-x: auto; max-height: 70vh; }
 #tip { position: fixed; z-index: 9; pointer-events: none; background: #fff; border: 1px solid #57606a; border-radius: 4px;

@@ -95,7 +95,7 @@ def report_parts(record: Record) -> list[Part]:
     parts += evaluation_parts(record.results) or [
         Heading("Evaluation"),
         Paragraph(
-            f"None yet: python -m legged.tools.evaluate --task {record.task} --load_run {record.folder.resolve().name}"
+            f"None yet: `python -m legged.tools.evaluate --task {record.task} --load_run {record.folder.resolve().name}`"
         ),
     ]
     if record.problems:

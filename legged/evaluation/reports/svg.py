@@ -175,7 +175,7 @@ class _Frame:
         self._key_x, self._rows = LEFT, 1 if names else 0
         for name in names:
             self._place(name)
-        self.top = TOP + 16.0 * self._rows
+        self.top = TOP + (16.0 * self._rows + 6.0 if self._rows else 0.0)
         self._key_x, self._rows = LEFT, 1 if names else 0
         self.height = HEIGHT + self.top - TOP
         self.floor = self.height - BOTTOM
