@@ -22,8 +22,8 @@ LEARNER = (
     ("Loss/value", "loss of the value function", 1.0),
 )
 NOT_OF_THE_TASK = (LENGTH, "Metrics/contact_overflows", "Metrics/non_finite_worlds")
-WATCHED = ("Eval/", "Evaluation/")
-"""Sections of what was measured without noise during training."""
+WATCHED = "Evaluation/"
+"""Section of what was measured without noise during training."""
 
 
 def curves_of_run(record: Record) -> list[str]:

@@ -32,6 +32,9 @@ class Number:
     value: float | None
 
 
+SHORT = 32
+"""Letters of a cell that stay on one line."""
+
 Cell = str | Mono | Link | Number
 
 
@@ -147,10 +150,15 @@ def _html_cell(cell: Cell) -> str:
         case Number(text, value):
             return f'<td class="n" data-sort="{"" if value is None else repr(float(value))}">{escape(text)}</td>'
         case Link(text, href):
-            return f'<td><a href="{escape(href)}">{escape(text)}</a></td>'
+            return f'<td class="short"><a href="{escape(href)}">{escape(text)}</a></td>'
         case Mono():
-            return f"<td><code>{escape(cell)}</code></td>"
-    return f"<td>{escape(cell)}</td>"
+            return f'<td class="{_width(cell)}"><code>{escape(cell)}</code></td>'
+    return f'<td class="{_width(cell)}">{escape(cell)}</td>'
+
+
+def _width(text: str) -> str:
+    """Return how a cell may be laid out: a short text stays on its line, a long one has room to be read."""
+    return "short" if len(text) <= SHORT else "long"
 
 
 # ---- Markdown --------------------------------------------------------------------------------------------------------

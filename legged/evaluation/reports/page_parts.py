@@ -20,8 +20,9 @@ code, pre { font: .87em/1.45 ui-monospace, "SF Mono", Menlo, Consolas, monospace
 table { border-collapse: collapse; font-size: .92em; }
 th, td { border-bottom: 1px solid var(--line); padding: 4px 10px; text-align: left; vertical-align: top; }
 th { background: var(--soft); }
-td { max-width: 56ch; overflow-wrap: anywhere; }
-td:first-child code { white-space: nowrap; }
+td { max-width: 56ch; overflow-wrap: break-word; }
+td.long { min-width: 16em; }
+td.short { white-space: nowrap; }
 .n { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
 th button { all: unset; cursor: pointer; font-weight: inherit; }
 th button:focus-visible { outline: 2px solid var(--link); }
