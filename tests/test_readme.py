@@ -28,7 +28,15 @@ def test_the_example_task_trains_without_touching_the_package(tmp_path, monkeypa
     path.write_text(code, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "_REGISTERED", {})
-    options = ["env.num_envs=4", "train.runner.num_steps_per_env=4", "--max_iterations", "1", "--sim_device", "cpu"]
+    options = [
+        "train.runner.report=false",
+        "env.num_envs=4",
+        "train.runner.num_steps_per_env=4",
+        "--max_iterations",
+        "1",
+        "--sim_device",
+        "cpu",
+    ]
     assert train.main(["--import", str(path), "--task", "careful", *options]) == 0
     assert list(tmp_path.glob("logs/careful/*/model_0.pt"))
 

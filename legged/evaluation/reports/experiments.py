@@ -19,7 +19,7 @@ EMPTY = ("", "-")
 
 
 def experiments_parts(records: Sequence[Record], beside: Path, ending: str) -> list[Part]:
-    """Return the page on some runs. Those below the folder `beside`, where the page is written, lead to their reports, of that
+    """Return the page on some runs. Those below the folder `beside`, where the page is written, lead to their reports of that
     `ending`.
     """
     newest = sorted(records, key=lambda record: (record.began, record.name), reverse=True)
