@@ -11,7 +11,20 @@ from helpers import POLICY
 
 from legged import registry
 from legged.registry import import_tasks, make_task, task_config
-from legged.tools import benchmark, compare, contact_sheet, evaluate, play, plot, show_terrain, train, warmup, zoo
+from legged.tools import (
+    benchmark,
+    compare,
+    contact_sheet,
+    evaluate,
+    experiments,
+    play,
+    plot,
+    report,
+    show_terrain,
+    train,
+    warmup,
+    zoo,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {path: path.read_text(encoding="utf-8") for path in (*ROOT.glob("*.md"), *sorted((ROOT / "docs").glob("*.md")))}
@@ -72,6 +85,8 @@ def test_the_readme_names_every_task():
         ("python -m legged.tools.show_terrain", show_terrain.main),
         ("python -m legged.tools.zoo", zoo.main),
         ("python -m legged.tools.contact_sheet", contact_sheet.main),
+        ("python -m legged.tools.report", report.main),
+        ("python -m legged.tools.experiments", experiments.main),
     ],
 )
 def test_every_flag_that_is_shown_exists(name, main, capsys):

@@ -194,3 +194,12 @@ def test_a_run_is_compared_with_others_only(capsys):
     assert "--compare: a run comes twice" in capsys.readouterr().err
     assert call(experiments.main, ["--compare", str(folder), f"{TASK}/{folder.name}x"]) == 2
     assert f"did you mean '{TASK}/{folder.name}'" in capsys.readouterr().err
+
+
+def test_the_log_of_this_project_is_one_that_the_tool_writes():
+    page = Path(experiments.__file__).parents[2] / "docs" / "experiments.md"
+    found = table(str(page))
+    assert {"began", "task", "what changed", "status", "steps/s"} <= found[0].keys()
+    began = [row["began"] for row in found]
+    assert began == sorted(began, reverse=True)
+    assert f"{len(found)} runs, newest first" in page.read_text(encoding="utf-8")
