@@ -33,7 +33,16 @@ MODULES = {name: text for name, text in BLOCKS if "/" not in name}
 EXCERPTS = [(name, text) for name, text in BLOCKS if "/" in name]
 NETWORKS = (ROOT / "docs" / "networks.md").read_text(encoding="utf-8")
 COMMANDS = [line for language, text in (*fenced(PAGE), *fenced(NETWORKS)) if not language for line in text.splitlines()]
-TINY = ["--num_envs", "8", "--max_iterations", "1", "--run_name", "tiny", "train.runner.num_steps_per_env=4"]
+TINY = [
+    "--num_envs",
+    "8",
+    "--max_iterations",
+    "1",
+    "--run_name",
+    "tiny",
+    "train.runner.report=false",
+    "train.runner.num_steps_per_env=4",
+]
 ENGINE = ["--sim_device", "cpu", "sim.physics=mujoco", "sim.threads=1"]
 MAINS = {
     "python train.py": (train.main, [*TINY, *ENGINE]),

@@ -104,6 +104,10 @@ class RunnerConfig:
     """Folder under logs/; the task's name when empty."""
     run_name: str = field(default="", metadata=NAME)
     """Appended to the run folder's date and time."""
+    report: bool = True
+    """Write report.html and report.md into the run folder when a training ends."""
+    film: bool = True
+    """Film the last policy for the report of a training that came to its end, if pictures can be drawn: some ten seconds."""
 
 
 @dataclass(frozen=True)

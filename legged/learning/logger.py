@@ -3,6 +3,7 @@
 import contextlib
 import io
 import math
+import statistics
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +13,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from legged.learning.display import Display, Progress
 from legged.learning.distributed import any_rank
+from legged.learning.divergence_meter import DivergenceMeter
 from legged.learning.watch import FAULT, MINI_BATCHES, Diverged, FaultWatch
 
 
@@ -30,6 +32,12 @@ class QuietLogger(Logger):
         self.stop_requested = False
         self.loop_s = 0.0
         """Time spent in iterations so far, this process [s]."""
+        self.return_std: float | None = None
+        """Standard deviation of the returns of the episodes that ended in the last rollout in which any did; of those in the
+        buffer of returns where the training loop does not say.
+        """
+        self.divergence: DivergenceMeter | None = None
+        """What hears of the divergence where rsl-rl's own update computes it."""
         self.latest: dict[str, float] = {}
         """The last value of everything the task logs, NaN while it had none: an iteration in which no episode ended has no
         episode means.
@@ -67,7 +75,10 @@ class QuietLogger(Logger):
         if left_out > 0.0:
             values[MINI_BATCHES] = left_out
         self.ep_extras[:] = [dict(values)] if values else []  # a copy: rsl-rl puts tensors in
-        losses = {name: loss for name, loss in kwargs.pop("loss_dict").items() if math.isfinite(loss)}
+        kl = self.divergence.flush() if self.divergence else None
+        losses = kwargs.pop("loss_dict") | ({} if kl is None else {"kl": kl})
+        losses = {name: loss for name, loss in losses.items() if math.isfinite(loss)}
+        self._log_return_std(it)
         with contextlib.redirect_stdout(io.StringIO()):
             super().log(it, start_it, total_it, collect_time, learn_time, loss_dict=losses, **kwargs)
         self.watch.judge(values, left_out)
@@ -92,3 +103,10 @@ class QuietLogger(Logger):
             raise Diverged(self.watch.why_stop or "numbers of another process were NaN or infinite")
         if any_rank(self.stop_requested, torch.device(self.device)) and it + 1 < total_it:
             raise Interrupted
+
+    def _log_return_std(self, it: int) -> None:
+        """Write how much returns of episodes differ, which rsl-rl leaves out."""
+        if self.writer is not None and self.rewbuffer:
+            std = statistics.pstdev(self.rewbuffer) if self.return_std is None else self.return_std
+            if math.isfinite(std):
+                self.writer.add_scalar("Train/std_reward", std, it)  # type: ignore[attr-defined]

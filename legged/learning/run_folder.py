@@ -19,6 +19,7 @@ from legged.registry import task_schema
 LOGS = Path("logs")
 CONFIG_FILE = "config.yaml"
 CODE_FILE = "code.diff"
+NOTE_FILE = "note.txt"
 SHIPPED_MODEL = "model.pt"
 GIT_S = 30.0
 """Git has so long to answer; on a slow network disk it may take its time [s]."""
@@ -65,7 +66,7 @@ def discard_run(folder: Path) -> None:
     """
     if checkpoints(folder):
         return
-    ours = [folder / CONFIG_FILE, folder / CODE_FILE, *folder.glob("events.out.tfevents.*")]
+    ours = [folder / name for name in (CONFIG_FILE, CODE_FILE, NOTE_FILE)] + [*folder.glob("events.out.tfevents.*")]
     with suppress(OSError):
         for path in ours:
             path.unlink(missing_ok=True)

@@ -24,6 +24,7 @@ from legged.learning.checkpoint import (
 )
 from legged.learning.display import Display
 from legged.learning.distributed import RankLost, join, leave
+from legged.learning.divergence_meter import DivergenceMeter
 from legged.learning.logger import Interrupted, QuietLogger
 from legged.learning.networks import keep_std_in_bounds, network_settings, use_matmul
 from legged.learning.recurrent import hidden_states
@@ -100,6 +101,7 @@ class Runner(OnPolicyRunner):
             display=display,
             left_out=self._left_out,
         )
+        self.logger.divergence = DivergenceMeter(self.alg.actor)
 
     def _left_out(self) -> float:
         """Return the share of the last update's mini-batches that changed nothing: their gradients were no numbers."""

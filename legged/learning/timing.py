@@ -37,6 +37,8 @@ class Timing:
     """Modules of Warp's kernels that its cache lacked."""
     beside: int = 0
     """Other trainings that ran on the same machine at the same time, as far as who started it knows."""
+    error: str = ""
+    """What ended it, in one line, where that was neither its last iteration nor a signal."""
 
     @property
     def steps_per_s(self) -> float:

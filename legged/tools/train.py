@@ -7,6 +7,8 @@ import shlex
 import signal
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -30,13 +32,13 @@ from legged.learning.captured import CapturedRunner
 from legged.learning.display import Display
 from legged.learning.distributed import RankLost, check_reachable
 from legged.learning.resume import resumed
-from legged.learning.run_folder import create_run, discard_run, experiment_folder, find_run
+from legged.learning.run_folder import NOTE_FILE, create_run, discard_run, experiment_folder, find_run
 from legged.learning.runner import Runner
 from legged.learning.timing import Timing, write_timing
 from legged.learning.transfer import transferred
 from legged.physics import engine_name, resolve_physics
 from legged.process.cores import available_cores
-from legged.process.paths import full_disk_in, ready_to_write, reason, relative
+from legged.process.paths import full_disk_in, ready_to_write, reason, relative, write_text
 from legged.process.ranks import Ranks
 from legged.process.startup import STARTED_S, command_of_ours, stage_ended
 from legged.registry import make_task, task_config
@@ -65,6 +67,7 @@ def build_parser() -> CommandParser:
     parser.add_argument("--transfer", action="store_true", help="begin with the networks of --load_run, also of another task")
     parser.add_argument("--run_name", help="appended to the run folder's name")
     parser.add_argument("--max_iterations", type=int, help="length of the whole training")
+    parser.add_argument("--note", help="a sentence about this run, for its report and the list of all runs")
     parser.add_argument("--rl_device", help="device of the networks; that of the simulation by default")
     parser.add_argument("--runner", choices=["stock", "captured"], help="training loop (train.runner.loop)")
     parser.add_argument("--headless", action="store_true", help="accepted for legged_gym's sake: training draws nothing")
@@ -135,9 +138,16 @@ def _train(
             how = f"all robots begin anew: {why_anew}" if why_anew else "robots and random numbers go on where they were"
             print(f"resumed {relative(checkpoint)} after iteration {runner.current_learning_iteration}; {how}", flush=True)
         ready = time.perf_counter()
+        resumed = checkpoint is not None and not args.transfer
+
+        def timing(finished: bool, error: str = "") -> Timing:
+            return replace(
+                _timing(runner, device, ready - start, time.perf_counter() - start, finished, resumed), error=error
+            )
+
         with stopping_on_signals(runner.stop) as stopped_by, quiet_writers():
             try:
-                folder, finished = _learn(runner, cfg, display)
+                folder, finished = _learn(runner, cfg, display, args.note, timing)
             except RankLost as lost:
                 print(lost, file=sys.stderr, flush=True)
                 return EXIT_FAILED
@@ -147,19 +157,21 @@ def _train(
                 print("interrupted", file=sys.stderr, flush=True)
                 return 128 + stopped_by[-1]
     if folder:
-        resumed = checkpoint is not None and not args.transfer
-        timing = _timing(runner, device, ready - start, time.perf_counter() - start, finished, resumed)
-        _summary(runner, folder, timing, play_command(args, cfg, folder))
-        write_timing(folder, timing)
+        took = timing(finished)
+        _summary(runner, folder, took, play_command(args, cfg, folder))
+        write_timing(folder, took)
+        _report(folder, cfg, args if finished else None)
     if finished:
         return 0
     # Without a signal of its own it is the output that went away, or another process that was asked to stop.
     return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
 
 
-def _learn(runner: Runner, cfg: TaskConfig, display: Display | None) -> tuple[Path | None, bool]:
+def _learn(
+    runner: Runner, cfg: TaskConfig, display: Display | None, note: str | None, timing: Callable[[bool, str], Timing]
+) -> tuple[Path | None, bool]:
     """Train into a new run folder; gives the folder, none where another process has it, and whether training got to its end.
-    A training that fails before its first checkpoint leaves no folder.
+    A training that fails before its first checkpoint leaves no folder; one that fails later says so there, with its times.
 
     Raises:
         RunError: the folder can't be written.
@@ -167,6 +179,8 @@ def _learn(runner: Runner, cfg: TaskConfig, display: Display | None) -> tuple[Pa
     folder = create_run(cfg) if display else None
     if folder is None or display is None:
         return None, runner.train(cfg.train.runner.max_iterations)
+    if note is not None:
+        write_text(folder / NOTE_FILE, f"{note}\n")
     print(f"run folder {relative(folder)}", flush=True)
     display.title = f"{cfg.task}: {relative(folder)}"
     runner.logger.log_dir = str(folder)
@@ -178,10 +192,32 @@ def _learn(runner: Runner, cfg: TaskConfig, display: Display | None) -> tuple[Pa
             with contextlib.suppress(OSError):
                 runner.logger.stop_logging_writer()
         discard_run(folder)
+        if folder.is_dir():
+            _leave_word(folder, error, cfg, timing)
         full = full_disk_in(error)
         if full is not None and not isinstance(error, RunError):  # TensorBoard's writer does not say which file
             raise RunError(f"{relative(folder)}: {reason(full)}") from error
         raise
+
+
+def _leave_word(folder: Path, error: BaseException, cfg: TaskConfig, timing: Callable[[bool, str], Timing]) -> None:
+    """Write into the folder of a training that failed what ended it, and the report on it; on a full disk nothing can be."""
+    said = "" if isinstance(error, KeyboardInterrupt) else " ".join(f"{type(error).__name__}: {error}".split())[:500]
+    with contextlib.suppress(RunError, RuntimeError):  # a broken CUDA device can't be asked for its name
+        write_timing(folder, timing(False, said))
+        _report(folder, cfg, None)
+
+
+def _report(folder: Path, cfg: TaskConfig, args: argparse.Namespace | None) -> None:
+    """Write the report on a training that has ended, unless it asks for none; with a film, if that can be told its task."""
+    if not cfg.train.runner.report:
+        return
+    from legged.evaluation.reports.at_end import report_at_end  # a start does without what it imports
+
+    film_with = None
+    if args is not None and cfg.train.runner.film:
+        film_with = ["--task", args.given_task, *(["--import", args.module] if args.module else [])]
+    report_at_end(folder, film_with)
 
 
 def describe(cfg: TaskConfig, device: torch.device) -> str:
