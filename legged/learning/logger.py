@@ -12,6 +12,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from legged.learning.display import Display, Progress
 from legged.learning.distributed import any_rank
+from legged.learning.evaluations import SECTION, Ended
 from legged.learning.watch import FAULT, MINI_BATCHES, Diverged, FaultWatch
 
 
@@ -28,6 +29,10 @@ class QuietLogger(Logger):
         self.display, self._left_out = display, left_out
         self.watch = FaultWatch(self.cfg["num_steps_per_env"] * self.num_envs)
         self.stop_requested = False
+        self.evaluate: Callable[[int, int], dict[str, float]] = lambda _iterations, _total: {}
+        """Evaluates the policy after so many iterations of a total, where that is due, and gives what it finds."""
+        self.why_end: Callable[[], str] | None = None
+        """Says why the last evaluation ends the training, or nothing; None where no process evaluates."""
         self.loop_s = 0.0
         """Time spent in iterations so far, this process [s]."""
         self.latest: dict[str, float] = {}
@@ -55,6 +60,7 @@ class QuietLogger(Logger):
 
         Raises:
             Interrupted: it was asked for.
+            Ended: an evaluation says so.
             Diverged: numbers have been NaN or infinite for too long.
         """
         # An episode mean has no value (NaN) in a rollout in which none ended; leave it out rather than write NaN.
@@ -63,6 +69,8 @@ class QuietLogger(Logger):
         for entry in self.ep_extras:
             stacked = torch.stack([value.reshape(()) for value in entry.values()]).tolist()  # one transfer, not twenty
             values.update({key: value for key, value in zip(entry, stacked, strict=True) if value == value})
+        evaluated = self.evaluate(it + 1, total_it)
+        values.update({f"{SECTION}{name}": value for name, value in evaluated.items() if math.isfinite(value)})
         left_out = self._left_out()
         if left_out > 0.0:
             values[MINI_BATCHES] = left_out
@@ -90,5 +98,7 @@ class QuietLogger(Logger):
             )
         if any_rank(bool(self.watch.why_stop), torch.device(self.device)):
             raise Diverged(self.watch.why_stop or "numbers of another process were NaN or infinite")
+        if self.why_end is not None and any_rank(bool(self.why_end()), torch.device(self.device)) and it + 1 < total_it:
+            raise Ended
         if any_rank(self.stop_requested, torch.device(self.device)) and it + 1 < total_it:
             raise Interrupted

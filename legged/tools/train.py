@@ -25,9 +25,11 @@ from legged.commandline.show import summary
 from legged.commandline.stopping import quiet_writers, stopping_on_signals
 from legged.config import TaskConfig, to_yaml
 from legged.errors import ConfigError, RunError
+from legged.evaluation.during_training import TrainingEvaluation, check_commands
 from legged.learning.captured import CapturedRunner
 from legged.learning.display import Display
 from legged.learning.distributed import RankLost, check_reachable
+from legged.learning.evaluations import Evaluations
 from legged.learning.resume import resumed
 from legged.learning.run_folder import create_run, discard_run, experiment_folder, find_run
 from legged.learning.runner import Runner
@@ -79,6 +81,7 @@ def _main(argv: list[str] | None) -> int:
     else:
         cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
     resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics"))
+    check_commands(cfg)
     if args.show:
         print(to_yaml(cfg), end="")
         print(*summary(cfg), sep="\n")
@@ -122,6 +125,8 @@ def _train(
             why_anew = runner.resume(str(checkpoint))
             how = f"all robots begin anew: {why_anew}" if why_anew else "robots and random numbers go on where they were"
             print(f"resumed {relative(checkpoint)} after iteration {runner.current_learning_iteration}; {how}", flush=True)
+        if cfg.train.runner.evaluate_interval:
+            _evaluate_during(runner, checkpoint if not args.transfer else None)
         ready = time.perf_counter()
         with stopping_on_signals(runner.stop) as stopped_by, quiet_writers():
             try:
@@ -145,6 +150,16 @@ def _train(
     return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
 
 
+def _evaluate_during(runner: Runner, resumed_from: Path | None) -> None:
+    """Let the first process evaluate the policy while it is trained."""
+    evaluations = None
+    if Ranks.now().first:
+        evaluations = Evaluations(runner.env.cfg, TrainingEvaluation(runner.env))
+        if resumed_from is not None:
+            evaluations.go_on_from(resumed_from)
+    runner.evaluate_with(evaluations)
+
+
 def _learn(runner: Runner, cfg: TaskConfig, display: Display | None) -> tuple[Path | None, bool]:
     """Train into a new run folder; gives the folder, none where another process has it, and whether training got to its end.
     A training that fails before its first checkpoint leaves no folder.
@@ -157,6 +172,8 @@ def _learn(runner: Runner, cfg: TaskConfig, display: Display | None) -> tuple[Pa
         return None, runner.train(cfg.train.runner.max_iterations)
     print(f"run folder {relative(folder)}", flush=True)
     display.title = f"{cfg.task}: {relative(folder)}"
+    if runner.evaluations is not None:
+        runner.evaluations.begin_in(folder)
     runner.logger.log_dir = str(folder)
     when_output_is_lost(runner.stop)
     try:
@@ -226,10 +243,13 @@ def _timing(runner: Runner, device: torch.device, start_up_s: float, wall_s: flo
         wall_s=wall_s,
         device=torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         kernels_compiled=runner.env.physics.compiled,
+        evaluation_s=runner.evaluations.spent_s if runner.evaluations is not None else 0.0,
     )
 
 
 def _summary(runner: Runner, folder: Path, timing: Timing, play: str) -> None:
+    if runner.evaluations is not None:
+        print(*runner.evaluations.summary(timing.loop_s), sep="\n")
     print(
         f"{'finished' if timing.finished else 'stopped'} after {runner.current_learning_iteration + 1} iterations: "
         f"{timing.steps:,} steps in {timing.loop_s:.1f} s of training loop ({timing.steps_per_s:,.0f} steps/s), "
