@@ -7,6 +7,7 @@ import shlex
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -51,7 +52,21 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
+Prepared = Callable[[Runner], None]
+"""What is told of the runner, once it is built and before it trains."""
+
+
+def train_as_asked(argv: list[str], prepared: Prepared) -> int:
+    """Train as a command line asks, within another command; return the exit code. Errors are raised.
+
+    Raises:
+        ConfigError: the command line or the configuration is wrong.
+        RunError: training could not go on.
+    """
+    return _main(argv, prepared)
+
+
+def _main(argv: list[str] | None, prepared: Prepared | None = None) -> int:
     start = STARTED_S if argv is None else time.perf_counter()  # as a command, imports are part of it
     stage_ended("imports")
     parser = argparse.ArgumentParser(prog="train.py", description="Train a legged robot.")
@@ -90,9 +105,9 @@ def _main(argv: list[str] | None) -> int:
         print(f"going on with the settings of {relative(checkpoint.parent)}" + "".join(f"; {text}" for text in changed))
     settle_on(device)
     if Ranks.now().first:
-        return _train(args, cfg, device, rl_device, checkpoint, start)
+        return _train(args, cfg, device, rl_device, checkpoint, start, prepared)
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-        return _train(args, cfg, device, rl_device, checkpoint, start)
+        return _train(args, cfg, device, rl_device, checkpoint, start, prepared)
 
 
 def _train(
@@ -102,6 +117,7 @@ def _train(
     rl_device: torch.device,
     checkpoint: Path | None,
     start: float,
+    prepared: Prepared | None,
 ) -> int:
     """Build and train; returns the exit code. Of several processes the first one has a run folder and a display."""
     first = Ranks.now().first
@@ -127,6 +143,8 @@ def _train(
             print(f"resumed {relative(checkpoint)} after iteration {runner.current_learning_iteration}; {how}", flush=True)
         if cfg.train.runner.evaluate_interval:
             _evaluate_during(runner, checkpoint if not args.transfer else None)
+        if prepared is not None:
+            prepared(runner)
         ready = time.perf_counter()
         with stopping_on_signals(runner.stop) as stopped_by, quiet_writers():
             try:
