@@ -150,12 +150,11 @@ def _telling(trials: Trials, start: float) -> Iterator[None]:
         last = False
         while not last:
             last = over.wait(TELL_S)
-            there = finished(trials.all)
-            for trial in there:
+            for trial in finished(trials.all):
                 if trial.number not in told:
                     told.add(trial.number)
                     what = trial.user_attrs.get(WHY) if trial.value is None else f"{trial.value:.4g}"
-                    counted = f"[{len(there)} of {trials.plan.given.trials}]"
+                    counted = f"[{len(told)} of {trials.plan.given.trials}]"
                     print(f"{time.perf_counter() - start:7.1f} s  trial {trial.number:3d}  {what}  {counted}", flush=True)
 
     thread = threading.Thread(target=tell, daemon=True)

@@ -134,7 +134,7 @@ def importances(trials: Trials) -> dict[str, float]:
 
 
 def draw_history(plan: Plan, trials: Sequence["FrozenTrial"], path: Path) -> None:
-    """Draw the value of each trial, and the best one so far; ticks on the axis are trials that were ended early."""
+    """Draw the value of each trial, and the best one so far; crosses on the axis are trials that were ended early."""
     there = [trial for trial in trials if trial.state.name == "COMPLETE"]
     early = [trial.number for trial in trials if trial.state.name == "PRUNED"]
     numbers, values = [trial.number for trial in there], [float(trial.value or 0.0) for trial in there]
@@ -143,10 +143,11 @@ def draw_history(plan: Plan, trials: Sequence["FrozenTrial"], path: Path) -> Non
     with figure(path, (7.0, 3.6)) as (drawn, axes):
         (axis,) = axes.flat
         axis.plot(numbers, values, "o", ms=4, color=BLUE, label="trial")
-        axis.step(numbers, best, where="post", color=VERMILLION, label="best so far")
+        until = max([*numbers, *early])
+        axis.step([*numbers, until], [*best, best[-1]], where="post", color=VERMILLION, label="best so far")
         if early:
             low = axis.get_ylim()[0]
-            axis.plot(early, [low] * len(early), "|", ms=8, color=GREY, clip_on=False, label="ended early")
+            axis.plot(early, [low] * len(early), "x", ms=6, color=GREY, clip_on=False, zorder=5, label="ended early")
             axis.set_ylim(bottom=low)
         axis.set_xlabel("trial")
         axis.set_ylabel(plan.objective_text)
@@ -218,7 +219,8 @@ def _scale(axis: Any, column: int, one: Parameter) -> None:
     """Write the ends of a setting's axis, or its choices, beside it."""
     marks = {index / max(len(one.choices) - 1, 1): text.strip('"') for index, text in enumerate(one.choices)}
     for height, text in (marks or {0.0: f"{one.low:g}", 1.0: f"{one.high:g}"}).items():
-        axis.text(column + 0.04, height, text, va="bottom" if height < 0.5 else "top", fontsize="small")
+        place = {"va": "bottom" if height < 0.5 else "top", "fontsize": "small"}
+        axis.text(column + 0.04, height, text, bbox={"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 1}, **place)
 
 
 def _short(path: str) -> str:
