@@ -120,6 +120,11 @@ class RunnerConfig:
     """Folder under logs/; the task's name when empty."""
     run_name: str = field(default="", metadata=NAME)
     """Appended to the run folder's date and time."""
+    logger: str = "tensorboard"
+    """Where training is logged beside TensorBoard: `tensorboard` for nowhere, `wandb`, `neptune`, or module:Class of a writer
+    that extends rsl-rl's LogWriter."""
+    logger_project: str = field(default="", metadata=NAME)
+    """Project there; the folder under logs/ when empty."""
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ import contextlib
 import io
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,6 +14,7 @@ from torch.utils.tensorboard import SummaryWriter
 from legged.learning.display import Display, Progress
 from legged.learning.distributed import any_rank
 from legged.learning.evaluations import SECTION, Ended
+from legged.learning.trackers import Tracker, open_writer
 from legged.learning.watch import FAULT, MINI_BATCHES, Diverged, FaultWatch
 
 
@@ -45,15 +47,25 @@ class QuietLogger(Logger):
         """Steps of all robots, on all GPUs."""
         return self.cfg["num_steps_per_env"] * self.num_envs * self.gpu_world_size
 
-    def _store_code_state(self) -> list[str]:
-        """Nothing: the run folder holds the state of this code already, see runs.code_state."""
-        return []
+    def init_logging_writer(self) -> None:
+        """Open TensorBoard's file, and the tracker if there is one.
+
+        Raises:
+            RunError: the tracker does not start.
+        """
+        self.writer = None
+        if self.log_dir is not None and not self.disable_logs:
+            self.writer = open_writer(self.env_cfg, self.log_dir)  # type: ignore[assignment,arg-type]
 
     def stop_logging_writer(self) -> None:
-        """Also end TensorBoard's writer and its thread, which rsl-rl leaves open."""
-        super().stop_logging_writer()
-        if isinstance(self.writer, SummaryWriter):
+        """End TensorBoard's writer and its thread, which rsl-rl leaves open. A tracker stays open until `hand_over`."""
+        if isinstance(self.writer, SummaryWriter | Tracker):
             self.writer.close()
+
+    def hand_over(self, iteration: int) -> None:
+        """Give the tracker, if there is one, the videos and reports that are in the run folder, and end it."""
+        if isinstance(self.writer, Tracker):
+            self.writer.hand_over(Path(self.log_dir), iteration)
 
     def log(self, it: int, start_it: int, total_it: int, collect_time: float, learn_time: float, **kwargs: Any) -> None:
         """Write one iteration, show it, and stop if that was asked for, of any process.

@@ -62,7 +62,7 @@ def runner_config(task: BaseTask, algorithm_class: str) -> dict[str, Any]:
         "num_steps_per_env": runner.num_steps_per_env,
         "save_interval": runner.save_interval,
         "run_name": runner.run_name,
-        "logger": "tensorboard",
+        "logger": runner.logger,
         "check_for_nan": False,  # it would wait for the GPU at every step; the task terminates and counts such robots
         **network_settings(cfg),
         "algorithm": {"class_name": algorithm_class, **settings},

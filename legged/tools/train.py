@@ -35,6 +35,7 @@ from legged.learning.resume import resumed
 from legged.learning.run_folder import create_run, discard_run, experiment_folder, find_run
 from legged.learning.runner import Runner
 from legged.learning.timing import Timing, write_timing
+from legged.learning.trackers import check_tracker
 from legged.learning.transfer import transferred
 from legged.physics import engine_name, resolve_physics
 from legged.process.cores import available_cores
@@ -97,6 +98,7 @@ def _main(argv: list[str] | None, prepared: Prepared | None = None) -> int:
         cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
     resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics"))
     check_commands(cfg)
+    check_tracker(cfg)
     if args.show:
         print(to_yaml(cfg), end="")
         print(*summary(cfg), sep="\n")
@@ -162,6 +164,7 @@ def _train(
         timing = _timing(runner, device, ready - start, time.perf_counter() - start, finished, resumed)
         _summary(runner, folder, timing, play_command(args, cfg, folder))
         write_timing(folder, timing)
+        runner.logger.hand_over(runner.current_learning_iteration)
     if finished:
         return 0
     # Without a signal of its own it is the output that went away, or another process that was asked to stop.
