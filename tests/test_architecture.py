@@ -122,6 +122,7 @@ def test_rsl_rl_is_known_to_its_boundary_only():
         "legged.learning.ppo",
         "legged.learning.rollout",
         "legged.learning.scaled_rewards",
+        "legged.learning.trackers",
     }
 
 

@@ -28,7 +28,17 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags that say which policy to load."""
     parser.add_argument("--experiment_name", help="folder under logs/; the task's name by default")
     parser.add_argument("--load_run", help="run folder, by name or path; the newest by default")
-    parser.add_argument("--checkpoint", type=int, help="iteration of the checkpoint; the latest by default")
+    parser.add_argument("--checkpoint", type=_iteration, help="iteration of the checkpoint, or best; the latest by default")
+
+
+def _iteration(text: str) -> int | str:
+    """Read the iteration of a checkpoint, or `best`; argparse says what is wrong with anything else."""
+    if text == "best":
+        return text
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"invalid value: '{text}' (an iteration, or best)") from None
 
 
 def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:

@@ -28,13 +28,16 @@ from legged.commandline.show import summary
 from legged.commandline.stopping import quiet_writers, stopping_on_signals
 from legged.config import TaskConfig, to_yaml
 from legged.errors import ConfigError, RunError
+from legged.evaluation.during_training import TrainingEvaluation, check_commands
 from legged.learning.captured import CapturedRunner
 from legged.learning.display import Display
 from legged.learning.distributed import RankLost, check_reachable
+from legged.learning.evaluations import Evaluations
 from legged.learning.resume import resumed
 from legged.learning.run_folder import NOTE_FILE, create_run, discard_run, experiment_folder, find_run
 from legged.learning.runner import Runner
 from legged.learning.timing import Timing, write_timing
+from legged.learning.trackers import check_tracker
 from legged.learning.transfer import transferred
 from legged.physics import engine_name, resolve_physics
 from legged.process.cores import available_cores
@@ -50,6 +53,10 @@ ROOM_MB = 16.0
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit code."""
     return run_main(_main, argv)
+
+
+Prepared = Callable[[Runner], None]
+"""What is told of the runner, once it is built and before it trains."""
 
 
 def build_parser() -> CommandParser:
@@ -77,7 +84,17 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+def train_as_asked(argv: list[str], prepared: Prepared) -> int:
+    """Train as a command line asks, within another command; return the exit code. Errors are raised.
+
+    Raises:
+        ConfigError: the command line or the configuration is wrong.
+        RunError: training could not go on.
+    """
+    return _main(argv, prepared)
+
+
+def _main(argv: list[str] | None, prepared: Prepared | None = None) -> int:
     start = STARTED_S if argv is None else time.perf_counter()  # as a command, imports are part of it
     stage_ended("imports")
     args = build_parser().parse_intermixed_args(argv)
@@ -94,6 +111,8 @@ def _main(argv: list[str] | None) -> int:
     else:
         cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
     resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics"))
+    check_commands(cfg)
+    check_tracker(cfg)
     if args.show:
         print(to_yaml(cfg), end="")
         print(*summary(cfg), sep="\n")
@@ -102,9 +121,9 @@ def _main(argv: list[str] | None) -> int:
         print(f"going on with the settings of {relative(checkpoint.parent)}" + "".join(f"; {text}" for text in changed))
     settle_on(device)
     if Ranks.now().first:
-        return _train(args, cfg, device, rl_device, checkpoint, start)
+        return _train(args, cfg, device, rl_device, checkpoint, start, prepared)
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-        return _train(args, cfg, device, rl_device, checkpoint, start)
+        return _train(args, cfg, device, rl_device, checkpoint, start, prepared)
 
 
 def _train(
@@ -114,6 +133,7 @@ def _train(
     rl_device: torch.device,
     checkpoint: Path | None,
     start: float,
+    prepared: Prepared | None,
 ) -> int:
     """Build and train; returns the exit code. Of several processes the first one has a run folder and a display."""
     first = Ranks.now().first
@@ -137,6 +157,10 @@ def _train(
             why_anew = runner.resume(str(checkpoint))
             how = f"all robots begin anew: {why_anew}" if why_anew else "robots and random numbers go on where they were"
             print(f"resumed {relative(checkpoint)} after iteration {runner.current_learning_iteration}; {how}", flush=True)
+        if cfg.train.runner.evaluate_interval:
+            _evaluate_during(runner, checkpoint if not args.transfer else None)
+        if prepared is not None:
+            prepared(runner)
         ready = time.perf_counter()
         resumed = checkpoint is not None and not args.transfer
 
@@ -161,10 +185,21 @@ def _train(
         _summary(runner, folder, took, play_command(args, cfg, folder))
         write_timing(folder, took)
         _report(folder, cfg, args if finished else None)
+        runner.logger.hand_over(runner.current_learning_iteration)
     if finished:
         return 0
     # Without a signal of its own it is the output that went away, or another process that was asked to stop.
     return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
+
+
+def _evaluate_during(runner: Runner, resumed_from: Path | None) -> None:
+    """Let the first process evaluate the policy while it is trained."""
+    evaluations = None
+    if Ranks.now().first:
+        evaluations = Evaluations(runner.env.cfg, TrainingEvaluation(runner.env))
+        if resumed_from is not None:
+            evaluations.go_on_from(resumed_from)
+    runner.evaluate_with(evaluations)
 
 
 def _learn(
@@ -183,6 +218,8 @@ def _learn(
         write_text(folder / NOTE_FILE, f"{note}\n")
     print(f"run folder {relative(folder)}", flush=True)
     display.title = f"{cfg.task}: {relative(folder)}"
+    if runner.evaluations is not None:
+        runner.evaluations.begin_in(folder)
     runner.logger.log_dir = str(folder)
     when_output_is_lost(runner.stop)
     try:
@@ -274,10 +311,13 @@ def _timing(runner: Runner, device: torch.device, start_up_s: float, wall_s: flo
         wall_s=wall_s,
         device=torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         kernels_compiled=runner.env.physics.compiled,
+        evaluation_s=runner.evaluations.spent_s if runner.evaluations is not None else 0.0,
     )
 
 
 def _summary(runner: Runner, folder: Path, timing: Timing, play: str) -> None:
+    if runner.evaluations is not None:
+        print(*runner.evaluations.summary(timing.loop_s), sep="\n")
     print(
         f"{'finished' if timing.finished else 'stopped'} after {runner.current_learning_iteration + 1} iterations: "
         f"{timing.steps:,} steps in {timing.loop_s:.1f} s of training loop ({timing.steps_per_s:,.0f} steps/s), "

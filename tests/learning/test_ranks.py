@@ -91,6 +91,18 @@ def wait_for_iterations(process) -> None:
         time.sleep(0.05)
 
 
+def test_two_processes_end_together_when_the_first_finds_their_target_reached():
+    """The second evaluates nothing."""
+    goal = ["train.runner.evaluate_interval=2", "train.runner.evaluate_envs=8", "train.runner.evaluate_s=0.1"]
+    arguments = [*TRAIN, "--max_iterations", "50", *goal, "train.runner.stop_at.falls=0.9"]
+    with two_processes(REPOSITORY / "train.py", *arguments) as process:
+        out = ended(process, 0)
+    (folder,) = run_folders()
+    assert checkpoints(folder) == [0, 1]
+    assert (folder / "model_best.pt").is_file()
+    assert out.count("reached its target after 2 iterations: falls 0") == 1
+
+
 def test_two_processes_learn_one_policy_from_different_robots():
     Path("spy.py").write_text(SPY)
     with two_processes("spy.py", *TRAIN, "--max_iterations", "2", "train.policy.obs_normalization=true") as process:
