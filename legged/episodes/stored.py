@@ -1,0 +1,158 @@
+"""Recorded episodes, in memory and as files: episodes.npz, and episodes.json, which says what its arrays are."""
+
+import json
+import zipfile
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from legged.config import TaskConfig, from_dict, to_yaml
+from legged.config.yaml_files import read_yaml
+from legged.errors import ConfigError
+from legged.process.paths import make_folder, relative, replacing, write_text
+from legged.registry import task_schema
+
+ARRAYS, ABOUT, CONFIG = "episodes.npz", "episodes.json", "episodes.yaml"
+"""The files: numbers; what they are; the configuration of the task that the robots were in."""
+FORMAT = 1
+"""Of episodes.json; grows when older files can't be read any more."""
+PER_EPISODE = {
+    "episode_start": "first row of every episode, and behind the last one",
+    "robot": "which robot ran it",
+    "failed": "it ended in a failure",
+    "timed_out": "it ended by time, or by a term that is nobody's fault",
+    "ended_by": "which terms ended it, in the order of `terminations`",
+    "first_qpos": "generalised positions before the first step",
+    "first_qvel": "and velocities",
+}
+"""Arrays of a row an episode; all others have a row a control step, of one episode after the other."""
+TIME_UP, NO_NUMBERS = "time", "non_finite"
+"""How an episode ended that no term has ended."""
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """E whole episodes of R control steps in all. Row k of an episode is its state at the end of control step k + 1, with the
+    action, the command and the reward of that step.
+    """
+
+    arrays: dict[str, np.ndarray]
+    about: dict[str, Any]
+    """Names, units, limits, task, checkpoint: what episodes.json holds."""
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self.arrays[name]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.arrays
+
+    def __len__(self) -> int:
+        return len(self.arrays["failed"])
+
+    @property
+    def dt(self) -> float:
+        """Control step [s]."""
+        return float(self.about["dt"])
+
+    @cached_property
+    def lengths(self) -> np.ndarray:
+        """(E,) steps."""
+        return np.diff(self.arrays["episode_start"])
+
+    def rows(self, number: int) -> slice:
+        """Return where an episode lies among the rows."""
+        start = self.arrays["episode_start"]
+        return slice(int(start[number]), int(start[number + 1]))
+
+    def of(self, number: int) -> dict[str, np.ndarray]:
+        """Return the arrays of one episode, (T, ...) each."""
+        rows = self.rows(number)
+        return {name: array[rows] for name, array in self.arrays.items() if name not in PER_EPISODE}
+
+    def columns(self, name: str) -> list[str]:
+        """Return what lies along the second axis of an array."""
+        return list(self.about["arrays"][name]["columns"])
+
+    def ended(self, number: int) -> list[str]:
+        """Return the terms that ended an episode: their names, TIME_UP, or NO_NUMBERS where physics blew up."""
+        terms = self.about["terminations"]
+        found = [term for term, mine in zip(terms, self.arrays["ended_by"][number], strict=True) if mine]
+        return found or [NO_NUMBERS if self.arrays["failed"][number] else TIME_UP]
+
+
+def save_episodes(episodes: Episodes, cfg: TaskConfig, folder: Path) -> None:
+    """Write the three files into `folder`; arrays as they are, with `time` [s] and `episode` beside them.
+
+    Raises:
+        ConfigError, RunError: a file can't be written.
+    """
+    make_folder(folder)
+    lengths = episodes.lengths
+    steps = np.concatenate([np.arange(1, count + 1) for count in lengths])
+    also = {
+        "time": (steps * episodes.dt).astype(np.float32),
+        "episode": np.repeat(np.arange(len(lengths), dtype=np.int32), lengths),
+    }
+    with replacing(folder / ARRAYS) as part:
+        np.savez(part, **also, **episodes.arrays)  # type: ignore[arg-type]
+    write_text(folder / CONFIG, to_yaml(cfg))
+    write_text(folder / ABOUT, json.dumps(episodes.about, indent=1, allow_nan=False))
+
+
+def load_episodes(folder: Path, where: str) -> Episodes:
+    """Read what `save_episodes` wrote; `where` is the flag that names the folder.
+
+    Raises:
+        ConfigError: the folder holds no episodes, or damaged ones.
+    """
+    for name in (ARRAYS, ABOUT):
+        if not (folder / name).is_file():
+            raise ConfigError(f"{where}: {relative(folder)} holds no {name}; python -m legged.tools.episodes writes it")
+    try:
+        about = json.loads((folder / ABOUT).read_text(encoding="utf-8"))
+        with np.load(folder / ARRAYS, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files if name not in ("time", "episode")}
+    except (OSError, ValueError, RecursionError, zipfile.BadZipFile, EOFError, KeyError) as error:
+        raise ConfigError(f"{where}: {relative(folder)}: the episodes there are damaged ({error})") from error
+    _check(about, arrays, f"{where}: {relative(folder)}")
+    return Episodes(arrays, about)
+
+
+def load_config(folder: Path, where: str) -> TaskConfig:
+    """Return the configuration of the task that stored episodes are of.
+
+    Raises:
+        ConfigError: the file is not there, or no longer fits the schema.
+    """
+    path = folder / CONFIG
+    if not path.is_file():
+        raise ConfigError(f"{where}: {relative(folder)} holds no {CONFIG}")
+    data = read_yaml(path)
+    return from_dict(data, source=str(path), schema=task_schema(str(data.get("task", ""))))
+
+
+def _check(about: Any, arrays: dict[str, np.ndarray], where: str) -> None:
+    """Check what the rest relies on.
+
+    Raises:
+        ConfigError: something is missing, or does not fit the rest.
+    """
+    wanted = ("format", "task", "checkpoint", "dt", "terminations", "arrays", "joints")
+    missing = [name for name in wanted if not isinstance(about, dict) or name not in about]
+    missing += [name for name in (*PER_EPISODE, "qpos", "qvel", "action", "reward", "reward_parts") if name not in arrays]
+    if missing:
+        raise ConfigError(f"{where}: the episodes there are damaged: {', '.join(missing)} missing")
+    if about["format"] != FORMAT:
+        raise ConfigError(f"{where}: {ABOUT} is of format {about['format']}; this version reads {FORMAT}")
+    start, count = arrays["episode_start"], len(arrays["failed"])
+    if start.shape != (count + 1,) or count == 0 or (np.diff(start) <= 0).any() or start[0] != 0:
+        raise ConfigError(f"{where}: the episodes there are damaged: episode_start does not say where {count} episodes begin")
+    for name, array in arrays.items():
+        rows = count + (name == "episode_start") if name in PER_EPISODE else int(start[-1])
+        if len(array) != rows:
+            raise ConfigError(f"{where}: the episodes there are damaged: {name} has {len(array)} rows, not {rows}")
+        if name not in PER_EPISODE and name not in about["arrays"]:
+            raise ConfigError(f"{where}: {ABOUT} does not say what {name} is")
