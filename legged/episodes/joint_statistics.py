@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from legged.episodes.panels import joint_unit
 from legged.episodes.stored import Episodes
 from legged.errors import ConfigError
 
@@ -14,6 +15,8 @@ PHASES = 50
 """Points of a gait cycle."""
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 0.1, 2.0
 """Between touch-downs that are nearer a foot has bounced, between those that are farther apart the robot has stood [s]."""
+UNUSUAL = 0.5
+"""A cycle whose length differs from the median by more than this share of it is none of the gait: a stop, a stumble."""
 MEASURED = (("joint_pos", "angle"), ("joint_vel", "velocity"), ("torque", "torque"))
 """Arrays that are summed up, and what they are called."""
 
@@ -49,8 +52,8 @@ class JointStatistics:
 def joint_statistics(episodes: Episodes, where: str = "--statistics") -> JointStatistics:
     """Sum up the joints of some episodes; `where` is the flag that asks for it.
 
-    A cycle begins when the first foot touches down and ends when it does so the next time, if that is within
-    `LONGEST_CYCLE_S`; values are interpolated linearly at `PHASES` equal parts of it.
+    A cycle begins when the first foot touches down and ends when it does so the next time, if that is neither too soon nor
+    too late (`SHORTEST_CYCLE_S`, `LONGEST_CYCLE_S`, `UNUSUAL`); values are interpolated linearly at `PHASES` equal parts of it.
 
     Raises:
         ConfigError: the task's joints are not known, or no episode is long enough.
@@ -64,26 +67,24 @@ def joint_statistics(episodes: Episodes, where: str = "--statistics") -> JointSt
         raise ConfigError(f"{where}: no episode of '{episodes.about['task']}' is longer than {SETTLE_S:g} s")
     feet = list(episodes.about.get("feet", []))
     pooled: dict[str, list[np.ndarray]] = {name: [] for name in names}
-    cycles: dict[str, list[np.ndarray]] = {name: [] for name in names}
-    lengths: list[float] = []
-    contacts: list[np.ndarray] = []
+    spans: list[tuple[int, int, dict[str, np.ndarray]]] = []
     for i in chosen:
         one = {name: array[settled:] for name, array in episodes.of(i).items()}
         for name in names:
             pooled[name].append(one[name])
-        if not feet:
-            continue
-        for begin, end in cycles_of(one["feet_contact"][:, 0], episodes.dt):
-            lengths.append((end - begin) * episodes.dt)
-            contacts.append(one["feet_contact"][begin:end])
-            for name in names:
-                cycles[name].append(resampled(one[name], begin, end))
+        if feet:
+            spans += [(*span, one) for span in cycles_of(one["feet_contact"][:, 0], episodes.dt)]
+    usual = float(np.median([end - begin for begin, end, _ in spans])) if spans else 0.0
+    spans = [(begin, end, one) for begin, end, one in spans if abs(end - begin - usual) <= UNUSUAL * usual]
+    lengths = [(end - begin) * episodes.dt for begin, end, _ in spans]
+    contacts = [one["feet_contact"][begin:end] for begin, end, one in spans]
+    cycles = {name: [resampled(one[name], begin, end) for begin, end, one in spans] for name in names}
     values = {name: np.concatenate(parts).astype(np.float64) for name, parts in pooled.items()}
     joints = episodes.about["joints"]
     duty = np.concatenate(contacts).mean(axis=0) if contacts else np.zeros(len(feet))
     return JointStatistics(
         joints=[joint["name"] for joint in joints],
-        units={name: [_unit(name, joint["unit"]) for joint in joints] for name in names},
+        units={name: [joint_unit(name, joint["unit"]) for joint in joints] for name in names},
         mean={name: value.mean(axis=0) for name, value in values.items()},
         std={name: value.std(axis=0) for name, value in values.items()},
         episodes=len(chosen),
@@ -109,12 +110,6 @@ def resampled(values: np.ndarray, begin: int, end: int) -> np.ndarray:
     below = np.floor(at).astype(int)
     share = (at - below)[:, None]
     return (1.0 - share) * values[below] + share * values[np.minimum(below + 1, end)]
-
-
-def _unit(name: str, of_position: str) -> str:
-    """Return the unit of an array, for a joint whose position is in radians or metres."""
-    turning = of_position == "rad"
-    return {"joint_pos": of_position, "joint_vel": f"{of_position}/s", "torque": "N m" if turning else "N"}[name]
 
 
 def check_comparable(one: JointStatistics, other: JointStatistics) -> None:

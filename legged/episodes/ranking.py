@@ -69,8 +69,7 @@ def figures_of(episodes: Episodes) -> Figures:
         return np.array([measure(episodes.of(i)) for i in numbers])
 
     seconds = episodes.lengths * episodes.dt
-    unit = float(episodes.about.get("reward_unit", 1.0))
-    values = {"length": seconds, "return": each(lambda one: float(one["reward"].sum(dtype=np.float64)) / unit)}
+    values = {"length": seconds, "return": each(lambda one: float(one["reward"].sum(dtype=np.float64)))}
     if "command" in episodes:
         values["tracking"] = each(lambda one: _rms(one["base_lin_vel"][:, :2] - one["command"][:, :2]))
         values["turning"] = each(lambda one: _rms((one["base_ang_vel"][:, 2] - one["command"][:, 2])[:, None]))

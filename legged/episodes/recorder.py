@@ -133,7 +133,7 @@ class _Gathered:
 
     def add(self, chunk: np.ndarray) -> None:
         """Take in steps (T, N, width + S): rows, and the states that robots were left in, of new episodes where one ended."""
-        over: np.ndarray = (chunk[:, :, self._flags] > 0.0).any(axis=2)
+        over = np.asarray(chunk[:, :, self._flags].any(axis=2))
         for robot, own in enumerate(self._finished):
             begin = 0
             for last in np.flatnonzero(over[:, robot]).tolist():

@@ -18,7 +18,6 @@ from legged.physics import engine_name, resolve_physics
 from legged.play.playground import SETTING, Playground
 from legged.policies.episodes import unit_of
 from legged.policies.restore import TrainedPolicy, restore, undisturbed
-from legged.process.paths import relative
 from legged.terrain import Terrain
 
 MOST_EPISODES = 4096
@@ -101,7 +100,7 @@ def roll_out(
     warn_of_overflows("episodes", lost)
     about = _about(task, StepRecord(task)) | {
         "checkpoint": policy.checkpoint.name,
-        "run": relative(policy.folder),
+        "run": "/".join(policy.folder.resolve().parts[-3:]),
         "physics": engine,
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "as_trained": wish.as_trained,
