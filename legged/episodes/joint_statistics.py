@@ -53,7 +53,7 @@ def joint_statistics(episodes: Episodes, where: str = "--statistics") -> JointSt
     """Sum up the joints of some episodes; `where` is the flag that asks for it.
 
     A cycle begins when the first foot touches down and ends when it does so the next time, if that is neither too soon nor
-    too late (`SHORTEST_CYCLE_S`, `LONGEST_CYCLE_S`, `UNUSUAL`); values are interpolated linearly at `PHASES` equal parts of it.
+    too late (`SHORTEST_CYCLE_S`, `LONGEST_CYCLE_S`, `UNUSUAL`); values are interpolated linearly at `PHASES` equal parts.
 
     Raises:
         ConfigError: the task's joints are not known, or no episode is long enough.
