@@ -24,6 +24,10 @@ MOST_EPISODES = 4096
 """More are not recorded at once: at 20 s each they are some gigabytes."""
 
 
+GOLDEN = 0.5 * (5.0**0.5 - 1.0)
+"""The golden ratio less 1."""
+
+
 @dataclass(frozen=True)
 class Wish:
     """What the command line asks for."""
@@ -35,7 +39,7 @@ class Wish:
     command: tuple[float, float, float] | None = None
     """vx, vy [m/s], yaw rate [rad/s] that all robots are asked for; drawn as in the training if there is none."""
     terrain: str | None = None
-    """Type of the tiles, as play has them."""
+    """Type of the tiles, as play has them; without it and a difficulty, the ground of the training."""
     difficulty: float | None = None
     changes: tuple[tuple[str, Any], ...] = ()
     """Overrides, which come last."""
@@ -60,6 +64,8 @@ def check_wish(policy: TrainedPolicy, wish: Wish) -> Playground | None:
                 raise ConfigError(f"--{flag}: --as_trained takes the ground of the training; leave one of them out")
         return None
     wanted: Any = override(policy.cfg, wish.changes)
+    if wish.terrain is None and wish.difficulty is None:
+        return None
     return Playground.of(wanted, wish.terrain, wish.difficulty)
 
 
@@ -95,7 +101,9 @@ def roll_out(
         built: Any = override(policy.cfg, asked)
         terrain = playground.build(built)
     task, act = restore(policy, asked, device, graph, terrain)
-    place = None if playground is None else partial(playground.place, task)
+    place = partial(playground.place, task) if playground is not None else None
+    if place is None and not wish.as_trained and getattr(task, "terrain_curriculum", None) is not None:
+        place = partial(spread, task)
     episodes, lost = record_episodes(task, act, wish.episodes, wish.command, place, graph)
     warn_of_overflows("episodes", lost)
     about = _about(task, StepRecord(task)) | {
@@ -112,6 +120,16 @@ def roll_out(
         "contact_overflows": lost,
     }
     return replace(episodes, about=about), task.cfg
+
+
+def spread(task: LeggedRobot) -> None:
+    """Put robots on tiles of all levels and types alike, where they stay: robot i on the level whose number is the fraction
+    of i times the golden ratio, so that any few of them are far apart.
+    """
+    assert task.terrain_curriculum is not None, "the task stands on a plane"
+    share = torch.arange(task.num_envs, device=task.device) * GOLDEN % 1.0
+    curriculum = task.terrain_curriculum
+    curriculum.place_at((share * curriculum.rows).long(), curriculum.columns.clone())
 
 
 def _changes(policy: TrainedPolicy, wish: Wish, playground: Playground | None) -> list[tuple[str, Any]]:

@@ -93,8 +93,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--episodes", type=int, help=f"how many; {EPISODES}")
     parser.add_argument("--as_trained", action="store_true", help="with noise, pushes, randomisation and curricula")
     parser.add_argument("--command", nargs=3, type=float, metavar=("VX", "VY", "YAW"), help="held [m/s, m/s, rad/s]")
-    parser.add_argument("--terrain", metavar="TYPE", help="type of the tiles, e.g. stairs_up; the task's own by default")
-    parser.add_argument("--difficulty", type=float, help="of the tiles, 0 to 1; 0.5 and 0.8 by default")
+    parser.add_argument("--terrain", metavar="TYPE", help="type of a few tiles, e.g. stairs_up, in place of the training's")
+    parser.add_argument("--difficulty", type=float, help="of such tiles, 0 to 1; 0.5 and 0.8 by default")
     parser.add_argument("--stored", type=Path, metavar="FOLDER", help="episodes recorded before; nothing is simulated")
     parser.add_argument(
         "--sort", default=FELL, help=f"{FELL}, {', '.join(column.name for column in COLUMNS)}; the worst first"

@@ -12,10 +12,11 @@ from legged.envs.final_step import keep_final_step
 from legged.episodes import recorder
 from legged.episodes.quantities import joints_of, quantities_of
 from legged.episodes.recorder import record_episodes, shares_of
-from legged.episodes.rollout import Wish, roll_out
+from legged.episodes.rollout import Wish, roll_out, spread
 from legged.episodes.stored import TIME_UP
 from legged.policies.restore import policy_of
 from legged.registry import make_task, register, task_config
+from legged.terrain import TERRAIN_TYPES
 
 LENGTHS = (3, 7, 11, 40)
 
@@ -107,6 +108,20 @@ def test_curricula_and_places_are_those_of_the_policy():
     record_episodes(task, stand, 4, place=lambda: seen.append(copy.deepcopy(task.progress())))
     (found,) = seen
     torch.testing.assert_close(found, before)
+
+
+def test_robots_are_spread_over_all_levels_and_stay_there():
+    torch.set_num_threads(1)
+    stairs = {**dict.fromkeys(TERRAIN_TYPES, 0.0), "stairs_up": 1.0}
+    small = [("terrain.num_rows", 4), ("terrain.num_cols", 2), ("terrain.border_size", 2.0), ("terrain.proportions", stairs)]
+    changes = [("env.num_envs", 8), ("env.episode_length_s", 0.1), *small, *ENGINE]
+    task = make_task(task_config("anymal_c", changes, on_cpu=True))
+    record_episodes(task, stand, 16, place=lambda: spread(task))
+    # Fractions of i times 0.618...: 0, .618, .236, .854, .472, .090, .708, .326; times four rows.
+    assert task.terrain_curriculum.levels.tolist() == [0, 2, 0, 3, 1, 0, 2, 1]
+    assert task.terrain_curriculum.columns.tolist() == [0] * 4 + [1] * 4
+    tiles = task.terrain.origins[task.terrain_curriculum.levels, task.terrain_curriculum.columns]
+    np.testing.assert_allclose(task.env_origins, tiles, atol=1e-6)
 
 
 def test_joints_of_every_kind_of_robot_are_found():

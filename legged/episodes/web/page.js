@@ -196,7 +196,9 @@
         brush.fillRect(x, top, Math.max(1, Math.min(plot.width - RIGHT, xOf(plot, k + 0.5)) - x), 0.68 * tall);
       }
       brush.fillStyle = INK;
-      brush.fillText(line.label.length > 7 ? line.label.slice(0, 6) + "…" : line.label, LEFT - 5, top + 0.34 * tall);
+      let name = line.label;
+      while (name.length > 2 && brush.measureText(name).width > LEFT - 8) name = name.slice(0, -2) + "…";
+      brush.fillText(name, LEFT - 5, top + 0.34 * tall);
     });
   }
 
