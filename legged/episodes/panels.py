@@ -50,8 +50,7 @@ class Panels:
         passive = self._passive()
         if passive:
             found.append(passive)
-        names = self.episodes.columns("action")
-        found.append(_section("Actions", self._plain("action", names, "action", "1"), is_open=False))
+        found.append(self._actions())
         return [section for section in found if section["panels"]]
 
     # ---- what legged robots have ------------------------------------------------------------------------------------
@@ -146,6 +145,11 @@ class Panels:
         unit = float(self.episodes.about.get("reward_unit", 1.0))
         self.arrays["reward_parts"] = parts / unit
         size = np.abs(np.nan_to_num(parts)).sum(axis=0)
+        note = "What is paid lies above zero, what it costs below."
+        if "termination" in names and size[names.index("termination")] > 0.0:
+            once = float(parts[-1, names.index("termination")])
+            note += f" What a failure costs, {once:.3g} once, at the end, is left out."
+            size[names.index("termination")] = 0.0
         largest = [int(i) for i in np.argsort(-size, kind="stable") if size[i] > 0.0]
         if len(largest) > MOST_PARTS + 1:
             rest = largest[MOST_PARTS:]
@@ -157,7 +161,7 @@ class Panels:
         if rest:
             lines.append(_line(f"{len(rest)} others", "other_parts", 0, OTHERS))
         panels = [_panel("reward parts, stacked", self._reward_unit(), lines, kind="stack", height=230)] if lines else []
-        return _section("Reward parts", panels, "What is paid lies above zero, what it costs below.", wide=True)
+        return _section("Reward parts", panels, note, wide=True)
 
     def _reward_unit(self) -> str:
         return "1/s" if float(self.episodes.about.get("reward_unit", 1.0)) != 1.0 else "1 a step"
@@ -168,17 +172,22 @@ class Panels:
         panels = []
         for kind, members in groups_of([joint["name"] for joint in self.joints]):
             units = {joint_unit(name, self.joints[i]["unit"]) for i in members}
-            lines = [
-                _line(self.joints[i]["name"], name, i, COLORS[k % len(COLORS)]) for k, i in enumerate(members[:MOST_LINES])
-            ]
+            lines = [_line(self.joints[i]["name"], name, i, COLORS[k % len(COLORS)]) for k, i in enumerate(members)]
             limits = sorted({value for i in members for value in _both(self.joints[i][limit])})
             include = limits if name == "torque" else []
             panels.append(_panel(f"{what}, {kind}", " or ".join(sorted(units)), lines, limits=limits, include=include))
         return _section(title, panels, note if any(panel["limits"] for panel in panels) else "", is_open=is_open)
 
+    def _actions(self) -> dict[str, Any]:
+        self.arrays["action"], names = self.one["action"], self.episodes.columns("action")
+        panels = []
+        for kind, members in groups_of(names):
+            lines = [_line(names[i], "action", i, COLORS[k % len(COLORS)]) for k, i in enumerate(members)]
+            panels.append(_panel(f"action, {kind}", "1", lines))
+        return _section("Actions", panels, is_open=False)
+
     def _plain(self, name: str, labels: Sequence[str], title: str, unit: str) -> list[dict[str, Any]]:
-        """Return the columns of an array, so many in a plot as can be told apart."""
-        self.arrays.setdefault(name, self.one[name] if name in self.one else np.zeros((0, len(labels))))
+        """Return the columns of an array that is drawn, so many in a plot as can be told apart."""
         lines = [_line(label, name, i, COLORS[i % MOST_LINES]) for i, label in enumerate(labels)]
         return [_panel(title, unit, lines[i : i + MOST_LINES]) for i in range(0, len(lines), MOST_LINES)]
 

@@ -76,12 +76,12 @@ def _main(argv: list[str] | None) -> int:
     print()
     Console(width=130).print(episodes_table(figures, shown, f"{counts_text(figures)}; by {args.sort}"))
     _write_list(folder, figures, order, args.sort)
-    if args.statistics:
-        _print_statistics(folder, {_label(episodes): joint_statistics(episodes)})
     if wanted:
         projector = Projector(episodes, load_config(folder, "--page"))
         for number in dict.fromkeys(wanted):
             write_page(folder, episodes, figures, number, projector.show(number))
+    if args.statistics:
+        _print_statistics(folder, {_label(episodes): joint_statistics(episodes)})
     return 0
 
 

@@ -137,6 +137,28 @@ def test_joints_of_different_legs_share_a_plot():
     assert without_common_words(["foot"]) == ["foot"]
 
 
+def test_what_a_failure_costs_once_is_said_and_not_drawn():
+    """Else it would be all that one sees."""
+    episodes = made_by_hand(3)
+    episodes.about["arrays"] = {**episodes.about["arrays"], "reward_parts": {"columns": ["tracking", "termination"]}}
+    episodes["reward_parts"][:] = [[0.01, 0.0], [0.01, 0.0], [0.0, -2.0]]
+    section = next(one for one in Panels(episodes, 0).sections() if one["title"] == "Reward parts")
+    assert [line["label"] for line in section["panels"][0]["lines"]] == ["tracking"]
+    assert "What a failure costs, -2 once" in section["note"]
+
+
+def test_parts_without_a_colour_of_their_own_are_drawn_as_one():
+    episodes = made_by_hand(2)
+    names = [f"part {i}" for i in range(10)]
+    episodes.about["arrays"] = {**episodes.about["arrays"], "reward_parts": {"columns": names}}
+    episodes.arrays["reward_parts"] = np.tile(-0.02 * np.arange(10.0), (2, 1))  # part 0 is never paid
+    panels = Panels(episodes, 0)
+    section = next(one for one in panels.sections() if one["title"] == "Reward parts")
+    labels = [line["label"] for line in section["panels"][0]["lines"]]
+    assert labels == [f"part {i}" for i in range(9, 2, -1)] + ["2 others"]
+    np.testing.assert_allclose(panels.arrays["other_parts"], -(1.0 + 2.0))
+
+
 def test_plots_of_an_episode_show_its_own_numbers():
     episodes = made_by_hand(3, 4)
     episodes["contact_force"][4, 2] = 30.0
@@ -146,6 +168,7 @@ def test_plots_of_an_episode_show_its_own_numbers():
     sections = {section["title"]: section for section in panels.sections()}
     np.testing.assert_allclose(panels.arrays["tilt"], np.degrees(0.5), rtol=1e-5)
     np.testing.assert_allclose(panels.arrays["reward_parts"], [[1.0, -2.0]] * 4, rtol=1e-6)  # a second
+    assert "left out" not in sections["Reward parts"]["note"]
     gait = sections["Feet"]["panels"][0]
     assert [line["label"] for line in gait["lines"]] == ["left", "right", "shin"]
     torques = sections["Torques"]["panels"]

@@ -109,7 +109,7 @@
     brush.lineWidth = 1;
     brush.textBaseline = "top";
     brush.textAlign = "center";
-    for (const time of ticks((first + 1) * dt, (last + 1) * dt, Math.max(2, width / 90))) {
+    for (const time of ticks((first + 1) * dt, (last + 1) * dt, Math.max(3, width / 70))) {
       const x = xOf(plot, time / dt - 1);
       brush.strokeStyle = GRID;
       brush.beginPath(); brush.moveTo(x, TOP); brush.lineTo(x, floor); brush.stroke();
