@@ -11,7 +11,7 @@ from helpers import POLICY
 
 from legged import registry
 from legged.registry import import_tasks, make_task, task_config
-from legged.tools import benchmark, compare, contact_sheet, evaluate, play, plot, show_terrain, train, warmup, zoo
+from legged.tools import benchmark, compare, contact_sheet, episodes, evaluate, play, plot, show_terrain, train, warmup, zoo
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {path: path.read_text(encoding="utf-8") for path in (*ROOT.glob("*.md"), *sorted((ROOT / "docs").glob("*.md")))}
@@ -57,6 +57,7 @@ def test_the_readme_names_every_task():
         ("python train.py", train.main),
         ("python play.py", play.main),
         ("python -m legged.tools.evaluate", evaluate.main),
+        ("python -m legged.tools.episodes", episodes.main),
         ("python -m legged.tools.benchmark", benchmark.main),
         ("python -m legged.tools.compare", compare.main),
         ("python -m legged.tools.plot", plot.main),
