@@ -90,16 +90,20 @@ def save_episodes(episodes: Episodes, cfg: TaskConfig, folder: Path) -> None:
         ConfigError, RunError: a file can't be written.
     """
     make_folder(folder)
-    lengths = episodes.lengths
-    steps = np.concatenate([np.arange(1, count + 1) for count in lengths])
-    also = {
-        "time": (steps * episodes.dt).astype(np.float32),
-        "episode": np.repeat(np.arange(len(lengths), dtype=np.int32), lengths),
-    }
     with replacing(folder / ARRAYS) as part:
-        np.savez(part, **also, **episodes.arrays)  # type: ignore[arg-type]
+        np.savez(part, **clock_of(episodes), **episodes.arrays)  # type: ignore[arg-type]
     write_text(folder / CONFIG, to_yaml(cfg))
     write_text(folder / ABOUT, json.dumps(episodes.about, indent=1, allow_nan=False))
+
+
+def clock_of(episodes: Episodes) -> dict[str, np.ndarray]:
+    """Return `episode` (T,), which one each row is of, and `time` (T,), how long it has lasted [s]."""
+    lengths = episodes.lengths
+    steps = np.concatenate([np.arange(1, count + 1) for count in lengths])
+    return {
+        "episode": np.repeat(np.arange(len(lengths), dtype=np.int32), lengths),
+        "time": (steps * episodes.dt).astype(np.float32),
+    }
 
 
 def load_episodes(folder: Path, where: str) -> Episodes:

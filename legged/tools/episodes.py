@@ -29,6 +29,7 @@ from legged.commandline.command import run_main
 from legged.episodes.film import Projector
 from legged.episodes.joint_statistics import JointStatistics, check_comparable, joint_statistics
 from legged.episodes.page import write_page
+from legged.episodes.parquet import check_parquet, write_parquet
 from legged.episodes.ranking import (
     COLUMNS,
     FELL,
@@ -76,6 +77,8 @@ def _main(argv: list[str] | None) -> int:
     print()
     Console(width=130).print(episodes_table(figures, shown, f"{counts_text(figures)}; by {args.sort}"))
     _write_list(folder, figures, order, args.sort)
+    if args.parquet:
+        write_parquet(episodes, folder)
     if wanted:
         projector = Projector(episodes, load_config(folder, "--page"))
         for number in dict.fromkeys(wanted):
@@ -104,6 +107,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--page", metavar="IDS", help="episodes to make pages of, by number: 3 or 3,17")
     parser.add_argument("--worst", type=int, default=0, help="make pages of so many of the list")
     parser.add_argument("--statistics", action="store_true", help="mean and standard deviation of every joint")
+    parser.add_argument("--parquet", action="store_true", help="also one flat table in Parquet; needs pyarrow")
     parser.add_argument("--compare", nargs=2, metavar=("A", "B"), help="two runs, shipped policies or folders of episodes")
     parser.add_argument("--out", type=Path, help="folder for all files; episodes/ in the run folder by default")
     return parser
@@ -124,7 +128,7 @@ def _check(args: argparse.Namespace) -> None:
             if getattr(args, flag) not in (None, False):
                 raise ConfigError(f"--{flag}: nothing is simulated with --stored; leave one of them out")
     if args.compare:
-        for flag in ("page", "worst", "ended", "load_run", "checkpoint", "statistics"):
+        for flag in ("page", "worst", "ended", "load_run", "checkpoint", "statistics", "parquet"):
             if getattr(args, flag):
                 raise ConfigError(f"--{flag}: --compare makes tables of joints only; leave one of them out")
     for flag, low, high in (
@@ -143,6 +147,8 @@ def _check(args: argparse.Namespace) -> None:
     if args.command and not all(abs(value) <= 100.0 for value in args.command):
         raise ConfigError("--command: velocities must be numbers of at most 100")
     _pages(args.page, None)
+    if args.parquet:
+        check_parquet("--parquet")
 
 
 def _pages(text: str | None, count: int | None) -> list[int]:

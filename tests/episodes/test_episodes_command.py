@@ -95,6 +95,29 @@ def test_other_tasks_show_what_they_have(capsys, monkeypatch):
     assert "--sort: tracking: these episodes have no such figure" in capsys.readouterr().err
 
 
+def test_a_table_of_all_steps_is_written(monkeypatch, capsys):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    assert call(episodes.main, [*HERE, "--out", "out", "--parquet"]) == 0
+    table = parquet.read_table("out/episodes.parquet").to_pydict()
+    with np.load("out/episodes.npz") as file:
+        for column, want in (
+            ("torque.LF_KFE", file["torque"][:, 2]),
+            ("feet_force.RH_FOOT.z", file["feet_force"][:, 3, 2]),
+            ("reward", file["reward"]),
+            ("episode", file["episode"]),
+            ("qpos.root.qw", file["qpos"][:, 3]),
+        ):
+            np.testing.assert_array_equal(table[column], want, err_msg=column)
+
+
+def test_without_its_package_a_table_is_refused(monkeypatch, capsys):
+    monkeypatch.setattr("legged.episodes.parquet.find_spec", lambda _: None)
+    assert call(episodes.main, [*HERE, "--parquet"]) == 2
+    assert capsys.readouterr().err == (
+        "error: --parquet: needs pyarrow, which is not installed: pip install 'legged[parquet]'\n"
+    )
+
+
 def test_two_policies_are_compared(capsys):
     changes = ["env.episode_length_s=1.2", *FEW]
     assert call(episodes.main, [*HERE, "--out", "out"]) == 0
