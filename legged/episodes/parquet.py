@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from legged.episodes.quantities import AXES
-from legged.episodes.stored import PER_EPISODE, Episodes, clock_of
+from legged.episodes.stored import Episodes, clock_of
+from legged.episodes.stored_check import PER_EPISODE
 from legged.errors import ConfigError
 from legged.process.paths import relative, replacing
 

@@ -11,7 +11,8 @@ from legged.config import LeggedConfig, TaskConfig, override
 from legged.envs import BaseTask, LeggedRobot
 from legged.episodes.quantities import joints_of
 from legged.episodes.recorder import StepRecord, record_episodes
-from legged.episodes.stored import FORMAT, Episodes
+from legged.episodes.stored import Episodes
+from legged.episodes.stored_check import FORMAT
 from legged.errors import ConfigError
 from legged.evaluation.overflows import warn_of_overflows
 from legged.physics import engine_name, resolve_physics

@@ -11,26 +11,19 @@ import numpy as np
 
 from legged.config import TaskConfig, from_dict, to_yaml
 from legged.config.yaml_files import read_yaml
+from legged.episodes.stored_check import PER_EPISODE, check_stored
 from legged.errors import ConfigError
 from legged.process.paths import make_folder, relative, replacing, write_text
 from legged.registry import task_schema
 
 ARRAYS, ABOUT, CONFIG = "episodes.npz", "episodes.json", "episodes.yaml"
 """The files: numbers; what they are; the configuration of the task that the robots were in."""
-FORMAT = 1
-"""Of episodes.json; grows when older files can't be read any more."""
-PER_EPISODE = {
-    "episode_start": "first row of every episode, and behind the last one",
-    "robot": "which robot ran it",
-    "failed": "it ended in a failure",
-    "timed_out": "it ended by time, or by a term that is nobody's fault",
-    "ended_by": "which terms ended it, in the order of `terminations`",
-    "first_qpos": "generalised positions before the first step",
-    "first_qvel": "and velocities",
-}
-"""Arrays of a row an episode; all others have a row a control step, of one episode after the other."""
 TIME_UP, NO_NUMBERS = "time", "non_finite"
 """How an episode ended that no term has ended."""
+
+
+DAMAGES = (OSError, ValueError, RecursionError, zipfile.BadZipFile, EOFError, KeyError, NotImplementedError, MemoryError)
+"""What json, zipfile and NumPy raise at files that are not what they should be."""
 
 
 @dataclass(frozen=True)
@@ -119,9 +112,9 @@ def load_episodes(folder: Path, where: str) -> Episodes:
         about = json.loads((folder / ABOUT).read_text(encoding="utf-8"))
         with np.load(folder / ARRAYS, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files if name not in ("time", "episode")}
-    except (OSError, ValueError, RecursionError, zipfile.BadZipFile, EOFError, KeyError) as error:
+    except DAMAGES as error:
         raise ConfigError(f"{where}: {relative(folder)}: the episodes there are damaged ({error})") from error
-    _check(about, arrays, f"{where}: {relative(folder)}")
+    check_stored(about, arrays, f"{where}: {relative(folder)}")
     return Episodes(arrays, about)
 
 
@@ -136,27 +129,3 @@ def load_config(folder: Path, where: str) -> TaskConfig:
         raise ConfigError(f"{where}: {relative(folder)} holds no {CONFIG}")
     data = read_yaml(path)
     return from_dict(data, source=str(path), schema=task_schema(str(data.get("task", ""))))
-
-
-def _check(about: Any, arrays: dict[str, np.ndarray], where: str) -> None:
-    """Check what the rest relies on.
-
-    Raises:
-        ConfigError: something is missing, or does not fit the rest.
-    """
-    wanted = ("format", "task", "checkpoint", "dt", "terminations", "arrays", "joints")
-    missing = [name for name in wanted if not isinstance(about, dict) or name not in about]
-    missing += [name for name in (*PER_EPISODE, "qpos", "qvel", "action", "reward", "reward_parts") if name not in arrays]
-    if missing:
-        raise ConfigError(f"{where}: the episodes there are damaged: {', '.join(missing)} missing")
-    if about["format"] != FORMAT:
-        raise ConfigError(f"{where}: {ABOUT} is of format {about['format']}; this version reads {FORMAT}")
-    start, count = arrays["episode_start"], len(arrays["failed"])
-    if start.shape != (count + 1,) or count == 0 or (np.diff(start) <= 0).any() or start[0] != 0:
-        raise ConfigError(f"{where}: the episodes there are damaged: episode_start does not say where {count} episodes begin")
-    for name, array in arrays.items():
-        rows = count + (name == "episode_start") if name in PER_EPISODE else int(start[-1])
-        if len(array) != rows:
-            raise ConfigError(f"{where}: the episodes there are damaged: {name} has {len(array)} rows, not {rows}")
-        if name not in PER_EPISODE and name not in about["arrays"]:
-            raise ConfigError(f"{where}: {ABOUT} does not say what {name} is")
