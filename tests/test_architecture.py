@@ -73,6 +73,7 @@ FLOORS = [  # from the ground up; each part imports from the floors below it onl
     {"policies", "gymnasium_envs"},
     {"play", "benchmarks"},
     {"evaluation"},
+    {"episodes"},
     {"tools"},
 ]
 PARTS = sorted({name_of(path).split(".")[1] for path in FILES if name_of(path) not in ("legged", "legged.__main__")})

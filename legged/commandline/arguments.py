@@ -11,9 +11,9 @@ from legged.process.ranks import Ranks
 from legged.registry import YAML_ENDINGS, import_tasks, register_file
 
 
-def add_task_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add --task, --import, engine and devices, and free `key=value` overrides."""
-    parser.add_argument("--task", required=True, help="name of the task, e.g. anymal_c_flat, or a YAML file")
+def add_task_arguments(parser: argparse.ArgumentParser, required: bool = True) -> None:
+    """Add --task, which is `required` or not, --import, engine and devices, and free `key=value` overrides."""
+    parser.add_argument("--task", required=required, help="name of the task, e.g. anymal_c_flat, or a YAML file")
     parser.add_argument("--import", dest="module", help="module or .py file that registers tasks of your own")
     parser.add_argument("--num_envs", type=int, help="number of robots (env.num_envs)")
     parser.add_argument("--seed", type=int, help="random seed (env.seed)")
