@@ -11,9 +11,11 @@ from legged.process.ranks import Ranks
 from legged.registry import YAML_ENDINGS, import_tasks, register_file
 
 
-def add_task_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add --task, --import, engine and devices, and free `key=value` overrides."""
-    parser.add_argument("--task", required=True, help="name of the task, e.g. anymal_c_flat, or a YAML file")
+def add_task_arguments(parser: argparse.ArgumentParser, required: bool = True) -> None:
+    """Add --task, which a run may name as well unless it is `required`, --import, engine and devices, and free `key=value`
+    overrides.
+    """
+    parser.add_argument("--task", required=required, help="name of the task, e.g. anymal_c_flat, or a YAML file")
     parser.add_argument("--import", dest="module", help="module or .py file that registers tasks of your own")
     parser.add_argument("--num_envs", type=int, help="number of robots (env.num_envs)")
     parser.add_argument("--seed", type=int, help="random seed (env.seed)")
@@ -117,5 +119,5 @@ def register_given(args: argparse.Namespace) -> None:
     if args.module:
         import_tasks(args.module)
     args.given_task = args.task  # what another process would have to be given
-    if args.task.endswith(YAML_ENDINGS):
+    if args.task is not None and args.task.endswith(YAML_ENDINGS):
         args.task = register_file(args.task)

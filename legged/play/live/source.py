@@ -47,7 +47,9 @@ def find_watched(args: argparse.Namespace) -> Watched:
     """
     flags = [(key, value) for key, value in overrides(args) if key == "train.runner.experiment_name"]
     task = None if args.task is None else task_config(args.task, flags)
-    experiment = experiment_folder(task) if task is not None else LOGS / args.experiment_name if args.experiment_name else None
+    experiment = (
+        experiment_folder(task) if task is not None else LOGS / args.experiment_name if args.experiment_name else None
+    )
     folder = _newest(task, experiment) if args.load_run in (None, "-1") else _named(args.load_run, experiment)
     cfg = run_config(folder)
     if args.task is not None and cfg.task != args.task:
@@ -67,7 +69,9 @@ def _newest(task: TaskConfig | None, experiment: Path | None) -> Path:
     shipped = None if task is None else shipped_policy(task.task)
     if shipped is None:
         place = relative(experiment or LOGS)
-        instead = "train one first" if task is not None else "train one first, or name a task whose policy is shipped (--task)"
+        instead = (
+            "train one first" if task is not None else "train one first, or name a task whose policy is shipped (--task)"
+        )
         raise ConfigError(f"--load_run: there is no run in {place}; {instead}")
     return shipped
 
