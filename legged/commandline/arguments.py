@@ -1,12 +1,15 @@
 """Command-line arguments that train, play and evaluate share, and how they become a configuration."""
 
 import argparse
+import shlex
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from legged.config import parse_override
 from legged.errors import ConfigError
+from legged.process.paths import relative
 from legged.process.ranks import Ranks
 from legged.registry import YAML_ENDINGS, import_tasks, register_file
 
@@ -121,3 +124,15 @@ def register_given(args: argparse.Namespace) -> None:
     args.given_task = args.task  # what another process would have to be given
     if args.task is not None and args.task.endswith(YAML_ENDINGS):
         args.task = register_file(args.task)
+
+
+def watch_command(args: argparse.Namespace, folder: Path) -> str:
+    """Return the command that shows the policy of a run folder in a browser, also while it is trained; `args` were given to
+    the command that runs now.
+    """
+    words = ["python", "-m", "legged.tools.watch"]
+    if args.module:
+        words += ["--import", args.module]
+    if args.given_task.endswith(YAML_ENDINGS):  # whose name alone would mean nothing
+        words += ["--task", args.given_task]
+    return shlex.join([*words, "--load_run", relative(folder)])

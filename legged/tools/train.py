@@ -18,6 +18,7 @@ from legged.commandline.arguments import (
     pick_device,
     register_given,
     settle_on,
+    watch_command,
 )
 from legged.commandline.command import EXIT_FAILED, run_main
 from legged.commandline.output import when_output_is_lost
@@ -125,7 +126,7 @@ def _train(
         ready = time.perf_counter()
         with stopping_on_signals(runner.stop) as stopped_by, quiet_writers():
             try:
-                folder, finished = _learn(runner, cfg, display)
+                folder, finished = _learn(runner, cfg, display, args)
             except RankLost as lost:
                 print(lost, file=sys.stderr, flush=True)
                 return EXIT_FAILED
@@ -145,7 +146,7 @@ def _train(
     return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
 
 
-def _learn(runner: Runner, cfg: TaskConfig, display: Display | None) -> tuple[Path | None, bool]:
+def _learn(runner: Runner, cfg: TaskConfig, display: Display | None, args: argparse.Namespace) -> tuple[Path | None, bool]:
     """Train into a new run folder; gives the folder, none where another process has it, and whether training got to its end.
     A training that fails before its first checkpoint leaves no folder.
 
@@ -155,7 +156,7 @@ def _learn(runner: Runner, cfg: TaskConfig, display: Display | None) -> tuple[Pa
     folder = create_run(cfg) if display else None
     if folder is None or display is None:
         return None, runner.train(cfg.train.runner.max_iterations)
-    print(f"run folder {relative(folder)}", flush=True)
+    print(f"run folder {relative(folder)}\nwatch it: {watch_command(args, folder)}", flush=True)
     display.title = f"{cfg.task}: {relative(folder)}"
     runner.logger.log_dir = str(folder)
     when_output_is_lost(runner.stop)

@@ -47,7 +47,6 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("--port", type=int, help=f"{PORT}, or the next one that is free, by default")
     args = parser.parse_intermixed_args(argv)
     register_given(args)
-    load_viser()
     port = free_port(args.host, None if args.port is None else check_port(args.port))
     count = ROBOTS if args.num_envs is None else args.num_envs
     if not 1 <= count <= MOST_ROBOTS:
@@ -61,6 +60,7 @@ def _main(argv: list[str] | None) -> int:
         engine = [("sim.physics", "mujoco"), ("sim.threads", min(available_cores(), math.ceil(count / ROBOTS_A_THREAD)))]
     changes = changes_for(watched.cfg, count, [*engine, *asked])
     ground = check_ground(watched.cfg, args.terrain, args.difficulty)
+    load_viser()
     session = Session(watched, changes, ground, device, graph=device.type == "cuda" and not args.no_graph)
     page = Page(session, args.host, port)
     try:

@@ -91,16 +91,17 @@ FRAME = 'fill="none" stroke="currentColor" stroke-opacity="0.25"'
 
 
 def short(name: str, names: Sequence[str]) -> str:
-    """Return a name without what all names have in common at their ends: 'LF_FOOT' among feet becomes 'LF'."""
+    """Return a name without the words that all `names` begin or end with: 'LF_FOOT' among feet becomes 'LF'."""
+    split = [other.split("_") for other in names]
     before = after = 0
     if len(names) > 1:
-        least = min(map(len, names)) - 1
-        while before < least and len({other[before] for other in names}) == 1:
+        least = min(map(len, split)) - 1
+        while before < least and len({words[before] for words in split}) == 1:
             before += 1
-        while after < least - before and len({other[len(other) - 1 - after] for other in names}) == 1:
+        while after < least - before and len({words[-1 - after] for words in split}) == 1:
             after += 1
-    found = name[before : len(name) - after].strip("_- ")
-    return (found or name)[:7]
+    words = name.split("_")
+    return "_".join(words[before : len(words) - after])[:7]
 
 
 def _stretches(times: np.ndarray, on: np.ndarray, dt: float) -> list[tuple[float, float]]:

@@ -10,7 +10,7 @@ from legged.config import TaskConfig
 from legged.envs import BaseTask, LeggedRobot
 from legged.errors import ConfigError
 from legged.learning.checkpoint import check_fits, read_checkpoint
-from legged.play.live.ground import OWN, PLANE, Ground, build, grounds_of
+from legged.play.live.ground import PLANE, Ground, build, grounds_of
 from legged.play.live.history import History
 from legged.play.live.source import BEST, NEWEST, Follower, Watched, age
 from legged.policies.actor import Actor
@@ -236,7 +236,7 @@ class Session:
         """Name the ground below the followed robot: 'stairs_up, step height 0.194 m'."""
         terrain = getattr(self.task, "terrain", None)
         if self.playground is None or terrain is None:
-            return self.ground.kind if self.ground.kind in (OWN, PLANE) else ""
+            return PLANE if self.ground.kind == PLANE else ""
         return self.playground.label(terrain, self.task.base_pos[self.followed].tolist())
 
     def _build(self, ground: Ground) -> None:

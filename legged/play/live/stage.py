@@ -37,6 +37,10 @@ FOG, SKY = (25.0, 55.0), (255, 255, 255)
 """Distances between which the ground goes over into the background [m], and its colour."""
 HIDDEN = -1000.0
 """Height of what is not to be seen [m]."""
+NARROW = 700
+"""Screens that are narrower have the controls below the picture, not beside it [pixels]."""
+FARTHER, LOWER = 1.3, 1.0
+"""There one looks from so many times as far away, at a point so far below the robot, in its lengths."""
 SQUARE = 2.0
 """Length after which the squares of a plane look the same: they are moved along by multiples of it [m]."""
 
@@ -61,6 +65,13 @@ class Stage:
         self.build()
         server.initial_camera.position = tuple(VIEW * self.length)
         server.initial_camera.look_at = (0.0, 0.0, -0.1 * self.length)
+        server.on_client_connect(self._suit)
+
+    def _suit(self, client: Any) -> None:
+        """Let a narrow screen, whose lower half has the controls, show the robot in its upper one."""
+        if client.camera.image_width < NARROW:
+            client.camera.position = tuple(FARTHER * VIEW * self.length)
+            client.camera.look_at = (0.0, 0.0, -LOWER * self.length)
 
     def build(self) -> None:
         """Draw everything anew: the task is another one."""
@@ -183,5 +194,5 @@ class Stage:
 
 
 def _rgb(color: str) -> tuple[int, ...]:
-    """Return a colour such as '#0072B2' as red, green and blue, 0 to 255, so dark that it looks like that in viser's light."""
+    """Return a colour such as '#0072B2' as red, green and blue, 0 to 255, so dark that viser's light makes it look so."""
     return tuple(round(DARKER * int(color[i : i + 2], 16)) for i in (1, 3, 5))
