@@ -74,6 +74,15 @@ def test_time_passes_as_fast_as_it_is_told_to(session):
     assert session.pass_time(0.0) == 0
 
 
+def test_a_machine_that_is_too_slow_is_noticed(session):
+    for _ in range(30):
+        session.pass_time(0.1)
+    assert session.pace == pytest.approx(1.0, abs=0.02)
+    for _ in range(9):
+        session.pass_time(2.0 * BEHIND_S)  # half of which is never made up for
+    assert session.pace == pytest.approx(0.5, abs=0.05)
+
+
 def test_slow_motion_makes_steps_that_are_longer_than_a_picture(session):
     session.set_speed(0.1)
     assert sum(session.pass_time(1.0 / 30.0) for _ in range(60)) == 10  # 2 s, a tenth of it, in steps of 0.02 s

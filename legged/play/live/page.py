@@ -20,6 +20,8 @@ PICTURES_S, PLOTS_S, LOOK_S = 1.0 / 30.0, 0.25, 1.0
 """Time between two pictures, two plots, and two looks for a newer checkpoint [s]."""
 IDLE_S = 0.1
 """Time between two looks for somebody who connects, while nobody is: nothing is simulated then [s]."""
+SLOW = 0.9
+"""A slower pace is said."""
 STEPS = (0.1, 0.1, 0.2)
 """Change of vx, vy [m/s] and yaw rate [rad/s] by one key press."""
 KEYS = (("I", 0, 1), ("K", 0, -1), ("U", 1, 1), ("O", 1, -1), ("J", 2, 1), ("L", 2, -1))
@@ -213,7 +215,8 @@ class Page:
         lines = [f"**{session.title()}**"]
         place = session.place()
         state = f"{session.time:.1f}\u00a0s" if session.running else f"paused at {session.time:.1f}\u00a0s"
-        lines.append(" · ".join(text for text in (f"robot {session.followed + 1}", place, state) if text))
+        slow = f"too slow: {session.pace:.0%} of the time that should pass" if session.running and session.pace < SLOW else ""
+        lines.append(" · ".join(text for text in (f"robot {session.followed + 1}", place, state, slow) if text))
         if session.problem:
             lines.append(f"⚠ {session.problem}")
         text = "\n\n".join(lines)

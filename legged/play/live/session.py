@@ -24,6 +24,8 @@ HARDEST_PUSH = 3.0
 """Largest change of a robot's velocity by one push [m/s]."""
 BEHIND_S = 0.2
 """More time than this is never made up for: the machine is too slow, or was busy [s]."""
+PACE_S = 2.0
+"""How long the pace is measured [s]."""
 FREE_JOINT = 0
 """MuJoCo's number of the type of joint that lets a base float."""
 
@@ -61,7 +63,9 @@ class Session:
         """The robot that is followed and plotted."""
         self.command = [0.0, 0.0, 0.0]
         """What all robots are asked: vx, vy [m/s], yaw rate [rad/s]."""
-        self._due = 0.0
+        self.pace = 1.0
+        """Share of the steps that were due lately which could be made: less than 1 where the machine is too slow."""
+        self._due = self._wanted = self._made = 0.0
         if self.checkpoint is not None:  # before anything is built
             self._check(self.checkpoint)
         self._build(ground)
@@ -150,6 +154,11 @@ class Session:
         for _ in range(steps):
             self.step()
         self._due -= steps * self.task.dt
+        self._wanted += self.speed * seconds
+        self._made += steps * self.task.dt
+        if self._wanted > self.speed * PACE_S:
+            self.pace = min(1.0, self._made / self._wanted)
+            self._wanted = self._made = 0.0
         return steps
 
     @torch.inference_mode()

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from legged.envs import LeggedRobot
-from legged.play.live.glb import glb
+from legged.play.live.glb import glb, linear
 from legged.play.live.plots import ACTUAL, COMMANDED
 from legged.play.live.session import Session
 from legged.play.live.shapes import bodies_of, plane_shape, terrain_shape
@@ -29,8 +29,6 @@ SLOWEST_SHOWN = 0.03
 """Slower robots have no arrow [m/s]."""
 VIEW = np.array([-1.75, -2.1, 1.15])
 """From where one looks at first, in lengths of a robot."""
-DARKER = 0.7
-"""What bright colours are multiplied with, since viser's light is strong."""
 AMBIENT = 0.35
 """Brightness of the light from all around, beside viser's own: with more, light colours are white."""
 FOG, SKY = (25.0, 55.0), (255, 255, 255)
@@ -194,5 +192,5 @@ class Stage:
 
 
 def _rgb(color: str) -> tuple[int, ...]:
-    """Return a colour such as '#0072B2' as red, green and blue, 0 to 255, so dark that viser's light makes it look so."""
-    return tuple(round(DARKER * int(color[i : i + 2], 16)) for i in (1, 3, 5))
+    """Return a colour such as '#0072B2' as the light of arrows, 0 to 255: they take it for that, and not for a screen's."""
+    return tuple(round(255.0 * float(linear(np.array(int(color[i : i + 2], 16))))) for i in (1, 3, 5))
