@@ -101,20 +101,20 @@ def test_while_nobody_looks_nothing_is_simulated():
 def test_another_ground_is_drawn():
     page = page_of(TASK)
     try:
-        nodes = page.stage._handles
+        nodes = page.drawing._handles
         page.session.go_to("stairs_up", 0.5)
-        page.stage.draw()
-        assert not set(map(id, page.stage._handles)) & set(map(id, nodes))
-        middle = -np.array(page.stage._world.position)
+        page.drawing.draw()
+        assert not set(map(id, page.drawing._handles)) & set(map(id, nodes))
+        middle = -np.array(page.drawing._world.position)
         assert middle == pytest.approx(page.session.task.base_pos[0].tolist(), abs=0.01)
         page.session.step()
-        page.stage.draw()
-        base = page.stage._nodes[0][0]
+        page.drawing.draw()
+        base = page.drawing._nodes[0][0]
         assert base.position == pytest.approx(page.session.task.base_pos[0].tolist(), abs=1e-4)
-        page.stage.follows = False
+        page.drawing.follows = False
         page.session.task.base_pos[0, 0] += 1.0
-        page.stage.draw()
-        assert -np.array(page.stage._world.position) == pytest.approx(middle, abs=0.05)
+        page.drawing.draw()
+        assert -np.array(page.drawing._world.position) == pytest.approx(middle, abs=0.05)
     finally:
         page.close()
 

@@ -10,7 +10,7 @@ from helpers import ENGINE, POLICY, TASK
 from legged.learning.checkpoint import read_checkpoint, write_checkpoint
 from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL, run_config
 from legged.math import quat_rotate
-from legged.play.live.ground import OWN, PLANE, Ground, changes_for, check_ground
+from legged.play.live.ground import OWN, PLANE, ChosenGround, changes_for, check_ground
 from legged.play.live.session import BEHIND_S, HARDEST_PUSH, Session, ago
 from legged.play.live.source import BEST, BEST_MODEL, NEWEST, Watched
 
@@ -191,7 +191,7 @@ def test_a_checkpoint_that_was_asked_for_stays(run):
     put(run, "model_50.pt", 50)
     put(run, "model_60.pt", 60)
     cfg = run_config(run)
-    session = Session(Watched(cfg, run, 50), changes_for(cfg, 1, ENGINE), Ground(PLANE))
+    session = Session(Watched(cfg, run, 50), changes_for(cfg, 1, ENGINE), ChosenGround(PLANE))
     assert session.iteration == 51
     put(run, BEST_MODEL, 20)
     assert not session.look()

@@ -10,7 +10,7 @@ from helpers import POLICY, TASK
 
 from legged.errors import ConfigError
 from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL
-from legged.play.live.source import BEST, BEST_MODEL, Follower, Watched, find_watched
+from legged.play.live.source import BEST, BEST_MODEL, CheckpointFollower, Watched, find_watched
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -84,7 +84,7 @@ def test_wrong_names_are_said_with_the_nearest_one():
 
 def test_a_checkpoint_is_given_once_and_again_when_it_was_written_anew():
     run = begin(f"{TASK}/run", 50, when=100.0)
-    follower = Follower(Watched(asked().cfg, run))
+    follower = CheckpointFollower(Watched(asked().cfg, run))
     assert follower.changed() == run / "model_50.pt"
     assert follower.changed() is None
     follower.forget()

@@ -23,7 +23,7 @@ APART = 1.0
 
 
 @dataclass(frozen=True)
-class Ground:
+class ChosenGround:
     """What robots stand on."""
 
     kind: str
@@ -44,7 +44,7 @@ def grounds_of(cfg: TaskConfig) -> list[str]:
     return [PLANE if on_plane else OWN, *TERRAIN_TYPES]
 
 
-def check_ground(cfg: TaskConfig, kind: str | None, difficulty: float | None) -> Ground:
+def check_ground(cfg: TaskConfig, kind: str | None, difficulty: float | None) -> ChosenGround:
     """Return the ground that --terrain and --difficulty ask for.
 
     Raises:
@@ -55,10 +55,10 @@ def check_ground(cfg: TaskConfig, kind: str | None, difficulty: float | None) ->
         for flag, given in (("terrain", kind), ("difficulty", difficulty)):
             if given is not None:
                 raise ConfigError(f"--{flag}: '{cfg.task}' has no terrain to choose; it has one of its own")
-        return Ground(kinds[0])
+        return ChosenGround(kinds[0])
     assert isinstance(cfg, LeggedConfig)
     Playground.of(cfg, kind, difficulty)
-    return Ground(kinds[0] if kind is None else kind, difficulty)
+    return ChosenGround(kinds[0] if kind is None else kind, difficulty)
 
 
 def changes_for(cfg: TaskConfig, num_envs: int, asked: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
@@ -73,7 +73,7 @@ def changes_for(cfg: TaskConfig, num_envs: int, asked: Sequence[tuple[str, Any]]
 def build(
     cfg: TaskConfig,
     changes: Sequence[tuple[str, Any]],
-    ground: Ground,
+    ground: ChosenGround,
     device: torch.device,
     graph: bool = False,
 ) -> tuple[BaseTask, Playground | None]:

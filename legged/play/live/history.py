@@ -11,7 +11,8 @@ KEPT_S = 10.0
 """How much is kept [s]."""
 SMOOTHED_S = 0.2
 """Rewards are shown as means over so long: a touch-down is paid in a single step [s]."""
-AXES = ("vx", "vy", "yaw rate")
+AXES, UNITS = ("vx", "vy", "yaw rate"), ("m/s", "m/s", "rad/s")
+"""Of a command."""
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ from functools import partial
 from typing import Any
 
 from legged.errors import ConfigError
-from legged.play.live.history import AXES
+from legged.play.live.drawing import Drawing
+from legged.play.live.history import AXES, UNITS
 from legged.play.live.plots import gait_figure, reward_figure, velocity_figures
 from legged.play.live.session import FASTEST, HARDEST_PUSH, SLOWEST, Session
 from legged.play.live.source import BEST, NEWEST
-from legged.play.live.stage import Stage
 
 INSTALL = "pip install 'legged[watch]'"
 PICTURES_S, PLOTS_S, LOOK_S = 1.0 / 30.0, 0.25, 1.0
@@ -28,7 +28,6 @@ KEYS = (("I", 0, 1), ("K", 0, -1), ("U", 1, 1), ("O", 1, -1), ("J", 2, 1), ("L",
 """Letters that change the command: which axis, and in which direction. Others, and the arrows, move viser's camera."""
 DIRECTIONS = {"forwards": 0.0, "left": 90.0, "backwards": 180.0, "right": -90.0}
 """Of a push, to the left of where the robot looks [degrees]."""
-UNITS = ("m/s", "m/s", "rad/s")
 
 
 def load_viser() -> Any:
@@ -59,10 +58,9 @@ class Page:
         # Nobody may send this machine's page to the public through somebody's tunnel, which any visitor could ask for.
         self.server.request_share_url = lambda verbose=True: None
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-        self.stage = Stage(self.server, session)
+        self.drawing = Drawing(self.server, session)
         self.sliders: list[tuple[int, Any]] = []
         """Axis of the command, and its slider."""
-        self._task = session.task
         self._add_controls()
         self._add_plots()
         self._add_keys()
@@ -101,7 +99,7 @@ class Page:
             self._add_time()
         with gui.add_folder("Camera"):
             follow = gui.add_checkbox("follow a robot", True)
-            follow.on_update(lambda _: setattr(self.stage, "follows", bool(follow.value)))
+            follow.on_update(lambda _: setattr(self.drawing, "follows", bool(follow.value)))
             if session.task.num_envs > 1:
                 self.robot = gui.add_slider("robot", min=1, max=session.task.num_envs, step=1, initial_value=1)
                 self.robot.on_update(lambda _: self._later(lambda: session.select(int(self.robot.value) - 1)))
@@ -119,7 +117,7 @@ class Page:
             start = min(max(session.command[axis], low), high)
             if low == high:
                 continue
-            slider = gui.add_slider(f"{name} [{unit}]", min=low, max=high, step=0.01, initial_value=round(start, 2))
+            slider = gui.add_slider(f"{name} [{unit}]", min=low, max=high, step=0.01, initial_value=start)
             slider.on_update(lambda event, axis=axis: self._later(lambda: session.ask(axis, float(event.target.value))))
             self.sliders.append((axis, slider))
         stand = gui.add_button("stand still" if session.clipped([0.0] * 3) == [0.0] * 3 else "slowest")
@@ -132,7 +130,7 @@ class Page:
     def _show_command(self) -> None:
         """Move the sliders to where the command is."""
         for axis, slider in self.sliders:
-            slider.value = round(self.session.command[axis], 2)
+            slider.value = round(self.session.command[axis], 3)
 
     def _add_time(self) -> None:
         gui, session = self.server.gui, self.session
@@ -255,7 +253,7 @@ class Page:
             last = now
             if now - drawn > PICTURES_S:
                 drawn = now
-                self.stage.draw()
+                self.drawing.draw()
             if now - plotted > PLOTS_S:
                 plotted = now
                 self.refresh()

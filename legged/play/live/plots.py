@@ -8,7 +8,7 @@ from html import escape
 
 import numpy as np
 
-from legged.play.live.history import AXES, KEPT_S, History
+from legged.play.live.history import AXES, KEPT_S, UNITS, History
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F")
 """Blue, vermilion, green, purple, orange, sky blue, grey."""
@@ -23,7 +23,6 @@ MOST_POINTS = 160
 """Points of a curve: more than are seen only cost."""
 PARTS = 6
 """Reward terms that are told apart: the largest. The others are added up."""
-UNITS = ("m/s", "m/s", "rad/s")
 
 
 @dataclass(frozen=True)

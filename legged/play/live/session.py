@@ -10,9 +10,9 @@ from legged.config import TaskConfig
 from legged.envs import BaseTask, LeggedRobot
 from legged.errors import ConfigError
 from legged.learning.checkpoint import check_fits, read_checkpoint
-from legged.play.live.ground import PLANE, Ground, build, grounds_of
+from legged.play.live.ground import PLANE, ChosenGround, build, grounds_of
 from legged.play.live.history import History
-from legged.play.live.source import BEST, NEWEST, Follower, Watched, age
+from legged.play.live.source import BEST, NEWEST, CheckpointFollower, Watched, age
 from legged.policies.actor import Actor
 from legged.process.paths import relative
 
@@ -37,7 +37,7 @@ class Session:
         self,
         watched: Watched,
         changes: Sequence[tuple[str, Any]],
-        ground: Ground,
+        ground: ChosenGround,
         device: torch.device | str = "cpu",
         graph: bool = False,
     ) -> None:
@@ -48,7 +48,7 @@ class Session:
         """
         self.watched, self.changes, self.ground = watched, list(changes), ground
         self.device, self._graph = torch.device(device), graph
-        self.follower = Follower(watched)
+        self.follower = CheckpointFollower(watched)
         self.iteration: int | None = None
         """How many iterations the policy on show was trained for; none while there is no checkpoint."""
         self.checkpoint = self.follower.wanted()
@@ -232,7 +232,7 @@ class Session:
         if kind not in self.grounds:
             raise ValueError(f"there is no ground '{kind}' for {self.cfg.task}")
         try:
-            self._build(Ground(kind, difficulty))
+            self._build(ChosenGround(kind, difficulty))
         except ConfigError as error:
             self.problem = str(error)
             return
@@ -248,7 +248,7 @@ class Session:
             return PLANE if self.ground.kind == PLANE else ""
         return self.playground.label(terrain, self.task.base_pos[self.followed].tolist())
 
-    def _build(self, ground: Ground) -> None:
+    def _build(self, ground: ChosenGround) -> None:
         """Build the task on a ground; the robots have not been reset."""
         task, playground = build(self.watched.cfg, self.changes, ground, self.device, self._graph)
         assert isinstance(task, BaseTask)

@@ -105,7 +105,7 @@ def _stamps(paths: Iterable[Path]) -> list[float]:
     return found
 
 
-class Follower:
+class CheckpointFollower:
     """Looks into a run folder for the checkpoint to be shown, and says when it is another one."""
 
     def __init__(self, watched: Watched) -> None:

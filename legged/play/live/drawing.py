@@ -43,7 +43,7 @@ SQUARE = 2.0
 """Length after which the squares of a plane look the same: they are moved along by multiples of it [m]."""
 
 
-class Stage:
+class Drawing:
     """Robots and ground of a session in a viser scene. Everything hangs on one frame, `/world`, which moves the other way
     when the camera follows a robot: so the view stays the user's to turn.
     """
