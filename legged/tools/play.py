@@ -16,6 +16,7 @@ from legged.commandline.arguments import (
     policy_overrides,
     register_given,
     settle_on,
+    watch_command,
 )
 from legged.commandline.command import run_main
 from legged.commandline.parser import CommandParser
@@ -87,7 +88,7 @@ def _main(argv: list[str] | None) -> int:
         policy, changes = for_episodes(policy, args.num_envs if args.num_envs is not None else SHOWN_ON_A_PLANE)
         ready_to_write(folder, ROOM_MB)
         task, act = restore(policy, [*changes, *asked], device, graph)
-    print(f"{policy.cfg.task}: {relative(policy.checkpoint)}")
+    print(f"{policy.cfg.task}: {relative(policy.checkpoint)}\nwatch it: {watch_command(args, policy.folder)}")
 
     differences = export(task, act.network, folder / EXPORTED)
     for name, difference in differences.items():

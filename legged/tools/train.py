@@ -20,6 +20,7 @@ from legged.commandline.arguments import (
     pick_device,
     register_given,
     settle_on,
+    watch_command,
 )
 from legged.commandline.command import EXIT_FAILED, run_main
 from legged.commandline.output import when_output_is_lost
@@ -171,7 +172,7 @@ def _train(
 
         with stopping_on_signals(runner.stop) as stopped_by, quiet_writers():
             try:
-                folder, finished = _learn(runner, cfg, display, args.note, timing)
+                folder, finished = _learn(runner, cfg, display, args, timing)
             except RankLost as lost:
                 print(lost, file=sys.stderr, flush=True)
                 return EXIT_FAILED
@@ -203,7 +204,7 @@ def _evaluate_during(runner: Runner, resumed_from: Path | None) -> None:
 
 
 def _learn(
-    runner: Runner, cfg: TaskConfig, display: Display | None, note: str | None, timing: Callable[[bool, str], Timing]
+    runner: Runner, cfg: TaskConfig, display: Display | None, args: argparse.Namespace, timing: Callable[[bool, str], Timing]
 ) -> tuple[Path | None, bool]:
     """Train into a new run folder; gives the folder, none where another process has it, and whether training got to its end.
     A training that fails before its first checkpoint leaves no folder; one that fails later says so there, with its times.
@@ -214,9 +215,9 @@ def _learn(
     folder = create_run(cfg) if display else None
     if folder is None or display is None:
         return None, runner.train(cfg.train.runner.max_iterations)
-    if note is not None:
-        write_text(folder / NOTE_FILE, f"{note}\n")
-    print(f"run folder {relative(folder)}", flush=True)
+    if args.note is not None:
+        write_text(folder / NOTE_FILE, f"{args.note}\n")
+    print(f"run folder {relative(folder)}\nwatch it: {watch_command(args, folder)}", flush=True)
     display.title = f"{cfg.task}: {relative(folder)}"
     if runner.evaluations is not None:
         runner.evaluations.begin_in(folder)
