@@ -26,6 +26,7 @@ from legged.commandline.arguments import (
     settle_on,
 )
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.episodes.film import Projector
 from legged.episodes.joint_statistics import JointStatistics, check_comparable, joint_statistics
 from legged.episodes.page import write_page
@@ -65,7 +66,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _main(argv: list[str] | None) -> int:
-    args = _parser().parse_intermixed_args(argv)
+    args = build_parser().parse_intermixed_args(argv)
     _check(args)
     if args.compare:
         return _compare(args)
@@ -88,9 +89,14 @@ def _main(argv: list[str] | None) -> int:
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    form = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(prog="episodes", description=__doc__, formatter_class=form)
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "episodes",
+        __doc__,
+        "python -m legged.tools.episodes --task anymal_c_flat --worst 1",
+        "python -m legged.tools.episodes --task anymal_c_flat --statistics --episodes 50",
+    )
     add_task_arguments(parser, required=False)
     add_run_arguments(parser)
     parser.add_argument("--episodes", type=int, help=f"how many; {EPISODES}")

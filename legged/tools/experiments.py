@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.errors import ConfigError, suggest
 from legged.evaluation.judged_run import folders_in
 from legged.evaluation.reports.comparison import comparison_parts
@@ -32,8 +33,14 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="experiments", description=__doc__)
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "experiments",
+        __doc__,
+        "python -m legged.tools.experiments",
+        "python -m legged.tools.experiments --compare logs/anymal_c_flat/11-22_s1 logs/go2_flat/11-22_s1",
+    )
     parser.add_argument("folders", nargs="*", type=Path, help=f"folders of runs; {LOGS}/ by default")
     parser.add_argument(
         "--compare", nargs="+", metavar="RUN", help="only these runs, side by side; the first is the reference"
@@ -41,7 +48,11 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("--out", type=Path, metavar="FOLDER", help=f"folder for the pages; {LOGS}/, or the first one given")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write nothing but the Markdown page, as this file")
     parser.add_argument("--import", dest="module", help="module or .py file that registers tasks of your own")
-    args = parser.parse_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
     if args.module:
         import_tasks(args.module)
     folder: Path = args.out or (args.folders[0] if args.folders else LOGS)

@@ -13,6 +13,7 @@ import torch
 
 from legged.commandline.arguments import add_run_arguments, register_given
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.config import LeggedConfig
 from legged.errors import ConfigError, RunError
 from legged.evaluation.reports.record import FILMS
@@ -33,15 +34,25 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="report", description=__doc__)
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "report",
+        __doc__,
+        "python -m legged.tools.report logs/anymal_c_flat/2026-11-22_05-38-19",
+        "python -m legged.tools.report --task anymal_c_flat --film",
+    )
     parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="run folders")
     parser.add_argument("--task", help="report on a run of this task; a name or a YAML file")
     add_run_arguments(parser)
     parser.add_argument("--import", dest="module", help="module or .py file that registers tasks of your own")
     parser.add_argument("--film", action="store_true", help=f"film the policy anew, into {FILMS[0]}")
     parser.add_argument("--note", help=f"a sentence about the run, kept in its {NOTE_FILE}")
-    args = parser.parse_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
     if args.task:
         register_given(args)
     elif args.module:

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from legged.commandline.arguments import pick_device
 from legged.commandline.command import EXIT_FAILED, run_main
+from legged.commandline.parser import CommandParser
 from legged.commandline.stopping import stopping_on_signals
 from legged.config.checks import shown
 from legged.errors import ConfigError
@@ -43,8 +44,14 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="sweep", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "sweep",
+        __doc__,
+        "python -m legged.tools.sweep cfg/sweeps/anymal_c_flat.yaml",
+        "python -m legged.tools.sweep cfg/sweeps/anymal_c_flat.yaml --trials 60 --jobs 4",
+    )
     parser.add_argument("file", help="YAML file of the sweep, or the name of one in cfg/sweeps")
     parser.add_argument("--trials", type=int, help="trials in all, of all processes; those of the file by default")
     parser.add_argument("--jobs", type=int, help="processes side by side; one for each device by default")
@@ -53,7 +60,11 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("--report", action="store_true", help="only write table and figures of what there is")
     parser.add_argument("--import", dest="module", help="module or .py file that registers tasks of your own")
     parser.add_argument("--worker", type=int, metavar="NUMBER", help=argparse.SUPPRESS)
-    args = parser.parse_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
     if Ranks.now().several:
         raise ConfigError("sweep: starts its processes by itself; run it without torchrun")
     for flag in ("jobs", "trials"):

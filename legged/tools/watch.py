@@ -4,7 +4,6 @@ Shows the newest checkpoint of a run and goes on to the next one as soon as ther
 alone, where there is no run of it. Commands, terrain, pushes and time are the visitor's; docs/watch.md says more.
 """
 
-import argparse
 import math
 import sys
 from typing import Any
@@ -18,6 +17,7 @@ from legged.commandline.arguments import (
     settle_on,
 )
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.errors import ConfigError
 from legged.play.live.address import HOST, PORT, check_port, free_port, is_loopback, url
 from legged.play.live.ground import changes_for, check_ground
@@ -37,15 +37,25 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="watch", description=__doc__)
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "watch",
+        __doc__,
+        "python -m legged.tools.watch --task anymal_c_flat",
+        "python -m legged.tools.watch --load_run logs/anymal_c_flat/2026-11-22_05-38-19",
+    )
     add_task_arguments(parser, required=False)
     add_run_arguments(parser)
     parser.add_argument("--terrain", metavar="TYPE", help="type of the tiles, e.g. stairs_up; the task's own by default")
     parser.add_argument("--difficulty", type=float, help="of the tiles, 0 to 1; 0.5 and 0.8 by default")
     parser.add_argument("--host", default=HOST, help="address that is listened at; this machine alone by default")
     parser.add_argument("--port", type=int, help=f"{PORT}, or the next one that is free, by default")
-    args = parser.parse_intermixed_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_intermixed_args(argv)
     register_given(args)
     port = free_port(args.host, None if args.port is None else check_port(args.port))
     count = ROBOTS if args.num_envs is None else args.num_envs

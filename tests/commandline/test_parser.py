@@ -26,7 +26,7 @@ def test_help_of_a_command_shows_two_examples_that_it_can_read(tool, capsys):
     shown = capsys.readouterr().out.partition("\nexamples:\n")[2].splitlines()
     assert shown == [f"  {example}" for example in parser.examples]
     for example in parser.examples:
-        assert example.startswith(INSTALLED.get(tool, f"python -m {tool} "))
+        assert f"{example} ".startswith(INSTALLED.get(tool, f"python -m {tool} "))
         args = parser.parse_intermixed_args(CommandParser.arguments_of(example))
         task = getattr(args, "task", None)
         assert task is None or task in tasks() or tool == "legged.tools.migrate"  # its tasks are those of legged_gym
