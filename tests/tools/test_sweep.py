@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -359,3 +360,25 @@ def test_processes_share_a_sweep(capsys):
     assert {path.name for path in Path("logs/sweep_mine/output").glob("worker*.txt")} == {"worker0.txt", "worker1.txt"}
     assert str(os.getpid()) not in {owner.split()[1] for owner in owners}
     assert [f"[{i} of 4]" in out for out in [capsys.readouterr().out] for i in range(1, 5)] == [True] * 4
+
+
+def test_a_signal_ends_the_trial_with_a_checkpoint_and_it_is_tried_again():
+    overrides = {**FILE["overrides"], "train.runner": {**FILE["overrides"]["train.runner"], "max_iterations": 100_000}}
+    written(overrides=overrides)
+    with open("out.txt", "w") as out:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "legged.tools.sweep", *FLAGS],
+            stdout=out,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        )
+        output = Path("logs/sweep_mine/output/trial000.txt")
+        wait_for(lambda: output.is_file() and "\nit " in output.read_text(), process)
+        process.terminate()
+        assert process.wait(timeout=60) == 128 + signal.SIGTERM
+    assert "stopped; it will be tried again  [0 of 3]" in Path("out.txt").read_text()
+    trials = Trials(plan_of(overrides=overrides))
+    assert states(trials) == ["FAIL", "WAITING"]
+    (run,) = trials.all[0].user_attrs[study.RUNS]
+    assert max(checkpoints(Path(run))) >= 0
+    assert trials.next().number == 1
