@@ -129,7 +129,7 @@ def _plan(args: argparse.Namespace) -> tuple[list[Training], Order]:
             raise ConfigError(f"zoo: '{name}' is named twice; each task may come once")
     on_cpu = pick_device(args.sim_device).type == "cpu"
     order = Order(
-        overrides=tuple(text for text in args.tasks if "=" in text),
+        overrides=("train.runner.film=false", *(text for text in args.tasks if "=" in text)),
         module=args.module,
         sim_device=args.sim_device,
         on_cpu=on_cpu,

@@ -154,14 +154,18 @@ class Plan:
         """Return the flags and `key=value`s of train.py for a trial of that number."""
         target = self.given.objective.target
         goal = {} if target is None else {f"train.runner.stop_at.{self.figure}": target}
-        settings = {**self._evaluations(), **self.given.overrides, **values, **goal}
+        settings = {**self._own_defaults(), **self.given.overrides, **values, **goal}
         flags = ["--task", self.given.task, "--seed", str(seed), "--experiment_name", self.name]
         flags += ["--run_name", f"trial{number:03d}_s{seed}"]
         return [*flags, *(f"{path}={json.dumps(value)}" for path, value in settings.items())]
 
-    def _evaluations(self) -> dict[str, Any]:
-        """Return the settings of evaluations that make trials comparable, where the file does not set them."""
+    def _own_defaults(self) -> dict[str, Any]:
+        """Return what the file need not set: evaluations that make trials comparable, and neither report nor film, which take
+        longer than many a trial; `legged.tools.report` makes them later.
+        """
         return {
+            "train.runner.report": False,
+            "train.runner.film": False,
             "train.runner.evaluate_interval": self.cfg.train.runner.evaluate_interval,
             "train.runner.evaluate_share": self.cfg.train.runner.evaluate_share,
         }
