@@ -8,7 +8,8 @@ import sys
 import pytest
 
 from legged.process.paths import data_folder
-from legged.process.startup import importing
+from legged.process.processes import child_environment
+from legged.process.startup import STAGES_FILE, importing
 
 
 def fail_to_import():
@@ -96,3 +97,12 @@ def test_a_list_that_nobody_reads_ends_in_one_line():
         done = subprocess.run([sys.executable, "-m", "legged"], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
+
+
+def test_the_start_of_a_process_that_a_timed_one_begins_is_not_its_own(tmp_path, monkeypatch):
+    monkeypatch.setenv(STAGES_FILE, str(tmp_path / "stages"))
+    code = "from legged.process.startup import stage_ended; stage_ended('mine')"
+    subprocess.run([sys.executable, "-c", code], env=child_environment(), check=True)
+    assert not (tmp_path / "stages").exists()
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert "mine" in (tmp_path / "stages").read_text()
