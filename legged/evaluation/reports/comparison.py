@@ -21,19 +21,31 @@ Measured = tuple[str, Interval] | None
 
 def comparison_parts(records: Sequence[Record]) -> list[Part]:
     """Return the page on some runs, the first of which the others are compared with."""
-    names = labels([record.folder for record in records], [record.config for record in records])
+    common, names = apart(labels([record.folder for record in records], [record.config for record in records]))
+    noted = any(record.note for record in records)
     rows: list[list[Cell]] = []
     for name, record in zip(names, records, strict=True):
         timing = record.timing
         row: list[Cell] = [name, Mono(record.name), record.status, record.why, number(record.robots, ",.0f")]
         row += [number(timing.loop_s if timing else None, ".1f"), number(timing.steps_per_s if timing else None, ",.0f")]
-        rows.append([*row, record.code.summary, record.note])
-    head = ["run", "folder", "status", "", "robots", "loop [s]", "steps/s", "commit", "note"]
-    parts: list[Part] = [Table(head, rows), Heading("Settings that differ"), _settings(names, records)]
+        rows.append([*row, record.code.summary, *([record.note] if noted else [])])
+    head = ["run", "folder", "status", "", "robots", "loop [s]", "steps/s", "commit", *(["note"] if noted else [])]
+    parts: list[Part] = [Paragraph(f"All runs: {common}.")] if common else []
+    parts += [Table(head, rows), Heading("Settings that differ"), _settings(names, records)]
     drawings = curves_of_runs(list(zip(names, records, strict=True)))
     if drawings:
         parts += [Heading("Curves"), Figures("curves", drawings, "learning curves of the runs")]
     return parts + _evaluations(names, records)
+
+
+def apart(names: Sequence[str]) -> tuple[str, list[str]]:
+    """Return what labels of runs have in common, and of each what tells it from the others; nothing and the labels themselves
+    where one of them would say nothing any more.
+    """
+    parts = [name.split(", ") for name in names]
+    common = [part for part in parts[0] if all(part in one for one in parts)]
+    rest = [", ".join(part for part in one if part not in common) for one in parts]
+    return (", ".join(common), rest) if all(rest) else ("", list(names))
 
 
 def _settings(names: Sequence[str], records: Sequence[Record]) -> Part:

@@ -17,6 +17,12 @@ SINGLE = (
     ("Metrics/falls", "episodes that end in a fall [%]", 100.0),
 )
 """Tag, title, factor."""
+CURRICULUM = (
+    ("Metrics/command_vx", "largest commanded vx [m/s]", 1.0),
+    ("Metrics/command_vy", "largest commanded vy [m/s]", 1.0),
+    ("Metrics/command_yaw", "largest commanded yaw rate [rad/s]", 1.0),
+)
+"""As far as a curriculum of commands has got; the same."""
 LEARNER = (
     ("Policy/mean_std", "standard deviation of actions (noise)", 1.0),
     ("Loss/value", "loss of the value function", 1.0),
@@ -45,11 +51,11 @@ def curves_of_runs(records: Sequence[tuple[str, Record]]) -> list[str]:
 def _several(records: Sequence[tuple[str, Record]]) -> list[str]:
     """Return one drawing a quantity, one line a run."""
     tags = dict.fromkeys(tag for _, record in records for tag in record.scalars)
-    own = [
-        tag for tag in tags if tag.startswith("Metrics/") and tag not in (*NOT_OF_THE_TASK, *(tag for tag, _, _ in SINGLE))
-    ]
+    named = (*NOT_OF_THE_TASK, *(tag for tag, _, _ in SINGLE + CURRICULUM))
+    own = [tag for tag in tags if tag.startswith("Metrics/") and tag not in named]
     found = [drawing for tag, title, factor in SINGLE for drawing in _one(tag, title, records, factor)]
     found += _lengths(records)
+    found += [drawing for tag, title, factor in CURRICULUM for drawing in _one(tag, title, records, factor)]
     for tag in [*own, *(tag for tag in tags if tag.startswith(WATCHED))]:
         title = tag.removeprefix("Metrics/").replace("_", " ")
         found += _one(tag, title, records, markers=tag.startswith(WATCHED))
