@@ -46,7 +46,7 @@ def rows(text: str) -> list[list[str]]:
 
 
 def table(name: str = "logs/experiments.md") -> list[dict[str, str]]:
-    head, *found = rows(Path(name).read_text(encoding="utf-8").replace("\\_", "_"))
+    head, *found = rows(Path(name).read_text(encoding="utf-8").replace("\\_", "_").replace("&nbsp;", ""))
     return [dict(zip((text.replace("\\", "") for text in head), row, strict=True)) for row in found]
 
 
@@ -253,4 +253,5 @@ def test_the_log_of_this_project_is_one_that_the_tool_writes():
     assert {"began", "task", "what changed", "status", "steps/s"} <= found[0].keys()
     began = [row["began"] for row in found]
     assert began == sorted(began, reverse=True)
-    assert f"{len(found)} runs, newest first" in page.read_text(encoding="utf-8")
+    runs = sum(len(row["seed"].split(",")) for row in found)
+    assert f"{runs} runs, newest first" in page.read_text(encoding="utf-8")
