@@ -3,10 +3,6 @@
 Optuna's TPE sampler draws the settings of each trial, which is an ordinary run in logs/<name of the sweep>; trials that fall
 behind are ended early. The sweep goes on where it was stopped or killed, and several processes, GPUs and machines share one
 by its storage. At the end, and with --report at any time, that folder gets table.md, best.yaml and figures.
-
-Examples:
-  python -m legged.tools.sweep anymal_c_flat --jobs 2
-  python -m legged.tools.sweep my_sweep.yaml --report
 """
 
 import argparse
