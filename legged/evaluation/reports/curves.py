@@ -6,7 +6,8 @@ import numpy as np
 
 from legged.evaluation.learning_curves import LEVEL, Scalars, always_promoted, smooth
 from legged.evaluation.reports.record import Record
-from legged.evaluation.reports.svg import COLORS, Axes, Line, curves, stacked
+from legged.evaluation.reports.svg import Axes, Line, curves, stacked
+from legged.figures import COLORS
 
 MOST_PARTS = len(COLORS) - 1
 """Reward parts with a colour of their own; all smaller ones are one."""
