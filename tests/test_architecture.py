@@ -1,4 +1,4 @@
-"""Rules about the code itself: how long files are, and which way imports point."""
+"""Rules about the code itself: how long files are, those of the tests too, and which way imports point."""
 
 import ast
 import sys
