@@ -68,9 +68,9 @@ def test_evaluations_during_training_have_their_time_and_their_best():
     assert f"| time to evaluate | {timing.evaluation_s:.1f} s |" in text
     assert f"| time for the rest | {rest_s:.1f} s (" in text
     assert r"the best by its evaluations is model\_best.pt" in text
-    assert {"largest commanded vx [m/s]", "largest commanded yaw rate [rad/s]"} <= set(
-        re.findall(r'aria-label="([^"]+)"', read(folder))
-    )
+    titles = set(re.findall(r'aria-label="([^"]+)"', read(folder)))
+    assert {"largest commanded vx [m/s]", "largest commanded yaw rate [rad/s]"} <= titles
+    assert {"evaluated: velocity RMSE [m/s]", "evaluated: robots that fell [%]"} <= titles
 
 
 def test_levels_are_drawn_by_type():

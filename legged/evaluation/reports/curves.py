@@ -31,6 +31,14 @@ LEARNER = (
 NOT_OF_THE_TASK = (LENGTH, "Metrics/contact_overflows", "Metrics/non_finite_worlds")
 WATCHED = "Evaluation/"
 """Section of what was measured without noise during training."""
+OF_EVALUATION = {
+    "lin_vel_rmse": ("velocity RMSE [m/s]", 1.0),
+    "ang_vel_rmse": ("yaw rate RMSE [rad/s]", 1.0),
+    "falls": ("robots that fell [%]", 100.0),
+    "return": ("return of an episode", 1.0),
+    "episode_length": ("length of an episode [control steps]", 1.0),
+}
+"""Title and factor of its figures; others are metrics of the task, called what they are."""
 
 
 def curves_of_run(record: Record) -> list[str]:
@@ -57,9 +65,12 @@ def _several(records: Sequence[tuple[str, Record]]) -> list[str]:
     found = [drawing for tag, title, factor in SINGLE for drawing in _one(tag, title, records, factor)]
     found += _lengths(records)
     found += [drawing for tag, title, factor in CURRICULUM for drawing in _one(tag, title, records, factor)]
-    for tag in [*own, *(tag for tag in tags if tag.startswith(WATCHED))]:
-        title = tag.removeprefix("Metrics/").replace("_", " ")
-        found += _one(tag, title, records, markers=tag.startswith(WATCHED))
+    for tag in own:
+        found += _one(tag, tag.removeprefix("Metrics/").replace("_", " "), records)
+    for tag in (tag for tag in tags if tag.startswith(WATCHED)):
+        name = tag.removeprefix(WATCHED)
+        title, factor = OF_EVALUATION.get(name, (name.replace("_", " "), 1.0))
+        found += _one(tag, f"evaluated: {title}", records, factor, markers=True)
     found += _one("Loss/learning_rate", "learning rate", records, log=True)
     found += [drawing for tag, title, factor in LEARNER for drawing in _one(tag, title, records, factor)]
     wanted = {record.at("train.algorithm.desired_kl") for _, record in records} - {None}
