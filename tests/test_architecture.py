@@ -1,4 +1,4 @@
-"""Rules about the code itself: how long files are, and which way imports point."""
+"""Rules about the code itself: how long files are, those of the tests too, and which way imports point."""
 
 import ast
 import sys
@@ -10,6 +10,7 @@ import legged
 
 PACKAGE = Path(legged.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
+TESTS = sorted(Path(__file__).parent.rglob("*.py"))
 LONGEST = 400
 
 
@@ -44,7 +45,7 @@ def test_the_rules_are_applied_to_all_of_the_package():
     assert uses(PACKAGE / "tools" / "train.py", "legged.learning", "torch", "warp") == {"legged.learning", "torch"}
 
 
-@pytest.mark.parametrize("path", FILES, ids=name_of)
+@pytest.mark.parametrize("path", [*FILES, *TESTS], ids=lambda path: path.relative_to(PACKAGE.parent).as_posix())
 def test_no_file_is_too_long_to_read(path):
     assert len(path.read_text(encoding="utf-8").splitlines()) <= LONGEST
 

@@ -41,7 +41,7 @@ def words_of(parser: argparse.ArgumentParser, choices: Mapping[str, tuple[str, .
     """
     alone = {name for action in parser._actions if not action.option_strings for name in str(action.metavar).split(" | ")}
     of_flags = {"--physics": choices["sim.physics"], "--solver": choices["sim.solver"]}
-    if "key=value" in alone:
+    if "key=value" in alone or any("--load_run" in action.option_strings for action in parser._actions):
         of_flags["--task"] = (TASKS,)
     flags: list[str] = []
     values: dict[str, tuple[str, ...]] = {}
