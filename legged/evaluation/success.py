@@ -21,7 +21,7 @@ from legged.envs import LeggedRobot
 from legged.errors import ConfigError
 from legged.evaluation.intervals import wilson
 from legged.evaluation.overflows import Overflows
-from legged.evaluation.tiles import on_terrain, tiles_of_sizes
+from legged.evaluation.tiles import cell_for, on_terrain, tiles_of_sizes
 from legged.math import uniform, yaw_of
 from legged.policies.restore import TrainedPolicy, restore, undisturbed
 from legged.terrain import METRES, TERRAIN_TYPES, hardest_difficulty, terrain_types, tile_size
@@ -36,10 +36,15 @@ FORWARD, SIDEWAYS = 0.75, 0.1
 """Velocity asked for: forward, and the largest to either side [m/s]."""
 SPAWN_RANGE = 0.1
 """Robots start at most this far from the middle of their tile, in x and in y, so that no two starts are the same [m]."""
+OF_STEPS = (
+    *("stairs_up", "stairs_down", "step", "obstacles"),
+    *("narrow_stairs_up", "narrow_stairs_down", "dense_blocks", "kerbs", "rubble"),
+)
+"""Types that are measured by the height of their steps."""
 SIZES: dict[str, tuple[float, ...]] = {
     **dict.fromkeys(("slope_up", "slope_down"), (5.0, 10.0, 15.0, 20.0, 22.0, 25.0, 30.0, 35.0)),
     **dict.fromkeys(("rough_slope_up", "rough_slope_down"), (5.0, 10.0, 15.0, 20.0, 25.0)),
-    **dict.fromkeys(("stairs_up", "stairs_down", "step", "obstacles"), tuple(round(0.05 + 0.025 * i, 3) for i in range(11))),
+    **dict.fromkeys(OF_STEPS, tuple(round(0.05 + 0.025 * i, 3) for i in range(11))),
     "waves": (0.05, 0.1, 0.15, 0.2, 0.25, 0.3),
     "gap": (0.2, 0.4, 0.6, 0.8, 1.0, 1.2),
     "pit": (0.1, 0.2, 0.4, 0.6, 0.8, 1.0),
@@ -50,7 +55,7 @@ SIZES: dict[str, tuple[float, ...]] = {
 FEWER: dict[str, tuple[float, ...]] = {
     **dict.fromkeys(("slope_up", "slope_down"), (10.0, 20.0, 25.0, 30.0)),
     **dict.fromkeys(("rough_slope_up", "rough_slope_down"), (10.0, 20.0, 25.0)),
-    **dict.fromkeys(("stairs_up", "stairs_down", "step", "obstacles"), (0.05, 0.1, 0.15, 0.2, 0.25, 0.3)),
+    **dict.fromkeys(OF_STEPS, (0.05, 0.1, 0.15, 0.2, 0.25, 0.3)),
 }
 """Type -> the sizes that are measured without `--full`, where they are fewer."""
 
@@ -203,6 +208,7 @@ def success_over_difficulty(
         own = [
             *undisturbed(robots * len(sizes), TIME_S),
             *on_terrain(policy.cfg, TILE * scale, SPAWN_RANGE * scale),
+            ("terrain.horizontal_scale", cell_for(name, policy.cfg.terrain)),
             ("observations.add_noise", policy.cfg.observations.add_noise),
             ("commands.heading_command", True),
             ("init_state.yaw", [-np.pi, np.pi]),

@@ -42,6 +42,21 @@ def on_terrain(cfg: LeggedConfig, side: float, spawn_range: float) -> list[tuple
     ]
 
 
+def dividing_cell(length: float, cell: float) -> float:
+    """Return the edge of the largest cells, not larger than `cell`, of which a whole number is `length` [m]."""
+    return length / ceil(length / cell - 1e-6)
+
+
+def cell_for(name: str, cfg: TerrainConfig) -> float:
+    """Return the edge of the cells in which a type is measured [m]: that of the training, or a smaller one that divides what
+    the type is made of.
+    """
+    kind = TERRAIN_TYPES[name]
+    if not kind.exact or kind.finest is None:
+        return cfg.horizontal_scale
+    return dividing_cell(kind.finest[0] * cfg.scale, cfg.horizontal_scale)
+
+
 def rough_ground(cfg: TerrainConfig, seed: int) -> Terrain:
     """Build one level tile with bumps, on which all robots of a grid start; the configuration says how large it is (see
     `rough_side`).
