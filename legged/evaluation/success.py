@@ -133,6 +133,17 @@ def trained_to(cfg: LeggedConfig) -> dict[str, float]:
     return {name: tile_size(terrain, name, hardest) for name, share in terrain.proportions.items() if share > 0.0}
 
 
+def to_run_out(cfg: LeggedConfig, num_envs: int) -> list[tuple[str, Any]]:
+    """Return overrides for a task of robots that walk out of tiles in the direction in which they find themselves."""
+    return [
+        *undisturbed(num_envs, TIME_S),
+        *on_terrain(cfg, TILE * cfg.terrain.scale, SPAWN_RANGE * cfg.terrain.scale),
+        ("observations.add_noise", cfg.observations.add_noise),
+        ("commands.heading_command", True),
+        ("init_state.yaw", [-np.pi, np.pi]),
+    ]
+
+
 def place(task: LeggedRobot, robots: int) -> None:
     """Put the first `robots` robots on the tiles of the first size, the next on those of the second, ..."""
     assert task.terrain is not None
@@ -149,6 +160,16 @@ def measure_success(
     """Run one type on a task with `robots` robots for each size on `tiles_of_sizes`; return its points, and how many times a
     robot lost contacts in a control step for want of memory.
     """
+    scores, lost = run_out(task, act, robots)
+    outcomes, times = scores.outcome.view(-1, robots).cpu(), scores.time_s.view(-1, robots).cpu()
+    return [point(size, *of_size) for size, *of_size in zip(sizes, outcomes, times, strict=True)], lost
+
+
+@torch.inference_mode()
+def run_out(task: LeggedRobot, act: Callable[[TensorDict], Tensor], robots: int) -> tuple[Scores, int]:
+    """Let all robots walk out of their tiles, `robots` of them on each kind of tile; return what has become of them, and how
+    many times a robot lost contacts.
+    """
     place(task, robots)
     task.reset()
     commands = torch.zeros(task.num_envs, 3, device=task.device)
@@ -164,9 +185,7 @@ def measure_success(
         if scores.done:
             break
     scores.finish()
-    outcomes, times = scores.outcome.view(-1, robots).cpu(), scores.time_s.view(-1, robots).cpu()
-    points = [point(size, *of_size) for size, *of_size in zip(sizes, outcomes, times, strict=True)]
-    return points, overflows.total(task)
+    return scores, overflows.total(task)
 
 
 def point(size: float, outcomes: Tensor, times: Tensor) -> dict[str, Any]:
@@ -206,12 +225,8 @@ def success_over_difficulty(
     for name in names:
         sizes = sizes_of(name, full, scale)
         own = [
-            *undisturbed(robots * len(sizes), TIME_S),
-            *on_terrain(policy.cfg, TILE * scale, SPAWN_RANGE * scale),
+            *to_run_out(policy.cfg, robots * len(sizes)),
             ("terrain.horizontal_scale", cell_for(name, policy.cfg.terrain)),
-            ("observations.add_noise", policy.cfg.observations.add_noise),
-            ("commands.heading_command", True),
-            ("init_state.yaw", [-np.pi, np.pi]),
             *changes,
         ]
         points, overflows = _on_type(policy, name, sizes, robots, own, device, graph)

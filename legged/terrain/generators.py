@@ -262,6 +262,20 @@ OF_NARROW_STAIRS, OF_KERB = (NARROW_TREAD, "tread of a narrow step"), (KERB, "wi
 OF_DENSE_BLOCKS, OF_RUBBLE = (BLOCK_SIDES[0], "side of a block"), (STONE_SIDES[0], "side of a stone")
 OF_DITCH = (NARROWEST_DITCH, "width of a ditch")
 
+
+def narrow_stairs(up: float) -> TerrainType:
+    """Return stairs with the treads of a house, around a platform at their top, or with `up` of -1 at their bottom."""
+    return TerrainType(
+        lambda tile, size: stairs(tile, up * size, tread=NARROW_TREAD),
+        _riser,
+        METRES,
+        "step height",
+        stepped=True,
+        finest=OF_NARROW_STAIRS,
+        exact=True,
+    )
+
+
 TERRAIN_TYPES: dict[str, TerrainType] = {
     "flat": TerrainType(flat, lambda d: 0.0, METRES, "height", stepped=False, platform=0.0),
     "slope_up": TerrainType(lambda t, s: slope(t, -s), _angle, DEGREES, "angle", stepped=False),
@@ -285,24 +299,8 @@ TERRAIN_TYPES: dict[str, TerrainType] = {
         platform=4.0,
         finest=OF_STONES,
     ),
-    "narrow_stairs_up": TerrainType(
-        lambda t, s: stairs(t, -s, tread=NARROW_TREAD),
-        _riser,
-        METRES,
-        "step height",
-        stepped=True,
-        finest=OF_NARROW_STAIRS,
-        exact=True,
-    ),
-    "narrow_stairs_down": TerrainType(
-        lambda t, s: stairs(t, s, tread=NARROW_TREAD),
-        _riser,
-        METRES,
-        "step height",
-        stepped=True,
-        finest=OF_NARROW_STAIRS,
-        exact=True,
-    ),
+    "narrow_stairs_up": narrow_stairs(-1.0),
+    "narrow_stairs_down": narrow_stairs(1.0),
     "dense_blocks": TerrainType(
         dense_blocks,
         lambda d: 0.05 + 0.2 * d,
