@@ -92,7 +92,9 @@ def build_parser() -> CommandParser:
         parser.add_argument(f"--{axis}", help=f"low:high:step of the command grid [{unit}]; evaluation.{axis} by default")
     parser.add_argument("--robots", type=int, help=f"robots a cell; {ROBOTS}")
     parser.add_argument("--types", help="terrain types to cross, e.g. stairs_up,pit; those of the training by default")
-    parser.add_argument("--full", action="store_true", help="all sizes of a type, 256 robots each")
+    parser.add_argument(
+        "--full", action="store_true", help="all sizes of a type, or all lines with every solver; 256 robots each"
+    )
     parser.add_argument("--robots-per-point", type=int, help="robots for each size of a type; 32, or 256 with --full")
     parser.add_argument("--all-checkpoints", action="store_true", help="which checkpoint of a run is the first that walks")
     parser.add_argument("--rmse", type=float, help=f"a robot that walks has a smaller velocity RMSE [m/s]; {WALKING_RMSE}")

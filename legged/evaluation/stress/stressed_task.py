@@ -98,6 +98,7 @@ class StressedTask(LeggedRobot):
         direction, sign = torch.pi * draw(), torch.where(draw() < 0.0, -1.0, 1.0)
         shift = torch.stack([direction.cos(), direction.sin(), torch.zeros_like(direction)], dim=1)
         self._map_shift = self._per_robot("map_shift").unsqueeze(1) * shift
+        self._map_place = torch.zeros_like(self._map_shift)  # launches know it by its address
         self._map_height = (sign * self._per_robot("map_height")).unsqueeze(1)
         points = self.measured_heights.shape[1]
         self._unseen = 0.5 * (draw(points) + 1.0) < self._per_robot("map_holes").unsqueeze(1)
@@ -136,7 +137,8 @@ class StressedTask(LeggedRobot):
     def sense(self) -> None:
         super().sense()
         self._read_encoders()
-        self._map.update(self.base_pos + self._map_shift, self.base_quat)
+        torch.add(self.base_pos, self._map_shift, out=self._map_place)
+        self._map.update(self._map_place, self.base_quat)
         torch.add(self._map.heights, self._map_height, out=self.measured_heights)
         under = self.height_scan.ground.unsqueeze(1)
         self.measured_heights.copy_(torch.where(self._unseen, under, self.measured_heights))
