@@ -61,7 +61,7 @@ def test_warp_is_known_to_the_physics_and_to_the_graph_only(path):
 FLOORS = [  # from the ground up; each part imports from the floors below it only
     {"errors", "math", "state"},
     {"process"},
-    {"graph", "config", "figures"},
+    {"graph", "config", "figures", "deploy"},
     {"robots", "terrain"},
     {"physics"},
     {"mdp"},
@@ -79,6 +79,7 @@ PARTS = sorted({name_of(path).split(".")[1] for path in FILES if name_of(path) n
 WITHOUT = {  # what else a part does without
     "errors": ["torch"],
     "process": ["torch"],
+    "deploy": ["torch", "mujoco", "yaml", "legged.process", "legged.config", "legged.graph"],
     "config": ["torch"],
     "robots": ["torch"],
     "terrain": ["torch", "mujoco"],

@@ -1,0 +1,88 @@
+"""A fixed rate: when cycles begin, how long they take, and which were late."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class CycleTimes:
+    """What the cycles of a run took [s]."""
+
+    count: int
+    mean: float
+    p50: float
+    p99: float
+    longest: float
+    late_p99: float
+    """How late cycles began, of which 1 % were later [s]."""
+    missed: int
+    """Cycles that ended after the next one should have begun."""
+
+    def line(self) -> str:
+        """Say it in one line, in milliseconds."""
+        times = ", ".join(
+            f"{name} {1e3 * value:.2f}"
+            for name, value in (("mean", self.mean), ("p50", self.p50), ("p99", self.p99), ("max", self.longest))
+        )
+        return f"{self.count} cycles: {times} ms; begun up to {1e3 * self.late_p99:.2f} ms late (p99); {self.missed} missed"
+
+
+class Pace:
+    """Cycles that begin every `dt` after a first one, however long each of them takes."""
+
+    def __init__(
+        self, dt: float, clock: Callable[[], float] = time.perf_counter, sleep: Callable[[float], object] = time.sleep
+    ) -> None:
+        """Begin the first cycle with the first call of `wait`."""
+        self._dt, self._clock, self._sleep = dt, clock, sleep
+        self._due: float | None = None
+        self._began = 0.0
+        self.took: list[float] = []
+        """From a cycle's begin to its end [s]."""
+        self.late: list[float] = []
+        """From when a cycle should have begun until it did [s]."""
+        self.missed = 0
+        self.missed_in_a_row = 0
+
+    def wait(self) -> float:
+        """Wait until the next cycle is due; return the time at which it begins [s]."""
+        now = self._clock()
+        if self._due is None:
+            self._due = now
+        if now < self._due:
+            self._sleep(self._due - now)
+            now = self._clock()
+        self.late.append(max(0.0, now - self._due))
+        self._began = now
+        return now
+
+    def done(self) -> None:
+        """End a cycle. One that ends after the next should have begun has missed its deadline; cycles that are then overdue
+        are left out.
+        """
+        assert self._due is not None
+        now = self._clock()
+        self.took.append(now - self._began)
+        self._due += self._dt
+        if now <= self._due:
+            self.missed_in_a_row = 0
+            return
+        self.missed += 1
+        self.missed_in_a_row += 1
+        self._due += self._dt * int((now - self._due) / self._dt)
+
+    def times(self) -> CycleTimes:
+        """Return what the cycles so far have taken."""
+        took = np.array(self.took or [0.0])
+        return CycleTimes(
+            count=len(self.took),
+            mean=float(took.mean()),
+            p50=float(np.percentile(took, 50)),
+            p99=float(np.percentile(took, 99)),
+            longest=float(took.max()),
+            late_p99=float(np.percentile(self.late or [0.0], 99)),
+            missed=self.missed,
+        )

@@ -1,0 +1,150 @@
+"""The robot's program on a simulated robot: `python -m legged.tools.deploy --policy anymal_c_proprio --robot sim`.
+
+It exports the policy where that has not been done, starts the simulated robot in one process and the robot's own program
+(`python -m legged.deploy`) in another, which talk by UDP, and says how far the robot got.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from legged.commandline.command import run_main
+from legged.deploy.__main__ import add_program_arguments, limits_of
+from legged.deploy.contract import read_contract
+from legged.errors import ConfigError, RunError
+from legged.policies.export import EXPORTED, export
+from legged.policies.restore import policy_of, restore, undisturbed
+from legged.process.paths import exists, ready_to_write, relative
+from legged.tools.simulate_robot import LISTENING, add_simulation_arguments, check_simulation
+
+ROOM_MB = 16.0
+"""What the disk must have room for: the exported policy and the log [MiB]."""
+END_S = 20.0
+"""A process that was asked to end must do so within so long [s]."""
+SIMULATED = ("terrain", "size", "cell", "sim_dt", "latency", "loss", "seed")
+PASSED_ON = ("input", "gamepad", "commands", "seconds", "stand_seconds", "max_tilt", "max_age", "max_missed")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def _main(argv: list[str] | None) -> int:
+    parser = argparse.ArgumentParser(prog="deploy", description=__doc__, conflict_handler="resolve")
+    parser.add_argument("--policy", required=True, help="exported folder, run folder, or task whose newest or shipped policy")
+    parser.add_argument("--robot", required=True, choices=("sim",), help="sim; a robot has its own command, legged.deploy")
+    add_simulation_arguments(parser)
+    add_program_arguments(parser)
+    parser.add_argument("--out", type=Path, help="folder for log.npz and report.json; logs/deploy/<task> by default")
+    parser.add_argument("--log", help=argparse.SUPPRESS)
+    args = parser.parse_args(argv)
+    limits_of(args)
+    args_seconds, args.seconds = args.seconds, min(args.seconds, 1e6)
+    check_simulation(args)
+    args.seconds = args_seconds
+    if args.log is not None:
+        raise ConfigError("--log: the log lies in the folder --out")
+    if args.commands is not None and not exists(args.commands):
+        raise ConfigError(f"--commands: there is no file {args.commands}")
+    exported = _exported(args.policy)
+    contract = read_contract(exported / "policy.json")
+    folder = args.out or Path("logs") / "deploy" / contract.task
+    ready_to_write(folder, ROOM_MB)
+    folder.mkdir(parents=True, exist_ok=True)
+    code, report = _run_both(args, exported, contract.robot, folder)
+    print(f"{relative(folder / 'report.json')}: {_told(report)}")
+    return code
+
+
+def _exported(name: str) -> Path:
+    """Return the folder with the export that `name` means; one is made of a run or of a shipped policy.
+
+    Raises:
+        ConfigError: there is none of that name.
+    """
+    for folder in (Path(name), Path(name).parent if name.endswith(".onnx") else Path(name) / EXPORTED):
+        if exists(folder / "policy.onnx"):
+            return folder
+    policy = policy_of(name)
+    folder = policy.output("deploy") / EXPORTED
+    changes = [*undisturbed(1, 1.0), ("sim.physics", "mujoco")]
+    task, act = restore(policy, changes, torch.device("cpu"), graph=False)
+    export(task, act.network, folder)
+    print(f"exported {relative(folder / 'policy.onnx')}")
+    return folder
+
+
+def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path) -> tuple[int, dict[str, Any]]:
+    """Run the simulated robot and the program to their ends; return the program's exit code and the robot's report.
+
+    Raises:
+        RunError: the simulated robot does not start, or does not end.
+    """
+    report = folder / "report.json"
+    simulator = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "legged.tools.simulate_robot", robot, "--report", str(report)),
+            *_flags(args, SIMULATED),
+        ],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,  # Ctrl-C is for the program, which brakes the robot first
+    )
+    try:
+        assert simulator.stdout is not None
+        line = simulator.stdout.readline()
+        if not line.startswith(LISTENING):
+            raise RunError(f"the simulated robot did not start (exit code {simulator.wait(END_S)})")
+        address = line.removeprefix(LISTENING).strip()
+        program = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "legged.deploy", "--policy", str(exported), "--robot", f"udp:{address}"),
+                *("--log", str(folder / "log.npz"), *_flags(args, PASSED_ON)),
+            ]
+        )
+        code = _wait(program)
+        try:
+            simulator.communicate(timeout=END_S)
+        except subprocess.TimeoutExpired as error:
+            raise RunError("the simulated robot did not hear the program's goodbye") from error
+    finally:
+        simulator.kill()
+        simulator.wait()
+    return code, json.loads(report.read_text(encoding="utf-8"))
+
+
+def _wait(program: subprocess.Popen) -> int:
+    """Wait for the program, which a Ctrl-C of the terminal reaches by itself; return its exit code."""
+    while True:
+        try:
+            return program.wait()
+        except KeyboardInterrupt:
+            continue
+
+
+def _flags(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
+    """Return the flags of those names that were given, or have a default."""
+    given = {name: getattr(args, name) for name in names}
+    return [
+        word for name, value in given.items() if value is not None for word in (f"--{name.replace('_', '-')}", str(value))
+    ]
+
+
+def _told(report: dict[str, Any]) -> str:
+    """Say in one line what became of the robot."""
+    lost = report["lost"] / max(1, report["sent"] + report["received"])
+    return (
+        f"{'fell' if report['fell'] else 'did not fall'}, {report['time']:.1f} s, {report['distance']:.2f} m away,"
+        f" {report['climbed']:+.2f} m higher, largest lean {report['largest_lean']:.2f} rad, {100 * lost:.1f} % of packets lost"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
