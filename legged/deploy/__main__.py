@@ -17,6 +17,7 @@ from legged.deploy.commands import Operator, Orders, Script
 from legged.deploy.gamepad import Gamepad
 from legged.deploy.interface import Interface
 from legged.deploy.keyboard import Keyboard
+from legged.deploy.pace import take_priority
 from legged.deploy.policy import Policy
 from legged.deploy.program import Program
 from legged.deploy.safety import Limits
@@ -71,7 +72,8 @@ def _main(argv: list[str] | None) -> int:
         operator.close()
         raise
     sys.setswitchinterval(SWITCH_S)
-    print(f"{policy.contract.task} on {robot.facts.name}, {1.0 / policy.contract.control_dt:g} Hz", flush=True)
+    hurry = "with priority" if take_priority() else "without priority: cycles may begin late on a busy machine (rtprio)"
+    print(f"{policy.contract.task} on {robot.facts.name}, {1.0 / policy.contract.control_dt:g} Hz, {hurry}", flush=True)
     try:
         outcome = program.run(args.seconds)
     finally:

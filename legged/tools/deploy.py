@@ -140,9 +140,10 @@ def _flags(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
 def _told(report: dict[str, Any]) -> str:
     """Say in one line what became of the robot."""
     lost = report["lost"] / max(1, report["sent"] + report["received"])
+    lean, share = report["largest_lean"], 100.0 * lost
     return (
         f"{'fell' if report['fell'] else 'did not fall'}, {report['time']:.1f} s, {report['distance']:.2f} m away,"
-        f" {report['climbed']:+.2f} m higher, largest lean {report['largest_lean']:.2f} rad, {100 * lost:.1f} % of packets lost"
+        f" {report['climbed']:+.2f} m higher, largest lean {lean:.2f} rad, {share:.1f} % of packets lost"
     )
 
 

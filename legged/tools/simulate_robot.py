@@ -1,4 +1,4 @@
-"""A simulated robot for the robot's program: `python -m legged.tools.simulate_robot anymal_c [--terrain stairs_up --size 0.17]`.
+"""A simulated robot for the robot's program: `python -m legged.tools.simulate_robot anymal_c [--terrain stairs_up]`.
 
 C MuJoCo in real time behind UDP on this machine, with a time step of its own, and a link that may be late and lose packets.
 It prints the port at which it listens; `python -m legged.deploy --robot udp:127.0.0.1:PORT` runs a policy on it.
@@ -13,6 +13,7 @@ import numpy as np
 
 from legged.commandline.command import run_main
 from legged.config.schema import SimConfig, TerrainConfig
+from legged.deploy.pace import take_priority
 from legged.errors import ConfigError
 from legged.process.paths import write_text
 from legged.robots.robot import load_robot
@@ -22,6 +23,8 @@ from legged.tools.simulator.server import Server
 
 LISTENING = "listening at "
 """What the line with the address begins with."""
+PRIORITY = 10
+"""Below that of the program."""
 BORDER = 10.0
 """Level ground around the tile [m]."""
 
@@ -41,6 +44,7 @@ def _main(argv: list[str] | None) -> int:
     robot = load_robot(args.robot)
     sim = SimConfig(dt=args.sim_dt, iterations=100, ls_iterations=50)
     server = Server(SimulatedRobot(robot, _terrain(args), sim), args.latency, args.loss, args.seed)
+    take_priority(PRIORITY)  # motors and sensors of a robot do not wait for other processes either
     print(f"{LISTENING}127.0.0.1:{server.port}", flush=True)
     report = server.run(args.seconds)
     if args.report is not None:
@@ -54,7 +58,7 @@ def add_simulation_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--terrain", metavar="TYPE", help="type of the tile it starts on, e.g. stairs_up; a plane by default")
     parser.add_argument("--size", type=float, help="of the tile's type, in its unit, e.g. the height of a step [m]")
     parser.add_argument(
-        "--cell", type=float, default=0.1, help="edge of the tile's cells [m]; treads are whole ones; default 0.1"
+        "--cell", type=float, default=0.1, help="edge of the tile's cells [m], of which treads have whole ones; default 0.1"
     )
     parser.add_argument("--sim-dt", type=float, default=0.002, help="physics step [s]; default 0.002")
     parser.add_argument("--latency", type=float, default=0.0, help="of packets, in each direction [s]; default 0")
