@@ -11,11 +11,14 @@ from legged.errors import ConfigError
 def commands() -> dict[str, str]:
     """Return module -> the first line of what it says about itself, of all modules that can be run as `python -m`."""
     found = {}
-    for path in sorted(Path(next(iter(legged.tools.__path__))).glob("*.py")):
+    tools = Path(next(iter(legged.tools.__path__)))
+    modules = {f"legged.tools.{path.stem}": path for path in sorted(tools.glob("*.py"))}
+    modules["legged.deploy"] = tools.parent / "deploy" / "__main__.py"
+    for name, path in modules.items():
         text = path.read_text(encoding="utf-8")
         if '__name__ == "__main__"' in text:
             summary = text.split('"""')[1].strip().splitlines()[0]
-            found[f"legged.tools.{path.stem}"] = summary.partition(": `")[0].rstrip(".:")
+            found[name] = summary.partition(": `")[0].rstrip(".:")
     return found
 
 

@@ -104,6 +104,8 @@ def unpack(data: bytes) -> list[Layer]:
             arrays = []
             for shape in shapes(kind, inputs, outputs):
                 size = math.prod(shape)
+                if place + 4 * size > len(data):
+                    raise ValueError("is cut short")
                 arrays.append(np.frombuffer(data, "<f4", size, place).reshape(shape))
                 place += 4 * size
             layers.append(Layer(kind, detail, inputs, outputs, tuple(arrays)))

@@ -1,13 +1,14 @@
 """Commands by keyboard, gamepad and file."""
 
 import os
+import signal
 import struct
 
 import numpy as np
 import pytest
-from helpers import call
+from helpers import call, kept_global_state
 
-from legged.deploy.__main__ import main
+from legged.deploy.__main__ import Interruptible, main
 from legged.deploy.commands import Script
 from legged.deploy.gamepad import Gamepad
 from legged.deploy.keyboard import Keyboard
@@ -125,6 +126,16 @@ def test_an_unplugged_gamepad_is_no_operator(device):
 def test_a_gamepad_that_is_not_there_is_named(tmp_path):
     with pytest.raises(ConfigError, match=r"--input: there is no gamepad at .*js7 \(No such file"):
         Gamepad(tmp_path / "js7")
+
+
+def test_a_signal_asks_the_program_to_end_and_keeps_what_else_was_asked(tmp_path):
+    path = tmp_path / "walk.txt"
+    path.write_text("0 damping\n1 stand\n")
+    with kept_global_state():
+        operator = Interruptible(Script(path))
+        assert operator.poll(0.0).events == (Event.DAMPING,)
+        signal.raise_signal(signal.SIGINT)
+        assert operator.poll(1.0).events == (Event.STAND, Event.QUIT)
 
 
 def test_a_script_says_what_it_says_when_its_time_has_come(tmp_path):
