@@ -54,6 +54,7 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("--robot", required=True, help=f"udp:HOST:PORT, {' or '.join(KINDS)}")
     parser.add_argument("--network", help="network interface of a robot of Unitree's, e.g. eth0; found by itself by default")
     parser.add_argument("--domain", type=int, default=0, help="DDS domain: 0 a robot, 1 Unitree's own simulator; default 0")
+    parser.add_argument("--log", type=Path, default=Path("deploy_log.npz"), help="file of the log; default deploy_log.npz")
     args = parser.parse_args(argv)
     limits = limits_of(args)
     policy = Policy(args.policy)
@@ -94,7 +95,6 @@ def add_program_arguments(parser: argparse.ArgumentParser) -> None:
         "--seconds", type=float, default=float("inf"), help="end after so long; at the operator's word by default"
     )
     parser.add_argument("--stand-seconds", type=float, default=2.0, help="time for standing up [s]; default 2")
-    parser.add_argument("--log", type=Path, default=Path("deploy_log.npz"), help="file of the log; default deploy_log.npz")
     parser.add_argument("--max-tilt", type=float, help=f"stop beyond this [rad]; default {standard['max_tilt']:g}")
     parser.add_argument("--max-age", type=float, help=f"stop at older data [s]; default {standard['max_age_s']:g}")
     parser.add_argument("--max-missed", type=int, help=f"stop at so many missed in a row; default {standard['max_missed']}")

@@ -20,7 +20,9 @@ from legged.errors import ConfigError, RunError
 from legged.policies.export import EXPORTED, export
 from legged.policies.restore import policy_of, restore, undisturbed
 from legged.process.paths import exists, ready_to_write, relative
-from legged.tools.simulate_robot import LISTENING, add_simulation_arguments, check_simulation
+from legged.robots.robot import load_robot
+from legged.tools.simulate_robot import LISTENING, add_simulation_arguments, check_simulation, terrain_of
+from legged.tools.simulator.film import POSES, make_film
 
 ROOM_MB = 16.0
 """What the disk must have room for: the exported policy and the log [MiB]."""
@@ -36,29 +38,29 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="deploy", description=__doc__, conflict_handler="resolve")
+    parser = argparse.ArgumentParser(prog="deploy", description=__doc__)
     parser.add_argument("--policy", required=True, help="exported folder, run folder, or task whose newest or shipped policy")
     parser.add_argument("--robot", required=True, choices=("sim",), help="sim; a robot has its own command, legged.deploy")
+    parser.add_argument("--simulated", metavar="ROBOT", help="name or folder of the robot; the policy's by default")
     add_simulation_arguments(parser)
     add_program_arguments(parser)
     parser.add_argument("--out", type=Path, help="folder for log.npz and report.json; logs/deploy/<task> by default")
-    parser.add_argument("--log", help=argparse.SUPPRESS)
+    parser.add_argument("--film", action="store_true", help="draw the first half minute as film.mp4")
     args = parser.parse_args(argv)
     limits_of(args)
-    args_seconds, args.seconds = args.seconds, min(args.seconds, 1e6)
     check_simulation(args)
-    args.seconds = args_seconds
-    if args.log is not None:
-        raise ConfigError("--log: the log lies in the folder --out")
     if args.commands is not None and not exists(args.commands):
         raise ConfigError(f"--commands: there is no file {args.commands}")
     exported = _exported(args.policy)
     contract = read_contract(exported / "policy.json")
+    robot = load_robot(args.simulated or contract.robot, "--simulated")
     folder = args.out or Path("logs") / "deploy" / contract.task
     ready_to_write(folder, ROOM_MB)
     folder.mkdir(parents=True, exist_ok=True)
-    code, report = _run_both(args, exported, contract.robot, folder)
+    code, report = _run_both(args, exported, str(robot.folder), folder)
     print(f"{relative(folder / 'report.json')}: {_told(report)}")
+    if args.film:
+        make_film(robot, terrain_of(args), folder)
     return code
 
 
@@ -90,6 +92,7 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
     simulator = subprocess.Popen(
         [
             *(sys.executable, "-m", "legged.tools.simulate_robot", robot, "--report", str(report)),
+            *(["--poses", str(folder / POSES)] if args.film else []),
             *_flags(args, SIMULATED),
         ],
         stdin=subprocess.DEVNULL,

@@ -15,7 +15,7 @@ from legged.commandline.command import run_main
 from legged.config.schema import SimConfig, TerrainConfig
 from legged.deploy.pace import take_priority
 from legged.errors import ConfigError
-from legged.process.paths import write_text
+from legged.process.paths import replacing, write_text
 from legged.robots.robot import load_robot
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, terrain_type
 from legged.tools.simulator.robot import SimulatedRobot
@@ -39,14 +39,21 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("robot", help="name of a robot, or its folder")
     add_simulation_arguments(parser)
     parser.add_argument("--report", type=Path, help="JSON file for what became of the robot")
+    parser.add_argument("--poses", type=Path, help=".npy file for its poses, 25 a second, of the first half minute")
+    parser.add_argument("--seconds", type=float, default=3600.0, help="end after so long; default 3600")
     args = parser.parse_args(argv)
     check_simulation(args)
+    if not args.seconds > 0.0:
+        raise ConfigError(f"--seconds: must be above 0, got {args.seconds:g}")
     robot = load_robot(args.robot)
     sim = SimConfig(dt=args.sim_dt, iterations=100, ls_iterations=50)
-    server = Server(SimulatedRobot(robot, _terrain(args), sim), args.latency, args.loss, args.seed)
+    server = Server(SimulatedRobot(robot, terrain_of(args), sim), args.latency, args.loss, args.seed)
     take_priority(PRIORITY)  # motors and sensors of a robot do not wait for other processes either
     print(f"{LISTENING}127.0.0.1:{server.port}", flush=True)
     report = server.run(args.seconds)
+    if args.poses is not None:
+        with replacing(args.poses) as part:
+            np.save(part, np.array(server.poses))
     if args.report is not None:
         write_text(args.report, json.dumps(report, indent=1))
     print(json.dumps(report), flush=True)
@@ -64,7 +71,6 @@ def add_simulation_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--latency", type=float, default=0.0, help="of packets, in each direction [s]; default 0")
     parser.add_argument("--loss", type=float, default=0.0, help="share of packets lost, in each direction; default 0")
     parser.add_argument("--seed", type=int, default=1, help="of the loss; default 1")
-    parser.add_argument("--seconds", type=float, default=600.0, help="end after so long; default 600")
 
 
 def check_simulation(args: argparse.Namespace) -> None:
@@ -83,13 +89,12 @@ def check_simulation(args: argparse.Namespace) -> None:
         ("--sim-dt", args.sim_dt, 1e-4, 0.02),
         ("--latency", args.latency, 0.0, 1.0),
         ("--loss", args.loss, 0.0, 0.9),
-        ("--seconds", args.seconds, 1e-3, 1e6),
     ):
         if value is not None and not low <= value <= high:
             raise ConfigError(f"{flag}: must be between {low:g} and {high:g}, got {value:g}")
 
 
-def _terrain(args: argparse.Namespace) -> Terrain | None:
+def terrain_of(args: argparse.Namespace) -> Terrain | None:
     """Return the ground that the flags ask for: one tile, and level ground around it."""
     if args.terrain is None:
         return None

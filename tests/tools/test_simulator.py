@@ -7,6 +7,7 @@ import sys
 import threading
 from pathlib import Path
 
+import imageio.v3 as iio
 import mujoco
 import numpy as np
 import pytest
@@ -15,10 +16,12 @@ from helpers import CALM, ENGINE, call
 from legged.config.schema import SimConfig, TerrainConfig
 from legged.deploy.udp import UdpRobot
 from legged.physics import RobotScene
+from legged.process.headless import off_screen_library
 from legged.registry import make_task, task_config
 from legged.robots.robot import load_robot
 from legged.terrain import Terrain, TileSpec
 from legged.tools import deploy, simulate_robot
+from legged.tools.simulator.film import make_film
 from legged.tools.simulator.link import Link
 from legged.tools.simulator.robot import SimulatedRobot
 from legged.tools.simulator.server import Server
@@ -160,7 +163,7 @@ def test_it_brakes_when_nobody_speaks_to_it_any_more(simulated):
         (["--sim-dt", "0"], "error: --sim-dt: must be between 0.0001 and 0.02, got 0"),
         (["--commands", "none.txt"], "error: --commands: there is no file none.txt"),
         (["--policy", "nobody"], "error: "),
-        (["--log", "x.npz"], "error: --log: the log lies in the folder --out"),
+        (["--simulated", "anymal_x"], "error: --simulated: there is no robot 'anymal_x'; did you mean"),
         (["--max-tilt", "-1"], "error: --max-tilt: must be above 0, got -1"),
     ],
 )
@@ -171,6 +174,20 @@ def test_a_wrong_flag_ends_the_command_with_one_line(flags, says, tmp_path, monk
     shown = capsys.readouterr().err
     assert shown.startswith(says)
     assert len(shown.splitlines()) == 1
+
+
+def test_a_film_has_a_picture_for_each_pose(tmp_path):
+    if off_screen_library() is None:
+        pytest.skip("nothing draws off screen here")
+    robot = load_robot("anymal_c")
+    pose = np.array([*robot.default_qpos[:2], robot.height, *robot.default_qpos[3:]])
+    np.save(tmp_path / "poses.npy", [[0.04 * i, *pose] for i in range(4)])
+    rows = {"times": np.array([0.0, 0.1]), "state": np.array([1, 2]), "states": np.array(["idle", "damping", "stand"])}
+    np.savez(tmp_path / "log.npz", **rows)
+    make_film(robot, None, tmp_path)
+    frames = iio.imread(tmp_path / "film.mp4")
+    assert frames.shape == (4, 360, 640, 3)
+    assert frames.std() > 10.0
 
 
 def test_an_unknown_robot_is_not_simulated(capsys):

@@ -26,6 +26,9 @@ from legged.tools.simulator.robot import SimulatedRobot
 
 STATE_S = 0.004
 """States are sent after so long [s], rounded to physics steps."""
+POSE_S = 0.04
+"""Poses are kept for a film after so long [s], at most `MOST_POSES` of them."""
+MOST_POSES = 750
 SOURCE_S = 0.02
 """Sources beside the sensors are sent after so long [s]."""
 HOLD_S = 0.2
@@ -44,6 +47,8 @@ class Server:
     loss: float = 0.0
     """Share of the packets that are lost, in each direction."""
     seed: int = 1
+    poses: list[np.ndarray] = field(default_factory=list)
+    """Time [s] and MuJoCo's generalised positions, (1 + nq,) each."""
     _socket: socket.socket = field(init=False)
 
     def __post_init__(self) -> None:
@@ -66,7 +71,7 @@ class Server:
         still until the first command has come.
         """
         dt = self.robot.model.opt.timestep
-        state_steps, source_steps = max(1, round(STATE_S / dt)), max(1, round(SOURCE_S / dt))
+        state_steps, source_steps, pose_steps = (max(1, round(each / dt)) for each in (STATE_S, SOURCE_S, POSE_S))
         began = time.perf_counter()
         due, steps = began, 0
         while not self._gone and (now := time.perf_counter()) - began < seconds:
@@ -87,6 +92,8 @@ class Server:
                 due += dt
                 if steps % state_steps == 0:
                     self._send_state(now, self._sources if steps % source_steps == 0 else {})
+                if steps % pose_steps == 0 and len(self.poses) < MOST_POSES:
+                    self.poses.append(np.array([self.robot.data.time, *self.robot.data.qpos]))
             self._deliver(now)
             time.sleep(max(0.0, min(due - time.perf_counter(), dt)))
         self._socket.close()
