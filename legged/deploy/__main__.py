@@ -94,7 +94,7 @@ def add_program_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seconds", type=float, default=float("inf"), help="end after so long; at the operator's word by default"
     )
-    parser.add_argument("--stand-seconds", type=float, default=2.0, help="time for standing up [s]; default 2")
+    parser.add_argument("--stand-seconds", type=float, default=3.0, help="time for standing up [s]; default 3")
     parser.add_argument("--max-tilt", type=float, help=f"stop beyond this [rad]; default {standard['max_tilt']:g}")
     parser.add_argument("--max-age", type=float, help=f"stop at older data [s]; default {standard['max_age_s']:g}")
     parser.add_argument("--max-missed", type=int, help=f"stop at so many missed in a row; default {standard['max_missed']}")

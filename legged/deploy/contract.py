@@ -92,6 +92,8 @@ class Contract:
     """(A,) the joint of each action."""
     default: np.ndarray
     """(D,) angles at action 0 [rad]."""
+    crouch: np.ndarray | None
+    """(D,) angles by way of which a robot that lies stands up [rad]; None if there are none."""
     stiffness: np.ndarray
     """(D,) P gains [N m/rad], and D gains [N m s/rad]."""
     damping: np.ndarray
@@ -212,6 +214,7 @@ def _contract(path: Path, said: Mapping[str, Any]) -> Contract:
         joint_names=joints,
         acted=np.array([joints.index(name) for name in acted]),
         default=_numbers(said, "default_joint_angles", count),
+        crouch=None if said["crouch_joint_angles"] is None else _numbers(said, "crouch_joint_angles", count),
         stiffness=_numbers(said, "stiffness", count),
         damping=_numbers(said, "damping", count),
         position_limits=np.array(limits, dtype=float).reshape(count, 2),

@@ -2,7 +2,7 @@
 
 import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,15 @@ from legged.deploy.states import MOVING, Event, State, next_state
 
 SETTLE_S = 1.0
 """Joints are braked for so long before the program lets go of the robot [s]."""
+
+
+def along(path: Sequence[np.ndarray], share: float) -> np.ndarray:
+    """Return the pose (D,) at a share of a path of poses, all legs of which take the same time and begin and end at rest."""
+    legs = len(path) - 1
+    i = min(int(share * legs), legs - 1)
+    part = min(1.0, share * legs - i)
+    smooth = part * part * (3.0 - 2.0 * part)
+    return np.asarray((1.0 - smooth) * path[i] + smooth * path[i + 1])
 
 
 @dataclass(frozen=True)
@@ -39,7 +48,7 @@ class Program:
         robot: Interface,
         operator: Operator,
         limits: Limits | None = None,
-        stand_s: float = 2.0,
+        stand_s: float = 3.0,
         clock: Callable[[], float] = time.perf_counter,
         sleep: Callable[[float], object] = time.sleep,
         tell: Callable[[str], object] = print,
@@ -61,7 +70,7 @@ class Program:
         self.state = State.IDLE
         self.stops: list[str] = []
         self._reading: Reading | None = None
-        self._from = contract.default
+        self._path = [contract.default]
         self._since = self._start = 0.0
         self._walked_s = 0.0
         nothing = np.zeros(len(contract.joint_names))
@@ -143,9 +152,11 @@ class Program:
 
     def _enter(self, state: State, now: float) -> None:
         self._say(f"{self.state.value} -> {state.value}", now)
-        self.state, self._since = state, now
         if state is State.STAND and self._reading is not None:
-            self._from = self._reading.positions
+            # Legs that lie anyhow are folded first; a robot that has walked stands already.
+            bent = self._contract.crouch if self.state is State.DAMPING else None
+            self._path = [self._reading.positions, *([] if bent is None else [bent]), self._contract.default]
+        self.state, self._since = state, now
         if state is State.WALK:
             self._policy.restart()
             self._ramp.restart()
@@ -159,9 +170,7 @@ class Program:
                 targets = self._policy.act(reading, self._ramp.advance(orders))
                 self._walked_s += contract.control_dt
             else:
-                share = min(1.0, (now - self._since) / self._stand_s)
-                smooth = share * share * (3.0 - 2.0 * share)
-                targets = (1.0 - smooth) * self._from + smooth * contract.default
+                targets = along(self._path, (now - self._since) / self._stand_s)
             clamped = clamp_targets(targets, reading.positions, reading.velocities, contract)
             return clamped, contract.stiffness, contract.damping
         positions = contract.default if reading is None else np.nan_to_num(reading.positions)

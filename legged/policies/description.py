@@ -10,6 +10,7 @@ from legged.deploy.contract import CONTRACT_VERSION, need_of
 from legged.envs import BaseTask, LeggedRobot
 from legged.mdp.observations import ObservationTerm
 from legged.policies.model_description import describe_control
+from legged.robots.crouch import crouch
 
 LAWS = {
     "P": "stiffness * (action_scale * action + default_joint_angles - q) - damping * dq",
@@ -41,7 +42,7 @@ def describe_robot(task: LeggedRobot) -> dict[str, Any]:
     """Return the robot of a task, its commands and its control law."""
     cfg, robot, control = task.cfg, task.robot, task.control
     low, high = task.command_sampler.full_ranges.t().tolist()
-    scale = control.action_scale
+    scale, bent = control.action_scale, crouch(robot)
     return {
         "contract_version": CONTRACT_VERSION,
         "robot": robot.name,
@@ -52,6 +53,7 @@ def describe_robot(task: LeggedRobot) -> dict[str, Any]:
         "joint_names": list(robot.joint_names),
         "action_joints": [robot.joint_names[i] for i in control.acted],
         "default_joint_angles": control.default_dof_pos.tolist(),
+        "crouch_joint_angles": None if bent is None else bent.tolist(),
         "control_type": cfg.control.control_type,
         "action_scale": scale if isinstance(scale, float) else scale.tolist(),
         "action_clip": cfg.control.clip_actions,
@@ -74,6 +76,7 @@ def conventions(task: LeggedRobot) -> dict[str, str]:
         "needs": "what a term is made of: a sensor of the robot, the command, what the program remembers, or a source"
         " beside these",
         "noise": "half width of the uniform noise that the policy was trained with, in the term's unit before scaling",
+        "crouch_joint_angles": "a robot that lies stands up by way of these angles; null if it has no such pose",
         "command_dead_zone": "horizontal commands that are shorter were never asked for, but 0 [m/s]",
         "base frame": f"fixed to the body '{task.robot.file.base}': x forward, y left, z up",
         "yaw frame": "origin at the base, z vertical, x where the base frame's x points, seen from above",

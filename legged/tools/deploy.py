@@ -6,6 +6,7 @@ It exports the policy where that has not been done, starts the simulated robot i
 
 import argparse
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -20,6 +21,7 @@ from legged.errors import ConfigError, RunError
 from legged.policies.export import EXPORTED, export
 from legged.policies.restore import policy_of, restore, undisturbed
 from legged.process.paths import exists, ready_to_write, relative
+from legged.process.startup import in_main_thread
 from legged.robots.robot import load_robot
 from legged.tools.simulate_robot import LISTENING, add_simulation_arguments, check_simulation, terrain_of
 from legged.tools.simulator.film import POSES, make_film
@@ -100,6 +102,9 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         text=True,
         start_new_session=True,  # Ctrl-C is for the program, which brakes the robot first
     )
+    program = None
+    if in_main_thread():  # who ends this process means all three
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         assert simulator.stdout is not None
         line = simulator.stdout.readline()
@@ -118,6 +123,9 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         except subprocess.TimeoutExpired as error:
             raise RunError("the simulated robot did not hear the program's goodbye") from error
     finally:
+        if program is not None and program.poll() is None:
+            program.terminate()
+            program.wait(END_S)
         simulator.kill()
         simulator.wait()
     return code, json.loads(report.read_text(encoding="utf-8"))

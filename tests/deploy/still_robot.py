@@ -111,9 +111,9 @@ class Stage:
         self.robot = StillRobot(self.policy.contract, self.time, facts)
         self.told = []
 
-    def run(self, plan, does=None, seconds=20.0, **settings):
+    def run(self, plan, does=None, seconds=20.0, stand_s=2.0, **settings):
         self.operator = Says(plan, does)
-        clocks = {"clock": self.time.clock, "sleep": self.time.sleep, "tell": self.told.append}
+        clocks = {"clock": self.time.clock, "sleep": self.time.sleep, "tell": self.told.append, "stand_s": stand_s}
         self.program = Program(self.policy, self.robot, self.operator, **clocks, **settings)
         self.outcome = self.program.run(seconds)
         return self.outcome

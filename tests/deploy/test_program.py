@@ -35,8 +35,10 @@ def test_it_stands_up_walks_and_lies_down_and_is_never_stopped(stage):
     at = {round(moment - 100.0, 2): asked for moment, *asked in stage.robot.written}
     np.testing.assert_array_equal(at[0.2][2], braking(contract))
     assert not at[0.2][1].any()
-    # Half way of the 2 s that standing up takes, joints are half way between where they were and the default pose.
-    np.testing.assert_allclose(at[1.5][0], contract.default + 0.05, atol=1e-9)
+    # Of the 2 s that standing up takes, joints move to the crouch in the first half, and half way there in half of that.
+    np.testing.assert_allclose(at[1.0][0], 0.5 * (contract.default + 0.1 + contract.crouch), atol=1e-9)
+    np.testing.assert_allclose(at[1.5][0], contract.crouch, atol=1e-9)
+    np.testing.assert_allclose(at[2.0][0], 0.5 * (contract.crouch + contract.default), atol=1e-9)
     np.testing.assert_allclose(at[2.5][0], contract.default, atol=1e-9)
     np.testing.assert_array_equal(at[2.5][1], contract.stiffness)
     np.testing.assert_array_equal(at[4.0][2], contract.damping)
@@ -56,6 +58,13 @@ def test_the_policy_gets_what_it_would_in_training_and_targets_follow_from_its_a
     np.testing.assert_allclose(seen[1][-12:], acted[0], atol=1e-6)
     np.testing.assert_allclose(seen[1][45 + 9 : 45 + 21], 0.5 * acted[0], atol=1e-6)
     np.testing.assert_allclose(log._cycles["targets"][walking[0]], contract.default + 0.5 * acted[0], atol=1e-6)
+
+
+def test_a_robot_that_has_walked_stands_without_a_crouch(stage):
+    stage.run({**WALKS, 4.0: STAND, 6.5: QUIT})
+    contract = stage.policy.contract
+    at = {round(moment - 100.0, 2): asked for moment, *asked in stage.robot.written}
+    np.testing.assert_allclose(at[5.0][0], 0.5 * (at[3.98][0] + contract.default), atol=1e-9)
 
 
 def spoil(**changes):
