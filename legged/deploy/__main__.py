@@ -17,6 +17,7 @@ from legged.deploy.commands import Operator, Orders, Script
 from legged.deploy.gamepad import Gamepad
 from legged.deploy.interface import Interface
 from legged.deploy.keyboard import Keyboard
+from legged.deploy.log import Log
 from legged.deploy.pace import take_priority
 from legged.deploy.policy import Policy
 from legged.deploy.program import Program
@@ -57,6 +58,7 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("--log", type=Path, default=Path("deploy_log.npz"), help="file of the log; default deploy_log.npz")
     args = parser.parse_args(argv)
     limits = limits_of(args)
+    Log.check(args.log)
     policy = Policy(args.policy)
     if args.robot in KINDS:  # what does not fit must be refused before a robot is asked to leave its own controller
         policy.contract.check_fits(KINDS[args.robot].facts)

@@ -1,6 +1,8 @@
 """What a run leaves behind: every reading with the targets in force, to fit actuators to, and every cycle of it."""
 
 import json
+import tempfile
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +11,13 @@ import numpy as np
 from legged.deploy.contract import Contract
 from legged.deploy.interface import Reading
 from legged.deploy.states import State
-from legged.errors import RunError
+from legged.errors import ConfigError, RunError
 
 STATES = tuple(state.value for state in State)
+
+
+MOST_READINGS, MOST_CYCLES = 300_000, 60_000
+"""Rows that are kept, the newest ones: twenty minutes at 250 readings and 50 cycles a second, some hundred megabytes."""
 
 
 class Log:
@@ -20,8 +26,8 @@ class Log:
     def __init__(self, contract: Contract) -> None:
         """Begin with nothing."""
         self._contract = contract
-        self._readings: dict[str, list[Any]] = {}
-        self._cycles: dict[str, list[Any]] = {}
+        self._readings: dict[str, deque[Any]] = {}
+        self._cycles: dict[str, deque[Any]] = {}
         self._notes: list[tuple[float, str]] = []
 
     def add_reading(
@@ -43,12 +49,12 @@ class Log:
             "state": STATES.index(state.value),
         }
         for name, value in row.items():
-            self._readings.setdefault(name, []).append(value)
+            self._readings.setdefault(name, deque(maxlen=MOST_READINGS)).append(value)
 
     def add_cycle(self, state: State, **row: float | np.ndarray) -> None:
         """Add a cycle of the program: its state, and numbers by name, the same names each time."""
         for name, value in {"state": STATES.index(state.value), **row}.items():
-            self._cycles.setdefault(name, []).append(np.copy(value))
+            self._cycles.setdefault(name, deque(maxlen=MOST_CYCLES)).append(np.copy(value))
 
     def note(self, seconds: float, text: str) -> None:
         """Add what happened, a change of state for instance, so long after the start [s]."""
@@ -58,6 +64,24 @@ class Log:
     def notes(self) -> list[str]:
         """What happened so far."""
         return [text for _, text in self._notes]
+
+    @staticmethod
+    def check(path: Path) -> None:
+        """Look before a run whether its log can be written to `path`.
+
+        Raises:
+            ConfigError: it is a folder, or lies where none can be made or nothing can be written.
+        """
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if path.is_dir() or path.suffix != ".npz":
+                raise ConfigError(f"--log: {path}: the name of an .npz file is wanted")
+            with tempfile.TemporaryFile(dir=path.parent):
+                return
+        except (OSError, ValueError) as error:
+            if isinstance(error, ConfigError):
+                raise
+            raise ConfigError(f"--log: {path}: cannot be written ({getattr(error, 'strerror', None) or error})") from error
 
     def save(self, path: Path) -> None:
         """Write the file. By reading: `times` by the robot's clock [s], `received` by this machine's [s], `targets` (T, D)

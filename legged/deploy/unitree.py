@@ -68,7 +68,10 @@ class SdkWire:
             default = import_module("unitree_sdk2py.idl.default")
             messages = import_module(f"unitree_sdk2py.idl.{kind.package}.msg.dds_")
         except ImportError as error:
-            raise ConfigError(f"--robot: Unitree's SDK is missing ({error}): pip install 'legged[unitree-sdk2]'") from error
+            raise ConfigError(
+                f"--robot: Unitree's SDK cannot be imported ({' '.join(str(error).split())}): pip install"
+                " 'legged[unitree-sdk2]'; where that is done, install it from Unitree's own sources (unitree_sdk2_python)"
+            ) from error
         channel.ChannelFactoryInitialize(domain, network)
         if release:
             self._release()

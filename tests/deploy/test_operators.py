@@ -177,6 +177,8 @@ def test_a_script_with_a_mistake_is_refused_by_its_line(tmp_path, text, says):
         (["--stand-seconds", "-1"], 2, "error: --stand-seconds: must be above 0, got -1"),
         (["--robot", "spot", "--commands", "walk.txt"], 2, "error: --robot: 'spot' is unknown"),
         (["--robot", "udp:here", "--commands", "walk.txt"], 2, "error: --robot: udp:here: expected udp:HOST:PORT"),
+        (["--log", "walk.txt"], 2, "error: --log: walk.txt: the name of an .npz file is wanted"),
+        (["--log", "walk.txt/log.npz"], 2, "error: --log: walk.txt/log.npz: cannot be written"),
         (["--robot", "go2"], 2, "joint_names: 'go2' has no joint 'LF_HAA'"),
         (["--commands", "nothing.txt"], 2, "error: --commands: nothing.txt: cannot be read"),
         (["--input", "gamepad", "--gamepad", "js9"], 2, "error: --input: there is no gamepad at js9"),
