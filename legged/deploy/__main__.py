@@ -63,6 +63,7 @@ def _main(argv: list[str] | None) -> int:
     if args.robot in KINDS:  # what does not fit must be refused before a robot is asked to leave its own controller
         policy.contract.check_fits(KINDS[args.robot].facts)
     operator = Interruptible(make_operator(args))
+    hurries = take_priority()  # before any thread of a robot's SDK begins: threads inherit it
     try:
         robot = _connect(args)
     except BaseException:
@@ -75,7 +76,7 @@ def _main(argv: list[str] | None) -> int:
         operator.close()
         raise
     sys.setswitchinterval(SWITCH_S)
-    hurry = "with priority" if take_priority() else "without priority: cycles may begin late on a busy machine (rtprio)"
+    hurry = "with priority" if hurries else "without priority: cycles may begin late on a busy machine (rtprio)"
     print(f"{policy.contract.task} on {robot.facts.name}, {1.0 / policy.contract.control_dt:g} Hz, {hurry}", flush=True)
     try:
         outcome = program.run(args.seconds)
