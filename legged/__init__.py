@@ -4,15 +4,16 @@ What this package offers is imported when it is first asked for: a robot's compu
 and has neither torch nor MuJoCo.
 """
 
-from legged.process.startup import importing  # first: it looks at the time
+from legged.process.startup import importing, only_lists  # first: it looks at the time
 
 import importlib
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from legged.process.headless import HEADLESS  # before MuJoCo: it sets MUJOCO_GL
-from legged.errors import ConfigError
-from legged.gymnasium_ids import announce
+if TYPE_CHECKING or not only_lists():
+    from legged.process.headless import HEADLESS  # before MuJoCo: it sets MUJOCO_GL
+    from legged.errors import ConfigError
+    from legged.gymnasium_ids import announce
 
 if TYPE_CHECKING:
     from legged.config import TaskConfig
@@ -53,4 +54,5 @@ def _task_names() -> Iterable[str]:
     return registry.task_names()
 
 
-announce(_task_names)
+if not only_lists():
+    announce(_task_names)

@@ -1,45 +1,48 @@
-"""`python -m legged` lists the commands."""
+"""`python -m legged` lists tasks, robots and commands."""
 
 import sys
-from pathlib import Path
+from collections.abc import Mapping
 
-import legged.tools
-from legged.commandline.command import run_main
+from legged.commandline.listing import robots, tasks, tools
+from legged.commandline.output import forgiving_output
 from legged.errors import ConfigError
 
-
-def commands() -> dict[str, str]:
-    """Return module -> the first line of what it says about itself, of all modules that can be run as `python -m`."""
-    found = {}
-    tools = Path(next(iter(legged.tools.__path__)))
-    modules = {f"legged.tools.{path.stem}": path for path in sorted(tools.glob("*.py"))}
-    modules["legged.deploy"] = tools.parent / "deploy" / "__main__.py"
-    for name, path in modules.items():
-        text = path.read_text(encoding="utf-8")
-        if '__name__ == "__main__"' in text:
-            summary = text.split('"""')[1].strip().splitlines()[0]
-            found[name] = summary.partition(": `")[0].rstrip(".:")
-    return found
+FAILED, WRONG_INPUT = 1, 2
+"""Exit codes, as `run_main` has them."""
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
+    """Run the command; return its exit code. It is no command of `run_main`, which would import torch."""
+    with forgiving_output() as output:
+        try:
+            _list(sys.argv[1:] if argv is None else argv)
+        except ConfigError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return WRONG_INPUT
+        output.flush()
+        if output.lost is not None:
+            print(f"error: {output.lost}", file=sys.stderr)
+    return 0 if output.lost is None else FAILED
 
 
-def _main(argv: list[str] | None) -> int:
-    given = sys.argv[1:] if argv is None else argv
-    there = commands()
+def _list(given: list[str]) -> None:
     if given and given not in (["--help"], ["-h"]):
-        wanted = [name for name in there if name.rpartition(".")[2] == given[0]]
+        wanted = [name for name in tools() if name.rpartition(".")[2] == given[0]]
         raise ConfigError(
             f"python -m legged: takes no arguments, got '{given[0]}'"
-            + (f"; did you mean python -m {wanted[0]}?" if wanted else "; without any it lists the commands")
+            + (f"; did you mean python -m {wanted[0]}?" if wanted else "; without any it lists tasks, robots and commands")
         )
-    print("commands, each with --help:")
-    for name, summary in there.items():
-        print(f"  python -m {name:30} {summary}")
-    return 0
+    _print("tasks, each for `python train.py --task NAME`", tasks())
+    _print("robots, each for `robot:` in a task's file", robots())
+    _print("commands, each with --help", {f"python -m {name}": summary for name, summary in tools().items()})
+
+
+def _print(title: str, rows: Mapping[str, str]) -> None:
+    """Print a title, and names with what they are."""
+    width = max(map(len, rows), default=0)
+    print(f"{title}:")
+    for name, summary in rows.items():
+        print(f"  {name:{width}}  {summary}".rstrip())
 
 
 if __name__ == "__main__":

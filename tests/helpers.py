@@ -34,6 +34,7 @@ CALM = [
 ]
 
 TINY_TRAINING = [
+    "train.runner.report=false",
     "sim.physics=mujoco",
     "sim.threads=1",
     "train.runner.num_steps_per_env=4",

@@ -1,4 +1,6 @@
-"""What docs/migrating.md shows works: its module trains, and the names, terms and settings that it gives are there."""
+"""What the pages for users of legged_gym, Isaac Lab and mjlab show works: their module trains, and the names, terms and
+settings that they give are there.
+"""
 
 import re
 import sys
@@ -16,9 +18,13 @@ from legged.envs import LeggedRobot
 from legged.envs.legged_gym_names import COMPUTED, CONSTANT, KEPT, PLAIN
 from legged.tools import train
 
-PAGE = (Path(__file__).resolve().parents[1] / "docs" / "migrating.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+PAGE = (DOCS / "migrating.md").read_text(encoding="utf-8")
 FILES = dict(named(PAGE))
-ISAAC = PAGE[PAGE.index("## From Isaac Lab") :]
+OTHERS = [
+    (DOCS / f"from_{name}.md").read_text(encoding="utf-8").partition("\n## Names\n")[2] for name in ("isaac_lab", "mjlab")
+]
+"""What Isaac Lab and mjlab call things, beside our names."""
 
 
 def column(text: str, index: int) -> set[str]:
@@ -70,7 +76,8 @@ def test_functions_of_mathematics_are_there():
     assert all(callable(getattr(legged_math, name)) for name in line.split(", "))
 
 
-def test_terms_and_settings_beside_isaac_labs_are_there():
+@pytest.mark.parametrize("table", OTHERS, ids=["Isaac Lab", "mjlab"])
+def test_terms_and_settings_beside_those_of_others_are_there(table):
     terms = {name for prefix in ("_reward_", "_obs_", "_terminate_") for name in LeggedRobot.terms(prefix)}
     settings = set()
 
@@ -81,12 +88,14 @@ def test_terms_and_settings_beside_isaac_labs_are_there():
 
     collect(to_dict(LeggedConfig()))
     settings |= {"robot", "link_mass", "terminate_after_contacts_on", "dof_names", "_init_buffers", "std"}
-    named_here = {part for name in column(ISAAC, 2) for part in re.findall(r"\w+", name)} - {"self"}
+    named_here = {part for name in column(table, 2) for part in re.findall(r"\w+", name)} - {"self"}
+    assert named_here
     assert named_here <= terms | settings
 
 
-def test_what_has_to_be_written_is_not_there():
-    (row,) = [line for line in ISAAC.splitlines() if "| write them" in line]
+@pytest.mark.parametrize("table", OTHERS, ids=["Isaac Lab", "mjlab"])
+def test_what_has_to_be_written_is_not_there(table):
+    (row,) = [line for line in table.splitlines() if "| write " in line]
     names = column(row, 1)
     assert names
     assert not names & LeggedRobot.terms("_reward_")

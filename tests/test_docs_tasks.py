@@ -1,4 +1,4 @@
-"""What docs/tasks.md shows works: its modules and YAML files, its commands, its excerpts of the code and its counts."""
+"""What docs/tasks.md and networks.md show works: their modules and YAML files, commands, excerpts of the code and counts."""
 
 import re
 import shlex
@@ -31,8 +31,18 @@ def named(page: str) -> list[tuple[str, str]]:
 BLOCKS = named(PAGE)
 MODULES = {name: text for name, text in BLOCKS if "/" not in name}
 EXCERPTS = [(name, text) for name, text in BLOCKS if "/" in name]
-COMMANDS = [line for language, text in fenced(PAGE) if not language for line in text.splitlines()]
-TINY = ["--num_envs", "8", "--max_iterations", "1", "--run_name", "tiny", "train.runner.num_steps_per_env=4"]
+NETWORKS = (ROOT / "docs" / "networks.md").read_text(encoding="utf-8")
+COMMANDS = [line for language, text in (*fenced(PAGE), *fenced(NETWORKS)) if not language for line in text.splitlines()]
+TINY = [
+    "--num_envs",
+    "8",
+    "--max_iterations",
+    "1",
+    "--run_name",
+    "tiny",
+    "train.runner.report=false",
+    "train.runner.num_steps_per_env=4",
+]
 ENGINE = ["--sim_device", "cpu", "sim.physics=mujoco", "sim.threads=1"]
 MAINS = {
     "python train.py": (train.main, [*TINY, *ENGINE]),

@@ -11,7 +11,21 @@ from helpers import POLICY
 
 from legged import registry
 from legged.registry import import_tasks, make_task, task_config
-from legged.tools import benchmark, compare, contact_sheet, evaluate, play, plot, show_terrain, train, warmup, zoo
+from legged.tools import (
+    benchmark,
+    compare,
+    contact_sheet,
+    episodes,
+    evaluate,
+    experiments,
+    play,
+    plot,
+    report,
+    show_terrain,
+    train,
+    warmup,
+    zoo,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {path: path.read_text(encoding="utf-8") for path in (*ROOT.glob("*.md"), *sorted((ROOT / "docs").glob("*.md")))}
@@ -28,7 +42,15 @@ def test_the_example_task_trains_without_touching_the_package(tmp_path, monkeypa
     path.write_text(code, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "_REGISTERED", {})
-    options = ["env.num_envs=4", "train.runner.num_steps_per_env=4", "--max_iterations", "1", "--sim_device", "cpu"]
+    options = [
+        "train.runner.report=false",
+        "env.num_envs=4",
+        "train.runner.num_steps_per_env=4",
+        "--max_iterations",
+        "1",
+        "--sim_device",
+        "cpu",
+    ]
     assert train.main(["--import", str(path), "--task", "careful", *options]) == 0
     assert list(tmp_path.glob("logs/careful/*/model_0.pt"))
 
@@ -57,6 +79,7 @@ def test_the_readme_names_every_task():
         ("python train.py", train.main),
         ("python play.py", play.main),
         ("python -m legged.tools.evaluate", evaluate.main),
+        ("python -m legged.tools.episodes", episodes.main),
         ("python -m legged.tools.benchmark", benchmark.main),
         ("python -m legged.tools.compare", compare.main),
         ("python -m legged.tools.plot", plot.main),
@@ -64,6 +87,8 @@ def test_the_readme_names_every_task():
         ("python -m legged.tools.show_terrain", show_terrain.main),
         ("python -m legged.tools.zoo", zoo.main),
         ("python -m legged.tools.contact_sheet", contact_sheet.main),
+        ("python -m legged.tools.report", report.main),
+        ("python -m legged.tools.experiments", experiments.main),
     ],
 )
 def test_every_flag_that_is_shown_exists(name, main, capsys):

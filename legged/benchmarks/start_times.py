@@ -30,7 +30,8 @@ def time_start(given: Sequence[str], repeats: int) -> dict[str, Any]:
     torch_s, stages = [], []
     for _ in range(repeats + 1):
         torch_s.append(_run([sys.executable, "-c", "import torch"], {})["end"])
-        command = [sys.executable, "-m", "legged.tools.train", *without_own(given), "--max_iterations", "1"]
+        command = [sys.executable, "-m", "legged.tools.train", *without_own(given)]
+        command += ["--max_iterations", "1", "train.runner.film=false"]
         with tempfile.NamedTemporaryFile() as file:
             stages.append(_run(command, {STAGES_FILE: file.name}))
     found = {name: statistics.median(run[name] for run in stages[1:]) for name in stages[0]}

@@ -1,19 +1,24 @@
 """Command-line arguments that train, play and evaluate share, and how they become a configuration."""
 
 import argparse
+import shlex
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from legged.config import parse_override
 from legged.errors import ConfigError
+from legged.process.paths import relative
 from legged.process.ranks import Ranks
 from legged.registry import YAML_ENDINGS, import_tasks, register_file
 
 
-def add_task_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add --task, --import, engine and devices, and free `key=value` overrides."""
-    parser.add_argument("--task", required=True, help="name of the task, e.g. anymal_c_flat, or a YAML file")
+def add_task_arguments(parser: argparse.ArgumentParser, required: bool = True) -> None:
+    """Add --task, which a run may name as well unless it is `required`, --import, engine and devices, and free `key=value`
+    overrides.
+    """
+    parser.add_argument("--task", required=required, help="name of the task, e.g. anymal_c_flat, or a YAML file")
     parser.add_argument("--import", dest="module", help="module or .py file that registers tasks of your own")
     parser.add_argument("--num_envs", type=int, help="number of robots (env.num_envs)")
     parser.add_argument("--seed", type=int, help="random seed (env.seed)")
@@ -28,7 +33,17 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags that say which policy to load."""
     parser.add_argument("--experiment_name", help="folder under logs/; the task's name by default")
     parser.add_argument("--load_run", help="run folder, by name or path; the newest by default")
-    parser.add_argument("--checkpoint", type=int, help="iteration of the checkpoint; the latest by default")
+    parser.add_argument("--checkpoint", type=_iteration, help="iteration of the checkpoint, or best; the latest by default")
+
+
+def _iteration(text: str) -> int | str:
+    """Read the iteration of a checkpoint, or `best`; argparse says what is wrong with anything else."""
+    if text == "best":
+        return text
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"invalid value: '{text}' (an iteration, or best)") from None
 
 
 def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
@@ -117,5 +132,17 @@ def register_given(args: argparse.Namespace) -> None:
     if args.module:
         import_tasks(args.module)
     args.given_task = args.task  # what another process would have to be given
-    if args.task.endswith(YAML_ENDINGS):
+    if args.task is not None and args.task.endswith(YAML_ENDINGS):
         args.task = register_file(args.task)
+
+
+def watch_command(args: argparse.Namespace, folder: Path) -> str:
+    """Return the command that shows the policy of a run folder in a browser, also while it is trained; `args` were given to
+    the command that runs now.
+    """
+    words = ["python", "-m", "legged.tools.watch"]
+    if args.module:
+        words += ["--import", args.module]
+    if args.given_task.endswith(YAML_ENDINGS):  # whose name alone would mean nothing
+        words += ["--task", args.given_task]
+    return shlex.join([*words, "--load_run", relative(folder)])

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from legged.config.bounds import NAME, NAMES, UNIT, between, items, positive
+from legged.config.bounds import LONGEST_S, NAME, NAMES, UNIT, between, items, positive
 
 HIDDEN = items(64, between(1, 16384))
 
@@ -94,6 +94,22 @@ class RunnerConfig:
     """Iterations of the whole training; a resumed run goes on up to this number."""
     save_interval: int = field(default=50, metadata=between(1, 1_000_000_000))
     """Iterations between two checkpoints."""
+    evaluate_interval: int = field(default=0, metadata=between(0, 1_000_000_000))
+    """Iterations between two evaluations during training: of the policy without its exploration, on robots of their own,
+    which nothing disturbs; 0 for none."""
+    evaluate_share: float = field(default=0.03, metadata=UNIT)
+    """Most of the time in iterations that these evaluations may take: one that would exceed it is left out. The first and the
+    last never are; 1 leaves out none."""
+    evaluate_envs: int = field(default=256, metadata=between(1, 2**20))
+    """Robots of an evaluation during training, at most; the commands of the task's grid are shared out among them."""
+    evaluate_s: float = field(default=0.0, metadata=between(0, LONGEST_S))
+    """Simulated time of an evaluation during training [s]; 0 takes 3 s, and a whole episode of tasks without commands."""
+    best_by: str = ""
+    """Figure of the evaluations during training by which model_best.pt is kept; lin_vel_rmse when empty, and the return of
+    tasks without commands."""
+    stop_at: dict[str, float] = field(default_factory=dict, metadata=between(-1e12, 1e12))
+    """Figure of the evaluations during training -> value; training ends as soon as all are reached. Those that end in _rmse,
+    and falls, must come down to it, others up."""
     loop: Literal["stock", "captured"] = "captured"
     """`captured`: rsl-rl's arithmetic without the host in between, on a GPU as CUDA graphs; it falls back to `stock` where
     networks or algorithm need that, and says why. `stock`: rsl-rl's own training loop."""
@@ -104,6 +120,15 @@ class RunnerConfig:
     """Folder under logs/; the task's name when empty."""
     run_name: str = field(default="", metadata=NAME)
     """Appended to the run folder's date and time."""
+    report: bool = True
+    """Write report.html and report.md into the run folder when a training ends."""
+    film: bool = True
+    """Film the last policy for the report of a training that came to its end, if pictures can be drawn: some ten seconds."""
+    logger: str = "tensorboard"
+    """Where training is logged beside TensorBoard: `tensorboard` for nowhere, `wandb`, `neptune`, or module:Class of a writer
+    that extends rsl-rl's LogWriter."""
+    logger_project: str = field(default="", metadata=NAME)
+    """Project there; the folder under logs/ when empty."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The robot's own command: `python -m legged.deploy --policy FOLDER --robot udp:HOST:PORT|go2|g1`.
+"""The robot's program: `python -m legged.deploy --policy FOLDER --robot udp:HOST:PORT|go2|g1`.
 
 It runs the policy that play.py exported into FOLDER (policy.onnx and policy.json) at its rate, under the keyboard, a gamepad
 or a file of commands, and writes a log. It needs numpy and onnxruntime; Unitree's robots need the extra `unitree-sdk2` too.
@@ -12,6 +12,7 @@ from dataclasses import fields
 from pathlib import Path
 from types import FrameType
 
+from legged.commandline.parser import CommandParser
 from legged.deploy import gamepad, keyboard
 from legged.deploy.commands import Operator, Orders, Script
 from legged.deploy.gamepad import Gamepad
@@ -48,15 +49,25 @@ def main(argv: list[str] | None = None) -> int:
         return 128 + signal.SIGINT
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m legged.deploy", description=__doc__.partition("\n\n")[2])
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "legged.deploy",
+        __doc__,
+        "python -m legged.deploy --policy logs/deploy/anymal_c_proprio/exported --robot udp:127.0.0.1:40000",
+        "python -m legged.deploy --policy exported --robot go2 --network eth0 --input gamepad",
+    )
     parser.add_argument("--policy", type=Path, required=True, help="folder with policy.onnx and policy.json")
     add_program_arguments(parser)
     parser.add_argument("--robot", required=True, help=f"udp:HOST:PORT, {' or '.join(KINDS)}")
     parser.add_argument("--network", help="network interface of a robot of Unitree's, e.g. eth0; found by itself by default")
     parser.add_argument("--domain", type=int, default=0, help="DDS domain: 0 a robot, 1 Unitree's own simulator; default 0")
     parser.add_argument("--log", type=Path, default=Path("deploy_log.npz"), help="file of the log; default deploy_log.npz")
-    args = parser.parse_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
     limits = limits_of(args)
     Log.check(args.log)
     policy = Policy(args.policy)

@@ -16,7 +16,7 @@ from torch import Tensor
 from legged.config.schema import TaskConfig
 from legged.envs.actions import as_actions, ordinary_tensors
 from legged.envs.checks import check_task
-from legged.envs.final_step import FinalStep
+from legged.envs.final_step import StepWatcher
 from legged.envs.saved import SavedTask
 from legged.errors import ConfigError
 from legged.graph.step_graph import Branch, StepGraph
@@ -143,8 +143,8 @@ class BaseTask(SavedTask, VecEnv):
         self._beside = Branch(device)  # type: ignore[arg-type]
         self.numbers = UniformNumbers(n, device)  # type: ignore[arg-type]
         """What a step draws at random; subclasses ask it for theirs in `_init_buffers`."""
-        self.final_step: FinalStep | None = None
-        """What episodes ended with, where somebody asked for it (`final_step.keep_final_step`)."""
+        self.final_step: StepWatcher | None = None
+        """What looks at a step before episodes begin anew, where somebody asked for it (`final_step.watch_steps`)."""
         self._steps_since_log = 0
         self._has_buffers = False
 

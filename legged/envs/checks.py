@@ -5,7 +5,7 @@ from itertools import pairwise
 from typing import get_args
 
 from legged.config.networks import check_networks
-from legged.config.schema import TaskConfig
+from legged.config.schema import LeggedConfig, TaskConfig
 from legged.envs.overrides import check_overrides, check_terms
 from legged.errors import ConfigError, suggest
 from legged.mdp.mirror_images import MirrorKind
@@ -14,6 +14,10 @@ from legged.physics.quantities import LAST_STEP, STAGES
 
 RESERVED = {"falls", "episode_length", "non_finite_worlds", "contact_overflows"}
 """Metrics that every task logs."""
+FOLLOWING = ("lin_vel_rmse", "ang_vel_rmse", "falls", "return")
+"""What evaluations during training find of robots that follow commands; the first is what matters most."""
+RETURNING = ("return", "falls", "episode_length")
+"""What they find of others."""
 MOST_IN_A_POOL = 2**31 - 1
 """Contacts or constraint rows of all robots, which engines count in 32 bits."""
 MOST_SAMPLES = 2**28
@@ -50,6 +54,39 @@ def check_task(cls: type, cfg: TaskConfig) -> None:
             raise ConfigError(f"{where}: there is no property '{field}' to randomise{suggest(field, FIELDS, 'properties')}")
     check_sizes(cfg)
     check_lengths(cfg)
+    check_evaluation(cls, cfg)
+
+
+def evaluated_figures(cls: type, cfg: TaskConfig) -> tuple[str, ...]:
+    """Return the names of what evaluations during training find of a task of class `cls`; by the first, if nobody says by
+    which, the best policy is kept. The task's own metrics are among them.
+    """
+    first = FOLLOWING if isinstance(cfg, LeggedConfig) else RETURNING
+    return *first, *sorted(cls.terms("_metric_") - {*first})  # type: ignore[attr-defined]
+
+
+def lower_is_better(figure: str) -> bool:
+    """Return whether a figure of an evaluation is an error or a share of falls."""
+    return figure.endswith("_rmse") or figure == "falls"
+
+
+def check_evaluation(cls: type, cfg: TaskConfig) -> None:
+    """Look whether the evaluations during training find what the configuration asks of them.
+
+    Raises:
+        ConfigError: a figure is none of theirs, or there are none.
+    """
+    runner, figures = cfg.train.runner, evaluated_figures(cls, cfg)
+    asked = {f"train.runner.stop_at.{name}": name for name in runner.stop_at}
+    if runner.best_by:
+        asked["train.runner.best_by"] = runner.best_by
+    for path, name in asked.items():
+        if name not in figures:
+            where = cfg.origins.where(path)
+            raise ConfigError(f"{where}: evaluations of '{cfg.task}' find no {name!r}{suggest(name, figures, 'they find')}")
+    if runner.stop_at and not runner.evaluate_interval:
+        where = cfg.origins.where("train.runner.stop_at")
+        raise ConfigError(f"{where}: nothing is evaluated during training; train.runner.evaluate_interval=50 does it")
 
 
 def check_lengths(cfg: TaskConfig) -> None:

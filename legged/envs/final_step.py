@@ -1,6 +1,8 @@
-"""The last step of an episode, kept for those who learn from it: the task begins the next episode within the same step."""
+"""What looks at a step before episodes that end in it begin anew, and one that does: it keeps the last step of an episode for
+those who learn from it.
+"""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import torch
 
@@ -9,6 +11,18 @@ from legged.physics import Physics
 
 if TYPE_CHECKING:
     from legged.envs.base_task import BaseTask
+
+
+class StepWatcher(Protocol):
+    """Looks at every environment in each step when its reward has been judged, before any is reset, pushed or given a new
+    command.
+    """
+
+    def take(self) -> None:
+        """Copy what is wanted of it: within the captured step, so without host reads or new addresses."""
+
+
+Watcher = TypeVar("Watcher", bound=StepWatcher)
 
 
 class FinalStep:
@@ -34,12 +48,17 @@ class FinalStep:
 
 
 def keep_final_step(task: "BaseTask", graph: bool = True) -> FinalStep:
-    """Let a task keep the last step of its episodes from now on, and return where it does. All episodes begin anew. With
-    `graph` the step is captured (again, if the task was built with a graph), or checked on the CPU, as at its start.
+    """Let a task keep the last step of its episodes from now on, and return where it does. Otherwise as `watch_steps`."""
+    return watch_steps(task, FinalStep(task.observation_terms, task.observation_groups, task.physics), graph)
+
+
+def watch_steps(task: "BaseTask", watcher: Watcher, graph: bool = True) -> Watcher:
+    """Let `watcher` look at every step of a task from now on, and return it. All episodes begin anew. With `graph` the step
+    is captured (again, if the task was built with a graph), or checked on the CPU, as at its start.
 
     Raises:
         TermError: the step cannot be captured.
     """
-    task.final_step = FinalStep(task.observation_terms, task.observation_groups, task.physics)
+    task.final_step = watcher
     task._build_graph(graph and (task.physics.capturable or task.physics.device.type == "cpu"))
-    return task.final_step
+    return watcher

@@ -252,6 +252,13 @@ class Terms:
         target = self.cfg.rewards.air_time_target_s
         return (target - (self.contacts.air_time.amax(dim=1) - target).abs()).clamp(min=0.0) * alone
 
+    def _reward_uneven_steps(self) -> Tensor:
+        """Difference between the longest and the shortest of the feet's last swings, while any velocity is commanded: a limp
+        [s].
+        """
+        swings = self.contacts.last_air_time
+        return (swings.amax(dim=1) - swings.amin(dim=1)) * self.is_moving
+
     def _reward_feet_slide(self) -> Tensor:
         """Squared horizontal speed of feet on the ground [m^2/s^2]."""
         return (self.feet_vel[:, :, :2].square().sum(dim=2) * self.contacts.in_contact).sum(dim=1)

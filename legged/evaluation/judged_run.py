@@ -86,13 +86,22 @@ def find_runs(paths: Iterable[Path]) -> list[JudgedRun]:
     """
     found: list[JudgedRun] = []
     for path in paths:
-        levels = [sorted(path.glob("/".join(["*"] * depth + [CONFIG_FILE]))) for depth in range(DEEPEST)]
-        folders = [file.parent for level in levels for file in level]
-        if not folders:
-            raise ConfigError(f"{path}: holds no run folder (there is no {CONFIG_FILE} in it)")
-        for folder in folders:
+        for folder in folders_in(path):
             found += [read_run(folder), *_other_seeds(folder)]
     return found
+
+
+def folders_in(path: Path) -> list[Path]:
+    """Return the run folders in a folder: itself, or what lies in logs/ or logs/<task>/.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    levels = [sorted(path.glob("/".join(["*"] * depth + [CONFIG_FILE]))) for depth in range(DEEPEST)]
+    folders = [file.parent for level in levels for file in level]
+    if not folders:
+        raise ConfigError(f"{path}: holds no run folder (there is no {CONFIG_FILE} in it)")
+    return folders
 
 
 def _other_seeds(folder: Path) -> list[JudgedRun]:

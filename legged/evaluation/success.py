@@ -19,6 +19,7 @@ from torch import Tensor
 from legged.config import LeggedConfig, override
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
+from legged.evaluation.intervals import wilson
 from legged.evaluation.overflows import Overflows
 from legged.evaluation.tiles import on_terrain, tiles_of_sizes
 from legged.math import uniform, yaw_of
@@ -53,8 +54,6 @@ FEWER: dict[str, tuple[float, ...]] = {
 }
 """Type -> the sizes that are measured without `--full`, where they are fewer."""
 
-Z95 = 1.959964
-"""Standard normal quantile that leaves 2.5 % above it."""
 OPEN, REACHED, FELL, STUCK = range(4)
 """What has become of a robot."""
 
@@ -92,14 +91,6 @@ class Scores:
     def done(self) -> bool:
         """Whether something has happened to everyone."""
         return not bool((self.outcome == OPEN).any())
-
-
-def wilson(successes: int, trials: int, z: float = Z95) -> tuple[float, float]:
-    """Return Wilson's score interval of a share (E. B. Wilson 1927): never outside [0, 1], never empty at 0 or 100 %."""
-    share, scale = successes / trials, 1.0 + z**2 / trials
-    middle = (share + 0.5 * z**2 / trials) / scale
-    half = z / scale * sqrt(share * (1.0 - share) / trials + 0.25 * z**2 / trials**2)
-    return max(0.0, middle - half), min(1.0, middle + half)
 
 
 # ---- what is measured ------------------------------------------------------------------------------------------------

@@ -23,19 +23,23 @@ an easy way out, and the interval of a share knows of robots only."""
 
 
 def on_terrain(cfg: LeggedConfig, side: float, spawn_range: float) -> list[tuple[str, Any]]:
-    """Return overrides for a task on tiles of our own, with sides of `side` [m]; what the policy sees stays as trained."""
-    changes: list[tuple[str, Any]] = [
+    """Return overrides for a task on tiles of our own, with sides of `side` [m]; what the policy sees stays as trained.
+
+    The tiles are built by the caller; of those of the training one stays, level, so that their number times our side does
+    not count as ground that is asked for.
+    """
+    return [
         ("terrain.mesh_type", "height_map"),
         ("terrain.curriculum", False),
+        ("terrain.num_rows", 1),
+        ("terrain.num_cols", 1),
+        ("terrain.max_init_terrain_level", 0),
+        ("terrain.proportions", {**dict.fromkeys(cfg.terrain.proportions, 0.0), "flat": 1.0}),
         ("terrain.terrain_length", side),
         ("terrain.terrain_width", side),
         ("terrain.border_size", BORDER),
         ("terrain.spawn_range", spawn_range),
     ]
-    if cfg.terrain.mesh_type == "plane":  # its proportions are not checked, and may be none
-        unused = dict.fromkeys(cfg.terrain.proportions, 0.0)
-        changes.append(("terrain.proportions", {**unused, "flat": 1.0}))
-    return changes
 
 
 def rough_ground(cfg: TerrainConfig, seed: int) -> Terrain:

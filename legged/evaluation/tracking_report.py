@@ -1,5 +1,6 @@
 """How well a policy follows commands, as a table and as heat maps."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -44,16 +45,29 @@ def _command(cell: list[float]) -> str:
     return f"at vx {cell[0]:g}, vy {cell[1]:g} m/s, yaw {cell[2]:g} rad/s"
 
 
+PANELS = (("rmse_lin", 2, "vy", "velocity RMSE [m/s]"), ("rmse_ang", 1, "yaw", "yaw rate RMSE [rad/s]"))
+"""What heat maps show: a figure of a cell, the axis over which its mean is taken, the axis that goes up, the title."""
+
+
+def grid_means(result: dict[str, Any], name: str, over: int) -> np.ndarray:
+    """Return the mean of a figure over axis `over` of the command grid, (values of vx, values of the other command); NaN
+    where no robot was left to be measured.
+    """
+    shape = tuple(len(result["grid"][axis]) for axis in AXES)
+    values = np.array([cell[name] for cell in result["cells"]], dtype=float).reshape(shape)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a mean of nothing
+        return np.nanmean(values, axis=over)
+
+
 def draw_tracking(result: dict[str, Any], path: Path) -> None:
     """Draw heat maps: for each (vx, vy) and each (vx, yaw), the mean over the third command."""
     grid = result["grid"]
-    shape = tuple(len(grid[name]) for name in AXES)
-    panels = (("rmse_lin", 2, "vy", "velocity RMSE [m/s]"), ("rmse_ang", 1, "yaw", "yaw rate RMSE [rad/s]"))
     with figure(path, (10.0, 4.2), columns=2) as (drawn, axes):
-        for axis, (name, over, other, label) in zip(axes[0], panels, strict=True):
-            values = np.nanmean(np.array([cell[name] for cell in result["cells"]], dtype=float).reshape(shape), axis=over)
+        for axis, (name, over, other, label) in zip(axes[0], PANELS, strict=True):
+            values = grid_means(result, name, over)
             image = axis.imshow(values.T, origin="lower", aspect="auto", cmap="viridis_r", vmin=0.0)
-            axis.set_xticks(range(shape[0]), [f"{v:g}" for v in grid["vx"]])
+            axis.set_xticks(range(len(grid["vx"])), [f"{v:g}" for v in grid["vx"]])
             axis.set_yticks(range(len(grid[other])), [f"{v:g}" for v in grid[other]])
             axis.set_xlabel(f"commanded vx [{AXES['vx']}]")
             axis.set_ylabel(f"commanded {other} [{AXES[other]}]")

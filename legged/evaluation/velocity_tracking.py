@@ -16,6 +16,7 @@ from legged.evaluation.velocity_grid import Grid, mean_and_worst, number_or_null
 from legged.mdp.tracking_error import velocity_error, yaw_rate_error
 from legged.policies.actor import Actor
 from legged.policies.restore import TrainedPolicy, restore, undisturbed
+from legged.terrain import Terrain
 
 GRAVITY = 9.81
 SLOWEST = 0.1
@@ -30,16 +31,24 @@ def ready_to_track(
     The task stands on a plane or, if it has terrain, on bumpy level ground.
     """
     assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
-    changes = undisturbed(grid.num_envs, grid.hold_s)
-    terrain = None
-    if policy.cfg.terrain.mesh_type == "plane":
-        changes += asked
-    else:
-        changes += [*on_terrain(policy.cfg, rough_side(grid), ROUGH_SPAWN), *asked]
-        cfg: Any = override(policy.cfg, changes)
-        terrain = rough_ground(cfg.terrain, cfg.env.seed)
+    changes, terrain = place_to_track(policy.cfg, grid, asked)
+    if terrain is not None:
         print(f"tracking on rough ground: {grid.size_text}", flush=True)
     return restore(policy, changes, device, graph, terrain)
+
+
+def place_to_track(
+    cfg: LeggedConfig, grid: Grid, asked: list[tuple[str, Any]]
+) -> tuple[list[tuple[str, Any]], Terrain | None]:
+    """Return overrides, `asked` among them, for a task of grid.num_envs robots that nothing disturbs, and the bumpy level
+    ground that it stands on; None for the plane of a task without terrain.
+    """
+    changes = undisturbed(grid.num_envs, grid.hold_s)
+    if cfg.terrain.mesh_type == "plane":
+        return [*changes, *asked], None
+    changes += [*on_terrain(cfg, rough_side(grid), ROUGH_SPAWN), *asked]
+    rough: Any = override(cfg, changes)
+    return changes, rough_ground(rough.terrain, rough.env.seed)
 
 
 @torch.inference_mode()

@@ -1,5 +1,6 @@
 """Training in which an iteration is two calls: a rollout and an update, on a GPU one CUDA graph each."""
 
+import math
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -108,8 +109,9 @@ class CapturedRunner(Runner):
     def _log(self, iteration: int, first: int, total: int, rollout: Rollout, clock: "Clock") -> None:
         """Read what is logged, which waits for the iteration to end."""
         logger = self.logger
-        ended, returns, lengths = rollout.ended.tolist()
+        ended, returns, lengths, squares = rollout.ended.tolist()
         if ended:
+            logger.return_std = math.sqrt(squares / ended)
             logger.rewbuffer.clear()
             logger.rewbuffer.append(returns / ended)
             logger.lenbuffer.clear()

@@ -108,6 +108,7 @@ INFOS: dict[str, Kind] = {
     "transferred_from": {str: (str, int)},
     "learning_rate": float,
     "wall_s": float,
+    "evaluation": {str: float},
 }
 """Entry -> what it is made of: a type, some types, or {type: kind of each value}."""
 

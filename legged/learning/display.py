@@ -11,6 +11,8 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
+from legged.learning.evaluations import SECTION
+
 PLAIN_LINES_EVERY_S = 2.0
 
 
@@ -84,7 +86,7 @@ class Progress:
         return (
             f"it {self.iteration}/{self.total}  {_time(self.elapsed_s)} < {_time(self.eta_s)}  "
             f"{self.steps_per_s:,.0f} steps/s ({self.collect_s:.2f}+{self.learn_s:.2f} s)  reward {self._reward()}"
-            f"{shown}  std {self.action_std:.2f}" + self.level() + self.warnings()
+            f"{shown}  std {self.action_std:.2f}" + self.level() + self.evaluated() + self.warnings()
         )
 
     def _word(self, name: str, value: float) -> str:
@@ -102,6 +104,11 @@ class Progress:
         """Return the mean terrain level, if there is one."""
         level = self.values.get("Terrain/level", nan)
         return "" if isnan(level) else f"  level {level:.2f}"
+
+    def evaluated(self) -> str:
+        """Return the first figure of the last evaluation during training, if there was one."""
+        found = [(key, value) for key, value in self.values.items() if key.startswith(SECTION)]
+        return "".join(f"  evaluated {plain(key.removeprefix(SECTION))} {value:.3f}" for key, value in found[:1])
 
     def levels(self) -> dict[str, str]:
         """Return for each terrain type its mean level, and the shares of episodes that moved up and down."""

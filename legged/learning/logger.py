@@ -3,7 +3,9 @@
 import contextlib
 import io
 import math
+import statistics
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -12,6 +14,9 @@ from torch.utils.tensorboard import SummaryWriter
 
 from legged.learning.display import Display, Progress
 from legged.learning.distributed import any_rank
+from legged.learning.divergence_meter import DivergenceMeter
+from legged.learning.evaluations import SECTION, Ended
+from legged.learning.trackers import Tracker, open_writer
 from legged.learning.watch import FAULT, MINI_BATCHES, Diverged, FaultWatch
 
 
@@ -28,8 +33,18 @@ class QuietLogger(Logger):
         self.display, self._left_out = display, left_out
         self.watch = FaultWatch(self.cfg["num_steps_per_env"] * self.num_envs)
         self.stop_requested = False
+        self.evaluate: Callable[[int, int], dict[str, float]] = lambda _iterations, _total: {}
+        """Evaluates the policy after so many iterations of a total, where that is due, and gives what it finds."""
+        self.why_end: Callable[[], str] | None = None
+        """Says why the last evaluation ends the training, or nothing; None where no process evaluates."""
         self.loop_s = 0.0
         """Time spent in iterations so far, this process [s]."""
+        self.return_std: float | None = None
+        """Standard deviation of the returns of the episodes that ended in the last rollout in which any did; of those in the
+        buffer of returns where the training loop does not say.
+        """
+        self.divergence: DivergenceMeter | None = None
+        """What hears of the divergence where rsl-rl's own update computes it."""
         self.latest: dict[str, float] = {}
         """The last value of everything the task logs, NaN while it had none: an iteration in which no episode ended has no
         episode means.
@@ -40,21 +55,32 @@ class QuietLogger(Logger):
         """Steps of all robots, on all GPUs."""
         return self.cfg["num_steps_per_env"] * self.num_envs * self.gpu_world_size
 
-    def _store_code_state(self) -> list[str]:
-        """Nothing: the run folder holds the state of this code already, see runs.code_state."""
-        return []
+    def init_logging_writer(self) -> None:
+        """Open TensorBoard's file, and the tracker if there is one.
+
+        Raises:
+            RunError: the tracker does not start.
+        """
+        self.writer = None
+        if self.log_dir is not None and not self.disable_logs:
+            self.writer = open_writer(self.env_cfg, self.log_dir)  # type: ignore[assignment,arg-type]
 
     def stop_logging_writer(self) -> None:
-        """Also end TensorBoard's writer and its thread, which rsl-rl leaves open."""
-        super().stop_logging_writer()
-        if isinstance(self.writer, SummaryWriter):
+        """End TensorBoard's writer and its thread, which rsl-rl leaves open. A tracker stays open until `hand_over`."""
+        if isinstance(self.writer, SummaryWriter | Tracker):
             self.writer.close()
+
+    def hand_over(self, iteration: int) -> None:
+        """Give the tracker, if there is one, the videos and reports that are in the run folder, and end it."""
+        if isinstance(self.writer, Tracker):
+            self.writer.hand_over(Path(self.log_dir), iteration)
 
     def log(self, it: int, start_it: int, total_it: int, collect_time: float, learn_time: float, **kwargs: Any) -> None:
         """Write one iteration, show it, and stop if that was asked for, of any process.
 
         Raises:
             Interrupted: it was asked for.
+            Ended: an evaluation says so.
             Diverged: numbers have been NaN or infinite for too long.
         """
         # An episode mean has no value (NaN) in a rollout in which none ended; leave it out rather than write NaN.
@@ -63,11 +89,16 @@ class QuietLogger(Logger):
         for entry in self.ep_extras:
             stacked = torch.stack([value.reshape(()) for value in entry.values()]).tolist()  # one transfer, not twenty
             values.update({key: value for key, value in zip(entry, stacked, strict=True) if value == value})
+        evaluated = self.evaluate(it + 1, total_it)
+        values.update({f"{SECTION}{name}": value for name, value in evaluated.items() if math.isfinite(value)})
         left_out = self._left_out()
         if left_out > 0.0:
             values[MINI_BATCHES] = left_out
         self.ep_extras[:] = [dict(values)] if values else []  # a copy: rsl-rl puts tensors in
-        losses = {name: loss for name, loss in kwargs.pop("loss_dict").items() if math.isfinite(loss)}
+        kl = self.divergence.flush() if self.divergence else None
+        losses = kwargs.pop("loss_dict") | ({} if kl is None else {"kl": kl})
+        losses = {name: loss for name, loss in losses.items() if math.isfinite(loss)}
+        self._log_return_std(it)
         with contextlib.redirect_stdout(io.StringIO()):
             super().log(it, start_it, total_it, collect_time, learn_time, loss_dict=losses, **kwargs)
         self.watch.judge(values, left_out)
@@ -90,5 +121,14 @@ class QuietLogger(Logger):
             )
         if any_rank(bool(self.watch.why_stop), torch.device(self.device)):
             raise Diverged(self.watch.why_stop or "numbers of another process were NaN or infinite")
+        if self.why_end is not None and any_rank(bool(self.why_end()), torch.device(self.device)) and it + 1 < total_it:
+            raise Ended
         if any_rank(self.stop_requested, torch.device(self.device)) and it + 1 < total_it:
             raise Interrupted
+
+    def _log_return_std(self, it: int) -> None:
+        """Write how much returns of episodes differ, which rsl-rl leaves out."""
+        if self.writer is not None and self.rewbuffer:
+            std = statistics.pstdev(self.rewbuffer) if self.return_std is None else self.return_std
+            if math.isfinite(std):
+                self.writer.add_scalar("Train/std_reward", std, it)  # type: ignore[attr-defined]

@@ -16,8 +16,10 @@ from legged.learning.scaled_rewards import ScaledRewards
 LOWEST_RATE, HIGHEST_RATE, RATE_STEP = 1e-5, 1e-2, 1.5
 """Bounds of the adaptive learning rate and the factor by which it moves, as in rsl-rl."""
 FEW = 1e-8
-LOSSES = ("value", "surrogate", "entropy", "symmetry")
-"""What is logged of an update, by rsl-rl's names; the last, how far the policy is from its mirror image, with symmetry."""
+LOSSES = ("value", "surrogate", "entropy", "kl", "symmetry")
+"""What is logged of an update, by rsl-rl's names, and `kl`, the divergence of the policy that acted from the one that learns;
+the last, how far the policy is from its mirror image, with symmetry.
+"""
 HALF_LOG_2PI = 0.9189385332046727
 """0.5 * log(2 pi)."""
 
@@ -206,6 +208,7 @@ class DevicePPO(ScaledRewards):
             losses.append((mean[samples:] - images[samples:]).square().mean())
 
         kl = divergence(old_mean, old_std, mean[:samples].detach(), std.detach())
+        losses.insert(LOSSES.index("kl"), kl)  # the tensor, into which several processes put their mean below
         if self.is_multi_gpu:
             self._shared.zero_()
             loss.backward()

@@ -28,8 +28,11 @@ class Rollout:
         self._return, self._length = self._so_far.unbind()
         self._ended = torch.zeros(3, env.num_envs, device=env.device)
         self._zero = torch.zeros((), device=env.device)
-        self.ended = torch.zeros(3, device=env.device)
-        """(3,) of the episodes that ended in the last rollout: number, sum of returns, sum of lengths [steps]."""
+        self._return_at = torch.zeros_like(st.rewards).squeeze(-1)  # (T, N) return of the episode so far, after each step
+        self.ended = torch.zeros(4, device=env.device)
+        """(4,) of the episodes that ended in the last rollout: number, sum of returns, sum of lengths [steps], sum of the
+        squared differences of returns from their mean.
+        """
 
     @property
     def episodes(self) -> dict[str, Tensor]:
@@ -46,7 +49,8 @@ class Rollout:
         self._ended.zero_()
         for t in range(steps or self.alg.storage.num_transitions_per_env):
             self._step(t)
-        torch.sum(self._ended, dim=1, out=self.ended)
+        torch.sum(self._ended, dim=1, out=self.ended[:3])
+        self._spread()
         self._judge()
         self._returns()
 
@@ -64,7 +68,7 @@ class Rollout:
         st.rewards[t].copy_(env.rew_buf.unsqueeze(1))
         st.dones[t].copy_(env.reset_buf.unsqueeze(1))
         self._cut_off[t].copy_(env.time_out_buf.unsqueeze(1))
-        self._count()
+        self._count(t)
 
     def _judge(self) -> None:
         """Compute what acting did not need, for all steps at once: log-probabilities, values, what they add to rewards."""
@@ -78,14 +82,22 @@ class Rollout:
         # The value of the state that was acted on stands for the one that a time-out cut off, as in rsl-rl.
         st.rewards.add_(alg.gamma * self._cut_off * st.values)
 
-    def _count(self) -> None:
-        """Record returns and lengths of episodes, for the log."""
+    def _count(self, t: int) -> None:
+        """Record returns and lengths of episodes after step `t`, for the log."""
         env = self.env
         self._return.add_(env.rew_buf)
+        self._return_at[t].copy_(self._return)
         self._length.add_(1.0)
         self._ended[0].add_(env.reset_buf)
         self._ended[1:].add_(torch.where(env.reset_buf, self._so_far, self._zero))
         self._so_far.masked_fill_(env.reset_buf, 0.0)
+
+    def _spread(self) -> None:
+        """Sum the squared differences of the returns of ended episodes from their mean: in two passes, because a sum of
+        squares would lose them in float32 where the mean is large.
+        """
+        moved = self._return_at - self.ended[1] / self.ended[0]
+        self.ended[3].copy_(torch.where(self.alg.storage.dones.squeeze(-1).bool(), moved.square(), self._zero).sum())
 
     @staticmethod
     def _input(model: MLPModel, observations: Mapping[str, Tensor] | TensorDict) -> Tensor:

@@ -19,7 +19,11 @@ from legged.registry import task_schema
 LOGS = Path("logs")
 CONFIG_FILE = "config.yaml"
 CODE_FILE = "code.diff"
+NOTE_FILE = "note.txt"
 SHIPPED_MODEL = "model.pt"
+BEST_MODEL = "model_best.pt"
+BEST = "best"
+"""What --checkpoint calls it."""
 GIT_S = 30.0
 """Git has so long to answer; on a slow network disk it may take its time [s]."""
 
@@ -63,9 +67,9 @@ def discard_run(folder: Path) -> None:
     """Remove the folder of a run that failed before its first checkpoint, and the folders above it that are empty then; a
     folder that holds anything else stays.
     """
-    if checkpoints(folder):
+    if checkpoints(folder) or (folder / BEST_MODEL).is_file():
         return
-    ours = [folder / CONFIG_FILE, folder / CODE_FILE, *folder.glob("events.out.tfevents.*")]
+    ours = [folder / name for name in (CONFIG_FILE, CODE_FILE, NOTE_FILE)] + [*folder.glob("events.out.tfevents.*")]
     with suppress(OSError):
         for path in ours:
             path.unlink(missing_ok=True)
@@ -155,12 +159,18 @@ def find_run_of_any_task(cfg: TaskConfig, load_run: str) -> Path:
     raise ConfigError(f"--load_run: there is no run '{load_run}'{suggest(load_run, known, 'runs')}")
 
 
-def find_checkpoint(folder: Path, checkpoint: int | None) -> Path:
-    """Return the checkpoint of that iteration in a run folder, or the latest.
+def find_checkpoint(folder: Path, checkpoint: int | str | None) -> Path:
+    """Return the checkpoint of that iteration in a run folder, the one that evaluations during training found to be the
+    best (BEST), or the latest.
 
     Raises:
         ConfigError: there is none.
     """
+    if checkpoint == BEST:
+        if not (folder / BEST_MODEL).is_file():
+            keeping = "with train.runner.evaluate_interval a training keeps it"
+            raise ConfigError(f"--checkpoint: {relative(folder)} has no {BEST_MODEL}; {keeping}")
+        return folder / BEST_MODEL
     found = checkpoints(folder)
     if not found:
         raise ConfigError(f"--load_run: {relative(folder)} holds no checkpoint (model_<iteration>.pt)")

@@ -5,6 +5,8 @@ It is as large as the robots are many, so only the newest is kept: state_<iterat
 """
 
 import random
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -89,3 +91,18 @@ def set_generators(state: dict[str, Any]) -> None:
             torch.cuda.set_rng_state(state["cuda"])
     except Exception as error:  # every generator refuses in a way of its own what is none of its states
         raise StateError(f"its random generators are damaged ({error})") from error
+
+
+@contextmanager
+def kept_generators(device: torch.device) -> Iterator[None]:
+    """Let the block draw random numbers without a trace: the generators of this process, of the host and of every GPU if
+    `device` is one, go on afterwards as if nothing had been drawn.
+    """
+    python, of_numpy = random.getstate(), np.random.get_state()
+    gpus = range(torch.cuda.device_count()) if device.type == "cuda" else []
+    try:
+        with torch.random.fork_rng(devices=gpus):
+            yield
+    finally:
+        random.setstate(python)
+        np.random.set_state(of_numpy)

@@ -24,9 +24,12 @@ from legged.learning.checkpoint import (
 )
 from legged.learning.display import Display
 from legged.learning.distributed import RankLost, join, leave
+from legged.learning.divergence_meter import DivergenceMeter
+from legged.learning.evaluations import Ended, Evaluations
 from legged.learning.logger import Interrupted, QuietLogger
 from legged.learning.networks import keep_std_in_bounds, network_settings, use_matmul
 from legged.learning.recurrent import hidden_states
+from legged.learning.run_folder import BEST_MODEL
 from legged.learning.run_state import generators, read_run_state, remove_older, set_generators, write_run_state
 from legged.learning.step_guard import StepGuard
 from legged.learning.symmetry import augment, images_of
@@ -60,7 +63,7 @@ def runner_config(task: BaseTask, algorithm_class: str) -> dict[str, Any]:
         "num_steps_per_env": runner.num_steps_per_env,
         "save_interval": runner.save_interval,
         "run_name": runner.run_name,
-        "logger": "tensorboard",
+        "logger": runner.logger,
         "check_for_nan": False,  # it would wait for the GPU at every step; the task terminates and counts such robots
         **network_settings(cfg),
         "algorithm": {"class_name": algorithm_class, **settings},
@@ -86,6 +89,8 @@ class Runner(OnPolicyRunner):
         self._state: dict[str, Any] | None = None
         self._transferred_from: dict[str, Any] | None = None
         self._last_saved = ""
+        self.evaluations: Evaluations | None = None
+        """What evaluates the policy during training; of several processes, in the first."""
         keep_std_in_bounds(self.alg.get_policy(), self.alg.optimizer)
         self._guard = None if hasattr(self.alg.optimizer, "found_inf") else StepGuard(self.alg.optimizer)
         self.logger = QuietLogger(
@@ -100,6 +105,7 @@ class Runner(OnPolicyRunner):
             display=display,
             left_out=self._left_out,
         )
+        self.logger.divergence = DivergenceMeter(self.alg.actor)
 
     def _left_out(self) -> float:
         """Return the share of the last update's mini-batches that changed nothing: their gradients were no numbers."""
@@ -109,9 +115,31 @@ class Runner(OnPolicyRunner):
         """Ask `learn` to stop after the iteration that is going on."""
         self.logger.stop_requested = True
 
+    def evaluate_with(self, evaluations: Evaluations | None) -> None:
+        """Evaluate the policy during training; None in those of several processes that leave it to the first."""
+        self.evaluations = evaluations
+        self.logger.why_end = lambda: "" if evaluations is None else evaluations.why_end
+        if evaluations is not None:
+            self.logger.evaluate = self._evaluate
+
+    def _evaluate(self, iterations: int, total: int) -> dict[str, float]:
+        """Evaluate where that is due, and keep the best policy; return what was found."""
+        evaluations, logger = self.evaluations, self.logger
+        assert evaluations is not None
+        if not evaluations.due(iterations, total, logger.loop_s):
+            return {}
+        steps = logger.tot_timesteps + logger.steps_per_iteration
+        best = evaluations.evaluate(self.alg.get_policy(), iterations, logger.loop_s, steps)
+        found = dict(evaluations.history[-1].figures)
+        if best and logger.writer is not None:
+            path = Path(logger.log_dir) / BEST_MODEL
+            write_checkpoint(path, self._content(path, {"evaluation": found}))
+            logger.save_model(str(path), iterations - 1)
+        return found
+
     def train(self, until_iteration: int) -> bool:
-        """Learn up to iteration `until_iteration`; false if stopped before. Leaves a checkpoint either way, and the other
-        processes, if there are any.
+        """Learn up to iteration `until_iteration`, or to the target; false if stopped before. Leaves a checkpoint either way,
+        and the other processes, if there are any.
 
         Raises:
             RankLost: one of those has died.
@@ -120,8 +148,9 @@ class Runner(OnPolicyRunner):
         finished = True
         try:
             self.learn(until_iteration - self.current_learning_iteration, init_at_random_ep_len=True)
-        except Interrupted:
-            finished = False
+        except (Interrupted, Ended) as end:
+            # Who evaluates nothing is told by the first process, in which nothing but a target ends a training of several.
+            finished = isinstance(end, Ended) and (self.evaluations is None or self.evaluations.reached)
             if self.logger.writer is not None:
                 self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
                 self.logger.stop_logging_writer()
@@ -163,6 +192,23 @@ class Runner(OnPolicyRunner):
         Raises:
             RunError: weights are NaN or infinite, or a file can't be written.
         """
+        saved = self._content(Path(path), infos)
+        if not self.is_distributed:  # the other processes' robots are not here
+            saved["infos"]["id"] = uuid4().hex
+            state = {"generators": generators(), "task": self.env.state_dict(), "episodes": self._episodes()}
+            state["memory"] = {name: tensor.clone() for name, tensor in self._memory().items()}
+            write_run_state(Path(path), {"id": saved["infos"]["id"], **state})
+        write_checkpoint(Path(path), saved)
+        remove_older(Path(path))
+        self._last_saved = path
+        self.logger.save_model(path, self.current_learning_iteration)
+
+    def _content(self, path: Path, infos: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Return what a checkpoint holds, with `infos` among what is ours.
+
+        Raises:
+            RunError: weights are NaN or infinite; names the `path` that is not written.
+        """
         saved = self.alg.save()
         try:
             for network in ("actor", "critic"):
@@ -179,15 +225,7 @@ class Runner(OnPolicyRunner):
         }
         if self._transferred_from is not None:
             saved["infos"]["transferred_from"] = self._transferred_from
-        if not self.is_distributed:  # the other processes' robots are not here
-            saved["infos"]["id"] = uuid4().hex
-            state = {"generators": generators(), "task": self.env.state_dict(), "episodes": self._episodes()}
-            state["memory"] = {name: tensor.clone() for name, tensor in self._memory().items()}
-            write_run_state(Path(path), {"id": saved["infos"]["id"], **state})
-        write_checkpoint(Path(path), saved)
-        remove_older(Path(path))
-        self._last_saved = path
-        self.logger.save_model(path, self.current_learning_iteration)
+        return saved
 
     def load(self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None) -> dict:
         """Restore networks, optimiser (if the checkpoint holds it; shipped ones do not), iteration count and the progress of

@@ -18,7 +18,7 @@ class Timing:
 
     task: str
     finished: bool
-    """Whether it came to its last iteration."""
+    """Whether it came to its last iteration, or reached its target."""
     robots: int
     """Of all processes."""
     iterations: int
@@ -37,6 +37,10 @@ class Timing:
     """Modules of Warp's kernels that its cache lacked."""
     beside: int = 0
     """Other trainings that ran on the same machine at the same time, as far as who started it knows."""
+    error: str = ""
+    """What ended it, in one line, where that was neither its last iteration nor a signal."""
+    evaluation_s: float = 0.0
+    """In evaluations during training [s]."""
 
     @property
     def steps_per_s(self) -> float:

@@ -100,6 +100,18 @@ def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:
     ]
 
 
+def nominal(cfg: TaskConfig, changes: Iterable[tuple[str, Any]]) -> TaskConfig:
+    """Return a configuration for measuring and showing the nominal model, with nothing drawn but what `changes` ask for.
+
+    Raises:
+        ConfigError: the changes do not fit it.
+    """
+    few_robots_do = ("train.algorithm.num_mini_batches", 1)  # nothing is trained
+    cfg = override(replace(cfg, domain_rand=replace(cfg.domain_rand, ranges={})), [*changes, few_robots_do])
+    task_class(cfg.task).check(cfg)
+    return cfg
+
+
 def restore(
     policy: TrainedPolicy,
     changes: Iterable[tuple[str, Any]],
@@ -113,11 +125,7 @@ def restore(
     Raises:
         ConfigError: the checkpoint does not fit the task.
     """
-    few_robots_do = ("train.algorithm.num_mini_batches", 1)  # nothing is trained
-    # What is measured and shown is the nominal model; only `changes` may ask for another.
-    nominal = replace(policy.cfg, domain_rand=replace(policy.cfg.domain_rand, ranges={}))
-    cfg = override(nominal, [*changes, few_robots_do])
-    task_class(cfg.task).check(cfg)
+    cfg = nominal(policy.cfg, changes)
     check_fits(policy.checkpoint, read_checkpoint(policy.checkpoint), cfg)
     task = make_task(cfg, device, graph, terrain)
     actor = Actor(task, device)

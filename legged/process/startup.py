@@ -81,6 +81,14 @@ def command_of_ours() -> str | None:
     return "script" if script.name in ("train.py", "play.py") and script.resolve().parent == top else None
 
 
+def only_lists() -> bool:
+    """Return whether this process is `python -m legged`, which lists what there is and imports none of it. Python calls a
+    module '-m' until it has found its file, so that another program's `-m legged` is not meant.
+    """
+    given = sys.orig_argv
+    return sys.argv[:1] == ["-m"] and given[given.index("-m") + 1] == "legged"
+
+
 def in_main_thread() -> bool:
     """Return whether this is the thread in which signal handlers can be set."""
     return threading.current_thread() is threading.main_thread()

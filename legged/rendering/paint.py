@@ -11,7 +11,7 @@ SHOWN_DEPTH = 0.6
 LOW, MIDDLE, HIGH = np.array([[0.42, 0.52, 0.58], [0.80, 0.77, 0.70], [0.78, 0.58, 0.42]])
 """Colours of the deepest, the level and the highest ground."""
 FAR = 100.0
-"""How far from its middle the ground goes on [m]."""
+"""How far from its middle the ground goes on, or a fifth farther than a terrain that is larger [m]."""
 CHECKER = 0.94, 1.0
 """Brightness of dark and of light squares."""
 SQUARE = 0.5
@@ -41,10 +41,11 @@ def add_painted_terrain(scene: mujoco.MjSpec, terrain: Terrain, checkered: bool 
 def add_horizon(scene: mujoco.MjSpec, terrain: Terrain) -> None:
     """Let the level ground around a checkered terrain go on to the horizon."""
     x, y = (0.5 * side for side in terrain.height_map.size)
-    half = 0.5 * (FAR - x), 0.5 * (FAR - y)
+    far = max(FAR, 1.2 * x, 1.2 * y)
+    half = 0.5 * (far - x), 0.5 * (far - y)
     for sign in (-1.0, 1.0):
         for place, size in (
-            ((sign * (x + half[0]), 0.0), (half[0], FAR)),
+            ((sign * (x + half[0]), 0.0), (half[0], far)),
             ((0.0, sign * (y + half[1])), (x, half[1])),
         ):
             scene.worldbody.add_geom(

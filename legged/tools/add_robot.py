@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.config.checks import PLAIN, is_plain_name, shown
 from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, exists, make_folder, ready_to_write, relative, write_text
@@ -28,8 +29,14 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="add_robot", description=__doc__)
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "add_robot",
+        __doc__,
+        "python -m legged.tools.add_robot path/to/my_robot.urdf --out mine",
+        "python -m legged.tools.add_robot menagerie:unitree_go2 --name my_go2",
+    )
     parser.add_argument("source", help="a URDF, an MJCF file, or menagerie:NAME")
     parser.add_argument("--name", help="of the robot; that of the file by default")
     parser.add_argument("--out", type=Path, help="folder for the robot's folder and its task; this clone's own by default")
@@ -39,7 +46,11 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("--stiffness", type=float, help="P gain of all joints [N m/rad]; the file's, or a rule's, by default")
     parser.add_argument("--damping", type=float, help="D gain of all joints [N m s/rad]")
     parser.add_argument("--force", action="store_true", help="write over a robot of that name")
-    args = parser.parse_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
     gains = _gains(args)
     path, source, licence = _source(args.source)
     name = args.name or plain(Path(args.source.removeprefix(PREFIX)).stem).lower()

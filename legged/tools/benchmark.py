@@ -9,7 +9,6 @@ On a GPU it also proves that the step never waits for the host: the timed steps 
 "error", which raises at any synchronisation.
 """
 
-import argparse
 import json
 import sys
 import time
@@ -26,6 +25,7 @@ from legged.benchmarks.start_times import start_report, time_start
 from legged.benchmarks.step_times import synchronize, time_steps
 from legged.commandline.arguments import add_task_arguments, overrides, pick_device, register_given, settle_on
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.config import LeggedConfig, override
 from legged.errors import ConfigError
 from legged.physics import resolve_physics
@@ -49,8 +49,14 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="benchmark", description=__doc__)
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "benchmark",
+        __doc__,
+        "python -m legged.tools.benchmark --task anymal_c_flat --runner captured --json times.json",
+        "python -m legged.tools.benchmark --task anymal_c --scale 1024,4096,16384",
+    )
     add_task_arguments(parser)
     parser.add_argument("--steps", type=int, default=200, help="control steps per measurement")
     parser.add_argument("--repeats", type=int, default=5, help="measurements; the median is reported")
@@ -61,7 +67,11 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("--kernels", type=int, metavar="COUNT", help="also list this many kernels that take longest (GPU)")
     parser.add_argument("--startup", action="store_true", help="time how a training begins, beside importing torch, instead")
     parser.add_argument("--json", type=Path, help="also write the result to this file")
-    args = parser.parse_intermixed_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_intermixed_args(argv)
     register_given(args)
     device = pick_device(args.sim_device)
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")

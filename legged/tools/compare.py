@@ -4,13 +4,13 @@ Takes evaluation files, or folders that hold them. Evaluations of one task in on
 mean and how far the farthest is from it, the picture their mean and range.
 """
 
-import argparse
 import sys
 from pathlib import Path
 
 from rich.console import Console
 
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.errors import ConfigError
 from legged.evaluation.comparison import (
     draw_comparison,
@@ -30,12 +30,22 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="compare", description=__doc__)
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "compare",
+        __doc__,
+        "python -m legged.tools.compare logs/anymal_c_flat/2026-11-22_05-38-19 logs/anymal_c_flat/2026-11-22_06-02-41",
+        "python -m legged.tools.compare logs/anymal_c/*/evaluation_mujoco.json --types stairs_up,slope_up --out success.png",
+    )
     parser.add_argument("paths", nargs="+", type=Path, help="evaluation_<physics>.json files, or folders that hold them")
     parser.add_argument("--types", help="terrain types to show, e.g. stairs_up,slope_up; all by default")
     parser.add_argument("--out", type=Path, help="also draw success against difficulty into this PNG file")
-    args = parser.parse_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
     if args.out:
         ready_to_write_file("--out", args.out)
     results = read_results(args.paths)

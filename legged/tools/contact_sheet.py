@@ -5,13 +5,13 @@ task names another. They walk in C MuJoCo on the CPU. A GIF shows them for four 
 picture.
 """
 
-import argparse
 import sys
 from pathlib import Path
 
 import torch
 
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.play.contact_sheet import film, sheet, write_sheet
@@ -31,14 +31,24 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="contact_sheet", description=__doc__)
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "contact_sheet",
+        __doc__,
+        "python -m legged.tools.contact_sheet anymal_c_flat half_cheetah --out robots.gif",
+        "python -m legged.tools.contact_sheet logs/go2_flat/2026-11-22_05-38-19 --out go2.png --side 400",
+    )
     parser.add_argument("robots", nargs="+", metavar="TASK | RUN", help="tasks, run folders, folders of shipped policies")
     parser.add_argument("--out", type=Path, required=True, help="the file, .gif or .png")
     parser.add_argument("--columns", type=int, help="tiles side by side; so many that the sheet is twice as wide as high")
     parser.add_argument("--side", type=int, default=SIDE, help=f"width and height of a tile [pixels]; {SIDE}")
     parser.add_argument("--import", dest="module", help="module or .py file that registers tasks of your own")
-    args = parser.parse_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
     if args.out.suffix not in ENDINGS:
         raise ConfigError(f"--out: '{args.out.name}' ends neither with .gif nor with .png")
     if args.columns is not None and args.columns < 1:

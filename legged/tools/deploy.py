@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.deploy.__main__ import add_program_arguments, limits_of
 from legged.deploy.contract import read_contract
 from legged.errors import ConfigError, RunError
@@ -39,8 +40,14 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="deploy", description=__doc__)
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "deploy",
+        __doc__,
+        "python -m legged.tools.deploy --policy anymal_c_proprio --robot sim",
+        "python -m legged.tools.deploy --policy anymal_c_proprio --robot sim --terrain stairs_up --size 0.17 --film",
+    )
     parser.add_argument("--policy", required=True, help="exported folder, run folder, or task whose newest or shipped policy")
     parser.add_argument("--robot", required=True, choices=("sim",), help="sim; a robot has its own command, legged.deploy")
     parser.add_argument("--simulated", metavar="ROBOT", help="name or folder of the robot; the policy's by default")
@@ -48,7 +55,11 @@ def _main(argv: list[str] | None) -> int:
     add_program_arguments(parser)
     parser.add_argument("--out", type=Path, help="folder for log.npz and report.json; logs/deploy/<task> by default")
     parser.add_argument("--film", action="store_true", help="draw the first half minute as film.mp4")
-    args = parser.parse_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
     limits_of(args)
     check_simulation(args)
     if args.commands is not None and not exists(args.commands):

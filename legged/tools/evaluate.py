@@ -25,6 +25,7 @@ from legged.commandline.arguments import (
     settle_on,
 )
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.config import LeggedConfig, override
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
@@ -57,8 +58,14 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="evaluate", description=__doc__)
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "evaluate",
+        __doc__,
+        "python -m legged.tools.evaluate --task anymal_c --physics mujoco",
+        "python -m legged.tools.evaluate --task half_cheetah --gymnasium --episodes 20",
+    )
     add_task_arguments(parser)
     add_run_arguments(parser)
     for axis, unit in AXES.items():
@@ -78,7 +85,11 @@ def _main(argv: list[str] | None) -> int:
         type=Path,
         help="folder for JSON and PNG; by default beside the checkpoint, or logs/evaluate for a shipped one",
     )
-    args = parser.parse_intermixed_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_intermixed_args(argv)
     register_given(args)
     if issubclass(task_class(args.task), LeggedRobot):
         return _follow_commands(args)

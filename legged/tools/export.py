@@ -5,7 +5,6 @@ after how many seconds from the start of its process (`wall_s`) it was written. 
 by default. play.py exports one policy; this is for `legged.tools.playback`, which says when a training had one that walks.
 """
 
-import argparse
 import sys
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import torch
 
 from legged.commandline.arguments import add_run_arguments, add_task_arguments, policy_overrides, register_given, settle_on
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.errors import ConfigError
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.run_folder import checkpoints
@@ -29,12 +29,22 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="export", description=__doc__)
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "export",
+        __doc__,
+        "python -m legged.tools.export --task go1_flat --out policies",
+        "python -m legged.tools.export --task anymal_c_flat --load_run 2026-11-22_05-38-19",
+    )
     add_task_arguments(parser)
     add_run_arguments(parser)
     parser.add_argument("--out", type=Path, help="folder for the folders; exported/ in the run folder by default")
-    args = parser.parse_intermixed_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_intermixed_args(argv)
     register_given(args)
     if args.checkpoint is not None:
         raise ConfigError("--checkpoint: all checkpoints of the run are exported; leave it out")

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.config.checks import PLAIN, is_plain_name, shown
 from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError
@@ -32,16 +33,24 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="migrate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "migrate",
+        __doc__,
+        "python -m legged.tools.migrate legged_gym/envs/go2/go2_config.py --robot go2",
+        "python -m legged.tools.migrate legged_gym/envs/__init__.py --task go2 --out tasks",
     )
     parser.add_argument("file", type=Path, help="a Python file with configuration classes")
     parser.add_argument("--task", help="which of its classes or registered tasks; or how the only one is to be called")
     parser.add_argument("--robot", help="robot under resources/robots/, or a folder; by the asset's name, if there is one")
     parser.add_argument("--out", type=Path, default=Path("."), help="folder for the files that are written")
     parser.add_argument("--force", action="store_true", help="write over files of the same names")
-    args = parser.parse_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
     if not (exists(args.file) and args.file.is_file()):
         raise ConfigError(f"file: there is no file {shown(str(args.file))}")
     tree = Tree()

@@ -16,8 +16,10 @@ from legged.commandline.arguments import (
     policy_overrides,
     register_given,
     settle_on,
+    watch_command,
 )
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.config import LeggedConfig, override
 from legged.envs import BaseTask, LeggedRobot
 from legged.errors import ConfigError, RunError
@@ -48,8 +50,14 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="play.py", description="See what a policy does, and export it.")
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "play.py",
+        "See what a policy does, and export it.",
+        "python play.py --task anymal_c --terrain stairs_up --difficulty 0.8",
+        "python play.py --task anymal_c_flat --load_run 2026-11-22_05-38-19 --headless --gif",
+    )
     add_task_arguments(parser)
     add_run_arguments(parser)
     parser.add_argument("--terrain", metavar="TYPE", help="type of the tiles, e.g. stairs_up; the task's own by default")
@@ -58,7 +66,11 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("--gif", action="store_true", help="also write a GIF")
     parser.add_argument("--no-video", action="store_true", help="export and measure only")
     parser.add_argument("--out", type=Path, help="folder for video and exported/; the run folder by default")
-    args = parser.parse_intermixed_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_intermixed_args(argv)
     register_given(args)
     device = pick_device(args.sim_device)
     settle_on(device)
@@ -76,7 +88,7 @@ def _main(argv: list[str] | None) -> int:
         policy, changes = for_episodes(policy, args.num_envs if args.num_envs is not None else SHOWN_ON_A_PLANE)
         ready_to_write(folder, ROOM_MB)
         task, act = restore(policy, [*changes, *asked], device, graph)
-    print(f"{policy.cfg.task}: {relative(policy.checkpoint)}")
+    print(f"{policy.cfg.task}: {relative(policy.checkpoint)}\nwatch it: {watch_command(args, policy.folder)}")
 
     differences = export(task, act.network, folder / EXPORTED)
     for name, difference in differences.items():

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.errors import ConfigError
 from legged.evaluation.playback import SETTLING_S, Played, follow, play
 from legged.evaluation.velocity_grid import AXES, AXIS, Grid, axis_values, check_size
@@ -36,8 +37,14 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="playback", description=__doc__)
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "playback",
+        __doc__,
+        "python -m legged.tools.playback g1 policy.onnx --layout holosoma",
+        "python -m legged.tools.playback go1 exported/policy.onnx --layout exported/policy.json --vx=-0.5:1:0.5 --rmse 0.2",
+    )
     parser.add_argument("robot", help="a robot's name, or its folder")
     parser.add_argument("policy", type=Path, nargs="+", help="the ONNX files")
     parser.add_argument(
@@ -54,7 +61,11 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument("--friction", type=float, default=0.8)
     parser.add_argument("--rmse", type=float, help="largest mean velocity RMSE of a grid that is followed [m/s]")
     parser.add_argument("--json", type=Path, help="file for the figures")
-    args = parser.parse_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
     grid = _grid(args)
     settling = grid.settle_s if grid else SETTLING_S
     seconds = args.seconds if args.seconds is not None else grid.hold_s if grid else SECONDS

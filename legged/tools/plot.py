@@ -5,11 +5,11 @@ from the first run's iteration times. Of runs on terrain, also the mean level of
 which robots moved up and down, as means over the runs.
 """
 
-import argparse
 import sys
 from pathlib import Path
 
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.evaluation.learning_curves import always_promoted, draw_runs, labels, read_config, read_scalars
 from legged.process.paths import ready_to_write_file, relative
 
@@ -19,11 +19,21 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="plot", description=__doc__)
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "plot",
+        __doc__,
+        "python -m legged.tools.plot logs/anymal_c_flat/2026-11-22_05-38-19",
+        "python -m legged.tools.plot logs/anymal_c/*_s1 logs/anymal_c/*_s2 --out seeds.png",
+    )
     parser.add_argument("runs", nargs="+", type=Path, help="run folders")
     parser.add_argument("--out", type=Path, default=Path("learning_curve.png"), help="PNG file")
-    args = parser.parse_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
     ready_to_write_file("--out", args.out)
     runs = [read_scalars(run) for run in args.runs]
     configs = [read_config(run) for run in args.runs]

@@ -3,7 +3,6 @@
 Writes terrain_map.png, the heights seen from above, and terrain.png, one tile of each type with a robot on it.
 """
 
-import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,6 +12,7 @@ from PIL import Image
 
 from legged.commandline.arguments import add_task_arguments, overrides, register_given
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.process.paths import make_folder, ready_to_write, relative, replacing
@@ -27,13 +27,23 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="show_terrain", description=__doc__)
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "show_terrain",
+        __doc__,
+        "python -m legged.tools.show_terrain --task anymal_c",
+        "python -m legged.tools.show_terrain --task anymal_c --types gap,pit,waves --difficulty 0.7",
+    )
     add_task_arguments(parser)
     parser.add_argument("--types", help="types side by side instead of the task's own grid, e.g. stairs_up,gap")
     parser.add_argument("--difficulty", type=float, default=0.5, help="of the tiles in the picture, 0 to 1")
     parser.add_argument("--out", type=Path, default=Path("."), help="folder for the two PNG files")
-    args = parser.parse_intermixed_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_intermixed_args(argv)
     register_given(args)
     if not 0.0 <= args.difficulty <= 1.0:
         raise ConfigError(f"--difficulty: must be between 0 and 1, got {args.difficulty:g}")

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.config.schema import SimConfig, TerrainConfig
 from legged.deploy.pace import take_priority
 from legged.errors import ConfigError
@@ -34,14 +35,24 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="simulate_robot", description=__doc__)
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "simulate_robot",
+        __doc__,
+        "python -m legged.tools.simulate_robot anymal_c",
+        "python -m legged.tools.simulate_robot go2 --terrain stairs_up --size 0.12 --latency 0.01 --loss 0.01",
+    )
     parser.add_argument("robot", help="name of a robot, or its folder")
     add_simulation_arguments(parser)
     parser.add_argument("--report", type=Path, help="JSON file for what became of the robot")
     parser.add_argument("--poses", type=Path, help=".npy file for its poses, 25 a second, of the first half minute")
     parser.add_argument("--seconds", type=float, default=3600.0, help="end after so long; default 3600")
-    args = parser.parse_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
     check_simulation(args)
     if not args.seconds > 0.0:
         raise ConfigError(f"--seconds: must be above 0, got {args.seconds:g}")

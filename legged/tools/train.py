@@ -7,6 +7,8 @@ import shlex
 import signal
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -18,24 +20,29 @@ from legged.commandline.arguments import (
     pick_device,
     register_given,
     settle_on,
+    watch_command,
 )
 from legged.commandline.command import EXIT_FAILED, run_main
 from legged.commandline.output import when_output_is_lost
+from legged.commandline.parser import CommandParser
 from legged.commandline.show import summary
 from legged.commandline.stopping import quiet_writers, stopping_on_signals
 from legged.config import TaskConfig, to_yaml
 from legged.errors import ConfigError, RunError
+from legged.evaluation.during_training import TrainingEvaluation, check_commands
 from legged.learning.captured import CapturedRunner
 from legged.learning.display import Display
 from legged.learning.distributed import RankLost, check_reachable
+from legged.learning.evaluations import Evaluations
 from legged.learning.resume import resumed
-from legged.learning.run_folder import create_run, discard_run, experiment_folder, find_run
+from legged.learning.run_folder import NOTE_FILE, create_run, discard_run, experiment_folder, find_run
 from legged.learning.runner import Runner
 from legged.learning.timing import Timing, write_timing
+from legged.learning.trackers import check_tracker
 from legged.learning.transfer import transferred
 from legged.physics import engine_name, resolve_physics
 from legged.process.cores import available_cores
-from legged.process.paths import full_disk_in, ready_to_write, reason, relative
+from legged.process.paths import full_disk_in, ready_to_write, reason, relative, write_text
 from legged.process.ranks import Ranks
 from legged.process.startup import STARTED_S, command_of_ours, stage_ended
 from legged.registry import make_task, task_config
@@ -49,23 +56,49 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    start = STARTED_S if argv is None else time.perf_counter()  # as a command, imports are part of it
-    stage_ended("imports")
-    parser = argparse.ArgumentParser(prog="train.py", description="Train a legged robot.")
+Prepared = Callable[[Runner], None]
+"""What is told of the runner, once it is built and before it trains."""
+
+
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "train.py",
+        "Train a legged robot.",
+        "python train.py --task anymal_c_flat",
+        "python train.py --task anymal_c --num_envs 8192 --seed 3 rewards.scales.torques=-1e-4",
+        "python train.py --task anymal_c --resume",
+    )
     add_task_arguments(parser)
     add_run_arguments(parser)
     parser.add_argument("--resume", action="store_true", help="go on from a checkpoint, in a new run folder")
     parser.add_argument("--transfer", action="store_true", help="begin with the networks of --load_run, also of another task")
     parser.add_argument("--run_name", help="appended to the run folder's name")
     parser.add_argument("--max_iterations", type=int, help="length of the whole training")
+    parser.add_argument("--note", help="a sentence about this run, for its report and the list of all runs")
     parser.add_argument("--rl_device", help="device of the networks; that of the simulation by default")
     parser.add_argument("--runner", choices=["stock", "captured"], help="training loop (train.runner.loop)")
     parser.add_argument("--headless", action="store_true", help="accepted for legged_gym's sake: training draws nothing")
     parser.add_argument(
         "--show", action="store_true", help="print the full configuration, terms, actions and joints, and stop"
     )
-    args = parser.parse_intermixed_args(argv)
+    return parser
+
+
+def train_as_asked(argv: list[str], prepared: Prepared) -> int:
+    """Train as a command line asks, within another command; return the exit code. Errors are raised.
+
+    Raises:
+        ConfigError: the command line or the configuration is wrong.
+        RunError: training could not go on.
+    """
+    return _main(argv, prepared)
+
+
+def _main(argv: list[str] | None, prepared: Prepared | None = None) -> int:
+    start = STARTED_S if argv is None else time.perf_counter()  # as a command, imports are part of it
+    stage_ended("imports")
+    args = build_parser().parse_intermixed_args(argv)
 
     register_given(args)
     device = pick_device(args.sim_device)
@@ -79,6 +112,8 @@ def _main(argv: list[str] | None) -> int:
     else:
         cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
     resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics"))
+    check_commands(cfg)
+    check_tracker(cfg)
     if args.show:
         print(to_yaml(cfg), end="")
         print(*summary(cfg), sep="\n")
@@ -87,9 +122,9 @@ def _main(argv: list[str] | None) -> int:
         print(f"going on with the settings of {relative(checkpoint.parent)}" + "".join(f"; {text}" for text in changed))
     settle_on(device)
     if Ranks.now().first:
-        return _train(args, cfg, device, rl_device, checkpoint, start)
+        return _train(args, cfg, device, rl_device, checkpoint, start, prepared)
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-        return _train(args, cfg, device, rl_device, checkpoint, start)
+        return _train(args, cfg, device, rl_device, checkpoint, start, prepared)
 
 
 def _train(
@@ -99,6 +134,7 @@ def _train(
     rl_device: torch.device,
     checkpoint: Path | None,
     start: float,
+    prepared: Prepared | None,
 ) -> int:
     """Build and train; returns the exit code. Of several processes the first one has a run folder and a display."""
     first = Ranks.now().first
@@ -122,10 +158,21 @@ def _train(
             why_anew = runner.resume(str(checkpoint))
             how = f"all robots begin anew: {why_anew}" if why_anew else "robots and random numbers go on where they were"
             print(f"resumed {relative(checkpoint)} after iteration {runner.current_learning_iteration}; {how}", flush=True)
+        if cfg.train.runner.evaluate_interval:
+            _evaluate_during(runner, checkpoint if not args.transfer else None)
+        if prepared is not None:
+            prepared(runner)
         ready = time.perf_counter()
+        resumed = checkpoint is not None and not args.transfer
+
+        def timing(finished: bool, error: str = "") -> Timing:
+            return replace(
+                _timing(runner, device, ready - start, time.perf_counter() - start, finished, resumed), error=error
+            )
+
         with stopping_on_signals(runner.stop) as stopped_by, quiet_writers():
             try:
-                folder, finished = _learn(runner, cfg, display)
+                folder, finished = _learn(runner, cfg, display, args, timing)
             except RankLost as lost:
                 print(lost, file=sys.stderr, flush=True)
                 return EXIT_FAILED
@@ -135,19 +182,32 @@ def _train(
                 print("interrupted", file=sys.stderr, flush=True)
                 return 128 + stopped_by[-1]
     if folder:
-        resumed = checkpoint is not None and not args.transfer
-        timing = _timing(runner, device, ready - start, time.perf_counter() - start, finished, resumed)
-        _summary(runner, folder, timing, play_command(args, cfg, folder))
-        write_timing(folder, timing)
+        took = timing(finished)
+        _summary(runner, folder, took, play_command(args, cfg, folder))
+        write_timing(folder, took)
+        _report(folder, cfg, args if finished else None)
+        runner.logger.hand_over(runner.current_learning_iteration)
     if finished:
         return 0
     # Without a signal of its own it is the output that went away, or another process that was asked to stop.
     return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
 
 
-def _learn(runner: Runner, cfg: TaskConfig, display: Display | None) -> tuple[Path | None, bool]:
+def _evaluate_during(runner: Runner, resumed_from: Path | None) -> None:
+    """Let the first process evaluate the policy while it is trained."""
+    evaluations = None
+    if Ranks.now().first:
+        evaluations = Evaluations(runner.env.cfg, TrainingEvaluation(runner.env))
+        if resumed_from is not None:
+            evaluations.go_on_from(resumed_from)
+    runner.evaluate_with(evaluations)
+
+
+def _learn(
+    runner: Runner, cfg: TaskConfig, display: Display | None, args: argparse.Namespace, timing: Callable[[bool, str], Timing]
+) -> tuple[Path | None, bool]:
     """Train into a new run folder; gives the folder, none where another process has it, and whether training got to its end.
-    A training that fails before its first checkpoint leaves no folder.
+    A training that fails before its first checkpoint leaves no folder; one that fails later says so there, with its times.
 
     Raises:
         RunError: the folder can't be written.
@@ -155,8 +215,12 @@ def _learn(runner: Runner, cfg: TaskConfig, display: Display | None) -> tuple[Pa
     folder = create_run(cfg) if display else None
     if folder is None or display is None:
         return None, runner.train(cfg.train.runner.max_iterations)
-    print(f"run folder {relative(folder)}", flush=True)
+    if args.note is not None:
+        write_text(folder / NOTE_FILE, f"{args.note}\n")
+    print(f"run folder {relative(folder)}\nwatch it: {watch_command(args, folder)}", flush=True)
     display.title = f"{cfg.task}: {relative(folder)}"
+    if runner.evaluations is not None:
+        runner.evaluations.begin_in(folder)
     runner.logger.log_dir = str(folder)
     when_output_is_lost(runner.stop)
     try:
@@ -166,10 +230,32 @@ def _learn(runner: Runner, cfg: TaskConfig, display: Display | None) -> tuple[Pa
             with contextlib.suppress(OSError):
                 runner.logger.stop_logging_writer()
         discard_run(folder)
+        if folder.is_dir():
+            _leave_word(folder, error, cfg, timing)
         full = full_disk_in(error)
         if full is not None and not isinstance(error, RunError):  # TensorBoard's writer does not say which file
             raise RunError(f"{relative(folder)}: {reason(full)}") from error
         raise
+
+
+def _leave_word(folder: Path, error: BaseException, cfg: TaskConfig, timing: Callable[[bool, str], Timing]) -> None:
+    """Write into the folder of a training that failed what ended it, and the report on it; on a full disk nothing can be."""
+    said = "" if isinstance(error, KeyboardInterrupt) else " ".join(f"{type(error).__name__}: {error}".split())[:500]
+    with contextlib.suppress(RunError, RuntimeError):  # a broken CUDA device can't be asked for its name
+        write_timing(folder, timing(False, said))
+        _report(folder, cfg, None)
+
+
+def _report(folder: Path, cfg: TaskConfig, args: argparse.Namespace | None) -> None:
+    """Write the report on a training that has ended, unless it asks for none; with a film, if that can be told its task."""
+    if not cfg.train.runner.report:
+        return
+    from legged.evaluation.reports.at_end import report_at_end  # a start does without what it imports
+
+    film_with = None
+    if args is not None and cfg.train.runner.film:
+        film_with = ["--task", args.given_task, *(["--import", args.module] if args.module else [])]
+    report_at_end(folder, film_with)
 
 
 def describe(cfg: TaskConfig, device: torch.device) -> str:
@@ -226,10 +312,13 @@ def _timing(runner: Runner, device: torch.device, start_up_s: float, wall_s: flo
         wall_s=wall_s,
         device=torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         kernels_compiled=runner.env.physics.compiled,
+        evaluation_s=runner.evaluations.spent_s if runner.evaluations is not None else 0.0,
     )
 
 
 def _summary(runner: Runner, folder: Path, timing: Timing, play: str) -> None:
+    if runner.evaluations is not None:
+        print(*runner.evaluations.summary(timing.loop_s), sep="\n")
     print(
         f"{'finished' if timing.finished else 'stopped'} after {runner.current_learning_iteration + 1} iterations: "
         f"{timing.steps:,} steps in {timing.loop_s:.1f} s of training loop ({timing.steps_per_s:,.0f} steps/s), "

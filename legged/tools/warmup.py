@@ -4,12 +4,12 @@ Builds the task as train.py would, with the same arguments, and stops there: War
 this machine's GPU (or, with sim.physics=mujoco_warp and no GPU, for its CPU).
 """
 
-import argparse
 import sys
 import time
 
 from legged.commandline.arguments import add_task_arguments, overrides, pick_device, register_given, settle_on
 from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
 from legged.physics import kernel_cache, resolve_physics
 from legged.process.startup import STARTED_S
 from legged.registry import make_task, task_config
@@ -20,11 +20,21 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "warmup",
+        __doc__,
+        "python -m legged.tools.warmup --task anymal_c",
+        "python -m legged.tools.warmup --task go2_flat --num_envs 8192",
+    )
+    add_task_arguments(parser)
+    return parser
+
+
 def _main(argv: list[str] | None) -> int:
     start = STARTED_S if argv is None else time.perf_counter()
-    parser = argparse.ArgumentParser(prog="warmup", description=__doc__)
-    add_task_arguments(parser)
-    args = parser.parse_intermixed_args(argv)
+    args = build_parser().parse_intermixed_args(argv)
     register_given(args)
     device = pick_device(args.sim_device)
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")

@@ -21,6 +21,7 @@ import torch
 
 from legged.commandline.arguments import pick_device
 from legged.commandline.command import EXIT_FAILED, run_main
+from legged.commandline.parser import CommandParser
 from legged.commandline.stopping import stopping_on_signals
 from legged.errors import ConfigError
 from legged.evaluation.judged_run import JudgedRun, find_runs
@@ -56,8 +57,14 @@ def main(argv: list[str] | None = None) -> int:
     return run_main(_main, argv)
 
 
-def _main(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(prog="zoo", description=__doc__)
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "zoo",
+        __doc__,
+        "python -m legged.tools.zoo anymal_c_flat go2_flat h1_flat --seeds 1,2,3",
+        "python -m legged.tools.zoo --table logs --ship resources/policies",
+    )
     parser.add_argument("tasks", nargs="*", metavar="TASK | key=value", help="tasks, and any field of all of them")
     parser.add_argument("--seeds", default="1", help="random seeds, e.g. 1,2,3; 1 by default")
     parser.add_argument("--jobs", type=int, default=1, help="trainings side by side; 1, so that their times are their own")
@@ -75,7 +82,11 @@ def _main(argv: list[str] | None) -> int:
     parser.add_argument(
         "--table", nargs="+", type=Path, metavar="DIR", help="make the table of the runs in these folders, only"
     )
-    args = parser.parse_intermixed_args(argv)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_intermixed_args(argv)
     if args.ship:
         ready_to_write(args.ship)
     if args.table:
@@ -118,7 +129,7 @@ def _plan(args: argparse.Namespace) -> tuple[list[Training], Order]:
             raise ConfigError(f"zoo: '{name}' is named twice; each task may come once")
     on_cpu = pick_device(args.sim_device).type == "cpu"
     order = Order(
-        overrides=tuple(text for text in args.tasks if "=" in text),
+        overrides=("train.runner.film=false", *(text for text in args.tasks if "=" in text)),
         module=args.module,
         sim_device=args.sim_device,
         on_cpu=on_cpu,

@@ -13,7 +13,12 @@ from legged.learning.runner import Runner
 from legged.policies.export import export
 
 PROPRIOCEPTION = ["base_ang_vel", "projected_gravity", "commands", "dof_pos", "dof_vel", "actions"]
-SMALL = [("train.policy.actor_hidden_dims", [16, 8]), ("train.policy.critic_hidden_dims", [8])]
+COMMANDS = [  # not the same to both sides
+    ("commands.ranges.lin_vel_x", [-0.6, 1.1]),
+    ("commands.ranges.lin_vel_y", [-0.4, 0.4]),
+    ("commands.ranges.ang_vel_yaw", [-0.7, 0.7]),
+]
+SMALL = [("train.policy.actor_hidden_dims", [16, 8]), ("train.policy.critic_hidden_dims", [8]), *COMMANDS]
 BLIND = [("observations.actor", PROPRIOCEPTION), ("observations.actor_history", 2)]
 
 

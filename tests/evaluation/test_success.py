@@ -11,6 +11,7 @@ from helpers import ENGINE, POLICY, small_config, stand
 from legged import make_task
 from legged.config import override
 from legged.evaluation import success, tiles
+from legged.evaluation.intervals import wilson
 from legged.evaluation.success import (
     FELL,
     OPEN,
@@ -18,7 +19,6 @@ from legged.evaluation.success import (
     STUCK,
     Scores,
     point,
-    wilson,
 )
 from legged.evaluation.tiles import on_terrain, tiles_of_sizes
 from legged.learning.run_folder import find_checkpoint, run_config

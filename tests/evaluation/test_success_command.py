@@ -20,10 +20,10 @@ from legged.evaluation.success import (
 from legged.evaluation.success_report import is_beyond, panels_of, with_other_engines
 from legged.evaluation.tiles import on_terrain, rough_ground, rough_side
 from legged.evaluation.velocity_grid import Grid
-from legged.evaluation.velocity_tracking import measure_tracking
+from legged.evaluation.velocity_tracking import measure_tracking, place_to_track
 from legged.policies.restore import undisturbed
 from legged.registry import task_config
-from legged.terrain import Terrain, TileSpec
+from legged.terrain import Terrain, TileSpec, check_terrain
 from legged.tools import evaluate
 
 pytestmark = pytest.mark.usefixtures("workplace")
@@ -95,6 +95,15 @@ def test_rough_ground_is_large_enough_and_has_bumps_of_5_cm():
     blocks = tile.reshape(4, 50, 4, 50).std(axis=(1, 3))
     assert blocks.min() > 0.01  # everywhere, and no slope
     assert abs(tile.reshape(4, 50, 4, 50).mean(axis=(1, 3))).max() < 0.01
+
+
+def test_small_robots_are_tracked_on_rough_ground_too():
+    """Their cells are small: on ten times twenty tiles of 20 m they would be too many, and only one is built."""
+    cfg = task_config("go2", [("sim.physics", "mujoco")])
+    grid = Grid([-1.0, 1.0], [-1.0, 1.0], [0.0])
+    changes, ground = place_to_track(cfg, grid, [])
+    check_terrain(override(cfg, changes).terrain, cfg.origins)
+    assert min(ground.tile_size) == pytest.approx(rough_side(grid), abs=cfg.terrain.horizontal_scale)
 
 
 def test_height_of_the_gait_is_above_the_ground():

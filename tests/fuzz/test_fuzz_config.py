@@ -32,7 +32,7 @@ def small_enough(cfg) -> bool:
     )
     return (
         cfg.control.decimation <= 20
-        and cfg.observations.groups.actor.history <= 20
+        and all(group.history <= 20 for group in cfg.observations.groups.values())
         and all(size <= 256 for size in layers)
         and len(layers) <= 12
         and cfg.train.algorithm.num_learning_epochs * cfg.train.algorithm.num_mini_batches <= 50

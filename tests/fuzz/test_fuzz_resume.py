@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from legged.learning.run_folder import run_config
 from legged.tools import play, train
 
-SMALL = ["sim.threads=1", "train.runner.num_steps_per_env=4"]
+SMALL = ["sim.threads=1", "train.runner.num_steps_per_env=4", "train.runner.report=false"]
 NUMBER = st.sampled_from([1, 2, 3, 5, 7, 12])
 
 
@@ -28,7 +28,8 @@ def test_going_on_with_changes(overrides, iterations, robots, trained, run, in_n
     """Whatever is changed on the command line; sizes stay small."""
     heavy = {"env.num_envs", "train.runner.num_steps_per_env", "control.decimation", "sim.iterations", "sim.ls_iterations"}
     heavy |= {"train.algorithm.num_learning_epochs", "train.algorithm.num_mini_batches", "domain_rand.friction_buckets"}
-    heavy |= {"terrain.mesh_type", "train.runner.experiment_name"}
+    heavy |= {"terrain.mesh_type", "train.runner.experiment_name", "train.runner.report"}
+    heavy |= {"train.runner.evaluate_interval", "train.runner.evaluate_envs", "train.runner.evaluate_s"}
     changes = [f"{path}={text_of(value)}" for path, value in overrides if path not in heavy]
     with in_new_folder() as folder:
         shutil.copytree(trained, folder / "logs" / TASK / "run")

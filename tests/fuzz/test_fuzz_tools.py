@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from legged.process.paths import data_folder
 from legged.registry import _REGISTERED
-from legged.tools import benchmark, compare, evaluate, play, plot, show_terrain, train
+from legged.tools import benchmark, compare, evaluate, experiments, play, plot, report, show_terrain, train
 
 POLICIES = data_folder("resources") / "policies"
 EVALUATIONS = [POLICIES / "anymal_c" / "evaluation_mujoco.json", POLICIES / TASK / "evaluation_mujoco.json"]
@@ -46,15 +46,39 @@ def test_compare_of_a_damaged_evaluation(data, how, value, flags, run, in_new_fo
         assert run(compare.main, ["evaluation_mujoco.json", str(source), *flags]).code in (0, 1, 2)
 
 
+def damaged(data, path: Path) -> None:
+    """Change some bytes of a file, and cut it off somewhere."""
+    content = bytearray(path.read_bytes())
+    for place in data.draw(st.lists(st.integers(0, len(content) - 1), max_size=4)):
+        content[place] ^= data.draw(st.integers(1, 255))
+    path.write_bytes(bytes(content[: data.draw(st.one_of(st.just(len(content)), st.integers(0, len(content))))]))
+
+
+@given(data=st.data(), how=HOW, value=VALUES)
+def test_reports_of_damaged_runs(data, how, value, trained, run, in_new_folder):
+    """A report is made of whatever can still be read; two runs are compared whatever their evaluations hold."""
+    source = data.draw(st.sampled_from(EVALUATIONS))
+    content = json.loads(source.read_text())
+    path = data.draw(st.sampled_from(places(content)))
+    with in_new_folder() as folder:
+        runs = [folder / "logs" / TASK / name for name in ("a", "b")]
+        for one in runs:
+            shutil.copytree(trained, one)
+            shutil.copy(source, one / "evaluation_mujoco.json")
+        (runs[0] / "evaluation_mujoco.json").write_text(json.dumps(mutated(content, path, how, value)), encoding="utf-8")
+        files = [*runs[0].glob("events.*"), *(runs[0] / name for name in ("config.yaml", "timing.json", "code.diff"))]
+        damaged(data, data.draw(st.sampled_from(files)))
+        assert run(report.main, [str(one) for one in runs]).code == 0
+        assert run(experiments.main, []).code == 0
+        assert run(experiments.main, ["--compare", *map(str, runs)]).code == 0
+
+
 @given(data=st.data(), out=st.sampled_from(["a.png", "b/c.png", ".", "x.nonsense", "/proc/a.png"]))
 def test_plot_of_damaged_events(data, out, trained, run, in_new_folder):
     with in_new_folder() as folder:
         shutil.copytree(trained, folder / "run")
         (events,) = (folder / "run").glob("events.*")
-        content = bytearray(events.read_bytes())
-        for place in data.draw(st.lists(st.integers(0, len(content) - 1), max_size=4)):
-            content[place] ^= data.draw(st.integers(1, 255))
-        events.write_bytes(bytes(content[: data.draw(st.one_of(st.just(len(content)), st.integers(0, len(content))))]))
+        damaged(data, events)
         assert run(plot.main, ["run", "--out", out]).code in (0, 1, 2)
 
 

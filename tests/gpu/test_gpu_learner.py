@@ -35,7 +35,7 @@ def trained(*arguments: str, task: str = TASK, iterations: int = 3, device: str 
     before = set(run_folders())
     flags = ["--task", task, "--sim_device", device, "--num_envs", str(ROBOTS), "--max_iterations", str(iterations)]
     with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(out):
-        code = train.main([*flags, f"train.runner.num_steps_per_env={STEPS}", *arguments])
+        code = train.main([*flags, "train.runner.report=false", f"train.runner.num_steps_per_env={STEPS}", *arguments])
     assert code == 0, out.getvalue()
     (folder,) = set(run_folders()) - before
     return folder, out.getvalue()

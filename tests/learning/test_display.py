@@ -37,6 +37,13 @@ def test_a_legged_robot_s_line_is_this():
     )
 
 
+def test_the_last_evaluation_is_on_the_line_and_in_the_table():
+    seen = progress(lin_vel_rmse=0.25)
+    seen.values.update({"Evaluation/lin_vel_rmse": 0.0612, "Evaluation/falls": 0.0})
+    assert seen.line().endswith("  std 0.37  evaluated lin vel rmse 0.061")
+    assert "evaluation: lin vel rmse" in shown(seen)
+
+
 def test_what_has_no_value_yet_is_a_dash_and_not_a_number():
     nothing = progress(lin_vel_rmse=nan, falls=nan, x_velocity=nan)
     line = nothing.line()

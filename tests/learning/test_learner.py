@@ -13,6 +13,7 @@ import legged.learning.captured as captured_module
 from legged.evaluation.learning_curves import read_scalars
 from legged.graph.step_graph import ForbidHostReads
 from legged.learning.captured import CapturedRunner, Clock, copies
+from legged.learning.divergence_meter import DivergenceMeter
 from legged.learning.ppo import DevicePPO
 from legged.learning.rollout import Rollout
 from legged.learning.run_folder import run_config
@@ -47,8 +48,9 @@ def exact_or_on_the_cpu(case) -> bool:
 @pytest.mark.usefixtures("full_precision")
 @pytest.mark.parametrize(("device", "options"), filter(exact_or_on_the_cpu, on_both(VARIANTS)))
 def test_an_update_is_that_of_rsl_rl(device, options, monkeypatch):
-    """Losses, learning rate, parameters and moments over three updates on the same data in the same order."""
+    """Losses, divergence, learning rate, parameters and moments over three updates on the same data in the same order."""
     stock, ours = learner(PPO, device=device, **options), learner(DevicePPO, device=device, **options)
+    divergence = DivergenceMeter(stock.actor)
     assert ours.why_stock == ""
     order = torch.Generator().manual_seed(1)
     rates = []
@@ -61,7 +63,11 @@ def test_an_update_is_that_of_rsl_rl(device, options, monkeypatch):
         wanted = stock.update()
         monkeypatch.undo()
         monkeypatch.setattr(ours, "_order", lambda _, p=permutation: p)
-        assert ours.update() == pytest.approx(wanted, rel=1e-4, abs=1e-6)
+        found = ours.update()
+        kl, asked = found.pop("kl"), divergence.flush()
+        assert asked is None or kl == pytest.approx(asked, rel=1e-3, abs=1e-6)
+        assert (asked is None) == (options.get("schedule") == "fixed")
+        assert found == pytest.approx(wanted, rel=1e-4, abs=1e-6)
         assert ours.learning_rate == pytest.approx(stock.learning_rate, rel=1e-5)
         rates.append(ours.learning_rate)
     assert len(set(rates)) > 1 or options.get("schedule") == "fixed"
@@ -134,14 +140,16 @@ def test_ended_episodes_are_counted_over_rollouts():
     rollout = Rollout(task, runner.alg)
     rewards = runner.alg.storage.rewards  # (T, N, 1)
     rollout.collect()
-    assert rollout.ended.tolist() == [0.0, 0.0, 0.0]
+    assert rollout.ended.tolist() == [0.0, 0.0, 0.0, 0.0]
     first = rewards.sum(dim=0).flatten()
     torch.testing.assert_close(rollout.episodes["return"], first)
     task.episode_length_buf = task.max_episode_length - torch.tensor([3, 5])
     rollout.collect()
-    ended, returns, lengths = rollout.ended.tolist()
+    ended, returns, lengths, squares = rollout.ended.tolist()
     assert (ended, lengths) == (2.0, 24.0)
-    assert returns == pytest.approx(float(first.sum() + rewards[:3, 0].sum() + rewards[:5, 1].sum()), rel=1e-5)
+    of_each = first + torch.stack([rewards[:3, 0].sum(), rewards[:5, 1].sum()])
+    assert returns == pytest.approx(float(of_each.sum()), rel=1e-5)
+    assert squares == pytest.approx(0.5 * float(of_each[0] - of_each[1]) ** 2, rel=1e-3)
     assert rollout.episodes["length"].tolist() == [5.0, 3.0]
     torch.testing.assert_close(rollout.episodes["return"], torch.cat([rewards[3:, 0].sum(0), rewards[5:, 1].sum(0)]))
 
@@ -208,7 +216,9 @@ def test_both_loops_log_the_same_things():
         folder: Path = tiny_run("--runner", loop, "env.episode_length_s=0.1")
         tags[loop] = set(read_scalars(folder))
     assert tags["stock"] == tags["captured"]
-    assert {"Train/mean_reward", "Loss/value", "Metrics/falls", "Perf/learning_time"} <= tags["captured"]
+    assert {"Train/mean_reward", "Train/std_reward", "Loss/value", "Loss/kl", "Metrics/falls", "Perf/learning_time"} <= tags[
+        "captured"
+    ]
 
 
 def test_the_captured_loop_stops_when_asked():

@@ -3,7 +3,9 @@
 import contextlib
 import os
 import re
+import shlex
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -46,18 +48,25 @@ sys.exit(train.main())
 """
 
 
-@contextlib.contextmanager
 def two_processes(script, *arguments: str):
-    """torchrun with two processes, its output in out.txt; killed in the end, with its children."""
-    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    command = [*launch, str(script), *arguments]
+    """torchrun with two processes, its output in out.txt."""
+    return torchrun("out.txt", "--standalone", "--nproc-per-node", "2", str(script), *arguments)
+
+
+@contextlib.contextmanager
+def torchrun(output: str, *arguments: str, **environment: str):
+    """torchrun with its output in a file; killed in the end, with its children."""
+    command = [sys.executable, "-m", "torch.distributed.run", *arguments]
     paths = os.pathsep.join(str(path) for path in (REPOSITORY, TESTS))
-    with open("out.txt", "w") as out:
-        environment = {**os.environ, "PYTHONPATH": paths}
-        process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=environment, start_new_session=True)
+    with open(output, "w") as out:
+        everything = {**os.environ, "PYTHONPATH": paths, **environment}
+        process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=everything, start_new_session=True)
     try:
         yield process
     finally:
+        with contextlib.suppress(OSError):  # it is a zombie by now, or there is no /proc
+            for child in children(process):  # torchrun gives each a session of its own
+                os.kill(child, signal.SIGKILL)
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
@@ -82,6 +91,18 @@ def wait_for_iterations(process) -> None:
         time.sleep(0.05)
 
 
+def test_two_processes_end_together_when_the_first_finds_their_target_reached():
+    """The second evaluates nothing."""
+    goal = ["train.runner.evaluate_interval=2", "train.runner.evaluate_envs=8", "train.runner.evaluate_s=0.1"]
+    arguments = [*TRAIN, "--max_iterations", "50", *goal, "train.runner.stop_at.falls=0.9"]
+    with two_processes(REPOSITORY / "train.py", *arguments) as process:
+        out = ended(process, 0)
+    (folder,) = run_folders()
+    assert checkpoints(folder) == [0, 1]
+    assert (folder / "model_best.pt").is_file()
+    assert out.count("reached its target after 2 iterations: falls 0") == 1
+
+
 def test_two_processes_learn_one_policy_from_different_robots():
     Path("spy.py").write_text(SPY)
     with two_processes("spy.py", *TRAIN, "--max_iterations", "2", "train.policy.obs_normalization=true") as process:
@@ -101,6 +122,52 @@ def test_two_processes_learn_one_policy_from_different_robots():
     assert all(tensor.equal(first["actor"][name]) for name, tensor in saved.items())
     assert out.count("it 2/2") == out.count("finished after 2 iterations: 128 steps") == 1
     assert "8 robots on each of 2 processes" in out
+
+
+def commands_of_the_page() -> list[list[str]]:
+    """Return the words of the torchrun commands in docs/distributed.md, those of the Slurm script too."""
+    page = (REPOSITORY / "docs" / "distributed.md").read_text(encoding="utf-8").replace("\\\n", " ")
+    return [shlex.split(command) for command in re.findall(r"torchrun (--nnodes .*)", page)]
+
+
+def test_two_machines_learn_one_policy_into_one_run_folder():
+    """Each machine is a torchrun of its own; they find each other by the flags that docs/distributed.md shows."""
+    Path("spy.py").write_text(SPY)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        endpoint = f"127.0.0.1:{free.getsockname()[1]}"
+    flags = commands_of_the_page()[0]
+    flags = flags[: flags.index("train.py")]
+    flags[flags.index("--nproc-per-node") + 1] = "1"
+    flags[flags.index("--rdzv-endpoint") + 1] = endpoint
+    command = [*flags, "spy.py", *TRAIN, "--max_iterations", "2"]
+    with (
+        torchrun("out.txt", *command, GLOO_SOCKET_IFNAME="lo") as one,
+        torchrun("other.txt", *command, GLOO_SOCKET_IFNAME="lo") as other,
+    ):
+        said = ended(one, 0)
+        assert other.wait(timeout=30) == 0, Path("other.txt").read_text()
+    said += Path("other.txt").read_text()
+    first, second = (torch.load(f"rank{r}.pt", weights_only=True) for r in (0, 1))
+    for network in ("actor", "critic"):
+        for name, tensor in first[network].items():
+            assert tensor.equal(second[network][name]), name
+    assert not first["start"].equal(first["actor"]["mlp.0.weight"])
+    assert not first["friction"].equal(second["friction"])
+    (folder,) = run_folders()
+    saved = torch.load(folder / "model_1.pt", weights_only=True)["actor_state_dict"]
+    assert all(tensor.equal(first["actor"][name]) for name, tensor in saved.items())
+    assert said.count("finished after 2 iterations: 128 steps") == 1
+    assert "8 robots on each of 2 processes" in said
+
+
+def test_the_slurm_script_starts_the_same_training_and_is_one_of_bash():
+    page = (REPOSITORY / "docs" / "distributed.md").read_text(encoding="utf-8")
+    by_hand, by_slurm = commands_of_the_page()
+    assert {word for word in by_hand if word.startswith("--")} <= set(by_slurm)
+    train.build_parser().parse_intermixed_args(by_slurm[by_slurm.index("train.py") + 1 :])
+    (script,) = re.findall(r"```bash\n(#!/bin/bash\n.*?)```", page, flags=re.DOTALL)
+    assert subprocess.run(["bash", "-n"], input=script, text=True, check=False).returncode == 0
 
 
 def test_updates_of_several_processes_are_those_of_rsl_rl():

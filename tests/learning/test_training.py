@@ -51,7 +51,7 @@ def test_a_run_leaves_its_configuration_the_state_of_the_code_events_and_checkpo
     code = (folder / "code.diff").read_text()
     assert re.match(r"legged \S+\n(commit [0-9a-f]{40}\n|not in a git repository of its own\n|git )", code)
     values = [("env.num_envs", 8), ("env.seed", 7), ("train.runner.max_iterations", 2), ("train.runner.run_name", "first")]
-    more = [("rewards.scales.torques", -3e-5), ("sim.physics", "mujoco"), ("sim.threads", 1)]
+    more = [("rewards.scales.torques", -3e-5), ("sim.physics", "mujoco"), ("sim.threads", 1), ("train.runner.report", False)]
     network = [("train.policy.actor_hidden_dims", [8]), ("train.policy.critic_hidden_dims", [8])]
     expected = task_config(TASK, [*values, *more, *network, ("train.runner.num_steps_per_env", 4)], on_cpu=True)
     assert run_config(folder) == expected

@@ -33,6 +33,7 @@ TERMS = [
     "feet_contact_forces",
     "no_fly",
     "single_stance",
+    "uneven_steps",
     "feet_slide",
     "feet_clearance",
     "posture",
@@ -268,6 +269,14 @@ def test_single_stance_pays_the_swing_while_the_other_foot_stands(task):
     task.contacts.in_contact.fill_(False)
     task.is_moving.fill_(True)
     assert value(task, "single_stance") == near(0.0, 0.0)
+
+
+def test_uneven_steps_is_the_difference_of_the_last_swings(task):
+    task.contacts.last_air_time.copy_(torch.tensor([[0.3, 0.25, 0.1, 0.2], [0.4, 0.4, 0.4, 0.4]]))
+    task.is_moving.fill_(True)
+    assert value(task, "uneven_steps") == near(0.2, 0.0)
+    task.is_moving.fill_(False)
+    assert value(task, "uneven_steps") == near(0.0, 0.0)
 
 
 def test_feet_slide_sees_feet_on_the_ground_only(task):

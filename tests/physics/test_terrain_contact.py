@@ -261,7 +261,7 @@ def test_level_cells_have_no_seams():
 
 def test_c_mujoco_s_height_fields_lean_at_seams_and_ours_follow_the_slope():
     """A convention that differs: a foot 2 mm deep in an even slope of 20 degrees, at 300 random places, as each back-end
-    represents it. C MuJoCo meets triangle by triangle: of its 543 contacts 26 % lean by more than 10 degrees, up to 21.
+    represents it. C MuJoCo meets triangle by triangle: of its 690 contacts 16 % lean by more than 10 degrees, up to 13.
     """
     ground = tiles(("slope_up", 20.0))
     rng = np.random.default_rng(0)
@@ -281,9 +281,9 @@ def test_c_mujoco_s_height_fields_lean_at_seams_and_ours_follow_the_slope():
     spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{free_body('foot')}</worldbody></mujoco>")
     add_terrain(spec, ground)
     theirs = leans(c_contacts(spec.compile(), qpos))
-    # A bracket around the figure in docs/results.md and decisions.md: outside it MuJoCo has changed, and both must, too.
-    assert 0.2 < (theirs > 10.0).mean() < 0.32
-    assert theirs.max() < 25.0
+    # A bracket around the figure in docs/results.md and engines.md: outside it MuJoCo has changed, and both must, too.
+    assert 0.12 < (theirs > 10.0).mean() < 0.2
+    assert theirs.max() < 15.0
 
 
 def test_a_capsule_rests_on_a_ridge_between_its_ends():
@@ -332,8 +332,9 @@ def tiles(*names_and_sizes: tuple[str, float]) -> Terrain:
 @pytest.mark.parametrize("where", [pytest.param("", id="cpu"), on_gpu(ON_A_GPU, id="cuda")])
 def test_robots_tumble_and_come_to_rest_alike_on_all_back_ends(robot, where):
     """Dropped off the platform onto stairs, a slope and rough ground, which throws two of them over: after 0.5 s, with
-    the trunk and legs on risers and rims, positions agree within 2 mm where the surface is the same (not on the rough
-    ground, where the C engine has triangles). Once at rest, upright or fallen, forces sum to the weight.
+    the trunk and legs on risers and rims, positions agree within 2 mm on steps, and within 15 mm on the slope, where the C
+    engine feels a height field from afar (not on the rough ground, where it has triangles). Once at rest, upright or
+    fallen, forces sum to the weight.
     """
     ground = tiles(("stairs_up", 0.15), ("slope_down", 15.0), ("rough_slope_up", 10.0), ("obstacles", 0.15))
     engines = {
@@ -357,14 +358,16 @@ def test_robots_tumble_and_come_to_rest_alike_on_all_back_ends(robot, where):
         force = physics.robot_state.contact_forces[:, :, 2].sum(dim=1)
         np.testing.assert_allclose(force.numpy(), robot.mass * 9.81, rtol=0.01, err_msg=name)
         assert not physics.overflowed.any()
-    exact = [0, 1, 3]
     for name in ("mujoco_warp", "newton"):
-        np.testing.assert_allclose(places[name][exact], places["mujoco"][exact], atol=2e-3, err_msg=name)
+        np.testing.assert_allclose(places[name][[0, 3]], places["mujoco"][[0, 3]], atol=2e-3, err_msg=name)
+        np.testing.assert_allclose(places[name][1], places["mujoco"][1], atol=0.015, err_msg=name)
     assert all(fallen.tolist() == [True, True, False, False] for fallen in tilted.values())
 
 
 def test_the_general_collider_carries_a_robot_too(robot):
-    """sim.terrain_collider=convex, across the rim of a platform on a slope: as C MuJoCo, with a height field there too."""
+    """sim.terrain_collider=convex, across the rim of a platform on a slope: as C MuJoCo, with a height field there too. That
+    one lies deeper; its contacts lie half way between, so feet roll as if they were thicker: 1 cm further.
+    """
     ground = tiles(("slope_up", 15.0))
     states = standing(robot, 1)
     place = ground.origins[0, 0] - [1.2, 0.0, 0.0]
@@ -379,8 +382,8 @@ def test_the_general_collider_carries_a_robot_too(robot):
         found.append(physics.robot_state)
         assert not physics.overflowed.any()
     assert (found[0].contact_forces[0, :, 2] > 50.0).sum() == 4
-    torch.testing.assert_close(found[1].base_pos, found[0].base_pos, atol=2e-4, rtol=0.0)
-    torch.testing.assert_close(found[1].base_quat, found[0].base_quat, atol=2e-4, rtol=0.0)
+    torch.testing.assert_close(found[1].base_pos, found[0].base_pos, atol=0.01, rtol=0.0)
+    torch.testing.assert_close(found[1].base_quat, found[0].base_quat, atol=5e-3, rtol=0.0)
 
 
 def test_self_collisions_are_kept_if_asked(robot):

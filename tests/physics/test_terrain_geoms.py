@@ -36,6 +36,11 @@ def compiled(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, mujoco.MjData]:
     return model, data
 
 
+def seen(terrain: Terrain) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """The geoms for the eye: those that collide lie deeper where they have a skin."""
+    return scene(terrain, collide=False)
+
+
 def scene(terrain: Terrain, **arguments) -> tuple[mujoco.MjModel, mujoco.MjData]:
     spec = mujoco.MjSpec()
     add_terrain(spec, terrain, **arguments)
@@ -75,7 +80,7 @@ def kinds(model) -> list[int]:
 def test_rays_find_the_height_map_on_every_type():
     terrain = terrain_of(list(TERRAIN_TYPES), (0.2, 0.9))
     ground = terrain.height_map
-    model, data = scene(terrain)
+    model, data = seen(terrain)
     i, j, x, y = points_in_cells(ground)
     error = np.abs(heights_by_ray(model, data, x, y) - ground.height_at(x, y))
     bound = twist(ground, i, j)
@@ -89,7 +94,7 @@ def test_rays_find_slopes_among_steps():
     """With slope_threshold 0.75 cells up to 7.5 cm apart are joined: slopes lie beside faces, and beside other slopes."""
     terrain = terrain_of(["obstacles", "rough_slope_up", "obstacles", "stairs_up"], (0.2, 0.5, 0.9), slope_threshold=0.75)
     ground = terrain.height_map
-    model, data = scene(terrain)
+    model, data = seen(terrain)
     i, j, x, y = points_in_cells(ground)
     error = np.abs(heights_by_ray(model, data, x, y) - ground.height_at(x, y))
     far = error > twist(ground, i, j) + 1e-4
@@ -109,7 +114,7 @@ def test_border_beside_rough_ground_slopes_with_it():
     i = np.full(80, 29)  # the last of the border's 30 cells before the tile
     j = np.arange(30, 110)
     x, y = ground.origin[0] + (i + 0.7) * 0.1, ground.origin[1] + (j + 0.5) * 0.1
-    model, data = scene(terrain)
+    model, data = seen(terrain)
     found = heights_by_ray(model, data, x, y)
     assert np.abs(found).max() > 0.005
     np.testing.assert_array_less(np.abs(found - ground.height_at(x, y)), twist(ground, i, j) + 1e-4)
@@ -159,6 +164,47 @@ def test_spheres_rest_on_treads_and_slopes():
     np.testing.assert_allclose(at[:, 2], np.add(grounds, radius), atol=0.002)
     np.testing.assert_allclose(at[:, :2], places, atol=0.002)
     assert np.abs(data.qvel).max() < 0.01
+
+
+def slope_contacts(depth: float, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A sphere 200 times in an even slope of 11 degrees: depths of its contacts below the surface [m], their normals,
+    and the number of the sphere, (C,), (C, 3), (C,).
+    """
+    terrain = terrain_of(["slope_up"], (0.5,), terrain_length=6.0, terrain_width=6.0, horizontal_scale=0.06)
+    spec = mujoco.MjSpec()
+    add_terrain(spec, terrain)
+    lean = np.arctan(0.2)
+    rng = np.random.default_rng(1)
+    for x, y in rng.uniform([-2.5, -0.5], [-1.7, 0.5], (200, 2)):
+        ground = float(terrain.height_map.height_at(np.array(x), np.array(y)))
+        body = spec.worldbody.add_body(
+            pos=np.array([x, y, ground]) + (radius - depth) * np.array([np.sin(lean), 0, np.cos(lean)])
+        )
+        body.add_freejoint()
+        body.add_geom(size=[radius, 0, 0], contype=1, conaffinity=2)
+    _, data = compiled(spec)
+    contact = data.contact
+    return contact.includemargin - contact.dist, contact.frame[:, :3], contact.geom.max(axis=1)
+
+
+def test_feet_are_felt_at_the_surface_though_a_height_field_lies_deeper():
+    """The deepest contact of each is 2 mm deep, along the slope's normal."""
+    depths, normals, spheres = slope_contacts(0.002, 0.022)
+    for sphere in np.unique(spheres):
+        own = np.flatnonzero(spheres == sphere)
+        deepest = own[depths[own].argmax()]
+        assert depths[deepest] == pytest.approx(0.002, abs=1e-6)
+        np.testing.assert_allclose(normals[deepest], [np.sin(np.arctan(0.2)), 0.0, np.cos(np.arctan(0.2))], atol=1e-4)
+    assert len(np.unique(spheres)) == 200
+
+
+def test_a_small_foot_that_sinks_in_is_pushed_out_upward():
+    """A Go2's foot of 22 mm, 25 mm deep after an impact: its middle is below the surface. A height field without its skin
+    pushed it sideways from prism to prism, with thousands of newtons, and held it there: Go2 fell on any slope.
+    """
+    _, normals, spheres = slope_contacts(0.025, 0.022)
+    assert len(np.unique(spheres)) == 200
+    assert normals[:, 2].min() > 0.4
 
 
 def test_geoms_touch_robots_not_each_other_and_can_be_for_the_eye_only():
@@ -216,8 +262,7 @@ def test_training_grid_builds_in_bounded_time():
     model = spec.compile()
     assert time.perf_counter() - start < 8.0
     assert model.ngeom == len(geoms) < 7000
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
+    model, data = seen(terrain)
     _, _, x, y = points_in_cells(terrain.height_map, 300)
     error = np.abs(heights_by_ray(model, data, x, y) - terrain.height_map.height_at(x, y))
     assert np.median(error) < 1e-6

@@ -7,7 +7,9 @@ import sys
 
 import pytest
 
-from legged.process.startup import importing
+from legged.process.paths import data_folder
+from legged.process.processes import child_environment
+from legged.process.startup import STAGES_FILE, importing
 
 
 def fail_to_import():
@@ -60,10 +62,47 @@ def test_a_machine_without_git_hears_nothing_of_it(tmp_path):
 
 
 def test_the_package_lists_its_commands_and_knows_their_short_names(capsys):
-    from legged.__main__ import commands, main
+    from legged.__main__ import main
+    from legged.commandline.listing import tools
 
-    assert {"legged.tools.train", "legged.tools.play", "legged.tools.evaluate", "legged.tools.compare"} <= commands().keys()
+    assert {"legged.tools.train", "legged.tools.play", "legged.tools.evaluate", "legged.tools.compare"} <= tools().keys()
     assert main([]) == 0
     assert "python -m legged.tools.plot" in capsys.readouterr().out
     assert main(["evaluate"]) == 2
     assert "did you mean python -m legged.tools.evaluate?" in capsys.readouterr().err
+
+
+def test_the_package_lists_tasks_and_robots_without_importing_what_they_need():
+    done = subprocess.run([sys.executable, "-X", "importtime", "-m", "legged"], capture_output=True, text=True, check=True)
+    imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
+    assert "legged.commandline.listing" in imported
+    assert not imported & {"torch", "mujoco", "numpy", "yaml"}
+    lines = [line.split() for line in done.stdout.splitlines()]
+    listed = {words[0] for words in lines if words}
+    assert {path.stem for path in data_folder("cfg").glob("*.yaml")} <= listed
+    assert {path.name for path in (data_folder("resources") / "robots").iterdir()} <= listed
+    assert ["go2", "Unitree", "Go2"] in lines
+    assert ["g1_flat", "Unitree's", "G1", "follows", "velocity", "commands", "on", "flat", "ground"] in lines
+
+
+def test_another_programs_m_legged_is_not_meant(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text("import legged, sys; print(legged.LeggedRobot.__name__, sys.argv[1:])")
+    done = subprocess.run([sys.executable, script, "-m", "legged"], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "LeggedRobot ['-m', 'legged']"
+
+
+def test_a_list_that_nobody_reads_ends_in_one_line():
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([sys.executable, "-m", "legged"], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+
+
+def test_the_start_of_a_process_that_a_timed_one_begins_is_not_its_own(tmp_path, monkeypatch):
+    monkeypatch.setenv(STAGES_FILE, str(tmp_path / "stages"))
+    code = "from legged.process.startup import stage_ended; stage_ended('mine')"
+    subprocess.run([sys.executable, "-c", code], env=child_environment(), check=True)
+    assert not (tmp_path / "stages").exists()
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert "mine" in (tmp_path / "stages").read_text()

@@ -13,6 +13,13 @@ from legged.terrain.terrain import Terrain
 DEPTH = 20.0
 """How far all geoms reach below the lowest point of the map [m]: nothing slips between two of them, and the flanks of a
 height field sunk to there lean by less than 1 mm for each 0.2 m of a face."""
+SKIN = 0.05
+"""Height fields that collide lie so much below the ground, measured along its normal, and are felt so much above themselves
+(MuJoCo's margin) [m].
+
+MuJoCo sees a height field as prisms side by side, each solid down to its foot. A foot that sinks below their tops at an
+impact, as small ones do, is pushed out of a prism sideways, into the next: it is wedged in. So it must not get there.
+"""
 SAME = 1e-6
 """Heights closer than this are the same [m]."""
 
@@ -28,13 +35,15 @@ def add_terrain(
 ) -> list[mujoco.MjsGeom]:
     """Add a terrain to the world body: boxes where it is made of steps, one height field a tile where it is smooth.
 
-    The surface is that of the height map, but for two triangles in place of a bilinear patch in cells that are twisted.
+    The surface is that of the height map, but for two triangles in place of a bilinear patch in cells that are twisted; to
+    those that collide with a height field it appears `SKIN` above the geom, with edges as round as that.
     `rows` and `cols`, all by default, must be without gaps; the border comes along on those sides that they reach.
     Geoms are named terrain_<number>. `material` is the name of one in `spec`. Without `collide`, they are for the eye
     only. `depth` [m] is how far they reach below the lowest point.
     """
     ground = terrain.height_map
-    add = _Geoms(spec, ground, float(ground.corners.min()) - depth, _attributes(material, collide))
+    skin = SKIN if collide else 0.0
+    add = _Geoms(spec, ground, float(ground.corners.min()) - depth, _attributes(material, collide), skin)
     length, width, border = (round(x / ground.cell) for x in (*terrain.tile_size, terrain.border))
     count = terrain.origins.shape[:2]
     # A slope may be joined to the border, whose next cells then slope too: the outer tiles take these along.
@@ -85,6 +94,8 @@ class _Geoms:
     floor: float
     """Height down to which all of them reach [m]."""
     attributes: dict[str, Any]
+    skin: float = 0.0
+    """How far smooth ground is felt above its geom [m]."""
     added: list[mujoco.MjsGeom] = field(default_factory=list)
 
     def box(self, x: slice, y: slice, top: float) -> None:
@@ -92,8 +103,10 @@ class _Geoms:
         half = [0.5 * (s.stop - s.start) * self.ground.cell for s in (x, y)] + [0.5 * (top - self.floor)]
         self._add(x.start, y.start, half, top - half[2], type=mujoco.mjtGeom.mjGEOM_BOX, size=half)
 
-    def surface(self, x: int, y: int, heights: np.ndarray) -> None:
-        """A height field with points `heights` (X + 1, Y + 1) [m], the first of them at the outer corner of cell x, y."""
+    def surface(self, x: int, y: int, heights: np.ndarray, skin: float = 0.0) -> None:
+        """A height field with points `heights` (X + 1, Y + 1) [m], the first of them at the outer corner of cell x, y, that
+        is felt at a distance of `skin` [m].
+        """
         half = [0.5 * (n - 1) * self.ground.cell for n in heights.shape]
         low, high = float(heights.min()), float(heights.max())
         name = self._name()
@@ -104,7 +117,7 @@ class _Geoms:
             size=[*half, max(high - low, SAME), max(low - self.floor, 0.1)],
             userdata=(heights.T.ravel() - low) / max(high - low, SAME),
         )
-        self._add(x, y, half, low, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=name)
+        self._add(x, y, half, low, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=name, margin=skin)
 
     def _name(self) -> str:
         return f"terrain_{len(self.added)}"
@@ -139,12 +152,15 @@ def _add_patch(add: _Geoms, x: slice, y: slice) -> None:
     flat = high - low < SAME
     points, apart = _lattice(corners)
     if not apart.any() and not flat.all():
-        add.surface(x.start, y.start, points)
+        if add.skin > 0.0:
+            points = _lattice(corners - add.skin * _steepness(corners, add.ground.cell)[:, :, None])[0]
+        add.surface(x.start, y.start, points, add.skin)
         return
     for i, j, top in _rectangles(low, flat):
         add.box(slice(x.start + i.start, x.start + i.stop), slice(y.start + j.start, y.start + j.stop), top)
     if not flat.all():
-        # Slopes among the steps. Points that no slope uses are sunk: what hangs down to them is inside the boxes.
+        # Slopes among the steps, without a skin, which would stand out beside their faces. Points that no slope uses are
+        # sunk: what hangs down to them is inside the boxes.
         i, j = (slice(int(at.min()), int(at.max()) + 1) for at in np.nonzero(~flat))
         points = _lattice(corners[i, j], ~flat[i, j])[0]
         add.surface(x.start + i.start, y.start + j.start, np.where(np.isnan(points), add.floor, points))
@@ -168,6 +184,13 @@ def _lattice(corners: np.ndarray, used: np.ndarray | None = None) -> tuple[np.nd
         high[at] = np.where(weight, np.maximum(high[at], own), high[at])
     mean = np.divide(total, number, out=np.full(shape, np.nan), where=number > 0)
     return mean, high - low > SAME
+
+
+def _steepness(corners: np.ndarray, cell: float) -> np.ndarray:
+    """Corners (X, Y, 4) of cells -> (X, Y) their surface over the area below it: 1 where it is level."""
+    signs = 2.0 * np.array(CORNERS) - 1.0
+    slopes = corners.astype(np.float64) @ signs / (2.0 * cell)
+    return np.sqrt(1.0 + (slopes**2).sum(axis=2))
 
 
 def _rectangles(low: np.ndarray, flat: np.ndarray) -> Iterator[tuple[slice, slice, float]]:

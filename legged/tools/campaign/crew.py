@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 
-import legged
 from legged.process.paths import make_folder
+from legged.process.processes import child_environment
 from legged.process.startup import STAGES_FILE
 
 POLL_S = 0.05
@@ -59,13 +59,7 @@ class Job:
         """Start the process, in a session of its own: Ctrl-C reaches it through us alone."""
         make_folder(self.output.parent)
         self.stages.unlink(missing_ok=True)
-        environment = {**os.environ, STAGES_FILE: str(self.stages)}
-        top = Path(legged.__file__).resolve().parents[1]
-        if top.name not in (
-            "site-packages",
-            "dist-packages",
-        ):  # it is not installed there: the process finds it as this one did
-            environment["PYTHONPATH"] = os.pathsep.join(filter(None, (str(top), os.environ.get("PYTHONPATH"))))
+        environment = child_environment() | {STAGES_FILE: str(self.stages)}
         with self.output.open("wb") as output:
             self.process = subprocess.Popen(
                 self.command,

@@ -106,18 +106,26 @@ def _seeded(cfg: LeggedConfig, seed: int) -> LeggedConfig:
 
 
 def finished_run(cfg: LeggedConfig) -> Path | None:
-    """Return the newest run that was trained to its end with just this configuration; how policies are judged may differ."""
+    """Return the newest run that was trained to its end with just this configuration; how policies are judged and shown may
+    differ.
+    """
     found = []
     for path in experiment_folder(cfg).glob(f"*_{cfg.train.runner.run_name}*/{CONFIG_FILE}"):
         folder = path.parent
         try:
             trained = run_config(folder)
-            same = isinstance(trained, LeggedConfig) and replace(trained, evaluation=cfg.evaluation) == cfg
+            same = isinstance(trained, LeggedConfig) and _shown_as(cfg, trained) == cfg
             if same and not why_unfinished(folder, cfg, read_timing(folder)):
                 found.append(folder)
         except ConfigError:  # of another version of the task, or damaged
             continue
     return max(found, key=lambda folder: max(file.stat().st_mtime for file in checkpoints(folder).values()), default=None)
+
+
+def _shown_as(cfg: LeggedConfig, trained: LeggedConfig) -> LeggedConfig:
+    """Return the configuration of a training, judged and shown as `cfg` says."""
+    runner = replace(trained.train.runner, film=cfg.train.runner.film, report=cfg.train.runner.report)
+    return replace(trained, evaluation=cfg.evaluation, train=replace(trained.train, runner=runner))
 
 
 # ---- commands --------------------------------------------------------------------------------------------------------

@@ -1,0 +1,134 @@
+"""The schema as text: every field with path, type, default, unit, bounds and meaning, for reference and completion."""
+
+import ast
+import dataclasses
+import functools
+import inspect
+import re
+import textwrap
+import types
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Union
+
+from legged.config.bounds import SMALLEST
+from legged.config.checks import hints_of
+from legged.config.loader import to_dict
+from legged.config.units import TOKENS, exponents
+
+
+@dataclass(frozen=True)
+class FieldText:
+    """What is to be known about a field of a configuration."""
+
+    path: str
+    """Dotted path, as on the command line; `<name>` stands for the entry of a map."""
+    kind: str
+    """What it takes, such as "a number" or "one of P, V, T"."""
+    default: Any
+    """Its default as plain values; None for a section, whose fields have their own."""
+    unit: str
+    """Its unit; empty if it has none, or if its meaning says it for each entry."""
+    bounds: str
+    """What its numbers must be; empty where they may be any."""
+    meaning: str
+    """Its docstring, on one line."""
+    choices: tuple[str, ...] = ()
+    """The values that it may have, where they can be counted."""
+    is_section: bool = False
+    """Whether it has fields of its own, which follow it."""
+
+
+def fields(schema: type, defaults: Any = None, prefix: str = "") -> Iterator[FieldText]:
+    """Yield all fields of a schema, each section before the fields in it; of a map of sections those of one entry."""
+    instance = schema() if defaults is None else defaults
+    for field in dataclasses.fields(schema):  # type: ignore[arg-type]
+        if not field.compare or field.name == "task":
+            continue
+        path, value = f"{prefix}{field.name}", getattr(instance, field.name)
+        hint = hints_of(schema)[field.name]
+        meaning = meaning_of(schema, field.name)
+        of_entries = typing.get_args(hint)[1] if typing.get_origin(hint) is dict else None
+        if dataclasses.is_dataclass(hint):
+            yield FieldText(path, "a section", None, "", "", meaning, is_section=True)
+            yield from fields(typing.cast(type, hint), value, f"{path}.")
+        elif dataclasses.is_dataclass(of_entries):
+            yield FieldText(f"{path}.<name>", "a section", None, "", "", meaning, is_section=True)
+            yield from fields(typing.cast(type, of_entries), None, f"{path}.<name>.")
+        else:
+            choices = (
+                ("true", "false") if hint is bool else typing.get_args(hint) if typing.get_origin(hint) is Literal else ()
+            )
+            unit, bounds = unit_of(meaning), bounds_of(field.metadata)
+            yield FieldText(path, kind_of(hint), to_dict(value), unit, bounds, meaning, choices)
+
+
+@functools.cache
+def _meanings(schema: type) -> dict[str, str]:
+    """Return field -> docstring of the fields that a class itself declares."""
+    (tree,) = ast.parse(textwrap.dedent(inspect.getsource(schema))).body
+    assert isinstance(tree, ast.ClassDef)
+    found = {}
+    for node, after in zip(tree.body, tree.body[1:], strict=False):
+        documented = (
+            isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) and isinstance(after.value.value, str)
+        )
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and documented:
+            found[node.target.id] = " ".join(ast.literal_eval(after.value).split())  # type: ignore[attr-defined]
+    return found
+
+
+def meaning_of(schema: type, name: str) -> str:
+    """Return the docstring of a field, of the nearest class that has one; empty if none has."""
+    classes = [kind for kind in schema.__mro__ if dataclasses.is_dataclass(kind)]
+    return next((_meanings(kind)[name] for kind in classes if name in _meanings(kind)), "")
+
+
+def kind_of(hint: Any) -> str:
+    """Say in words what a field of that type takes."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Literal:
+        return f"one of {', '.join(f'`{arg}`' for arg in args)}"
+    if origin in (Union, types.UnionType):
+        kinds = [kind_of(arg) for arg in args if arg is not type(None)]
+        return " or ".join([*kinds, *(["`null`"] if type(None) in args else [])])
+    if origin is tuple and args[1:] == (Ellipsis,):
+        return f"a list: {kind_of(args[0])} each"
+    if origin is tuple:
+        return f"[low, high]: {len(args)} numbers" if len(args) == 2 else f"a list of {len(args)} numbers"
+    if origin is dict:
+        return f"a map: {kind_of(args[1])} for each name"
+    return {bool: "true or false", int: "a whole number", float: "a number", str: "text", Any: "anything"}[hint]
+
+
+def unit_of(meaning: str) -> str:
+    """Return the first unit in brackets of a docstring; empty without one."""
+    return next((text for text in re.findall(r"\[([^\]]*)\]", meaning) if _is_unit(text)), "")
+
+
+def _is_unit(text: str) -> bool:
+    return any(exponents(text)) or TOKENS.findall(text) in (["rad"], ["deg"])
+
+
+def bounds_of(metadata: Mapping[str, Any]) -> str:
+    """Say in words what the bounds of a field allow."""
+    low, high = metadata.get("min"), metadata.get("max")
+    parts = []
+    if "above" in metadata and high is not None:
+        least = f"above {metadata['above']}" if low is None or low <= SMALLEST else f"at least {_number(low)}"
+        parts.append(f"{least}, at most {_number(high)}")
+    elif low is not None and high is not None:
+        parts.append(f"at most {_number(high)} in size" if low == -high else f"{_number(low)} to {_number(high)}")
+    if "items" in metadata:
+        parts.append(f"{0 if metadata.get('may_be_empty') else 1} to {metadata['items']} items")
+    if metadata.get("unique"):
+        parts.append("none twice")
+    if metadata.get("name"):
+        parts.append("a name that a folder can have")
+    return ", ".join(parts)
+
+
+def _number(value: float) -> str:
+    """Return a bound as it is shortest to read; whole numbers of up to seven digits are exact."""
+    return f"{value:.7g}" if isinstance(value, int) else f"{value:g}"

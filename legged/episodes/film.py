@@ -1,0 +1,113 @@
+"""Pictures of a recorded episode: its states are put into a task of one robot again, and drawn as play draws them. Where
+nothing can be drawn, the bodies' places as a stick figure.
+"""
+
+import base64
+import io
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from PIL import Image
+
+from legged.config import TaskConfig, override
+from legged.envs import BaseTask, LeggedRobot
+from legged.episodes.rollout import ground_of
+from legged.episodes.stored import Episodes
+from legged.errors import ConfigError, RunError
+from legged.registry import make_task
+from legged.rendering import RobotsCamera, camera_of
+
+WIDTH, HEIGHT = 640, 360
+"""Of a picture [pixels]."""
+FPS, MOST_PICTURES = 25.0, 400
+"""Pictures a second, and of an episode, at most: longer ones have fewer a second."""
+FILL, GLIDE = 0.5, 0.3
+"""Share of the picture that a robot fills, and of the way to it that the camera makes up in a picture."""
+QUALITIES = (80, 70, 60, 50, 40, 30)
+"""Of JPEG: the first whose pictures fit into BUDGET_MB all together."""
+BUDGET_MB = 3.2
+"""Room for the pictures; as text in a page they take a third more [MB]."""
+
+
+class Projector:
+    """Shows recorded episodes of one task: builds the task once, of one robot in the C engine."""
+
+    def __init__(self, episodes: Episodes, cfg: TaskConfig) -> None:
+        """Build the task that `cfg` describes, on the ground that the episodes were recorded on.
+
+        Raises:
+            ConfigError: that task is not there any more.
+        """
+        self.episodes = episodes
+        nominal = replace(cfg, domain_rand=replace(cfg.domain_rand, ranges={}))
+        alone = [("env.num_envs", 1), ("sim.physics", "mujoco"), ("sim.solver", "mujoco"), ("sim.threads", 1)]
+        terrain = ground_of(cfg, episodes.about.get("ground"))
+        self.task: BaseTask = make_task(override(nominal, alone), "cpu", False, terrain)
+        model = self.task.physics.model
+        for name, width in (("qpos", model.nq), ("qvel", model.nv)):
+            if episodes[name].shape[1] != width:
+                raise ConfigError(f"{cfg.task}: its model has changed: {name} has {width} numbers, not as in the episodes")
+
+    def show(self, number: int) -> dict[str, Any]:
+        """Return what a page draws beside the plots of an episode: `every` steps a picture, and `pictures` as JPEG in base64;
+        or, where nothing can be drawn, `why` not, and a stick figure: the `parents` of B bodies, and their `places`
+        (T', B, 3) [m], world frame.
+        """
+        steps = int(self.episodes.lengths[number])
+        every = max(1, round(1.0 / (FPS * self.episodes.dt)), -(-steps // MOST_PICTURES))
+        shown = list(range(0, steps, every))
+        try:
+            return {"every": every, "width": WIDTH, "height": HEIGHT, "pictures": self._pictures(number, shown)}
+        except RunError as error:
+            return {"every": every, "why": str(error), **self._stick_figure(number, shown)}
+
+    def _pictures(self, number: int, shown: list[int]) -> list[str]:
+        one, task = self.episodes.of(number), self.task
+        camera = camera_of(task, 1, WIDTH, HEIGHT)
+        if isinstance(camera, RobotsCamera):
+            camera.come_near(FILL, GLIDE)
+            camera.arrows = True
+        frames = []
+        try:
+            for step in shown:
+                self._put(one, step)
+                frames.append(Image.fromarray(camera.picture()))
+        finally:
+            camera.close()
+        for quality in QUALITIES:
+            found = [_jpeg(frame, quality) for frame in frames]
+            if sum(map(len, found)) <= BUDGET_MB * 1e6:
+                break
+        return [base64.b64encode(picture).decode("ascii") for picture in found]
+
+    def _put(self, one: dict[str, np.ndarray], step: int) -> None:
+        """Put the robot into a state, with the command that it had."""
+        task = self.task
+        qpos, qvel = (torch.as_tensor(np.nan_to_num(one[name][step : step + 1])) for name in ("qpos", "qvel"))
+        task.physics.write(torch.ones(1, dtype=torch.bool), qpos, qvel)
+        task.physics.refresh()
+        if isinstance(task, LeggedRobot):
+            task.commands[:, :3].copy_(torch.as_tensor(one["command"][step]))
+
+    def _stick_figure(self, number: int, shown: list[int]) -> dict[str, Any]:
+        model = self.task.physics.model
+        data, states, places = mujoco.MjData(model), self.episodes.of(number)["qpos"], []
+        for step in shown:
+            data.qpos[:] = np.nan_to_num(states[step])
+            mujoco.mj_kinematics(model, data)
+            places.append(data.xpos[1:].copy())
+        moved = [i for i in range(1, model.nbody) if model.body_weldid[i] != 0]  # terrain is a part of the world
+        rows = {body: row for row, body in enumerate(moved)}
+        return {
+            "parents": [rows.get(int(model.body_parentid[body]), -1) for body in moved],
+            "places": np.round(np.array(places)[:, [body - 1 for body in moved]], 3).tolist(),
+        }
+
+
+def _jpeg(frame: Image.Image, quality: int) -> bytes:
+    written = io.BytesIO()
+    frame.save(written, "JPEG", quality=quality, optimize=True)
+    return written.getvalue()

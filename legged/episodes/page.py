@@ -1,0 +1,96 @@
+"""The page of an episode: one HTML file with pictures, numbers and the code that draws them; it asks no network."""
+
+import base64
+import json
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from legged.episodes.panels import Panels
+from legged.episodes.ranking import Figures
+from legged.episodes.stored import Episodes
+from legged.process.paths import relative, write_text
+
+WEB = Path(__file__).resolve().parent / "web"
+
+
+def page_name(number: int) -> str:
+    """Return what the page of an episode is called."""
+    return f"episode_{number:03d}.html"
+
+
+def write_page(folder: Path, episodes: Episodes, figures: Figures, number: int, film: dict[str, Any]) -> Path:
+    """Write the page of an episode into `folder`, with what `Projector.show` returned of it; return its path.
+
+    Raises:
+        RunError: it can't be written.
+    """
+    panels = Panels(episodes, number)
+    sections = panels.sections()
+    about = episodes.about
+    title = f"{about['task']}, episode {number}: {_ending(episodes, figures, number)}"
+    data = {
+        "title": title,
+        "summary": f"{about['checkpoint']} of {about.get('run', '')}, {about.get('physics', '')}; {_conditions(about)}",
+        "steps": int(episodes.lengths[number]),
+        "dt": episodes.dt,
+        "film": film,
+        "series": {name: _packed(array) for name, array in panels.arrays.items()},
+        "sections": sections,
+        "tables": [
+            {"rows": _facts(episodes, figures, number), "numbers": False},
+            {"rows": _sums(episodes, number), "numbers": True},
+        ],
+    }
+    # Within a script a text must not end it.
+    text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    page = Template((WEB / "page.html").read_text(encoding="utf-8")).substitute(
+        title=title.replace("&", "&amp;").replace("<", "&lt;"),
+        style=(WEB / "page.css").read_text(encoding="utf-8"),
+        script=(WEB / "page.js").read_text(encoding="utf-8"),
+        data=text,
+    )
+    path = folder / page_name(number)
+    write_text(path, page)
+    print(f"page {relative(path)} ({len(page) / 1e6:.1f} MB)")
+    return path
+
+
+def _packed(array: np.ndarray) -> dict[str, Any]:
+    """Return numbers (T,) or (T, K) as text: little-endian 32-bit floats in base64, row by row."""
+    rows = array.reshape(len(array), -1)
+    return {"values": base64.b64encode(rows.astype("<f4").tobytes()).decode("ascii"), "columns": rows.shape[1]}
+
+
+def _ending(episodes: Episodes, figures: Figures, number: int) -> str:
+    seconds, terms = figures.values["length"][number], ", ".join(figures.ended[number])
+    return f"{'failed' if figures.failed[number] else 'ended'} after {seconds:.2f} s by {terms}"
+
+
+def _conditions(about: dict[str, Any]) -> str:
+    """Say under which conditions episodes were recorded."""
+    return (
+        "noise, pushes and randomisation as trained" if about.get("as_trained") else "without noise, pushes and randomisation"
+    )
+
+
+def _facts(episodes: Episodes, figures: Figures, number: int) -> list[tuple[str, str]]:
+    about = episodes.about
+    rows = [(column.title, f"{figures.values[column.name][number]:{column.form}}") for column in figures.columns]
+    if figures.strained:
+        rows.append(("at the joint", figures.strained[number]))
+    rows += [("robot", str(int(episodes["robot"][number]))), ("steps", f"{episodes.lengths[number]} of {episodes.dt:g} s")]
+    if about.get("held_command"):
+        rows.append(("command held [m/s, rad/s]", ", ".join(f"{value:g}" for value in about["held_command"])))
+    rows += [("device", str(about.get("device", ""))), ("seed", str(about.get("seed", "")))]
+    return rows
+
+
+def _sums(episodes: Episodes, number: int) -> list[tuple[str, str]]:
+    """Return the return by part, the largest first."""
+    sums = np.nan_to_num(episodes.of(number)["reward_parts"]).sum(axis=0, dtype=np.float64)
+    names = episodes.columns("reward_parts")
+    order = np.argsort(-np.abs(sums), kind="stable")
+    return [(f"return of {names[i]}", f"{sums[i]:.2f}") for i in order]

@@ -1,0 +1,55 @@
+"""Intervals of 95 % around measured shares and means, and around differences of two."""
+
+from collections.abc import Sequence
+from math import sqrt
+
+import numpy as np
+
+Z95 = 1.959964
+"""Quantile of the normal distribution [standard deviations]."""
+DRAWS = 2000
+"""Samples that a bootstrap draws."""
+
+Interval = tuple[float, float]
+
+
+def wilson(successes: int, trials: int, z: float = Z95) -> Interval:
+    """Return Wilson's score interval of a share (E. B. Wilson 1927): never outside [0, 1], never empty at 0 or 100 %."""
+    share, scale = successes / trials, 1.0 + z**2 / trials
+    middle = (share + 0.5 * z**2 / trials) / scale
+    half = z / scale * sqrt(share * (1.0 - share) / trials + 0.25 * z**2 / trials**2)
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def newcombe(first: tuple[int, int], second: tuple[int, int]) -> Interval:
+    """Return the interval of the difference second - first of two shares, each (successes, trials), out of the Wilson
+    intervals of both (R. G. Newcombe, Statistics in Medicine 17, 1998, method 10).
+    """
+    (a, (a_low, a_high)), (b, (b_low, b_high)) = ((n / of, wilson(n, of)) for n, of in (first, second))
+    return (
+        b - a - sqrt((b - b_low) ** 2 + (a_high - a) ** 2),
+        b - a + sqrt((b_high - b) ** 2 + (a - a_low) ** 2),
+    )
+
+
+def normal_mean(mean: float, std: float, count: int) -> Interval:
+    """Return the interval of a mean over `count` values, by their standard deviation and the normal distribution."""
+    half = Z95 * std / sqrt(count)
+    return mean - half, mean + half
+
+
+def welch(first: tuple[float, float, int], second: tuple[float, float, int]) -> Interval:
+    """Return the interval of the difference second - first of two means, each (mean, standard deviation, count), whose
+    standard deviations may differ (B. L. Welch 1947), by the normal distribution: counts are large.
+    """
+    half = Z95 * sqrt(sum(std**2 / count for _, std, count in (first, second)))
+    difference = second[0] - first[0]
+    return difference - half, difference + half
+
+
+def bootstrap_mean(values: Sequence[float], seed: int = 0) -> Interval:
+    """Return the percentile bootstrap interval of the mean of some values (B. Efron 1979), the same at every call."""
+    given = np.asarray(values, dtype=float)
+    picks = np.random.default_rng(seed).integers(0, len(given), (DRAWS, len(given)))
+    low, high = np.quantile(given[picks].mean(axis=1), (0.025, 0.975))
+    return float(low), float(high)

@@ -1,0 +1,195 @@
+"""Several runs side by side: what they set otherwise, their curves over each other, their evaluations with intervals."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from legged.evaluation.engines import ENGINES, engine_of
+from legged.evaluation.intervals import Interval, bootstrap_mean, newcombe, normal_mean, welch, wilson
+from legged.evaluation.learning_curves import labels
+from legged.evaluation.reports.curves import curves_of_runs
+from legged.evaluation.reports.differences import differences, words
+from legged.evaluation.reports.document import Cell, Figures, Heading, Mono, Paragraph, Part, Table
+from legged.evaluation.reports.evaluation_part import BROKEN, between, falls_of, number, success_drawing, success_line
+from legged.evaluation.reports.record import Record
+from legged.evaluation.result_file import tracking_of
+
+Measured = tuple[str, Interval] | None
+"""A figure in words, and its interval; None where a run lacks it."""
+
+
+def comparison_parts(records: Sequence[Record]) -> list[Part]:
+    """Return the page on some runs, the first of which the others are compared with."""
+    names = labels([record.folder for record in records], [record.config for record in records])
+    rows: list[list[Cell]] = []
+    for name, record in zip(names, records, strict=True):
+        timing = record.timing
+        row: list[Cell] = [name, Mono(record.name), record.status, record.why, number(record.robots, ",.0f")]
+        row += [number(timing.loop_s if timing else None, ".1f"), number(timing.steps_per_s if timing else None, ",.0f")]
+        rows.append([*row, record.code.summary, record.note])
+    head = ["run", "folder", "status", "", "robots", "loop [s]", "steps/s", "commit", "note"]
+    parts: list[Part] = [Table(head, rows), Heading("Settings that differ"), _settings(names, records)]
+    drawings = curves_of_runs(list(zip(names, records, strict=True)))
+    if drawings:
+        parts += [Heading("Curves"), Figures("curves", drawings, "learning curves of the runs")]
+    return parts + _evaluations(names, records)
+
+
+def _settings(names: Sequence[str], records: Sequence[Record]) -> Part:
+    """Return a table of the settings that are not the same in all runs."""
+    found = differences([record.config for record in records])
+    if not found:
+        return Paragraph("None.")
+    rows: list[list[Cell]] = [[Mono(path), *(Mono(words(value)) for value in values)] for path, values in found.items()]
+    return Table(["setting", *names], rows)
+
+
+def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
+    """Return tables and drawings of the engines in which at least two of the runs were judged."""
+    by_engine = [{result["physics"]: result for result in record.results} for record in records]
+    engines = dict.fromkeys(name for one in by_engine for name in one)
+    parts: list[Part] = []
+    for engine in sorted(engines, key=lambda name: [*ENGINES, name].index(name)):
+        results = [one.get(engine) for one in by_engine]
+        if sum(result is not None for result in results) < 2:
+            continue
+        parts += [Heading(f"Evaluation in {engine_of(engine).label}"), _table(names, results)]
+        drawings = _success(names, results)
+        if drawings:
+            parts.append(Figures(f"success_{engine}", drawings, f"success over difficulty in {engine_of(engine).label}"))
+    if not parts:
+        return [Heading("Evaluation"), Paragraph("No two of the runs were evaluated in the same engine.")]
+    text = (
+        "In brackets, intervals of 95 %: of shares Wilson's, of their difference Newcombe's; of errors a bootstrap over the"
+        " commands of the grid, the same commands for both in a difference; of returns by their standard deviation (Welch)."
+        " They say how sure a figure is of this one policy: another seed may differ by more. A * marks differences whose"
+        " interval leaves out 0."
+    )
+    return [*parts, Paragraph(text)]
+
+
+def _table(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> Table:
+    """Return one engine's figures: a line a measure, a column a run, and one for each difference from the first run."""
+    rows: list[list[Cell]] = []
+    for label, measure, difference in _measures(results):
+        found = [measure(result) if result is not None else None for result in results]
+        row: list[Cell] = [label, *(_words(one) for one in found)]
+        for result in results[1:]:
+            both = results[0] is not None and result is not None
+            row.append(_words(difference(results[0], result) if both else None, marked=True))
+        rows.append(row)
+    return Table(["measure", *names, *(f"{name} - {names[0]}" for name in names[1:])], rows)
+
+
+def _words(found: Measured, marked: bool = False) -> str:
+    if found is None:
+        return "-"
+    text, (low, high) = found
+    return f"{text}{' *' if marked and not low <= 0.0 <= high else ''}"
+
+
+def _measures(results: Sequence[dict[str, Any] | None]) -> list[tuple[str, Any, Any]]:
+    """Return what is compared: label, a run's figure, and the difference of two."""
+    if any(result is not None and "episodes" in result for result in results):
+        return [
+            ("return", _returned, _returned_more),
+            ("episodes that ended in a failure [%]", *_share(_failures)),
+        ]
+    return [
+        ("velocity RMSE [m/s]", *_error("rmse_lin")),
+        ("yaw rate RMSE [rad/s]", *_error("rmse_ang")),
+        ("falls [%]", *_share(lambda result: falls_of(tracking_of(result)))),
+    ]
+
+
+def _error(name: str) -> tuple[Any, Any]:
+    """Return the mean of an error over the cells of the grid, and the difference of two on the same grid."""
+
+    def cells(result: dict[str, Any]) -> dict[tuple[float, ...], float]:
+        try:
+            found = tracking_of(result)["cells"]
+            return {tuple(cell["command"]): float(cell[name]) for cell in found if cell[name] is not None}
+        except BROKEN:
+            return {}
+
+    def of(result: dict[str, Any]) -> Measured:
+        values = list(cells(result).values())
+        if not values:
+            mean = tracking_of(result).get(name, {}).get("mean")
+            return None if mean is None else (f"{mean:.3f}", (mean, mean))
+        interval = bootstrap_mean(values)
+        return f"{np.mean(values):.3f} ({between(interval, form='.3f')})", interval
+
+    def more(first: dict[str, Any], second: dict[str, Any]) -> Measured:
+        a, b = cells(first), cells(second)
+        common = [command for command in a if command in b]
+        if not common:
+            return None
+        moved = [b[command] - a[command] for command in common]
+        interval = bootstrap_mean(moved)
+        return f"{np.mean(moved):+.3f} ({between(interval, form='+.3f')})", interval
+
+    return of, more
+
+
+def _share(counted: Any) -> tuple[Any, Any]:
+    """Return a share, and the difference of two, of what `counted` finds in a result: (how many, of how many), or None."""
+
+    def of(result: dict[str, Any]) -> Measured:
+        found = counted(result)
+        if found is None:
+            return None
+        interval = wilson(*found)
+        return f"{100.0 * found[0] / found[1]:.2f} ({between(interval, 100.0, '.2f')})", interval
+
+    def more(first: dict[str, Any], second: dict[str, Any]) -> Measured:
+        a, b = counted(first), counted(second)
+        if a is None or b is None:
+            return None
+        interval = newcombe(a, b)
+        moved = 100.0 * (b[0] / b[1] - a[0] / a[1])
+        return f"{moved:+.2f} ({between(interval, 100.0, '+.2f')})", interval
+
+    return of, more
+
+
+def _failures(result: dict[str, Any]) -> tuple[int, int] | None:
+    count = int(result["episodes"]["count"]) if "episodes" in result else 0
+    return (round(result["episodes"]["failures"] * count), count) if count > 0 else None
+
+
+def _spread(result: dict[str, Any]) -> tuple[float, float, int] | None:
+    """Return mean and standard deviation of returns, and the number of episodes."""
+    episodes = result.get("episodes")
+    if episodes is None or int(episodes["count"]) < 1:
+        return None
+    return episodes["return"]["mean"], episodes["return"]["std"], int(episodes["count"])
+
+
+def _returned(result: dict[str, Any]) -> Measured:
+    found = _spread(result)
+    if found is None:
+        return None
+    interval = normal_mean(*found)
+    return f"{found[0]:.1f} ({between(interval)})", interval
+
+
+def _returned_more(first: dict[str, Any], second: dict[str, Any]) -> Measured:
+    a, b = _spread(first), _spread(second)
+    if a is None or b is None:
+        return None
+    interval = welch(a, b)
+    return f"{b[0] - a[0]:+.1f} ({between(interval, form='+.1f')})", interval
+
+
+def _success(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> list[str]:
+    """Return a drawing a terrain type that at least two of the runs have crossed."""
+    entries = [(result or {}).get("success", {}).get("types", {}) for result in results]
+    found = []
+    for kind in dict.fromkeys(kind for one in entries for kind in one):
+        there = [(name, one[kind]) for name, one in zip(names, entries, strict=True) if kind in one]
+        if len(there) > 1:
+            lines = [success_line(name, entry) for name, entry in there]
+            found.append(success_drawing(kind.replace("_", " "), there[0][1], lines))
+    return found

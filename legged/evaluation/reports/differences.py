@@ -1,0 +1,77 @@
+"""In what configurations differ: a run's from its task file's, and those of several runs."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import yaml
+
+from legged.config import to_dict
+from legged.errors import ConfigError
+from legged.evaluation.reports.record import Record
+from legged.registry import task_config
+
+MISSING = object()
+"""Stands where a configuration lacks a setting."""
+NAMES = ("train.runner.run_name", "train.runner.experiment_name", "train.runner.report", "train.runner.film", "task")
+"""Settings that say nothing of how a policy comes to be."""
+MOST_WORDS = 4
+"""Settings that are named in a few words."""
+LONGEST_VALUE = 60
+
+
+def flat(config: Any, prefix: str = "") -> dict[str, Any]:
+    """Return dotted path -> value of all settings; a list is one value."""
+    if not isinstance(config, Mapping) or (not config and prefix):
+        return {prefix: config}
+    return {
+        path: value for key, entry in config.items() for path, value in flat(entry, f"{prefix}.{key}".lstrip(".")).items()
+    }
+
+
+def differences(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Return dotted path -> its value in each configuration, of settings that are not the same in all; MISSING stands where
+    one lacks it.
+    """
+    all_flat = [flat(config) for config in configs]
+    paths = dict.fromkeys(path for one in all_flat for path in one)
+    found = {path: [one.get(path, MISSING) for one in all_flat] for path in paths}
+    return {path: values for path, values in found.items() if any(not _same(values[0], value) for value in values[1:])}
+
+
+def _same(a: Any, b: Any) -> bool:
+    return (a is b) if MISSING in (a, b) else bool(a == b)
+
+
+def from_task_file(record: Record) -> dict[str, list[Any]] | None:
+    """Return the settings in which a run differs from its task as it is now, each with both values; None where there is no
+    such task any more. A run that does not say on which device it was made is compared with the settings that it is nearest
+    to, those of a CPU or the others.
+    """
+    where = [record.timing.device == "cpu"] if record.timing else [False, True]
+    found = []
+    for on_cpu in where:
+        try:
+            found.append(differences([record.config, to_dict(task_config(record.task, on_cpu=on_cpu))]))
+        except (ConfigError, OSError):
+            return None
+    return min(found, key=len)
+
+
+def words(value: Any) -> str:
+    """Return a value as it would stand in a YAML file, on one line; a dash for none."""
+    if value is MISSING:
+        return "-"
+    text = yaml.safe_dump(value, default_flow_style=True, width=1_000_000).strip().removesuffix("...").strip()
+    return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 3] + "..."
+
+
+def what_changed(record: Record) -> str:
+    """Say in a few words what a run is about: somebody's note, else its own name and what it sets otherwise than its task."""
+    if record.note:
+        return record.note
+    changed = from_task_file(record) or {}
+    changed = {path: values for path, values in changed.items() if path not in (*NAMES, "env.seed")}
+    named = [f"{path.rpartition('.')[2]} {words(given)}" for path, (given, _) in changed.items()]
+    if len(named) > MOST_WORDS:
+        named = [*named[:MOST_WORDS], f"{len(named) - MOST_WORDS} more settings"]
+    return ": ".join(text for text in (record.run_name, ", ".join(named)) if text)

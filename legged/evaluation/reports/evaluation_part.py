@@ -1,0 +1,172 @@
+"""What an evaluation found, as tables and drawings: heat maps over commands, success over difficulty, returns of episodes."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from legged.evaluation.engines import ENGINES, engine_of
+from legged.evaluation.intervals import wilson
+from legged.evaluation.reports.document import Cell, Figures, Heading, Number, Paragraph, Part, Table
+from legged.evaluation.reports.svg import Axes, Line, curves, heat_map
+from legged.evaluation.result_file import tracking_of
+from legged.evaluation.success_report import PANELS as SUCCESS_PANELS
+from legged.evaluation.success_report import TRAINED_LABEL, panels_of
+from legged.evaluation.tracking_report import PANELS, grid_means
+from legged.evaluation.velocity_grid import AXES
+
+BROKEN = (KeyError, TypeError, ValueError, IndexError, AttributeError)
+"""What a file that lacks something of an evaluation raises where it is drawn."""
+
+
+def number(value: float | None, form: str = ".3f", unit: str = "") -> Number:
+    """Return a number as a cell, a dash for none."""
+    return Number("-" if value is None else f"{value:{form}}{unit}", value)
+
+
+def between(interval: tuple[float, float], factor: float = 1.0, form: str = ".1f") -> str:
+    """Return an interval in words."""
+    return f"{factor * interval[0]:{form}} to {factor * interval[1]:{form}}"
+
+
+def falls_of(tracking: dict[str, Any]) -> tuple[int, int] | None:
+    """Return how many robots of a command grid fell, and how many there were; None where the file does not say that."""
+    try:
+        robots = len(tracking["cells"]) * int(tracking["robots_per_cell"])
+        return (round(tracking["falls"] * robots), robots) if robots > 0 else None
+    except BROKEN:
+        return None
+
+
+def evaluation_parts(results: Sequence[dict[str, Any]]) -> list[Part]:
+    """Return the part of a report on evaluations, one an engine; nothing of none."""
+    if not results:
+        return []
+    results = sorted(results, key=lambda one: [*ENGINES, one["physics"]].index(one["physics"]))
+    of_episodes = [result for result in results if "episodes" in result]
+    following = [result for result in results if "episodes" not in result]
+    parts: list[Part] = [Heading("Evaluation")]
+    if following:
+        parts += _following(following)
+    for result in of_episodes:
+        parts += _episodes(result)
+    return parts
+
+
+def _following(results: Sequence[dict[str, Any]]) -> list[Part]:
+    """Return tables and drawings of robots that follow commands."""
+    rows: list[list[Cell]] = []
+    drawings = []
+    for result in results:
+        tracking, label = tracking_of(result), engine_of(result["physics"]).label
+        counted = falls_of(tracking)
+        rows.append(
+            [
+                label,
+                *(number(tracking[name][part]) for name in ("rmse_lin", "rmse_ang") for part in ("mean", "worst")),
+                number(100.0 * tracking["falls"], ".2f"),
+                "-" if counted is None else between(wilson(*counted), 100.0, ".2f"),
+                number(tracking.get("cost_of_transport"), ".2f"),
+            ]
+        )
+        drawings += _heat_maps(tracking, label)
+    head = [
+        "engine",
+        "velocity RMSE [m/s]",
+        "worst cell",
+        "yaw rate RMSE [rad/s]",
+        "worst cell",
+        "falls [%]",
+        "95 % interval",
+        "cost of transport",
+    ]
+    parts: list[Part] = [
+        Paragraph(
+            "Without noise and pushes, on a grid of commands: root mean square of the error over time, mean of the cells. The"
+            " interval of falls is Wilson's. A cell of the maps is the mean over the third command."
+        ),
+        Table(head, rows),
+    ]
+    if drawings:
+        parts.append(Figures("tracking", drawings, "velocity and yaw rate errors over commands"))
+    success = _success(results)
+    if success:
+        parts += [
+            Paragraph(
+                "Robots that get out of a tile of each size, with Wilson's interval of 95 %; a dotted line is the hardest of"
+                " training."
+            ),
+            Figures("success", success, "success over difficulty"),
+        ]
+    return parts
+
+
+def _heat_maps(tracking: dict[str, Any], label: str) -> list[str]:
+    """Return maps of errors over commands; none where the file lacks the cells."""
+    try:
+        grid, found = tracking["grid"], []
+        for name, over, other, title in PANELS:
+            values = grid_means(tracking, name, over)
+            where = (f"commanded vx [{AXES['vx']}]", f"commanded {other} [{AXES[other]}]")
+            found.append(heat_map(f"{title}, {label}", *where, grid["vx"], grid[other], values))
+        return found
+    except BROKEN:
+        return []
+
+
+def _success(results: Sequence[dict[str, Any]]) -> list[str]:
+    """Return a drawing a kind of terrain: success over size, one line a type and engine."""
+    names = dict.fromkeys(name for result in results for name in result.get("success", {}).get("types", {}))
+    found = []
+    for title, types in panels_of(list(names)).items():
+        entries = [
+            (name, result["physics"], entry)
+            for name in types
+            for result in results
+            if (entry := result.get("success", {}).get("types", {}).get(name)) is not None
+        ]
+        lines = [success_line(_label(name, physics, types, results), entry) for name, physics, entry in entries]
+        found.append(success_drawing(title if title in SUCCESS_PANELS else title.replace("_", " "), entries[0][2], lines))
+    return found
+
+
+def _label(name: str, physics: str, types: Sequence[str], results: Sequence[dict[str, Any]]) -> str:
+    """Return what tells a line from the others of its drawing."""
+    words = [name.replace("_", " ")] if len(types) > 1 else []
+    words += [engine_of(physics).label] if len(results) > 1 else []
+    return ", ".join(words)
+
+
+def success_line(label: str, entry: dict[str, Any]) -> Line:
+    """Return success over size of one terrain type, with its intervals where the file has them."""
+    points = sorted(entry["points"], key=lambda point: point["size"])
+    size, share = (np.array([point[key] for point in points], dtype=float) for key in ("size", "share"))
+    band = None
+    if all(isinstance(point.get(key), int | float) for point in points for key in ("low", "high")):
+        band = (np.array([point["low"] for point in points]), np.array([point["high"] for point in points]))
+    return Line(label, size, share, band, markers=True)
+
+
+def success_drawing(title: str, entry: dict[str, Any], lines: Sequence[Line]) -> str:
+    """Draw success over the size of a terrain type."""
+    trained = entry["trained_to"]
+    wall = None if trained is None else (TRAINED_LABEL, float(trained))
+    x_label = f"{entry['what']} [{entry['unit']}]"
+    return curves(Axes(f"success: {title}", x_label, unit=entry["what"], high=1.0, percent=True, wall=wall), lines)
+
+
+def _episodes(result: dict[str, Any]) -> list[Part]:
+    """Return a table of full episodes."""
+    episodes = result["episodes"]
+    rows: list[list[Cell]] = []
+    for label, key in (("return", "return"), ("length [control steps]", "length")):
+        rows.append([label, *(number(episodes[key][part], ".1f") for part in ("mean", "std", "min", "max"))])
+    blank = [number(None)] * 3
+    rows += [[f"return of {name}", number(value, ".1f"), *blank] for name, value in episodes["terms"].items()]
+    rows.append(["ended in a failure [%]", number(100.0 * episodes["failures"], ".1f"), *blank])
+    rows += [[name.replace("_", " "), number(value), *blank] for name, value in episodes["metrics"].items()]
+    label = engine_of(result["physics"]).label
+    return [
+        Paragraph(f"{episodes['count']:.0f} full episodes without noise, in {label}."),
+        Table(["measure", "mean", "standard deviation", "least", "greatest"], rows),
+    ]

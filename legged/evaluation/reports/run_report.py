@@ -1,0 +1,206 @@
+"""The report on one run: report.html, which needs nothing else, and report.md with pictures beside it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from legged.evaluation.learning_curves import Scalars, smooth
+from legged.evaluation.reports.curves import curves_of_run
+from legged.evaluation.reports.differences import from_task_file, words
+from legged.evaluation.reports.document import (
+    Cell,
+    Figures,
+    Heading,
+    Listing,
+    Mono,
+    Number,
+    Paragraph,
+    Part,
+    Picture,
+    Table,
+    to_html,
+    to_markdown,
+)
+from legged.evaluation.reports.evaluation_part import evaluation_parts, number
+from legged.evaluation.reports.record import Record, read_record
+from legged.evaluation.reports.svg import sheet
+from legged.learning.run_folder import CODE_FILE, checkpoints
+from legged.process.paths import write_text
+
+REPORT = "report"
+"""What its files are called, before their ending."""
+ROWS = 10
+"""Lines of the table over training."""
+LARGEST_FILM = 12 * 2**20
+"""A larger film is named and not put into the page [bytes]."""
+LONGEST_DIFF = 200_000
+"""Letters of a difference in the page; the whole one is in its file."""
+OVER_TRAINING = (
+    ("Train/mean_reward", "return", 1.0, ".2f"),
+    ("Train/std_reward", "its standard deviation", 1.0, ".2f"),
+    ("Metrics/lin_vel_rmse", "velocity error [m/s]", 1.0, ".3f"),
+    ("Metrics/ang_vel_rmse", "yaw rate error [rad/s]", 1.0, ".3f"),
+    ("Metrics/falls", "falls [%]", 100.0, ".1f"),
+    ("Metrics/episode_length", "episode [steps]", 1.0, ".0f"),
+    ("Terrain/level", "terrain level", 1.0, ".2f"),
+)
+"""Tag, head, factor and form of the columns of the table over training."""
+
+
+def write_report(folder: Path) -> Path:
+    """Write report.html, report.md and its pictures into a run folder; return the page.
+
+    Raises:
+        ConfigError: it is no run folder.
+        RunError: a file can't be written.
+    """
+    record = read_record(folder)
+    return write_pages(folder / REPORT, title_of(record), report_parts(record))
+
+
+def write_pages(stem: Path, title: str, parts: Sequence[Part]) -> Path:
+    """Write a page as <stem>.html and as <stem>.md with its pictures beside it; return the first.
+
+    Raises:
+        RunError: a file can't be written.
+    """
+    page = stem.with_name(f"{stem.name}.html")
+    write_text(page, to_html(title, parts))
+    for part in parts:
+        if isinstance(part, Figures):
+            write_text(stem.with_name(f"{stem.name}_{part.name}.svg"), sheet(part.drawings))
+    write_text(stem.with_name(f"{stem.name}.md"), to_markdown(title, parts, stem.name))
+    return page
+
+
+def title_of(record: Record) -> str:
+    """Return the title of a run's report."""
+    return f"{record.task}: {record.folder.resolve().name}"
+
+
+def report_parts(record: Record) -> list[Part]:
+    """Return all parts of a run's report."""
+    parts: list[Part] = [Paragraph(record.why, record.status)]
+    if record.note:
+        parts.append(Paragraph(record.note))
+    parts += _film(record)
+    parts += [Heading("Run"), Table(["", ""], _facts(record))]
+    parts += _differences(record)
+    if record.scalars:
+        parts += [Heading("Over training"), Paragraph("Running means over nine iterations."), over_training(record)]
+        parts += [Heading("Curves"), Figures("curves", curves_of_run(record), "learning curves")]
+    else:
+        parts += [Heading("Curves"), Paragraph("There is no TensorBoard file with values in this folder.")]
+    parts += evaluation_parts(record.results) or [
+        Heading("Evaluation"),
+        Paragraph(
+            f"None yet: `python -m legged.tools.evaluate --task {record.task} --load_run {record.folder.resolve().name}`"
+        ),
+    ]
+    if record.problems:
+        parts += [Heading("What could not be read"), *(Paragraph(text) for text in record.problems)]
+    if record.code.text:
+        shown = record.code.text[:LONGEST_DIFF]
+        rest = "" if len(shown) == len(record.code.text) else f"\n... and more: see {CODE_FILE}"
+        parts += [Heading("Code"), Listing(f"version {record.code.version}, {record.code.summary}", shown + rest, CODE_FILE)]
+    return parts
+
+
+def _facts(record: Record) -> list[list[Cell]]:
+    """Return what there is to say of a run in one line each."""
+    timing, code = record.timing, record.code
+    found: dict[str, str | None] = {
+        "began": f"{record.began:%Y-%m-%d %H:%M:%S}",
+        "code": f"legged {code.version}, commit {code.summary}" if code.commit else code.version and f"legged {code.version}",
+        "robots, seed": f"{record.robots or '-'}, {record.at('env.seed')}",
+    }
+    if timing is not None:
+        rest_s = timing.wall_s - timing.start_up_s - timing.loop_s
+        compiled = f", {timing.kernels_compiled} modules of kernels compiled" if timing.kernels_compiled else ""
+        beside = f", beside {timing.beside} other trainings" if timing.beside else ""
+        found |= {
+            "device": ("CPU" if timing.device == "cpu" else timing.device) + beside,
+            "iterations, steps": f"{timing.iterations:,}, {timing.steps:,}" + (" after it was resumed" * timing.resumed),
+            "time to start": f"{timing.start_up_s:.1f} s (imports, task{compiled or ', no kernels compiled'})",
+            "time to train": f"{timing.loop_s:.1f} s ({timing.steps_per_s:,.0f} steps/s)",
+            "time for the rest": f"{rest_s:.1f} s (graphs captured, checkpoints, logs); {timing.wall_s:.1f} s in all",
+        }
+    elif record.scalars:
+        seconds, _ = _loop_time(record.scalars)
+        found["time to train"] = f"{seconds[-1]:.1f} s in the log" if len(seconds) else None
+    faults = [tag for tag in record.scalars if tag.startswith("Faults/")]
+    lost = record.scalars.get("Metrics/contact_overflows")
+    saved = checkpoints(record.folder)
+    found |= {
+        "checkpoints": f"{len(saved)}, the last is {saved[max(saved)].name}" if saved else "none",
+        "faults": ", ".join(tag.partition("/")[2] for tag in faults) or None,
+        "contacts lost": f"in {lost[1].sum():,.0f} robot steps" if lost is not None and lost[1].sum() > 0 else None,
+    }
+    return [[name, text] for name, text in found.items() if text]
+
+
+def _film(record: Record) -> list[Part]:
+    """Return the film of a policy, if there is one that a page can hold."""
+    film = record.film
+    if film is None:
+        return []
+    try:
+        size = film.stat().st_size
+    except OSError:
+        return []
+    if not 0 < size <= LARGEST_FILM:
+        return [Paragraph(f"A film of the policy is in {film.name} ({size / 2**20:.0f} MiB).")]
+    return [Picture(film, "the last policy")]
+
+
+def _differences(record: Record) -> list[Part]:
+    """Return the settings in which a run differs from its task."""
+    heading = Heading("Settings other than the task's")
+    found = from_task_file(record)
+    if found is None:
+        text = f"There is no task '{record.task}' here to compare with; config.yaml has all settings."
+        return [heading, Paragraph(text)]
+    if not found:
+        return [heading, Paragraph("None: the run is its task as the task is now.")]
+    rows: list[list[Cell]] = [[Mono(path), Mono(words(own)), Mono(words(of_task))] for path, (own, of_task) in found.items()]
+    return [heading, Table(["setting", "this run", "the task's files now"], rows)]
+
+
+def over_training(record: Record) -> Table:
+    """Return about ten rows over a training: steps, time, returns, errors."""
+    scalars = record.scalars
+    columns = [column for column in OVER_TRAINING if column[0] in scalars]
+    first = scalars[columns[0][0]][0] if columns else next(iter(scalars.values()))[0]
+    steps = np.unique(np.concatenate([scalars[tag][0] for tag, *_ in columns])) if columns else np.unique(first)
+    picked = steps[np.unique(np.linspace(0, len(steps) - 1, ROWS).round().astype(int))]
+    seconds, at = _loop_time(scalars)
+    smoothed = {tag: (scalars[tag][0], smooth(factor * scalars[tag][1])) for tag, _, factor, _ in columns}
+    rows: list[list[Cell]] = []
+    for step in picked:
+        count = None if record.steps_per_iteration is None else float((step + 1) * record.steps_per_iteration)
+        until = at <= step
+        row: list[Cell] = [Number(f"{step + 1:,d}", float(step + 1)), number(count, ",.0f")]
+        row.append(number(float(seconds[until][-1]) if until.any() else None, ".1f"))
+        row += [number(_at(smoothed[tag], step), form) for tag, _, _, form in columns]
+        rows.append(row)
+    return Table(["iteration", "steps", "time [s]", *(head for _, head, _, _ in columns)], rows)
+
+
+def _at(curve: tuple[np.ndarray, np.ndarray], step: int) -> float | None:
+    """Return the last value of a curve up to an iteration; None before its first."""
+    before = np.flatnonzero(curve[0] <= step)
+    return float(curve[1][before[-1]]) if len(before) else None
+
+
+def _loop_time(scalars: Scalars) -> tuple[np.ndarray, np.ndarray]:
+    """Return seconds of training loop since the log began, and the iterations at whose ends they had passed."""
+    both = [
+        dict(zip(*scalars[f"Perf/{name}_time"], strict=True))
+        for name in ("collection", "learning")
+        if f"Perf/{name}_time" in scalars
+    ]
+    if len(both) < 2:
+        return np.array([]), np.array([])
+    steps = sorted(both[0].keys() & both[1].keys())
+    return np.cumsum([both[0][step] + both[1][step] for step in steps]), np.array(steps)

@@ -1,0 +1,147 @@
+"""Trackers beside TensorBoard, by rsl-rl's writers: W&B and others. None is needed; one that fails ends nothing."""
+
+import inspect
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from rsl_rl.utils.log_writer import LogWriter
+from torch.utils.tensorboard import SummaryWriter
+
+from legged.config import TaskConfig, to_dict
+from legged.config.checks import shown
+from legged.errors import ConfigError, RunError, suggest
+
+TENSORBOARD = "tensorboard"
+FLUSH_S = 10
+"""TensorBoard's file is written so often [s]."""
+SECONDS = "/time"
+"""How names end whose steps are seconds; trackers count iterations."""
+FILES = ("config.yaml", "code.diff", "timing.json", "report.html", "report.md", "evaluation_*.json", "*.gif", "*.png")
+"""What of a run folder is handed to a tracker at the end, beside videos."""
+
+
+def check_tracker(cfg: TaskConfig) -> None:
+    """Look whether the tracker that a configuration asks for is there.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if cfg.train.runner.logger != TENSORBOARD:
+        _writer_class(cfg)
+
+
+def _writer_class(cfg: TaskConfig) -> type[LogWriter]:
+    """Return the class of the writer that a configuration asks for. Raises as `check_tracker`."""
+    from rsl_rl.utils import neptune_log_writer, wandb_log_writer  # they import their trackers, where those are installed
+
+    name, where = cfg.train.runner.logger, cfg.origins.where("train.runner.logger")
+    known: dict[str, tuple[Any, str, type]] = {
+        "wandb": (wandb_log_writer.wandb, "wandb", wandb_log_writer.WandbLogWriter),
+        "neptune": (neptune_log_writer.neptune, "neptune", neptune_log_writer.NeptuneLogWriter),
+    }
+    if name in known:
+        package, pip, kind = known[name]
+        if package is None:
+            raise ConfigError(f"{where}: '{name}' needs the package {pip}, which is not installed here: pip install {pip}")
+        return kind
+    module, colon, attribute = name.partition(":")
+    if not colon:
+        allowed = suggest(name[:100], (TENSORBOARD, *known))
+        raise ConfigError(f"{where}: there is no tracker {shown(name)}{allowed}, or module:Class of a writer of your own")
+    try:
+        found = getattr(import_module(module), attribute)
+    except Exception as error:  # whatever a user's module does
+        raise ConfigError(f"{where}: {shown(name)} can't be imported ({type(error).__name__}: {error})") from error
+    if not (isinstance(found, type) and issubclass(found, LogWriter)):
+        raise ConfigError(f"{where}: {shown(name)} does not extend rsl_rl.utils.log_writer.LogWriter")
+    return found
+
+
+def open_writer(cfg: TaskConfig, folder: str) -> "SummaryWriter | Tracker":
+    """Open the writers that a configuration asks for, for a run folder: TensorBoard's, and maybe a tracker's beside it.
+
+    Raises:
+        ConfigError: as `check_tracker`.
+        RunError: the tracker does not start: nobody has logged in, or it can't be reached.
+    """
+    runner = cfg.train.runner
+    if runner.logger == TENSORBOARD:
+        return SummaryWriter(log_dir=folder, flush_secs=FLUSH_S)
+    kind = _writer_class(cfg)
+    given: dict[str, Any] = {"log_dir": folder}
+    if "project_name" in inspect.signature(kind).parameters:
+        given["project_name"] = runner.logger_project or runner.experiment_name or cfg.task
+    try:
+        writer = kind(**given)
+        writer.store_config(_Plain(to_dict(cfg)), to_dict(cfg.train))
+    except Exception as error:  # of each tracker its own
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise RunError(f"train.runner.logger: {runner.logger} does not start: {text[:300]}") from error
+    return Tracker(writer, folder)
+
+
+class _Plain:
+    """A configuration as rsl-rl's writers ask for it."""
+
+    def __init__(self, values: dict[str, Any]) -> None:
+        self._values = values
+
+    def to_dict(self) -> dict[str, Any]:
+        return self._values
+
+
+class Tracker(LogWriter):
+    """TensorBoard with a tracker beside it. A tracker that fails is told of once and left out from then on."""
+
+    def __init__(self, writer: LogWriter, folder: str) -> None:
+        """`writer` is the tracker's, which may write TensorBoard's file itself, as rsl-rl's do."""
+        self._writer = writer
+        self._both = isinstance(writer, SummaryWriter)
+        self._tensorboard = writer if isinstance(writer, SummaryWriter) else SummaryWriter(folder, flush_secs=FLUSH_S)
+        self._failed = False
+
+    def add_scalar(self, tag: str, scalar_value: float, global_step: int) -> None:
+        if not self._both or self._failed or tag.endswith(SECONDS):
+            SummaryWriter.add_scalar(self._tensorboard, tag, scalar_value, global_step)
+            if self._both or tag.endswith(SECONDS):
+                return
+        self._try(lambda: self._writer.add_scalar(tag, float(scalar_value), global_step))
+
+    def save_model(self, model_path: str, it: int) -> None:
+        self._try(lambda: self._writer.save_model(model_path, it))
+
+    def save_file(self, path: str) -> None:
+        self._try(lambda: self._writer.save_file(path))
+
+    def save_video(self, video: Path, it: int) -> None:
+        self._try(lambda: self._writer.save_video(video, it))
+
+    def stop(self) -> None:
+        self._try(self._writer.stop)
+
+    def close(self) -> None:
+        """End TensorBoard's file; the tracker stays open for what is written at the end of a run."""
+        self._tensorboard.close()
+
+    def hand_over(self, folder: Path, iteration: int) -> None:
+        """Give the tracker the videos and reports that are in a run folder, then end it."""
+        for pattern in FILES:
+            for path in sorted(folder.glob(pattern)):
+                self.save_file(str(path))
+        for video in sorted(folder.rglob("*.mp4")):
+            self.save_video(video, iteration)
+        self.stop()
+
+    def _try(self, call: Callable[[], object]) -> None:
+        """Call the tracker, unless it has failed before."""
+        if self._failed:
+            return
+        try:
+            call()
+        except Exception as error:  # the network's, the tracker's
+            self._failed = True
+            text = " ".join(str(error).split()) or type(error).__name__
+            print(f"warning: the tracker has failed and is left out: {text[:300]}", file=sys.stderr, flush=True)

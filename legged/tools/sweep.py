@@ -1,0 +1,181 @@
+"""Search for settings that learn better or sooner: `python -m legged.tools.sweep cfg/sweeps/anymal_c_flat.yaml`.
+
+Optuna's TPE sampler draws the settings of each trial, which is an ordinary run in logs/<name of the sweep>; trials that fall
+behind are ended early. The sweep goes on where it was stopped or killed, and several processes, GPUs and machines share one
+by its storage. At the end, and with --report at any time, that folder gets table.md, best.yaml and figures.
+
+Examples:
+  python -m legged.tools.sweep anymal_c_flat --jobs 2
+  python -m legged.tools.sweep my_sweep.yaml --report
+"""
+
+import argparse
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from legged.commandline.arguments import pick_device
+from legged.commandline.command import EXIT_FAILED, run_main
+from legged.commandline.parser import CommandParser
+from legged.commandline.stopping import stopping_on_signals
+from legged.config.checks import shown
+from legged.errors import ConfigError
+from legged.process.cores import available_cores
+from legged.process.paths import ready_to_write, relative
+from legged.process.ranks import Ranks
+from legged.registry import import_tasks
+from legged.tools.campaign.crew import Crew, Job, Kind, why_failed
+from legged.tools.sweeping.plan import Plan, plan_sweep, read_sweep, sweep_file
+from legged.tools.sweeping.report import write_report
+from legged.tools.sweeping.study import WHY, Trials, check_installed, finished
+from legged.tools.sweeping.worker import Worker
+
+TELL_S = 1.0
+"""What other processes have done is looked at so often [s]."""
+MOST_STARTS = 10
+"""Times that each worker may be started anew, if its process ends before the sweep does."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "sweep",
+        __doc__,
+        "python -m legged.tools.sweep cfg/sweeps/anymal_c_flat.yaml",
+        "python -m legged.tools.sweep cfg/sweeps/anymal_c_flat.yaml --trials 60 --jobs 4",
+    )
+    parser.add_argument("file", help="YAML file of the sweep, or the name of one in cfg/sweeps")
+    parser.add_argument("--trials", type=int, help="trials in all, of all processes; those of the file by default")
+    parser.add_argument("--jobs", type=int, help="processes side by side; one for each device by default")
+    parser.add_argument("--sim_device", help="cpu, cuda, or several with commas, which the jobs take in turn")
+    parser.add_argument("--storage", help="URL of a database that several machines share, or journal:<file>")
+    parser.add_argument("--report", action="store_true", help="only write table and figures of what there is")
+    parser.add_argument("--import", dest="module", help="module or .py file that registers tasks of your own")
+    parser.add_argument("--worker", type=int, metavar="NUMBER", help=argparse.SUPPRESS)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
+    if Ranks.now().several:
+        raise ConfigError("sweep: starts its processes by itself; run it without torchrun")
+    for flag in ("jobs", "trials"):
+        value = getattr(args, flag)
+        if value is not None and value < 1:
+            raise ConfigError(f"--{flag}: must be at least 1, got {value}")
+    check_installed()
+    if args.module:
+        import_tasks(args.module)
+    devices = [pick_device(name) for name in args.sim_device.split(",")] if args.sim_device else [pick_device(None)]
+    if len({device.type for device in devices}) > 1:
+        raise ConfigError(f"--sim_device: {shown(args.sim_device)}: trials on a CPU and on a GPU can't be compared")
+    on_cpu = devices[0].type == "cpu"
+    path = sweep_file(args.file)
+    given = read_sweep(path)
+    plan = plan_sweep(given, path, on_cpu)
+    if args.trials is not None:
+        plan = plan.with_trials(args.trials)
+    ready_to_write(plan.folder)
+    names = [str(device) for device in devices]
+    if args.worker is not None:
+        return _work(args, plan, names[0])
+    trials = Trials(plan, args.storage or "")
+    if args.report:
+        print(*write_report(trials), sep="\n")
+        return 0
+    jobs = args.jobs or len(devices)
+    print(f"{plan.name}: {plan.given.trials} trials of {plan.cfg.task} for the {plan.objective_text}; {jobs} at once")
+    again = trials.take_back()
+    if trials.all:
+        numbers = f"; tried again: {', '.join(map(str, again))}" if again else ""
+        print(
+            f"going on in {relative(plan.folder)}: {trials.done} of {plan.given.trials} trials are done{numbers}", flush=True
+        )
+    if jobs == 1:
+        worker = Worker(plan, trials, _flags(args, names[0], on_cpu, jobs))
+        stopped_by = worker.run()
+    else:
+        stopped_by = _crew(args, trials, path, names, jobs)
+    print(*write_report(trials), sep="\n")
+    if stopped_by:
+        return 128 + stopped_by[0]
+    return 0 if trials.done >= plan.given.trials else EXIT_FAILED
+
+
+def _work(args: argparse.Namespace, plan: Plan, device: str) -> int:
+    """Make trials as one of several processes; return the exit code."""
+    trials = Trials(plan, args.storage or "", args.worker)
+    stopped_by = Worker(plan, trials, _flags(args, device, device == "cpu", args.jobs or 1)).run()
+    return 128 + stopped_by[0] if stopped_by else 0
+
+
+def _flags(args: argparse.Namespace, device: str, on_cpu: bool, jobs: int) -> list[str]:
+    """Return the flags of train.py that say where a trial is trained."""
+    flags = ["--sim_device", device, *(["--import", args.module] if args.module else [])]
+    return [*flags, f"sim.threads={max(1, available_cores() // jobs)}"] if on_cpu and jobs > 1 else flags
+
+
+def _crew(args: argparse.Namespace, trials: Trials, path: Path, devices: list[str], jobs: int) -> list[int]:
+    """Let several processes make trials; return the signals that ended them early."""
+    plan = trials.plan
+    start, starts = time.perf_counter(), [0] * jobs
+    crew = Crew({Kind.TRAINING: jobs}, ())
+
+    def job(number: int) -> Job:
+        starts[number] += 1
+        flags = ["--worker", str(number), "--jobs", str(jobs), "--sim_device", devices[number % len(devices)]]
+        flags += ["--trials", str(plan.given.trials), *(["--storage", args.storage] if args.storage else [])]
+        flags += ["--import", args.module] if args.module else []
+        command = [sys.executable, "-m", "legged.tools.sweep", str(path), *flags]
+        return Job(
+            Kind.TRAINING, command, plan.folder / "output" / f"worker{number}.txt", lambda *ended: done(number, *ended)
+        )
+
+    def done(number: int, ended: Job, code: int) -> list[Job]:
+        if code == 0 or crew.stopped:
+            return []
+        say = f"{time.perf_counter() - start:7.1f} s  process {number} has ended: {why_failed(ended, code)}"
+        again = code < 0 and starts[number] < MOST_STARTS
+        print(f"{say}; {'another takes its place' if again else relative(ended.output)}", flush=True)
+        return [job(number)] if again else []
+
+    with stopping_on_signals(crew.stop) as stopped_by, _telling(trials, start):
+        crew.run([job(number) for number in range(jobs)])
+    return stopped_by
+
+
+@contextmanager
+def _telling(trials: Trials, start: float) -> Iterator[None]:
+    """Print what becomes of trials, which other processes make while the block runs."""
+    over, told = threading.Event(), {trial.number for trial in finished(trials.all)}
+
+    def tell() -> None:
+        last = False
+        while not last:
+            last = over.wait(TELL_S)
+            for trial in finished(trials.all):
+                if trial.number not in told:
+                    told.add(trial.number)
+                    what = trial.user_attrs.get(WHY) if trial.value is None else f"{trial.value:.4g}"
+                    counted = f"[{len(told)} of {trials.plan.given.trials}]"
+                    print(f"{time.perf_counter() - start:7.1f} s  trial {trial.number:3d}  {what}  {counted}", flush=True)
+
+    thread = threading.Thread(target=tell, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

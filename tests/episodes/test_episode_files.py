@@ -1,0 +1,88 @@
+"""Stored episodes come back as they were; damaged ones are refused in one line."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from handmade import made_by_hand
+from helpers import small_config
+
+from legged.episodes.stored import ABOUT, ARRAYS, CONFIG, load_config, load_episodes, save_episodes
+from legged.errors import ConfigError
+
+pytestmark = pytest.mark.usefixtures("workplace")
+
+
+def saved() -> Path:
+    episodes = made_by_hand(3, 5)
+    episodes["joint_pos"][:] = np.random.default_rng(0).normal(size=episodes["joint_pos"].shape)
+    save_episodes(episodes, small_config(), Path("kept"))
+    return Path("kept")
+
+
+def test_episodes_come_back_as_they_were():
+    folder = saved()
+    found, want = load_episodes(folder, "--stored"), made_by_hand(3, 5)
+    assert found.about == want.about
+    assert found.arrays.keys() == want.arrays.keys()
+    np.testing.assert_array_equal(found["joint_pos"], np.random.default_rng(0).normal(size=(8, 4)).astype(np.float32))
+    assert load_config(folder, "--stored").task == "anymal_c_flat"
+    with np.load(folder / ARRAYS) as plain:  # as somebody reads it who knows nothing of this package
+        np.testing.assert_allclose(plain["time"], 0.02 * np.array([1, 2, 3, 1, 2, 3, 4, 5]), rtol=1e-6)
+        assert plain["episode"].tolist() == [0] * 3 + [1] * 5
+
+
+def cut(path: Path):
+    path.write_bytes(path.read_bytes()[:200])
+
+
+def change(**entries):
+    def apply(folder: Path):
+        about = json.loads((folder / ABOUT).read_text())
+        (folder / ABOUT).write_text(json.dumps({**about, **entries}))
+
+    return apply
+
+
+def replace_array(name: str, array: np.ndarray):
+    def apply(folder: Path):
+        with np.load(folder / ARRAYS) as file:
+            arrays = {**file}
+        np.savez(folder / ARRAYS, **{**arrays, name: array})
+
+    return apply
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda folder: (folder / ARRAYS).unlink(), f"kept holds no {ARRAYS}"),
+        (lambda folder: cut(folder / ARRAYS), "the episodes there are damaged"),
+        (lambda folder: (folder / ABOUT).write_text("{"), "the episodes there are damaged"),
+        (lambda folder: (folder / ABOUT).write_text("[]"), "the whole file: expected a mapping, got list"),
+        (change(format=99), "format: expected 1, got int '99'"),
+        (change(arrays={}), r"arrays\.\w+: expected a mapping, got nothing"),
+        (change(dt=0.0), "dt: expected a number above 0"),
+        (change(joints=[]), r"joints: expected \(4,\) of them, as joint_pos has"),
+        (change(feet=["one"]), r"feet_pos: expected rows of shape \(1, 3\), got \(2, 3\)"),
+        (change(terminations=["one"]), "terminations: expected"),
+        (replace_array("torque", np.zeros((7, 4))), "torque: expected 8 rows of numbers, got shape"),
+        (replace_array("torque", np.full((8, 4), "x")), "torque: expected 8 rows of numbers"),
+        (replace_array("qvel", np.zeros((8, 3))), r"arrays\.qvel\.columns: expected names"),
+        (replace_array("episode_start", np.array([0, 9, 8])), "episode_start does not say"),
+    ],
+)
+def test_damaged_episodes_are_refused(damage, words):
+    folder = saved()
+    damage(folder)
+    with pytest.raises(ConfigError, match=words) as caught:
+        load_episodes(folder, "--stored")
+    assert re.match("--stored: kept", str(caught.value))
+
+
+def test_a_folder_without_configuration_is_told():
+    (saved() / CONFIG).unlink()
+    with pytest.raises(ConfigError, match=f"--page: kept holds no {CONFIG}"):
+        load_config(Path("kept"), "--page")

@@ -1,0 +1,165 @@
+"""The command: records, lists, makes pages, sums up joints; and refuses what cannot be before anything is built."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import POLICY, TASK, call, tiny_run
+
+from legged.episodes import film
+from legged.episodes.stored import ABOUT, ARRAYS
+from legged.errors import RunError
+from legged.policies import restore
+from legged.tools import episodes
+
+pytestmark = pytest.mark.usefixtures("workplace")
+FEW = ["--physics", "mujoco", "--episodes", "3", "--num_envs", "2", "sim.threads=1"]
+HERE = ["--task", TASK, "--load_run", str(POLICY), *FEW, "env.episode_length_s=1.2"]
+
+
+def test_a_policy_is_recorded_listed_and_summed_up(capsys):
+    assert call(episodes.main, [*HERE, "--out", "out", "--statistics", "--sort", "energy"]) == 0
+    out = capsys.readouterr().out
+    assert "3 episodes, 0 failed; ended: 3 by time; by energy" in out
+    assert {path.name for path in Path("out").iterdir()} == {
+        ARRAYS,
+        ABOUT,
+        "episodes.yaml",
+        "episodes.md",
+        "joint_statistics.md",
+        "joint_statistics.html",
+        "joint_statistics.png",
+    }
+    about = json.loads(Path("out", ABOUT).read_text())
+    assert (about["task"], about["checkpoint"], about["physics"], about["robots"]) == (TASK, "model.pt", "mujoco", 2)
+    with np.load(Path("out", ARRAYS)) as file:
+        assert np.diff(file["episode_start"]).tolist() == [60, 60, 60]
+        work = np.abs(file["torque"] * file["joint_vel"]).sum(axis=1).reshape(3, 60).sum(axis=1) * about["dt"]
+    rows = [line.split("|")[1:-1] for line in Path("out/episodes.md").read_text().splitlines() if re.match(r"\| \d", line)]
+    assert [int(row[0]) for row in rows] == np.argsort(-work).tolist()
+    assert [float(row[6]) for row in rows] == pytest.approx(sorted(work, reverse=True), abs=0.6)
+    page = Path("out/joint_statistics.html").read_text()
+    assert "data:image/png;base64," in page
+    assert "http" not in page
+
+
+def test_a_run_has_its_episodes_beside_it_and_they_are_listed_again(capsys, monkeypatch):
+    run = tiny_run("env.episode_length_s=0.4")
+    capsys.readouterr()
+    assert call(episodes.main, ["--task", TASK, *FEW]) == 0
+    assert (run / "episodes" / ARRAYS).is_file()
+    monkeypatch.setattr(restore, "make_task", lambda *_: pytest.fail("simulated"))
+    capsys.readouterr()
+    assert call(episodes.main, ["--stored", str(run / "episodes"), "--sort", "torque", "--top", "1"]) == 0
+    out = capsys.readouterr().out
+    assert len(re.findall(r"(?m)^│ +\d+ │", out)) == 1
+    assert call(episodes.main, ["--stored", str(run / "episodes"), "--page", "3"]) == 2
+    assert "--page: there is no episode 3; they are 0 to 2" in capsys.readouterr().err
+
+
+def test_where_nothing_can_be_drawn_a_page_has_a_stick_figure(monkeypatch, capsys):
+    def fail(*_):
+        raise RunError("cannot render here")
+
+    monkeypatch.setattr(film, "camera_of", fail)
+    assert call(episodes.main, [*HERE, "--out", "out", "--worst", "1"]) == 0
+    (page,) = Path("out").glob("episode_*.html")
+    text = page.read_text()
+    data = json.loads(text.partition('id="data">')[2].partition("</script>")[0])
+    assert data["film"]["why"] == "cannot render here"
+    parents, places = data["film"]["parents"], np.array(data["film"]["places"])
+    assert places.shape == (len(range(0, 60, data["film"]["every"])), len(parents), 3)
+    assert parents[0] == -1
+    assert all(0 <= parent < i for i, parent in enumerate(parents) if i)
+    with np.load(Path("out", ARRAYS)) as file:
+        number = int(page.stem.rpartition("_")[2])
+        base = file["qpos"][file["episode_start"][number], :3]
+    np.testing.assert_allclose(places[0, 0], base, atol=6e-4)
+
+
+def test_other_tasks_show_what_they_have(capsys, monkeypatch):
+    monkeypatch.setattr(film, "MOST_PICTURES", 4)
+    policy = POLICY.parent / "half_cheetah"
+    few = ["--load_run", str(policy), *FEW, "env.episode_length_s=1"]
+    assert call(episodes.main, ["--task", "half_cheetah", *few, "--out", "out", "--page", "0"]) == 0
+    assert "mean power [W]" in Path("out/episodes.md").read_text()
+    text = Path("out/episode_000.html").read_text()
+    data = json.loads(text.partition('id="data">')[2].partition("</script>")[0])
+    assert [section["title"] for section in data["sections"]][:3] == ["Generalised coordinates", "Reward parts", "Torques"]
+    assert data["steps"] == 20
+    assert len(data["film"].get("pictures") or data["film"]["places"]) == 4
+    capsys.readouterr()
+    assert call(episodes.main, ["--stored", "out", "--sort", "tracking"]) == 2
+    assert "--sort: tracking: these episodes have no such figure" in capsys.readouterr().err
+
+
+def test_a_table_of_all_steps_is_written(monkeypatch, capsys):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    assert call(episodes.main, [*HERE, "--out", "out", "--parquet"]) == 0
+    table = parquet.read_table("out/episodes.parquet").to_pydict()
+    with np.load("out/episodes.npz") as file:
+        for column, want in (
+            ("torque.LF_KFE", file["torque"][:, 2]),
+            ("feet_force.RH_FOOT.z", file["feet_force"][:, 3, 2]),
+            ("reward", file["reward"]),
+            ("episode", file["episode"]),
+            ("qpos.root.qw", file["qpos"][:, 3]),
+        ):
+            np.testing.assert_array_equal(table[column], want, err_msg=column)
+
+
+def test_without_its_package_a_table_is_refused(monkeypatch, capsys):
+    monkeypatch.setattr("legged.episodes.parquet.find_spec", lambda _: None)
+    assert call(episodes.main, [*HERE, "--parquet"]) == 2
+    assert capsys.readouterr().err == (
+        "error: --parquet: needs pyarrow, which is not installed: pip install 'legged[parquet]'\n"
+    )
+
+
+def test_two_policies_are_compared(capsys):
+    changes = ["env.episode_length_s=1.2", *FEW]
+    assert call(episodes.main, [*HERE, "--out", "out"]) == 0
+    other = str(POLICY.parent / "anymal_c_step")
+    assert call(episodes.main, ["--compare", "out", other, *changes, "--out", "both"]) == 0
+    text = Path("both/joint_statistics.md").read_text()
+    assert "difference of the means" in text
+    assert "anymal_c_flat (shipped)" in text
+    assert "anymal_c_step (shipped)" in text
+    capsys.readouterr()
+    cheetah = str(POLICY.parent / "half_cheetah")
+    assert call(episodes.main, ["--compare", "out", cheetah, "--episodes", "1", "--physics", "mujoco", "sim.threads=1"]) == 2
+    assert "--compare: the two have other joints" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "--task: one of --task, --stored and --compare says whose episodes; none is given"),
+        (["--task", TASK, "--stored", "x"], "got --task and --stored"),
+        (["--stored", "nowhere"], "--stored: nowhere holds no episodes.npz"),
+        (["--stored", "x", "--episodes", "3"], "--episodes: nothing is simulated with --stored"),
+        (["--compare", "a", "b", "--worst", "1"], "--worst: --compare makes tables of joints only"),
+        (["--compare", "a", "b"], "'a'"),
+        ([*HERE, "--sort", "energi"], "--sort: there is no order 'energi'; did you mean 'energy'?"),
+        ([*HERE, "--episodes", "0"], "--episodes: must be at least 1, got 0"),
+        ([*HERE, "--episodes", "100000"], "--episodes: must be at most 4,096, got 100,000"),
+        ([*HERE, "--num_envs", "9"], "--num_envs: 9 robots have no more than 3 episodes to run"),
+        ([*HERE, "--page", "two"], "--page: expected numbers of episodes like 3 or 3,17, got 'two'"),
+        ([*HERE, "--page", "7"], "--page: there is no episode 7; they are 0 to 2"),
+        ([*HERE, "--top", "-1"], "--top: must be at least 0"),
+        ([*HERE, "--command", "1", "0", "nan"], "--command: velocities must be numbers"),
+        ([*HERE, "--terrain", "stares_up"], "--terrain: "),
+        ([*HERE, "--as_trained", "--terrain", "pit"], "--terrain: --as_trained takes the ground of the training"),
+        ([*HERE, "--difficulty", "2"], "--difficulty: must be between 0 and 1"),
+        (["--task", "half_cheetah", "--command", "1", "0", "0"], "--command: 'half_cheetah' follows no commands"),
+        (["--task", "half_cheetah", "--terrain", "pit"], "--terrain: 'half_cheetah' has no terrain to choose"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_built(arguments, words, capsys, monkeypatch):
+    monkeypatch.setattr(restore, "make_task", lambda *_: pytest.fail("built"))
+    assert call(episodes.main, arguments) == 2
+    err = capsys.readouterr().err
+    assert words in err
+    assert err.count("\n") == 1
