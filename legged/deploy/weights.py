@@ -10,6 +10,7 @@ and float32 numbers, matrices row by row:
 - `GRU`: the same with 3 in place of 4; gates r, z, n. Both are as in torch.nn.
 """
 
+import itertools
 import math
 import struct
 from collections.abc import Callable
@@ -91,7 +92,7 @@ def unpack(data: bytes) -> list[Layer]:
     """Return the layers of a file.
 
     Raises:
-        ValueError: it is none, or is cut short.
+        ValueError: it is none, is cut short, or has layers that make no network.
     """
     if data[: len(MAGIC)] != MAGIC:
         raise ValueError("is no policy.weights of an export")
@@ -113,7 +114,26 @@ def unpack(data: bytes) -> list[Layer]:
         raise ValueError("is cut short") from error
     if place != len(data):
         raise ValueError("is longer than it says")
+    _check_chain(layers)
     return layers
+
+
+def _check_chain(layers: list[Layer]) -> None:
+    """Look whether what one layer gives is what the next one takes.
+
+    Raises:
+        ValueError: it is not, or there is none, or one that nobody knows.
+    """
+    if not layers:
+        raise ValueError("has no layers")
+    for layer, following in itertools.pairwise([*layers, None]):
+        assert layer is not None
+        if layer.kind in (NORMALISE, ACTIVATION) and layer.inputs != layer.outputs:
+            raise ValueError("has a layer that changes a width it cannot change")
+        if layer.kind == ACTIVATION and layer.detail >= len(ACTIVATIONS):
+            raise ValueError("has a layer that this program does not know")
+        if following is not None and layer.outputs != following.inputs:
+            raise ValueError("has layers that do not fit together")
 
 
 class NumpyNetwork:

@@ -129,6 +129,29 @@ def test_what_is_no_file_of_weights_is_refused(data, says, program, tmp_path):
         unpack(data)
 
 
+def linear(inputs, outputs):
+    return Layer(LINEAR, 0, inputs, outputs, (np.ones((outputs, inputs)), np.ones(outputs)))
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        (pack([]), "has no layers"),
+        (pack([linear(3, 2), linear(3, 2)]), "has layers that do not fit together"),
+        (pack([linear(3, 2), Layer(2, 99, 2, 2, ())]), "has a layer that this program does not know"),
+        (pack([linear(3, 2), Layer(2, 0, 2, 9, ())]), "has a layer that changes a width it cannot change"),
+        (pack([linear(3, 2)]) + b"x", "is longer than it says"),
+    ],
+    ids=["no layers", "do not fit", "unknown activation", "another width", "longer"],
+)
+def test_layers_that_make_no_network_are_refused_by_both(data, says, program, tmp_path):
+    (tmp_path / "policy.weights").write_bytes(data)
+    done = subprocess.run([str(program), str(tmp_path / "policy.weights")], capture_output=True, text=True, check=False)
+    assert (done.returncode, says in done.stderr) == (2, True), done.stderr
+    with pytest.raises(ValueError, match=says):
+        unpack(data)
+
+
 def test_a_layer_by_hand():
     """(2 - 1) / 4 = 0.25; 3 * 0.25 - 1 = -0.25; elu of that is exp(-0.25) - 1."""
     layers = [

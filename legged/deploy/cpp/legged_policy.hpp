@@ -42,6 +42,10 @@ public:
             layer.outputs = head[3];
             if (layer.kind > gru || layer.inputs > largest || layer.outputs > largest)
                 throw std::runtime_error(path + ": has a layer that this program does not know");
+            if (layer.kind == activation && layer.detail >= activations)
+                throw std::runtime_error(path + ": has a layer that this program does not know");
+            if ((layer.kind == activation || layer.kind == normalise) && layer.inputs != layer.outputs)
+                throw std::runtime_error(path + ": has a layer that changes a width it cannot change");
             if (!layers_.empty() && layer.inputs != layers_.back().outputs)
                 throw std::runtime_error(path + ": has layers that do not fit together");
             layer.numbers.resize(layer.size());
@@ -55,6 +59,7 @@ public:
             if (x_.size() < width) x_.resize(width), y_.resize(width);
             layers_.push_back(layer);
         }
+        if (file.peek() != std::ifstream::traits_type::eof()) throw std::runtime_error(path + ": is longer than it says");
         if (layers_.empty()) throw std::runtime_error(path + ": has no layers");
     }
 
@@ -92,7 +97,7 @@ public:
 
 private:
     enum Kind : std::uint32_t { normalise, linear, activation, lstm, gru };
-    static constexpr std::uint32_t largest = 1u << 14;
+    static constexpr std::uint32_t largest = 1u << 14, activations = 10;
 
     struct Layer {
         std::uint32_t kind, detail;
