@@ -283,6 +283,7 @@ def _check_sizes(contract: Contract) -> None:
             raise ConfigError(f"{path}: observation: '{term.name}' has {term.size} numbers and {len(term.scale)} scales")
         if term.source == "heights" and (term.points is None or len(term.points) != term.size):
             raise ConfigError(f"{path}: observation: 'heights' has {term.size} numbers and no point for each")
+    _check_numbers(contract)
     filled = {name: sum(term.size for term in contract.terms if term.group == name) for name in groups}
     for name, group in groups.items():
         if filled[name] != group.size:
@@ -292,6 +293,39 @@ def _check_sizes(contract: Contract) -> None:
     if outside.any():
         joint = contract.joint_names[int(outside.argmax())]
         raise ConfigError(f"{path}: default_joint_angles: that of '{joint}' lies outside its position_limits")
+
+
+def _check_numbers(contract: Contract) -> None:
+    """Look for numbers that would move a robot as no policy of ours does.
+
+    Raises:
+        ConfigError: there is one.
+    """
+    low, high = contract.command_ranges.T
+    for key, values, allowed, right in (
+        ("stiffness", contract.stiffness, "0 or more", contract.stiffness >= 0.0),
+        ("damping", contract.damping, "above 0: it is what stops a robot", contract.damping > 0.0),
+        ("torque_limits", contract.torque_limits, "above 0", contract.torque_limits > 0.0),
+        ("velocity_limits", contract.velocity_limits, "above 0", contract.velocity_limits > 0.0),
+        ("position_limits", contract.position_limits[:, 0], "below the upper ones", np.less(*contract.position_limits.T)),
+        ("action_scale", contract.action_scale, "finite", np.isfinite(contract.action_scale)),
+        ("action_clip", contract.action_clip, "above 0 and finite", 0.0 < contract.action_clip < np.inf),
+        ("observation_clip", contract.observation_clip, "above 0 and finite", 0.0 < contract.observation_clip < np.inf),
+        ("command_dead_zone", contract.dead_zone, "0 or more", 0.0 <= contract.dead_zone < np.inf),
+        ("command_ranges", low, "finite, and not above the upper ones", np.isfinite(low) & np.isfinite(high) & (low <= high)),
+        *((f"scale of {t.name}", t.scale, "finite", np.isfinite(t.scale)) for t in contract.terms),
+    ):
+        wrong = np.atleast_1d(~np.asarray(right))
+        if wrong.any():
+            value = np.atleast_1d(values)[int(wrong.argmax())]
+            raise ConfigError(f"{contract.path}: {key}: must be {allowed}, got {value:g}")
+    if len(set(contract.joint_names)) < len(contract.joint_names):
+        raise ConfigError(f"{contract.path}: joint_names: must differ from each other")
+    if any(group.history < 1 or group.size < 1 for group in contract.groups):
+        raise ConfigError(f"{contract.path}: observation_groups: each must have a history and a size of at least 1")
+    starts = np.cumsum([0, *(group.size * group.history for group in contract.groups)])[:-1].tolist()
+    if [group.start for group in contract.groups] != starts:
+        raise ConfigError(f"{contract.path}: observation_groups: must lie side by side, starting at {starts}")
 
 
 def _difference(wanted: Sequence[str], there: Sequence[str], robot: str) -> str:

@@ -13,7 +13,10 @@ from legged.errors import ConfigError
 
 WARM_UP = 20
 """Runs of the network before the first that counts: the first ones take ten times as long."""
-COMPARED = ("contract_version", "joint_names", "observation", "observation_groups", "default_joint_angles", "action_scale")
+COMPARED = (
+    *("contract_version", "joint_names", "action_joints", "imu_frame", "control_dt", "observation", "observation_groups"),
+    *("observation_clip", "default_joint_angles", "action_scale", "action_clip", "stiffness", "damping", "recurrent"),
+)
 """What the ONNX file's own metadata must say as policy.json does."""
 
 

@@ -85,6 +85,20 @@ def test_a_joint_without_limits_has_none_in_the_contract_too(folder, tmp_path):
         ({"stiffness": [1.0]}, r"is no policy\.json of an export \(ValueError: stiffness: 12 numbers are wanted"),
         ({"damping": ["much"] * 12}, r"is no policy\.json of an export \(ValueError"),
         ({"imu_frame": None}, r"is no policy\.json of an export \(KeyError: 'imu_frame'\)"),
+        ({"damping": [4.0] * 11 + [0.0]}, r"damping: must be above 0: it is what stops a robot, got 0"),
+        ({"stiffness": [-1.0] + [90.0] * 11}, r"stiffness: must be 0 or more, got -1"),
+        ({"action_scale": float("nan")}, r"action_scale: must be finite, got nan"),
+        ({"action_clip": float("inf")}, r"action_clip: must be above 0 and finite, got inf"),
+        ({"torque_limits": [0.0] * 12}, r"torque_limits: must be above 0, got 0"),
+        ({"position_limits": [[1.0, -1.0]] * 12}, r"position_limits: must be below the upper ones, got 1"),
+        (
+            {"command_ranges": {"vx": [1.0, -1.0], "vy": [0.0, 0.0], "yaw_rate": [0.0, 0.0]}},
+            r"command_ranges: must be finite, and not above the upper ones, got 1",
+        ),
+        (
+            {"observation_groups": [{"name": "actor", "start": 0, "size": 45, "history": 0}]},
+            r"observation_groups: each must have a history and a size of at least 1",
+        ),
         ({"control_dt": 5.0}, r"control_dt: must be between 0\.001 and 1, got 5"),
         ({"default_joint_angles": [2.0] * 12}, r"default_joint_angles: that of 'LF_HAA' lies outside its position_limits"),
         (
@@ -148,9 +162,10 @@ def test_a_policy_that_needs_more_than_sensors_is_refused_by_the_name_of_the_obs
 
 def test_files_of_two_exports_are_refused(folder, tmp_path):
     (tmp_path / "policy.onnx").write_bytes((folder / "policy.onnx").read_bytes())
-    changed(folder, tmp_path, action_scale=0.25)
-    with pytest.raises(ConfigError, match=r"action_scale: is not that of .*policy\.onnx: they are of different exports"):
-        Policy(tmp_path)
+    for key, value in (("action_scale", 0.25), ("stiffness", [90.5] * 12), ("damping", [3.0] * 12), ("control_dt", 0.01)):
+        changed(folder, tmp_path, **{key: value})
+        with pytest.raises(ConfigError, match=rf"{key}: is not that of .*policy\.onnx: they are of different exports"):
+            Policy(tmp_path)
 
 
 def test_folders_without_an_export_are_refused(folder, tmp_path):
