@@ -8,6 +8,7 @@ import argparse
 import gc
 import signal
 import sys
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from types import FrameType
@@ -24,11 +25,22 @@ from legged.deploy.policy import Policy
 from legged.deploy.program import Program
 from legged.deploy.safety import Limits
 from legged.deploy.states import Event
+from legged.deploy.telling import Telling
 from legged.deploy.udp import UdpRobot
 from legged.deploy.unitree import SdkWire, UnitreeRobot
 from legged.deploy.unitree_messages import KINDS
 from legged.errors import ConfigError, RunError, suggest
 
+BOUNDS = {
+    "stand_seconds": (1.0, 60.0),
+    "max_tilt": (0.1, 1.6),
+    "max_age": (0.005, 0.5),
+    "max_missed": (1, 50),
+}
+"""Flag -> its least and largest value, in seconds, radians and cycles: whoever thinks in degrees or milliseconds is told."""
+ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
+"""Signals that ask the program to end: Ctrl-C, kill, a closed terminal or a lost connection, Ctrl-\\ and Ctrl-Z. Most of them
+would by default leave a robot alone with its last command."""
 SWITCH_S = 5e-4
 """A thread that waits for Python's lock gets it after so long [s]; 5 ms, the default, is a quarter of a cycle."""
 EXIT_STOPPED = 3
@@ -69,11 +81,14 @@ def build_parser() -> CommandParser:
 def _main(argv: list[str] | None) -> int:
     args = build_parser().parse_args(argv)
     limits = limits_of(args)
+    if not args.robot.startswith("udp:") and args.robot not in KINDS:
+        raise ConfigError(f"--robot: '{args.robot}' is unknown{suggest(args.robot, [*KINDS, 'udp:HOST:PORT'])}")
     Log.check(args.log)
     policy = Policy(args.policy)
     if args.robot in KINDS:  # what does not fit must be refused before a robot is asked to leave its own controller
         policy.contract.check_fits(KINDS[args.robot].facts)
     operator = Interruptible(make_operator(args))
+    tell = Telling()
     hurries = take_priority()  # before any thread of a robot's SDK begins: threads inherit it
     try:
         robot = _connect(args)
@@ -81,20 +96,22 @@ def _main(argv: list[str] | None) -> int:
         operator.close()
         raise
     try:
-        program = Program(policy, robot, operator, limits, args.stand_seconds)
+        program = Program(policy, robot, operator, limits, args.stand_seconds, tell=tell)
     except BaseException:
         robot.close()
         operator.close()
         raise
     sys.setswitchinterval(SWITCH_S)
     hurry = "with priority" if hurries else "without priority: cycles may begin late on a busy machine (rtprio)"
-    print(f"{policy.contract.task} on {robot.facts.name}, {1.0 / policy.contract.control_dt:g} Hz, {hurry}", flush=True)
+    tell(f"{policy.contract.task} on {robot.facts.name}, {1.0 / policy.contract.control_dt:g} Hz, {hurry}")
     try:
         outcome = program.run(args.seconds)
     finally:
         program.log.save(args.log)
-        print(f"wrote {args.log}", flush=True)
-    print(outcome.cycles.line(), flush=True)
+        tell(f"wrote {args.log}")
+        tell.close()
+    with suppress(OSError):  # the terminal may be closed
+        print(outcome.cycles.line(), flush=True)
     gc.collect()
     return EXIT_STOPPED if outcome.stops else 0
 
@@ -120,10 +137,12 @@ def limits_of(args: argparse.Namespace) -> Limits:
     Raises:
         ConfigError: a number that makes no sense.
     """
-    for flag in ("seconds", "stand_seconds", "max_tilt", "max_age", "max_missed"):
+    if not args.seconds > 0.0:
+        raise ConfigError(f"--seconds: must be above 0, got {args.seconds:g}")
+    for flag, (low, high) in BOUNDS.items():
         value = getattr(args, flag)
-        if value is not None and not value > 0:
-            raise ConfigError(f"--{flag.replace('_', '-')}: must be above 0, got {value:g}")
+        if value is not None and not low <= value <= high:
+            raise ConfigError(f"--{flag.replace('_', '-')}: must be between {low:g} and {high:g}, got {value:g}")
     given = {"max_tilt": args.max_tilt, "max_age_s": args.max_age, "max_missed": args.max_missed}
     return Limits(**{name: value for name, value in given.items() if value is not None})
 
@@ -142,13 +161,14 @@ def make_operator(args: argparse.Namespace) -> Operator:
 
 
 class Interruptible(Operator):
-    """An operator who can also end the program by Ctrl-C, or by asking the process to end: the robot is braked first."""
+    """An operator who can also end the program by Ctrl-C and the like (`ENDING`): the robot is braked first."""
 
     def __init__(self, operator: Operator) -> None:
         """Listen to signals on top of `operator`."""
         self._operator, self._ends = operator, False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._end)
+        for name in ENDING:
+            if hasattr(signal, name):
+                signal.signal(getattr(signal, name), self._end)
 
     def _end(self, _number: int, _frame: FrameType | None) -> None:
         self._ends = True
@@ -167,13 +187,11 @@ def _connect(args: argparse.Namespace) -> Interface:
     """Return the robot that --robot names.
 
     Raises:
-        ConfigError: there is none of that name, or what it needs is not installed.
+        ConfigError: that is no address, or what it needs is not installed.
         RunError: it does not answer.
     """
     if args.robot.startswith("udp:"):
         return UdpRobot(args.robot.removeprefix("udp:"))
-    if args.robot not in KINDS:
-        raise ConfigError(f"--robot: '{args.robot}' is unknown{suggest(args.robot, [*KINDS, 'udp:HOST:PORT'])}")
     return UnitreeRobot(args.robot, SdkWire(KINDS[args.robot], args.network, args.domain))
 
 

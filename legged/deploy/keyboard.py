@@ -1,6 +1,7 @@
 """Commands by the keyboard of a terminal."""
 
 import os
+import re
 import select
 import sys
 
@@ -22,11 +23,15 @@ EVENTS = {
 }
 STEPS = {"w": (0, 1.0), "s": (0, -1.0), "a": (1, 1.0), "d": (1, -1.0), "q": (2, 1.0), "e": (2, -1.0)}
 """Key -> axis of the command, and its sense."""
+SEQUENCE = re.compile("\x1b[\\[O][0-?]*[ -/]*[@-~]")
+"""What arrows and the like send (ECMA-48, 5.4): it begins as the escape key alone does, but is no key of ours."""
+SILENCE_S = 10.0
+"""A command lasts so long after the last key [s]: of whoever types nothing, nobody knows that he is still there."""
 STEP = 0.1
 """What a key changes a command by, as a share of the largest one."""
 HELP = (
     "0 idle, 1 damping, 2 stand up, 3 walk, space stop, x quit;"
-    " w s forward and back, a d left and right, q e turn, r no command"
+    f" w s forward and back, a d left and right, q e turn, r no command; a command ends {SILENCE_S:g} s after the last key"
 )
 
 
@@ -48,13 +53,17 @@ class Keyboard(Operator):
         self._before = termios.tcgetattr(self._descriptor)
         tty.setcbreak(self._descriptor)
         self._velocity = np.zeros(3)
+        self._typed = 0.0
         self._lost: str | None = None
 
     def poll(self, seconds: float) -> Orders:
         events = []
         keys = self._keys()
-        # What arrows and the like send begins as the escape key alone does; they are no keys of ours.
-        for key in keys if len(keys) == 1 or not keys.startswith("\x1b") else "":
+        if keys:
+            self._typed = seconds
+        elif seconds - self._typed > SILENCE_S:
+            self._velocity = np.zeros(3)
+        for key in SEQUENCE.sub("", keys):
             if key in EVENTS:
                 events.append(EVENTS[key])
             if key == "r" or EVENTS.get(key) in (Event.STOP, Event.STAND, Event.WALK):

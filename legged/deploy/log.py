@@ -26,6 +26,7 @@ class Log:
     def __init__(self, contract: Contract) -> None:
         """Begin with nothing."""
         self._contract = contract
+        self._said = json.dumps(json.loads(contract.path.read_text(encoding="utf-8")))
         self._readings: dict[str, deque[Any]] = {}
         self._cycles: dict[str, deque[Any]] = {}
         self._notes: list[tuple[float, str]] = []
@@ -99,7 +100,7 @@ class Log:
             "states": np.array(STATES),
             "notes": np.array([text for _, text in self._notes], dtype=str),
             "note_times": np.array([seconds for seconds, _ in self._notes]),
-            "contract": np.array(json.dumps(json.loads(self._contract.path.read_text(encoding="utf-8")))),
+            "contract": np.array(self._said),
         }
         part = path.with_name(f".{path.name}.part.npz")
         try:

@@ -35,7 +35,7 @@ class CycleTimes:
     late_p99: float
     """How late cycles began, of which 1 % were later [s]."""
     missed: int
-    """Cycles that ended after the next one should have begun."""
+    """Cycles that did not begin or end in time: a cycle that takes two and a half of them has missed two deadlines."""
 
     def line(self) -> str:
         """Say it in one line, in milliseconds."""
@@ -76,8 +76,8 @@ class Pace:
         return now
 
     def done(self) -> None:
-        """End a cycle. One that ends after the next should have begun has missed its deadline; cycles that are then overdue
-        are left out.
+        """End a cycle. One that ends after the next should have begun has missed its deadline, and those of all cycles that
+        are overdue by then, which are left out.
         """
         assert self._due is not None
         now = self._clock()
@@ -86,9 +86,10 @@ class Pace:
         if now <= self._due:
             self.missed_in_a_row = 0
             return
-        self.missed += 1
-        self.missed_in_a_row += 1
-        self._due += self._dt * int((now - self._due) / self._dt)
+        overdue = int((now - self._due) / self._dt)
+        self.missed += 1 + overdue
+        self.missed_in_a_row += 1 + overdue
+        self._due += self._dt * overdue
 
     def times(self) -> CycleTimes:
         """Return what the cycles so far have taken."""

@@ -3,7 +3,8 @@
 import gc
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +16,10 @@ from legged.deploy.policy import Policy
 from legged.deploy.safety import Limits, Watch, braking, clamp_targets
 from legged.deploy.states import MOVING, Event, State, next_state
 
+STANDS_WITHIN = 0.6
+"""A robot stands when no joint is further from the default pose [rad]; its weight makes some of that."""
+FAR = 100.0
+"""Angles that are further from 0 are no measurements [rad]."""
 SETTLE_S = 1.0
 """Joints are braked for so long before the program lets go of the robot [s]."""
 
@@ -61,7 +66,7 @@ class Program:
         policy.contract.check_fits(robot.facts)
         self._policy, self._robot, self._operator = policy, robot, operator
         self._contract = contract = policy.contract
-        self._stand_s, self._clock, self._tell = stand_s, clock, tell
+        self._stand_s, self._clock, self._sleep, self._tell = stand_s, clock, sleep, tell
         self._watch = Watch(contract, limits or Limits())
         self._ramp = Ramp(contract)
         self._braking = braking(contract)
@@ -70,6 +75,8 @@ class Program:
         self.state = State.IDLE
         self.stops: list[str] = []
         self._reading: Reading | None = None
+        self._ticks = False
+        """Whether the robot's clock has been seen to go on."""
         self._path = [contract.default]
         self._since = self._start = 0.0
         self._walked_s = 0.0
@@ -79,24 +86,28 @@ class Program:
 
     def run(self, seconds: float = np.inf) -> Outcome:
         """Run until the operator quits, or for so long [s]; then brake, and let go of the robot."""
-        robot = self._robot
-        robot.ask({name: term.points for name, term in self._contract.sources.items()})
         collects = gc.isenabled()
         gc.freeze()
         gc.disable()  # a collection would take longer than a cycle may
         try:
+            self._robot.ask({name: term.points for name, term in self._contract.sources.items()})
             self._start = self._clock()
             quits = False
             while not quits:
                 now = self._pace.wait()
                 quits = self._cycle(now) or now - self._start > seconds
             self._settle()
+            self._write(self._contract.default, 0.0, self._braking)
+        except BaseException:
+            self._settle_blindly()
+            raise
         finally:
-            self._write(np.copy(self._contract.default), 0.0, self._braking)
-            robot.close()
-            self._operator.close()
             if collects:
                 gc.enable()
+            try:
+                self._robot.close()
+            finally:
+                self._operator.close()
         return Outcome(self._pace.times(), tuple(self.stops), self._walked_s)
 
     def _cycle(self, now: float) -> bool:
@@ -123,10 +134,22 @@ class Program:
         return Event.QUIT in events
 
     def _read(self) -> None:
-        """Take what has come, and log it with what was asked for when it did."""
+        """Take what has come, and log it with what was asked for when it did. A reading with the time of the last one is the
+        same measurement, as old as that, however often it is sent. A stop that any of them asks for is asked for.
+        """
+        stops = False
         for reading in self._robot.read():
+            last = self._reading
+            if last is not None and (reading.time != last.time or self._ticks):
+                self._ticks = True
+                if reading.time == last.time:
+                    reading = replace(reading, received=last.received)
             self.log.add_reading(reading, self.state, *self._asked)
+            self._watch.see(reading)
+            stops |= reading.stop
             self._reading = reading
+        if stops and self._reading is not None:
+            self._reading = replace(self._reading, stop=True)
 
     def _handle(self, event: Event, reason: str | None, now: float) -> None:
         """Follow an event, or say why not."""
@@ -140,8 +163,20 @@ class Program:
             self._say(f"refused: {event.value}: {reason}", now)
         elif event is Event.WALK and now - self._since < self._stand_s:
             self._say(f"refused: walk: it stands up for {self._stand_s:g} s first", now)
+        elif event is Event.WALK and (crooked := self._crooked()) is not None:
+            self._say(f"refused: walk: {crooked}", now)
         else:
             self._enter(following, now)
+
+    def _crooked(self) -> str | None:
+        """Return which joint is not where a robot that stands has it; None if all are."""
+        if self._reading is None:
+            return "nothing has been read yet"
+        away = np.abs(self._reading.positions - self._contract.default)
+        if away.max() <= STANDS_WITHIN:
+            return None
+        name = self._contract.joint_names[int(away.argmax())]
+        return f"it does not stand: {name} is {away.max():.2f} rad from its default angle (allowed: {STANDS_WITHIN:g})"
 
     def _stop(self, reason: str, now: float) -> None:
         """Go to the state `stop`, and say why."""
@@ -153,9 +188,11 @@ class Program:
     def _enter(self, state: State, now: float) -> None:
         self._say(f"{self.state.value} -> {state.value}", now)
         if state is State.STAND and self._reading is not None:
-            # Legs that lie anyhow are folded first; a robot that has walked stands already.
-            bent = self._contract.crouch if self.state is State.DAMPING else None
-            self._path = [self._reading.positions, *([] if bent is None else [bent]), self._contract.default]
+            # Legs that lie anyhow are folded first. One that has walked stands already, and what carries it is how far its
+            # targets are from its joints: they go on from where they were.
+            lies, bent = self.state is State.DAMPING, self._contract.crouch
+            first = self._reading.positions if lies else self._asked[0]
+            self._path = [first, *([bent] if lies and bent is not None else []), self._contract.default]
         self.state, self._since = state, now
         if state is State.WALK:
             self._policy.restart()
@@ -173,7 +210,9 @@ class Program:
                 targets = along(self._path, (now - self._since) / self._stand_s)
             clamped = clamp_targets(targets, reading.positions, reading.velocities, contract)
             return clamped, contract.stiffness, contract.damping
-        positions = contract.default if reading is None else np.nan_to_num(reading.positions)
+        positions = contract.default
+        if reading is not None:  # the P gain is 0, but 0 times what is no number is none
+            positions = np.where(np.abs(reading.positions) < FAR, reading.positions, positions)
         return positions, nothing, nothing if self.state is State.IDLE else self._braking
 
     def _write(self, targets: np.ndarray, stiffness: np.ndarray | float, damping: np.ndarray) -> None:
@@ -207,6 +246,14 @@ class Program:
             self._write(*self._decide(Orders(np.zeros(3)), now))
             self._log_cycle(now)
             self._pace.done()
+
+    def _settle_blindly(self) -> None:
+        """Do the same after a failure, whatever fails: one command alone may get lost."""
+        contract = self._contract
+        for _ in range(int(np.ceil(SETTLE_S / contract.control_dt))):
+            with suppress(Exception):
+                self._write(contract.default, 0.0, self._braking)
+            self._sleep(contract.control_dt)
 
     def _say(self, text: str, now: float) -> None:
         self.log.note(now - self._start, text)

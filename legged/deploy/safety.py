@@ -10,6 +10,8 @@ from legged.deploy.observations import gravity_in
 
 SLOWEST_FALL = 0.5
 """Share of a joint's largest speed at which damping asks for its whole torque."""
+AT_ONCE = 2.0
+"""A joint that is so many times faster than it may be for an instant is too fast at once."""
 MOST_DAMPING = 4.0
 """Damping is at most so many times the policy's own D gain, which the motors are known to be stable with."""
 
@@ -24,6 +26,10 @@ class Limits:
     """Age of the newest reading [s]."""
     speed_share: float = 1.2
     """Largest joint speed, as a share of the contract's velocity limit."""
+    fast_s: float = 0.04
+    """Time for which a joint may be faster than that: a foot that hits an edge makes it so for an instant [s]."""
+    beyond: float = 0.2
+    """How far beyond its position limits a joint may be [rad]."""
     max_missed: int = 5
     """Deadlines missed in a row."""
     max_temperature: float = 90.0
@@ -37,6 +43,16 @@ class Watch:
         """Watch a robot of `contract`."""
         self._contract, self.limits = contract, limits
         self._fastest = limits.speed_share * contract.velocity_limits
+        self._fast_s = np.zeros(len(self._fastest))
+        """Time for which each joint has been too fast, less a quarter of that for which it was not since [s]."""
+        self._seen: float | None = None
+
+    def see(self, reading: Reading) -> None:
+        """Take a reading, each one that comes: how long joints are too fast is counted from one to the next."""
+        passed = 0.0 if self._seen is None else np.clip(reading.received - self._seen, 0.0, self.limits.max_age_s)
+        self._seen = reading.received
+        fast = np.abs(reading.velocities) > self._fastest
+        self._fast_s = np.maximum(0.0, self._fast_s + np.where(fast, passed, -0.25 * passed))
 
     def reason(self, reading: Reading | None, now: float, missed: int) -> str | None:
         """Return why the robot must stop, in one line; None if nothing is wrong.
@@ -66,11 +82,19 @@ class Watch:
         tilt = float(np.arccos(np.clip(-gravity_in(reading.quaternion)[2], -1.0, 1.0)))
         if tilt > limits.max_tilt:
             return f"tilt: {tilt:.2f} rad (allowed: {limits.max_tilt:g})"
-        too_fast = np.abs(reading.velocities) > self._fastest
+        at_once = np.abs(reading.velocities) > AT_ONCE * self._fastest
+        too_fast = at_once | (self._fast_s >= limits.fast_s)
         if too_fast.any():
-            i = int(too_fast.argmax())
+            i = int((at_once if at_once.any() else too_fast).argmax())
+            name, most = self._contract.joint_names[i], f"{self._fastest[i]:.1f} rad/s for {1e3 * limits.fast_s:.0f} ms"
+            how = f"turns at {reading.velocities[i]:.1f} rad/s" if at_once.any() else "has been faster than that"
+            return f"joint speed: {name} {how} (allowed: {most})"
+        low, high = self._contract.position_limits.T
+        beyond = np.maximum(low - reading.positions, reading.positions - high)
+        if beyond.max() > limits.beyond:
+            i = int(beyond.argmax())
             name = self._contract.joint_names[i]
-            return f"joint speed: {name} turns at {reading.velocities[i]:.1f} rad/s (allowed: {self._fastest[i]:.1f})"
+            return f"joint position: {name} is at {reading.positions[i]:.2f} rad (its limits: {low[i]:.2f} to {high[i]:.2f})"
         if reading.temperatures is not None and reading.temperatures.max() > limits.max_temperature:
             i = int(reading.temperatures.argmax())
             name = self._contract.joint_names[i]

@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from importlib import import_module
 from typing import Any, Protocol
 
@@ -195,7 +196,8 @@ class UnitreeRobot(Interface):
                 if not self._braked and time.perf_counter() - self._written > HOLD_S:
                     self._fill(nothing, nothing, np.full(len(self._places), BRAKING))
                     self._braked = True
-                self._wire.send(self._command)
+                with suppress(Exception):  # what a later one may cure; who writes hears of it
+                    self._wire.send(self._command)
 
     def close(self) -> None:
         self._closing.set()

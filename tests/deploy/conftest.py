@@ -3,10 +3,16 @@
 from pathlib import Path
 
 import pytest
-from still_robot import exported
+from still_robot import Stage, exported
 
 
 @pytest.fixture(scope="session")
 def policy_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder with its export."""
     return exported(tmp_path_factory.mktemp("policy"))
+
+
+@pytest.fixture
+def stage(policy_folder: Path) -> Stage:
+    """A program in virtual time."""
+    return Stage(policy_folder)

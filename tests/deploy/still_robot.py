@@ -9,10 +9,13 @@ from legged.deploy.commands import Operator, Orders
 from legged.deploy.interface import Interface, Reading, RobotFacts
 from legged.deploy.policy import Policy
 from legged.deploy.program import Program
+from legged.deploy.states import Event
 from legged.learning.runner import Runner
 from legged.policies.export import export
 
 PROPRIOCEPTION = ["base_ang_vel", "projected_gravity", "commands", "dof_pos", "dof_vel", "actions"]
+WALKS = {0.0: Event.DAMPING, 0.5: Event.STAND, 3.0: Event.WALK}
+"""From 3 s on the policy acts."""
 COMMANDS = [  # not the same to both sides
     ("commands.ranges.lin_vel_x", [-0.6, 1.1]),
     ("commands.ranges.lin_vel_y", [-0.4, 0.4]),
@@ -56,7 +59,7 @@ class Time:
 
 
 class StillRobot(Interface):
-    """A robot whose joints are where they were asked to be at once; `change` makes of its readings something else."""
+    """A robot whose joints are where they were asked to be at once; `change` makes of a reading another, or several."""
 
     def __init__(self, contract, time, facts=None):
         self.facts = facts or facts_for(contract)
@@ -73,7 +76,8 @@ class StillRobot(Interface):
         now = self.time.now
         still = np.zeros(len(self.positions))
         reading = Reading(now, now, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), self.positions.copy(), still, torques=still)
-        return [self.change(reading)]
+        changed = self.change(reading)
+        return changed if isinstance(changed, list) else [changed]
 
     def write(self, positions, stiffness, damping):
         self.written.append((self.time.now, positions.copy(), stiffness.copy(), damping.copy()))
@@ -122,3 +126,24 @@ class Stage:
         self.program = Program(self.policy, self.robot, self.operator, **clocks, **settings)
         self.outcome = self.program.run(seconds)
         return self.outcome
+
+
+def spoil(**changes):
+    """A change of readings: name of a field -> what makes it of a reading."""
+    return lambda reading: replace(reading, **{name: make(reading) for name, make in changes.items()})
+
+
+def tilted(angle):
+    """A change by which the base leans to a side [rad]."""
+    return spoil(quaternion=lambda _: np.array([np.cos(0.5 * angle), np.sin(0.5 * angle), 0.0, 0.0]))
+
+
+def with_one(name, value):
+    """A change of the second number of a field."""
+
+    def make(reading):
+        values = getattr(reading, name).copy()
+        values[1] = value
+        return values
+
+    return spoil(**{name: make})

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import call, kept_global_state
 
-from legged.deploy.__main__ import Interruptible, main
+from legged.deploy.__main__ import ENDING, Interruptible, main
 from legged.deploy.commands import Script
 from legged.deploy.gamepad import Gamepad
 from legged.deploy.keyboard import Keyboard
@@ -59,6 +59,29 @@ def test_escape_stops_and_an_arrow_does_not(terminal):
     assert keyboard.poll(0.0).events == ()
     os.write(typed, b"\x1b")
     assert keyboard.poll(0.0).events == (Event.STOP,)
+    keyboard.close()
+
+
+@pytest.mark.parametrize("typed_at_once", [b"\x1b\x1b\x1b", b"\x1b[A ", b" \x1b[1;5C", b"\x1bOP\x1b", b"w\x1b"])
+def test_nothing_that_comes_with_it_hides_a_stop(terminal, typed_at_once):
+    """Keys that are hammered, or pressed with an arrow, come at once."""
+    typed, read = terminal
+    keyboard = Keyboard(read)
+    os.write(typed, typed_at_once)
+    assert Event.STOP in keyboard.poll(0.0).events
+    keyboard.close()
+
+
+def test_a_command_ends_when_nobody_types_any_more(terminal):
+    typed, read = terminal
+    keyboard = Keyboard(read)
+    os.write(typed, b"www")
+    assert keyboard.poll(5.0).velocity[0] == pytest.approx(0.3)
+    assert keyboard.poll(14.9).velocity[0] == pytest.approx(0.3)
+    os.write(typed, b"h")  # no key of ours, but somebody is there
+    assert keyboard.poll(15.0).velocity[0] == pytest.approx(0.3)
+    assert keyboard.poll(24.9).velocity[0] == pytest.approx(0.3)
+    np.testing.assert_array_equal(keyboard.poll(25.1).velocity, 0.0)
     keyboard.close()
 
 
@@ -128,14 +151,18 @@ def test_a_gamepad_that_is_not_there_is_named(tmp_path):
         Gamepad(tmp_path / "js7")
 
 
-def test_a_signal_asks_the_program_to_end_and_keeps_what_else_was_asked(tmp_path):
+@pytest.mark.parametrize("name", ENDING)
+def test_a_signal_asks_the_program_to_end_and_keeps_what_else_was_asked(tmp_path, name):
     path = tmp_path / "walk.txt"
     path.write_text("0 damping\n1 stand\n")
+    kept = {number: signal.getsignal(number) for number in map(signal.Signals.__getitem__, ENDING)}
     with kept_global_state():
         operator = Interruptible(Script(path))
         assert operator.poll(0.0).events == (Event.DAMPING,)
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(getattr(signal, name))
         assert operator.poll(1.0).events == (Event.STAND, Event.QUIT)
+    for number, handler in kept.items():
+        signal.signal(number, handler)
 
 
 def test_a_script_says_what_it_says_when_its_time_has_come(tmp_path):
@@ -173,9 +200,12 @@ def test_a_script_with_a_mistake_is_refused_by_its_line(tmp_path, text, says):
     ("flags", "code", "says"),
     [
         (["--policy", "none"], 2, "error: --policy: there is no none/policy.onnx"),
-        (["--max-tilt", "0"], 2, "error: --max-tilt: must be above 0, got 0"),
-        (["--stand-seconds", "-1"], 2, "error: --stand-seconds: must be above 0, got -1"),
-        (["--robot", "spot", "--commands", "walk.txt"], 2, "error: --robot: 'spot' is unknown"),
+        (["--max-tilt", "0"], 2, "error: --max-tilt: must be between 0.1 and 1.6, got 0"),
+        (["--max-tilt", "60"], 2, "error: --max-tilt: must be between 0.1 and 1.6, got 60"),
+        (["--max-age", "50"], 2, "error: --max-age: must be between 0.005 and 0.5, got 50"),
+        (["--stand-seconds", "0.1"], 2, "error: --stand-seconds: must be between 1 and 60, got 0.1"),
+        (["--seconds", "nan"], 2, "error: --seconds: must be above 0, got nan"),
+        (["--robot", "spot"], 2, "error: --robot: 'spot' is unknown"),
         (["--robot", "udp:here", "--commands", "walk.txt"], 2, "error: --robot: udp:here: expected udp:HOST:PORT"),
         (["--log", "walk.txt"], 2, "error: --log: walk.txt: the name of an .npz file is wanted"),
         (["--log", "walk.txt/log.npz"], 2, "error: --log: walk.txt/log.npz: cannot be written"),

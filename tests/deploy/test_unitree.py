@@ -267,6 +267,26 @@ def test_a_command_is_repeated_and_joints_are_braked_when_the_program_is_silent(
     assert wire.sent[-1][1].motor_cmd[motor].kp == 20.0
 
 
+def test_a_message_that_cannot_be_sent_does_not_end_what_watches_over_the_program(robot, monkeypatch):
+    robot, wire = robot
+    count = len(robot.kind.motors)
+    send = wire.send
+
+    def fail(_):
+        raise OSError("no buffer space")
+
+    robot.write(np.ones(count), np.full(count, 20.0), np.full(count, 0.5))
+    monkeypatch.setattr(wire, "send", fail)
+    with pytest.raises(OSError, match="no buffer space"):
+        robot.write(np.ones(count), np.full(count, 20.0), np.full(count, 0.5))
+    time.sleep(0.02)
+    monkeypatch.setattr(wire, "send", send)
+    before = len(wire.sent)
+    time.sleep(unitree.HOLD_S + 0.2)
+    assert len(wire.sent) > before
+    assert wire.sent[-1][1].motor_cmd[robot.kind.motors[0]].kd == unitree.BRAKING
+
+
 @pytest.mark.parametrize(
     ("keys", "stops"), [([(2, 3)], True), ([(2, 5), (3, 1)], True), ([(2, 5)], False), ([(3, 1)], False)]
 )

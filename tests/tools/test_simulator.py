@@ -164,7 +164,7 @@ def test_it_brakes_when_nobody_speaks_to_it_any_more(simulated):
         (["--commands", "none.txt"], "error: --commands: there is no file none.txt"),
         (["--policy", "nobody"], "error: "),
         (["--simulated", "anymal_x"], "error: --simulated: there is no robot 'anymal_x'; did you mean"),
-        (["--max-tilt", "-1"], "error: --max-tilt: must be above 0, got -1"),
+        (["--max-tilt", "-1"], "error: --max-tilt: must be between 0.1 and 1.6, got -1"),
     ],
 )
 def test_a_wrong_flag_ends_the_command_with_one_line(flags, says, tmp_path, monkeypatch, capsys):
