@@ -20,6 +20,10 @@ STANDS_WITHIN = 0.6
 """A robot stands when no joint is further from the default pose [rad]; its weight makes some of that."""
 FAR = 100.0
 """Angles that are further from 0 are no measurements [rad]."""
+HALT_S = 1.0
+"""A robot that walks is asked to stand still for so long before it stands [s]: joints that stop at 1 m/s make it fall."""
+RETURN_S = 0.3
+"""A robot that has walked reaches the default pose in so long [s]: it stands on some of its legs, and would tip over."""
 SETTLE_S = 1.0
 """Joints are braked for so long before the program lets go of the robot [s]."""
 
@@ -77,9 +81,11 @@ class Program:
         self._reading: Reading | None = None
         self._ticks = False
         """Whether the robot's clock has been seen to go on."""
-        self._path = [contract.default]
+        self._path, self._path_s = [contract.default], stand_s
         self._since = self._start = 0.0
         self._walked_s = 0.0
+        self._halting_s: float | None = None
+        """Time for which a robot that is to stand has had no command [s]; None if it is not to."""
         nothing = np.zeros(len(contract.joint_names))
         self._asked = (nothing, nothing, nothing)
         """Targets and gains that the robot has been told last."""
@@ -124,6 +130,8 @@ class Program:
         for event in events:
             if event is not Event.QUIT:
                 self._handle(event, reason, now)
+        if self._halting_s is not None and self._halting_s >= HALT_S:
+            self._enter(State.STAND, now)
         targets, stiffness, damping = self._decide(orders, now)
         if not np.isfinite(targets).all():
             self._stop("non-finite output of the policy", now)
@@ -156,15 +164,23 @@ class Program:
         if event is Event.STOP:
             self._stop("operator: stop", now)
             return
+        if event is Event.WALK and self._halting_s is not None:
+            self._halting_s = None
+            self._say("walk: it walks on", now)
+            return
         following = next_state(self.state, event)
         if following is None:
             self._say(f"refused: '{event.value}' leads nowhere from {self.state.value}", now)
         elif following in MOVING and reason is not None:
             self._say(f"refused: {event.value}: {reason}", now)
-        elif event is Event.WALK and now - self._since < self._stand_s:
-            self._say(f"refused: walk: it stands up for {self._stand_s:g} s first", now)
+        elif event is Event.WALK and now - self._since < self._path_s:
+            self._say(f"refused: walk: it stands up for {self._path_s:g} s first", now)
         elif event is Event.WALK and (crooked := self._crooked()) is not None:
             self._say(f"refused: walk: {crooked}", now)
+        elif self.state is State.WALK and event is Event.STAND:
+            if self._halting_s is None:
+                self._halting_s = 0.0
+                self._say("walk: it halts, and then stands", now)
         else:
             self._enter(following, now)
 
@@ -192,8 +208,9 @@ class Program:
             # targets are from its joints: they go on from where they were.
             lies, bent = self.state is State.DAMPING, self._contract.crouch
             first = self._reading.positions if lies else self._asked[0]
+            self._path_s = self._stand_s if lies else min(RETURN_S, self._stand_s)
             self._path = [first, *([bent] if lies and bent is not None else []), self._contract.default]
-        self.state, self._since = state, now
+        self.state, self._since, self._halting_s = state, now, None
         if state is State.WALK:
             self._policy.restart()
             self._ramp.restart()
@@ -204,10 +221,14 @@ class Program:
         nothing = np.zeros(len(contract.joint_names))
         if self.state in MOVING and reading is not None:
             if self.state is State.WALK:
-                targets = self._policy.act(reading, self._ramp.advance(orders))
+                halts = self._halting_s is not None
+                command = self._ramp.advance(Orders(np.zeros(3)) if halts else orders)
+                if halts and not command.any():
+                    self._halting_s = (self._halting_s or 0.0) + contract.control_dt
+                targets = self._policy.act(reading, command)
                 self._walked_s += contract.control_dt
             else:
-                targets = along(self._path, (now - self._since) / self._stand_s)
+                targets = along(self._path, (now - self._since) / self._path_s)
             clamped = clamp_targets(targets, reading.positions, reading.velocities, contract)
             return clamped, contract.stiffness, contract.damping
         positions = contract.default

@@ -46,10 +46,13 @@ def test_the_policy_gets_what_it_would_in_training_and_targets_follow_from_its_a
 
 
 def test_a_robot_that_has_walked_stands_without_a_crouch(stage):
-    stage.run({**WALKS, 4.0: STAND, 6.5: QUIT})
+    """A second to halt, then 0.3 s to the default pose: after 0.14 s a share of 3 x^2 - 2 x^3 = 0.450 with x = 0.467."""
+    stage.run({**WALKS, 4.0: STAND, 5.2: WALK, 5.4: WALK, 7.5: QUIT})
     contract = stage.policy.contract
     at = {round(moment - 100.0, 2): asked for moment, *asked in stage.robot.written}
-    np.testing.assert_allclose(at[5.0][0], 0.5 * (at[3.98][0] + contract.default), atol=1e-9)
+    np.testing.assert_allclose(at[5.14][0], 0.55 * at[4.98][0] + 0.45 * contract.default, atol=1e-3)
+    np.testing.assert_allclose(at[5.3][0], contract.default, atol=1e-9)
+    assert stage.program.log.notes[-3:-1] == ["refused: walk: it stands up for 0.3 s first", "stand -> walk"]
 
 
 def test_it_does_not_walk_when_it_does_not_stand(stage):
@@ -67,9 +70,28 @@ def test_one_that_has_walked_stands_up_from_its_targets_not_from_its_joints(stag
     def sag():
         stage.robot.change = spoil(positions=lambda reading: reading.positions - 0.2)
 
-    stage.run({**WALKS, 4.0: STAND, 6.5: QUIT}, {3.5: sag})
+    stage.run({**WALKS, 4.0: STAND, 7.5: QUIT}, {3.5: sag})
     at = {round(moment - 100.0, 2): asked for moment, *asked in stage.robot.written}
-    np.testing.assert_allclose(at[4.0][0], at[3.98][0], atol=1e-9)
+    np.testing.assert_allclose(at[5.0][0], at[4.98][0], atol=1e-9)
+
+
+def test_one_that_walks_halts_before_it_stands(stage):
+    """From 0.5 m/s in half a second, and a second more without a command."""
+    stage.run({**WALKS, 3.1: (0.5, 0.0, 0.0), 5.0: STAND, 8.9: QUIT})
+    cycles = stage.program.log._cycles
+    times, commands, states = (np.array(cycles[name]) for name in ("times", "command", "state"))
+    np.testing.assert_allclose(commands[np.searchsorted(times, [4.99, 5.25, 5.55]), 0], [0.5, 0.25, 0.0], atol=0.03)
+    assert times[np.flatnonzero(states == 3)[-1]] == pytest.approx(6.5, abs=0.05)
+    assert stage.program.log.notes[3:5] == ["walk: it halts, and then stands", "walk -> stand"]
+
+
+def test_one_that_halts_can_walk_on_and_can_be_stopped(stage):
+    plan = {**WALKS, 3.1: (0.5, 0.0, 0.0), 5.0: STAND, 5.2: WALK, 7.0: STAND, 7.2: Event.STOP, 8.0: QUIT}
+    stage.run(plan)
+    said = ["walk: it halts, and then stands", "walk: it walks on", "walk: it halts, and then stands", "stop: operator: stop"]
+    assert stage.program.log.notes[3:7] == said
+    cycles = stage.program.log._cycles
+    assert cycles["command"][np.searchsorted(cycles["times"], 6.9)][0] == pytest.approx(0.5)
 
 
 def test_it_does_not_walk_before_it_stands_nor_stand_up_when_something_is_wrong(stage):
