@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from legged.deploy.actuator_log import actuator_arrays
 from legged.deploy.contract import Contract
 from legged.deploy.interface import Reading
 from legged.deploy.states import State
 from legged.errors import ConfigError, RunError
 
 STATES = tuple(state.value for state in State)
-
-
+ACTUATORS = "_actuators"
 MOST_READINGS, MOST_CYCLES = 300_000, 60_000
 """Rows that are kept, the newest ones: twenty minutes at 250 readings and 50 cycles a second, some hundred megabytes."""
 
@@ -89,6 +89,7 @@ class Log:
         [rad], `stiffness`, `damping`, `positions` [rad], `velocities` [rad/s], `torques` [N m] (NaN where there are none),
         `quaternions` (T, 4), `gyro` (T, 3), `state` (T,), a number of `states`. By cycle, with `cycle_` before their names:
         what `add_cycle` was given. Beside them `joint_names`, `states`, `notes`, `note_times` [s] and `contract` (JSON).
+        What actuators can be fitted to goes into a file of its own, with `ACTUATORS` after its name.
 
         Raises:
             RunError: it can't be written.
@@ -102,11 +103,23 @@ class Log:
             "note_times": np.array([seconds for seconds, _ in self._notes]),
             "contract": np.array(self._said),
         }
-        part = path.with_name(f".{path.name}.part.npz")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            np.savez_compressed(part, allow_pickle=False, **arrays)
-            part.replace(path)
-        except OSError as error:
-            part.unlink(missing_ok=True)
-            raise RunError(f"{path}: {error.strerror or error}") from error
+        _write(path, arrays)
+        of_actuators = actuator_arrays(arrays, self._contract)
+        if of_actuators is not None:
+            _write(path.with_stem(f"{path.stem}{ACTUATORS}"), of_actuators)
+
+
+def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write a file, whole or not at all.
+
+    Raises:
+        RunError: it can't be written.
+    """
+    part = path.with_name(f".{path.name}.part.npz")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(part, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise RunError(f"{path}: {error.strerror or error}") from error

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from still_robot import WALKS, spoil, tilted, with_one
 
-from legged.deploy.safety import braking, clamp_targets
+from legged.deploy.safety import Limits, braking, clamp_targets
 from legged.deploy.states import Event
 
 DAMPING, STAND, WALK, QUIT = Event.DAMPING, Event.STAND, Event.WALK, Event.QUIT
@@ -149,6 +149,31 @@ def test_clamped_targets_never_ask_for_more_torque_than_there_is(stage):
         q, dq, wanted = rng.normal(0.0, [[1.0], [10.0], [3.0]], (3, 12))
         torques = contract.stiffness * (clamp_targets(wanted, q, dq, contract) - q) - contract.damping * dq
         assert (np.abs(torques) <= contract.torque_limits + 1e-9).all()
+
+
+def test_the_log_for_fitting_is_even_and_cut_where_a_reading_is_lost(stage, tmp_path):
+    """It follows targets from 0.5 s to 4 s, 50 readings a second; that at 2 s and all from 3.1 to 3.3 s are lost."""
+    lost = {100, *range(155, 166)}
+    stage.robot.change = lambda reading: [] if round((reading.time - 100.0) / 0.02) in lost else reading
+    stage.policy.contract.stiffness[:] = 60.0
+    stage.run({**WALKS, 4.0: DAMPING, 5.0: QUIT}, limits=Limits(max_age_s=0.4))
+    stage.program.log.save(tmp_path / "log.npz")
+    log = np.load(tmp_path / "log_actuators.npz", allow_pickle=False)
+    assert set(log.files) == {
+        *("joint_names", "dt", "run", "target", "position", "velocity", "torque", "stiffness", "damping")
+    }
+    assert log["dt"] == pytest.approx(0.02)
+    # A reading counts when the gains were told before it: from 0.52 s to 4.00 s.
+    np.testing.assert_array_equal(np.bincount(log["run"]), [99 - 26 + 1, 154 - 101 + 1, 200 - 166 + 1])
+    assert log["target"].shape == log["torque"].shape == (len(log["run"]), 12)
+    np.testing.assert_allclose(log["position"], log["target"], atol=1e-12)  # as this robot does
+    assert (log["stiffness"] == 60.0).all()
+
+
+def test_a_robot_that_never_stood_up_leaves_nothing_to_fit_to(stage, tmp_path):
+    stage.run({0.0: DAMPING, 1.0: QUIT})
+    stage.program.log.save(tmp_path / "log.npz")
+    assert [path.name for path in tmp_path.iterdir()] == ["log.npz"]
 
 
 def test_the_log_has_what_an_actuator_can_be_fitted_to(stage, tmp_path):
