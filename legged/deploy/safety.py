@@ -104,6 +104,9 @@ class Watch:
         lacking = [name for name in self._contract.sources if name not in reading.sources]
         if lacking:
             return f"missing data: source {lacking[0]}"
+        for name, term in self._contract.sources.items():
+            if reading.sources[name].shape != (term.size,):
+                return f"missing data: source {name} has {reading.sources[name].size} numbers, not {term.size}"
         return None
 
 

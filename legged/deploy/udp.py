@@ -6,6 +6,7 @@ import struct
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 
 import numpy as np
 
@@ -72,7 +73,9 @@ class UdpRobot(Interface):
             time.sleep(ASK_EVERY_S)
             for data, _ in self._received():
                 opened = open_packet(data)
-                if opened is not None and opened[0] == FACTS:
+                if opened is None or opened[0] != FACTS:
+                    continue
+                with suppress(ValueError, KeyError, TypeError, RecursionError):  # somebody else's
                     return facts_of_json(json.loads(opened[2]))
         self._socket.close()
         raise RunError(f"--robot: no robot answers at udp:{address} within {ANSWER_S:g} s")

@@ -72,14 +72,21 @@ def facts_as_json(facts: RobotFacts) -> dict[str, Any]:
 
 
 def facts_of_json(said: Mapping[str, Any]) -> RobotFacts:
-    """Return the facts that `facts_as_json` wrote."""
-    limits = np.array([[np.nan if x is None else x for x in pair] for pair in said["position_limits"]], dtype=float)
+    """Return the facts that `facts_as_json` wrote.
+
+    Raises:
+        ValueError, KeyError, TypeError: these are none.
+    """
+    count = len(said["joint_names"])
+    limits = np.array([[np.nan if x is None else x for x in pair] for pair in said["position_limits"]], dtype=float).reshape(
+        count, 2
+    )
     return RobotFacts(
         name=str(said["name"]),
         joint_names=tuple(said["joint_names"]),
         position_limits=np.where(np.isnan(limits), [-np.inf, np.inf], limits),
-        velocity_limits=np.array(said["velocity_limits"], dtype=float),
-        torque_limits=np.array(said["torque_limits"], dtype=float),
+        velocity_limits=np.array(said["velocity_limits"], dtype=float).reshape(count),
+        torque_limits=np.array(said["torque_limits"], dtype=float).reshape(count),
         imu_body=str(said["imu_body"]),
         offers=frozenset(said["offers"]),
     )

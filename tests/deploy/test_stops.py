@@ -226,18 +226,23 @@ def test_a_terminal_that_is_held_or_closed_holds_nothing_up():
     assert said == ["a", "b", "c"]
 
 
-def test_a_policy_that_needs_a_source_stops_when_it_falls_silent(tmp_path):
+@pytest.mark.parametrize(
+    ("after", "says"),
+    [(lambda reading: reading, ""), (spoil(sources=lambda _: {"base_lin_vel": np.zeros(2)}), " has 2 numbers, not 3")],
+    ids=["silent", "too short"],
+)
+def test_a_policy_that_needs_a_source_stops_when_it_gives_nothing_more(tmp_path, after, says):
     folder = exported(tmp_path, ("observations.actor", ["base_lin_vel", *dict(BLIND)["observations.actor"]]))
     facts = facts_for(Policy(folder).contract, offers=frozenset({"base_lin_vel"}))
     stage = Stage(folder, facts)
     speaks = spoil(sources=lambda _: {"base_lin_vel": np.array([0.3, 0.0, 0.0])})
     stage.robot.change = speaks
 
-    def silence():
-        stage.robot.change = lambda reading: reading
+    def change():
+        stage.robot.change = after
 
-    outcome = stage.run({**WALKS, 5.0: QUIT}, {4.0: silence})
+    outcome = stage.run({**WALKS, 5.0: QUIT}, {4.0: change})
     assert stage.robot.asked == {"base_lin_vel": None}
-    assert outcome.stops == ("missing data: source base_lin_vel",)
+    assert outcome.stops == (f"missing data: source base_lin_vel{says}",)
     seen = next(row for row in stage.program.log._cycles["observation"] if np.isfinite(row).all())
     np.testing.assert_allclose(seen[:3], [0.6, 0.0, 0.0], atol=1e-6)

@@ -74,6 +74,26 @@ def test_facts_come_out_as_they_went_in(policy_folder):
     np.testing.assert_array_equal(found.torque_limits, facts.torque_limits)
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"torque_limits": [1.0]},
+        {"position_limits": [[0.0, 1.0]]},
+        {"joint_names": 3},
+        {"velocity_limits": None},
+        {"name": {}},
+    ],
+    ids=["torques", "positions", "names", "velocities", "none"],
+)
+def test_what_are_no_facts_is_refused(policy_folder, changes):
+    said = facts_as_json(facts_for(read_contract(policy_folder / "policy.json")))
+    said |= changes
+    if "name" in changes:
+        del said["imu_body"]
+    with pytest.raises((ValueError, KeyError, TypeError)):
+        facts_of_json(said)
+
+
 class Answers:
     """What greets back, and then sends what the test tells it to."""
 
@@ -175,6 +195,15 @@ def test_a_command_says_what_was_written(link):
 def test_what_is_no_address_is_refused(address):
     with pytest.raises(ConfigError, match="expected udp:HOST:PORT"):
         UdpRobot(address)
+
+
+def test_somebody_who_answers_with_something_else_is_no_robot(monkeypatch):
+    monkeypatch.setattr(udp, "ANSWER_S", 0.4)
+    monkeypatch.setattr(f"{__name__}.facts_as_json", lambda _: {"joint_names": ["one"]})
+    there = Answers(None)
+    with pytest.raises(RunError, match="no robot answers"):
+        UdpRobot(there.address)
+    there.end()
 
 
 def test_a_robot_that_does_not_answer_is_named(monkeypatch):
