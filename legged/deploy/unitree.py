@@ -13,6 +13,7 @@ from legged.deploy.interface import Interface, Reading
 from legged.deploy.unitree_messages import (
     KINDS,
     L2,
+    OTHER_G1,
     SELECT,
     B,
     UnitreeKind,
@@ -121,6 +122,7 @@ class UnitreeRobot(Interface):
         """Listen to the robot `name`, a key of `KINDS`, until its first state has come.
 
         Raises:
+            ConfigError: it is one with fewer joints.
             RunError: nothing is heard of it.
         """
         self.kind = KINDS[name]
@@ -137,6 +139,10 @@ class UnitreeRobot(Interface):
             raise RunError(
                 f"--robot: {name}: no state came within {FIRST_STATE_S:g} s; is it on, and --network the right one?"
             )
+        lacks = OTHER_G1.get(self._mode_machine or 0) if name == "g1" else None
+        if lacks is not None:
+            wire.close()
+            raise ConfigError(f"--robot: g1: mode_machine is {self._mode_machine}: this robot has {lacks}, not 29 joints")
         self._record = new_command(self.kind, self._mode_machine or 0)
         self._command = wire.new_command()
         self._written: float | None = None

@@ -53,6 +53,14 @@ ENABLED, DISABLED = 1, 0
 """Modes of a motor."""
 SERIES = 0
 """`mode_pr` under which the ankles and the waist of G1 take pitch and roll, as joints of ours do, not their two motors'."""
+OTHER_G1 = {
+    1: "23 joints",
+    3: "a locked waist",
+    4: "23 joints",
+    6: "a locked waist",
+    9: "no legs",
+}
+"""`mode_machine` of a G1 that has not all of the 29 joints -> what it has (the table beside Unitree's description of G1)."""
 BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 """Byte -> the same with its bits the other way round."""
 SELECT, L2, B = (2, 3), (2, 5), (3, 1)

@@ -297,6 +297,15 @@ def test_select_and_l2_with_b_of_the_remote_control_stop_it(keys, stops):
     robot.close()
 
 
+def test_a_g1_with_fewer_joints_is_refused_before_anything_is_sent():
+    kind = KINDS["g1"]
+    for code, says in ((4, "23 joints"), (6, "a locked waist")):
+        wire = StandIn("g1", [state_of(kind, np.zeros(29), np.zeros(29), mode_machine=code)])
+        with pytest.raises(ConfigError, match=f"g1: mode_machine is {code}: this robot has {says}, not 29 joints"):
+            UnitreeRobot("g1", wire)
+        assert (wire.closed, wire.sent) == (True, [])
+
+
 def test_a_robot_that_says_nothing_is_named(monkeypatch):
     monkeypatch.setattr(unitree, "FIRST_STATE_S", 0.05)
     wire = StandIn("g1")
