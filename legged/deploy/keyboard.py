@@ -4,6 +4,7 @@ import os
 import re
 import select
 import sys
+from contextlib import suppress
 
 import numpy as np
 
@@ -89,5 +90,5 @@ class Keyboard(Operator):
     def close(self) -> None:
         import termios
 
-        if self._lost is None:
-            termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
+        with suppress(termios.error):  # it may be gone; TCSANOW, because one that is held never drains
+            termios.tcsetattr(self._descriptor, termios.TCSANOW, self._before)

@@ -93,6 +93,13 @@ def test_a_closed_terminal_is_no_operator(terminal):
     keyboard.close()
 
 
+def test_a_terminal_that_has_gone_unnoticed_is_let_go_of(terminal):
+    typed, read = terminal
+    keyboard = Keyboard(read)
+    os.close(typed)
+    keyboard.close()
+
+
 def test_the_keyboard_needs_a_terminal():
     reads, writes = os.pipe()
     try:

@@ -1,7 +1,10 @@
 """A robot behind UDP: packets there and back, what gets lost, comes late or is none of ours."""
 
 import json
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 
@@ -11,8 +14,10 @@ from still_robot import facts_for
 
 from legged.deploy import udp
 from legged.deploy.contract import read_contract
+from legged.deploy.safety import braking
 from legged.deploy.udp import UdpRobot
 from legged.deploy.udp_packets import (
+    BYE,
     COMMAND,
     FACTS,
     HELLO,
@@ -189,6 +194,39 @@ def test_a_command_says_what_was_written(link):
     kind, sequence, body = there.heard[-1]
     assert (kind, sequence) == (COMMAND, 1)
     np.testing.assert_allclose(unpack_command(body)[1].mean(axis=1), [0.5, 90.0, 4.0])
+
+
+@pytest.mark.parametrize("name", ["SIGHUP", "SIGTSTP"])
+def test_a_program_that_is_asked_to_end_brakes_the_robot_for_a_second_and_says_goodbye(name, policy_folder, tmp_path):
+    """The command as a process, whose terminal is closed, or in which somebody types Ctrl-Z."""
+    contract = read_contract(policy_folder / "policy.json")
+    there = Answers(facts_for(contract))
+    (tmp_path / "lie.txt").write_text("0 damping\n")
+    command = [sys.executable, "-m", "legged.deploy", "--policy", str(policy_folder), "--robot", f"udp:{there.address}"]
+    with open(tmp_path / "out", "w") as out:
+        command += ["--commands", "lie.txt", "--log", "log.npz"]
+        program = subprocess.Popen(command, cwd=tmp_path, stdout=out, stderr=subprocess.STDOUT, start_new_session=True)
+        try:
+            for i in range(1, 5000):
+                if there.client is not None:
+                    there.send(packet(STATE, i, pack_state(state(0.01 * i))))
+                if sum(opened[0] == COMMAND for opened in there.heard) == 20:
+                    break
+                time.sleep(0.002)
+            asked = time.perf_counter()
+            program.send_signal(getattr(signal, name))
+            assert program.wait(20.0) == 0, (tmp_path / "out").read_text()
+            assert time.perf_counter() - asked > 0.9
+        finally:
+            program.kill()
+            there.end()
+    assert there.heard[-1][0] == BYE
+    braked = [unpack_command(body)[1] for kind, _, body in there.heard if kind == COMMAND][-40:]
+    assert len(braked) == 40
+    for asked_for in braked:
+        assert not asked_for[1].any()
+        np.testing.assert_allclose(asked_for[2], braking(contract), rtol=1e-6)
+    assert (tmp_path / "log.npz").is_file()
 
 
 @pytest.mark.parametrize("address", ["", "here", "127.0.0.1:", "127.0.0.1:0", "127.0.0.1:99999", ":80"])
