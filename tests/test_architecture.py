@@ -70,7 +70,7 @@ FLOORS = [  # from the ground up; each part imports from the floors below it onl
     {"user_modules", "gymnasium_ids"},
     {"registry"},
     {"commandline"},
-    {"learning", "rendering"},
+    {"learning", "rendering", "deploy"},
     {"policies", "gymnasium_envs"},
     {"play", "benchmarks"},
     {"evaluation"},
@@ -78,9 +78,12 @@ FLOORS = [  # from the ground up; each part imports from the floors below it onl
     {"tools"},
 ]
 PARTS = sorted({name_of(path).split(".")[1] for path in FILES if name_of(path) not in ("legged", "legged.__main__")})
+OF_ROBOTS = ("deploy", "errors", "commandline")
+"""What a robot's computer runs; of `commandline` it is the parser, which imports nothing: tests/deploy looks at that."""
 WITHOUT = {  # what else a part does without
     "errors": ["torch"],
     "process": ["torch"],
+    "deploy": ["torch", "mujoco", "yaml", *(f"legged.{part}" for part in PARTS if part not in OF_ROBOTS)],
     "config": ["torch"],
     "robots": ["torch"],
     "terrain": ["torch", "mujoco"],
