@@ -285,6 +285,8 @@ def test_trials_are_ordinary_runs_and_the_report_names_the_best(capsys):
 
     table = (plan.folder / "table.md").read_text()
     assert f"| 1 | {best.number} | {best.value:.4g} |" in table
+    assert all(f"`{path}=" in table for path in plan.given.overrides)
+    assert plan.given.overrides
     found = yaml.safe_load((plan.folder / "best.yaml").read_text())
     assert found["train"]["policy"]["activation"] == settings(plan, best)["train.policy.activation"]
     for name in ("history", "parallel"):

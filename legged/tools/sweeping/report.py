@@ -86,6 +86,9 @@ def table(plan: Plan, trials: Sequence["FrozenTrial"]) -> str:
         command = shlex.join([f"{path}={_text(value)}" for path, value in settings(plan, ranked[0]).items()])
         lines += ["", "The settings of the best, as YAML:", "", "```yaml", best_yaml(plan, ranked[0]).rstrip(), "```"]
         lines += ["", "and on the command line:", "", "```", f"python train.py --task {plan.given.task} {command}", "```"]
+        if plan.given.overrides:
+            common = ", ".join(f"`{path}={_text(value)}`" for path, value in plan.given.overrides.items())
+            lines += ["", f"Neither holds what all trials had in common: {common}."]
     return "\n".join(lines) + "\n"
 
 
