@@ -35,7 +35,7 @@ from legged.evaluation.crossing import EVERYWHERE, cross
 from legged.evaluation.episodes import MOST_EPISODES, evaluate_episodes
 from legged.evaluation.following import evaluate_following
 from legged.evaluation.gymnasium_episodes import EPISODES, environment_of, evaluate_in_gymnasium
-from legged.evaluation.stress.measuring import RISER, TREAD
+from legged.evaluation.stress.measuring import RISER, TREAD, Wish
 from legged.evaluation.stress.report import evaluate_stress
 from legged.evaluation.success import chosen_types
 from legged.evaluation.velocity_grid import AXES, MOST_ROBOTS, Grid, axes_of, axis_values, check_size
@@ -50,6 +50,8 @@ ROBOTS = 16
 """Robots a cell, if nobody says how many."""
 ENVIRONMENTS = 256
 """Episodes, each of an environment of its own, if nobody says how many."""
+OF_STRESS = ("riser", "tread", "payload")
+"""Flags of --stress."""
 OF_COMMANDS = (
     *AXES,
     "robots",
@@ -60,14 +62,11 @@ OF_COMMANDS = (
     "rmse",
     "falls",
     "stress",
-    "riser",
-    "tread",
+    *OF_STRESS,
 )
 """Flags of tasks that follow commands."""
-OF_STRESS = ("riser", "tread")
-"""Flags of --stress."""
-STAIR_LIMITS = {"riser": (0.0, 1.0), "tread": (0.05, 2.0)}
-"""Flag -> smallest and largest length [m]."""
+STRESS_LIMITS = {"riser": (0.0, 1.0, "m"), "tread": (0.05, 2.0, "m"), "payload": (0.0, 1000.0, "kg")}
+"""Flag -> smallest and largest number, and its unit."""
 OF_EPISODES = ("episodes", "gymnasium")
 """Flags of other tasks."""
 
@@ -106,6 +105,9 @@ def build_parser() -> CommandParser:
         "--riser", type=float, help=f"height of the steps of --stress [m]; {RISER} for a robot half a metre high"
     )
     parser.add_argument("--tread", type=float, help=f"their width [m]; {TREAD}")
+    parser.add_argument(
+        "--payload", type=float, help="mass on the base in --stress [kg]; 8 kg for an ANYmal C, for others like it"
+    )
     many = f"of a task without commands; {ENVIRONMENTS}, {EPISODES} with --gymnasium"
     parser.add_argument("--episodes", type=int, help=many)
     parser.add_argument("--gymnasium", action="store_true", help="the exported policy in Gymnasium's environment")
@@ -190,8 +192,8 @@ def _follow_commands(args: argparse.Namespace) -> int:
     asked = [("sim.physics", resolve_physics("auto", device)), *policy_overrides(args)]
     where = "--physics" if args.physics else "sim.physics"
     if args.stress:
-        stairs = (args.riser, args.tread)
-        return evaluate_stress(policy, a_point, args.full, stairs, asked, device, graph, folder, where)
+        wish = Wish(args.riser, TREAD if args.tread is None else args.tread, args.payload)
+        return evaluate_stress(policy, a_point, args.full, wish, asked, device, graph, folder, where)
     if args.all_checkpoints:
         return evaluate_all_checkpoints(policy, grid, asked, device, graph, folder, rmse, falls)
     types = chosen_types(policy.cfg, args.types)  # type: ignore[arg-type]
@@ -205,16 +207,16 @@ def _check_stress(args: argparse.Namespace) -> None:
         ConfigError: one of them does not.
     """
     if not args.stress:
-        _refuse(args, OF_STRESS, "is of the stairs of --stress; add it")
+        _refuse(args, OF_STRESS, "is of --stress; add it")
         return
     own = "--stress has a table of its own; leave it out"
     _refuse(args, (*AXES, "robots", "types", "all_checkpoints"), own)
     if args.physics == EVERYWHERE:
         raise ConfigError(f"--stress: looks at one engine; leave out --physics {EVERYWHERE}")
-    for flag, (low, high) in STAIR_LIMITS.items():
+    for flag, (low, high, unit) in STRESS_LIMITS.items():
         value = getattr(args, flag)
         if value is not None and not low <= value <= high:
-            raise ConfigError(f"--{flag}: must be between {low:g} and {high:g} m, got {value:g}")
+            raise ConfigError(f"--{flag}: must be between {low:g} and {high:g} {unit}, got {value:g}")
 
 
 def _run_episodes(args: argparse.Namespace) -> int:

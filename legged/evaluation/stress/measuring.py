@@ -44,6 +44,18 @@ COMMANDS = (
 
 
 @dataclass(frozen=True)
+class Wish:
+    """What is asked for in place of the usual numbers."""
+
+    riser: float | None = None
+    """Height of the steps [m]; as RISER says for the robot, if nobody says."""
+    tread: float = TREAD
+    """Their width [m]."""
+    payload: float | None = None
+    """Mass on the base [kg]; as the table says for the robot, if nobody says."""
+
+
+@dataclass(frozen=True)
 class Setting:
     """Another solver, by what it changes in the configuration."""
 
@@ -70,25 +82,23 @@ class Bench:
         self,
         policy: TrainedPolicy,
         robots: int,
-        riser: float | None,
-        tread: float,
+        wish: Wish,
         asked: Sequence[tuple[str, Any]],
         device: torch.device,
         graph: bool,
     ) -> None:
-        """Take `robots` for each line of the table; steps are `riser` [m] high, or as high as RISER says for the robot, and
-        `tread` wide [m]. `asked` is what the command line changes.
+        """Take `robots` for each line of the table; `asked` is what the command line changes of the configuration.
 
         Raises:
             ConfigError: the robot cannot be loaded.
         """
         assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
         self.cfg: LeggedConfig = policy.cfg
-        self.rows = table(size_of(policy.cfg.robot), size_of(WRITTEN_FOR))
+        self.rows = table(size_of(policy.cfg.robot), size_of(WRITTEN_FOR), wish.payload)
         """The lines of the table."""
         self.scale = policy.cfg.terrain.scale
-        self.riser = round(RISER * self.scale, 3) if riser is None else riser
-        self.tread, self.robots = tread, robots
+        self.riser = round(RISER * self.scale, 3) if wish.riser is None else wish.riser
+        self.tread, self.robots = wish.tread, robots
         self.limit = LIMIT * sqrt(self.scale)
         """Error up to which a robot follows its command [m/s]."""
         self.lost = 0

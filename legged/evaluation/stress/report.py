@@ -13,7 +13,7 @@ from rich.table import Table
 from legged.config import LeggedConfig, override
 from legged.evaluation.episodes import header
 from legged.evaluation.overflows import warn_of_overflows
-from legged.evaluation.stress.measuring import HOLD_S, SETTLE_S, TREAD, Bench, score, settings
+from legged.evaluation.stress.measuring import HOLD_S, SETTLE_S, Bench, Wish, score, settings
 from legged.evaluation.stress.table import NOMINAL
 from legged.evaluation.success import FORWARD, TIME_S
 from legged.figures import figure
@@ -33,16 +33,16 @@ def evaluate_stress(
     policy: TrainedPolicy,
     robots: int,
     full: bool,
-    stairs: tuple[float | None, float | None],
+    wish: Wish,
     asked: list[tuple[str, Any]],
     device: torch.device,
     graph: bool,
     folder: Path,
     where: str = "sim.physics",
 ) -> int:
-    """Run the stress test with `robots` for each line of its table, on steps of that height and width [m], or the usual ones;
-    with `full`, all lines with every setting of the solver. Print it, then write stress_<physics>.json and .png into
-    `folder`. Return the exit code. `where` says who asks for the engine.
+    """Run the stress test with `robots` for each line of its table; with `full`, all lines with every setting of the solver.
+    Print it, then write stress_<physics>.json and .png into `folder`. Return the exit code. `where` says who asks for the
+    engine.
 
     Raises:
         RunError: a file can't be written.
@@ -51,8 +51,7 @@ def evaluate_stress(
     assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
     cfg: Any = override(policy.cfg, asked)
     engine = engine_name(cfg.sim, device, where)
-    riser, tread = stairs
-    bench = Bench(policy, robots, riser, TREAD if tread is None else tread, asked, device, graph)
+    bench = Bench(policy, robots, wish, asked, device, graph)
     print(f"{len(bench.rows)} lines x {robots} robots, in {engine}", flush=True)
     lines = bench.measure(bench.rows)
     ground = {} if bench.on_plane else bench.on_new_ground()
@@ -103,8 +102,8 @@ def rows_of(result: dict[str, Any]) -> list[tuple[str, str, str, dict[str, Any] 
         for line in lines:
             rows.append(("settings", f"{name}: {line['name']}", line["what"], line.get("stairs"), line["flat"]))
     for name, entry in result["ground"].items():
-        what = f"{entry['what']} {entry['size']:g} {entry['unit']}"
-        rows.append(("ground", f"{name.replace('_', ' ')}, {entry['size']:g} {entry['unit']}", what, entry, None))
+        what = f"{entry['what']} {entry['size']:.3g} {entry['unit']}"
+        rows.append(("ground", f"{name.replace('_', ' ')}, {entry['size']:.3g} {entry['unit']}", what, entry, None))
     return rows
 
 

@@ -86,11 +86,13 @@ TOGETHER = ("payload", "friction", "weak motors", "delay 20 ms")
 delay."""
 
 
-def table(robot: Size, anymal: Size) -> tuple[Disturbance, ...]:
+def table(robot: Size, anymal: Size, payload: float | None = None) -> tuple[Disturbance, ...]:
     """Return all lines for a robot of that size: nothing, each alone, some together, everything. `anymal` is the size of the
-    robot that they are written for; numbers that grow have two digits.
+    robot that they are written for; numbers that grow have two digits. A `payload` [kg] takes the place of the table's.
     """
     alone = [scaled(one, robot, anymal) for one in ALONE]
+    if payload is not None:
+        alone = [replace(one, payload=payload) if one.payload else one for one in alone]
     all_but = [one for one in alone if one.name != "delay 40 ms"]
     together = combined("together", [one for one in alone if one.name in TOGETHER])
     return NOMINAL, *alone, together, combined("everything", all_but)

@@ -9,7 +9,7 @@ from helpers import ENGINE, POLICY, TASK, call, kept_global_state, tiny_run
 
 from legged.evaluation import success
 from legged.evaluation.stress import measuring
-from legged.evaluation.stress.measuring import GROUND, STAIRS, Bench
+from legged.evaluation.stress.measuring import GROUND, STAIRS, Bench, Wish
 from legged.evaluation.stress.table import ALONE, Disturbance
 from legged.evaluation.success import FELL, REACHED, STUCK, Scores
 from legged.policies.restore import policy_of
@@ -83,8 +83,9 @@ def test_a_policy_of_a_plane_is_stressed_on_the_flat_only(short, tmp_path):
 
 def test_half_of_a_lines_robots_go_up_and_the_others_down(trained, monkeypatch):
     """Two lines of four robots: of the first, those that go up get out; of the second, those that go down fall."""
-    bench = Bench(policy_of(str(trained)), 4, None, 0.3, ENGINE, torch.device("cpu"), False)
+    bench = Bench(policy_of(str(trained)), 4, Wish(tread=0.3, payload=3.0), ENGINE, torch.device("cpu"), False)
     assert (bench.riser, bench.limit, bench.on_plane) == (0.17, 0.25, False)
+    assert [row.payload for row in bench.rows if row.payload] == [3.0] * 3  # alone, together, everything
     seen = {}
 
     def decide(task, act, robots):
@@ -110,7 +111,7 @@ def test_half_of_a_lines_robots_go_up_and_the_others_down(trained, monkeypatch):
 
 
 def test_robots_take_turns_at_commands_within_the_tasks_grid(trained, monkeypatch):
-    bench = Bench(policy_of(str(trained)), 9, None, 0.28, ENGINE, torch.device("cpu"), False)
+    bench = Bench(policy_of(str(trained)), 9, Wish(), ENGINE, torch.device("cpu"), False)
     seen = {}
 
     def look(task, act, commands):
@@ -136,7 +137,8 @@ def test_robots_take_turns_at_commands_within_the_tasks_grid(trained, monkeypatc
         (["--stress", "--physics", "all"], ["--stress: looks at one engine"]),
         (["--stress", "--tread", "0"], ["--tread: must be between 0.05 and 2 m, got 0"]),
         (["--stress", "--riser", "nan"], ["--riser: must be between 0 and 1 m, got nan"]),
-        (["--riser", "0.1"], ["--riser", "stairs of --stress; add it"]),
+        (["--stress", "--payload", "-1"], ["--payload: must be between 0 and 1000 kg, got -1"]),
+        (["--riser", "0.1"], ["--riser", "is of --stress; add it"]),
         (["--stress", "--robots-per-point", "0"], ["--robots-per-point", "at least 1, got 0"]),
     ],
 )
