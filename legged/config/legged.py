@@ -6,6 +6,7 @@ Defaults are legged_gym's (v1.0.2, arXiv 2109.11978) where it has the field.
 from dataclasses import dataclass, field
 from typing import Literal
 
+from legged.config.actuator import ActuatorConfig
 from legged.config.bounds import (
     LARGEST,
     LONGEST_S,
@@ -153,6 +154,8 @@ class LeggedControlConfig(ControlConfig):
     """Target = action_scale * action + default angle (P) [rad]; one number, or joint-name pattern -> number."""
     held: tuple[str, ...] = field(default=(), metadata=TERMS)
     """Patterns of joints that have no action (P): their motors hold the default angle with the gains that they have."""
+    actuator: ActuatorConfig = field(default_factory=ActuatorConfig)
+    """How the motors differ from ideal ones: torque over speed, friction, delay, learned laws."""
 
 
 @dataclass(frozen=True)

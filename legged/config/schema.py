@@ -4,6 +4,7 @@ A file under `cfg/` states only what differs. The sections of every task are in 
 legged robot that follows commands in legged.py.
 """
 
+from legged.config.actuator import ActuatorConfig
 from legged.config.learning import AlgorithmConfig, PolicyConfig, RunnerConfig, TrainConfig
 from legged.config.legged import (
     STATE_TERMS,
@@ -34,6 +35,7 @@ from legged.config.world import EnvConfig, NewtonSolver, SimConfig
 
 __all__ = [
     "STATE_TERMS",
+    "ActuatorConfig",
     "AlgorithmConfig",
     "CommandCurriculumConfig",
     "CommandRanges",

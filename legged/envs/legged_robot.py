@@ -102,7 +102,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.last_dof_vel = torch.zeros_like(self.dof_vel)
 
         self.pushes = Pushes(cfg.domain_rand, n, self.dt, device, kernels, self.numbers)
-        self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt, kernels)
+        self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt, kernels, self.numbers)
         self.torques, self.default_dof_pos = self.control.torques, self.control.default_dof_pos
         self.command_sampler = Commands(cfg.commands, n, self.dt, device, kernels, self.numbers)
         self.commands, self.is_moving = self.command_sampler.commands, self.command_sampler.is_moving
@@ -293,4 +293,6 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         }
         if self.terrain_curriculum is not None:
             parts["terrain_curriculum"] = self.terrain_curriculum
+        if self.control.actuator is not None:
+            parts["actuator"] = self.control.actuator
         return parts

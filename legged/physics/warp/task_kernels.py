@@ -11,6 +11,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from legged.physics.warp.actuator_kernels import drive_joints
+
 PI = wp.constant(wp.float32(torch.pi))
 
 
@@ -302,6 +304,10 @@ class TaskKernels:
     def hold_joints(self, dim: tuple[int, ...], *arguments: Tensor) -> None:
         """As `Control.compute` of joints that are held by P gains: the last argument is written."""
         self._launch(hold_joints, dim, arguments)
+
+    def drive_joints(self, dim: tuple[int, ...], *arguments: Tensor | float) -> None:
+        """As `Actuator.drive` of joints with P gains: the last argument is written."""
+        self._launch(drive_joints, dim, arguments)
 
     def advance_feet(self, forces: Tensor, *arguments: Tensor | float) -> None:
         """As `FeetContacts.update`."""
