@@ -28,6 +28,7 @@ from legged.config.mdp import (
     RewardsConfig,
     TerminationsConfig,
 )
+from legged.config.sensors import HeightMapConfig
 from legged.config.task import TaskConfig
 
 MOTION = between(-100, 100)
@@ -269,6 +270,8 @@ class LeggedObservationsConfig(ObservationsConfig):
     """Observed heights are relative to this far below the base [m]."""
     heights_limit: float = field(default=1.0, metadata=carried("m", positive(100)))
     """Observed heights are at most this large [m]."""
+    height_map: HeightMapConfig = field(default_factory=HeightMapConfig)
+    """What is wrong with the map of heights, beside the noise of its points."""
 
 
 @dataclass(frozen=True)

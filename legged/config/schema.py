@@ -30,6 +30,7 @@ from legged.config.mdp import (
     RewardsConfig,
     TerminationsConfig,
 )
+from legged.config.sensors import HeightMapConfig
 from legged.config.task import TaskConfig
 from legged.config.world import EnvConfig, NewtonSolver, SimConfig
 
@@ -44,6 +45,7 @@ __all__ = [
     "DomainRandConfig",
     "EnvConfig",
     "EvaluationConfig",
+    "HeightMapConfig",
     "InitStateConfig",
     "LeggedConfig",
     "LeggedControlConfig",
