@@ -128,6 +128,7 @@ class Actuator:
             of = modelled_joints(robot, actuator)
             self.network = ActuatorNetwork(NetworkWeights.load(actuator.network), n, joints, sim_dt, device, kernels)
             self._by_network = torch.tensor([i in of for i in range(joints)], device=device)
+            self._error = torch.zeros(n, joints, device=device)
             self.STATE = (*self.STATE, "past")
 
     @property
@@ -175,7 +176,8 @@ class Actuator:
         target = self.delayed()
         asked = law(target)
         if self.network is not None:
-            asked = torch.where(self._by_network, self.network.torques(target - dof_pos, dof_vel), asked)
+            torch.sub(target, dof_pos, out=self._error)
+            asked = torch.where(self._by_network, self.network.torques(self._error, dof_vel), asked)
         self._limit(asked, dof_vel, out)
         self._steps += 1
 

@@ -141,26 +141,41 @@ class ActuatorNetwork:
             ConfigError: the physics step [s] does not fit the samples that the network was trained on.
         """
         self.kind, self._kernels = weights.kind, kernels
-        self._shape, rows = (num_envs, joints), num_envs * joints
-        between = weights.steps_between(sim_dt)
-        self._position, self._velocity, self._torque = map(float, weights.scales)
+        self._shape, self._rows = (num_envs, joints), num_envs * joints
+        self._every, self._samples = weights.steps_between(sim_dt), weights.samples
+        self._scales = self._position, self._velocity, self._torque = tuple(map(float, weights.scales))
         self._layers = [{name: torch.tensor(array, device=device) for name, array in of.items()} for of in weights.layers]
+        self._hidden = [] if self.kind == "mlp" else [layer["hidden"].shape[1] for layer in self._layers[:-1]]
         if self.kind == "mlp":
-            self._every, self._samples = between, weights.samples
-            kept = between * (weights.samples - 1) + 1
-            self.state = torch.zeros(num_envs, kept, 2, joints, device=device)
-            """(N, steps, 2, D) scaled errors and velocities of the last steps, the newest first; of an LSTM (N, cells, 2, H,
-            D) hidden and cell states."""
+            shape = (self._every * (weights.samples - 1) + 1, 2, joints)
         else:
-            hidden = [layer["hidden"].shape[1] for layer in self._layers[:-1]]
-            self._hidden = hidden
-            self.state = torch.zeros(num_envs, len(hidden), 2, max(hidden), joints, device=device)
-        self._rows = rows
+            shape = (2 * len(self._hidden), max(self._hidden, default=1), joints)
+        self.state = torch.zeros(num_envs, *shape, device=device)
+        """(N, steps, 2, D) scaled errors and velocities of the last steps, the newest first; of an LSTM (N, 2 cells, H, D),
+        the hidden states of each cell and then its cell states.
+        """
+        if kernels is not None:
+            widths = [2 * weights.samples, *(len(layer["bias"]) for layer in weights.layers)]
+            widths[1:-1] = self._hidden or widths[1:-1]
+            self._widths = torch.tensor(widths, dtype=torch.int32, device=device)
+            parts = [
+                of[name].flatten() for of in self._layers for name in ("input", "hidden", "weight", "bias") if name in of
+            ]
+            self._weights = torch.cat(parts)
+            self._scratch = torch.zeros(2, max(widths), self._rows, device=device)
+            self._found = torch.zeros(self._shape, device=device)
 
     def torques(self, error: Tensor, dof_vel: Tensor) -> Tensor:
         """Return torques (N, D) [N m] for errors, target less angle [rad], and velocities [rad/s], (N, D) each, of this
         step.
         """
+        if self._kernels is not None:
+            net = (self._weights, self._widths, self.state, self._scratch, self._found)
+            if self.kind == "mlp":
+                self._kernels.run_mlp(error, dof_vel, *self._scales, self._every, self._samples, *net)
+            else:
+                self._kernels.run_lstm(error, dof_vel, *self._scales, *net)
+            return self._found
         found = self._mlp(error, dof_vel) if self.kind == "mlp" else self._lstm(error, dof_vel)
         return (self._torque * found).view(self._shape)
 
@@ -178,13 +193,13 @@ class ActuatorNetwork:
     def _lstm(self, error: Tensor, dof_vel: Tensor) -> Tensor:
         x = torch.stack([self._position * error, self._velocity * dof_vel]).view(2, self._rows)
         for i, (layer, size) in enumerate(zip(self._layers[:-1], self._hidden, strict=True)):
-            h, c = (self.state[:, i, k, :size].permute(1, 0, 2).reshape(size, self._rows) for k in range(2))
+            h, c = (self.state[:, 2 * i + k, :size].permute(1, 0, 2).reshape(size, self._rows) for k in range(2))
             gates = torch.addmm(torch.addmm(layer["bias"].unsqueeze(1), layer["input"], x), layer["hidden"], h)
             take, keep, new, show = gates.chunk(4)
             c = torch.sigmoid(keep) * c + torch.sigmoid(take) * torch.tanh(new)
             x = torch.sigmoid(show) * torch.tanh(c)
             for k, value in enumerate((x, c)):
-                self.state[:, i, k, :size].copy_(value.view(size, *self._shape).permute(1, 0, 2))
+                self.state[:, 2 * i + k, :size].copy_(value.view(size, *self._shape).permute(1, 0, 2))
         return torch.addmm(self._layers[-1]["bias"].unsqueeze(1), self._layers[-1]["weight"], x)
 
     def reset(self, mask: Tensor) -> None:

@@ -12,6 +12,7 @@ from legged.config.actuator import ActuatorConfig
 from legged.config.legged import LeggedControlConfig
 from legged.errors import ConfigError
 from legged.mdp.actuator import Friction, MotorCurve, is_ideal
+from legged.mdp.actuator_network import NetworkWeights
 from legged.mdp.control import Control
 from legged.mdp.uniform_numbers import UniformNumbers
 from legged.physics.warp.task_kernels import TaskKernels
@@ -187,6 +188,36 @@ def test_kernels_and_torch_agree():
                 torch.testing.assert_close(*found, rtol=0.0, atol=within, equal_nan=True)
                 hits += (found[0].abs() == EFFORT).sum()
         assert hits > 20
+
+
+@pytest.mark.parametrize("kind", ["mlp", "lstm"])
+def test_networks_by_kernels_and_by_torch_agree(kind, tmp_path):
+    random = np.random.default_rng(0)
+
+    def weights(*shape):
+        return random.standard_normal(shape).astype(np.float32) / 2.0
+
+    if kind == "mlp":
+        layers = [{"weight": weights(b, a), "bias": weights(b)} for a, b in ((6, 8), (8, 5), (5, 1))]
+    else:
+        cells = [
+            {"input": weights(4 * b, a), "hidden": weights(4 * b, b), "bias": weights(4 * b)} for a, b in ((2, 6), (6, 4))
+        ]
+        layers = [*cells, {"weight": weights(1, 4), "bias": weights(1)}]
+    scales, samples = np.array([2.0, 0.3, 20.0], np.float32), 3 if kind == "mlp" else 1
+    path = tmp_path / "network.npz"
+    NetworkWeights(kind, 2 * DT if kind == "mlp" else DT, samples, scales, tuple(layers)).save(path)
+    laws = [control(k, network=str(path), joints=("KFE",), delay=(1, 1)) for k in (None, TaskKernels(nullcontext))]
+    state = torch.randn(12, 2, N, D)
+    for k in range(12):
+        for law in laws:
+            law.reset(torch.arange(N) == k)
+            law.set_actions(0.3 * state[k - 1, 0])
+        for _ in range(4):
+            found = [law.compute(0.3 * state[k, 0], state[k, 1]) for law in laws]
+            torch.testing.assert_close(*found, rtol=1e-5, atol=1e-4)
+    assert found[0].std() > 1.0
+    torch.testing.assert_close(*(law.actuator.past for law in laws), rtol=1e-5, atol=1e-5)
 
 
 def test_ideal_motors_are_the_control_law_itself():

@@ -12,6 +12,7 @@ import warp as wp
 from torch import Tensor
 
 from legged.physics.warp.actuator_kernels import drive_joints
+from legged.physics.warp.network_kernels import run_lstm, run_mlp
 
 PI = wp.constant(wp.float32(torch.pi))
 
@@ -308,6 +309,14 @@ class TaskKernels:
     def drive_joints(self, dim: tuple[int, ...], *arguments: Tensor | float) -> None:
         """As `Actuator.drive` of joints with P gains: the last argument is written."""
         self._launch(drive_joints, dim, arguments)
+
+    def run_mlp(self, error: Tensor, *arguments: Tensor | float) -> None:
+        """As `ActuatorNetwork.torques` of an MLP: the last argument is written."""
+        self._launch(run_mlp, tuple(error.shape), (error, *arguments))
+
+    def run_lstm(self, error: Tensor, *arguments: Tensor | float) -> None:
+        """The same of an LSTM."""
+        self._launch(run_lstm, tuple(error.shape), (error, *arguments))
 
     def advance_feet(self, forces: Tensor, *arguments: Tensor | float) -> None:
         """As `FeetContacts.update`."""
