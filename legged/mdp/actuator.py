@@ -111,8 +111,8 @@ class Actuator:
         self._has_friction = bool(self.friction.coulomb.any() | self.friction.extra.any() | self.friction.viscous.any())
         self._has_curve = actuator.model == "dc_motor"
         low, high = actuator.delay
-        self.longest = high
-        """Longest delay, in physics steps."""
+        self.shortest, self.longest = low, high
+        """Range of the delay, in physics steps."""
         kept = 1 + math.ceil(high / cfg.decimation)
         self.targets = middle.expand(kept, n, joints).clone()
         """(K, N, D) targets of this control step and of those before."""
@@ -130,6 +130,21 @@ class Actuator:
             self._by_network = torch.tensor([i in of for i in range(joints)], device=device)
             self._error = torch.zeros(n, joints, device=device)
             self.STATE = (*self.STATE, "past")
+
+    def describe(self, joint: int) -> str:
+        """Return what is not ideal about the motor of a joint, in a few words."""
+        curve, friction, parts = self.curve, self.friction, []
+        if self.network is not None and bool(self._by_network[joint]):
+            parts.append(f"torque by a network ({self.network.kind})")
+        stall, fastest = float(curve.stall_torque[joint]), float(curve.no_load_speed[joint])
+        if math.isfinite(fastest):
+            parts.append(f"{stall:g} N m at rest, none at {fastest:g} rad/s")
+        dry, extra, viscous = (float(of[joint]) for of in (friction.coulomb, friction.extra, friction.viscous))
+        if dry or extra or viscous:
+            parts.append(f"friction {dry:g} N m ({dry + extra:g} to break away) + {viscous:g} N m s/rad")
+        if self.longest:
+            parts.append(f"delay {self.shortest} to {self.longest} physics steps")
+        return ", ".join(parts) or "ideal motor"
 
     @property
     def past(self) -> Tensor:

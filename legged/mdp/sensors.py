@@ -47,6 +47,7 @@ class Sensors:
         self.noise = {name: noise.get(name, 0.0) for name in self.names}
         """Term -> half width of the noise that is added here, in the term's unit."""
         self._source, self._map = source, height_map
+        self._shares, self._delays = (bias, dropped), delay
         num_envs, device = source.values.shape[0], source.values.device
         columns = [i for name in self.names for i in range(source.columns[name].start, source.columns[name].stop)]
         widths = [source.columns[name].stop - source.columns[name].start for name in self.names]
@@ -114,6 +115,17 @@ class Sensors:
         if self._lost_drawn is not None:
             now = torch.where(self._lost(), self.held, now)
         self._show(now)
+
+    def describe(self, name: str) -> str:
+        """Return what is wrong with a measured term, in a few words."""
+        bias, lost = (table.get(name, 0.0) for table in self._shares)
+        low, high = self._delays.get(name, (0, 0))
+        parts = [f"+-{self.noise[name]:.6g}"] if self.noise[name] else []
+        parts += [f"bias +-{bias:.6g}"] if bias else []
+        parts += [f"delay {low} to {high} steps"] if high else []
+        parts += [f"dropped {lost:.3g}"] if lost else []
+        parts += ["map with errors"] if self._map is not None and name == HEIGHTS else []
+        return ", ".join(parts)
 
     def parts(self) -> dict[str, "Sensors | HeightMapErrors"]:
         """Return what has a state, by name."""
