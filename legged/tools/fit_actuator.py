@@ -13,6 +13,7 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -132,11 +133,17 @@ def _write(folder: Path, log: ActuatorLog, drive: Drive, judged: dict[str, dict[
         RunError: the files can't be written.
     """
     make_folder(folder)
-    section = {"control": {"actuator": actuator_section(log, drive, log.dt)}}
+    control: dict[str, Any] = {"actuator": actuator_section(log, drive, log.dt)}
+    if log.stiffness is None or log.damping is None:  # gains that the log does not state are part of the fit
+        gains = (("stiffness", drive.stiffness), ("damping", drive.damping))
+        control |= {name: {joint: float(f"{gain:.4g}") for joint in log.joint_names} for name, gain in gains}
     told = "# Fitted by legged.tools.fit_actuator: to be laid into the YAML of a task\n"
-    write_text(folder / "actuator.yaml", told + yaml.safe_dump(section, sort_keys=False, default_flow_style=None, width=120))
+    write_text(
+        folder / "actuator.yaml",
+        told + yaml.safe_dump({"control": control}, sort_keys=False, default_flow_style=None, width=120),
+    )
     numbers = {name: value if np.isfinite(value) else None for name, value in vars(drive).items()}
-    facts = {"joints": list(log.joint_names), "dt": log.dt, "drive": numbers, "held_out": judged}
+    facts = {"joints": list(log.joint_names), "sim_dt": log.dt, "drive": numbers, "held_out": judged}
     write_text(folder / "fit.json", json.dumps(facts, indent=1))
 
 
