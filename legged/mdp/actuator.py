@@ -36,19 +36,19 @@ def is_ideal(cfg: ActuatorConfig) -> bool:
 class MotorCurve:
     """Between what torques the motors of D joints can choose at a velocity."""
 
-    def __init__(self, stall_torque: Tensor, no_load_speed: Tensor, effort: Tensor) -> None:
-        """Take what a motor gives at rest [N m], at what speed it gives nothing [rad/s], and what the joint bears [N m], (D,)
-        each. An infinite no-load speed makes a motor ideal.
+    def __init__(self, stall_torque: Tensor, no_load_speed: Tensor) -> None:
+        """Take what a motor gives at rest [N m] and at what speed it gives nothing [rad/s], (D,) each. An infinite no-load
+        speed makes a motor ideal.
         """
-        self.stall_torque, self.no_load_speed, self.effort = stall_torque, no_load_speed, effort
-        self.fastest = no_load_speed * (1.0 + torch.nan_to_num(effort / stall_torque, nan=1.0))
-        """(D,) speed beyond which the limits change no more: both are the effort limit against the motion [rad/s]."""
+        self.stall_torque, self.no_load_speed = stall_torque, no_load_speed
 
-    def limits(self, dof_vel: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the lowest and the highest torque (N, D) [N m] at velocities (N, D) [rad/s]."""
-        share = torch.minimum(torch.maximum(dof_vel, -self.fastest), self.fastest) / self.no_load_speed
-        high = torch.minimum(self.stall_torque * (1.0 - share), self.effort)
-        low = torch.maximum(self.stall_torque * (-1.0 - share), -self.effort)
+    def limits(self, dof_vel: Tensor, effort: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the lowest and the highest torque (N, D) [N m] at velocities (N, D) [rad/s], where joints bear `effort`,
+        (D,) or (N, D) [N m].
+        """
+        share = dof_vel / self.no_load_speed
+        high = torch.minimum(torch.maximum(self.stall_torque * (1.0 - share), -effort), effort)
+        low = torch.maximum(torch.minimum(self.stall_torque * (-1.0 - share), effort), -effort)
         return low, high
 
 
@@ -102,9 +102,11 @@ class Actuator:
         def tensor(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
-        self.decimation, self._middle, self._kernels = cfg.decimation, middle, kernels
+        self.decimation, self._kernels = cfg.decimation, kernels
+        self.middle = middle
+        """(D,), (N, D) or () the target of action 0."""
         stall, fastest = map(tensor, motor_numbers(robot, actuator))
-        self.curve = MotorCurve(stall, fastest, tensor(robot.torque_limits))
+        self.curve = MotorCurve(stall, fastest)
         coulomb, breakaway, viscous = map(tensor, friction_numbers(robot, actuator))
         speeds = (actuator.stribeck_velocity, actuator.friction_smoothing)
         self.friction = Friction(coulomb, breakaway, viscous, *speeds)
@@ -172,20 +174,20 @@ class Actuator:
         dof_vel: Tensor,
         law: Callable[[Tensor], Tensor],
         gains: tuple[Tensor, Tensor] | None,
+        effort: Tensor,
         out: Tensor,
     ) -> None:
         """Write to `out` the torques (N, D) of one physics step at joint angles [rad] and velocities [rad/s], (N, D) each.
         `law` makes of targets the torques that are asked for; where it is the P law, `gains` are its stiffness and damping.
+        Joints bear `effort` [N m]; it and gains are (D,) or (N, D).
         """
         if self._kernels is not None and gains is not None and self.network is None:
             curve, friction = self.curve, self.friction
-            self._kernels.drive_joints(
-                tuple(out.shape),
-                *(self.targets, self.delay, self._steps, self.decimation, dof_pos, dof_vel, *gains),
-                *(curve.effort, curve.stall_torque, curve.no_load_speed, curve.fastest),
-                *(friction.coulomb, friction.extra, friction.viscous, friction.stribeck_velocity, friction.smoothing),
-                *(self._has_friction, out),
-            )
+            by_robot = (each.expand_as(out) for each in (*gains, effort))
+            now: tuple[Tensor | float, ...] = (self.targets, self.delay, self._steps, self.decimation, dof_pos, dof_vel)
+            rough = (friction.coulomb, friction.extra, friction.viscous, friction.stribeck_velocity, friction.smoothing)
+            motor = (curve.stall_torque, curve.no_load_speed)
+            self._kernels.drive_joints(tuple(out.shape), *now, *by_robot, *motor, *rough, self._has_friction, out)
             self._steps += 1
             return
         target = self.delayed()
@@ -193,14 +195,13 @@ class Actuator:
         if self.network is not None:
             torch.sub(target, dof_pos, out=self._error)
             asked = torch.where(self._by_network, self.network.torques(self._error, dof_vel), asked)
-        self._limit(asked, dof_vel, out)
+        self._limit(asked, dof_vel, effort, out)
         self._steps += 1
 
-    def _limit(self, asked: Tensor, dof_vel: Tensor, out: Tensor) -> None:
+    def _limit(self, asked: Tensor, dof_vel: Tensor, effort: Tensor, out: Tensor) -> None:
         """Write to `out` what motors give of the torques that are asked for, less friction, (N, D) each."""
-        effort = self.curve.effort
         if self._has_curve:
-            low, high = self.curve.limits(dof_vel)
+            low, high = self.curve.limits(dof_vel, effort)
             asked = torch.minimum(torch.maximum(asked, low), high)
         elif self._has_friction:
             asked = torch.clamp(asked, -effort, effort)
@@ -218,7 +219,7 @@ class Actuator:
             else:
                 masked_set_(self.delay, mask, drawn)
         if self.longest:
-            torch.where(mask.view(1, -1, 1), self._middle, self.targets, out=self.targets)
+            torch.where(mask.view(1, -1, 1), self.middle, self.targets, out=self.targets)
         if self.network is not None:
             self.network.reset(mask)
 

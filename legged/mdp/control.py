@@ -95,7 +95,8 @@ class Control:
         """Compute torques (N, D) [N m] at joint angles [rad] and velocities [rad/s], each (N, D), for one physics step."""
         if self.actuator is not None:
             of_law = (self.stiffness, self.damping) if self.control_type == "P" else None
-            self.actuator.drive(dof_pos, dof_vel, partial(self._law, dof_pos, dof_vel), of_law, self.torques)
+            law = partial(self._law, dof_pos, dof_vel)
+            self.actuator.drive(dof_pos, dof_vel, law, of_law, self.torque_limits, self.torques)
             return self.torques
         if self.control_type == "P" and self._kernels is not None:
             gains = (self.stiffness, self.damping, self.torque_limits)

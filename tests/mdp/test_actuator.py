@@ -53,8 +53,8 @@ def full(value: float) -> torch.Tensor:
     ],
 )
 def test_a_motor_gives_less_the_faster_it_turns(speed, low, high):
-    curve = MotorCurve(torch.tensor([120.0]), torch.tensor([7.5]), torch.tensor([80.0]))
-    found = curve.limits(torch.tensor([[speed]]))
+    curve = MotorCurve(torch.tensor([120.0]), torch.tensor([7.5]))
+    found = curve.limits(torch.tensor([[speed]]), torch.tensor([80.0]))
     assert [limit.item() for limit in found] == pytest.approx([low, high], abs=1e-4)
 
 

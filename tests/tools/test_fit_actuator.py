@@ -9,6 +9,7 @@ import yaml
 from helpers import call, small_task
 from simulated_motor import TRUTH, simulated_log
 
+from legged.config import load_config
 from legged.errors import ConfigError
 from legged.mdp.actuator import Friction, MotorCurve
 from legged.mdp.actuator_network import NetworkWeights
@@ -66,9 +67,9 @@ def test_a_limit_that_the_log_does_not_reach_is_not_invented(tmp_path):
 def test_the_drive_is_the_actuator_of_the_task():
     drive = Drive(50.0, 2.0, 1.0, 1.5, 0.2, 0.3, 40.0, 12.0, 35.0)
     velocity, error = np.linspace(-20.0, 20.0, 101), np.linspace(1.0, -1.0, 101)
-    one = [torch.tensor([value]) for value in (40.0, 12.0, 35.0)]
+    stall, fastest, effort = (torch.tensor([value]) for value in (40.0, 12.0, 35.0))
     speeds = torch.tensor(velocity, dtype=torch.float32).unsqueeze(1)
-    low, high = MotorCurve(*one).limits(speeds)
+    low, high = MotorCurve(stall, fastest).limits(speeds, effort)
     asked = torch.tensor(50.0 * error - 2.0 * velocity, dtype=torch.float32).unsqueeze(1)
     friction = Friction(*[torch.tensor([v]) for v in (1.0, 1.5, 0.3)], 0.2, SMOOTHING)
     wanted = torch.minimum(torch.maximum(asked, low), high) - friction.torques(speeds)
@@ -147,6 +148,17 @@ def test_a_network_in_a_task_gives_what_the_fit_says_of_it(tmp_path):
         x = torch.nn.functional.softsign(x) if i < 3 else x
     wanted = (x[..., 0] * float(weights.scales[2])).clamp(-80.0, 80.0)
     torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
+
+
+def test_the_file_is_looked_for_beside_the_yaml_that_names_it(tmp_path, monkeypatch):
+    layers = ({"weight": np.zeros((1, 2), np.float32), "bias": np.ones(1, np.float32)},)
+    (tmp_path / "mine").mkdir()
+    NetworkWeights("mlp", 0.005, 1, np.ones(3, np.float32), layers).save(tmp_path / "mine" / "ones.npz")
+    (tmp_path / "mine" / "own.yaml").write_text("extends: anymal_c_flat\ncontrol: {actuator: {network: ones.npz}}\n")
+    cfg = load_config(tmp_path / "mine" / "own.yaml", "own")
+    assert cfg.control.actuator.network == str(tmp_path / "mine" / "ones.npz")
+    cfg = load_config(tmp_path / "mine" / "own.yaml", "own", [("control.actuator.network", "mine/ones.npz")])
+    assert cfg.control.actuator.network == str(tmp_path / "mine" / "ones.npz")
 
 
 def test_an_lstm_in_a_task_is_torchs():

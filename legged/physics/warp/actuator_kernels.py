@@ -28,12 +28,11 @@ def drive_joints(
     decimation: int,
     dof_pos: wp.array2d[float],
     dof_vel: wp.array2d[float],
-    stiffness: wp.array[float],
-    damping: wp.array[float],
-    effort: wp.array[float],
+    stiffness: wp.array2d[float],
+    damping: wp.array2d[float],
+    effort: wp.array2d[float],
     stall_torque: wp.array[float],
     no_load_speed: wp.array[float],
-    fastest: wp.array[float],
     coulomb: wp.array[float],
     extra: wp.array[float],
     viscous: wp.array[float],
@@ -47,12 +46,12 @@ def drive_joints(
     late = wp.max(delay[robot] - step, 0)
     age = wp.min((late + decimation - 1) // decimation, targets.shape[0] - 1)
     velocity = dof_vel[robot, joint]
-    spring = stiffness[joint] * (targets[age, robot, joint] - dof_pos[robot, joint])
-    torque = spring - damping[joint] * velocity
-    limit, stall = effort[joint], stall_torque[joint]
-    share = below(above(velocity, -fastest[joint]), fastest[joint]) / no_load_speed[joint]
-    torque = above(torque, above(stall * (-1.0 - share), -limit))
-    torque = below(torque, below(stall * (1.0 - share), limit))
+    spring = stiffness[robot, joint] * (targets[age, robot, joint] - dof_pos[robot, joint])
+    torque = spring - damping[robot, joint] * velocity
+    limit, stall = effort[robot, joint], stall_torque[joint]
+    share = velocity / no_load_speed[joint]
+    torque = above(torque, above(below(stall * (-1.0 - share), limit), -limit))
+    torque = below(torque, below(above(stall * (1.0 - share), -limit), limit))
     if has_friction:
         slow = wp.exp(-((velocity / stribeck_velocity) * (velocity / stribeck_velocity)))
         resistance = (coulomb[joint] + extra[joint] * slow) * wp.tanh(velocity / smoothing) + viscous[joint] * velocity
