@@ -76,6 +76,9 @@ def _observations(task: BaseTask) -> Iterator[str]:
             scales = term.scale.tolist()
             scales = scales[:1] if len(set(scales)) == 1 else scales
             noise = f"+-{_number(term.noise)}" if term.noise else "-"
+            sensors = task.observation_terms.sensors if task.cfg.observations.groups[name].noise else None
+            if sensors is not None and term.name in sensors.names:
+                noise = sensors.describe(term.name)
             columns = f"{term.columns.start}:{term.columns.stop}"
             rows.append((columns, term.name, ", ".join(map(_number, scales)), noise, _says(task, f"_obs_{term.name}")))
         steps = f" x {group.history} steps, oldest first" if group.history > 1 else ""
@@ -137,7 +140,8 @@ def _effect(task: BaseTask, i: int) -> str:
     else:
         target = f"{'velocity' if law.control_type == 'V' else 'torque'} {scales[i]:g} a"
     gains = "" if law.control_type == "T" else f", stiffness {p:g}, damping {d:g}"
-    return f"{joint}: {target}{gains}, torque at most {limit:g} N m"
+    motor = "" if control.actuator is None else f"; {control.actuator.describe(i)}"
+    return f"{joint}: {target}{gains}, torque at most {limit:g} N m{motor}"
 
 
 def _joints(task: BaseTask) -> Iterator[str]:

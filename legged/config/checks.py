@@ -131,7 +131,7 @@ def _check(kind: Any, value: Any, path: str, origins: Origins, source: str) -> A
         if len(value) != len(args):
             raise fail(f"a list of {len(args)} numbers")
         checked = tuple(_check(args[i], v, f"{path}[{i}]", origins, source) for i, v in enumerate(value))
-        if args == (float, float) and checked[0] > checked[1]:
+        if args in ((float, float), (int, int)) and checked[0] > checked[1]:
             raise fail("[low, high] with low <= high")
         return checked
     if origin is dict:

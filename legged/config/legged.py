@@ -6,6 +6,7 @@ Defaults are legged_gym's (v1.0.2, arXiv 2109.11978) where it has the field.
 from dataclasses import dataclass, field
 from typing import Literal
 
+from legged.config.actuator import ActuatorConfig
 from legged.config.bounds import (
     LARGEST,
     LONGEST_S,
@@ -27,6 +28,7 @@ from legged.config.mdp import (
     RewardsConfig,
     TerminationsConfig,
 )
+from legged.config.sensors import HeightMapConfig
 from legged.config.task import TaskConfig
 
 MOTION = between(-100, 100)
@@ -153,6 +155,8 @@ class LeggedControlConfig(ControlConfig):
     """Target = action_scale * action + default angle (P) [rad]; one number, or joint-name pattern -> number."""
     held: tuple[str, ...] = field(default=(), metadata=TERMS)
     """Patterns of joints that have no action (P): their motors hold the default angle with the gains that they have."""
+    actuator: ActuatorConfig = field(default_factory=ActuatorConfig)
+    """How the motors differ from ideal ones: torque over speed, friction, delay, learned laws."""
 
 
 @dataclass(frozen=True)
@@ -266,6 +270,8 @@ class LeggedObservationsConfig(ObservationsConfig):
     """Observed heights are relative to this far below the base [m]."""
     heights_limit: float = field(default=1.0, metadata=carried("m", positive(100)))
     """Observed heights are at most this large [m]."""
+    height_map: HeightMapConfig = field(default_factory=HeightMapConfig)
+    """What is wrong with the map of heights, beside the noise of its points."""
 
 
 @dataclass(frozen=True)

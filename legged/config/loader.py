@@ -164,6 +164,7 @@ def _merged(
         for section in (data, data.get("cpu", {})):
             if "robot" in section:
                 section["robot"] = robot_path(section["robot"], layer.folder)
+            actuator_path(section, layer.folder)
         parts.append((layer, data))
     if robot is None:
         asked = [data.get("cpu", {}).get("robot") for _, data in parts if on_cpu], [data.get("robot") for _, data in parts]
@@ -225,6 +226,17 @@ def robot_path(robot: Any, folder: Path) -> Any:
         if exists(path / "robot.yaml"):
             return str(path.resolve())
     return str((folder / robot).absolute()) if robot.startswith(".") or "/" in robot else robot
+
+
+def actuator_path(section: Any, folder: Path) -> None:
+    """Make the file of a learned actuator, which a file in `folder` names in a section, an absolute path: it lies beside that
+    file, or else in the working directory.
+    """
+    for key in ("control", "actuator"):
+        section = section.get(key) if isinstance(section, Mapping) else None
+    name = section.get("network") if isinstance(section, dict) else None
+    if isinstance(name, str) and name:
+        section["network"] = str((folder / name if exists(folder / name) else Path.cwd() / name).absolute())
 
 
 def parse_override(text: str) -> tuple[str, Any]:
@@ -291,6 +303,7 @@ def _merge_overrides(
         layer = nest(key, robot_path(value, Path.cwd()) if key == "robot" else copy.deepcopy(value))
         layer = renamed(layer, "command line")
         build(schema, layer, "", Origins(), "command line")
+        actuator_path(layer, Path.cwd())
         merge(data, layer, "command line", origins)
 
 

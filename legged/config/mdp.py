@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass, field
 
-from legged.config.bounds import LARGEST, NAMES, TERMS, between, carried_by_entry, positive
+from legged.config.actuator import LONGEST_DELAY, Steps
+from legged.config.bounds import LARGEST, NAMES, TERMS, UNIT, between, carried_by_entry, carried_by_term, positive
 
 Range = tuple[float, float]
 
@@ -75,5 +76,12 @@ class ObservationsConfig:
     """Factor on all noise."""
     noise: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
     """Term -> half width of its uniform noise, in the term's unit before scaling."""
+    bias: dict[str, float] = field(default_factory=dict, metadata=carried_by_term("_obs_", 1, between(0, LARGEST)))
+    """Term -> half width of the error of each of its numbers that stays for an episode, in the term's unit before scaling.
+    Bias, delay and lost packets are seen by the groups that have noise, and only while `add_noise` is on."""
+    delay: dict[str, Steps] = field(default_factory=dict, metadata=between(0, LONGEST_DELAY))
+    """Term -> range from which each robot's delay is drawn for an episode, in control steps."""
+    dropped: dict[str, float] = field(default_factory=dict, metadata=UNIT)
+    """Term -> share of the control steps in which it does not arrive: the numbers of the step before are seen again."""
     clip: float = field(default=100.0, metadata=positive(LARGEST))
     """Scaled observations are clipped at plus and minus this."""

@@ -4,6 +4,7 @@ A file under `cfg/` states only what differs. The sections of every task are in 
 legged robot that follows commands in legged.py.
 """
 
+from legged.config.actuator import ActuatorConfig
 from legged.config.learning import AlgorithmConfig, PolicyConfig, RunnerConfig, TrainConfig
 from legged.config.legged import (
     STATE_TERMS,
@@ -29,11 +30,13 @@ from legged.config.mdp import (
     RewardsConfig,
     TerminationsConfig,
 )
+from legged.config.sensors import HeightMapConfig
 from legged.config.task import TaskConfig
 from legged.config.world import EnvConfig, NewtonSolver, SimConfig
 
 __all__ = [
     "STATE_TERMS",
+    "ActuatorConfig",
     "AlgorithmConfig",
     "CommandCurriculumConfig",
     "CommandRanges",
@@ -42,6 +45,7 @@ __all__ = [
     "DomainRandConfig",
     "EnvConfig",
     "EvaluationConfig",
+    "HeightMapConfig",
     "InitStateConfig",
     "LeggedConfig",
     "LeggedControlConfig",

@@ -16,6 +16,7 @@ from torch import Tensor
 from legged.config.schema import TaskConfig
 from legged.envs.actions import as_actions, ordinary_tensors
 from legged.envs.checks import check_task
+from legged.envs.observing import ObservingTask
 from legged.envs.saved import SavedTask
 from legged.envs.step_watchers import StepWatcher
 from legged.errors import ConfigError
@@ -34,7 +35,7 @@ from legged.process.ranks import Ranks
 from legged.process.startup import stage_ended
 
 
-class BaseTask(SavedTask, VecEnv):
+class BaseTask(ObservingTask, SavedTask, VecEnv):
     """N environments on one device. A subclass says what the world is (`make_scene`), how an episode begins (`draw_reset`)
     and which terms there are; the rest are hooks.
     """
@@ -173,6 +174,7 @@ class BaseTask(SavedTask, VecEnv):
         # Those of the largest group first, so that it finds them side by side.
         in_order = [name for group in sorted(groups.values(), key=lambda g: -len(g.terms)) for name in group.terms]
         self.observation_terms = ObservationTerms(self._methods("_obs_", dict.fromkeys(in_order)))
+        self.observation_terms.sensors = self.make_sensors()
         self.observation_groups: dict[str, ObservationGroup] = {name: self._group(name) for name in groups}
         self.faults = Faults(self.rewards.names, self.observation_terms, self.num_envs, device)  # type: ignore[arg-type]
         metrics = self._methods("_metric_", sorted(self.terms("_metric_")))
@@ -186,19 +188,6 @@ class BaseTask(SavedTask, VecEnv):
     def active_terminations(self) -> tuple[list[str], list[str]]:
         """Return the failures and the time-outs that can happen."""
         return list(self.cfg.terminations.failures), list(self.cfg.terminations.time_outs)
-
-    def observation_scales(self) -> dict[str, Any]:
-        """Return the factor on each term, a number or one for each of its columns; 1 for those that are missing."""
-        return dict(self.cfg.observations.scales)
-
-    def _group(self, name: str) -> ObservationGroup:
-        """Make the observation group `name`."""
-        cfg = self.cfg.observations
-        group = cfg.groups[name]
-        noisy = group.noise and cfg.add_noise
-        noise = {term: half * cfg.noise_level for term, half in cfg.noise.items()} if noisy else {}
-        terms, scales = self.observation_terms, self.observation_scales()
-        return ObservationGroup(terms, group.terms, scales, noise, cfg.clip, group.history, self.numbers)
 
     def _build_graph(self, enabled: bool) -> None:
         """Capture the step (on a GPU) or check that it could be (on the CPU), then start all episodes anew."""
@@ -309,7 +298,7 @@ class BaseTask(SavedTask, VecEnv):
 
     def observe(self) -> None:
         """Write the observation groups."""
-        self.observation_terms.evaluate()
+        self.observation_terms.evaluate(self.reset_buf)
         with self._beside.fork():
             self.faults.check_observations()
         for group in self.observation_groups.values():

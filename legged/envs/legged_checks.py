@@ -5,6 +5,7 @@ from typing import Any
 from legged.config.schema import LeggedConfig
 from legged.envs.checks import check_mirror_kinds
 from legged.errors import ConfigError
+from legged.mdp.actuator import check_actuator
 from legged.mdp.control import acted_joints, action_scales, control_gains
 from legged.mdp.mirror_images import mirror_of_actions
 from legged.robots.robot import Robot
@@ -25,6 +26,7 @@ def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     control_gains(robot, cfg.control, cfg.origins.where)
     check_passive(cfg, robot)
     action_scales(robot, cfg.control, cfg.origins.where)
+    check_actuator(robot, cfg.control, cfg.sim.dt, cfg.origins.where)
     check_terrain(cfg.terrain, cfg.origins)
     check_base_mass(cfg, robot)
     check_points(cfg)

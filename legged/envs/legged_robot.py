@@ -17,6 +17,7 @@ from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts, contact_force
 from legged.mdp.control import Control, acted_joints
+from legged.mdp.height_map_errors import HeightMapErrors, is_exact
 from legged.mdp.height_scan import HeightScan
 from legged.mdp.mirror_images import MirrorImages
 from legged.mdp.randomization import Pushes, RobotRandomization
@@ -102,7 +103,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.last_dof_vel = torch.zeros_like(self.dof_vel)
 
         self.pushes = Pushes(cfg.domain_rand, n, self.dt, device, kernels, self.numbers)
-        self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt, kernels)
+        self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt, kernels, self.numbers)
         self.torques, self.default_dof_pos = self.control.torques, self.control.default_dof_pos
         self.command_sampler = Commands(cfg.commands, n, self.dt, device, kernels, self.numbers)
         self.commands, self.is_moving = self.command_sampler.commands, self.command_sampler.is_moving
@@ -173,6 +174,15 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         lin, ang = scales.get("base_lin_vel", 1.0), scales.get("base_ang_vel", 1.0)
         scales.setdefault("commands", [lin, lin, ang])
         return scales
+
+    def make_height_map(self) -> HeightMapErrors | None:
+        cfg = self.cfg.observations.height_map
+        if is_exact(cfg):
+            return None
+        scan = self.height_scan
+        if cfg.shift or cfg.shift_drift:
+            scan = HeightScan(self.cfg.terrain, self.terrain, self.num_envs, self.device, self.physics.kernels)  # type: ignore[arg-type]
+        return HeightMapErrors(cfg, scan, (self.base_pos, self.base_quat), self.heights_seen, self.dt, self.numbers)
 
     def mirror_images(self) -> MirrorImages | None:
         mirror, points = self.robot.mirror, self.height_scan.points
@@ -250,7 +260,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         `heading` (N,) [rad] and in heading mode, the yaw rate steers towards it instead.
         """
         self.command_sampler.hold(commands, heading)
-        self.observation_terms.evaluate()
+        self.observation_terms.evaluate(self.episode_length_buf == 0, again=True)
         for group in self.observation_groups.values():
             group.compute()
             group.restart(self.episode_length_buf == 0)
@@ -293,4 +303,6 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         }
         if self.terrain_curriculum is not None:
             parts["terrain_curriculum"] = self.terrain_curriculum
+        if self.control.actuator is not None:
+            parts["actuator"] = self.control.actuator
         return parts

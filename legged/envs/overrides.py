@@ -135,7 +135,7 @@ def named_terms(cfg: TaskConfig) -> list[tuple[str, str, str]]:
     named = [("_reward_", name, f"rewards.scales.{name}") for name in cfg.rewards.scales]
     for group, content in cfg.observations.groups.items():
         named += [("_obs_", name, f"observations.groups.{group}.terms") for name in content.terms]
-    for part in ("scales", "noise"):
+    for part in ("scales", "noise", "bias", "delay", "dropped"):
         named += [("_obs_", name, f"observations.{part}.{name}") for name in getattr(cfg.observations, part)]
     for part in ("failures", "time_outs"):
         named += [("_terminate_", name, f"terminations.{part}") for name in getattr(cfg.terminations, part)]

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from legged.mdp.faults import Faults
-from legged.mdp.observations import ObservationGroup
+from legged.mdp.observations import ObservationGroup, ObservationTerms
 from legged.mdp.randomization import Randomization
 from legged.mdp.rewards import Rewards
 from legged.physics import Physics
@@ -22,6 +22,7 @@ class SavedTask:
     rewards: Rewards
     faults: Faults
     observation_groups: dict[str, ObservationGroup]
+    observation_terms: ObservationTerms
 
     def progress(self) -> dict[str, Any]:
         """Return how far the curricula have got: what every checkpoint holds, whatever the number of environments."""
@@ -37,6 +38,7 @@ class SavedTask:
             "randomization": self.randomization,
             "rewards": self.rewards,
             **{f"observations_{name}": group for name, group in self.observation_groups.items()},
+            **(sensors.parts() if (sensors := self.observation_terms.sensors) is not None else {}),
         }
 
     def state_dict(self) -> dict[str, Any]:

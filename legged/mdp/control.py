@@ -1,6 +1,7 @@
 """Action -> joint torque."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,8 @@ from torch import Tensor
 from legged.config.schema import LeggedControlConfig
 from legged.errors import ConfigError
 from legged.math import masked_set_
+from legged.mdp.actuator import Actuator, is_ideal
+from legged.mdp.uniform_numbers import UniformNumbers
 from legged.robots.patterns import match_names, match_values
 from legged.robots.robot import Robot
 
@@ -36,9 +39,10 @@ class Control:
         torques: Tensor,
         sim_dt: float,
         kernels: "TaskKernels | None" = None,
+        numbers: UniformNumbers | None = None,
     ) -> None:
         """Write torques to `torques` (N, D), the physics' own tensor, which takes their device along. Gains come
-        from `cfg` if it names any, else from the robot.
+        from `cfg` if it names any, else from the robot. Delays of targets are drawn from `numbers`.
 
         Raises:
             ConfigError: a pattern that matches no joint, a joint without a gain or scale, or joints held without P.
@@ -65,9 +69,18 @@ class Control:
         self._target = torch.zeros_like(self.torques)  # joint angles, velocities or torques
         self._columns = None if len(self.acted) == robot.num_dof else torch.tensor(self.acted, device=torques.device)
         self._last_dof_vel = torch.zeros_like(self.torques)
+        self.actuator: Actuator | None = None
+        """What motors do that are not ideal."""
+        if not is_ideal(cfg.actuator):
+            middle = self.default_dof_pos if cfg.control_type == "P" else self._zero
+            drawn = numbers or UniformNumbers(len(torques), torques.device)
+            self.actuator = Actuator(robot, cfg, middle, (len(torques), robot.num_dof), sim_dt, drawn, kernels)
+            self._target = self.actuator.newest
 
     def set_actions(self, actions: Tensor) -> None:
         """Take the actions (N, A) that the following calls of `compute` realise."""
+        if self.actuator is not None:
+            self.actuator.advance()
         middle = self.default_dof_pos if self.control_type == "P" else self._zero
         if self._columns is None and isinstance(self.action_scale, float):
             torch.add(middle, actions, alpha=self.action_scale, out=self._target)
@@ -80,25 +93,36 @@ class Control:
 
     def compute(self, dof_pos: Tensor, dof_vel: Tensor) -> Tensor:
         """Compute torques (N, D) [N m] at joint angles [rad] and velocities [rad/s], each (N, D), for one physics step."""
+        if self.actuator is not None:
+            of_law = (self.stiffness, self.damping) if self.control_type == "P" else None
+            law = partial(self._law, dof_pos, dof_vel)
+            self.actuator.drive(dof_pos, dof_vel, law, of_law, self.torque_limits, self.torques)
+            return self.torques
         if self.control_type == "P" and self._kernels is not None:
             gains = (self.stiffness, self.damping, self.torque_limits)
             shape = tuple(self.torques.shape)
             self._kernels.hold_joints(shape, self._target, dof_pos, dof_vel, *gains, self.torques)
             return self.torques
+        asked = self._law(dof_pos, dof_vel, self._target)
+        return torch.clamp(asked, self._lowest_torques, self.torque_limits, out=self.torques)
+
+    def _law(self, dof_pos: Tensor, dof_vel: Tensor, target: Tensor) -> Tensor:
+        """Return the torques (N, D) that the law asks for, whatever the motors can give [N m]."""
         if self.control_type == "P":
-            torques = torch.addcmul(self.stiffness * (self._target - dof_pos), self.damping, dof_vel, value=-1.0)
-        elif self.control_type == "V":
+            return torch.addcmul(self.stiffness * (target - dof_pos), self.damping, dof_vel, value=-1.0)
+        if self.control_type == "V":
             acceleration = (dof_vel - self._last_dof_vel) / self.sim_dt
-            torques = self.stiffness * (self._target - dof_vel) - self.damping * acceleration
+            torques = self.stiffness * (target - dof_vel) - self.damping * acceleration
             self._last_dof_vel.copy_(dof_vel)
-        else:
-            torques = self._target
-        return torch.clamp(torques, self._lowest_torques, self.torque_limits, out=self.torques)
+            return torques
+        return target
 
     def reset(self, mask: Tensor) -> None:
         """Forget the past of the robots in `mask`, for the law that has one."""
         if self.control_type == "V":
             masked_set_(self._last_dof_vel, mask, 0.0)
+        if self.actuator is not None:
+            self.actuator.reset(mask)
 
 
 def control_gains(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> tuple[np.ndarray, np.ndarray]:

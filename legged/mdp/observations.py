@@ -8,6 +8,7 @@ from torch import Tensor
 
 from legged.graph.step_graph import calling
 from legged.math import masked_set_
+from legged.mdp.sensors import Sensors
 from legged.mdp.uniform_numbers import UniformNumbers
 
 
@@ -34,15 +35,23 @@ class ObservationTerms:
         """(N, width) the terms as groups read them, with 0 for what is no number."""
         self.raw = self.values
         """(N, width) the terms as they gave them, numbers or not."""
+        self.sensors: Sensors | None = None
+        """What measures some of the terms, for groups with noise; None if sensors are ideal but for their noise."""
 
-    def evaluate(self) -> None:
-        """Bring `raw` and `values` up to date."""
+    def evaluate(self, begun: Tensor | None = None, again: bool = False) -> None:
+        """Bring `raw` and `values` up to date, and the sensors: by a control step, in which the episodes of `begun` (N,) are
+        new, or `again` in the same one; without `begun` they only show what they would measure.
+        """
         found = []
         for name, function in self._functions.items():
             with calling(f"_obs_{name}"):
                 found.append(function())
         self.raw = torch.cat(found, dim=1).float()
         torch.nan_to_num(self.raw, nan=0.0, posinf=0.0, neginf=0.0, out=self.values)
+        if self.sensors is not None and begun is None:
+            self.sensors.preview()
+        elif self.sensors is not None and begun is not None:
+            self.sensors.update(begun, again)
 
 
 @dataclass(frozen=True)
@@ -66,7 +75,7 @@ class ObservationGroup:
 
     def __init__(
         self,
-        source: ObservationTerms,
+        source: ObservationTerms | Sensors,
         names: Sequence[str],
         scales: Mapping[str, Sequence[float] | float],
         noise: Mapping[str, float],

@@ -44,6 +44,27 @@ def test_observation_terms_have_columns_scales_and_noise():
     assert actor[0][4] == "Linear velocity (x, y, z) of the base, in the base frame [m/s]"
 
 
+def test_motors_and_sensors_that_are_not_ideal_are_told():
+    lines = summary(
+        small_config(
+            ("observations.add_noise", True),
+            ("observations.bias", {"dof_pos": 0.02}),
+            ("observations.delay", {"dof_pos": [0, 2]}),
+            ("observations.dropped", {"dof_vel": 0.01}),
+            ("control.actuator.model", "dc_motor"),
+            ("control.actuator.no_load_speed", {"KFE": 12.0}),
+            ("control.actuator.coulomb_friction", {"KFE": 1.5}),
+            ("control.actuator.delay", [0, 4]),
+        )
+    )
+    actor, critic = (rows(lines, f"observations '{name}'") for name in ("actor", "critic"))
+    assert [row[3] for row in actor[4:6]] == ["+-0.01, bias +-0.02, delay 0 to 2 steps", "+-1.5, dropped 0.01"]
+    assert [row[3] for row in critic] == ["-"] * 7
+    actions = rows(lines, "actions: 12 numbers")
+    motor = "80 N m at rest, none at 12 rad/s, friction 1.5 N m (1.5 to break away) + 0 N m s/rad, delay 0 to 4 physics steps"
+    assert actions[2][2].endswith(f"torque at most 80 N m; {motor}")
+
+
 def test_rewards_terminations_actions_and_joints_of_a_legged_robot():
     lines = summary(small_config(("rewards.scales.collision", 0.0), ("terminations.max_tilt", 1.0)))
     rewards = {row[0]: row[1] for row in rows(lines, "rewards, times the control step of 0.02 s; off: collision")}

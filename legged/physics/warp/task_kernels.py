@@ -11,6 +11,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from legged.physics.warp.actuator_kernels import drive_joints
+from legged.physics.warp.network_kernels import run_lstm, run_mlp
+
 PI = wp.constant(wp.float32(torch.pi))
 
 
@@ -302,6 +305,18 @@ class TaskKernels:
     def hold_joints(self, dim: tuple[int, ...], *arguments: Tensor) -> None:
         """As `Control.compute` of joints that are held by P gains: the last argument is written."""
         self._launch(hold_joints, dim, arguments)
+
+    def drive_joints(self, dim: tuple[int, ...], *arguments: Tensor | float) -> None:
+        """As `Actuator.drive` of joints with P gains: the last argument is written."""
+        self._launch(drive_joints, dim, arguments)
+
+    def run_mlp(self, error: Tensor, *arguments: Tensor | float) -> None:
+        """As `ActuatorNetwork.torques` of an MLP: the last argument is written."""
+        self._launch(run_mlp, tuple(error.shape), (error, *arguments))
+
+    def run_lstm(self, error: Tensor, *arguments: Tensor | float) -> None:
+        """The same of an LSTM."""
+        self._launch(run_lstm, tuple(error.shape), (error, *arguments))
 
     def advance_feet(self, forces: Tensor, *arguments: Tensor | float) -> None:
         """As `FeetContacts.update`."""

@@ -1,0 +1,57 @@
+"""What networks see of a task: observation groups, and the sensors between its terms and the groups with noise."""
+
+from typing import Any
+
+from legged.config.schema import TaskConfig
+from legged.mdp.height_map_errors import HeightMapErrors
+from legged.mdp.observations import ObservationGroup, ObservationTerms
+from legged.mdp.sensors import HEIGHTS, Sensors
+from legged.mdp.uniform_numbers import UniformNumbers
+
+
+class ObservingTask:
+    """The half of a task that makes its observations."""
+
+    cfg: TaskConfig  # type: ignore[assignment]
+    observation_terms: ObservationTerms
+    numbers: UniformNumbers
+
+    def observation_scales(self) -> dict[str, Any]:
+        """Return the factor on each term, a number or one for each of its columns; 1 for those that are missing."""
+        return dict(self.cfg.observations.scales)
+
+    def make_height_map(self) -> HeightMapErrors | None:
+        """Return the map that the term `heights` is measured with, if it has errors."""
+        return None
+
+    def make_sensors(self) -> Sensors | None:
+        """Return what measures the terms with bias, delay, lost packets or a map; None if there are none in a group with
+        noise.
+        """
+        cfg, noise = self.cfg.observations, self._noise()
+        noisy = {term for group in cfg.groups.values() if group.noise for term in group.terms} if cfg.add_noise else set()
+        height_map = self.make_height_map() if HEIGHTS in noisy else None
+        named = {name for table in (cfg.bias, cfg.dropped) for name, value in table.items() if value}
+        named |= {name for name, (_, most) in cfg.delay.items() if most}
+        measured = noisy & (named | ({HEIGHTS} if height_map is not None else set()))
+        if not measured:
+            return None
+        errors = (cfg.bias, cfg.delay, cfg.dropped)
+        return Sensors(self.observation_terms, sorted(measured), *errors, noise, self.numbers, height_map)
+
+    def _noise(self) -> dict[str, float]:
+        """Return the half width of each term's noise, in the term's unit."""
+        cfg = self.cfg.observations
+        return {term: half * cfg.noise_level for term, half in cfg.noise.items()}
+
+    def _group(self, name: str) -> ObservationGroup:
+        """Make the observation group `name`."""
+        cfg, terms = self.cfg.observations, self.observation_terms
+        group = cfg.groups[name]
+        noisy = group.noise and cfg.add_noise
+        noise = self._noise() if noisy else {}
+        measured = terms.sensors if noisy else None
+        if measured is not None:  # they add the noise of what they measure
+            noise = {term: half for term, half in noise.items() if term not in measured.names}
+        scales = self.observation_scales()
+        return ObservationGroup(measured or terms, group.terms, scales, noise, cfg.clip, group.history, self.numbers)

@@ -1,0 +1,298 @@
+"""Motors that are not ideal: delay of targets, torque over speed, friction of joints, laws that were learned from data.
+
+The torque-speed line is that of a direct-current motor: its torque falls from the stall torque at rest to nothing at the
+no-load speed (any textbook; Isaac Lab's DCMotor, mjlab's dc_actuator and Newton's ClampingDCMotor have the same one).
+Friction is Coulomb's and viscous friction with the Stribeck effect, after Armstrong-Helouvry, Dupont, Canudas de Wit, "A
+survey of models, analysis tools and compensation methods for the control of machines with friction", Automatica 30 (1994),
+smoothed at rest.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from legged.config.schema import ActuatorConfig, LeggedControlConfig
+from legged.errors import ConfigError
+from legged.math import masked_set_
+from legged.mdp.actuator_network import ActuatorNetwork, NetworkWeights
+from legged.mdp.uniform_numbers import UniformNumbers
+from legged.robots.patterns import match_names
+from legged.robots.robot import Robot
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
+
+
+def is_ideal(cfg: ActuatorConfig) -> bool:
+    """Return whether motors give what the control law asks for, at once, up to their effort limit."""
+    friction = any(any(table.values()) for table in (cfg.coulomb_friction, cfg.breakaway_friction, cfg.viscous_friction))
+    return cfg.model == "ideal" and not friction and cfg.delay == (0, 0) and not cfg.network
+
+
+class MotorCurve:
+    """Between what torques the motors of D joints can choose at a velocity."""
+
+    def __init__(self, stall_torque: Tensor, no_load_speed: Tensor) -> None:
+        """Take what a motor gives at rest [N m] and at what speed it gives nothing [rad/s], (D,) each. An infinite no-load
+        speed makes a motor ideal.
+        """
+        self.stall_torque, self.no_load_speed = stall_torque, no_load_speed
+
+    def limits(self, dof_vel: Tensor, effort: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the lowest and the highest torque (N, D) [N m] at velocities (N, D) [rad/s], where joints bear `effort`,
+        (D,) or (N, D) [N m].
+        """
+        share = dof_vel / self.no_load_speed
+        high = torch.minimum(torch.maximum(self.stall_torque * (1.0 - share), -effort), effort)
+        low = torch.maximum(torch.minimum(self.stall_torque * (-1.0 - share), effort), -effort)
+        return low, high
+
+
+class Friction:
+    """Torque by which D joints resist their motion."""
+
+    def __init__(
+        self, coulomb: Tensor, breakaway: Tensor, viscous: Tensor, stribeck_velocity: float, smoothing: float
+    ) -> None:
+        """Take friction of a moving joint and at the start of its motion [N m] and viscous friction [N m s/rad], (D,) each,
+        and the speeds [rad/s] by which it falls from the one to the other, and below which it fades.
+        """
+        self.coulomb, self.extra, self.viscous = coulomb, breakaway - coulomb, viscous
+        self.stribeck_velocity, self.smoothing = stribeck_velocity, smoothing
+
+    def torques(self, dof_vel: Tensor) -> Tensor:
+        """Return (N, D) [N m], with the sign of the velocities (N, D) [rad/s]."""
+        slow = torch.exp(-(dof_vel / self.stribeck_velocity).square())
+        return (self.coulomb + self.extra * slow) * torch.tanh(dof_vel / self.smoothing) + self.viscous * dof_vel
+
+
+class Actuator:
+    """What stands between targets and joint torques, of N robots with D joints.
+
+    Targets come once a control step. Each robot has them after its delay of some physics steps; before the first has come,
+    its joints have the target of action 0. What the law asks for is then limited to what the motor can give, and less by
+    friction.
+    """
+
+    STATE: tuple[str, ...] = ("targets", "delay")
+
+    def __init__(
+        self,
+        robot: Robot,
+        cfg: LeggedControlConfig,
+        middle: Tensor,
+        shape: tuple[int, int],
+        sim_dt: float,
+        numbers: UniformNumbers,
+        kernels: "TaskKernels | None" = None,
+    ) -> None:
+        """Build for `shape` (N, D) on the device of `middle`, the target of action 0 (D,) or (). Delays come from `numbers`.
+
+        Raises:
+            ConfigError: as `check_actuator`.
+        """
+        check_actuator(robot, cfg, sim_dt)
+        actuator, device = cfg.actuator, middle.device
+        n, joints = shape
+
+        def tensor(values: np.ndarray) -> Tensor:
+            return torch.as_tensor(values, dtype=torch.float32, device=device)
+
+        self.decimation, self._kernels = cfg.decimation, kernels
+        self.middle = middle
+        """(D,), (N, D) or () the target of action 0."""
+        stall, fastest = map(tensor, motor_numbers(robot, actuator))
+        self.curve = MotorCurve(stall, fastest)
+        coulomb, breakaway, viscous = map(tensor, friction_numbers(robot, actuator))
+        speeds = (actuator.stribeck_velocity, actuator.friction_smoothing)
+        self.friction = Friction(coulomb, breakaway, viscous, *speeds)
+        self._has_friction = bool(self.friction.coulomb.any() | self.friction.extra.any() | self.friction.viscous.any())
+        self._has_curve = actuator.model == "dc_motor"
+        low, high = actuator.delay
+        self.shortest, self.longest = low, high
+        """Range of the delay, in physics steps."""
+        kept = 1 + math.ceil(high / cfg.decimation)
+        self.targets = middle.expand(kept, n, joints).clone()
+        """(K, N, D) targets of this control step and of those before."""
+        self.newest = self.targets[0]
+        """(N, D) the target of this control step, to be written."""
+        self.delay = torch.full((n,), high, dtype=torch.int32, device=device)
+        """(N,) delay of each robot, in physics steps."""
+        self._varies = actuator.delay_varies and low < high
+        self._drawn = numbers.between(float(low), float(high + 1), 1) if low < high else None
+        self._steps = 0  # physics steps since the newest target
+        self.network: ActuatorNetwork | None = None
+        if actuator.network:
+            of = modelled_joints(robot, actuator)
+            self.network = ActuatorNetwork(NetworkWeights.load(actuator.network), n, joints, sim_dt, device, kernels)
+            self._by_network = torch.tensor([i in of for i in range(joints)], device=device)
+            self._error = torch.zeros(n, joints, device=device)
+            self.STATE = (*self.STATE, "past")
+
+    def describe(self, joint: int) -> str:
+        """Return what is not ideal about the motor of a joint, in a few words."""
+        curve, friction, parts = self.curve, self.friction, []
+        if self.network is not None and bool(self._by_network[joint]):
+            parts.append(f"torque by a network ({self.network.kind})")
+        stall, fastest = float(curve.stall_torque[joint]), float(curve.no_load_speed[joint])
+        if math.isfinite(fastest):
+            parts.append(f"{stall:g} N m at rest, none at {fastest:g} rad/s")
+        dry, extra, viscous = (float(of[joint]) for of in (friction.coulomb, friction.extra, friction.viscous))
+        if dry or extra or viscous:
+            parts.append(f"friction {dry:g} N m ({dry + extra:g} to break away) + {viscous:g} N m s/rad")
+        if self.longest:
+            parts.append(f"delay {self.shortest} to {self.longest} physics steps")
+        return ", ".join(parts) or "ideal motor"
+
+    @property
+    def past(self) -> Tensor:
+        """What a network remembers."""
+        assert self.network is not None
+        return self.network.state
+
+    def advance(self) -> None:
+        """Make room for a new target, which is to be written to `newest`."""
+        if len(self.targets) > 1:
+            self.targets[1:].copy_(self.targets[:-1].clone())
+        self._steps = 0
+
+    def delayed(self) -> Tensor:
+        """Return the targets (N, D) that have arrived at this physics step."""
+        if not self.longest:
+            return self.newest
+        late = (self.delay - self._steps).clamp_(min=0) + (self.decimation - 1)
+        age = torch.div(late, self.decimation, rounding_mode="floor").long()
+        return self.targets.gather(0, age.view(1, -1, 1).expand(1, *self.newest.shape))[0]
+
+    def drive(
+        self,
+        dof_pos: Tensor,
+        dof_vel: Tensor,
+        law: Callable[[Tensor], Tensor],
+        gains: tuple[Tensor, Tensor] | None,
+        effort: Tensor,
+        out: Tensor,
+    ) -> None:
+        """Write to `out` the torques (N, D) of one physics step at joint angles [rad] and velocities [rad/s], (N, D) each.
+        `law` makes of targets the torques that are asked for; where it is the P law, `gains` are its stiffness and damping.
+        Joints bear `effort` [N m]; it and gains are (D,) or (N, D).
+        """
+        if self._kernels is not None and gains is not None and self.network is None:
+            curve, friction = self.curve, self.friction
+            by_robot = (each.expand_as(out) for each in (*gains, effort))
+            now: tuple[Tensor | float, ...] = (self.targets, self.delay, self._steps, self.decimation, dof_pos, dof_vel)
+            rough = (friction.coulomb, friction.extra, friction.viscous, friction.stribeck_velocity, friction.smoothing)
+            motor = (curve.stall_torque, curve.no_load_speed)
+            self._kernels.drive_joints(tuple(out.shape), *now, *by_robot, *motor, *rough, self._has_friction, out)
+            self._steps += 1
+            return
+        target = self.delayed()
+        asked = law(target)
+        if self.network is not None:
+            torch.sub(target, dof_pos, out=self._error)
+            asked = torch.where(self._by_network, self.network.torques(self._error, dof_vel), asked)
+        self._limit(asked, dof_vel, effort, out)
+        self._steps += 1
+
+    def _limit(self, asked: Tensor, dof_vel: Tensor, effort: Tensor, out: Tensor) -> None:
+        """Write to `out` what motors give of the torques that are asked for, less friction, (N, D) each."""
+        if self._has_curve:
+            low, high = self.curve.limits(dof_vel, effort)
+            asked = torch.minimum(torch.maximum(asked, low), high)
+        elif self._has_friction:
+            asked = torch.clamp(asked, -effort, effort)
+        if self._has_friction:
+            asked = asked - self.friction.torques(dof_vel)
+        torch.clamp(asked, -effort, effort, out=out)
+
+    def reset(self, mask: Tensor) -> None:
+        """Forget the past of the robots in `mask` (N,) and draw their delay; where delays vary, draw those of all robots."""
+        if self._drawn is not None:
+            drawn = self._drawn.values[:, 0].clamp(max=float(self.longest)).int()
+            if self._varies:  # what arrived by the last physics step stays, however late the next target is
+                latest = (torch.div(self.delay, self.decimation, rounding_mode="floor") + 1) * self.decimation
+                torch.where(mask, drawn, torch.minimum(drawn, latest), out=self.delay)
+            else:
+                masked_set_(self.delay, mask, drawn)
+        if self.longest:
+            torch.where(mask.view(1, -1, 1), self.middle, self.targets, out=self.targets)
+        if self.network is not None:
+            self.network.reset(mask)
+
+
+def modelled_joints(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str) -> tuple[int, ...]:
+    """Return the joints that have the model, and the network if there is one. `where` makes of a dotted path how an error
+    begins.
+
+    Raises:
+        ConfigError: a pattern that matches no joint.
+    """
+    if not cfg.joints:
+        return tuple(range(robot.num_dof))
+    return match_names(cfg.joints, robot.joint_names, where("control.actuator.joints"))
+
+
+def motor_numbers(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str) -> tuple[np.ndarray, np.ndarray]:
+    """Return stall torque [N m] and no-load speed [rad/s] of all joints, (D,); that of ideal motors is infinite. `where` is
+    as for `modelled_joints`.
+
+    Raises:
+        ConfigError: as there, or a motor whose speed nobody states.
+    """
+    stall = by_joint(cfg.stall_torque, robot, where("control.actuator.stall_torque"), robot.torque_limits)
+    speed = by_joint(cfg.no_load_speed, robot, where("control.actuator.no_load_speed"), robot.dof_vel_limits)
+    driven = np.isin(np.arange(robot.num_dof), modelled_joints(robot, cfg, where)) & (cfg.model == "dc_motor")
+    if not np.all(np.isfinite(speed[driven]) & (speed[driven] > 0.0)):
+        name = robot.joint_names[int(np.flatnonzero(driven & ~(np.isfinite(speed) & (speed > 0.0)))[0])]
+        raise ConfigError(f"{where('control.actuator.no_load_speed')}: '{name}' has no velocity limit; name its speed here")
+    return np.where(driven, stall, robot.torque_limits), np.where(driven, speed, np.inf)
+
+
+def friction_numbers(
+    robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return Coulomb friction, friction at the start of a motion [N m] and viscous friction [N m s/rad] of all joints, (D,).
+    `where` is as for `modelled_joints`.
+
+    Raises:
+        ConfigError: a pattern that matches no joint.
+    """
+    nothing = np.zeros(robot.num_dof)
+    coulomb = by_joint(cfg.coulomb_friction, robot, where("control.actuator.coulomb_friction"), nothing)
+    breakaway = by_joint(cfg.breakaway_friction, robot, where("control.actuator.breakaway_friction"), coulomb)
+    viscous = by_joint(cfg.viscous_friction, robot, where("control.actuator.viscous_friction"), nothing)
+    return coulomb, breakaway, viscous
+
+
+def by_joint(table: Mapping[str, float], robot: Robot, where: str, otherwise: np.ndarray) -> np.ndarray:
+    """Return for each joint the number of the longest pattern in its name, (D,), and of joints without one that of
+    `otherwise`.
+
+    Raises:
+        ConfigError: a pattern that matches no joint.
+    """
+    match_names(tuple(table), robot.joint_names, where)
+    found = [max((p for p in table if p in name), key=len, default=None) for name in robot.joint_names]
+    return np.array([otherwise[i] if p is None else table[p] for i, p in enumerate(found)], dtype=float)
+
+
+def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where: Callable[[str], str] = str) -> None:
+    """Look whether the actuators fit the robot, its control law and the physics step. `where` is as for `modelled_joints`.
+
+    Raises:
+        ConfigError: a pattern matches no joint, a speed is missing, or a network is not there, is none, needs another law
+        than P
+            or another time step.
+    """
+    actuator = cfg.actuator
+    motor_numbers(robot, actuator, where)
+    friction_numbers(robot, actuator, where)
+    if actuator.network:
+        path = where("control.actuator.network")
+        if cfg.control_type != "P":
+            raise ConfigError(f"{path}: a learned actuator takes joint angles (control_type P), not {cfg.control_type}")
+        NetworkWeights.load(actuator.network, path).steps_between(sim_dt, path)

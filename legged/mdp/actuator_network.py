@@ -1,0 +1,207 @@
+"""Actuators learned from data: joint torque from errors and velocities of the last moments (MLP), or from all before (LSTM).
+
+The MLP is that of Hwangbo et al., "Learning agile and dynamic motor skills for legged robots", Science Robotics 4 (2019),
+eaau5872: position error and velocity now and at two moments before, small layers with softsign. All joints share one network.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from legged.errors import ConfigError, suggest
+from legged.math import masked_set_
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
+
+KINDS = ("mlp", "lstm")
+FORMAT = 1
+"""Version of the file's layout."""
+WIDEST, DEEPEST = 1024, 16
+"""Units of a layer, and layers, at most."""
+TOLERANCE = 1e-3
+"""Share of a physics step by which the samples of a network may lie beside physics steps."""
+
+
+@dataclass(frozen=True)
+class NetworkWeights:
+    """What a file of a learned actuator holds (.npz, nothing in it is code)."""
+
+    kind: str
+    """`mlp` or `lstm`."""
+    dt: float
+    """Time between the samples that it was trained on [s]."""
+    samples: int
+    """Samples that an MLP sees: now and at `samples - 1` moments before, `dt` apart; 1 for an LSTM."""
+    scales: np.ndarray
+    """(3,) factors on position errors [1/rad], on velocities [s/rad] and on the output [N m]."""
+    layers: tuple[dict[str, np.ndarray], ...]
+    """Of each linear layer `weight` (out, in) and `bias` (out,); an LSTM's cells before, with `input` (4 H, in), `hidden`
+    (4 H, H) and `bias` (4 H,), for the gates i, f, g, o in torch's order."""
+    facts: dict[str, float] = field(default_factory=dict)
+    """What the fit says of itself, such as its error on data that it had not seen."""
+
+    def save(self, path: Path) -> None:
+        """Write the file."""
+        arrays = {f"layer{i}.{name}": array for i, layer in enumerate(self.layers) for name, array in layer.items()}
+        facts = {f"fact.{name}": np.array(value) for name, value in self.facts.items()}
+        header = {"format": FORMAT, "kind": self.kind, "dt": self.dt, "samples": self.samples, "scales": self.scales}
+        with open(path, "wb") as file:
+            np.savez(file, **{**header, **arrays, **facts})  # type: ignore[arg-type]
+
+    @classmethod
+    def load(cls, path: str | Path, where: str = "control.actuator.network") -> "NetworkWeights":
+        """Read a file; `where` is how an error begins.
+
+        Raises:
+            ConfigError: it is not there, or is no file of a learned actuator.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}
+        except OSError as error:
+            raise ConfigError(f"{where}: {path}: {error.strerror or 'no file of a learned actuator (.npz)'}") from error
+        except Exception as error:  # zipfile's, numpy's and zlib's own, of a damaged file
+            raise ConfigError(f"{where}: {path}: no file of a learned actuator (.npz), as fit_actuator writes") from error
+        try:
+            return cls._of(arrays)
+        except (KeyError, ValueError, TypeError) as error:
+            said = f"'{error.args[0]}' is missing" if isinstance(error, KeyError) else str(error)
+            raise ConfigError(f"{where}: {path}: no file of a learned actuator: {said}") from error
+
+    @classmethod
+    def _of(cls, arrays: dict[str, np.ndarray]) -> "NetworkWeights":
+        """Return what a file's arrays mean; KeyError or ValueError if they mean nothing."""
+        if int(arrays["format"]) != FORMAT:
+            raise ValueError(f"its format is {int(arrays['format'])}, not {FORMAT}")
+        kind, dt, samples = str(arrays["kind"]), float(arrays["dt"]), int(arrays["samples"])
+        if kind not in KINDS:
+            raise ValueError(f"unknown kind '{kind}'{suggest(kind, KINDS)}")
+        scales = arrays["scales"].astype(np.float32)
+        layers: list[dict[str, np.ndarray]] = []
+        while len(layers) <= DEEPEST and any(name.startswith(f"layer{len(layers)}.") for name in arrays):
+            prefix = f"layer{len(layers)}."
+            layers.append({n.removeprefix(prefix): a.astype(np.float32) for n, a in arrays.items() if n.startswith(prefix)})
+        weights = cls(kind, dt, samples, scales, tuple(layers), {})
+        weights._check()
+        return weights
+
+    def _check(self) -> None:
+        """Look whether layers fit each other; ValueError or KeyError if they don't."""
+        if not (self.dt > 0.0 and self.samples > 0 and self.scales.shape == (3,) and 0 < len(self.layers) <= DEEPEST):
+            raise ValueError("its header makes no sense")
+        width = 2 * self.samples
+        for i, layer in enumerate(self.layers):
+            cell = self.kind == "lstm" and i + 1 < len(self.layers)
+            out = len(layer["bias"]) // 4 if cell else len(layer["bias"])
+            shapes = {"input": (4 * out, width), "hidden": (4 * out, out)} if cell else {"weight": (out, width)}
+            if not 0 < out <= WIDEST or any(layer[name].shape != shape for name, shape in shapes.items()):
+                raise ValueError(f"layer {i} does not fit the one before")
+            if not all(np.isfinite(array).all() for array in layer.values()):
+                raise ValueError(f"layer {i} has weights that are no numbers")
+            width = out
+        if width != 1:
+            raise ValueError(f"it gives {width} numbers, not a torque")
+
+    def steps_between(self, sim_dt: float, where: str = "control.actuator.network") -> int:
+        """Return how many physics steps of `sim_dt` [s] lie between two samples.
+
+        Raises:
+            ConfigError: no whole number of them, or of an LSTM, which sees every step, more than one.
+        """
+        steps = round(self.dt / sim_dt)
+        if steps < 1 or abs(self.dt / sim_dt - steps) > TOLERANCE or (self.kind == "lstm" and steps != 1):
+            allowed = f"{self.dt:g}" if self.kind == "lstm" else f"{self.dt:g} or a whole part of it"
+            raise ConfigError(
+                f"{where}: was trained on samples {self.dt:g} s apart, which physics steps of sim.dt={sim_dt:g} do not meet;"
+                f" sim.dt must be {allowed} (fit_actuator --dt trains for another one)"
+            )
+        return steps
+
+
+class ActuatorNetwork:
+    """A learned actuator evaluated for all joints of all robots, M = N D of them, once a physics step."""
+
+    def __init__(
+        self,
+        weights: NetworkWeights,
+        num_envs: int,
+        joints: int,
+        sim_dt: float,
+        device: torch.device,
+        kernels: "TaskKernels | None" = None,
+    ) -> None:
+        """Start with nothing remembered: all errors, velocities and hidden states are 0.
+
+        Raises:
+            ConfigError: the physics step [s] does not fit the samples that the network was trained on.
+        """
+        self.kind, self._kernels = weights.kind, kernels
+        self._shape, self._rows = (num_envs, joints), num_envs * joints
+        self._every, self._samples = weights.steps_between(sim_dt), weights.samples
+        self._scales = self._position, self._velocity, self._torque = tuple(map(float, weights.scales))
+        self._layers = [{name: torch.tensor(array, device=device) for name, array in of.items()} for of in weights.layers]
+        self._hidden = [] if self.kind == "mlp" else [layer["hidden"].shape[1] for layer in self._layers[:-1]]
+        if self.kind == "mlp":
+            shape = (self._every * (weights.samples - 1) + 1, 2, joints)
+        else:
+            shape = (2 * len(self._hidden), max(self._hidden, default=1), joints)
+        self.state = torch.zeros(num_envs, *shape, device=device)
+        """(N, steps, 2, D) scaled errors and velocities of the last steps, the newest first; of an LSTM (N, 2 cells, H, D),
+        the hidden states of each cell and then its cell states.
+        """
+        if kernels is not None:
+            widths = [2 * weights.samples, *(len(layer["bias"]) for layer in weights.layers)]
+            widths[1:-1] = self._hidden or widths[1:-1]
+            self._widths = torch.tensor(widths, dtype=torch.int32, device=device)
+            parts = [
+                of[name].flatten() for of in self._layers for name in ("input", "hidden", "weight", "bias") if name in of
+            ]
+            self._weights = torch.cat(parts)
+            self._scratch = torch.zeros(2, max(widths), self._rows, device=device)
+            self._found = torch.zeros(self._shape, device=device)
+
+    def torques(self, error: Tensor, dof_vel: Tensor) -> Tensor:
+        """Return torques (N, D) [N m] for errors, target less angle [rad], and velocities [rad/s], (N, D) each, of this
+        step.
+        """
+        if self._kernels is not None:
+            net = (self._weights, self._widths, self.state, self._scratch, self._found)
+            if self.kind == "mlp":
+                self._kernels.run_mlp(error, dof_vel, *self._scales, self._every, self._samples, *net)
+            else:
+                self._kernels.run_lstm(error, dof_vel, *self._scales, *net)
+            return self._found
+        found = self._mlp(error, dof_vel) if self.kind == "mlp" else self._lstm(error, dof_vel)
+        return (self._torque * found).view(self._shape)
+
+    def _mlp(self, error: Tensor, dof_vel: Tensor) -> Tensor:
+        if self.state.shape[1] > 1:
+            self.state[:, 1:].copy_(self.state[:, :-1].clone())
+        torch.mul(error, self._position, out=self.state[:, 0, 0])
+        torch.mul(dof_vel, self._velocity, out=self.state[:, 0, 1])
+        # All errors, then all velocities, the newest of each first; a column is a joint of a robot.
+        x = self.state[:, :: self._every].permute(2, 1, 0, 3).reshape(2 * self._samples, self._rows)
+        for layer in self._layers[:-1]:
+            x = torch.nn.functional.softsign(torch.addmm(layer["bias"].unsqueeze(1), layer["weight"], x))
+        return torch.addmm(self._layers[-1]["bias"].unsqueeze(1), self._layers[-1]["weight"], x)
+
+    def _lstm(self, error: Tensor, dof_vel: Tensor) -> Tensor:
+        x = torch.stack([self._position * error, self._velocity * dof_vel]).view(2, self._rows)
+        for i, (layer, size) in enumerate(zip(self._layers[:-1], self._hidden, strict=True)):
+            h, c = (self.state[:, 2 * i + k, :size].permute(1, 0, 2).reshape(size, self._rows) for k in range(2))
+            gates = torch.addmm(torch.addmm(layer["bias"].unsqueeze(1), layer["input"], x), layer["hidden"], h)
+            take, keep, new, show = gates.chunk(4)
+            c = torch.sigmoid(keep) * c + torch.sigmoid(take) * torch.tanh(new)
+            x = torch.sigmoid(show) * torch.tanh(c)
+            for k, value in enumerate((x, c)):
+                self.state[:, 2 * i + k, :size].copy_(value.view(size, *self._shape).permute(1, 0, 2))
+        return torch.addmm(self._layers[-1]["bias"].unsqueeze(1), self._layers[-1]["weight"], x)
+
+    def reset(self, mask: Tensor) -> None:
+        """Forget the past of the robots in `mask` (N,)."""
+        masked_set_(self.state, mask, 0.0)

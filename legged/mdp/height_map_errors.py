@@ -1,0 +1,75 @@
+"""What is wrong with a map of heights that a robot makes while it walks."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from legged.config.schema import HeightMapConfig
+from legged.math import masked_set_
+from legged.mdp.height_scan import HeightScan
+from legged.mdp.uniform_numbers import UniformNumbers
+
+
+def is_exact(cfg: HeightMapConfig) -> bool:
+    """Return whether the map has no errors."""
+    return not (cfg.offset or cfg.shift or cfg.drift or cfg.shift_drift or cfg.holes)
+
+
+class HeightMapErrors:
+    """The map of N robots lies beside the ground, by an amount that grows, and knows nothing of some of P points."""
+
+    STATE = ("error", "rate", "holes")
+
+    def __init__(
+        self,
+        cfg: HeightMapConfig,
+        scan: HeightScan,
+        pose: tuple[Tensor, Tensor],
+        seen: Callable[[Tensor], Tensor],
+        dt: float,
+        numbers: UniformNumbers,
+    ) -> None:
+        """Read heights around the `pose` of bases, positions (N, 3) and orientations (N, 4) in the world. Where the map may
+        be displaced, they are looked up by `scan`, which nobody else uses then; else they are those that it has. `seen` makes
+        the observation of ground heights (N, P) in the world; `dt` is the control step [s].
+        """
+        self._scan, self._seen, self._dt = scan, seen, dt
+        self._position, self._orientation = pose
+        num_envs, device = scan.heights.shape[0], scan.heights.device
+        self._moved = cfg.shift > 0.0 or cfg.shift_drift > 0.0
+        self._drifts = cfg.drift > 0.0 or cfg.shift_drift > 0.0
+        half = torch.tensor([cfg.shift, cfg.shift, cfg.offset, cfg.shift_drift, cfg.shift_drift, cfg.drift], device=device)
+        self._drawn = numbers.between(-half, half, 6)
+        self.error = torch.zeros(num_envs, 3, device=device)
+        """(N, 3) where the map lies, world frame [m]."""
+        self.rate = torch.zeros_like(self.error)
+        """(N, 3) how fast it moves there [m/s]."""
+        self._place = torch.zeros_like(self.error)
+        self._share = cfg.holes
+        points = scan.heights.shape[1]
+        self._holes_drawn = numbers.between(0.0, 1.0, points) if cfg.holes else None
+        self.holes = torch.zeros(num_envs, points if cfg.holes else 0, dtype=torch.bool, device=device)
+        """(N, P) points of which nothing is known, if there are any."""
+
+    def advance(self, begun: Tensor) -> None:
+        """Let a control step pass, in which the episodes of `begun` (N,) are new."""
+        if self._drifts:
+            self.error.add_(self.rate, alpha=self._dt)
+        masked_set_(self.error, begun, self._drawn.values[:, :3])
+        masked_set_(self.rate, begun, self._drawn.values[:, 3:])
+        if self._holes_drawn is not None:
+            masked_set_(self.holes, begun, self._holes_drawn.values < self._share)
+
+    def read(self) -> Tensor:
+        """Return the observation of the heights that the map has (N, P)."""
+        if self._moved:
+            # The map has at a place what the ground has where the map should have been.
+            torch.sub(self._position, self.error, out=self._place)
+            self._scan.update(self._place, self._orientation)
+        return torch.nan_to_num(self._seen(self._scan.heights + self.error[:, 2:]), nan=0.0)
+
+    def cut_holes(self, observed: Tensor) -> None:
+        """Write 0 into observations (N, P) of which nothing is known."""
+        if self._holes_drawn is not None:
+            observed.masked_fill_(self.holes, 0.0)

@@ -1,0 +1,175 @@
+"""Sensors that are not ideal: numbers that are off by the same amount all episode long, late, or lost on the way.
+
+What a term says goes through here once a control step, for all groups that have noise: they see the same sensor.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from legged.math import masked_set_
+from legged.mdp.height_map_errors import HeightMapErrors
+from legged.mdp.uniform_numbers import UniformNumbers
+
+if TYPE_CHECKING:
+    from legged.mdp.observations import ObservationTerms
+
+HEIGHTS = "heights"
+"""The term that is read from a map."""
+
+
+class Sensors:
+    """Some terms as N robots measure them: bias and noise are added, then numbers are delayed, then lost.
+
+    `values` and `columns` are as those of `ObservationTerms`; terms that are measured ideally are copied.
+    """
+
+    STATE: tuple[str, ...] = ("bias", "delay", "past", "held")
+
+    def __init__(
+        self,
+        source: "ObservationTerms",
+        names: Sequence[str],
+        bias: Mapping[str, float],
+        delay: Mapping[str, tuple[int, int]],
+        dropped: Mapping[str, float],
+        noise: Mapping[str, float],
+        numbers: UniformNumbers,
+        height_map: HeightMapErrors | None = None,
+    ) -> None:
+        """Measure the terms `names` of `source`: with a `bias` and `noise` up to these half widths, in the term's unit, a
+        `delay` of fewest to most control steps, and a share of the control steps `dropped`; none where a term is not named.
+        What is drawn comes from `numbers`. The heights are read from `height_map`.
+        """
+        self.columns, self.names = source.columns, tuple(sorted(names, key=lambda name: source.columns[name].start))
+        self.noise = {name: noise.get(name, 0.0) for name in self.names}
+        """Term -> half width of the noise that is added here, in the term's unit."""
+        self._source, self._map = source, height_map
+        self._shares, self._delays = (bias, dropped), delay
+        num_envs, device = source.values.shape[0], source.values.device
+        columns = [i for name in self.names for i in range(source.columns[name].start, source.columns[name].stop)]
+        widths = [source.columns[name].stop - source.columns[name].start for name in self.names]
+        term_of = [i for i, width in enumerate(widths) for _ in range(width)]
+        self.values = torch.zeros_like(source.values)
+        """(N, width) the terms as groups with noise read them."""
+        together = columns == list(range(columns[0], columns[0] + len(columns)))
+        self._slice = slice(columns[0], columns[0] + len(columns)) if together else None
+        self._columns = torch.tensor(columns, device=device)
+        self._term_of = torch.tensor(term_of, device=device)
+        if height_map is not None and HEIGHTS in self.names:
+            start = sum(widths[: self.names.index(HEIGHTS)])
+            self._of_map: slice | None = slice(start, start + widths[self.names.index(HEIGHTS)])
+        else:
+            self._of_map = None
+
+        def by_column(table: Mapping[str, float]) -> Tensor:
+            return torch.tensor([float(table.get(self.names[i], 0.0)) for i in term_of], device=device)
+
+        half, width = by_column(bias), by_column(noise)
+        self._bias_drawn = numbers.between(-half, half, len(columns)) if half.any() else None
+        self.bias = torch.zeros(num_envs, len(columns) if self._bias_drawn else 0, device=device)
+        """(N, C) error of each of the C measured columns in this episode, if there is any."""
+        self._noise = numbers.between(-width, width, len(columns)) if width.any() else None
+        low, high = (torch.tensor([delay.get(name, (0, 0))[k] for name in self.names], device=device) for k in (0, 1))
+        self._longest = int(high.max())
+        self._most = high
+        self._delay_drawn = numbers.between(low.float(), high.float() + 1.0, len(high)) if self._longest else None
+        self.delay = high.expand(num_envs, -1).clone()
+        """(N, T) delay of each of the T measured terms in this episode, in control steps."""
+        self.past = torch.zeros(num_envs, self._longest + 1 if self._longest else 0, len(columns), device=device)
+        """(N, steps, C) what was measured, the newest first, if anything is delayed."""
+        lost = torch.tensor([float(dropped.get(name, 0.0)) for name in self.names], device=device)
+        self._dropped = lost if lost.any() else None
+        self._lost_drawn = numbers.between(0.0, 1.0, len(lost)) if lost.any() else None
+        self.held = torch.zeros(num_envs, len(columns) if self._lost_drawn else 0, device=device)
+        """(N, C) what arrived last, if anything can be lost."""
+
+    def update(self, begun: Tensor, again: bool = False) -> None:
+        """Measure in a new control step, in which the episodes of `begun` (N,) are new: with errors of their own, and what
+        they measure first for their past. With `again` the step is the same one, and only its measurement is repeated.
+        """
+        if not again:
+            self._draw(begun)
+            if self._longest:
+                self.past[:, 1:].copy_(self.past[:, :-1].clone())
+        now = self._measured()
+        if self._longest:
+            self.past[:, 0].copy_(now)
+            masked_set_(self.past, begun, now.unsqueeze(1).expand_as(self.past))
+            now = self._late(self.past, self.delay)
+        if self._lost_drawn is not None:
+            lost = self._lost() & ~begun.unsqueeze(1)
+            torch.where(lost, self.held, now, out=self.held)
+            now = self.held
+        self._show(now)
+
+    def preview(self) -> None:
+        """Show in `values` what would be measured if a control step ended now; nothing else changes."""
+        now = self._measured()
+        if self._longest:
+            before = self._late(self.past, (self.delay - 1).clamp_(min=0))
+            prompt = (self.delay == 0).index_select(1, self._term_of)
+            now = torch.where(prompt, now, before)
+        if self._lost_drawn is not None:
+            now = torch.where(self._lost(), self.held, now)
+        self._show(now)
+
+    def describe(self, name: str) -> str:
+        """Return what is wrong with a measured term, in a few words."""
+        bias, lost = (table.get(name, 0.0) for table in self._shares)
+        low, high = self._delays.get(name, (0, 0))
+        parts = [f"+-{self.noise[name]:.6g}"] if self.noise[name] else []
+        parts += [f"bias +-{bias:.6g}"] if bias else []
+        parts += [f"delay {low} to {high} steps"] if high else []
+        parts += [f"dropped {lost:.3g}"] if lost else []
+        parts += ["map with errors"] if self._map is not None and name == HEIGHTS else []
+        return ", ".join(parts)
+
+    def parts(self) -> dict[str, "Sensors | HeightMapErrors"]:
+        """Return what has a state, by name."""
+        return {"sensors": self, **({"height_map": self._map} if self._map is not None else {})}
+
+    def _draw(self, begun: Tensor) -> None:
+        """Draw the errors of new episodes, and let those of the map grow."""
+        if self._bias_drawn is not None:
+            masked_set_(self.bias, begun, self._bias_drawn.values)
+        if self._delay_drawn is not None:
+            masked_set_(self.delay, begun, torch.minimum(self._delay_drawn.values.long(), self._most))
+        if self._map is not None:
+            self._map.advance(begun)
+
+    def _measured(self) -> Tensor:
+        """Return the terms of now (N, C), with bias and noise."""
+        source = self._source.values
+        now = source[:, self._slice] if self._slice is not None else source.index_select(1, self._columns)
+        if self._of_map is not None and self._map is not None:
+            now = now.clone()
+            now[:, self._of_map].copy_(self._map.read())
+        if self._bias_drawn is not None:
+            now = now + self.bias
+        if self._noise is not None:
+            now = now + self._noise.values
+        if self._of_map is not None and self._map is not None:
+            self._map.cut_holes(now[:, self._of_map])
+        return now
+
+    def _late(self, past: Tensor, delay: Tensor) -> Tensor:
+        """Return what of the past (N, steps, C) is seen with delays (N, T), (N, C)."""
+        age = delay.index_select(1, self._term_of).unsqueeze(1)
+        return past.gather(1, age)[:, 0]
+
+    def _lost(self) -> Tensor:
+        """Return which numbers (N, C) do not arrive in this step."""
+        assert self._lost_drawn is not None
+        assert self._dropped is not None
+        return (self._lost_drawn.values < self._dropped).index_select(1, self._term_of)
+
+    def _show(self, seen: Tensor) -> None:
+        """Write the measured terms into `values`, beside the others."""
+        self.values.copy_(self._source.values)
+        if self._slice is not None:
+            self.values[:, self._slice].copy_(seen)
+        else:
+            self.values.index_copy_(1, self._columns, seen)

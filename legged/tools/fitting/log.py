@@ -1,0 +1,181 @@
+"""Logs of actuators: .npz files of targets, positions, velocities and torques of joints, in runs without gaps."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from legged.errors import ConfigError, suggest
+from legged.robots.patterns import match_names
+
+NEEDED = ("joint_names", "target", "position", "velocity", "torque")
+OPTIONAL = ("dt", "time", "run", "stiffness", "damping", "torque_limit")
+BLOCKS = 10
+"""A run is cut into so many blocks of time, of which every `HELD_OUT`th is kept for the judgement."""
+HELD_OUT = 5
+UNEVEN = 0.01
+"""Share of the mean time step by which samples may be out of step."""
+SHORTEST = 200
+"""Samples of a joint, at least."""
+
+
+@dataclass(frozen=True)
+class ActuatorLog:
+    """T samples of D joints, `dt` [s] apart within a run."""
+
+    joint_names: tuple[str, ...]
+    dt: float
+    run: np.ndarray
+    """(T,) number of the run that each sample belongs to; samples of a run follow each other without a gap."""
+    target: np.ndarray
+    """(T, D) target angles as the controller sent them [rad]."""
+    position: np.ndarray
+    """(T, D) measured angles [rad]."""
+    velocity: np.ndarray
+    """(T, D) measured velocities [rad/s]."""
+    torque: np.ndarray
+    """(T, D) measured torques [N m]."""
+    stiffness: np.ndarray | None = None
+    """(D,) gains of the drives [N m/rad] and [N m s/rad], if they are known."""
+    damping: np.ndarray | None = None
+    torque_limit: np.ndarray | None = None
+    """(D,) limits that the drives keep [N m], if they are known."""
+
+    @property
+    def held_out(self) -> np.ndarray:
+        """(T,) bool: samples that nothing is fitted to: of several runs every fifth run, of fewer every fifth block of
+        time.
+        """
+        runs = np.unique(self.run)
+        if len(runs) >= HELD_OUT:
+            return np.isin(self.run, runs[HELD_OUT - 1 :: HELD_OUT])
+        held = np.zeros(len(self.run), dtype=bool)
+        for number in runs:
+            rows = np.flatnonzero(self.run == number)
+            block = np.arange(len(rows)) * BLOCKS // len(rows)
+            held[rows] = block % HELD_OUT == HELD_OUT - 1
+        return held
+
+    def only(self, patterns: Sequence[str]) -> "ActuatorLog":
+        """Return the log of the joints whose names contain one of the patterns; without patterns, all of it.
+
+        Raises:
+            ConfigError: a pattern matches none.
+        """
+        if not patterns:
+            return self
+        keep = list(match_names(tuple(patterns), self.joint_names, "--joints"))
+        arrays: dict[str, Any] = {name: getattr(self, name)[:, keep] for name in NEEDED[1:]}
+        of_joints: dict[str, Any] = {name: None if (a := getattr(self, name)) is None else a[keep] for name in OPTIONAL[3:]}
+        return replace(self, joint_names=tuple(self.joint_names[i] for i in keep), **arrays, **of_joints)
+
+    def resampled(self, dt: float) -> "ActuatorLog":
+        """Return the log at samples `dt` [s] apart: measurements between two samples lie on the line between them, a target
+        is the last one that was sent.
+
+        Raises:
+            ConfigError: the log's own samples are further apart.
+        """
+        if np.isclose(dt, self.dt, rtol=UNEVEN):
+            return replace(self, dt=dt)
+        if dt < self.dt:
+            raise ConfigError(
+                f"--dt: the log was sampled every {self.dt:g} s; what happens within {dt:g} s can't be learned from it"
+            )
+        parts: dict[str, list[np.ndarray]] = {name: [] for name in ("run", *NEEDED[1:])}
+        for number in np.unique(self.run):
+            rows = np.flatnonzero(self.run == number)
+            at = np.arange(0.0, (len(rows) - 1) * self.dt * (1.0 + 1e-9), dt) / self.dt
+            before = np.minimum(np.floor(at + 1e-6).astype(int), len(rows) - 1)
+            after, share = np.minimum(before + 1, len(rows) - 1), np.clip(at - before, 0.0, 1.0)[:, None]
+            parts["run"].append(np.full(len(at), number))
+            parts["target"].append(self.target[rows[before]])
+            for name in NEEDED[2:]:
+                values = getattr(self, name)[rows]
+                parts[name].append((1.0 - share) * values[before] + share * values[after])
+        joined: dict[str, Any] = {name: np.concatenate(values) for name, values in parts.items()}
+        return replace(self, dt=dt, **joined)
+
+
+def read_log(path: Path) -> ActuatorLog:
+    """Read a log: `joint_names` (D,), `target`, `position`, `velocity`, `torque` (T, D), and `dt` or `time` (T,) [s]. It may
+    have `run` (T,), where it consists of several, and of the drives `stiffness`, `damping` and `torque_limit`, a number or
+    (D,).
+
+    Raises:
+        ConfigError: something is missing, of another shape, no number, or sampled unevenly.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or 'no .npz file'}") from error
+    except Exception as error:  # zipfile's, numpy's and zlib's own
+        raise ConfigError(f"{path}: no .npz file of plain arrays") from error
+    for name in arrays:
+        if name not in NEEDED + OPTIONAL:
+            raise ConfigError(f"{path}: unknown key '{name}'{suggest(name, NEEDED + OPTIONAL)}")
+    for name in NEEDED:
+        if name not in arrays:
+            raise ConfigError(f"{path}: '{name}' is missing (keys: {', '.join(NEEDED)}, and dt or time)")
+    names = tuple(str(name) for name in np.atleast_1d(arrays["joint_names"]))
+    shape = arrays["target"].shape
+    if len(shape) != 2 or shape[1] != len(names):
+        raise ConfigError(f"{path}: target: expected (samples, {len(names)} joints), got {shape}")
+    found: dict[str, np.ndarray] = {}
+    for name in NEEDED[1:]:
+        if arrays[name].shape != shape:
+            raise ConfigError(f"{path}: {name}: expected {shape} as target, got {arrays[name].shape}")
+        found[name] = _numbers(arrays[name], f"{path}: {name}")
+    if shape[0] < SHORTEST:
+        raise ConfigError(f"{path}: target: {shape[0]} samples are too few; at least {SHORTEST} are needed")
+    run = np.atleast_1d(arrays.get("run", np.zeros(shape[0], dtype=int)))
+    if run.shape != shape[:1]:
+        raise ConfigError(f"{path}: run: expected ({shape[0]},), got {run.shape}")
+    for name in OPTIONAL[3:]:
+        if name in arrays:
+            values = _numbers(arrays[name], f"{path}: {name}")
+            if values.shape not in ((), (1,), (len(names),)):
+                raise ConfigError(f"{path}: {name}: expected a number or ({len(names)},), got {values.shape}")
+            found[name] = np.broadcast_to(values, (len(names),)).copy()
+    return ActuatorLog(names, _time_step(arrays, run, path), run, **found)
+
+
+def _numbers(values: np.ndarray, where: str) -> np.ndarray:
+    """Return an array as float64.
+
+    Raises:
+        ConfigError: it holds anything but finite numbers.
+    """
+    if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
+        raise ConfigError(f"{where}: expected finite numbers")
+    return values.astype(np.float64)
+
+
+def _time_step(arrays: dict[str, np.ndarray], run: np.ndarray, path: Path) -> float:
+    """Return the time between two samples [s].
+
+    Raises:
+        ConfigError: nobody says it, or it changes within a run.
+    """
+    if "dt" in arrays:
+        dt = float(_numbers(arrays["dt"], f"{path}: dt").reshape(-1)[0])
+        if dt <= 0.0:
+            raise ConfigError(f"{path}: dt: must be above 0, got {dt:g}")
+        return dt
+    if "time" not in arrays:
+        raise ConfigError(f"{path}: 'dt' is missing: the time between two samples [s], or 'time' of each of them")
+    time = _numbers(arrays["time"], f"{path}: time")
+    if time.shape != run.shape:
+        raise ConfigError(f"{path}: time: expected {run.shape}, got {time.shape}")
+    steps = np.diff(time)[np.diff(run) == 0]
+    dt = float(np.median(steps))
+    if dt <= 0.0 or np.abs(steps - dt).max() > max(UNEVEN * dt, 1e-9):
+        worst = float(np.abs(steps - dt).max())
+        raise ConfigError(
+            f"{path}: time: samples are not evenly spaced (median step {dt:g} s, one is off by {worst:g} s); cut the log into"
+            " runs at its gaps (key 'run'), or interpolate it"
+        )
+    return dt
