@@ -29,6 +29,7 @@ from legged.config.mdp import (
     RewardsConfig,
     TerminationsConfig,
 )
+from legged.config.randomization import DrawConfig, ForceConfig, KickConfig
 from legged.config.task import TaskConfig
 from legged.config.world import EnvConfig, NewtonSolver, SimConfig
 
@@ -40,9 +41,12 @@ __all__ = [
     "CommandsConfig",
     "ControlConfig",
     "DomainRandConfig",
+    "DrawConfig",
     "EnvConfig",
     "EvaluationConfig",
+    "ForceConfig",
     "InitStateConfig",
+    "KickConfig",
     "LeggedConfig",
     "LeggedControlConfig",
     "LeggedDomainRandConfig",

@@ -121,7 +121,7 @@ class Terms:
 
     def _obs_dof_pos(self) -> Tensor:
         """Joint angle minus default_joint_angles, by joint [rad]."""
-        return self.dof_pos - self.default_dof_pos
+        return self.dof_pos - self.control.zero_dof_pos
 
     def _obs_dof_vel(self) -> Tensor:
         """Joint velocity, by joint [rad/s]."""

@@ -31,6 +31,7 @@ class NewtonPhysics(WarpPhysics):
         num_envs: int,
         device: torch.device,
         randomized: Collection[str] = (),
+        pushed: bool = False,
     ) -> None:
         """Build the scene on `device` and place all robots at the model's initial state; compiles on first use."""
         super().__init__(num_envs, sim.dt, device)
@@ -105,6 +106,18 @@ class NewtonPhysics(WarpPhysics):
             told = suggest(field, self._randomized, "those are")
             raise ValueError(f"randomize: '{field}' is none of the fields that make_physics was told of{told}")
         {"friction": self._set_friction, "added_base_mass": self._add_base_mass}[field](values.to(self.device))
+
+    def prepare_redraws(self, drawn: Tensor, columns: Mapping[str, slice], fields: Collection[str]) -> None:
+        raise NotImplementedError
+
+    def redraw(self, mask: Tensor) -> None:
+        raise NotImplementedError
+
+    def set_variants(self, values: Mapping[str, Tensor]) -> None:
+        raise NotImplementedError
+
+    def choose_variants(self, mask: Tensor, chosen: Tensor) -> None:
+        raise NotImplementedError
 
     def _set_friction(self, values: Tensor) -> None:
         model, layout = self._simulation.model, self._simulation.layout
