@@ -251,6 +251,7 @@ class BaseTask(PrivilegedTerms, SavedTask, VecEnv):
     def draw(self) -> None:
         """Draw random numbers for every environment, used by those that are reset, and noise. Runs beside the step."""
         self.numbers.draw()
+        self.randomization.draw()
         self.draw_reset()
 
     @abstractmethod

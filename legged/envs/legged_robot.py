@@ -104,7 +104,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
 
         self.pushes = Pushes(cfg.domain_rand, n, self.dt, device, kernels, self.numbers)
         steps = cfg.train.runner.num_steps_per_env
-        self.disturbances = Disturbances(cfg.domain_rand, self.physics, n, self.dt, steps, device, self.numbers)
+        self.disturbances = Disturbances(cfg.domain_rand, self.physics, self.dt, steps, self.numbers)
         self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt, kernels)
         self._vary_control()
         self.torques, self.default_dof_pos = self.control.torques, self.control.default_dof_pos
@@ -122,7 +122,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self._nominal_vel_limits = torch.tensor(robot.dof_vel_limits, dtype=torch.float32, device=device)
         self.dof_vel_limits = self._nominal_vel_limits
         if "velocity_limit" in self.randomization.draws:
-            self.dof_vel_limits = self._nominal_vel_limits.expand_as(self.dof_vel).contiguous()
+            self.dof_vel_limits = torch.zeros_like(self.dof_vel)
         self._vary_velocity_limits()
         self.dof_pos_limits = self._soft_limits(robot)
         self.posture_joints = torch.tensor(~robot.swings, dtype=torch.float32, device=device)
@@ -200,6 +200,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
     def draw(self) -> None:
         super().draw()
         self.command_sampler.draw()
+        self.disturbances.draw()
 
     def draw_reset(self) -> None:
         """Draw joints near the default pose and a base at its spawn height, moving. Of a robot with passive joints, a pose is

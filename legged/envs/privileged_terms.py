@@ -10,6 +10,7 @@ from torch import Tensor
 from legged.config.randomization import DrawConfig, ForceConfig, draw_of
 from legged.config.schema import LeggedConfig
 from legged.errors import ConfigError
+from legged.mdp.mirror_images import MirrorKind
 from legged.mdp.randomization import Randomization
 from legged.physics.fields import FIELDS, Field
 
@@ -40,6 +41,20 @@ class PrivilegedTerms:
             largest = max(abs(end) for axis in (cfg.x, cfg.y, cfg.z) for end in axis)
             found.append(torch.zeros(self.num_envs, 3, device=self.device) if acting is None else acting.force / largest)
         return torch.cat(found, dim=1)
+
+
+def _mirror_kind(name: str, field: Field) -> MirrorKind:
+    """Return how a field changes when left and right are exchanged. What bodies and shapes have of their own has no image."""
+    if name == "joint_offset":
+        return "joints"
+    if name.endswith("_y"):
+        return "sideways"
+    return "of_joints" if field.law or name.startswith(("joint_", "motor_", "actuator_")) else "scalar"
+
+
+MIRROR_KINDS: dict[str, MirrorKind] = {f"{PREFIX}{name}": _mirror_kind(name, field) for name, field in FIELDS.items()}
+"""Privileged observation -> its kind."""
+MIRROR_KINDS["push_force"] = "vectors"
 
 
 def observed_forces(cfg: LeggedConfig) -> dict[str, ForceConfig]:

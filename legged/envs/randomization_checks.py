@@ -51,9 +51,11 @@ def _check_draw(name: str, draw: DrawConfig, legged: bool, path: str, where: Cal
         raise ConfigError(f"{given}: log_uniform draws from ranges above 0, not from [{low:g}, {high:g}]; uniform from any")
     if draw.std and draw.distribution != "gaussian":
         raise ConfigError(f"{where(f'{path}.std')}: only gaussian has a standard deviation, {draw.distribution} has none")
-    if (draw.when == "interval") != (draw.interval_s > 0.0):
-        told = "must be above 0 [s] where `when` is interval" if draw.when == "interval" else "is of `when: interval` only"
-        raise ConfigError(f"{where(f'{path}.interval_s')}: {told}, got {draw.interval_s:g} with `when: {draw.when}`")
+    if draw.when == "interval" and not draw.interval_s:
+        raise ConfigError(f"{where(f'{path}.when')}: interval needs an interval_s above 0 [s], such as interval_s: 4.0")
+    if draw.when != "interval" and draw.interval_s:
+        told = f"is of `when: interval` only, got {draw.interval_s:g} with `when: {draw.when}`"
+        raise ConfigError(f"{where(f'{path}.interval_s')}: {told}")
     _check_grow(draw, path, where)
     if draw.grow[1] and draw.when == "start":
         raise ConfigError(f"{where(f'{path}.grow')}: what is drawn at the start can't grow; `when: reset` draws it again")
@@ -133,3 +135,10 @@ def check_observed(cfg: TaskConfig) -> None:
                 )
             if term == "push_force" and isinstance(cfg, LeggedConfig) and not observed_forces(cfg):
                 raise ConfigError(f"{cfg.origins.where(path)}: push_force: domain_rand.forces names no force to observe")
+            if term == "push_force" and isinstance(cfg, LeggedConfig) and cfg.train.algorithm.symmetry:
+                aside = [force.body for force in observed_forces(cfg).values() if force.body]
+                if aside:
+                    raise ConfigError(
+                        f"{cfg.origins.where(path)}: push_force: of a force on '{aside[0]}' there is no mirror image, only of"
+                        " those on the base; train.algorithm.symmetry=false learns without"
+                    )

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from legged.config.schema import LeggedConfig
+from legged.envs.privileged_terms import MIRROR_KINDS
 from legged.math import squared_difference
 from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
@@ -39,6 +40,7 @@ class Terms:
         "heights": "heights",
         "passive_pos": "passive",
         "passive_vel": "passive",
+        **MIRROR_KINDS,
     }
     """Observation term -> how its numbers change when left and right are exchanged; a subclass adds its own terms'."""
     cfg: LeggedConfig

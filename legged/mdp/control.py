@@ -84,9 +84,9 @@ class Control:
         if not self._varied:
             self._varied = True
             self.stiffness, self.damping, self.torque_limits, self._lowest_torques = (
-                nominal.expand_as(self.torques).contiguous() for nominal in (*self._nominal.values(), self._lowest_torques)
+                torch.zeros_like(self.torques) + nominal for nominal in (*self._nominal.values(), self._lowest_torques)
             )
-            self.zero_dof_pos = self.default_dof_pos.expand_as(self.torques).contiguous()
+            self.zero_dof_pos = torch.zeros_like(self.torques) + self.default_dof_pos
         written = {"p_gain": self.stiffness, "d_gain": self.damping, "torque_limit": self.torque_limits}
         for name, values in each.items():
             if name in written:

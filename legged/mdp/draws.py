@@ -20,8 +20,14 @@ def standard_deviation(draw: DrawConfig) -> float:
 class Draws:
     """V columns of numbers, some of which are drawn evenly, some evenly in their logarithm, some normally."""
 
-    def __init__(self, columns: Sequence[DrawConfig], neutral: Sequence[float], device: torch.device) -> None:
-        """Say how each of V columns is drawn, and towards what it shrinks while it grows."""
+    def __init__(
+        self,
+        columns: Sequence[DrawConfig],
+        neutral: Sequence[float],
+        device: torch.device,
+        steps_per_iteration: int = 1,
+    ) -> None:
+        """Say how each of V columns is drawn, and from what value on it grows over iterations of so many steps."""
         self._order = sorted(range(len(columns)), key=lambda i: KINDS.index(columns[i].distribution))
         ordered = [columns[i] for i in self._order]
         self._counts = [sum(draw.distribution == kind for draw in ordered) for kind in KINDS]
@@ -39,7 +45,12 @@ class Draws:
         self.low, self.high = (tensor([end[k] for end in ends]) for k in range(2))
         """(V,) bounds of the even numbers, in an order of their own."""
         self._least, self._most = (tensor([draw.range[k] for draw in columns]) for k in range(2))
-        self._grow = tensor([draw.grow for draw in columns]) if any(draw.grow[1] > 0.0 for draw in columns) else None
+        self._pace: tuple[Tensor, Tensor] | None = None
+        """(V,) how much wider a range gets in a step, and how wide it is at the first one, as shares; None if none grows."""
+        if any(draw.grow[1] > 0.0 for draw in columns):
+            paces = [1.0 / (draw.grow[1] - draw.grow[0]) if draw.grow[1] > 0.0 else 0.0 for draw in columns]
+            first = [-draw.grow[0] * pace if pace else 1.0 for draw, pace in zip(columns, paces, strict=True)]
+            self._pace = tensor([pace / steps_per_iteration for pace in paces]), tensor(first)
         self._neutral = torch.minimum(torch.maximum(tensor(neutral), self._least), self._most)
 
     def ask(self, numbers: UniformNumbers) -> Drawn:
@@ -51,8 +62,8 @@ class Draws:
         even = self.low + torch.rand(count, len(self.low), device=self.low.device) * (self.high - self.low)
         return self.values(even, torch.zeros((), device=even.device))
 
-    def values(self, even: Tensor, steps: Tensor | None = None, steps_per_iteration: int = 1) -> Tensor:
-        """Return (N, V) numbers from even ones, (N, V) within `low` and `high`; after so many `steps`, if any grow."""
+    def values(self, even: Tensor, steps: Tensor) -> Tensor:
+        """Return (N, V) numbers from even ones, (N, V) within `low` and `high`, after so many `steps` of training, ()."""
         parts = list(even.split(self._counts, dim=1))
         if self._counts[1]:
             parts[1] = parts[1].exp()
@@ -62,12 +73,11 @@ class Draws:
         if self._back is not None:
             drawn = drawn.index_select(1, self._back)
         if any(self._counts[1:]):
-            drawn = torch.minimum(torch.maximum(drawn, self._least), self._most)  # rounding must not leave the range
-        if self._grow is None or steps is None:
+            drawn = torch.clamp(drawn, self._least, self._most)  # rounding must not leave the range
+        if self._pace is None:
             return drawn
-        start, end = self._grow.unbind(dim=1)
-        share = ((steps / steps_per_iteration - start) / (end - start).clamp(min=1e-6)).clamp(0.0, 1.0)
-        return torch.lerp(self._neutral.expand_as(drawn), drawn, torch.where(end > 0.0, share, 1.0))
+        share = torch.addcmul(self._pace[1], self._pace[0], steps).clamp_(0.0, 1.0)
+        return torch.lerp(self._neutral.expand_as(drawn), drawn, share.expand_as(drawn))
 
 
 def _ends(draw: DrawConfig) -> tuple[float, float]:

@@ -1,6 +1,7 @@
 """What differs from world to world, drawn at the start, at resets or at intervals; and legged_gym's pushes."""
 
 from collections.abc import Collection, Mapping
+from itertools import accumulate
 from typing import TYPE_CHECKING
 
 import torch
@@ -10,7 +11,7 @@ from legged.config.randomization import DrawConfig, Range, draw_of
 from legged.config.schema import LeggedDomainRandConfig
 from legged.math import masked_set_, uniform
 from legged.mdp.draws import Draws
-from legged.mdp.uniform_numbers import Drawn, UniformNumbers
+from legged.mdp.uniform_numbers import UniformNumbers
 from legged.physics import FIELDS, MODEL_FIELDS, Physics
 
 if TYPE_CHECKING:
@@ -19,29 +20,6 @@ if TYPE_CHECKING:
 VARIANTS = 1024
 """Models among which worlds choose where masses, inertias or armatures are drawn again: constants are derived from them when
 they are drawn, which is not done within a step."""
-
-
-class Moment:
-    """Columns that are drawn again at the same moments: when episodes begin, or at intervals."""
-
-    def __init__(self, columns: list[int], draws: Draws | None, interval: int, num_envs: int, device: torch.device) -> None:
-        """Draw `columns` by `draws`, or if None, by choosing a variant; every `interval` steps, or with 0 at resets."""
-        self.draws, self.interval = draws, interval
-        self.columns = torch.tensor(columns, device=device)
-        self.steps_left = torch.zeros(num_envs, device=device)
-        """(N,) control steps until the next draw, of an interval; the first ones are spread over a whole interval."""
-        if interval:
-            self.steps_left.random_(1, interval + 1)
-        self.even: Drawn
-
-    def due(self, reset: Tensor) -> Tensor:
-        """Return the worlds (N,) that draw now, where episodes begin in those of `reset` (N,)."""
-        if not self.interval:
-            return reset
-        self.steps_left.sub_(1.0)
-        due = self.steps_left <= 0.0
-        masked_set_(self.steps_left, due, float(self.interval))
-        return due
 
 
 class Randomization:
@@ -67,17 +45,16 @@ class Randomization:
         """Fields that are drawn again within steps."""
         self.chosen_fields = tuple(name for name in again if FIELDS[name].derived)
         """Those of them from which constants are derived, of which worlds choose a variant of all together."""
-        self._moments: list[Moment] = []
         if again:
             self.steps = torch.zeros((), device=device)
             """Control steps since training began, by which ranges grow."""
             self.STATE = ("drawn", "steps")
 
-    def _draws(self, names: Collection[str], widths: Mapping[str, int] | None = None) -> Draws:
+    def _draws(self, names: Collection[str], widths: Mapping[str, int] | None = None, pace: int = 1) -> Draws:
         """Return what draws the columns of some fields."""
         wide = [name for name in names for _ in range((widths or {}).get(name, 1))]
         neutral = [FIELDS[name].neutral for name in wide]
-        return Draws([self.draws[name] for name in wide], neutral, self.drawn.device)
+        return Draws([self.draws[name] for name in wide], neutral, self.drawn.device, pace)
 
     def widen(self, rows: Mapping[str, int]) -> None:
         """Draw numbers for each row of the fields that ask for it, now that it is known how many `rows` they have."""
@@ -94,7 +71,10 @@ class Randomization:
             """(K, W) numbers of the fields of which worlds choose, by variant."""
             self.chosen = torch.randint(VARIANTS, (len(self.drawn),), device=self.drawn.device)
             """(N,) the variant of each world."""
-            self._take_chosen(torch.ones_like(self.chosen, dtype=torch.bool))
+            found, start = self.variants[self.chosen], 0
+            for name in self.chosen_fields:
+                self._of(name).copy_(found[:, start : start + widths[name]])
+                start += widths[name]
             self.STATE = (*self.STATE, "variants", "chosen")
 
     def is_each(self, name: str) -> bool:
@@ -123,57 +103,66 @@ class Randomization:
 
     def prepare(self, physics: Physics, numbers: UniformNumbers, dt: float, steps_per_iteration: int) -> None:
         """Prepare for draws within steps of `dt` [s], from `numbers`; nothing is done where there are none."""
-        self._steps_per_iteration = steps_per_iteration
-        groups: dict[tuple[float, bool], list[str]] = {}
-        for name in self.redrawn:
-            draw = self.draws[name]
-            interval = draw.interval_s if draw.when == "interval" else 0.0
-            groups.setdefault((interval, name in self.chosen_fields), []).append(name)
-        for (seconds, chooses), names in groups.items():
-            steps = max(1, round(seconds / dt)) if seconds else 0
-            columns = [c for name in names for c in range(self.columns[name].start, self.columns[name].stop)]
-            widths = {name: self.columns[name].stop - self.columns[name].start for name in names}
-            draws = None if chooses else self._draws(names, widths)
-            moment = Moment(columns, draws, steps, len(self.drawn), self.drawn.device)  # type: ignore[arg-type]
-            moment.even = numbers.between(0.0, float(VARIANTS), 1) if draws is None else draws.ask(numbers)
-            self._moments.append(moment)
-        for number, moment in enumerate(self._moments):
-            setattr(self, f"_steps_left_{number}", moment.steps_left)
-            self.STATE = (*self.STATE, f"_steps_left_{number}")
-        model_fields = [name for name in self.redrawn if name in MODEL_FIELDS and name not in self.chosen_fields]
-        if model_fields:
-            known = {n: c for n, c in self.columns.items() if n in MODEL_FIELDS and n not in self.chosen_fields}
-            physics.prepare_redraws(self.drawn, known, model_fields)
-        self._writes_model = bool(model_fields)
+        if not self.redrawn:
+            return
+        device, worlds = self.drawn.device, len(self.drawn)
+        own = [name for name in self.redrawn if name not in self.chosen_fields]
+        widths = {name: columns.stop - columns.start for name, columns in self.columns.items()}
+        self._own = self._draws(own, widths, steps_per_iteration) if own else None
+        self._even = self._own.ask(numbers) if self._own is not None else None
+        self._choice = numbers.between(0.0, float(VARIANTS), 1) if self.chosen_fields else None
+        self._new_chosen = torch.zeros(worlds, dtype=torch.long, device=device)
+        # What is new lies in the order of `own`, then of the chosen fields; the first moment is never, the second a reset.
+        intervals = sorted({self.draws[name].interval_s for name in self.redrawn if self.draws[name].when == "interval"})
+        order, place, moment = [*own, *self.chosen_fields], [], []
+        starts = dict(zip(order, accumulate((widths[name] for name in order), initial=0), strict=False))
+        for name, draw in self.draws.items():
+            kind = 0 if draw.when == "start" else 1 if draw.when == "reset" else 2 + intervals.index(draw.interval_s)
+            for k in range(widths[name]):
+                place.append(starts[name] + k if kind else 0)
+                moment.append(kind)
+        self._place, self._moment = (torch.tensor(values, device=device) for values in (place, moment))
+        self._fresh = torch.zeros_like(self.drawn)
+        self._due = torch.zeros(worlds, 2 + len(intervals), dtype=torch.bool, device=device)
+        self._interval = torch.tensor([float(max(1, round(each / dt))) for each in intervals], device=device)
+        self.steps_left = torch.floor(torch.rand(worlds, len(intervals), device=device) * self._interval) + 1.0
+        """(N, I) control steps until the next draw of each interval; the first ones are spread over a whole interval."""
+        self.STATE = (*self.STATE, "steps_left")
+        if self.chosen_fields:
+            draw = self.draws[self.chosen_fields[0]]
+            self._chosen_at = 1 if draw.when == "reset" else 2 + intervals.index(draw.interval_s)
+        known = {n: c for n, c in self.columns.items() if n in MODEL_FIELDS and n not in self.chosen_fields}
+        self._of_model = [name for name in own if name in MODEL_FIELDS]
+        if self._of_model:
+            physics.prepare_redraws(self.drawn, known, self._of_model)
+
+    def draw(self) -> None:
+        """Draw for every world what those that are due will take. Runs beside the step."""
+        if not self.redrawn:
+            return
+        parts = []
+        if self._own is not None and self._even is not None:
+            parts.append(self._own.values(self._even.values, self.steps))
+        if self._choice is not None:
+            self._new_chosen.copy_(self._choice.values[:, 0]).clamp_(max=VARIANTS - 1)
+            parts.append(self.variants.index_select(0, self._new_chosen))
+        torch.index_select(torch.cat(parts, dim=1), 1, self._place, out=self._fresh)
 
     def redraw(self, physics: Physics, reset: Tensor) -> None:
-        """Draw again what is due, within a step, where episodes begin in the worlds of `reset` (N,)."""
-        any_due: Tensor | None = None
-        for moment in self._moments:
-            due = moment.due(reset)
-            if moment.draws is None:
-                new = moment.even.values[:, 0].long().clamp_(max=VARIANTS - 1)
-                masked_set_(self.chosen, due, new)
-                self._take_chosen(due)
-                physics.choose_variants(due, self.chosen)
-                continue
-            values = moment.draws.values(moment.even.values, self.steps, self._steps_per_iteration)
-            old = self.drawn.index_select(1, moment.columns)
-            self.drawn.index_copy_(1, moment.columns, torch.where(due.unsqueeze(1), values, old))
-            any_due = due if any_due is None else any_due | due
-        if any_due is not None and self._writes_model:
-            physics.redraw(any_due)
-        if self._moments:
-            self.steps.add_(1.0)
-
-    def _take_chosen(self, mask: Tensor) -> None:
-        """Note what the variants of the worlds of `mask` (N,) have of each field."""
-        found = self.variants.index_select(0, self.chosen)
-        start = 0
-        for name in self.chosen_fields:
-            width = self.columns[name].stop - self.columns[name].start
-            masked_set_(self._of(name), mask, found[:, start : start + width])
-            start += width
+        """Let the worlds that are due take what was drawn, within a step, where episodes begin in those of `reset` (N,)."""
+        self._due[:, 1].copy_(reset)
+        if len(self._interval):
+            self.steps_left.sub_(1.0)
+            due = torch.le(self.steps_left, 0.0, out=self._due[:, 2:])
+            torch.where(due, self._interval, self.steps_left, out=self.steps_left)
+        torch.where(self._due.index_select(1, self._moment), self._fresh, self.drawn, out=self.drawn)
+        if self.chosen_fields:
+            chosen = self._due[:, self._chosen_at].contiguous()
+            masked_set_(self.chosen, chosen, self._new_chosen)
+            physics.choose_variants(chosen, self.chosen)
+        if self._of_model:
+            physics.redraw(self._due.any(dim=1) if len(self._interval) else reset)
+        self.steps.add_(1.0)
 
     def progress(self) -> dict[str, Tensor]:
         """Return how far ranges have grown, whatever the number of worlds; empty if none does."""
