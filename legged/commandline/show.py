@@ -109,9 +109,9 @@ def _randomisation(task: BaseTask) -> Iterator[str]:
     """Yield what differs from robot to robot, by legged_gym's names too, and what disturbs them."""
     rows = []
     for name, draw in task.randomization.draws.items():
-        span, distribution, moments = _drawn(draw, FIELDS[name].unit)
+        drawn_from, distribution, moments = _drawn(draw, FIELDS[name].unit)
         each = f", for each of {task.field_rows[name]}" if task.randomization.is_each(name) else ""
-        rows.append((name, span, distribution, moments + each, FIELDS[name].meaning))
+        rows.append((name, drawn_from, distribution, moments + each, FIELDS[name].meaning))
     rand = task.cfg.domain_rand
     for name, on, span in _of_legged_gym(rand) if isinstance(rand, LeggedDomainRandConfig) else ():
         if on and name not in task.randomization.draws:

@@ -22,6 +22,11 @@ def check_randomization(cfg: TaskConfig) -> None:
         for name, entry in ranges.items():
             _check_draw(name, draw_of(entry), legged, f"domain_rand.{key}.{name}", cfg.origins.where)
     _check_derived(cfg)
+    if cfg.sim.physics == "newton" and cfg.sim.solver != "mujoco":
+        for name, entry in rand.ranges.items():
+            if draw_of(entry).when != "start":
+                where = cfg.origins.where(f"domain_rand.ranges.{name}.when")
+                raise ConfigError(f"{where}: newton's {cfg.sim.solver} draws at the start only; sim.solver=mujoco does not")
     if isinstance(cfg, LeggedConfig) and cfg.control.control_type == "T":
         for name in ("p_gain", "d_gain", "joint_offset"):
             if name in rand.ranges:

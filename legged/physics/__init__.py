@@ -9,7 +9,7 @@ import torch
 from legged.config.schema import SimConfig
 from legged.errors import ConfigError, suggest
 from legged.physics.base import Physics
-from legged.physics.fields import FIELDS, MODEL_FIELDS, row_counts
+from legged.physics.fields import FIELDS, MODEL_FIELDS, NEWTONS_FIELDS, row_counts
 from legged.physics.quantities import check_quantities
 from legged.physics.randomized_model import check_ranges
 from legged.physics.robot_state import RobotState
@@ -64,10 +64,6 @@ def engine_name(sim: SimConfig, device: torch.device, where: str = "sim.physics"
     return f"newton_{sim.solver}" if engine == "newton" else engine
 
 
-NEWTONS_FIELDS = ("friction", "added_base_mass")
-"""What can be randomised in newton: its model has names and arrays of its own."""
-
-
 def check_engine(
     scene: Scene,
     sim: SimConfig,
@@ -100,9 +96,10 @@ def check_engine(
             f" (passive_joints), and their loops; {others} do"
         )
     for field in randomized:
-        if field not in NEWTONS_FIELDS:
+        if sim.solver != "mujoco" and field not in NEWTONS_FIELDS:
             can = suggest(field, NEWTONS_FIELDS, "newton can")
-            raise ConfigError(f"{where(f'domain_rand.ranges.{field}')}: newton cannot randomise it{can}; {others} can")
+            path = where(f"domain_rand.ranges.{field}")
+            raise ConfigError(f"{path}: newton's {sim.solver} cannot randomise it{can}; sim.solver=mujoco and {others} can")
     if quantities:
         names = ", ".join(quantities)
         raise ConfigError(f"{where('sim.physics')}: newton does not compute {names} for the task; {others} does")

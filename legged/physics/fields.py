@@ -241,6 +241,10 @@ FIELDS = {
 MODEL_FIELDS = {name: field for name, field in FIELDS.items() if field.changes}
 """Those that change the model, and that `Physics.randomize` takes; the others are the control law's alone."""
 
+NEWTONS_FIELDS = ("friction", "added_base_mass")
+"""What can be randomised in all of newton's solvers: its model has names and arrays of its own. Its MuJoCo solver takes
+all."""
+
 
 def row_counts(scene: Scene, model: mujoco.MjModel) -> dict[str, int]:
     """Return of each field how many rows of its arrays change, or how many joints have it."""

@@ -268,10 +268,10 @@ def test_a_state_that_is_put_back_gives_the_same_steps():
 # ---- both engines, and a graph -------------------------------------------------------------------------------------------
 
 
-def run(engine, steps=12):
+def run(engine, steps=35):
     """Everything drawn, through resets, kicks and forces; joint angles, base and what was drawn."""
     name, _, gpu = engine.partition(", ")
-    cfg = small_config(*ALL, ("env.episode_length_s", 0.16), ("sim.physics", name))
+    cfg = small_config(*ALL, ("env.episode_length_s", 0.4), ("sim.physics", name))
     torch.manual_seed(0)
     task = make_task(cfg, "cuda:0" if gpu else "cpu", graph=not gpu)
     torch.manual_seed(1)
@@ -282,18 +282,27 @@ def run(engine, steps=12):
     return task
 
 
-def test_both_engines_make_the_same_of_everything():
-    """12 control steps in the air and on the ground, with resets in between; the fused step takes all of it."""
-    ours, fused = run("mujoco"), run("mujoco_warp")
-    assert fused.physics.why_library == ""
-    torch.testing.assert_close(fused.randomization.drawn, ours.randomization.drawn)
-    torch.testing.assert_close(fused.physics.forces, ours.physics.forces)
-    assert ours.physics.forces.any()
-    torch.testing.assert_close(fused.dof_pos, ours.dof_pos, atol=2e-5, rtol=0.0)
-    torch.testing.assert_close(fused.base_pos, ours.base_pos, atol=2e-5, rtol=0.0)
+@pytest.fixture(scope="module")
+def in_c():
+    return run("mujoco")
 
 
-@pytest.mark.parametrize("engine", ["mujoco", "mujoco_warp", on_gpu("mujoco_warp, cuda")])
+@pytest.mark.parametrize("engine", ["mujoco_warp", "newton"])
+def test_all_engines_make_the_same_of_everything(in_c, engine):
+    """35 control steps in the air and on the ground, with resets in between; the fused step takes all of it, and Newton's
+    MuJoCo solver.
+    """
+    other = run(engine)
+    assert other.physics.why_library == ""
+    torch.testing.assert_close(other.randomization.drawn, in_c.randomization.drawn)
+    torch.testing.assert_close(other.physics.forces, in_c.physics.forces)
+    assert in_c.physics.forces.any()
+    assert in_c.contact_forces.any()
+    torch.testing.assert_close(other.dof_pos, in_c.dof_pos, atol=2e-4, rtol=0.0)
+    torch.testing.assert_close(other.base_pos, in_c.base_pos, atol=2e-5, rtol=0.0)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "mujoco_warp", "newton", on_gpu("mujoco_warp, cuda"), on_gpu("newton, cuda")])
 def test_a_step_in_which_everything_is_drawn_can_be_captured(engine):
     name, _, gpu = engine.partition(", ")
     cfg = small_config(*ALL, ("env.episode_length_s", 0.1), ("sim.physics", name))
