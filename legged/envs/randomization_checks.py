@@ -92,11 +92,11 @@ def _check_derived(cfg: TaskConfig) -> None:
         if moment != moments[first]:
             a, b = ("at the start" if when == "start" else f"at {when}" for when, _ in (moments[first], moment))
             path = name if name in cfg.domain_rand.ranges else first
-            raise ConfigError(
-                f"{cfg.origins.where(f'domain_rand.ranges.{path}')}: {first} is drawn {a}, {name} {b}: MuJoCo derives"
-                f" constants from {', '.join(moments)} together, so they must have the same `when` and interval_s"
-                f"{'' if 'added_base_mass' in cfg.domain_rand.ranges else ' (randomize_base_mass draws at the start)'}"
-            )
+            names = ", ".join(moments)
+            text = f"MuJoCo derives constants from {names} together, so they must have the same `when` and interval_s"
+            if "added_base_mass" in moments and "added_base_mass" not in cfg.domain_rand.ranges:
+                text += " (randomize_base_mass draws at the start; added_base_mass among the ranges takes its place)"
+            raise ConfigError(f"{cfg.origins.where(f'domain_rand.ranges.{path}')}: {first} is drawn {a}, {name} {b}: {text}")
 
 
 def check_disturbances(cfg: LeggedConfig, robot: Robot) -> None:

@@ -121,11 +121,14 @@ def check_ranges(
             raise ConfigError(f"{path}: there is no field '{name}'{suggest(name, FIELDS, 'fields')}")
     given = RandomizedModel(scene, model, ranges, torch.float64, torch.device("cpu")) if model else None
     for name, field in FIELDS.items():
-        if given is None or name not in ranges:
+        if given is None or model is None or name not in ranges:
             continue
         path, low = where(f"domain_rand.ranges.{name}"), float(draw_of(ranges[name]).range[0])
         if not len(field.rows(scene, model)):
             raise ConfigError(f"{path}: {scene.name} has no {field.what}")
+        if name == "restitution" and (model.geom_solref[field.rows(scene, model), 0] <= 0.0).any():
+            told = "contacts have a stiffness of their own (a negative solref), in place of a time constant"
+            raise ConfigError(f"{path}: {scene.name}: {told}")
         changed = given.give(name, torch.tensor([low], dtype=torch.float64)) if field.changes else {}
         for change in field.changes:
             rows = changed[change.array][:, field.rows(scene, model)]

@@ -360,6 +360,21 @@ def test_forces_are_observed_as_shares_of_the_largest():
     assert task._obs_push_force()[0].tolist() == pytest.approx([0.0, 0.5, 0.0, *task._obs_push_force()[0, 3:].tolist()])
 
 
+def test_privileged_observations_have_mirror_images():
+    """Left and right joints change places, what points to the left changes its sign, and numbers of the whole robot stay."""
+    ranges = {"friction": [0.4, 1.2], "base_com_y": [-0.1, 0.1], "motor_strength": {"range": [0.8, 1.1], "each": True}}
+    terms = ["rand_friction", "rand_base_com_y", "rand_motor_strength", "push_force"]
+    forces = {"pull": {"x": [-1.0, 1.0]}, "lift": {"z": [0.0, 1.0]}}
+    cfg = ("domain_rand.ranges", ranges), ("domain_rand.forces", forces), ("observations.groups.critic.terms", terms)
+    columns, signs = small_task(*cfg, num_envs=1).mirror_images().groups["critic"]
+    assert columns.tolist() == [0, 1, 5, 6, 7, 2, 3, 4, 11, 12, 13, 8, 9, 10, 14, 15, 16, 17, 18, 19]
+    assert signs.tolist() == [1.0, -1.0, *[1.0] * 12, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0]
+    each = {"link_mass": {"range": [0.9, 1.1], "each": True}}
+    task = small_task(("domain_rand.ranges", each), ("observations.groups.critic.terms", ["rand_link_mass"]), num_envs=1)
+    with pytest.raises(ConfigError, match=r"'rand_link_mass' has 13 numbers, but its kind 'scalar' is for 1"):
+        task.mirror_images()
+
+
 # ---- what is refused -----------------------------------------------------------------------------------------------------
 
 
