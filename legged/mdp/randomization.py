@@ -75,6 +75,7 @@ class Randomization:
             for name in self.chosen_fields:
                 self._of(name).copy_(found[:, start : start + widths[name]])
                 start += widths[name]
+            self._given: Tensor | None = None
             self.STATE = (*self.STATE, "variants", "chosen")
 
     def is_each(self, name: str) -> bool:
@@ -97,8 +98,10 @@ class Randomization:
             if field in MODEL_FIELDS and field not in self.chosen_fields:
                 physics.randomize(field, values)
         if self.chosen_fields:
-            widths = [self.columns[name].stop - self.columns[name].start for name in self.chosen_fields]
-            physics.set_variants(dict(zip(self.chosen_fields, self.variants.split(widths, dim=1), strict=True)))
+            if self._given is None or not torch.equal(self._given, self.variants):  # to derive constants takes a while
+                widths = [self.columns[name].stop - self.columns[name].start for name in self.chosen_fields]
+                physics.set_variants(dict(zip(self.chosen_fields, self.variants.split(widths, dim=1), strict=True)))
+                self._given = self.variants.clone()
             physics.choose_variants(torch.ones_like(self.chosen, dtype=torch.bool), self.chosen)
 
     def prepare(self, physics: Physics, numbers: UniformNumbers, dt: float, steps_per_iteration: int) -> None:

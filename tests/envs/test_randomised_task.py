@@ -8,6 +8,7 @@ import pytest
 import torch
 from devices import on_gpu
 from helpers import small_config, small_task, zero_actions
+from launches import counting
 
 from legged.errors import ConfigError
 from legged.graph.step_graph import ForbidHostReads
@@ -313,6 +314,17 @@ def test_a_step_in_which_everything_is_drawn_can_be_captured(engine):
                 task._step()
     if gpu:
         assert task.captured
+
+
+def test_everything_adds_few_launches():
+    """A third of them beside the step; and what is not asked for adds none (test_launches.py)."""
+    counts = []
+    for settings in ([], ALL):
+        task = make_task(small_config(*settings, ("sim.physics", "mujoco_warp"), num_envs=2))
+        with torch.no_grad(), counting() as launches:
+            task.step_in_place(zero_actions(task))
+        counts.append(launches.total())
+    assert counts[1] - counts[0] <= 66, counts
 
 
 # ---- observed ------------------------------------------------------------------------------------------------------------
