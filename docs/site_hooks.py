@@ -19,7 +19,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from legged.commandline.listing import robots, tasks, tools
+from legged.commandline.listing import module_of, robots, tasks, tools
 from legged.config.reference import FieldText, fields
 from legged.config.schema import LeggedConfig
 
@@ -117,7 +117,7 @@ def commands_page() -> str:
     """Return the page with what every command says of itself, its examples first."""
     lines = ["# Commands", "", "`python -m legged` lists them, with all tasks and robots."]
     for module, summary in tools().items():
-        parser = import_module(module).build_parser()
+        parser = import_module(module_of(module)).build_parser()
         lines += ["", f"## {parser.prog}", "", f"{summary}.", "", "```", *parser.examples, "```", ""]
         lines += ["| argument | |", "|---|---|", *_arguments(parser)]
     return "\n".join(lines)

@@ -12,8 +12,12 @@ from legged.process.paths import make_folder, replacing
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COLORS = ("#1f6fb4", "#d9541e", "#3a923a", "#8a56b8", "#6b5b4b")
-"""Of curves and bars, in this order."""
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C8C00")
+"""Of curves, bars and areas, in this order: those of Okabe and Ito ("Color universal design", 2008), which readers of any
+colour vision tell apart. The last is their yellow, darkened to be seen on white.
+"""
+STYLES = ("-", "--", "-.", ":")
+"""Of curves that differ by more than their colours, in this order."""
 DPI = 110
 """Pixels an inch."""
 
@@ -23,18 +27,21 @@ def figure(
     path: Path, size: tuple[float, float], rows: int = 1, columns: int = 1, share_y: bool = False, **saving: Any
 ) -> Iterator[tuple["Figure", np.ndarray]]:
     """Give a figure of `size` (width, height) [inches] and its (rows, columns) axes to draw into; it is then written to
-    `path` as a PNG file that is whole or not there. With `share_y` all axes have one scale of y; `saving` are options of
-    matplotlib's savefig.
+    `path` as a PNG file that is whole or not there. Curves take the colours of all figures. With `share_y` all axes have one
+    scale of y; `saving` are options of matplotlib's savefig.
 
     No window system is asked: matplotlib's choice of one (MPLBACKEND) has no say here.
 
     Raises:
         RunError: the file can't be written.
     """
-    from matplotlib.figure import Figure  # takes a while; commands that fail early do without
+    from matplotlib import rc_context  # takes a while; commands that fail early do without
+    from matplotlib.figure import Figure
+    from matplotlib.rcsetup import cycler
 
-    drawn = Figure(figsize=size, layout="constrained")
-    yield drawn, drawn.subplots(rows, columns, squeeze=False, sharey=share_y)
-    make_folder(path.parent)
-    with replacing(path) as part:
-        drawn.savefig(part, **{"dpi": DPI, "format": "png", **saving})
+    with rc_context({"axes.prop_cycle": cycler(color=COLORS)}):
+        drawn = Figure(figsize=size, layout="constrained")
+        yield drawn, drawn.subplots(rows, columns, squeeze=False, sharey=share_y)
+        make_folder(path.parent)
+        with replacing(path) as part:
+            drawn.savefig(part, **{"dpi": DPI, "format": "png", **saving})

@@ -9,11 +9,12 @@ import torch
 from devices import engine_of
 from torch import Tensor
 
-from legged.config.schema import SimConfig
+from legged.config.schema import SimConfig, TerrainConfig
 from legged.math import quat_rotate
 from legged.physics import Physics, RobotState
 from legged.physics.scene import RobotScene
 from legged.robots.robot import Robot
+from legged.terrain import Terrain, TileSpec
 
 TOUCHING = 0.54982
 """Base height at which the feet of the default pose end 1 mm above the ground [m]."""
@@ -229,3 +230,9 @@ class CWorlds:
                 if geom in self.shapes:
                     forces[self.shapes[geom]] += force
         return forces
+
+
+def tiles(*names_and_sizes: tuple[str, float]) -> Terrain:
+    """A row of tiles of these types and sizes, on a height map, the same every time."""
+    cfg = TerrainConfig(mesh_type="height_map", border_size=4.0)
+    return Terrain.of_tiles([[TileSpec(*pair) for pair in names_and_sizes]], cfg, np.random.default_rng(5))

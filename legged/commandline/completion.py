@@ -41,7 +41,7 @@ def words_of(parser: argparse.ArgumentParser, choices: Mapping[str, tuple[str, .
     """
     alone = {name for action in parser._actions if not action.option_strings for name in str(action.metavar).split(" | ")}
     of_flags = {"--physics": choices["sim.physics"], "--solver": choices["sim.solver"]}
-    if "key=value" in alone:
+    if "key=value" in alone or any("--load_run" in action.option_strings for action in parser._actions):
         of_flags["--task"] = (TASKS,)
     flags: list[str] = []
     values: dict[str, tuple[str, ...]] = {}
@@ -76,9 +76,9 @@ def keys_of(kinds: Iterable[type[BaseTask]]) -> dict[str, tuple[str, ...]]:
 
 
 def script(shell: str, commands: Mapping[str, Words], keys: Mapping[str, tuple[str, ...]]) -> str:
-    """Return the script for a shell, bash or zsh, that completes `commands` (name of a tool -> words)."""
+    """Return the script for a shell, bash or zsh, that completes `commands` (module -> words)."""
     lines = [f"# Completion of legged for {shell}, written by `python -m legged.tools.completion {shell}`."]
-    lines += _function("_legged_modules", [f"legged.tools.{name}" for name in commands])
+    lines += _function("_legged_modules", commands)
     lines += _function("_legged_keys", keys)
     lines += _cases("_legged_choices", {key: choices for key, choices in keys.items() if choices})
     lines += _cases("_legged_flags", {name: words.flags for name, words in commands.items()})

@@ -7,14 +7,14 @@ _legged_tasks() {
   done
 }
 
-# The tool that a command line is about: its words -> "train"; nothing for other programs.
+# The tool that a command line is about: its words -> "legged.tools.train"; nothing for other programs.
 _legged_tool() {
   local word after=
   for word in "$@"; do
     case "$word" in
-      train.py | */train.py | legged-train) echo train; return ;;
-      play.py | */play.py | legged-play) echo play; return ;;
-      legged.tools.*) if [ "$after" = -m ]; then echo "${word#legged.tools.}"; fi; return ;;
+      train.py | */train.py | legged-train) echo legged.tools.train; return ;;
+      play.py | */play.py | legged-play) echo legged.tools.play; return ;;
+      legged.*) if [ "$after" = -m ]; then echo "$word"; fi; return ;;
       python* | */python* | -m) ;;
       *) return ;;
     esac

@@ -4,18 +4,27 @@ from pathlib import Path
 
 from legged.process.paths import data_folder
 
-TOOLS = Path(__file__).resolve().parents[1] / "tools"
+PACKAGE = Path(__file__).resolve().parents[1]
+ON_ROBOTS = "legged.deploy"
+"""The command that lies outside legged.tools: a robot's computer runs it without them."""
 
 
 def tools() -> dict[str, str]:
     """Return module -> the first line of what it says about itself, of all modules that can be run as `python -m`."""
+    files = {f"legged.tools.{path.stem}": path for path in sorted((PACKAGE / "tools").glob("*.py"))}
+    files[ON_ROBOTS] = PACKAGE / "deploy" / "__main__.py"
     found = {}
-    for path in sorted(TOOLS.glob("*.py")):
+    for name, path in files.items():
         text = path.read_text(encoding="utf-8")
         if '__name__ == "__main__"' in text:
             summary = text.split('"""')[1].strip().splitlines()[0]
-            found[f"legged.tools.{path.stem}"] = summary.partition(": `")[0].rstrip(".:")
+            found[name] = summary.partition(": `")[0].rstrip(".:")
     return found
+
+
+def module_of(tool: str) -> str:
+    """Return the module with the `main` and the `build_parser` of a key of `tools`: of a package it is __main__."""
+    return f"{tool}.__main__" if tool == ON_ROBOTS else tool
 
 
 def tasks() -> dict[str, str]:

@@ -16,9 +16,9 @@ from torch import Tensor
 from legged.config.schema import TaskConfig
 from legged.envs.actions import as_actions, ordinary_tensors
 from legged.envs.checks import check_task
-from legged.envs.final_step import StepWatcher
 from legged.envs.privileged_terms import PrivilegedTerms
 from legged.envs.saved import SavedTask
+from legged.envs.step_watchers import StepWatcher
 from legged.errors import ConfigError
 from legged.graph.step_graph import Branch, StepGraph
 from legged.math import masked_set_
@@ -135,8 +135,8 @@ class BaseTask(PrivilegedTerms, SavedTask, VecEnv):
         self._beside = Branch(device)  # type: ignore[arg-type]
         self.numbers = UniformNumbers(n, device)  # type: ignore[arg-type]
         """What a step draws at random; subclasses ask it for theirs in `_init_buffers`."""
-        self.final_step: StepWatcher | None = None
-        """What looks at a step before episodes begin anew, where somebody asked for it (`final_step.watch_steps`)."""
+        self.step_watcher: StepWatcher | None = None
+        """What looks at a step before episodes begin anew, where somebody asked for it (`step_watchers.watch_steps`)."""
         self._steps_since_log = 0
         self._has_buffers = False
 
@@ -220,8 +220,8 @@ class BaseTask(PrivilegedTerms, SavedTask, VecEnv):
             self.measure()
         self.compute_reward()
         self._beside.join()
-        if self.final_step is not None:
-            self.final_step.take()
+        if self.step_watcher is not None:
+            self.step_watcher.take()
         with self._beside.fork():
             self.faults.check_rewards(self.rewards.fine, self.valid)
         self.update_curricula()

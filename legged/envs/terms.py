@@ -245,14 +245,16 @@ class Terms:
         return (force - self.cfg.rewards.max_contact_force).clamp(min=0.0).sum(dim=1)
 
     def _reward_single_stance(self) -> Tensor:
-        """Swings of a biped: how long a foot has been in the air while exactly the other one stands, up to the target, and
-        beyond it the less the longer, down to nothing; while any velocity is commanded [s].
+        """Steps of a biped, while exactly one foot stands and any velocity is commanded: half the target, and how long the
+        other foot has been in the air, up to the target, then the less the longer; after twice the target nothing [s].
 
-        Paid for any long swing, robots take one step a second, and can't turn or be steered in between.
+        Paid for any long swing, robots take one step a second, and can't turn or be steered in between. Paid for the swing
+        alone, short steps are worth next to nothing, and robots that began to hop on both feet go on hopping.
         """
         alone = (self.contacts.in_contact.sum(dim=1) == 1) & self.is_moving
         target = self.cfg.rewards.air_time_target_s
-        return (target - (self.contacts.air_time.amax(dim=1) - target).abs()).clamp(min=0.0) * alone
+        swing = target - (self.contacts.air_time.amax(dim=1) - target).abs()
+        return torch.where(alone & (swing > 0.0), 0.5 * target + swing, 0.0)
 
     def _reward_uneven_steps(self) -> Tensor:
         """Difference between the longest and the shortest of the feet's last swings, while any velocity is commanded: a limp

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from legged.episodes.stored import Episodes
+from legged.figures import COLORS
 
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#B8A800")
-"""Those of Okabe and Ito, whom readers of any colour vision tell apart (the last one, a yellow, is darker on white)."""
 OTHERS = "#BBBBBB"
 MOST_PARTS = 7
 """Reward parts that have a colour of their own, the largest ones; the rest is drawn as one."""

@@ -11,9 +11,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from legged.episodes.joint_statistics import MEASURED, PHASES, SETTLE_S, JointStatistics
-from legged.episodes.panels import COLORS
 from legged.episodes.ranking import markdown_table
-from legged.figures import figure
+from legged.figures import COLORS, STYLES, figure
 from legged.process.paths import relative, write_text
 
 NAME = "joint_statistics"
@@ -149,9 +148,6 @@ def draw_statistics(found: Mapping[str, JointStatistics], path: Path) -> None:
         _draw_cycles(found, names, path)
     else:
         _draw_means(found, names, path)
-
-
-STYLES = ("-", "--", "-.", ":")
 
 
 def _draw_cycles(found: Mapping[str, JointStatistics], names: list[tuple[str, str]], path: Path) -> None:

@@ -32,6 +32,17 @@ def newcombe(first: tuple[int, int], second: tuple[int, int]) -> Interval:
     )
 
 
+def mean_of_shares(shares: Sequence[tuple[int, int]]) -> tuple[float, Interval]:
+    """Return the mean of some shares, each (successes, trials), all of the same weight, and its interval out of their Wilson
+    intervals: squared distances to their ends add (G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008). It is not empty
+    where all shares are 0 or 100 %.
+    """
+    found = [(n / of, *wilson(n, of)) for n, of in shares]
+    mean = sum(share for share, _, _ in found) / len(found)
+    below, above = (sqrt(sum((one[0] - one[end]) ** 2 for one in found)) / len(found) for end in (1, 2))
+    return mean, (max(0.0, mean - below), min(1.0, mean + above))
+
+
 def normal_mean(mean: float, std: float, count: int) -> Interval:
     """Return the interval of a mean over `count` values, by their standard deviation and the normal distribution."""
     half = Z95 * std / sqrt(count)

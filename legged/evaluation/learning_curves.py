@@ -9,7 +9,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from legged.config.loader import read_yaml
 from legged.errors import ConfigError
-from legged.figures import figure
+from legged.figures import STYLES, figure
 from legged.learning.run_folder import CONFIG_FILE
 
 CURVES = (
@@ -120,12 +120,13 @@ def draw_runs(runs: dict[str, Scalars], path: Path, always: Collection[float] = 
     rows = -(-len(curves) // 2) + bool(types)
     with figure(path, (10.0, 3.0 * rows), rows, 2) as (_, axes):
         for axis, (tag, label, factor) in zip(axes.flat, curves, strict=False):
-            for name, scalars in runs.items():
+            for i, (name, scalars) in enumerate(runs.items()):
                 if tag in scalars:
                     steps, values = scalars[tag]
-                    axis.plot(steps + 1, smooth(factor * values), label=name, linewidth=1.5)
+                    look = {"color": f"C{i}", "linestyle": STYLES[i % len(STYLES)], "linewidth": 1.5}
+                    axis.plot(steps + 1, smooth(factor * values), label=name, **look)
             axis.set_ylabel(label)
-            axis.set_ylim(bottom=min(0.0, axis.get_ylim()[0]))
+            axis.set_ylim(bottom=0.0 if axis.dataLim.y0 >= 0.0 else None)
         if axes[0, 0].lines:  # a run that was killed early may lack the first curve
             axes[0, 0].legend(fontsize="small")
         if len(types) == 1:

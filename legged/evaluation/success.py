@@ -21,7 +21,7 @@ from legged.envs import LeggedRobot
 from legged.errors import ConfigError
 from legged.evaluation.intervals import wilson
 from legged.evaluation.overflows import Overflows
-from legged.evaluation.tiles import on_terrain, tiles_of_sizes
+from legged.evaluation.tiles import cell_for, on_terrain, tiles_of_sizes
 from legged.math import uniform, yaw_of
 from legged.policies.restore import TrainedPolicy, restore, undisturbed
 from legged.terrain import METRES, TERRAIN_TYPES, hardest_difficulty, terrain_types, tile_size
@@ -36,10 +36,15 @@ FORWARD, SIDEWAYS = 0.75, 0.1
 """Velocity asked for: forward, and the largest to either side [m/s]."""
 SPAWN_RANGE = 0.1
 """Robots start at most this far from the middle of their tile, in x and in y, so that no two starts are the same [m]."""
+OF_STEPS = (
+    *("stairs_up", "stairs_down", "step", "obstacles"),
+    *("narrow_stairs_up", "narrow_stairs_down", "dense_blocks", "kerbs", "rubble"),
+)
+"""Types that are measured by the height of their steps."""
 SIZES: dict[str, tuple[float, ...]] = {
     **dict.fromkeys(("slope_up", "slope_down"), (5.0, 10.0, 15.0, 20.0, 22.0, 25.0, 30.0, 35.0)),
     **dict.fromkeys(("rough_slope_up", "rough_slope_down"), (5.0, 10.0, 15.0, 20.0, 25.0)),
-    **dict.fromkeys(("stairs_up", "stairs_down", "step", "obstacles"), tuple(round(0.05 + 0.025 * i, 3) for i in range(11))),
+    **dict.fromkeys(OF_STEPS, tuple(round(0.05 + 0.025 * i, 3) for i in range(11))),
     "waves": (0.05, 0.1, 0.15, 0.2, 0.25, 0.3),
     "gap": (0.2, 0.4, 0.6, 0.8, 1.0, 1.2),
     "pit": (0.1, 0.2, 0.4, 0.6, 0.8, 1.0),
@@ -50,7 +55,7 @@ SIZES: dict[str, tuple[float, ...]] = {
 FEWER: dict[str, tuple[float, ...]] = {
     **dict.fromkeys(("slope_up", "slope_down"), (10.0, 20.0, 25.0, 30.0)),
     **dict.fromkeys(("rough_slope_up", "rough_slope_down"), (10.0, 20.0, 25.0)),
-    **dict.fromkeys(("stairs_up", "stairs_down", "step", "obstacles"), (0.05, 0.1, 0.15, 0.2, 0.25, 0.3)),
+    **dict.fromkeys(OF_STEPS, (0.05, 0.1, 0.15, 0.2, 0.25, 0.3)),
 }
 """Type -> the sizes that are measured without `--full`, where they are fewer."""
 
@@ -128,6 +133,17 @@ def trained_to(cfg: LeggedConfig) -> dict[str, float]:
     return {name: tile_size(terrain, name, hardest) for name, share in terrain.proportions.items() if share > 0.0}
 
 
+def to_run_out(cfg: LeggedConfig, num_envs: int) -> list[tuple[str, Any]]:
+    """Return overrides for a task of robots that walk out of tiles in the direction in which they find themselves."""
+    return [
+        *undisturbed(num_envs, TIME_S),
+        *on_terrain(cfg, TILE * cfg.terrain.scale, SPAWN_RANGE * cfg.terrain.scale),
+        ("observations.add_noise", cfg.observations.add_noise),
+        ("commands.heading_command", True),
+        ("init_state.yaw", [-np.pi, np.pi]),
+    ]
+
+
 def place(task: LeggedRobot, robots: int) -> None:
     """Put the first `robots` robots on the tiles of the first size, the next on those of the second, ..."""
     assert task.terrain is not None
@@ -144,6 +160,16 @@ def measure_success(
     """Run one type on a task with `robots` robots for each size on `tiles_of_sizes`; return its points, and how many times a
     robot lost contacts in a control step for want of memory.
     """
+    scores, lost = run_out(task, act, robots)
+    outcomes, times = scores.outcome.view(-1, robots).cpu(), scores.time_s.view(-1, robots).cpu()
+    return [point(size, *of_size) for size, *of_size in zip(sizes, outcomes, times, strict=True)], lost
+
+
+@torch.inference_mode()
+def run_out(task: LeggedRobot, act: Callable[[TensorDict], Tensor], robots: int) -> tuple[Scores, int]:
+    """Let all robots walk out of their tiles, `robots` of them on each kind of tile; return what has become of them, and how
+    many times a robot lost contacts.
+    """
     place(task, robots)
     task.reset()
     commands = torch.zeros(task.num_envs, 3, device=task.device)
@@ -159,9 +185,7 @@ def measure_success(
         if scores.done:
             break
     scores.finish()
-    outcomes, times = scores.outcome.view(-1, robots).cpu(), scores.time_s.view(-1, robots).cpu()
-    points = [point(size, *of_size) for size, *of_size in zip(sizes, outcomes, times, strict=True)]
-    return points, overflows.total(task)
+    return scores, overflows.total(task)
 
 
 def point(size: float, outcomes: Tensor, times: Tensor) -> dict[str, Any]:
@@ -201,11 +225,8 @@ def success_over_difficulty(
     for name in names:
         sizes = sizes_of(name, full, scale)
         own = [
-            *undisturbed(robots * len(sizes), TIME_S),
-            *on_terrain(policy.cfg, TILE * scale, SPAWN_RANGE * scale),
-            ("observations.add_noise", policy.cfg.observations.add_noise),
-            ("commands.heading_command", True),
-            ("init_state.yaw", [-np.pi, np.pi]),
+            *to_run_out(policy.cfg, robots * len(sizes)),
+            ("terrain.horizontal_scale", cell_for(name, policy.cfg.terrain)),
             *changes,
         ]
         points, overflows = _on_type(policy, name, sizes, robots, own, device, graph)

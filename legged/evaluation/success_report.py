@@ -15,6 +15,7 @@ from legged.terrain import TERRAIN_TYPES
 
 PANELS = {
     "stairs": ("stairs_up", "stairs_down"),
+    "narrow stairs": ("narrow_stairs_up", "narrow_stairs_down"),
     "obstacles": ("obstacles",),
     "slopes": ("slope_up", "slope_down"),
     "rough slopes": ("rough_slope_up", "rough_slope_down"),

@@ -42,6 +42,21 @@ def on_terrain(cfg: LeggedConfig, side: float, spawn_range: float) -> list[tuple
     ]
 
 
+def dividing_cell(length: float, cell: float) -> float:
+    """Return the edge of the largest cells, not larger than `cell`, of which a whole number is `length` [m]."""
+    return length / ceil(length / cell - 1e-6)
+
+
+def cell_for(name: str, cfg: TerrainConfig) -> float:
+    """Return the edge of the cells in which a type is measured [m]: that of the training, or a smaller one that divides what
+    the type is made of.
+    """
+    kind = TERRAIN_TYPES[name]
+    if not kind.exact or kind.finest is None:
+        return cfg.horizontal_scale
+    return dividing_cell(kind.finest[0] * cfg.scale, cfg.horizontal_scale)
+
+
 def rough_ground(cfg: TerrainConfig, seed: int) -> Terrain:
     """Build one level tile with bumps, on which all robots of a grid start; the configuration says how large it is (see
     `rough_side`).
@@ -56,11 +71,16 @@ def rough_side(grid: Grid) -> float:
 
 
 def tiles_of_sizes(name: str, sizes: Sequence[float], cfg: TerrainConfig, seed: int) -> Terrain:
-    """Build the tiles of every size: size i in row 2 i, variant k in column 2 k. Between them is level ground, so that nobody
-    steps onto another size before it has left its own.
+    """Build the tiles of every size of a type: see `tiles_apart`."""
+    return tiles_apart([TileSpec(name, size) for size in sizes], cfg, seed)
+
+
+def tiles_apart(specs: Sequence[TileSpec], cfg: TerrainConfig, seed: int) -> Terrain:
+    """Build tiles of every kind: kind i in row 2 i, variant k in column 2 k. Between them is level ground, so that nobody
+    steps onto another kind before it has left its own.
     """
-    variants = 1 if TERRAIN_TYPES[name].regular else VARIANTS
-    rows = [[TileSpec("flat", 0.0)] * (2 * variants - 1) for _ in range(2 * len(sizes) - 1)]
-    for i, size in enumerate(sizes):
-        rows[2 * i][::2] = [TileSpec(name, size)] * variants
+    variants = 1 if all(TERRAIN_TYPES[spec.type].regular for spec in specs) else VARIANTS
+    rows = [[TileSpec("flat", 0.0)] * (2 * variants - 1) for _ in range(2 * len(specs) - 1)]
+    for i, spec in enumerate(specs):
+        rows[2 * i][::2] = [spec] * variants
     return Terrain.of_tiles(rows, cfg, np.random.default_rng(seed))

@@ -65,11 +65,12 @@ def stamped(cfg: TaskConfig) -> str:
 
 def discard_run(folder: Path) -> None:
     """Remove the folder of a run that failed before its first checkpoint, and the folders above it that are empty then; a
-    folder that holds anything else stays.
+    folder that holds anything else stays. The state that is written just before a checkpoint is of no use without it.
     """
     if checkpoints(folder) or (folder / BEST_MODEL).is_file():
         return
-    ours = [folder / name for name in (CONFIG_FILE, CODE_FILE, NOTE_FILE)] + [*folder.glob("events.out.tfevents.*")]
+    ours = [folder / name for name in (CONFIG_FILE, CODE_FILE, NOTE_FILE)]
+    ours += [*folder.glob("events.out.tfevents.*"), *folder.glob("state_*.pt")]
     with suppress(OSError):
         for path in ours:
             path.unlink(missing_ok=True)

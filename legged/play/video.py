@@ -64,13 +64,18 @@ class Video:
         if not (self.camera and self.folder):
             return
         self.camera.close()
-        _write_mp4(self.frames, self.folder / "play.mp4", self.fps)
+        write_mp4(self.frames, self.folder / "play.mp4", self.fps)
         if self.gif:
             _write_gif(self.frames, self.folder / "play.gif", self.fps)
         print(f"recorded {len(self.frames)} frames in {time.perf_counter() - self._start:.1f} s")
 
 
-def _write_mp4(frames: list[np.ndarray], path: Path, fps: float) -> None:
+def write_mp4(frames: list[np.ndarray], path: Path, fps: float) -> None:
+    """Write pictures (height, width, 3) uint8 as a film of so many a second.
+
+    Raises:
+        RunError: it can't be written.
+    """
     try:
         program = imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError as error:

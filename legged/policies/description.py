@@ -1,13 +1,16 @@
 """What a robot's controller must know to run an exported policy, as plain data: policy.json."""
 
 import inspect
+import math
 from typing import Any
 
 from legged.config.networks import groups_of
 from legged.config.units import unit_in
+from legged.deploy.contract import CONTRACT_VERSION, need_of
 from legged.envs import BaseTask, LeggedRobot
 from legged.mdp.observations import ObservationTerm
 from legged.policies.model_description import describe_control
+from legged.robots.crouch import crouch
 
 LAWS = {
     "P": "stiffness * (action_scale * action + default_joint_angles - q) - damping * dq",
@@ -39,20 +42,26 @@ def describe_robot(task: LeggedRobot) -> dict[str, Any]:
     """Return the robot of a task, its commands and its control law."""
     cfg, robot, control = task.cfg, task.robot, task.control
     low, high = task.command_sampler.full_ranges.t().tolist()
-    scale = control.action_scale
+    scale, bent = control.action_scale, crouch(robot)
     return {
+        "contract_version": CONTRACT_VERSION,
         "robot": robot.name,
         "conventions": conventions(task),
+        "imu_frame": {"body": robot.file.base},
         "command_ranges": dict(zip(("vx", "vy", "yaw_rate"), zip(low, high, strict=True), strict=True)),
+        "command_dead_zone": cfg.commands.small_command,
         "joint_names": list(robot.joint_names),
         "action_joints": [robot.joint_names[i] for i in control.acted],
         "default_joint_angles": control.default_dof_pos.tolist(),
+        "crouch_joint_angles": None if bent is None else bent.tolist(),
         "control_type": cfg.control.control_type,
         "action_scale": scale if isinstance(scale, float) else scale.tolist(),
         "action_clip": cfg.control.clip_actions,
         "stiffness": control.stiffness.tolist(),
         "damping": control.damping.tolist(),
         "torque_limits": control.torque_limits.tolist(),
+        "position_limits": [pair if math.isfinite(sum(pair)) else None for pair in robot.dof_pos_limits.tolist()],
+        "velocity_limits": robot.dof_vel_limits.tolist(),
         "control_dt": task.dt,
         "sim_dt": cfg.sim.dt,
     }
@@ -62,6 +71,13 @@ def conventions(task: LeggedRobot) -> dict[str, str]:
     """Return frames, orders and the way of time, in words."""
     law = LAWS[task.cfg.control.control_type]
     return {
+        "imu_frame": "angular velocity and gravity are those of the frame of this body, which is the base frame: what an IMU"
+        " measures that is turned or sits elsewhere must be turned into it",
+        "needs": "what a term is made of: a sensor of the robot, the command, what the program remembers, or a source"
+        " beside these",
+        "noise": "half width of the uniform noise that the policy was trained with, in the term's unit before scaling",
+        "crouch_joint_angles": "a robot that lies stands up by way of these angles; null if it has no such pose",
+        "command_dead_zone": "horizontal commands that are shorter were never asked for, but 0 [m/s]",
         "base frame": f"fixed to the body '{task.robot.file.base}': x forward, y left, z up",
         "yaw frame": "origin at the base, z vertical, x where the base frame's x points, seen from above",
         "world frame": "z up",
@@ -96,20 +112,23 @@ def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any]) 
     """Return one observation term; unit, frame and formula are those that its method's docstring says."""
     docstring = inspect.getdoc(getattr(type(task), f"_obs_{term.name}"))
     text = " ".join((docstring or "").partition("\n\n")[0].split())
+    cfg = task.cfg.observations
     entry: dict[str, Any] = {
         "name": term.name,
         "group": group["name"],
         "start": group["start"] + term.columns.start,
         "size": term.columns.stop - term.columns.start,
         "scale": [float(value) for value in term.scale],
+        "needs": need_of(term.name),
+        "noise": cfg.noise.get(term.name, 0.0) * cfg.noise_level if cfg.groups[group["name"]].noise else 0.0,
         "unit": unit_in(docstring),
         "frame": next((frame for frame in FRAMES if frame in text), None),
         "formula": text or None,
     }
     if isinstance(task, LeggedRobot) and term.name == "heights":
         points = [[round(value, 6) for value in point] for point in task.height_scan.points.tolist()]
-        cfg = task.cfg.observations
-        entry |= {"points": points, "offset": cfg.heights_offset, "limit": cfg.heights_limit}
+        legged = task.cfg.observations
+        entry |= {"points": points, "offset": legged.heights_offset, "limit": legged.heights_limit}
     if isinstance(task, LeggedRobot) and term.name in ("passive_pos", "passive_vel") and task.robot.passive is not None:
         entry |= {"joints": list(task.robot.passive.names), "default": task.passive_default_pos.tolist()}
     return entry

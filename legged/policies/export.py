@@ -1,4 +1,4 @@
-"""Export of a policy as TorchScript and ONNX, with what a robot's controller needs to know, checked against torch."""
+"""Export of a policy as TorchScript, ONNX and plain numbers, with what a controller must know, checked against torch."""
 
 import io
 import json
@@ -14,9 +14,11 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged.deploy.weights import NumpyNetwork
 from legged.envs import BaseTask
 from legged.errors import RunError
 from legged.policies.description import describe
+from legged.policies.weights_file import weights_of
 from legged.process.paths import make_folder, write_bytes, write_text
 
 EXPORTED = "exported"
@@ -35,10 +37,10 @@ class ExportError(RunError):
 
 
 def export(task: BaseTask, policy: Any, folder: Path, training: Mapping[str, Any] | None = None) -> dict[str, float]:
-    """Write `policy`, rsl-rl's network of the actor, as policy.pt (TorchScript) and policy.onnx to `folder`; return the
-    largest difference of each to it.
+    """Write `policy`, rsl-rl's network of the actor, as policy.pt (TorchScript), policy.onnx and policy.weights (plain
+    numbers, legged.deploy.weights) to `folder`; return the largest difference of each to it.
 
-    Both take one flat observation (batch, width) and give actions (batch, joints), without noise: the groups that the policy
+    All take one flat observation (batch, width) and give actions (batch, joints), without noise: the groups that the policy
     reads side by side, and of each with a history of H steps H times its layout, oldest step first. Of a recurrent policy
     the TorchScript keeps the hidden state of a batch of 1 inside, until its reset(); the ONNX takes it and gives it back. The
     metadata is in the ONNX file and beside it in policy.json, with what is said of its `training`.
@@ -64,6 +66,7 @@ def export(task: BaseTask, policy: Any, folder: Path, training: Mapping[str, Any
         policy.to("cpu").eval()
         wanted = _run_policy(policy, observations, begins, widths)
         script, network = _torchscript(policy), _onnx(policy, metadata)
+        weights = weights_of(policy, task.cfg.train.policy.activation, task.num_actions)
     finally:
         policy.to(device)
         policy.reset(hidden_state=hidden)
@@ -74,8 +77,9 @@ def export(task: BaseTask, policy: Any, folder: Path, training: Mapping[str, Any
     else:
         by_script = [(_run_script(script, observations, begins[:, 0]), wanted)]
     by_onnx = [(_run_onnx(network, observations, begins, metadata["recurrent"]), wanted)]
+    by_weights = [(_run_weights(weights, observations, begins), wanted)]
     differences = {}
-    for name, pairs in (("policy.pt", by_script), ("policy.onnx", by_onnx)):
+    for name, pairs in (("policy.pt", by_script), ("policy.onnx", by_onnx), ("policy.weights", by_weights)):
         difference = float(np.max([np.abs(found - right).max() / max(1.0, np.abs(right).max()) for found, right in pairs]))
         if not difference <= LARGEST_DIFFERENCE:
             raise ExportError(f"{name}: differs from the policy by {difference:.1e} (allowed: {LARGEST_DIFFERENCE})")
@@ -83,6 +87,7 @@ def export(task: BaseTask, policy: Any, folder: Path, training: Mapping[str, Any
     make_folder(folder)
     write_bytes(folder / "policy.pt", script)
     write_bytes(folder / "policy.onnx", network)
+    write_bytes(folder / "policy.weights", weights)
     write_text(folder / "policy.json", json.dumps(metadata, indent=1))
     return differences
 
@@ -131,6 +136,17 @@ def _run_onnx(content: bytes, observations: Tensor, begins: Tensor, memory: dict
         action, *states = session.run(None, {"obs": step.numpy(), **hidden})
         hidden = {name: np.array(state) for name, state in zip(hidden, states, strict=True)}
         actions.append(np.asarray(action))
+    return np.stack(actions)
+
+
+def _run_weights(content: bytes, observations: Tensor, begins: Tensor) -> np.ndarray:
+    """Return those of the file of weights, which forgets where `begins` (T, batch) says that an episode does."""
+    network = NumpyNetwork(content)
+    network.run(observations[0].numpy())
+    actions = []
+    for step, new in zip(observations.numpy(), begins.numpy(), strict=True):
+        network.restart(new)
+        actions.append(network.run(step))
     return np.stack(actions)
 
 

@@ -1,7 +1,7 @@
 """Finding a trained policy and putting it back into its task."""
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -118,16 +118,17 @@ def restore(
     device: torch.device,
     graph: bool = True,
     terrain: Terrain | None = None,
+    make: Callable[..., Any] = make_task,
 ) -> tuple[Any, Actor]:
     """Build the task with some settings changed, on its own terrain or on the one given, and the policy that acts in it;
-    nothing is written.
+    nothing is written. `make` builds a task of a configuration, as `make_task` does.
 
     Raises:
         ConfigError: the checkpoint does not fit the task.
     """
     cfg = nominal(policy.cfg, changes)
     check_fits(policy.checkpoint, read_checkpoint(policy.checkpoint), cfg)
-    task = make_task(cfg, device, graph, terrain)
+    task = make(cfg, device, graph, terrain)
     actor = Actor(task, device)
     actor.load(policy.checkpoint)
     return task, actor

@@ -93,6 +93,10 @@ def choose() -> None:
         raise ConfigError(f"MUJOCO_GL: unknown value '{given}'{suggest(value, (*ALLOWED, 'off'))}")
     try:
         import_module("mujoco.rendering.classic.gl_context")
+    except ModuleNotFoundError as error:
+        if error.name != "mujoco":
+            raise
+        return  # a robot's computer, which draws nothing
     except (ImportError, AttributeError, RuntimeError, OSError) as error:
         works = off_screen_library()
         instead = f"{works} would" if works else "none of them is here; leave it out, and play with --no-video"

@@ -29,6 +29,14 @@ BUMPS = 0.05
 """Largest height and depth of the bumps of rough ground [m]."""
 LEDGE = 1.0
 """How far a single step goes on before it goes down again [m]."""
+NARROW_TREAD = 0.28
+"""Width of a step of narrow stairs, such as those of a house [m]."""
+KERB, KERB_SPACING = 0.2, 1.0
+"""Width of a kerb, and from where one begins to where the next one does [m]."""
+BLOCK_SIDES = (0.3, 0.8)
+"""Shortest and longest side of the blocks of dense ground [m]."""
+STONE_SIDES = (0.2, 0.5)
+"""Shortest and longest side of a stone of rubble [m]."""
 NARROWEST_DITCH = 0.5
 """Cells must not be larger than this for a ditch whose width grows to 1 m [m]."""
 
@@ -44,6 +52,8 @@ class Tile:
     """Source of all randomness of the tile."""
     scale: float = 1.0
     """Factor on the lengths that its type is made of."""
+    tread: float | None = None
+    """Width of a step of its stairs, where it is not that of the type [m]; the scale is no factor on it."""
 
     def cells(self, metres: float) -> int:
         """Return a length, times the tile's scale, in whole cells. Scales and cells have six digits, so that a hair of a cell
@@ -90,8 +100,11 @@ def bumps(tile: Tile, amplitude: float, step: float = 0.005, spacing: float = 0.
 
 
 def stairs(tile: Tile, riser: float, platform: float = 3.0, tread: float = TREAD) -> None:
-    """Make rings of steps up to a platform in the middle (down, for a negative riser). The tread is cut to whole cells."""
-    width, across = max(1, tile.cells(tread)), tile.cells(platform)
+    """Make rings of steps up to a platform in the middle (down, for a negative riser). The tread, that of the tile or else
+    `tread`, is cut to whole cells.
+    """
+    width = max(1, tile.cells(tread if tile.tread is None else tile.tread / tile.scale))
+    across = tile.cells(platform)
     first = 0
     while min(tile.heights.shape) - 2 * first > across:
         first += width
@@ -150,6 +163,51 @@ def waves(tile: Tile, amplitude: float, length: float = WAVE) -> None:
     tile.heights[:] = 0.5 * amplitude * pattern * fade
 
 
+def dense_blocks(tile: Tile, height: float, platform: float = 2.0, cover: float = 1.2) -> None:
+    """Lay blocks on each other, all over the tile but in the middle. Sides are drawn from BLOCK_SIDES, tops are at 0 to
+    `height` in quarters of it, and a later block hides what lies below it; their areas together are `cover` times that of the
+    tile. So every few steps there is a face, of up to `height`, and hardly any ground is level for as long as a robot.
+    """
+    rows, columns = tile.heights.shape
+    left = cover * rows * columns
+    while left > 0.0:
+        length, width = (max(1, tile.cells(side)) for side in tile.rng.uniform(*BLOCK_SIDES, 2))
+        x, y = (int(tile.rng.integers(-side // 2, n)) for side, n in ((length, rows), (width, columns)))
+        tile.heights[max(0, x) : x + length, max(0, y) : y + width] = 0.25 * height * tile.rng.integers(0, 5)
+        left -= length * width
+    tile.heights[tile.middle(platform)] = 0.0
+
+
+def kerbs(tile: Tile, height: float, platform: float = 2.0, width: float = KERB, spacing: float = KERB_SPACING) -> None:
+    """Make rings of kerbs that stand out of level ground, all around the platform, one every `spacing`."""
+    across, every, inner = max(1, tile.cells(width)), max(2, tile.cells(spacing)), tile.cells(platform)
+    rows, columns = tile.heights.shape
+    innermost = max(0, (min(rows, columns) - inner) // 2) - across
+    for first in sorted(range(innermost, -1, -every)):  # from the edge inward: each clears what is inside of it
+        last = first + across
+        tile.heights[first : rows - first, first : columns - first] = height
+        tile.heights[last : rows - last, last : columns - last] = 0.0
+
+
+def rubble(tile: Tile, height: float, platform: float = 2.0, cover: float = 2.0) -> None:
+    """Heap up slabs of stone all over the tile but in the middle. Sides are drawn from STONE_SIDES, edges lie at any angle,
+    tops are at quarters of `height` up to it, and of two stones in one place the higher one is seen; their areas together are
+    `cover` times that of the tile. So faces come at any angle, ragged by the cells, and few tops hold a whole foot's step.
+    """
+    rows, columns = tile.heights.shape
+    step = tile.cell / tile.scale
+    x, y = np.meshgrid((np.arange(rows) + 0.5) * step, (np.arange(columns) + 0.5) * step, indexing="ij")
+    left = cover * rows * columns * step**2
+    while left > 0.0:
+        length, width = tile.rng.uniform(*STONE_SIDES, 2)
+        turn, dx, dy = tile.rng.uniform(0.0, np.pi), *(one - tile.rng.uniform(0.0, one.max()) for one in (x, y))
+        along, across = np.cos(turn) * dx + np.sin(turn) * dy, np.cos(turn) * dy - np.sin(turn) * dx
+        inside = (np.abs(along) < 0.5 * length) & (np.abs(across) < 0.5 * width)
+        tile.heights[inside] = np.maximum(tile.heights[inside], 0.25 * height * tile.rng.integers(1, 5))
+        left -= length * width
+    tile.heights[tile.middle(platform)] = 0.0
+
+
 def flat(tile: Tile, size: float = 0.0) -> None:
     """Leave the ground level, however difficult."""
 
@@ -173,6 +231,8 @@ class TerrainType:
     """Side of the level square in the middle at scale 1 [m]."""
     finest: tuple[float, str] | None = None
     """Length of the smallest part that a tile of scale 1 is made of [m], and its name; cells must not be larger."""
+    exact: bool = False
+    """Whether cells that do not divide that part make another ground of it: where the type is measured, they do."""
 
     def sized(self, difficulty: float, scale: float) -> float:
         """Return the size at that difficulty on tiles of that scale, in `unit`: lengths grow, angles do not."""
@@ -198,7 +258,23 @@ def _riser(difficulty: float) -> float:
 OF_WAVES, OF_STAIRS = (WAVE / 4, "quarter of a wave"), (TREAD, "tread of a step")
 OF_LEDGE = (LEDGE, "ledge of a step")
 OF_BLOCKS, OF_STONES = (SMALLEST_BLOCK, "side of a block"), (JOINT, "gap between two stones")
+OF_NARROW_STAIRS, OF_KERB = (NARROW_TREAD, "tread of a narrow step"), (KERB, "width of a kerb")
+OF_DENSE_BLOCKS, OF_RUBBLE = (BLOCK_SIDES[0], "side of a block"), (STONE_SIDES[0], "side of a stone")
 OF_DITCH = (NARROWEST_DITCH, "width of a ditch")
+
+
+def narrow_stairs(up: float) -> TerrainType:
+    """Return stairs with the treads of a house, around a platform at their top, or with `up` of -1 at their bottom."""
+    return TerrainType(
+        lambda tile, size: stairs(tile, up * size, tread=NARROW_TREAD),
+        _riser,
+        METRES,
+        "step height",
+        stepped=True,
+        finest=OF_NARROW_STAIRS,
+        exact=True,
+    )
+
 
 TERRAIN_TYPES: dict[str, TerrainType] = {
     "flat": TerrainType(flat, lambda d: 0.0, METRES, "height", stepped=False, platform=0.0),
@@ -222,6 +298,22 @@ TERRAIN_TYPES: dict[str, TerrainType] = {
         regular=False,
         platform=4.0,
         finest=OF_STONES,
+    ),
+    "narrow_stairs_up": narrow_stairs(-1.0),
+    "narrow_stairs_down": narrow_stairs(1.0),
+    "dense_blocks": TerrainType(
+        dense_blocks,
+        lambda d: 0.05 + 0.2 * d,
+        METRES,
+        "height",
+        stepped=True,
+        regular=False,
+        platform=2.0,
+        finest=OF_DENSE_BLOCKS,
+    ),
+    "kerbs": TerrainType(kerbs, _riser, METRES, "height", stepped=True, platform=2.0 + 2.0 * KERB, finest=OF_KERB),
+    "rubble": TerrainType(
+        rubble, lambda d: 0.05 + 0.2 * d, METRES, "height", stepped=True, regular=False, platform=2.0, finest=OF_RUBBLE
     ),
     "gap": TerrainType(gap, lambda d: 1.0 * d, METRES, "width", stepped=True, finest=OF_DITCH),
     "pit": TerrainType(pit, lambda d: 1.0 * d, METRES, "depth", stepped=True, platform=4.0),

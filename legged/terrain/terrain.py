@@ -32,6 +32,8 @@ class TileSpec:
     type: str
     size: float
     """In the unit of the type [m or degrees]."""
+    tread: float | None = None
+    """Width of a step of stairs, where it is not that of the type [m]."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class Terrain:
         for r, row in enumerate(rows):
             for c, spec in enumerate(row):
                 kind = TERRAIN_TYPES[spec.type]
-                tile = Tile(np.zeros((length, width)), cell, rng, cfg.scale)
+                tile = Tile(np.zeros((length, width)), cell, rng, cfg.scale, spec.tread)
                 kind.generate(tile, spec.size)
                 x, y = border + r * length, border + c * width
                 heights[x : x + length, y : y + width] = tile.heights

@@ -4,7 +4,8 @@ Of robots that follow commands: how well they do, for tasks with terrain on roug
 cross. Prints tables and writes evaluation_<physics>.json and .png and success_<physics>.png beside the checkpoint (or to
 --out). With `--physics all`, the same commands in every engine and solver: crossing.json and .png. With `--all-checkpoints`,
 all checkpoints of a run on the grid, and when the first of them walked: time_to_walk.json; seconds are counted from the start
-of the process that wrote the checkpoint, and a small train.runner.save_interval makes them finer.
+of the process that wrote the checkpoint, and a small train.runner.save_interval makes them finer. With `--stress`, a table of
+disturbances on stairs and on the flat, ground that nobody trains on, and other solvers: stress_<physics>.json and .png.
 
 Of all other tasks: returns and lengths of full episodes, in evaluation_<physics>.json. With `--gymnasium`, of the exported
 policy in Gymnasium's own environment, as Gymnasium counts them.
@@ -34,6 +35,8 @@ from legged.evaluation.crossing import EVERYWHERE, cross
 from legged.evaluation.episodes import MOST_EPISODES, evaluate_episodes
 from legged.evaluation.following import evaluate_following
 from legged.evaluation.gymnasium_episodes import EPISODES, environment_of, evaluate_in_gymnasium
+from legged.evaluation.stress.measuring import RISER, TREAD
+from legged.evaluation.stress.report import evaluate_stress
 from legged.evaluation.success import chosen_types
 from legged.evaluation.velocity_grid import AXES, MOST_ROBOTS, Grid, axes_of, axis_values, check_size
 from legged.physics import resolve_physics
@@ -47,8 +50,24 @@ ROBOTS = 16
 """Robots a cell, if nobody says how many."""
 ENVIRONMENTS = 256
 """Episodes, each of an environment of its own, if nobody says how many."""
-OF_COMMANDS = (*AXES, "robots", "types", "full", "robots_per_point", "all_checkpoints", "rmse", "falls")
+OF_COMMANDS = (
+    *AXES,
+    "robots",
+    "types",
+    "full",
+    "robots_per_point",
+    "all_checkpoints",
+    "rmse",
+    "falls",
+    "stress",
+    "riser",
+    "tread",
+)
 """Flags of tasks that follow commands."""
+OF_STRESS = ("riser", "tread")
+"""Flags of --stress."""
+STAIR_LIMITS = {"riser": (0.0, 1.0), "tread": (0.05, 2.0)}
+"""Flag -> smallest and largest length [m]."""
 OF_EPISODES = ("episodes", "gymnasium")
 """Flags of other tasks."""
 
@@ -64,6 +83,7 @@ def build_parser() -> CommandParser:
         "evaluate",
         __doc__,
         "python -m legged.tools.evaluate --task anymal_c --physics mujoco",
+        "python -m legged.tools.evaluate --task anymal_c --stress --physics mujoco",
         "python -m legged.tools.evaluate --task half_cheetah --gymnasium --episodes 20",
     )
     add_task_arguments(parser)
@@ -72,11 +92,20 @@ def build_parser() -> CommandParser:
         parser.add_argument(f"--{axis}", help=f"low:high:step of the command grid [{unit}]; evaluation.{axis} by default")
     parser.add_argument("--robots", type=int, help=f"robots a cell; {ROBOTS}")
     parser.add_argument("--types", help="terrain types to cross, e.g. stairs_up,pit; those of the training by default")
-    parser.add_argument("--full", action="store_true", help="all sizes of a type, 256 robots each")
+    parser.add_argument(
+        "--full", action="store_true", help="all sizes of a type, or all lines with every solver; 256 robots each"
+    )
     parser.add_argument("--robots-per-point", type=int, help="robots for each size of a type; 32, or 256 with --full")
     parser.add_argument("--all-checkpoints", action="store_true", help="which checkpoint of a run is the first that walks")
     parser.add_argument("--rmse", type=float, help=f"a robot that walks has a smaller velocity RMSE [m/s]; {WALKING_RMSE}")
     parser.add_argument("--falls", type=float, help=f"and a smaller share of falls; {WALKING_FALLS}")
+    parser.add_argument(
+        "--stress", action="store_true", help="what disturbances, unknown ground and other solvers leave of it"
+    )
+    parser.add_argument(
+        "--riser", type=float, help=f"height of the steps of --stress [m]; {RISER} for a robot half a metre high"
+    )
+    parser.add_argument("--tread", type=float, help=f"their width [m]; {TREAD}")
     many = f"of a task without commands; {ENVIRONMENTS}, {EPISODES} with --gymnasium"
     parser.add_argument("--episodes", type=int, help=many)
     parser.add_argument("--gymnasium", action="store_true", help="the exported policy in Gymnasium's environment")
@@ -139,6 +168,7 @@ def _follow_commands(args: argparse.Namespace) -> int:
             raise ConfigError(f"--all-checkpoints: looks at one engine; leave out --physics {EVERYWHERE}")
     else:
         _refuse(args, ("rmse", "falls"), "is a limit of --all-checkpoints; add it")
+    _check_stress(args)
     rmse = WALKING_RMSE if args.rmse is None else args.rmse
     falls = WALKING_FALLS if args.falls is None else args.falls
     check_limits(rmse, falls)
@@ -158,11 +188,33 @@ def _follow_commands(args: argparse.Namespace) -> int:
         return cross(policy, grid, policy_overrides(args), device, graph, folder)
     # The engine is that of the device, not that of the training.
     asked = [("sim.physics", resolve_physics("auto", device)), *policy_overrides(args)]
+    where = "--physics" if args.physics else "sim.physics"
+    if args.stress:
+        stairs = (args.riser, args.tread)
+        return evaluate_stress(policy, a_point, args.full, stairs, asked, device, graph, folder, where)
     if args.all_checkpoints:
         return evaluate_all_checkpoints(policy, grid, asked, device, graph, folder, rmse, falls)
     types = chosen_types(policy.cfg, args.types)  # type: ignore[arg-type]
-    where = "--physics" if args.physics else "sim.physics"
     return evaluate_following(policy, grid, types, a_point, args.full, asked, device, graph, folder, where)
+
+
+def _check_stress(args: argparse.Namespace) -> None:
+    """Look whether the flags fit --stress, or its absence.
+
+    Raises:
+        ConfigError: one of them does not.
+    """
+    if not args.stress:
+        _refuse(args, OF_STRESS, "is of the stairs of --stress; add it")
+        return
+    own = "--stress has a table of its own; leave it out"
+    _refuse(args, (*AXES, "robots", "types", "all_checkpoints"), own)
+    if args.physics == EVERYWHERE:
+        raise ConfigError(f"--stress: looks at one engine; leave out --physics {EVERYWHERE}")
+    for flag, (low, high) in STAIR_LIMITS.items():
+        value = getattr(args, flag)
+        if value is not None and not low <= value <= high:
+            raise ConfigError(f"--{flag}: must be between {low:g} and {high:g} m, got {value:g}")
 
 
 def _run_episodes(args: argparse.Namespace) -> int:

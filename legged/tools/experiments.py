@@ -1,9 +1,9 @@
 """All runs in one table: `python -m legged.tools.experiments`, or some of them side by side: `--compare A B`.
 
 Looks for runs in logs/, or in the folders given, and writes experiments.md and experiments.html there, newest first; the page
-sorts by a click on a column and filters by words. With `--compare`, comparison.md and .html have what two or more runs set
-otherwise, their curves over each other, and their evaluations with confidence intervals. Runs are named by folder, or as
-<experiment>/<run> below logs/.
+sorts by a click on a column and filters by words; `--seeds_share` makes one row of the seeds of a training. With `--compare`,
+comparison.md and .html have what two or more runs set otherwise, their curves over each other, and their evaluations with
+confidence intervals. Runs are named by folder, or as <experiment>/<run> below logs/.
 """
 
 import argparse
@@ -47,6 +47,9 @@ def build_parser() -> CommandParser:
     )
     parser.add_argument("--out", type=Path, metavar="FOLDER", help=f"folder for the pages; {LOGS}/, or the first one given")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write nothing but the Markdown page, as this file")
+    parser.add_argument(
+        "--seeds_share", action="store_true", help="a row of means for runs that differ in nothing but their seed"
+    )
     parser.add_argument("--import", dest="module", help="module or .py file that registers tasks of your own")
     return parser
 
@@ -67,11 +70,12 @@ def _main(argv: list[str] | None) -> int:
     found = {run.resolve(): run for given in args.folders or [LOGS] for run in folders_in(given)}
     records = [read_record(run) for run in found.values()]
     if args.markdown is not None:
-        return _only_markdown(args.markdown, TITLE, experiments_parts(records, args.markdown.parent, "md"))
+        return _only_markdown(args.markdown, TITLE, experiments_parts(records, args.markdown.parent, "md", args.seeds_share))
     make_folder(folder)
-    write_text(folder / "experiments.md", to_markdown(TITLE, experiments_parts(records, folder, "md"), "experiments"))
+    parts = {ending: experiments_parts(records, folder, ending, args.seeds_share) for ending in ("md", "html")}
+    write_text(folder / "experiments.md", to_markdown(TITLE, parts["md"], "experiments"))
     page = folder / "experiments.html"
-    write_text(page, to_html(TITLE, experiments_parts(records, folder, "html")))
+    write_text(page, to_html(TITLE, parts["html"]))
     print(f"written: {relative(page)}, {len(records)} runs")
     return 0
 

@@ -20,7 +20,7 @@ from legged.policies.export import EXPORTED, export
 from legged.policies.restore import find_policy, restore, undisturbed
 from legged.process.paths import ready_to_write, relative
 
-MEGABYTES = 4.0
+MEGABYTES = 5.0
 """What the files of one policy need at most [MiB]."""
 
 

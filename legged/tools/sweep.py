@@ -3,18 +3,12 @@
 Optuna's TPE sampler draws the settings of each trial, which is an ordinary run in logs/<name of the sweep>; trials that fall
 behind are ended early. The sweep goes on where it was stopped or killed, and several processes, GPUs and machines share one
 by its storage. At the end, and with --report at any time, that folder gets table.md, best.yaml and figures.
-
-Examples:
-  python -m legged.tools.sweep anymal_c_flat --jobs 2
-  python -m legged.tools.sweep my_sweep.yaml --report
 """
 
 import argparse
 import sys
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 from legged.commandline.arguments import pick_device
@@ -26,6 +20,7 @@ from legged.errors import ConfigError
 from legged.process.cores import available_cores
 from legged.process.paths import ready_to_write, relative
 from legged.process.ranks import Ranks
+from legged.process.repeating import repeating
 from legged.registry import import_tasks
 from legged.tools.campaign.crew import Crew, Job, Kind, why_failed
 from legged.tools.sweeping.plan import Plan, plan_sweep, read_sweep, sweep_file
@@ -147,34 +142,24 @@ def _crew(args: argparse.Namespace, trials: Trials, path: Path, devices: list[st
         print(f"{say}; {'another takes its place' if again else relative(ended.output)}", flush=True)
         return [job(number)] if again else []
 
-    with stopping_on_signals(crew.stop) as stopped_by, _telling(trials, start):
+    with stopping_on_signals(crew.stop) as stopped_by, repeating(_teller(trials, start), TELL_S, at_end=True):
         crew.run([job(number) for number in range(jobs)])
     return stopped_by
 
 
-@contextmanager
-def _telling(trials: Trials, start: float) -> Iterator[None]:
-    """Print what becomes of trials, which other processes make while the block runs."""
-    over, told = threading.Event(), {trial.number for trial in finished(trials.all)}
+def _teller(trials: Trials, start: float) -> Callable[[], None]:
+    """Return what prints, whenever it is called, what has become of trials since, which other processes make."""
+    told = {trial.number for trial in finished(trials.all)}
 
     def tell() -> None:
-        last = False
-        while not last:
-            last = over.wait(TELL_S)
-            for trial in finished(trials.all):
-                if trial.number not in told:
-                    told.add(trial.number)
-                    what = trial.user_attrs.get(WHY) if trial.value is None else f"{trial.value:.4g}"
-                    counted = f"[{len(told)} of {trials.plan.given.trials}]"
-                    print(f"{time.perf_counter() - start:7.1f} s  trial {trial.number:3d}  {what}  {counted}", flush=True)
+        for trial in finished(trials.all):
+            if trial.number not in told:
+                told.add(trial.number)
+                what = trial.user_attrs.get(WHY) if trial.value is None else f"{trial.value:.4g}"
+                counted = f"[{len(told)} of {trials.plan.given.trials}]"
+                print(f"{time.perf_counter() - start:7.1f} s  trial {trial.number:3d}  {what}  {counted}", flush=True)
 
-    thread = threading.Thread(target=tell, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
+    return tell
 
 
 if __name__ == "__main__":

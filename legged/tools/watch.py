@@ -78,7 +78,7 @@ def _main(argv: list[str] | None) -> int:
         if not is_loopback(args.host):
             open_to_all = "whoever reaches this machine can watch and steer; nobody is asked for a password"
             print(f"warning: --host {args.host}: {open_to_all}", file=sys.stderr, flush=True)
-        print(f"watch it at {url(args.host, page.port)}; Ctrl-C ends it", flush=True)
+        print(f"watch it at {url(args.host, page.port)} (Ctrl-C ends it)", flush=True)
         page.run()
     finally:
         page.close()

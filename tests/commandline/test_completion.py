@@ -60,6 +60,8 @@ def test_tasks_are_those_of_the_installation(complete):
     assert complete("python train.py --task ") == set(tasks())
     assert complete("python train.py --task=h1") == {"--task=h1", "--task=h1_flat"}
     assert complete("python -m legged.tools.zoo anymal_c_fl") == {"anymal_c_flat"}
+    assert complete("python -m legged.tools.report --task anymal_c_fl") == {"anymal_c_flat"}
+    assert complete("python -m legged.tools.migrate --task anymal_c_fl") == set()  # that is a name of legged_gym's
 
 
 def test_flags_are_those_of_the_tool(complete):
@@ -67,6 +69,7 @@ def test_flags_are_those_of_the_tool(complete):
     assert complete("legged-train --max") == {"--max_iterations"}
     assert complete("python3 -m legged.tools.evaluate --gym") == {"--gymnasium"}
     assert complete("python -m legged.tools.plot --") == {"--help", "--out"}
+    assert complete("python -m legged.deploy --rob") == {"--robot"}
 
 
 def test_keys_are_offered_section_by_section(complete):
@@ -91,6 +94,7 @@ def test_values_are_those_that_a_field_may_have(complete):
 
 def test_modules_are_offered_to_python_and_nothing_to_other_programs(complete):
     assert complete("python -m legged.tools.ev") == {"legged.tools.evaluate"}
+    assert complete("python -m legged.de") == {"legged.deploy"}
     assert complete("python other.py --ta") == set()
     assert complete("python other.py train.py --ta") == set()
 

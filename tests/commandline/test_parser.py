@@ -5,7 +5,7 @@ from importlib import import_module
 import pytest
 
 from legged.commandline.arguments import overrides
-from legged.commandline.listing import tasks, tools
+from legged.commandline.listing import module_of, tasks, tools
 from legged.commandline.parser import CommandParser
 from legged.registry import task_config
 
@@ -13,7 +13,7 @@ INSTALLED = {"legged.tools.train": "python train.py ", "legged.tools.play": "pyt
 
 
 def parser_of(tool: str) -> CommandParser:
-    return import_module(tool).build_parser()
+    return import_module(module_of(tool)).build_parser()
 
 
 @pytest.mark.parametrize("tool", tools())
@@ -21,7 +21,7 @@ def test_help_of_a_command_shows_two_examples_that_it_can_read(tool, capsys):
     parser = parser_of(tool)
     assert len(parser.examples) >= 2
     with pytest.raises(SystemExit) as stop:
-        import_module(tool).main(["--help"])
+        import_module(module_of(tool)).main(["--help"])
     assert stop.value.code == 0
     shown = capsys.readouterr().out.partition("\nexamples:\n")[2].splitlines()
     assert shown == [f"  {example}" for example in parser.examples]

@@ -2,8 +2,10 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers import POLICY, TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
 
@@ -18,7 +20,7 @@ from legged.evaluation.success import (
     trained_to,
 )
 from legged.evaluation.success_report import is_beyond, panels_of, with_other_engines
-from legged.evaluation.tiles import on_terrain, rough_ground, rough_side
+from legged.evaluation.tiles import cell_for, dividing_cell, on_terrain, rough_ground, rough_side, tiles_of_sizes
 from legged.evaluation.velocity_grid import Grid
 from legged.evaluation.velocity_tracking import measure_tracking, place_to_track
 from legged.policies.restore import undisturbed
@@ -104,6 +106,23 @@ def test_small_robots_are_tracked_on_rough_ground_too():
     changes, ground = place_to_track(cfg, grid, [])
     check_terrain(override(cfg, changes).terrain, cfg.origins)
     assert min(ground.tile_size) == pytest.approx(rough_side(grid), abs=cfg.terrain.horizontal_scale)
+
+
+def test_types_are_measured_in_cells_that_make_what_they_are_called():
+    """0.28 m are 3 cells of 0.0933 m, not 2 of 0.1 m; a robot of another size has treads and cells times the scale."""
+    terrain = task_config("anymal_c", on_cpu=True).terrain
+    assert (terrain.scale, terrain.horizontal_scale) == (1.0, 0.1)
+    assert cell_for("stairs_up", terrain) == 0.1
+    assert cell_for("narrow_stairs_up", terrain) == pytest.approx(0.28 / 3)
+    assert dividing_cell(0.4, 0.1) == pytest.approx(0.1)
+    half = replace(terrain, scale=0.5, horizontal_scale=0.05)
+    assert cell_for("narrow_stairs_down", half) == pytest.approx(0.14 / 3)
+    cfg = replace(terrain, horizontal_scale=cell_for("narrow_stairs_down", terrain), terrain_length=8.0, terrain_width=8.0)
+    heights = tiles_of_sizes("narrow_stairs_down", [0.1], cfg, 1).height_map
+    middle = heights.heights[:, heights.heights.shape[1] // 2]
+    rises = np.flatnonzero(np.diff(middle) > 0.05)
+    assert len(rises) > 5
+    assert np.diff(rises) * heights.cell == pytest.approx(0.28)
 
 
 def test_height_of_the_gait_is_above_the_ground():

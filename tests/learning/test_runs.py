@@ -86,6 +86,19 @@ def test_a_first_iteration_that_fails_leaves_no_folder_and_a_later_one_its_check
     assert run_folders() == [folder]
 
 
+def test_a_first_checkpoint_that_finds_no_room_leaves_no_folder(monkeypatch, capsys):
+    """The state of the robots, which is written before it, found some."""
+
+    def full(path, _content):
+        assert [found.name for found in path.parent.glob("*.pt")] == ["state_0.pt"]
+        raise RunError(f"{path}: no space left on the disk")
+
+    monkeypatch.setattr("legged.learning.runner.write_checkpoint", full)
+    assert train.main(ARGUMENTS) == 1
+    assert not Path("logs").exists()
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
 def test_a_folder_with_something_else_in_it_is_not_discarded():
     cfg = small_config()
     first, second = create_run(cfg), create_run(cfg)

@@ -253,16 +253,16 @@ def test_no_fly_is_exactly_one_foot_on_the_ground(task, vertical, expected):
     assert value(task, "no_fly")[0] == expected
 
 
-def test_single_stance_pays_the_swing_while_the_other_foot_stands(task):
-    """Up to the target of 0.5 s, then less; a robot with several feet on the ground, or with none, gets nothing, nor who may
-    rest.
+def test_single_stance_pays_steps_of_which_one_foot_stands(task):
+    """Half the target of 0.5 s and the swing, up to the target, then less; a robot with several feet on the ground, or with
+    none, gets nothing, nor who may rest.
     """
     task.contacts.air_time.copy_(torch.tensor([[0.0, 0.3, 0.2, 0.1], [0.0, 0.7, 0.1, 0.1]]))
     task.is_moving.fill_(True)
     task.contacts.in_contact[:, 0] = True
-    assert value(task, "single_stance") == near(0.3, 0.3)
+    assert value(task, "single_stance") == near(0.55, 0.55)
     task.contacts.air_time[0, 1], task.contacts.air_time[1, 1] = 0.5, 1.1
-    assert value(task, "single_stance") == near(0.5, 0.0)
+    assert value(task, "single_stance") == near(0.75, 0.0)
     task.is_moving[1] = False
     task.contacts.in_contact[0, 1] = True
     assert value(task, "single_stance") == near(0.0, 0.0)

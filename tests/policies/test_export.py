@@ -65,9 +65,9 @@ def test_onnx_computes_the_policy_for_any_batch_size(exported, cases):
 
 def test_the_reported_differences_are_small_and_nothing_half_written_is_left(exported):
     folder, differences = exported
-    assert set(differences) == {"policy.pt", "policy.onnx"}
+    assert set(differences) == {"policy.pt", "policy.onnx", "policy.weights"}
     assert all(0.0 <= value < 1e-5 for value in differences.values())
-    assert {path.name for path in folder.iterdir()} == {"policy.pt", "policy.onnx", "policy.json"}
+    assert {path.name for path in folder.iterdir()} == {"policy.pt", "policy.onnx", "policy.weights", "policy.json"}
 
 
 def test_the_metadata_says_what_a_controller_must_know(exported, runner):
@@ -105,9 +105,9 @@ def test_the_metadata_says_what_a_controller_must_know(exported, runner):
     assert (metadata["task"], metadata["robot"]) == ("anymal_c_flat", "anymal_c")
 
 
-@pytest.mark.parametrize("file", ["policy.pt", "policy.onnx"])
+@pytest.mark.parametrize("file", ["policy.pt", "policy.onnx", "policy.weights"])
 def test_an_export_that_computes_something_else_is_refused_by_name(runner, tmp_path, monkeypatch, file):
-    function = {"policy.pt": "_torchscript", "policy.onnx": "_onnx"}[file]
+    function = {"policy.pt": "_torchscript", "policy.onnx": "_onnx", "policy.weights": "weights_of"}[file]
     write = getattr(export_module, function)
 
     def write_another(policy, *rest):

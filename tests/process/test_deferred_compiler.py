@@ -30,7 +30,7 @@ def test_a_training_does_without_the_compiler(tmp_path):
 
 def test_who_compiles_gets_the_real_one_and_it_knows_of_all_marks():
     code = f"""{AS_A_COMMAND}
-import legged, torch, inspect
+import legged.envs, torch, inspect
 optimizer = torch.optim.Adam([torch.nn.Parameter(torch.ones(2))])
 optimizer.zero_grad()
 optimizer.step()
@@ -55,7 +55,7 @@ assert torch.optim.Optimizer.zero_grad.__wrapped__.__dynamo_disable is not torch
 def test_modules_inside_it_are_imported_once():
     for ask in ("import torch._dynamo.config as found", "from torch._dynamo import config as found"):
         code = f"""{AS_A_COMMAND}
-import legged, torch
+import legged.envs, torch
 assert {DEFERRED}
 {ask}
 assert found is sys.modules["torch._dynamo.config"] is sys.modules["torch._dynamo"].config
@@ -68,7 +68,7 @@ assert CompileCounter().frame_count == 0
 
 def test_who_only_imports_legged_has_the_real_one():
     finders = "[type(finder).__name__ for finder in sys.meta_path]"
-    run(f"import sys, legged, torch\nassert not ({DEFERRED})\nassert '_Submodules' not in {finders}")
+    run(f"import sys, legged.envs, torch\nassert not ({DEFERRED})\nassert '_Submodules' not in {finders}")
 
 
 def test_a_process_that_a_command_starts_collects_garbage_and_has_the_real_one(tmp_path):
@@ -77,7 +77,7 @@ def test_a_process_that_a_command_starts_collects_garbage_and_has_the_real_one(t
     worker.write_text(
         "import gc, sys\n"
         "def work(told):\n"
-        "    import legged, torch\n"
+        "    import legged.envs, torch\n"
         "    told.put((gc.isenabled(), 'torch._dynamo.utils' in sys.modules))\n"
     )
     code = (

@@ -287,7 +287,7 @@ def test_wrong_terrain_is_named(changes, words):
         {"proportions": {"stairs_up": 0.95, "gap": 0.05}},  # one column
         {"horizontal_scale": 0.31},  # a cell a step
         {"horizontal_scale": 2.0, "proportions": {"flat": 1.0}},
-        {"proportions": dict.fromkeys(TERRAIN_TYPES, 1.0 / 13.0), "num_cols": 13},
+        {"proportions": dict.fromkeys(TERRAIN_TYPES, 1.0 / len(TERRAIN_TYPES)), "num_cols": len(TERRAIN_TYPES)},
     ],
 )
 def test_right_terrain_passes(changes):

@@ -5,8 +5,23 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from legged.terrain import TERRAIN_TYPES
-from legged.terrain.generators import Tile, bumps, gap, obstacles, pit, rough_slope, slope, stairs, stepping_stones, waves
+from legged.config.schema import TerrainConfig
+from legged.terrain import TERRAIN_TYPES, HeightMap, Terrain, TileSpec
+from legged.terrain.generators import (
+    Tile,
+    bumps,
+    dense_blocks,
+    gap,
+    kerbs,
+    obstacles,
+    pit,
+    rough_slope,
+    rubble,
+    slope,
+    stairs,
+    stepping_stones,
+    waves,
+)
 
 CELLS = np.arange(80)
 FROM_EDGE = np.minimum(CELLS, CELLS[::-1])
@@ -165,6 +180,9 @@ def test_every_type_is_made_of_its_size():
     assert middle["rough_slope_up"] == pytest.approx(-0.5, abs=0.05)
     assert middle["rough_slope_down"] == pytest.approx(0.5, abs=0.05)
     assert middle["pit"] == pytest.approx(-0.5)
+    assert middle["narrow_stairs_up"] == pytest.approx(-13 * 0.14)  # treads of 2 cells: after 24 there are 32 left, then 30
+    assert middle["narrow_stairs_down"] == pytest.approx(13 * 0.14)
+    assert middle["dense_blocks"] == middle["kerbs"] == middle["rubble"] == 0.0
     assert middle["gap"] == middle["obstacles"] == middle["stepping_stones"] == middle["flat"] == 0.0
 
 
@@ -173,7 +191,8 @@ def test_every_type_is_made_of_its_size():
     [
         (["slope_up", "slope_down", "rough_slope_up", "rough_slope_down"], (0.0, 0.2, 0.36)),  # rise over run
         (["stairs_up", "stairs_down"], (0.05, 0.14, 0.212)),
-        (["obstacles"], (0.05, 0.15, 0.23)),
+        (["narrow_stairs_up", "narrow_stairs_down", "kerbs"], (0.05, 0.14, 0.212)),
+        (["obstacles", "dense_blocks", "rubble"], (0.05, 0.15, 0.23)),
         (["stepping_stones"], (1.575, 0.825, 0.225)),
         (["gap"], (0.0, 0.5, 0.9)),
         (["pit"], (0.0, 0.5, 0.9)),
@@ -234,3 +253,80 @@ def test_a_single_step_goes_up_all_around_the_platform_and_down_again():
     assert (tile.heights[(distance > 1.5) & (distance < 2.5)] == 0.15).all()
     assert (tile.heights[(distance < 1.5) | (distance > 2.5)] == 0.0).all()
     assert (tile.heights > 0.0).sum() == 50**2 - 30**2
+
+
+# ---- ground that nobody trains on ------------------------------------------------------------------------------------
+
+
+def test_narrow_stairs_have_their_tread_where_cells_divide_it():
+    """0.28 m are 4 cells of 0.07 m: rings at 4, 8, ... of a tile of 114 cells, to a platform of at most 42: after 36."""
+    one = Tile(np.zeros((114, 114)), 0.07, np.random.default_rng(0))
+    TERRAIN_TYPES["narrow_stairs_down"].generate(one, 0.17)
+    edge = np.minimum(np.arange(114), np.arange(114)[::-1])
+    np.testing.assert_allclose(one.heights[57], 0.17 * np.minimum(edge // 4, 9))
+
+
+def test_a_tile_may_have_a_tread_of_its_own_whatever_its_scale():
+    """0.5 m on a tile of half the scale, in cells of 0.05 m: 10 cells, to a platform of 1.5 m: 30."""
+    for name in ("stairs_down", "narrow_stairs_down"):
+        one = Tile(np.zeros((80, 80)), 0.05, np.random.default_rng(0), scale=0.5, tread=0.5)
+        TERRAIN_TYPES[name].generate(one, 0.1)
+        np.testing.assert_allclose(one.heights[40], 0.1 * np.minimum(FROM_EDGE // 10, 3))
+    terrain = Terrain.of_tiles([[TileSpec("stairs_down", 0.1, tread=0.4)]], TerrainConfig(border_size=2.0), None)
+    assert runs(terrain.height_map.heights[60, 20:40])[:3] == [(pytest.approx(0.0), 4), (pytest.approx(0.1), 4), (0.2, 4)]
+
+
+def test_dense_blocks_leave_no_room_but_the_middle():
+    """Tops at quarters of the height; anywhere else level ground of the size of a robot (0.9 by 0.5 m) is rare."""
+    heights = made(dense_blocks, 0.2, seed=3)
+    assert set((heights / 0.05).round(6).ravel()) == {0.0, 1.0, 2.0, 3.0, 4.0}
+    assert not heights[30:50, 30:50].any()
+    outside = np.ones((80, 80), dtype=bool)
+    outside[30:50, 30:50] = False
+    assert (heights[outside] > 0.0).mean() > 0.5
+    windows = np.lib.stride_tricks.sliding_window_view(np.where(outside, heights, np.nan), (9, 5))
+    level = np.ptp(windows, axis=(2, 3)) == 0.0  # windows that reach into the middle are NaN: not level
+    assert level.mean() < 0.05
+
+
+def test_a_single_dense_block_has_sides_of_3_to_8_cells():
+    sides = set()
+    for seed in range(200):
+        one = made(dense_blocks, 0.2, seed=seed, platform=0.0, cover=1e-6)
+        at = np.argwhere(one > 0.0)
+        if len(at):
+            low, high = at.min(axis=0), at.max(axis=0) + 1
+            assert len(at) == np.prod(high - low)
+            if low.min() > 0 and high.max() < 80:  # the tile's edge cuts off no part
+                sides |= set((high - low).tolist())
+    assert sides == {3, 4, 5, 6, 7}  # 8 would be drawn as 0.8 m exactly
+
+
+def test_kerbs_stand_out_of_level_ground():
+    """Around a platform of 2 m, from 1 m on: 2 cells up, 8 level, 2 up, ...: rings 28 and 29, 18 and 19, 8 and 9."""
+    np.testing.assert_allclose(made(kerbs, 0.15), np.where(np.isin(RING, [8, 9, 18, 19, 28, 29]), 0.15, 0.0))
+
+
+def test_rubble_is_made_of_turned_slabs():
+    heights = made(rubble, 0.2, seed=2)
+    assert not heights[30:50, 30:50].any()
+    assert set((heights / 0.05).round(6).ravel()) == {0.0, 1.0, 2.0, 3.0, 4.0}
+    assert 0.5 < (heights > 0.0).mean() < 0.95
+    turned = 0
+    for seed in range(40):
+        stone = made(rubble, 0.2, seed=seed, platform=0.0, cover=1e-6) > 0.0  # a single one
+        at = np.argwhere(stone)
+        assert len(at) <= 30  # 0.5 x 0.5 m are 25 cells, as many centres more or less as the edge lies
+        turned += len(at) > 0 and len(at) < np.prod(np.ptp(at, axis=0) + 1)  # it does not fill its outline
+    assert turned > 20
+
+
+@pytest.mark.parametrize("name", ["dense_blocks", "kerbs", "rubble", "narrow_stairs_up"])
+def test_faces_of_new_ground_are_vertical(name):
+    """In the height map, all cells of a corner that differ by more than 2 cm (a slope of 0.2) keep corners of their own."""
+    terrain = Terrain.of_tiles([[TileSpec(name, 0.2)]], TerrainConfig(border_size=2.0), np.random.default_rng(5))
+    ground: HeightMap = terrain.height_map
+    jump = np.abs(np.diff(ground.heights, axis=0)) > 0.15
+    assert jump.any()
+    right, left = ground.corners[:-1, :, 1], ground.corners[1:, :, 0]  # two sides of one lattice point
+    assert (np.abs(right - left)[jump] > 0.05).all()

@@ -12,8 +12,9 @@ from helpers import POLICY, TASK, call, tiny_run
 from torch.utils.tensorboard import SummaryWriter
 
 from legged.config import to_dict
-from legged.evaluation.reports.comparison import comparison_parts
+from legged.evaluation.reports.comparison import apart, comparison_parts
 from legged.evaluation.reports.document import Table
+from legged.evaluation.reports.experiments import highest_stairs
 from legged.evaluation.reports.record import read_record
 from legged.learning.timing import Timing, write_timing
 from legged.registry import task_config
@@ -45,7 +46,7 @@ def rows(text: str) -> list[list[str]]:
 
 
 def table(name: str = "logs/experiments.md") -> list[dict[str, str]]:
-    head, *found = rows(Path(name).read_text(encoding="utf-8").replace("\\_", "_"))
+    head, *found = rows(Path(name).read_text(encoding="utf-8").replace("\\_", "_").replace("&nbsp;", ""))
     return [dict(zip((text.replace("\\", "") for text in head), row, strict=True)) for row in found]
 
 
@@ -102,6 +103,54 @@ def test_a_folder_of_several_and_one_inside_it_name_a_run_once():
     assert len(table("pages/experiments.md")) == 2
 
 
+def test_seeds_of_a_training_share_a_row():
+    """RMSE of 0.04 and 0.07 m/s; the third seed learned with another reward, the fourth run has a note."""
+    for stamp, seed, error in zip(STAMPS, (2, 1, 3), (0.04, 0.07, 0.5), strict=True):
+        other = {"rewards.scales.torques": -2e-4} if seed == 3 else {}
+        folder = write_run(stamp, **{"env.seed": seed, "train.runner.run_name": f"s{seed}", **other})
+        means = {"rmse_lin": {"mean": error, "worst": 1.0}, "rmse_ang": {"mean": 2 * error, "worst": 1.0}}
+        result = {"task": TASK, "physics": "mujoco", "falls": seed / 100, **means}
+        (folder / "evaluation_mujoco.json").write_text(json.dumps(result))
+    (write_run("2025-01-01_00-00-00") / "note.txt").write_text("as it was")
+    assert experiments.main(["--seeds_share"]) == 0
+    names = ("began", "what changed", "seed", "RMSE [m/s]", "yaw rate RMSE [rad/s]", "falls [%]", "loop [s]")
+    assert [tuple(row[name] for name in names) for row in table()] == [
+        ("2026-03-01 00:00", "s3: scales.torques -0.0002", "3", "0.500", "1.000", "3.00", "12.5"),
+        ("2026-01-02 03:04", "", "1, 2", "0.055", "0.110", "1.50", "12.5"),
+        ("2025-01-01 00:00", "as it was", "1", "-", "-", "-", "12.5"),
+    ]
+    text = Path("logs/experiments.md").read_text()
+    assert text.splitlines()[2].startswith("4 runs, newest first")
+    assert "share a row" in text
+    assert experiments.main([]) == 0
+    assert len(table()) == 4
+
+
+@pytest.mark.parametrize(
+    ("up", "down", "highest"),
+    [
+        ({0.05: 1.0, 0.1: 0.95, 0.15: 0.9, 0.2: 0.89}, {0.05: 1.0, 0.1: 1.0, 0.15: 0.91, 0.2: 1.0}, 0.15),
+        ({0.05: 1.0, 0.1: 0.8, 0.15: 0.95}, {0.05: 1.0, 0.1: 1.0, 0.15: 1.0}, 0.05),
+        ({0.05: 0.5, 0.1: 1.0}, {0.05: 1.0, 0.1: 1.0}, 0.0),
+        ({0.05: 1.0}, {0.1: 1.0}, None),
+        ({}, {0.1: 1.0}, None),
+    ],
+)
+def test_highest_stairs_that_were_crossed(up, down, highest):
+    ways = {"stairs_up": up, "stairs_down": down}
+    types = {
+        name: {"points": [{"size": size, "share": share} for size, share in found.items()]} for name, found in ways.items()
+    }
+    assert highest_stairs({"success": {"types": types}}) == highest
+    assert highest_stairs({}) is None
+
+
+def test_labels_leave_out_what_all_have():
+    assert apart(["go2, wide, seed 1", "go2, narrow, seed 1"]) == ("go2, seed 1", ["wide", "narrow"])
+    assert apart(["go2, seed 1", "a1, seed 1"]) == ("seed 1", ["go2", "a1"])
+    assert apart(["go2, seed 1", "go2, wide, seed 1"]) == ("", ["go2, seed 1", "go2, wide, seed 1"])
+
+
 def test_real_runs_are_compared():
     a = tiny_run("train.runner.run_name=a", "env.episode_length_s=0.1", iterations=2)
     b = tiny_run("train.runner.run_name=b", "env.episode_length_s=0.1", "rewards.scales.torques=-3e-4", iterations=3)
@@ -110,8 +159,10 @@ def test_real_runs_are_compared():
     assert "| `rewards.scales.torques` | `-1.0e-05` | `-0.0003` |" in text
     assert "episode_length_s" not in text
     drawing = page.partition('aria-label="velocity error [m/s]"')[2].partition("</svg>")[0]
-    assert re.findall(r'data-name="([^"]+)"', drawing) == [f"{TASK}, a, seed 1", f"{TASK}, b, seed 1"]
+    assert re.findall(r'data-name="([^"]+)"', drawing) == ["a", "b"]
     assert re.findall(r'data-x="([^"]+)"', drawing) == ["1 2", "1 2 3"]
+    assert text.splitlines()[2] == f"All runs: {TASK.replace('_', chr(92) + '_')}, seed 1."
+    assert "note" not in rows(text)[0]
     assert Path("logs/comparison_curves.svg").is_file()
     assert "No two of the runs were evaluated in the same engine." in page
 
@@ -202,4 +253,5 @@ def test_the_log_of_this_project_is_one_that_the_tool_writes():
     assert {"began", "task", "what changed", "status", "steps/s"} <= found[0].keys()
     began = [row["began"] for row in found]
     assert began == sorted(began, reverse=True)
-    assert f"{len(found)} runs, newest first" in page.read_text(encoding="utf-8")
+    runs = sum(len(row["seed"].split(",")) for row in found)
+    assert f"{runs} runs, newest first" in page.read_text(encoding="utf-8")

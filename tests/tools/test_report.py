@@ -59,6 +59,20 @@ def test_a_training_ends_with_a_report():
     assert not (folder / "film.gif").exists()
 
 
+def test_evaluations_during_training_have_their_time_and_their_best():
+    evaluated = ["train.runner.evaluate_interval=1", "train.runner.evaluate_envs=8", "train.runner.evaluate_s=1.1"]
+    folder = tiny_run(*REPORTED, *evaluated, "commands.curriculum.enabled=true")
+    text, timing = read(folder, "report.md"), read_record(folder).timing
+    rest_s = timing.wall_s - timing.start_up_s - timing.loop_s - timing.evaluation_s
+    assert 0.0 < timing.evaluation_s < timing.wall_s - timing.start_up_s - timing.loop_s
+    assert f"| time to evaluate | {timing.evaluation_s:.1f} s |" in text
+    assert f"| time for the rest | {rest_s:.1f} s (" in text
+    assert r"the best by its evaluations is model\_best.pt" in text
+    titles = set(re.findall(r'aria-label="([^"]+)"', read(folder)))
+    assert {"largest commanded vx [m/s]", "largest commanded yaw rate [rad/s]"} <= titles
+    assert {"evaluated: velocity RMSE [m/s]", "evaluated: robots that fell [%]"} <= titles
+
+
 def test_levels_are_drawn_by_type():
     short = ["env.episode_length_s=0.1", "terrain.num_rows=2", "terrain.num_cols=10", "terrain.max_init_terrain_level=1"]
     arguments = ["--task", "anymal_c", "--sim_device", "cpu", "--num_envs", "20", "--max_iterations", "2"]
@@ -73,7 +87,7 @@ def test_levels_are_drawn_by_type():
 def test_the_table_has_the_numbers_of_the_log():
     folder = tiny_run("env.episode_length_s=0.1", iterations=25)
     table = over_training(read_record(folder))
-    assert table.head[:5] == ["iteration", "steps", "time [s]", "return", "its standard deviation"]
+    assert table.head[:5] == ["iteration", "steps", "time [s]", "return", "standard deviation of the return"]
     iterations = [row[0].value for row in table.rows]
     assert (len(iterations), iterations[0], iterations[-1]) == (10, 1.0, 25.0)
     assert [row[1].value for row in table.rows] == [32.0 * iteration for iteration in iterations]

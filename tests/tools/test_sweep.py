@@ -16,6 +16,7 @@ import yaml
 from helpers import call, wait_for
 
 from legged.errors import ConfigError
+from legged.evaluation.reports.record import read_note
 from legged.learning.evaluations import Evaluated
 from legged.learning.run_folder import checkpoints, run_config
 from legged.learning.timing import read_timing
@@ -304,6 +305,9 @@ def test_a_trial_that_falls_behind_is_ended_and_keeps_its_run(monkeypatch):
     (run,) = trial.user_attrs[study.RUNS]
     assert list(checkpoints(Path(run))) == [0]
     assert not read_timing(Path(run)).finished
+    drawn = settings(plan_of(trials=1), trial)
+    words = ", ".join(f"{path.split('.', 1)[1]} {json.dumps(value)}" for path, value in drawn.items())
+    assert read_note(Path(run)) == f"trial 0 of sweep_mine: {words}; {worker.PRUNED} (after 1 iterations)"
 
 
 def test_settings_that_do_not_fit_each_other_have_no_value_and_end_nothing_else():

@@ -21,19 +21,31 @@ Measured = tuple[str, Interval] | None
 
 def comparison_parts(records: Sequence[Record]) -> list[Part]:
     """Return the page on some runs, the first of which the others are compared with."""
-    names = labels([record.folder for record in records], [record.config for record in records])
+    common, names = apart(labels([record.folder for record in records], [record.config for record in records]))
+    noted = any(record.note for record in records)
     rows: list[list[Cell]] = []
     for name, record in zip(names, records, strict=True):
         timing = record.timing
         row: list[Cell] = [name, Mono(record.name), record.status, record.why, number(record.robots, ",.0f")]
         row += [number(timing.loop_s if timing else None, ".1f"), number(timing.steps_per_s if timing else None, ",.0f")]
-        rows.append([*row, record.code.summary, record.note])
-    head = ["run", "folder", "status", "", "robots", "loop [s]", "steps/s", "commit", "note"]
-    parts: list[Part] = [Table(head, rows), Heading("Settings that differ"), _settings(names, records)]
+        rows.append([*row, record.code.summary, *([record.note] if noted else [])])
+    head = ["run", "folder", "status", "", "robots", "loop [s]", "steps/s", "commit", *(["note"] if noted else [])]
+    parts: list[Part] = [Paragraph(f"All runs: {common}.")] if common else []
+    parts += [Table(head, rows), Heading("Settings that differ"), _settings(names, records)]
     drawings = curves_of_runs(list(zip(names, records, strict=True)))
     if drawings:
         parts += [Heading("Curves"), Figures("curves", drawings, "learning curves of the runs")]
     return parts + _evaluations(names, records)
+
+
+def apart(names: Sequence[str]) -> tuple[str, list[str]]:
+    """Return what labels of runs have in common, and of each what tells it from the others; nothing and the labels themselves
+    where one of them would say nothing any more.
+    """
+    parts = [name.split(", ") for name in names]
+    common = [part for part in parts[0] if all(part in one for one in parts)]
+    rest = [", ".join(part for part in one if part not in common) for one in parts]
+    return (", ".join(common), rest) if all(rest) else ("", list(names))
 
 
 def _settings(names: Sequence[str], records: Sequence[Record]) -> Part:
@@ -93,7 +105,7 @@ def _measures(results: Sequence[dict[str, Any] | None]) -> list[tuple[str, Any, 
     """Return what is compared: label, a run's figure, and the difference of two."""
     if any(result is not None and "episodes" in result for result in results):
         return [
-            ("return", _returned, _returned_more),
+            ("return", *_figure(_spread, lambda mean, _std, _count: mean, normal_mean, welch, ".1f")),
             ("episodes that ended in a failure [%]", *_share(_failures)),
         ]
     return [
@@ -133,25 +145,31 @@ def _error(name: str) -> tuple[Any, Any]:
     return of, more
 
 
-def _share(counted: Any) -> tuple[Any, Any]:
-    """Return a share, and the difference of two, of what `counted` finds in a result: (how many, of how many), or None."""
+def _figure(read: Any, value: Any, interval: Any, of_difference: Any, form: str, factor: float = 1.0) -> tuple[Any, Any]:
+    """Return a figure, and the difference of two. `read` finds in a result what it follows from, or None; `value` and
+    `interval` make of that the figure and its interval, `of_difference` of two of them the interval of their difference.
+    """
 
     def of(result: dict[str, Any]) -> Measured:
-        found = counted(result)
+        found = read(result)
         if found is None:
             return None
-        interval = wilson(*found)
-        return f"{100.0 * found[0] / found[1]:.2f} ({between(interval, 100.0, '.2f')})", interval
+        around = interval(*found)
+        return f"{factor * value(*found):{form}} ({between(around, factor, form)})", around
 
     def more(first: dict[str, Any], second: dict[str, Any]) -> Measured:
-        a, b = counted(first), counted(second)
+        a, b = read(first), read(second)
         if a is None or b is None:
             return None
-        interval = newcombe(a, b)
-        moved = 100.0 * (b[0] / b[1] - a[0] / a[1])
-        return f"{moved:+.2f} ({between(interval, 100.0, '+.2f')})", interval
+        around = of_difference(a, b)
+        return f"{factor * (value(*b) - value(*a)):+{form}} ({between(around, factor, f'+{form}')})", around
 
     return of, more
+
+
+def _share(counted: Any) -> tuple[Any, Any]:
+    """Return a share, and the difference of two, of what `counted` finds in a result: (how many, of how many), or None."""
+    return _figure(counted, lambda some, of_all: some / of_all, wilson, newcombe, ".2f", 100.0)
 
 
 def _failures(result: dict[str, Any]) -> tuple[int, int] | None:
@@ -165,22 +183,6 @@ def _spread(result: dict[str, Any]) -> tuple[float, float, int] | None:
     if episodes is None or int(episodes["count"]) < 1:
         return None
     return episodes["return"]["mean"], episodes["return"]["std"], int(episodes["count"])
-
-
-def _returned(result: dict[str, Any]) -> Measured:
-    found = _spread(result)
-    if found is None:
-        return None
-    interval = normal_mean(*found)
-    return f"{found[0]:.1f} ({between(interval)})", interval
-
-
-def _returned_more(first: dict[str, Any], second: dict[str, Any]) -> Measured:
-    a, b = _spread(first), _spread(second)
-    if a is None or b is None:
-        return None
-    interval = welch(a, b)
-    return f"{b[0] - a[0]:+.1f} ({between(interval, form='+.1f')})", interval
 
 
 def _success(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> list[str]:

@@ -6,7 +6,8 @@ import numpy as np
 
 from legged.evaluation.learning_curves import LEVEL, Scalars, always_promoted, smooth
 from legged.evaluation.reports.record import Record
-from legged.evaluation.reports.svg import COLORS, Axes, Line, curves, stacked
+from legged.evaluation.reports.svg import Axes, Line, curves, stacked
+from legged.figures import COLORS
 
 MOST_PARTS = len(COLORS) - 1
 """Reward parts with a colour of their own; all smaller ones are one."""
@@ -17,6 +18,12 @@ SINGLE = (
     ("Metrics/falls", "episodes that end in a fall [%]", 100.0),
 )
 """Tag, title, factor."""
+CURRICULUM = (
+    ("Metrics/command_vx", "largest commanded vx [m/s]", 1.0),
+    ("Metrics/command_vy", "largest commanded vy [m/s]", 1.0),
+    ("Metrics/command_yaw", "largest commanded yaw rate [rad/s]", 1.0),
+)
+"""As far as a curriculum of commands has got; the same."""
 LEARNER = (
     ("Policy/mean_std", "standard deviation of actions (noise)", 1.0),
     ("Loss/value", "loss of the value function", 1.0),
@@ -24,6 +31,14 @@ LEARNER = (
 NOT_OF_THE_TASK = (LENGTH, "Metrics/contact_overflows", "Metrics/non_finite_worlds")
 WATCHED = "Evaluation/"
 """Section of what was measured without noise during training."""
+OF_EVALUATION = {
+    "lin_vel_rmse": ("velocity RMSE [m/s]", 1.0),
+    "ang_vel_rmse": ("yaw rate RMSE [rad/s]", 1.0),
+    "falls": ("robots that fell [%]", 100.0),
+    "return": ("return of an episode", 1.0),
+    "episode_length": ("length of an episode [control steps]", 1.0),
+}
+"""Title and factor of its figures; others are metrics of the task, called what they are."""
 
 
 def curves_of_run(record: Record) -> list[str]:
@@ -45,14 +60,17 @@ def curves_of_runs(records: Sequence[tuple[str, Record]]) -> list[str]:
 def _several(records: Sequence[tuple[str, Record]]) -> list[str]:
     """Return one drawing a quantity, one line a run."""
     tags = dict.fromkeys(tag for _, record in records for tag in record.scalars)
-    own = [
-        tag for tag in tags if tag.startswith("Metrics/") and tag not in (*NOT_OF_THE_TASK, *(tag for tag, _, _ in SINGLE))
-    ]
+    named = (*NOT_OF_THE_TASK, *(tag for tag, _, _ in SINGLE + CURRICULUM))
+    own = [tag for tag in tags if tag.startswith("Metrics/") and tag not in named]
     found = [drawing for tag, title, factor in SINGLE for drawing in _one(tag, title, records, factor)]
     found += _lengths(records)
-    for tag in [*own, *(tag for tag in tags if tag.startswith(WATCHED))]:
-        title = tag.removeprefix("Metrics/").replace("_", " ")
-        found += _one(tag, title, records, markers=tag.startswith(WATCHED))
+    found += [drawing for tag, title, factor in CURRICULUM for drawing in _one(tag, title, records, factor)]
+    for tag in own:
+        found += _one(tag, tag.removeprefix("Metrics/").replace("_", " "), records)
+    for tag in (tag for tag in tags if tag.startswith(WATCHED)):
+        name = tag.removeprefix(WATCHED)
+        title, factor = OF_EVALUATION.get(name, (name.replace("_", " "), 1.0))
+        found += _one(tag, f"evaluated: {title}", records, factor, markers=True)
     found += _one("Loss/learning_rate", "learning rate", records, log=True)
     found += [drawing for tag, title, factor in LEARNER for drawing in _one(tag, title, records, factor)]
     wanted = {record.at("train.algorithm.desired_kl") for _, record in records} - {None}

@@ -65,13 +65,22 @@ def words(value: Any) -> str:
     return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 3] + "..."
 
 
-def what_changed(record: Record) -> str:
-    """Say in a few words what a run is about: somebody's note, else its own name and what it sets otherwise than its task."""
+def what_changed(record: Record, named: bool = True) -> str:
+    """Say in a few words what a run is about: somebody's note, else its own name, where it is to be `named`, and what it sets
+    otherwise than its task.
+    """
     if record.note:
         return record.note
     changed = from_task_file(record) or {}
     changed = {path: values for path, values in changed.items() if path not in (*NAMES, "env.seed")}
-    named = [f"{path.rpartition('.')[2]} {words(given)}" for path, (given, _) in changed.items()]
-    if len(named) > MOST_WORDS:
-        named = [*named[:MOST_WORDS], f"{len(named) - MOST_WORDS} more settings"]
-    return ": ".join(text for text in (record.run_name, ", ".join(named)) if text)
+    said = [f"{'.'.join(path.split('.')[-2:])} {words(given)}" for path, (given, _) in changed.items()]
+    if len(said) > MOST_WORDS:
+        said = [*said[:MOST_WORDS], f"{len(said) - MOST_WORDS} more settings"]
+    return ": ".join(text for text in (record.run_name if named else "", ", ".join(said)) if text)
+
+
+def but_for_seeds(record: Record) -> str:
+    """Return a text that is the same for all runs that differ in nothing but their seed and what they are called."""
+    told = {path: value for path, value in flat(record.config).items() if path not in (*NAMES[:-1], "env.seed")}
+    device = record.timing.device if record.timing else ""
+    return repr((sorted(told.items()), record.note, record.status, record.done, record.code.summary, device))

@@ -175,9 +175,15 @@ def _markdown(part: Part, pictures: str) -> str:
             return f"## {_plain(text)}"
         case Paragraph(text, badge):
             return f"**{_plain(badge)}**: {_markdown_text(text)}" if badge else _markdown_text(text)
-        case Table(head, rows):
+        case Table(head, rows, wide):
             numeric = [bool(rows) and all(isinstance(row[i], Number) for row in rows) for i in range(len(head))]
-            lines = [[_plain(text) for text in head], ["---:" if one else "---" for one in numeric]]
+            heads = [_plain(text) for text in head]
+            if wide:
+                heads = [
+                    text if one else text + _room(text, [row[i] for row in rows])
+                    for i, (text, one) in enumerate(zip(heads, numeric, strict=True))
+                ]
+            lines = [heads, ["---:" if one else "---" for one in numeric]]
             lines += [[_markdown_cell(cell) for cell in row] for row in rows]
             return "\n".join(f"| {' | '.join(line)} |" for line in lines)
         case Figures(name, _, alt):
@@ -186,6 +192,16 @@ def _markdown(part: Part, pictures: str) -> str:
             return f"{'!' if KINDS[path.suffix.lower()].startswith('image') else ''}[{_plain(alt)}]({path.name})"
         case Listing(title, _, file):
             return f"{_plain(title)}: see [{_plain(file)}]({file})"
+
+
+def _room(head: str, cells: Sequence[Cell]) -> str:
+    """Return spaces that do not break, which keep a column of texts wide enough to be read: viewers of Markdown squeeze the
+    texts of a table that is wider than the page to a word a line, but not below the width of their head. Two spaces are as
+    wide as a letter.
+    """
+    texts = [cell.text if isinstance(cell, Link | Number) else cell for cell in cells]
+    longest = max((len(text) for text in texts if " " in text), default=0)
+    return "&nbsp;" * (2 * (min(longest, SHORT) - len(head)))
 
 
 def _markdown_cell(cell: Cell) -> str:

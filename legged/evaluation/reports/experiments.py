@@ -1,12 +1,14 @@
-"""All runs there are in one table, newest first."""
+"""All runs there are in one table, newest first; seeds of one training may share a row."""
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
 from legged.evaluation.engines import ENGINES
 from legged.evaluation.learning_curves import smooth
-from legged.evaluation.reports.differences import what_changed
+from legged.evaluation.reports.differences import but_for_seeds, what_changed
 from legged.evaluation.reports.document import Cell, Link, Mono, Number, Paragraph, Part, Table
 from legged.evaluation.reports.evaluation_part import number
 from legged.evaluation.reports.record import Record
@@ -16,23 +18,62 @@ from legged.evaluation.result_file import tracking_of
 TITLE = "Experiments"
 EMPTY = ("", "-")
 """Cells that say nothing; a column of nothing else is left out."""
+FORMS = {
+    "RMSE [m/s]": ".3f",
+    "yaw rate RMSE [rad/s]": ".3f",
+    "falls [%]": ".2f",
+    "stairs [m]": ".3f",
+    "return, evaluated": ".1f",
+    "terrain level": ".2f",
+    "return": ".2f",
+    "velocity error [m/s]": ".3f",
+    "steps [M]": ".1f",
+    "start-up [s]": ".1f",
+    "loop [s]": ".1f",
+    "steps/s": ",.0f",
+}
+"""How the figures are written of which seeds that share a row have a mean."""
+STAIRS = ("stairs_up", "stairs_down")
+PASSED = 0.9
+"""Share of the robots that get over stairs which count as crossed."""
 
 
-def experiments_parts(records: Sequence[Record], beside: Path, ending: str) -> list[Part]:
+def experiments_parts(records: Sequence[Record], beside: Path, ending: str, seeds_share: bool = False) -> list[Part]:
     """Return the page on some runs. Those below the folder `beside`, where the page is written, lead to their reports of that
-    `ending`.
+    `ending`. Where `seeds_share` a row, runs that differ in nothing but their seed are one, with means.
     """
     newest = sorted(records, key=lambda record: (record.began, record.name), reverse=True)
-    rows = [_row(record, beside, ending) for record in newest]
+    groups: dict[str, list[Record]] = {}
+    for record in newest:
+        groups.setdefault(but_for_seeds(record) if seeds_share else str(record.folder), []).append(record)
+    rows = [_shared_row(group, beside, ending) for group in groups.values()]
     head = list(rows[0]) if rows else []
     shown = [name for name in head if any(_text(row[name]) not in EMPTY for row in rows)]
     text = (
-        f"{len(rows)} runs, newest first, made by `python -m legged.tools.experiments`. What changed is a note to the run"
-        " (`--note`), else its own name and what it sets otherwise than its task as it is now. Return and velocity error are"
-        " those of the end of training, with noise and pushes; RMSE and falls are those of the evaluation, without them, by"
-        " `python -m legged.tools.evaluate`. A commit with a + had changes that were not committed."
+        f"{len(newest)} runs, newest first, made by `python -m legged.tools.experiments`. What changed is a note to the run"
+        " (`--note`), else its own name and what it sets otherwise than its task as it is now. RMSE, falls and stairs are"
+        " those of the evaluation, without noise and pushes, by `python -m legged.tools.evaluate`; stairs are the highest"
+        " steps that nine robots of ten got up, and nine got down. Terrain level, return and velocity error are those of the"
+        " end of training, with both. A commit with a + had changes that were not committed."
     )
+    if len(rows) < len(newest):
+        text += " Runs that differ in nothing but their seed share a row, with the means over them."
     return [Paragraph(text), Table(shown, [[row[name] for name in shown] for row in rows], wide=True)]
+
+
+def _shared_row(group: Sequence[Record], beside: Path, ending: str) -> dict[str, Cell]:
+    """Return what the table says of runs that differ in their seeds, or of the only one."""
+    rows = [_row(record, beside, ending) for record in group]
+    if len(rows) == 1:
+        return rows[0]
+    shared: dict[str, Cell] = dict(rows[0])
+    for name, form in FORMS.items():
+        known = [cell.value for row in rows if isinstance(cell := row[name], Number) and cell.value is not None]
+        shared[name] = number(mean(known) if known else None, form)
+    seeds = [value for record in group if (value := _whole(record.at("env.seed"))) is not None]
+    shared["seed"] = Number(", ".join(f"{seed:,d}" for seed in sorted(seeds)), min(seeds, default=None))
+    shared["what changed"] = what_changed(group[0], named=False)
+    return shared
 
 
 def _text(cell: Cell) -> str:
@@ -46,26 +87,43 @@ def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
     judged = _judged(record)
     tracking = {} if judged is None or "episodes" in judged else tracking_of(judged)
     episodes = judged["episodes"] if judged is not None and "episodes" in judged else None
+    figures = {
+        "RMSE [m/s]": tracking["rmse_lin"]["mean"] if tracking else None,
+        "yaw rate RMSE [rad/s]": tracking["rmse_ang"]["mean"] if tracking else None,
+        "falls [%]": 100.0 * tracking["falls"] if tracking else None,
+        "stairs [m]": None if judged is None else highest_stairs(judged),
+        "return, evaluated": episodes["return"]["mean"] if episodes else None,
+        "terrain level": _last(record, "Terrain/level"),
+        "return": _last(record, "Train/mean_reward"),
+        "velocity error [m/s]": _last(record, "Metrics/lin_vel_rmse"),
+        "steps [M]": None if steps is None else steps / 1e6,
+        "start-up [s]": timing.start_up_s if timing else None,
+        "loop [s]": timing.loop_s if timing else None,
+        "steps/s": timing.steps_per_s if timing else None,
+    }
     return {
         "began": _began(record, beside, ending),
         "task": record.task,
         "what changed": what_changed(record),
         "status": record.status,
-        "seed": number(_whole(record.at("env.seed")), ",.0f"),
-        "robots": number(record.robots, ",.0f"),
         "iterations": number(record.done, ",.0f"),
-        "steps [M]": number(None if steps is None else steps / 1e6, ".1f"),
-        "start-up [s]": number(timing.start_up_s if timing else None, ".1f"),
-        "loop [s]": number(timing.loop_s if timing else None, ".1f"),
-        "steps/s": number(timing.steps_per_s if timing else None, ",.0f"),
-        "return": number(_last(record, "Train/mean_reward"), ".2f"),
-        "velocity error [m/s]": number(_last(record, "Metrics/lin_vel_rmse")),
-        "RMSE [m/s]": number(tracking["rmse_lin"]["mean"] if tracking else None),
-        "falls [%]": number(100.0 * tracking["falls"] if tracking else None, ".2f"),
-        "return, evaluated": number(episodes["return"]["mean"] if episodes else None, ".1f"),
+        "seed": number(_whole(record.at("env.seed")), ",.0f"),
+        **{name: number(value, FORMS[name]) for name, value in figures.items()},
+        "robots": number(record.robots, ",.0f"),
         "device": ("" if timing is None else "CPU" if timing.device == "cpu" else timing.device),
         "commit": Mono(record.code.commit[:10] + ("+" if record.code.files else "")),
     }
+
+
+def highest_stairs(result: dict[str, Any]) -> float | None:
+    """Return the height of the highest steps that an evaluation found crossed, up and down, with all lower ones [m]; 0 where
+    the lowest were not; None where there were none both ways.
+    """
+    types = result.get("success", {}).get("types", {})
+    ways = [{point["size"]: point["share"] for point in types.get(name, {"points": []})["points"]} for name in STAIRS]
+    sizes = sorted(ways[0].keys() & ways[1].keys())
+    crossed = list(itertools.takewhile(lambda size: min(way[size] for way in ways) >= PASSED, sizes))
+    return max(crossed, default=0.0) if sizes else None
 
 
 def _began(record: Record, beside: Path, ending: str) -> Cell:

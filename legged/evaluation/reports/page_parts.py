@@ -21,9 +21,10 @@ table { border-collapse: collapse; font-size: .92em; }
 th, td { border-bottom: 1px solid var(--line); padding: 4px 10px; text-align: left; vertical-align: top; }
 th { background: var(--soft); }
 td { max-width: 56ch; overflow-wrap: break-word; }
-td.long { min-width: 16em; }
+td.long { min-width: min(26em, 60vw); }
 td.short { white-space: nowrap; }
-.n { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
+.n { text-align: right; font-variant-numeric: tabular-nums; }
+td.n { white-space: nowrap; }
 th button { all: unset; cursor: pointer; font-weight: inherit; }
 th button:focus-visible { outline: 2px solid var(--link); }
 th[aria-sort=ascending] button::after { content: " \\2191"; }

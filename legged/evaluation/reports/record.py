@@ -179,7 +179,7 @@ def _status(folder: Path, timing: Timing | None, until: Any, done: int, saved: i
             return "finished", of
         if timing.error:
             return "crashed", f"after {of}: {timing.error}"
-        return "interrupted", f"after {of}, by a signal or because its output went away"
+        return "interrupted", f"after {of}, by a signal, by its sweep, or because its output went away"
     if (folder / "model.pt").is_file():
         return "finished", "a policy that comes with this package"
     if isinstance(until, int) and saved >= until:

@@ -25,7 +25,7 @@ from legged.evaluation.reports.document import (
 from legged.evaluation.reports.evaluation_part import evaluation_parts, number
 from legged.evaluation.reports.record import Record, read_record
 from legged.evaluation.reports.svg import sheet
-from legged.learning.run_folder import CODE_FILE, checkpoints
+from legged.learning.run_folder import BEST_MODEL, CODE_FILE, checkpoints
 from legged.process.paths import write_text
 
 REPORT = "report"
@@ -38,7 +38,7 @@ LONGEST_DIFF = 200_000
 """Letters of a difference in the page; the whole one is in its file."""
 OVER_TRAINING = (
     ("Train/mean_reward", "return", 1.0, ".2f"),
-    ("Train/std_reward", "its standard deviation", 1.0, ".2f"),
+    ("Train/std_reward", "standard deviation of the return", 1.0, ".2f"),
     ("Metrics/lin_vel_rmse", "velocity error [m/s]", 1.0, ".3f"),
     ("Metrics/ang_vel_rmse", "yaw rate error [rad/s]", 1.0, ".3f"),
     ("Metrics/falls", "falls [%]", 100.0, ".1f"),
@@ -116,7 +116,7 @@ def _facts(record: Record) -> list[list[Cell]]:
         "robots, seed": f"{record.robots or '-'}, {record.at('env.seed')}",
     }
     if timing is not None:
-        rest_s = timing.wall_s - timing.start_up_s - timing.loop_s
+        rest_s = timing.wall_s - timing.start_up_s - timing.loop_s - timing.evaluation_s
         compiled = f", {timing.kernels_compiled} modules of kernels compiled" if timing.kernels_compiled else ""
         beside = f", beside {timing.beside} other trainings" if timing.beside else ""
         found |= {
@@ -124,6 +124,7 @@ def _facts(record: Record) -> list[list[Cell]]:
             "iterations, steps": f"{timing.iterations:,}, {timing.steps:,}" + (" after it was resumed" * timing.resumed),
             "time to start": f"{timing.start_up_s:.1f} s (imports, task{compiled or ', no kernels compiled'})",
             "time to train": f"{timing.loop_s:.1f} s ({timing.steps_per_s:,.0f} steps/s)",
+            "time to evaluate": f"{timing.evaluation_s:.1f} s" if timing.evaluation_s else None,
             "time for the rest": f"{rest_s:.1f} s (graphs captured, checkpoints, logs); {timing.wall_s:.1f} s in all",
         }
     elif record.scalars:
@@ -132,8 +133,9 @@ def _facts(record: Record) -> list[list[Cell]]:
     faults = [tag for tag in record.scalars if tag.startswith("Faults/")]
     lost = record.scalars.get("Metrics/contact_overflows")
     saved = checkpoints(record.folder)
+    best = f"; the best by its evaluations is {BEST_MODEL}" if (record.folder / BEST_MODEL).is_file() else ""
     found |= {
-        "checkpoints": f"{len(saved)}, the last is {saved[max(saved)].name}" if saved else "none",
+        "checkpoints": f"{len(saved)}, the last is {saved[max(saved)].name}{best}" if saved else "none",
         "faults": ", ".join(tag.partition("/")[2] for tag in faults) or None,
         "contacts lost": f"in {lost[1].sum():,.0f} robot steps" if lost is not None and lost[1].sum() > 0 else None,
     }

@@ -12,9 +12,9 @@ from html import escape
 
 import numpy as np
 
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C8C00")
-"""Of lines and areas, in this order; the last is Okabe and Ito's yellow, darkened to be seen on white."""
-DASHES = ("", "7 3", "2 2", "9 3 2 3", "5 2", "1 3", "12 3", "3 3")
+from legged.figures import COLORS
+
+DASHES = ("", "7 3", "2 2", "9 3 2 3", "5 2", "14 3 2 3 2 3", "12 3", "3 3")
 WIDTH, HEIGHT = 480.0, 250.0
 """Of a drawing without its legend [SVG units, which are pixels on a wide screen]."""
 LEFT, RIGHT, TOP, BOTTOM = 58.0, 14.0, 30.0, 42.0

@@ -1,5 +1,5 @@
 """The live plots as SVG: velocities asked and reached, feet on the ground, parts of the reward. Text takes the colour of the
-page; curves have colours that colour-blind readers tell apart (Okabe and Ito, "Color universal design", 2008), and dashes.
+page; curves have the colours of all figures, and dashes.
 """
 
 from collections.abc import Sequence
@@ -8,10 +8,11 @@ from html import escape
 
 import numpy as np
 
+from legged.figures import COLORS
 from legged.play.live.history import AXES, KEPT_S, UNITS, History
 
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F")
-"""Blue, vermilion, green, purple, orange, sky blue, grey."""
+OTHERS = "#7F7F7F"
+"""Colour of what is added up."""
 DASHES = ("", "5 2", "2 2")
 """The second and third dozen of curves are dashed."""
 COMMANDED, ACTUAL = COLORS[1], COLORS[0]
@@ -60,7 +61,7 @@ def reward_figure(history: History) -> str:
     others = [i for i in range(len(history.terms)) if i not in largest]
     if others:
         name = history.terms[others[0]] if len(others) == 1 else f"{len(others)} others"
-        curves.append(Curve(name, values[others].sum(axis=0), COLORS[6], DASHES[1]))
+        curves.append(Curve(name, values[others].sum(axis=0), OTHERS, DASHES[1]))
     return figure(_reward_unit(history), history.times(), curves, 130.0)
 
 

@@ -156,8 +156,13 @@ class Plan:
         goal = {} if target is None else {f"train.runner.stop_at.{self.figure}": target}
         settings = {**self._own_defaults(), **self.given.overrides, **values, **goal}
         flags = ["--task", self.given.task, "--seed", str(seed), "--experiment_name", self.name]
-        flags += ["--run_name", f"trial{number:03d}_s{seed}"]
+        flags += ["--run_name", f"trial{number:03d}_s{seed}", "--note", self.note(values, number)]
         return [*flags, *(f"{path}={json.dumps(value)}" for path, value in settings.items())]
+
+    def note(self, values: Mapping[str, Any], number: int) -> str:
+        """Return what the runs of a trial say of themselves: what was drawn for it."""
+        drawn = [f"{'.'.join(path.split('.')[-2:])} {json.dumps(value)}" for path, value in values.items()]
+        return f"trial {number} of {self.name}: {', '.join(drawn)}"
 
     def _own_defaults(self) -> dict[str, Any]:
         """Return what the file need not set: evaluations that make trials comparable, and neither report nor film, which take

@@ -9,7 +9,7 @@ import yaml
 
 from legged.config.loader import merge, nest
 from legged.config.origins import Origins
-from legged.figures import figure
+from legged.figures import COLORS, figure
 from legged.process.paths import relative, write_text
 from legged.tools.sweeping.plan import Parameter, Plan
 from legged.tools.sweeping.study import RUNS, WHY, Trials
@@ -17,7 +17,7 @@ from legged.tools.sweeping.study import RUNS, WHY, Trials
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
 
-BLUE, VERMILLION, GREY = "#0072B2", "#D55E00", "#999999"
+BLUE, VERMILLION, GREY = COLORS[0], COLORS[1], "#999999"
 """Of Okabe and Ito's colours, which colour-blind readers tell apart."""
 FEWEST = 4
 """Trials with a value of which it can be said which setting mattered."""

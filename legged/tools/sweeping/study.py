@@ -2,16 +2,15 @@
 
 import os
 import socket
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from legged.errors import ConfigError, RunError
 from legged.process.paths import make_folder
+from legged.process.repeating import repeating
 from legged.tools.sweeping.plan import Parameter, Plan
 
 if TYPE_CHECKING:
@@ -157,23 +156,14 @@ class Trials:
     def _running(self) -> list["FrozenTrial"]:
         return [trial for trial in self.all if trial.state.name == "RUNNING"]
 
-    @contextmanager
-    def alive(self, trial: "Trial") -> Iterator[None]:
-        """Say now and then, while the block runs, that this process works on a trial."""
-        over = threading.Event()
+    def alive(self, trial: "Trial") -> AbstractContextManager[None]:
+        """Return a block during which this process says now and then that it works on a trial."""
 
         def beat() -> None:
-            while not over.wait(BEAT_S):
-                with suppress(Exception):  # a storage that is away for a moment
-                    self._storage.set_trial_user_attr(trial._trial_id, ALIVE, time.time())
+            with suppress(Exception):  # a storage that is away for a moment
+                self._storage.set_trial_user_attr(trial._trial_id, ALIVE, time.time())
 
-        thread = threading.Thread(target=beat, daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            over.set()
-            thread.join()
+        return repeating(beat, BEAT_S)
 
 
 def finished(trials: list["FrozenTrial"]) -> list["FrozenTrial"]:

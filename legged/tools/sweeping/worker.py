@@ -17,9 +17,10 @@ from legged.commandline.stopping import stopping_on_signals
 from legged.envs.checks import lower_is_better
 from legged.errors import ConfigError
 from legged.learning.evaluations import Evaluated, reaches
+from legged.learning.run_folder import NOTE_FILE
 from legged.learning.runner import Runner
 from legged.learning.watch import Diverged
-from legged.process.paths import make_folder, relative
+from legged.process.paths import make_folder, relative, write_text
 from legged.tools.sweeping.plan import Plan
 from legged.tools.sweeping.study import RUNS, WHY, Trials
 from legged.tools.train import train_as_asked
@@ -164,7 +165,9 @@ class Worker:
         runs = [*trial.user_attrs.get(RUNS, []), relative(Path(runner.logger.log_dir))]
         trial.set_user_attr(RUNS, runs)
         if evaluations.why_end == PRUNED:
-            raise NoValue(f"{PRUNED} (after {evaluations.history[-1].iterations} iterations)")
+            why = f"{PRUNED} (after {evaluations.history[-1].iterations} iterations)"
+            write_text(Path(runner.logger.log_dir) / NOTE_FILE, f"{self.plan.note(values, trial.number)}; {why}\n")
+            raise NoValue(why)
         if code >= SIGNALLED:
             raise Stopped(code - SIGNALLED)
         return self._taken(evaluations.history)

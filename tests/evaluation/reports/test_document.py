@@ -80,6 +80,13 @@ def test_markdown_keeps_its_tables_whole():
     assert lines == ["| a\\|b | n |", "| --- | ---: |", "| x\\|y z | 3 |", "| `p\\|q` | 4 |"]
 
 
+def test_long_texts_of_a_wide_table_have_room():
+    rows = [["go2_flat", "cheap torques", Number("1 000", 1000.0)], ["a1", "wide " * 20, Number("2", 2.0)]]
+    plain, wide = (to_markdown("t", [Table(["task", "note", "n"], rows, wide=one)], "p").splitlines()[2] for one in (0, 1))
+    assert plain == "| task | note | n |"
+    assert wide == f"| task | note{'&nbsp;' * 56} | n |"
+
+
 def test_pictures_are_inside_the_page_and_beside_the_markdown(tmp_path):
     film = tmp_path / "film.gif"
     Image.new("P", (4, 4)).save(film)

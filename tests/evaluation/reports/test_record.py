@@ -184,7 +184,7 @@ def test_a_run_is_compared_with_its_task_on_the_device_that_it_was_made_on():
 def test_what_changed_in_a_few_words():
     folder = folder_of(**{"rewards.scales.torques": -1e-4, "train.runner.run_name": "cheap", "env.seed": 9})
     write_timing(folder, times())
-    assert what_changed(read_record(folder)) == "cheap: num_envs 8, torques -0.0001"
+    assert what_changed(read_record(folder)) == "cheap: env.num_envs 8, scales.torques -0.0001"
     (folder / "note.txt").write_text("torques cost\nten times as much\n")
     assert what_changed(read_record(folder)) == "torques cost ten times as much"
     many = {f"rewards.scales.{name}": -7.0 for name in ("torques", "dof_acc", "collision", "action_rate", "orientation")}

@@ -8,7 +8,6 @@ import pytest
 
 from legged.evaluation.reports.svg import (
     BOTTOM,
-    COLORS,
     HEIGHT,
     LEFT,
     MOST_POINTS,
@@ -25,6 +24,7 @@ from legged.evaluation.reports.svg import (
     stacked,
     ticks,
 )
+from legged.figures import COLORS
 
 NS = "{http://www.w3.org/2000/svg}"
 

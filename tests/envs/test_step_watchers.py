@@ -4,15 +4,15 @@ import pytest
 import torch
 from helpers import small_task, zero_actions
 
-from legged.envs.final_step import keep_final_step
+from legged.envs.step_watchers import keep_final_step
 from legged.registry import make_task, task_config
 
 
 def test_it_is_kept_only_where_somebody_asks():
     task = small_task()
-    assert task.final_step is None
+    assert task.step_watcher is None
     kept = keep_final_step(task)
-    assert task.final_step is kept
+    assert task.step_watcher is kept
     assert set(kept.observations) == set(task.observation_groups)
 
 

@@ -59,6 +59,6 @@ def watch_steps(task: "BaseTask", watcher: Watcher, graph: bool = True) -> Watch
     Raises:
         TermError: the step cannot be captured.
     """
-    task.final_step = watcher
+    task.step_watcher = watcher
     task._build_graph(graph and (task.physics.capturable or task.physics.device.type == "cpu"))
     return watcher

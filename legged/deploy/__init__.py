@@ -1,0 +1,1 @@
+"""The program that runs an exported policy on a robot. It needs numpy and onnxruntime, and of this package errors only."""

@@ -1,0 +1,199 @@
+"""The robot's program: `python -m legged.deploy --policy FOLDER --robot udp:HOST:PORT|go2|g1`.
+
+It runs the policy that play.py exported into FOLDER (policy.onnx and policy.json) at its rate, under the keyboard, a gamepad
+or a file of commands, and writes a log. It needs numpy and onnxruntime; Unitree's robots need the extra `unitree-sdk2` too.
+"""
+
+import argparse
+import gc
+import signal
+import sys
+from contextlib import suppress
+from dataclasses import fields
+from pathlib import Path
+from types import FrameType
+
+from legged.commandline.parser import CommandParser
+from legged.deploy import gamepad, keyboard
+from legged.deploy.commands import Operator, Orders, Script
+from legged.deploy.gamepad import Gamepad
+from legged.deploy.interface import Interface
+from legged.deploy.keyboard import Keyboard
+from legged.deploy.log import Log
+from legged.deploy.pace import take_priority
+from legged.deploy.policy import Policy
+from legged.deploy.program import Program
+from legged.deploy.safety import Limits
+from legged.deploy.states import Event
+from legged.deploy.telling import Telling
+from legged.deploy.udp import UdpRobot
+from legged.deploy.unitree import SdkWire, UnitreeRobot
+from legged.deploy.unitree_messages import KINDS
+from legged.errors import ConfigError, RunError, suggest
+
+BOUNDS = {
+    "stand_seconds": (1.0, 60.0),
+    "max_tilt": (0.1, 1.6),
+    "max_age": (0.005, 0.5),
+    "max_missed": (1, 50),
+}
+"""Flag -> its least and largest value, in seconds, radians and cycles: whoever thinks in degrees or milliseconds is told."""
+ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
+"""Signals that ask the program to end: Ctrl-C, kill, a closed terminal or a lost connection, Ctrl-\\ and Ctrl-Z. Most of them
+would by default leave a robot alone with its last command."""
+SWITCH_S = 5e-4
+"""A thread that waits for Python's lock gets it after so long [s]; 5 ms, the default, is a quarter of a cycle."""
+EXIT_STOPPED = 3
+"""The program ran to its end, but had to stop the robot for a reason of its own."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code: 0 done, 1 it could not go on, 2 wrong input, 3 the robot had to be stopped, 130
+    interrupted while it had no robot yet.
+    """
+    try:
+        return _main(argv)
+    except (ConfigError, RunError) as error:
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        return 2 if isinstance(error, ConfigError) else 1
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr, flush=True)
+        return 128 + signal.SIGINT
+
+
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "legged.deploy",
+        __doc__,
+        "python -m legged.deploy --policy logs/deploy/anymal_c_proprio/exported --robot udp:127.0.0.1:40000",
+        "python -m legged.deploy --policy exported --robot go2 --network eth0 --input gamepad",
+    )
+    parser.add_argument("--policy", type=Path, required=True, help="folder with policy.onnx and policy.json")
+    add_program_arguments(parser)
+    parser.add_argument("--robot", required=True, help=f"udp:HOST:PORT, {' or '.join(KINDS)}")
+    parser.add_argument("--network", help="network interface of a robot of Unitree's, e.g. eth0; found by itself by default")
+    parser.add_argument("--domain", type=int, default=0, help="DDS domain: 0 a robot, 1 Unitree's own simulator; default 0")
+    parser.add_argument("--log", type=Path, default=Path("deploy_log.npz"), help="file of the log; default deploy_log.npz")
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
+    limits = limits_of(args)
+    if not args.robot.startswith("udp:") and args.robot not in KINDS:
+        raise ConfigError(f"--robot: '{args.robot}' is unknown{suggest(args.robot, [*KINDS, 'udp:HOST:PORT'])}")
+    Log.check(args.log)
+    policy = Policy(args.policy)
+    if args.robot in KINDS:  # what does not fit must be refused before a robot is asked to leave its own controller
+        policy.contract.check_fits(KINDS[args.robot].facts)
+    operator = Interruptible(make_operator(args))
+    tell = Telling()
+    hurries = take_priority()  # before any thread of a robot's SDK begins: threads inherit it
+    try:
+        robot = _connect(args)
+    except BaseException:
+        operator.close()
+        raise
+    try:
+        program = Program(policy, robot, operator, limits, args.stand_seconds, tell=tell)
+    except BaseException:
+        robot.close()
+        operator.close()
+        raise
+    sys.setswitchinterval(SWITCH_S)
+    hurry = "with priority" if hurries else "without priority: cycles may begin late on a busy machine (rtprio)"
+    tell(f"{policy.contract.task} on {robot.facts.name}, {1.0 / policy.contract.control_dt:g} Hz, {hurry}")
+    try:
+        outcome = program.run(args.seconds)
+    finally:
+        program.log.save(args.log)
+        tell(f"wrote {args.log}")
+        tell.close()
+    with suppress(OSError):  # the terminal may be closed
+        print(outcome.cycles.line(), flush=True)
+    gc.collect()
+    return EXIT_STOPPED if outcome.stops else 0
+
+
+def add_program_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the program that do not depend on the robot."""
+    standard = {field.name: field.default for field in fields(Limits)}
+    parser.add_argument("--input", choices=("keyboard", "gamepad"), default="keyboard", help="who commands; default keyboard")
+    parser.add_argument("--gamepad", type=Path, default=gamepad.DEVICE, help=f"device; default {gamepad.DEVICE}")
+    parser.add_argument("--commands", type=Path, help="file of commands, in place of a keyboard or gamepad")
+    parser.add_argument(
+        "--seconds", type=float, default=float("inf"), help="end after so long; at the operator's word by default"
+    )
+    parser.add_argument("--stand-seconds", type=float, default=3.0, help="time for standing up [s]; default 3")
+    parser.add_argument("--max-tilt", type=float, help=f"stop beyond this [rad]; default {standard['max_tilt']:g}")
+    parser.add_argument("--max-age", type=float, help=f"stop at older data [s]; default {standard['max_age_s']:g}")
+    parser.add_argument("--max-missed", type=int, help=f"stop at so many missed in a row; default {standard['max_missed']}")
+
+
+def limits_of(args: argparse.Namespace) -> Limits:
+    """Return the limits that the flags ask for.
+
+    Raises:
+        ConfigError: a number that makes no sense.
+    """
+    if not args.seconds > 0.0:
+        raise ConfigError(f"--seconds: must be above 0, got {args.seconds:g}")
+    for flag, (low, high) in BOUNDS.items():
+        value = getattr(args, flag)
+        if value is not None and not low <= value <= high:
+            raise ConfigError(f"--{flag.replace('_', '-')}: must be between {low:g} and {high:g}, got {value:g}")
+    given = {"max_tilt": args.max_tilt, "max_age_s": args.max_age, "max_missed": args.max_missed}
+    return Limits(**{name: value for name, value in given.items() if value is not None})
+
+
+def make_operator(args: argparse.Namespace) -> Operator:
+    """Return who commands.
+
+    Raises:
+        ConfigError: there is no such file, device or terminal.
+    """
+    if args.commands is not None:
+        return Script(args.commands)
+    operator: Operator = Gamepad(args.gamepad) if args.input == "gamepad" else Keyboard()
+    print(gamepad.HELP if args.input == "gamepad" else keyboard.HELP, flush=True)
+    return operator
+
+
+class Interruptible(Operator):
+    """An operator who can also end the program by Ctrl-C and the like (`ENDING`): the robot is braked first."""
+
+    def __init__(self, operator: Operator) -> None:
+        """Listen to signals on top of `operator`."""
+        self._operator, self._ends = operator, False
+        for name in ENDING:
+            if hasattr(signal, name):
+                signal.signal(getattr(signal, name), self._end)
+
+    def _end(self, _number: int, _frame: FrameType | None) -> None:
+        self._ends = True
+
+    def poll(self, seconds: float) -> Orders:
+        orders = self._operator.poll(seconds)
+        if not self._ends:
+            return orders
+        return Orders(orders.velocity, (*orders.events, Event.QUIT), orders.shares, orders.lost)
+
+    def close(self) -> None:
+        self._operator.close()
+
+
+def _connect(args: argparse.Namespace) -> Interface:
+    """Return the robot that --robot names.
+
+    Raises:
+        ConfigError: that is no address, or what it needs is not installed.
+        RunError: it does not answer.
+    """
+    if args.robot.startswith("udp:"):
+        return UdpRobot(args.robot.removeprefix("udp:"))
+    return UnitreeRobot(args.robot, SdkWire(KINDS[args.robot], args.network, args.domain))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

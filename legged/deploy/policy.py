@@ -1,0 +1,120 @@
+"""An exported policy that acts: policy.onnx and its contract, for one robot."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+
+from legged.deploy.contract import Contract, read_contract
+from legged.deploy.interface import Reading
+from legged.deploy.observations import Observer
+from legged.errors import ConfigError
+
+WARM_UP = 20
+"""Runs of the network before the first that counts: the first ones take ten times as long."""
+COMPARED = (
+    *("contract_version", "joint_names", "action_joints", "imu_frame", "control_dt", "observation", "observation_groups"),
+    *("observation_clip", "default_joint_angles", "action_scale", "action_clip", "stiffness", "damping", "recurrent"),
+)
+"""What the ONNX file's own metadata must say as policy.json does."""
+
+
+class Network:
+    """A policy.onnx: observation -> actions, with the hidden state of a recurrent one."""
+
+    def __init__(self, path: Path, contract: Contract) -> None:
+        """Load the file.
+
+        Raises:
+            ConfigError: it cannot be read, has other sizes than the contract says, or is of another export.
+        """
+        try:
+            options = onnxruntime.SessionOptions()
+            options.intra_op_num_threads = options.inter_op_num_threads = 1  # too small to be shared out
+            options.log_severity_level = 3
+            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # its errors have no class in common
+            raise ConfigError(f"{path}: onnxruntime cannot read it: {' '.join(str(error).split())}") from error
+        self._path, self._memory = path, contract.memory
+        self._check(contract)
+        self._hidden: dict[str, np.ndarray] = {}
+        self.restart()
+        for _ in range(WARM_UP):
+            actions = self.run(np.zeros(contract.width, dtype=np.float32))
+        if actions.shape != contract.acted.shape:
+            raise ConfigError(f"{path}: gives {actions.size} actions, policy.json says {len(contract.acted)}")
+        self.restart()
+
+    def _check(self, contract: Contract) -> None:
+        """Compare with the contract.
+
+        Raises:
+            ConfigError: something differs.
+        """
+        memory = contract.memory
+        inputs = {given.name: given.shape for given in self._session.get_inputs()}
+        wanted = ["obs", *(memory.inputs if memory else ())]
+        if list(inputs) != wanted:
+            raise ConfigError(f"{self._path}: takes {', '.join(inputs)}; policy.json says {', '.join(wanted)}")
+        if inputs["obs"][-1] != contract.width:
+            raise ConfigError(f"{self._path}: takes {inputs['obs'][-1]} numbers, policy.json says {contract.width}")
+        inside = self._session.get_modelmeta().custom_metadata_map
+        beside = json.loads(contract.path.read_text(encoding="utf-8"))
+        for key in COMPARED:
+            if key in inside and json.loads(inside[key]) != beside[key]:
+                raise ConfigError(f"{contract.path}: {key}: is not that of {self._path}: they are of different exports")
+
+    def restart(self) -> None:
+        """Forget the past."""
+        if self._memory is not None:
+            shape = (self._memory.layers, 1, self._memory.width)
+            self._hidden = {name: np.zeros(shape, dtype=np.float32) for name in self._memory.inputs}
+
+    def run(self, observation: np.ndarray) -> np.ndarray:
+        """Return the actions (A,) for an observation (width,), float32 both."""
+        actions, *hidden = self._session.run(None, {"obs": observation[None], **self._hidden})
+        self._hidden = dict(zip(self._hidden, hidden, strict=False))
+        return np.asarray(actions)[0]
+
+
+class Policy:
+    """A policy on one robot: readings and commands -> joint targets, once every `contract.control_dt`."""
+
+    def __init__(self, folder: Path) -> None:
+        """Load the export in `folder`, or the one whose policy.onnx `folder` is.
+
+        Raises:
+            ConfigError: it is none, or one that this program cannot run.
+        """
+        path = folder if folder.suffix == ".onnx" else folder / "policy.onnx"
+        for needed in (path, path.with_name("policy.json")):
+            if not needed.is_file():
+                raise ConfigError(f"--policy: there is no {needed}: a folder with policy.onnx and policy.json is wanted")
+        self.contract = read_contract(path.with_name("policy.json"))
+        self._network = Network(path, self.contract)
+        self._observer = Observer(self.contract)
+        self.actions = np.zeros(len(self.contract.acted))
+        """(A,) the last output, within plus and minus action_clip."""
+        self.observation = np.zeros(self.contract.width, dtype=np.float32)
+        """(width,) what the last call saw."""
+
+    def restart(self) -> None:
+        """Begin anew: no memory, no last action, no history."""
+        self._network.restart()
+        self._observer.restart()
+        self.actions = np.zeros(len(self.contract.acted))
+
+    def act(self, reading: Reading, command: np.ndarray) -> np.ndarray:
+        """Return the angles (D,) that the joints are asked for [rad]; not finite where the network's output is not.
+
+        Raises:
+            KeyError: a source that the policy needs has given nothing.
+        """
+        contract = self.contract
+        self.observation = self._observer.observe(reading, command, self.actions)
+        actions = self._network.run(self.observation).astype(float)
+        self.actions = np.clip(actions, -contract.action_clip, contract.action_clip)
+        targets = contract.default.copy()
+        targets[contract.acted] += contract.action_scale * self.actions
+        return targets

@@ -1,0 +1,281 @@
+"""The program: a cycle that reads, decides, writes and logs, at the rate of the policy."""
+
+import gc
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from legged.deploy.commands import Operator, Orders, Ramp
+from legged.deploy.interface import Interface, Reading
+from legged.deploy.log import Log
+from legged.deploy.pace import CycleTimes, Pace
+from legged.deploy.policy import Policy
+from legged.deploy.safety import Limits, Watch, braking, clamp_targets
+from legged.deploy.states import MOVING, Event, State, next_state
+
+STANDS_WITHIN = 0.6
+"""A robot stands when no joint is further from the default pose [rad]; its weight makes some of that."""
+FAR = 100.0
+"""Angles that are further from 0 are no measurements [rad]."""
+HALT_S = 1.0
+"""A robot that walks is asked to stand still for so long before it stands [s]: joints that stop at 1 m/s make it fall."""
+RETURN_S = 0.3
+"""A robot that has walked reaches the default pose in so long [s]: it stands on some of its legs, and would tip over."""
+SETTLE_S = 1.0
+"""Joints are braked for so long before the program lets go of the robot [s]."""
+
+
+def along(path: Sequence[np.ndarray], share: float) -> np.ndarray:
+    """Return the pose (D,) at a share of a path of poses, all legs of which take the same time and begin and end at rest."""
+    legs = len(path) - 1
+    i = min(int(share * legs), legs - 1)
+    part = min(1.0, share * legs - i)
+    smooth = part * part * (3.0 - 2.0 * part)
+    return np.asarray((1.0 - smooth) * path[i] + smooth * path[i + 1])
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended."""
+
+    cycles: CycleTimes
+    stops: tuple[str, ...]
+    """Reasons of all stops, in order."""
+    walked_s: float
+    """Time for which the policy acted [s]."""
+
+
+class Program:
+    """One policy on one robot, under one operator."""
+
+    def __init__(
+        self,
+        policy: Policy,
+        robot: Interface,
+        operator: Operator,
+        limits: Limits | None = None,
+        stand_s: float = 3.0,
+        clock: Callable[[], float] = time.perf_counter,
+        sleep: Callable[[float], object] = time.sleep,
+        tell: Callable[[str], object] = print,
+    ) -> None:
+        """Compare policy and robot, and begin idle. `stand_s` is what standing up takes [s]; `tell` hears what happens.
+
+        Raises:
+            ConfigError: they do not fit.
+        """
+        policy.contract.check_fits(robot.facts)
+        self._policy, self._robot, self._operator = policy, robot, operator
+        self._contract = contract = policy.contract
+        self._stand_s, self._clock, self._sleep, self._tell = stand_s, clock, sleep, tell
+        self._watch = Watch(contract, limits or Limits())
+        self._ramp = Ramp(contract)
+        self._braking = braking(contract)
+        self._pace = Pace(contract.control_dt, clock, sleep)
+        self.log = Log(contract)
+        self.state = State.IDLE
+        self.stops: list[str] = []
+        self._reading: Reading | None = None
+        self._ticks = False
+        """Whether the robot's clock has been seen to go on."""
+        self._path, self._path_s = [contract.default], stand_s
+        self._since = self._start = 0.0
+        self._walked_s = 0.0
+        self._halting_s: float | None = None
+        """Time for which a robot that is to stand has had no command [s]; None if it is not to."""
+        nothing = np.zeros(len(contract.joint_names))
+        self._asked = (nothing, nothing, nothing)
+        """Targets and gains that the robot has been told last."""
+
+    def run(self, seconds: float = np.inf) -> Outcome:
+        """Run until the operator quits, or for so long [s]; then brake, and let go of the robot."""
+        collects = gc.isenabled()
+        gc.freeze()
+        gc.disable()  # a collection would take longer than a cycle may
+        try:
+            self._robot.ask({name: term.points for name, term in self._contract.sources.items()})
+            self._start = self._clock()
+            quits = False
+            while not quits:
+                now = self._pace.wait()
+                quits = self._cycle(now) or now - self._start > seconds
+            self._settle()
+            self._write(self._contract.default, 0.0, self._braking)
+        except BaseException:
+            self._settle_blindly()
+            raise
+        finally:
+            if collects:
+                gc.enable()
+            try:
+                self._robot.close()
+            finally:
+                self._operator.close()
+        return Outcome(self._pace.times(), tuple(self.stops), self._walked_s)
+
+    def _cycle(self, now: float) -> bool:
+        """Do what a cycle consists of; return whether the operator quits."""
+        self._read()
+        orders = self._operator.poll(now - self._start)
+        reason = self._watch.reason(self._reading, now, self._pace.missed_in_a_row)
+        events = list(orders.events)
+        if orders.lost is not None and self.state in MOVING:
+            self._stop(f"operator lost: {orders.lost}", now)
+        if reason is not None and self.state in MOVING:
+            self._stop(reason, now)
+            events = [event for event in events if event is Event.QUIT]
+        for event in events:
+            if event is not Event.QUIT:
+                self._handle(event, reason, now)
+        if self._halting_s is not None and self._halting_s >= HALT_S:
+            self._enter(State.STAND, now)
+        targets, stiffness, damping = self._decide(orders, now)
+        if not np.isfinite(targets).all():
+            self._stop("non-finite output of the policy", now)
+            targets, stiffness, damping = self._decide(orders, now)
+        self._write(targets, stiffness, damping)
+        self._log_cycle(now)
+        self._pace.done()
+        return Event.QUIT in events
+
+    def _read(self) -> None:
+        """Take what has come, and log it with what was asked for when it did. A reading with the time of the last one is the
+        same measurement, as old as that, however often it is sent. A stop that any of them asks for is asked for.
+        """
+        stops = False
+        for reading in self._robot.read():
+            last = self._reading
+            if last is not None and (reading.time != last.time or self._ticks):
+                self._ticks = True
+                if reading.time == last.time:
+                    reading = replace(reading, received=last.received)
+            self.log.add_reading(reading, self.state, *self._asked)
+            self._watch.see(reading)
+            stops |= reading.stop
+            self._reading = reading
+        if stops and self._reading is not None:
+            self._reading = replace(self._reading, stop=True)
+
+    def _handle(self, event: Event, reason: str | None, now: float) -> None:
+        """Follow an event, or say why not."""
+        if event is Event.STOP:
+            self._stop("operator: stop", now)
+            return
+        if event is Event.WALK and self._halting_s is not None:
+            self._halting_s = None
+            self._say("walk: it walks on", now)
+            return
+        following = next_state(self.state, event)
+        if following is None:
+            self._say(f"refused: '{event.value}' leads nowhere from {self.state.value}", now)
+        elif following in MOVING and reason is not None:
+            self._say(f"refused: {event.value}: {reason}", now)
+        elif event is Event.WALK and now - self._since < self._path_s:
+            self._say(f"refused: walk: it stands up for {self._path_s:g} s first", now)
+        elif event is Event.WALK and (crooked := self._crooked()) is not None:
+            self._say(f"refused: walk: {crooked}", now)
+        elif self.state is State.WALK and event is Event.STAND:
+            if self._halting_s is None:
+                self._halting_s = 0.0
+                self._say("walk: it halts, and then stands", now)
+        else:
+            self._enter(following, now)
+
+    def _crooked(self) -> str | None:
+        """Return which joint is not where a robot that stands has it; None if all are."""
+        if self._reading is None:
+            return "nothing has been read yet"
+        away = np.abs(self._reading.positions - self._contract.default)
+        if away.max() <= STANDS_WITHIN:
+            return None
+        name = self._contract.joint_names[int(away.argmax())]
+        return f"it does not stand: {name} is {away.max():.2f} rad from its default angle (allowed: {STANDS_WITHIN:g})"
+
+    def _stop(self, reason: str, now: float) -> None:
+        """Go to the state `stop`, and say why."""
+        if self.state is not State.STOP:
+            self.stops.append(reason)
+            self._say(f"stop: {reason}", now)
+            self._enter(State.STOP, now)
+
+    def _enter(self, state: State, now: float) -> None:
+        self._say(f"{self.state.value} -> {state.value}", now)
+        if state is State.STAND and self._reading is not None:
+            # Legs that lie anyhow are folded first. One that has walked stands already, and what carries it is how far its
+            # targets are from its joints: they go on from where they were.
+            lies, bent = self.state is State.DAMPING, self._contract.crouch
+            first = self._reading.positions if lies else self._asked[0]
+            self._path_s = self._stand_s if lies else min(RETURN_S, self._stand_s)
+            self._path = [first, *([bent] if lies and bent is not None else []), self._contract.default]
+        self.state, self._since, self._halting_s = state, now, None
+        if state is State.WALK:
+            self._policy.restart()
+            self._ramp.restart()
+
+    def _decide(self, orders: Orders, now: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return targets, P gains and D gains (D,) for the state as it is."""
+        contract, reading = self._contract, self._reading
+        nothing = np.zeros(len(contract.joint_names))
+        if self.state in MOVING and reading is not None:
+            if self.state is State.WALK:
+                halts = self._halting_s is not None
+                command = self._ramp.advance(Orders(np.zeros(3)) if halts else orders)
+                if halts and not command.any():
+                    self._halting_s = (self._halting_s or 0.0) + contract.control_dt
+                targets = self._policy.act(reading, command)
+                self._walked_s += contract.control_dt
+            else:
+                targets = along(self._path, (now - self._since) / self._path_s)
+            clamped = clamp_targets(targets, reading.positions, reading.velocities, contract)
+            return clamped, contract.stiffness, contract.damping
+        positions = contract.default
+        if reading is not None:  # the P gain is 0, but 0 times what is no number is none
+            positions = np.where(np.abs(reading.positions) < FAR, reading.positions, positions)
+        return positions, nothing, nothing if self.state is State.IDLE else self._braking
+
+    def _write(self, targets: np.ndarray, stiffness: np.ndarray | float, damping: np.ndarray) -> None:
+        asked = (targets, np.broadcast_to(stiffness, targets.shape), damping)
+        self._robot.write(*asked)
+        self._asked = asked
+
+    def _log_cycle(self, now: float) -> None:
+        policy, reading = self._policy, self._reading
+        walks = self.state is State.WALK
+        self.log.add_cycle(
+            self.state,
+            times=now - self._start,
+            took=self._clock() - now,
+            age=np.nan if reading is None else now - reading.received,
+            command=self._ramp.command if walks else np.zeros(3),
+            observation=policy.observation if walks else np.full_like(policy.observation, np.nan),
+            actions=policy.actions if walks else np.full_like(policy.actions, np.nan),
+            targets=self._asked[0],
+        )
+
+    def _settle(self) -> None:
+        """Brake the joints of a robot that may stand, until it lies."""
+        if self.state in (State.IDLE, State.STOP) and self._reading is None:
+            return
+        if self.state in MOVING:
+            self._enter(State.DAMPING, self._clock())
+        end = self._clock() + (SETTLE_S if self.state is not State.IDLE else 0.0)
+        while (now := self._pace.wait()) < end:
+            self._read()
+            self._write(*self._decide(Orders(np.zeros(3)), now))
+            self._log_cycle(now)
+            self._pace.done()
+
+    def _settle_blindly(self) -> None:
+        """Do the same after a failure, whatever fails: one command alone may get lost."""
+        contract = self._contract
+        for _ in range(int(np.ceil(SETTLE_S / contract.control_dt))):
+            with suppress(Exception):
+                self._write(contract.default, 0.0, self._braking)
+            self._sleep(contract.control_dt)
+
+    def _say(self, text: str, now: float) -> None:
+        self.log.note(now - self._start, text)
+        self._tell(f"{now - self._start:7.2f} s  {text}")

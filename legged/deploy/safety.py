@@ -1,0 +1,133 @@
+"""What keeps a robot and those around it whole: limits of targets, and reasons to stop."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from legged.deploy.contract import Contract
+from legged.deploy.interface import Reading
+from legged.deploy.observations import gravity_in
+
+SLOWEST_FALL = 0.5
+"""Share of a joint's largest speed at which damping asks for its whole torque."""
+AT_ONCE = 2.0
+"""A joint that is so many times faster than it may be for an instant is too fast at once."""
+MOST_DAMPING = 4.0
+"""Damping is at most so many times the policy's own D gain, which the motors are known to be stable with."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When to stop."""
+
+    max_tilt: float = 1.0
+    """Largest angle between the base's up axis and the vertical [rad]."""
+    max_age_s: float = 0.05
+    """Age of the newest reading [s]."""
+    speed_share: float = 1.2
+    """Largest joint speed, as a share of the contract's velocity limit."""
+    fast_s: float = 0.04
+    """Time for which a joint may be faster than that: a foot that hits an edge makes it so for an instant [s]."""
+    beyond: float = 0.2
+    """How far beyond its position limits a joint may be [rad]."""
+    max_missed: int = 5
+    """Deadlines missed in a row."""
+    max_temperature: float = 90.0
+    """Of a motor [degrees Celsius]."""
+
+
+class Watch:
+    """Looks for reasons to stop."""
+
+    def __init__(self, contract: Contract, limits: Limits) -> None:
+        """Watch a robot of `contract`."""
+        self._contract, self.limits = contract, limits
+        self._fastest = limits.speed_share * contract.velocity_limits
+        self._fast_s = np.zeros(len(self._fastest))
+        """Time for which each joint has been too fast, less a quarter of that for which it was not since [s]."""
+        self._seen: float | None = None
+
+    def see(self, reading: Reading) -> None:
+        """Take a reading, each one that comes: how long joints are too fast is counted from one to the next."""
+        passed = 0.0 if self._seen is None else np.clip(reading.received - self._seen, 0.0, self.limits.max_age_s)
+        self._seen = reading.received
+        fast = np.abs(reading.velocities) > self._fastest
+        self._fast_s = np.maximum(0.0, self._fast_s + np.where(fast, passed, -0.25 * passed))
+
+    def reason(self, reading: Reading | None, now: float, missed: int) -> str | None:
+        """Return why the robot must stop, in one line; None if nothing is wrong.
+
+        `reading` is the newest one, `now` the time by `time.perf_counter` [s], `missed` the deadlines missed in a row.
+        """
+        limits = self.limits
+        if reading is None:
+            return "no data: nothing has been read yet"
+        if reading.stop:
+            return "remote control: the operator asks for a stop"
+        age = now - reading.received
+        if age > limits.max_age_s:
+            return f"stale data: the newest reading is {1e3 * age:.0f} ms old (allowed: {1e3 * limits.max_age_s:.0f} ms)"
+        for name, values in (
+            ("quaternion", reading.quaternion),
+            ("gyro", reading.gyro),
+            ("joint positions", reading.positions),
+            ("joint velocities", reading.velocities),
+            *((f"source {name}", values) for name, values in reading.sources.items()),
+        ):
+            if not np.isfinite(values).all():
+                return f"non-finite data: {name}"
+        norm = float(np.linalg.norm(reading.quaternion))
+        if not 0.9 < norm < 1.1:
+            return f"quaternion: its norm is {norm:.3g}, not 1"
+        tilt = float(np.arccos(np.clip(-gravity_in(reading.quaternion)[2], -1.0, 1.0)))
+        if tilt > limits.max_tilt:
+            return f"tilt: {tilt:.2f} rad (allowed: {limits.max_tilt:g})"
+        at_once = np.abs(reading.velocities) > AT_ONCE * self._fastest
+        too_fast = at_once | (self._fast_s >= limits.fast_s)
+        if too_fast.any():
+            i = int((at_once if at_once.any() else too_fast).argmax())
+            name, most = self._contract.joint_names[i], f"{self._fastest[i]:.1f} rad/s for {1e3 * limits.fast_s:.0f} ms"
+            how = f"turns at {reading.velocities[i]:.1f} rad/s" if at_once.any() else "has been faster than that"
+            return f"joint speed: {name} {how} (allowed: {most})"
+        low, high = self._contract.position_limits.T
+        beyond = np.maximum(low - reading.positions, reading.positions - high)
+        if beyond.max() > limits.beyond:
+            i = int(beyond.argmax())
+            name = self._contract.joint_names[i]
+            return f"joint position: {name} is at {reading.positions[i]:.2f} rad (its limits: {low[i]:.2f} to {high[i]:.2f})"
+        if reading.temperatures is not None and reading.temperatures.max() > limits.max_temperature:
+            i = int(reading.temperatures.argmax())
+            name = self._contract.joint_names[i]
+            return f"temperature: {name} has {reading.temperatures[i]:.0f} degrees (allowed: {limits.max_temperature:g})"
+        if missed >= limits.max_missed:
+            return f"missed deadlines: {missed} in a row (allowed: {limits.max_missed - 1})"
+        lacking = [name for name in self._contract.sources if name not in reading.sources]
+        if lacking:
+            return f"missing data: source {lacking[0]}"
+        for name, term in self._contract.sources.items():
+            if reading.sources[name].shape != (term.size,):
+                return f"missing data: source {name} has {reading.sources[name].size} numbers, not {term.size}"
+        return None
+
+
+def clamp_targets(
+    targets: np.ndarray,
+    positions: np.ndarray,
+    velocities: np.ndarray,
+    contract: Contract,
+) -> np.ndarray:
+    """Return targets (D,) within the position limits, and so near to the joints that |kp (target - q) - kd dq| stays within
+    the torque limits [rad]. Where both cannot be had, that of torques is kept.
+    """
+    kp, kd, most = contract.stiffness, contract.damping, contract.torque_limits
+    inside = np.clip(targets, *contract.position_limits.T)
+    stiff = np.where(kp > 0.0, kp, 1.0)
+    low, high = positions + (kd * velocities - most) / stiff, positions + (kd * velocities + most) / stiff
+    return np.where(kp > 0.0, np.clip(inside, low, high), inside)
+
+
+def braking(contract: Contract) -> np.ndarray:
+    """Return the D gains (D,) that brake joints [N m s/rad]: the whole torque at half the largest speed, but no more than
+    four times the policy's own D gain.
+    """
+    return np.minimum(contract.torque_limits / (SLOWEST_FALL * contract.velocity_limits), MOST_DAMPING * contract.damping)

@@ -1,0 +1,211 @@
+"""A Go2 or a G1 behind Unitree's SDK 2, on the network or in a simulator of its own."""
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from importlib import import_module
+from typing import Any, Protocol
+
+import numpy as np
+
+from legged.deploy.interface import Interface, Reading
+from legged.deploy.unitree_messages import (
+    KINDS,
+    L2,
+    OTHER_G1,
+    SELECT,
+    B,
+    UnitreeKind,
+    copy_into,
+    fill_command,
+    new_command,
+    pressed,
+)
+from legged.errors import ConfigError, RunError
+
+COMMAND_TOPIC, STATE_TOPIC = "rt/lowcmd", "rt/lowstate"
+REPEAT_S = 0.005
+"""A command is sent again after so long: motors, and simulators more so, expect more than one in a control step [s]."""
+HOLD_S = 0.1
+"""A program that has written nothing for so long is taken for dead, and joints are braked [s]."""
+FIRST_STATE_S = 5.0
+"""A robot must send its first state within so long [s]."""
+RELEASE_S = 10.0
+"""A robot must have let go of its own walking within so long [s]."""
+BRAKING = 2.0
+"""D gain of joints that are braked because the program is dead [N m s/rad]."""
+
+
+class Wire(Protocol):
+    """What carries Unitree's messages."""
+
+    def new_command(self) -> Any:
+        """Return a LowCmd_ of the robot's kind, with zeros."""
+
+    def listen(self, heard: Callable[[Any], None]) -> None:
+        """Call `heard` with every LowState_, in a thread of its own."""
+
+    def send(self, command: Any) -> None:
+        """Send a LowCmd_."""
+
+    def close(self) -> None:
+        """Let go."""
+
+
+class SdkWire:
+    """The messages by Unitree's own SDK (the extra `unitree-sdk2`)."""
+
+    def __init__(self, kind: UnitreeKind, network: str | None, domain: int, release: bool = True) -> None:
+        """Join the network: `network` names its interface, eth0 for instance; a DDS domain of 0 is a robot, and 1 is what
+        Unitree's simulator takes. With `release`, a robot that walks by itself is told to leave that first: two programs must
+        never command one robot.
+
+        Raises:
+            ConfigError: the SDK is not installed.
+            RunError: the robot does not let go.
+        """
+        try:
+            channel = import_module("unitree_sdk2py.core.channel")
+            default = import_module("unitree_sdk2py.idl.default")
+            messages = import_module(f"unitree_sdk2py.idl.{kind.package}.msg.dds_")
+        except ImportError as error:
+            raise ConfigError(
+                f"--robot: Unitree's SDK cannot be imported ({' '.join(str(error).split())}): pip install"
+                " 'legged[unitree-sdk2]'; where that is done, install it from Unitree's own sources (unitree_sdk2_python)"
+            ) from error
+        channel.ChannelFactoryInitialize(domain, network)
+        if release:
+            self._release()
+        self._new: Callable[[], Any] = getattr(default, f"{kind.package}_msg_dds__LowCmd_")
+        self._publisher = channel.ChannelPublisher(COMMAND_TOPIC, messages.LowCmd_)
+        self._publisher.Init()
+        self._subscriber = channel.ChannelSubscriber(STATE_TOPIC, messages.LowState_)
+
+    @staticmethod
+    def _release() -> None:
+        """Make the robot leave its own controller.
+
+        Raises:
+            RunError: it does not.
+        """
+        client = import_module("unitree_sdk2py.comm.motion_switcher.motion_switcher_client").MotionSwitcherClient()
+        client.SetTimeout(RELEASE_S)
+        client.Init()
+        end = time.perf_counter() + RELEASE_S
+        while time.perf_counter() < end:
+            code, mode = client.CheckMode()
+            if code == 0 and not (mode or {}).get("name"):
+                return
+            client.ReleaseMode()
+            time.sleep(1.0)
+        raise RunError(f"--robot: the robot's own controller is still on after {RELEASE_S:g} s; leave it by hand")
+
+    def new_command(self) -> Any:
+        return self._new()
+
+    def listen(self, heard: Callable[[Any], None]) -> None:
+        self._subscriber.Init(heard, 10)
+
+    def send(self, command: Any) -> None:
+        self._publisher.Write(command)
+
+    def close(self) -> None:
+        self._subscriber.Close()
+        self._publisher.Close()
+
+
+class UnitreeRobot(Interface):
+    """A robot of Unitree's. A thread sends the newest command again and again, and brakes the joints if the program dies."""
+
+    def __init__(self, name: str, wire: Wire, repeat_s: float = REPEAT_S) -> None:
+        """Listen to the robot `name`, a key of `KINDS`, until its first state has come.
+
+        Raises:
+            ConfigError: it is one with fewer joints.
+            RunError: nothing is heard of it.
+        """
+        self.kind = KINDS[name]
+        self.facts = self.kind.facts
+        self._wire, self._repeat_s = wire, repeat_s
+        self._places = list(self.kind.motors)
+        self._lock = threading.Lock()
+        self._heard: list[Reading] = []
+        self._mode_machine: int | None = None
+        self._first = threading.Event()
+        wire.listen(self._hear)
+        if not self._first.wait(FIRST_STATE_S):
+            wire.close()
+            raise RunError(
+                f"--robot: {name}: no state came within {FIRST_STATE_S:g} s; is it on, and --network the right one?"
+            )
+        lacks = OTHER_G1.get(self._mode_machine or 0) if name == "g1" else None
+        if lacks is not None:
+            wire.close()
+            raise ConfigError(f"--robot: g1: mode_machine is {self._mode_machine}: this robot has {lacks}, not 29 joints")
+        self._record = new_command(self.kind, self._mode_machine or 0)
+        self._command = wire.new_command()
+        self._written: float | None = None
+        self._braked = False
+        self._closing = threading.Event()
+        self._repeater = threading.Thread(target=self._repeat, name="unitree-commands", daemon=True)
+        self._repeater.start()
+
+    def _hear(self, state: Any) -> None:
+        """Take a LowState_."""
+        received = time.perf_counter()
+        motors = [state.motor_state[place] for place in self._places]
+        reading = Reading(
+            time=1e-3 * float(state.tick),
+            received=received,
+            quaternion=np.array(state.imu_state.quaternion, dtype=float),
+            gyro=np.array(state.imu_state.gyroscope, dtype=float),
+            positions=np.array([motor.q for motor in motors], dtype=float),
+            velocities=np.array([motor.dq for motor in motors], dtype=float),
+            torques=np.array([motor.tau_est for motor in motors], dtype=float),
+            temperatures=np.array([np.max(motor.temperature) for motor in motors], dtype=float),
+            stop=pressed(state.wireless_remote, SELECT)
+            or (pressed(state.wireless_remote, L2) and pressed(state.wireless_remote, B)),
+        )
+        with self._lock:
+            self._heard.append(reading)
+            self._mode_machine = int(getattr(state, "mode_machine", 0))
+        self._first.set()
+
+    def ask(self, sources: Mapping[str, np.ndarray | None]) -> None:
+        """Do nothing: it has no sources, and a policy that needs one has been refused."""
+
+    def read(self) -> list[Reading]:
+        with self._lock:
+            found, self._heard = self._heard, []
+        return found
+
+    def write(self, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:
+        with self._lock:
+            self._fill(positions, stiffness, damping)
+            self._written, self._braked = time.perf_counter(), False
+            self._wire.send(self._command)
+
+    def _fill(self, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:
+        if "mode_machine" in (self._record.dtype.names or ()):
+            self._record["mode_machine"] = self._mode_machine or 0
+        fill_command(self._record, self.kind, positions, stiffness, damping)
+        copy_into(self._record, self._command)
+
+    def _repeat(self) -> None:
+        """Send the newest command until the robot is let go of; brake once it is too old."""
+        nothing = np.zeros(len(self._places))
+        while not self._closing.wait(self._repeat_s):
+            with self._lock:
+                if self._written is None:
+                    continue
+                if not self._braked and time.perf_counter() - self._written > HOLD_S:
+                    self._fill(nothing, nothing, np.full(len(self._places), BRAKING))
+                    self._braked = True
+                with suppress(Exception):  # what a later one may cure; who writes hears of it
+                    self._wire.send(self._command)
+
+    def close(self) -> None:
+        self._closing.set()
+        self._repeater.join()
+        self._wire.close()

@@ -1,0 +1,188 @@
+"""policy.weights: a network as plain numbers, for computers without onnxruntime. `cpp/legged_policy.hpp` reads the same.
+
+All little-endian. `MAGIC`, the number of layers (uint32), then layer by layer: kind, detail, inputs, outputs (uint32 each),
+and float32 numbers, matrices row by row:
+
+- `NORMALISE`: means and divisors (inputs each); x -> (x - mean) / divisor.
+- `LINEAR`: matrix (outputs, inputs) and bias (outputs).
+- `ACTIVATION`: none; `detail` is its place in `ACTIVATIONS`.
+- `LSTM`: matrices (4 outputs, inputs) and (4 outputs, outputs) and two biases (4 outputs); gates i, f, g, o.
+- `GRU`: the same with 3 in place of 4; gates r, z, n. Both are as in torch.nn.
+"""
+
+import itertools
+import math
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+MAGIC = b"LEGGEDW1"
+COUNT = struct.Struct("<I")
+HEAD = struct.Struct("<4I")
+NORMALISE, LINEAR, ACTIVATION, LSTM, GRU = range(5)
+SELU_ALPHA, SELU_SCALE = 1.6732632423543772, 1.0507009873554805
+_erf = np.vectorize(math.erf, otypes=[float])
+
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    return 0.5 * (1.0 + np.tanh(0.5 * x))
+
+
+def _softplus(x: np.ndarray) -> np.ndarray:
+    return np.logaddexp(0.0, x)
+
+
+ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "elu": lambda x: np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0))),
+    "selu": lambda x: SELU_SCALE * np.where(x > 0.0, x, SELU_ALPHA * np.expm1(np.minimum(x, 0.0))),
+    "relu": lambda x: np.maximum(x, 0.0),
+    "lrelu": lambda x: np.where(x > 0.0, x, 0.01 * x),
+    "tanh": np.tanh,
+    "sigmoid": _sigmoid,
+    "softplus": _softplus,
+    "gelu": lambda x: 0.5 * x * (1.0 + _erf(x / math.sqrt(2.0))),
+    "swish": lambda x: x * _sigmoid(x),
+    "mish": lambda x: x * np.tanh(_softplus(x)),
+}
+"""Activation functions, by rsl-rl's names."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A layer of a network."""
+
+    kind: int
+    detail: int
+    inputs: int
+    outputs: int
+    arrays: tuple[np.ndarray, ...]
+    """Its numbers, in the order of the file."""
+
+
+def shapes(kind: int, inputs: int, outputs: int) -> list[tuple[int, ...]]:
+    """Return the shapes of a layer's arrays.
+
+    Raises:
+        ValueError: there is no such kind of layer.
+    """
+    if kind == NORMALISE:
+        return [(inputs,), (inputs,)]
+    if kind == LINEAR:
+        return [(outputs, inputs), (outputs,)]
+    if kind == ACTIVATION:
+        return []
+    if kind in (LSTM, GRU):
+        rows = (4 if kind == LSTM else 3) * outputs
+        return [(rows, inputs), (rows, outputs), (rows,), (rows,)]
+    raise ValueError(f"there is no layer of kind {kind}")
+
+
+def pack(layers: list[Layer]) -> bytes:
+    """Return the file of a network."""
+    parts = [MAGIC, COUNT.pack(len(layers))]
+    for layer in layers:
+        parts.append(HEAD.pack(layer.kind, layer.detail, layer.inputs, layer.outputs))
+        parts += [np.ascontiguousarray(array, dtype="<f4").tobytes() for array in layer.arrays]
+    return b"".join(parts)
+
+
+def unpack(data: bytes) -> list[Layer]:
+    """Return the layers of a file.
+
+    Raises:
+        ValueError: it is none, is cut short, or has layers that make no network.
+    """
+    if data[: len(MAGIC)] != MAGIC:
+        raise ValueError("is no policy.weights of an export")
+    try:
+        (count,) = COUNT.unpack_from(data, len(MAGIC))
+        place, layers = len(MAGIC) + COUNT.size, []
+        for _ in range(count):
+            kind, detail, inputs, outputs = HEAD.unpack_from(data, place)
+            place += HEAD.size
+            arrays = []
+            for shape in shapes(kind, inputs, outputs):
+                size = math.prod(shape)
+                if place + 4 * size > len(data):
+                    raise ValueError("is cut short")
+                arrays.append(np.frombuffer(data, "<f4", size, place).reshape(shape))
+                place += 4 * size
+            layers.append(Layer(kind, detail, inputs, outputs, tuple(arrays)))
+    except struct.error as error:
+        raise ValueError("is cut short") from error
+    if place != len(data):
+        raise ValueError("is longer than it says")
+    _check_chain(layers)
+    return layers
+
+
+def _check_chain(layers: list[Layer]) -> None:
+    """Look whether what one layer gives is what the next one takes.
+
+    Raises:
+        ValueError: it is not, or there is none, or one that nobody knows.
+    """
+    if not layers:
+        raise ValueError("has no layers")
+    for layer, following in itertools.pairwise([*layers, None]):
+        assert layer is not None
+        if layer.kind in (NORMALISE, ACTIVATION) and layer.inputs != layer.outputs:
+            raise ValueError("has a layer that changes a width it cannot change")
+        if layer.kind == ACTIVATION and layer.detail >= len(ACTIVATIONS):
+            raise ValueError("has a layer that this program does not know")
+        if following is not None and layer.outputs != following.inputs:
+            raise ValueError("has layers that do not fit together")
+
+
+class NumpyNetwork:
+    """The network of such a file, in float64, for a batch of observations; a recurrent one remembers from call to call."""
+
+    def __init__(self, data: bytes) -> None:
+        """Take the contents of a file.
+
+        Raises:
+            ValueError: as `unpack`.
+        """
+        self._layers = unpack(data)
+        self._functions = list(ACTIVATIONS.values())
+        self._hidden: dict[int, np.ndarray] = {}
+        self._cells: dict[int, np.ndarray] = {}
+
+    def restart(self, begins: np.ndarray | None = None) -> None:
+        """Forget the past, of those of the batch in `begins` (N,) bool, or of all."""
+        for states in (self._hidden, self._cells):
+            for state in states.values():
+                state[slice(None) if begins is None else begins] = 0.0
+
+    def run(self, observations: np.ndarray) -> np.ndarray:
+        """Return actions (N, A) for observations (N, width)."""
+        x = np.asarray(observations, dtype=float)
+        for place, layer in enumerate(self._layers):
+            if layer.kind == NORMALISE:
+                x = (x - layer.arrays[0]) / layer.arrays[1]
+            elif layer.kind == LINEAR:
+                x = x @ layer.arrays[0].T + layer.arrays[1]
+            elif layer.kind == ACTIVATION:
+                x = self._functions[layer.detail](x)
+            else:
+                x = self._recurrent(place, layer, x)
+        return x
+
+    def _recurrent(self, place: int, layer: Layer, x: np.ndarray) -> np.ndarray:
+        """Return the new hidden state (N, outputs) of a recurrent layer."""
+        size = (len(x), layer.outputs)
+        h = self._hidden.setdefault(place, np.zeros(size))
+        of_input = x @ layer.arrays[0].T + layer.arrays[2]
+        of_past = h @ layer.arrays[1].T + layer.arrays[3]
+        if layer.kind == LSTM:
+            c = self._cells.setdefault(place, np.zeros(size))
+            i, f, g, o = np.split(of_input + of_past, 4, axis=1)
+            c[:] = _sigmoid(f) * c + _sigmoid(i) * np.tanh(g)
+            h[:] = _sigmoid(o) * np.tanh(c)
+        else:
+            (r, z, n), (hr, hz, hn) = np.split(of_input, 3, axis=1), np.split(of_past, 3, axis=1)
+            update = _sigmoid(z + hz)
+            h[:] = (1.0 - update) * np.tanh(n + _sigmoid(r + hr) * hn) + update * h
+        return h.copy()

@@ -1,0 +1,234 @@
+"""The stress test: every disturbance on stairs and on the flat, ground that nobody trains on, and other solvers."""
+
+import gc
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from math import sqrt
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from legged.config import LeggedConfig, override
+from legged.evaluation.intervals import mean_of_shares, wilson
+from legged.evaluation.overflows import Overflows
+from legged.evaluation.stress.stressed_task import StressedTask, declared, make_stressed
+from legged.evaluation.stress.table import NOMINAL, WRITTEN_FOR, Disturbance, table
+from legged.evaluation.success import point, run_out, to_run_out
+from legged.evaluation.tiles import dividing_cell, tiles_apart
+from legged.evaluation.velocity_grid import axes_of, number_or_null
+from legged.mdp.tracking_error import velocity_error
+from legged.policies.restore import TrainedPolicy, restore, undisturbed
+from legged.robots.similarity import size_of
+from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec
+
+RISER = 0.17
+"""Height of the steps on which disturbances are tried, at scale 1 [m]."""
+TREAD = 0.28
+"""Their width, for a robot of any size: a house's stairs [m]."""
+STAIRS = ("stairs_up", "stairs_down")
+"""Half of the robots go up, the others down."""
+GROUND = {"dense_blocks": 0.25, "kerbs": 0.17, "rubble": 0.2}
+"""Type that nobody trains on -> its size at scale 1 [m]."""
+HOLD_S, SETTLE_S = 6.0, 1.0
+"""Time for which a command is held on the flat, and the part of it, from the start, that is not measured [s]."""
+LIMIT = 0.25
+"""A robot follows its command if the root mean square of its velocity's error is no more than this, at scale 1 [m/s]."""
+COMMANDS = (
+    *((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)),
+    *((0.5, 0.0, 0.5), (0.5, 0.0, -0.5)),
+)
+"""Commands on the flat (vx, vy, yaw rate), in parts of the ends of the axes of the task's grid; robots take turns."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Another solver, by what it changes in the configuration."""
+
+    name: str
+    changes: tuple[tuple[str, Any], ...]
+
+
+def settings(cfg: LeggedConfig, engine: str) -> list[Setting]:
+    """Return the settings of the solver that are tried beside the task's own: those that the engine knows."""
+    halved = (("sim.dt", 0.5 * cfg.sim.dt), ("control.decimation", 2 * cfg.control.decimation))
+    found = [Setting("half the time step", halved)]
+    if engine in ("mujoco", "mujoco_warp", "newton_mujoco"):
+        found += [
+            Setting("elliptic cones", (("sim.cone", "elliptic"),)),
+            Setting("impratio 100", (("sim.impratio", 100.0), ("sim.iterations", max(50, cfg.sim.iterations)))),
+        ]
+    return found
+
+
+class Bench:
+    """A policy on the bench: builds tasks of stressed robots and measures them, one after the other."""
+
+    def __init__(
+        self,
+        policy: TrainedPolicy,
+        robots: int,
+        riser: float | None,
+        tread: float,
+        asked: Sequence[tuple[str, Any]],
+        device: torch.device,
+        graph: bool,
+    ) -> None:
+        """Take `robots` for each line of the table; steps are `riser` [m] high, or as high as RISER says for the robot, and
+        `tread` wide [m]. `asked` is what the command line changes.
+
+        Raises:
+            ConfigError: the robot cannot be loaded.
+        """
+        assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
+        self.cfg: LeggedConfig = policy.cfg
+        self.rows = table(size_of(policy.cfg.robot), size_of(WRITTEN_FOR))
+        """The lines of the table."""
+        self.scale = policy.cfg.terrain.scale
+        self.riser = round(RISER * self.scale, 3) if riser is None else riser
+        self.tread, self.robots = tread, robots
+        self.limit = LIMIT * sqrt(self.scale)
+        """Error up to which a robot follows its command [m/s]."""
+        self.lost = 0
+        """Times that a robot lost contacts in a control step for want of memory."""
+        self._policy, self._asked, self._device, self._graph = policy, tuple(asked), device, graph
+
+    @property
+    def on_plane(self) -> bool:
+        """Whether the policy was trained on a plane, so that it is measured on the flat only."""
+        return self.cfg.terrain.mesh_type == "plane"
+
+    def measure(self, rows: Sequence[Disturbance], changes: Sequence[tuple[str, Any]] = ()) -> list[dict[str, Any]]:
+        """Return the figures of some lines of the table; `changes` are those of a solver."""
+        found: list[dict[str, Any]] = [{"name": row.name, "what": row.text} for row in rows]
+        if not self.on_plane:
+            for line, figures in zip(found, self.on_stairs(rows, changes), strict=True):
+                line["stairs"] = figures
+        for line, figures in zip(found, self.on_flat(rows, changes), strict=True):
+            line["flat"] = figures
+        return found
+
+    def on_stairs(self, rows: Sequence[Disturbance], changes: Sequence[tuple[str, Any]] = ()) -> list[dict[str, Any]]:
+        """Return the success of each line, half of its robots going up."""
+        half = max(1, self.robots // 2)
+        per_robot = [row for _ in STAIRS for row in rows for _ in range(half)]
+        cell = dividing_cell(self.tread, self.cfg.terrain.horizontal_scale)
+        specs = [TileSpec(name, self.riser, self.tread) for name in STAIRS]
+        outcomes, times = self._run_out(per_robot, specs, [("terrain.horizontal_scale", cell), *changes])
+        # (up or down, line, robot) -> line by line
+        outcomes, times = (values.view(2, len(rows), half).transpose(0, 1).flatten(1) for values in (outcomes, times))
+        return [point(self.riser, *of_row) for of_row in zip(outcomes, times, strict=True)]
+
+    def on_new_ground(self) -> dict[str, Any]:
+        """Return type -> the success of robots with which nothing is wrong on ground that nobody trains on."""
+        specs = [TileSpec(name, round(size * self.scale, 6)) for name, size in GROUND.items()]
+        found = self._run_out([NOMINAL] * (len(specs) * self.robots), specs, [])
+        outcomes, times = (values.view(len(specs), self.robots) for values in found)
+        return {
+            spec.type: {
+                "unit": TERRAIN_TYPES[spec.type].unit,
+                "what": TERRAIN_TYPES[spec.type].what,
+                **point(spec.size, *of_type),
+            }
+            for spec, *of_type in zip(specs, outcomes, times, strict=True)
+        }
+
+    def on_flat(self, rows: Sequence[Disturbance], changes: Sequence[tuple[str, Any]] = ()) -> list[dict[str, Any]]:
+        """Return how each line's robots follow their commands on a plane."""
+        per_robot = [row for row in rows for _ in range(self.robots)]
+        axes = axes_of(self.cfg)
+        ends = torch.tensor([[abs(axis[end]) for axis in axes.values()] for end in (0, -1)])
+        parts = torch.tensor(COMMANDS)
+        commands = torch.where(parts < 0.0, parts * ends[0], parts * ends[1])
+        turns = torch.arange(self.robots) % len(COMMANDS)
+        own = [
+            *undisturbed(len(per_robot), HOLD_S),
+            ("observations.add_noise", self.cfg.observations.add_noise),
+            ("terrain.mesh_type", "plane"),
+        ]
+        task, act = self._build(per_robot, [*own, *changes], None)
+        error, fell = self._follow(task, act, commands[turns].repeat(len(rows), 1))
+        limit = LIMIT * sqrt(self.scale)
+        return [followed(*of_row, limit) for of_row in zip(error.view(len(rows), -1), fell.view(len(rows), -1), strict=True)]
+
+    def _build(
+        self, rows: Sequence[Disturbance], changes: Sequence[tuple[str, Any]], terrain: Terrain | None
+    ) -> tuple[StressedTask, Callable[[TensorDict], Tensor]]:
+        gc.collect()  # the task before this one lives in a cycle of references; two need not fit on a GPU
+        make = partial(_make, rows)
+        return restore(self._policy, [*changes, *declared(rows), *self._asked], self._device, self._graph, terrain, make)
+
+    def _run_out(
+        self, rows: Sequence[Disturbance], specs: Sequence[TileSpec], changes: Sequence[tuple[str, Any]]
+    ) -> tuple[Tensor, Tensor]:
+        """Return the outcomes (N,) of robots that are shared out among tiles, and when [s]."""
+        own = [*to_run_out(self.cfg, len(rows)), *changes]
+        cfg: Any = override(self.cfg, [*own, *self._asked])
+        task, act = self._build(rows, own, tiles_apart(specs, cfg.terrain, cfg.env.seed))
+        scores, lost = run_out(task, act, len(rows) // len(specs))
+        self.lost += lost
+        return scores.outcome.cpu(), scores.time_s.cpu()
+
+    @torch.inference_mode()
+    def _follow(self, task: StressedTask, act: Callable[[TensorDict], Tensor], commands: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the mean square error of each robot's velocity up to its fall (N,) [m^2/s^2], NaN for those that fell before
+        anything was measured, and who fell (N,).
+        """
+        task.reset()
+        observations = task.hold_commands(commands.to(task.device))
+        alive = torch.ones(task.num_envs, dtype=torch.bool, device=task.device)
+        total, steps = (torch.zeros(task.num_envs, device=task.device) for _ in range(2))
+        overflows = Overflows()
+        for step in range(round(HOLD_S / task.dt)):
+            observations, _, _, extras = task.step(act(observations))
+            overflows.add(extras)
+            alive &= ~task.terminated_buf
+            if step >= round(SETTLE_S / task.dt):
+                total += torch.where(alive, velocity_error(task.commands, task.base_lin_vel), 0.0)
+                steps += alive
+        self.lost += overflows.total(task)
+        return (total / steps).cpu(), ~alive.cpu()
+
+
+def _make(
+    rows: Sequence[Disturbance], cfg: LeggedConfig, device: torch.device, graph: bool, terrain: Terrain | None
+) -> StressedTask:
+    task: Any = make_stressed(cfg, rows, device, graph, terrain)
+    return task
+
+
+def followed(error: Tensor, fell: Tensor, limit: float) -> dict[str, Any]:
+    """Return the figures of robots (n,) on the flat, by the mean square of their velocities' errors [m^2/s^2] and who fell. A
+    robot has followed its command if it stood and its error is no more than `limit` [m/s].
+    """
+    good = ~fell & (error.sqrt() <= limit)
+    trials, successes = len(fell), int(good.sum())
+    low, high = wilson(successes, trials)
+    known = error[~error.isnan()]
+    return {
+        "robots": trials,
+        "successes": successes,
+        "share": successes / trials,
+        "low": low,
+        "high": high,
+        "fell": int(fell.sum()),
+        "rmse_lin": number_or_null(float(known.double().mean().sqrt())) if len(known) else None,
+    }
+
+
+def score(lines: Sequence[dict[str, Any]], ground: dict[str, Any]) -> dict[str, Any]:
+    """Return the one number: the mean of the shares of robots that came through, over all lines of the table but the nominal
+    one, on stairs and on the flat, and over all new ground; its interval of 95 %, and the means of the three parts.
+    """
+    disturbed = [line for line in lines if line["name"] != NOMINAL.name]
+    parts = {
+        "stairs": [line["stairs"] for line in disturbed if "stairs" in line],
+        "flat": [line["flat"] for line in disturbed],
+        "ground": list(ground.values()),
+    }
+    counts = {name: [(one["successes"], one["robots"]) for one in found] for name, found in parts.items()}
+    value, (low, high) = mean_of_shares([one for found in counts.values() for one in found])
+    means = {name: mean_of_shares(found)[0] for name, found in counts.items() if found}
+    return {"value": value, "low": low, "high": high, **means}

@@ -1,0 +1,189 @@
+"""The stress test as a table, a picture and a file."""
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from legged.config import LeggedConfig, override
+from legged.evaluation.episodes import header
+from legged.evaluation.overflows import warn_of_overflows
+from legged.evaluation.stress.measuring import HOLD_S, SETTLE_S, TREAD, Bench, score, settings
+from legged.evaluation.stress.table import NOMINAL
+from legged.evaluation.success import FORWARD, TIME_S
+from legged.figures import figure
+from legged.physics import engine_name
+from legged.policies.restore import TrainedPolicy
+from legged.process.paths import make_folder, relative, write_text
+
+COLORS = {"table": "#0072B2", "combined": "#D55E00", "settings": "#009E73", "ground": "#E69F00"}
+"""Of bars, by what they are of; Okabe and Ito's, whom readers of any colour vision tell apart."""
+LABELS = {"table": "one disturbance", "combined": "several", "settings": "another solver", "ground": "new ground"}
+COMBINED = ("together", "everything")
+SETTING_LINES = ("nominal", "together")
+"""Lines of the table that are measured with each setting of the solver, if not all are."""
+
+
+def evaluate_stress(
+    policy: TrainedPolicy,
+    robots: int,
+    full: bool,
+    stairs: tuple[float | None, float | None],
+    asked: list[tuple[str, Any]],
+    device: torch.device,
+    graph: bool,
+    folder: Path,
+    where: str = "sim.physics",
+) -> int:
+    """Run the stress test with `robots` for each line of its table, on steps of that height and width [m], or the usual ones;
+    with `full`, all lines with every setting of the solver. Print it, then write stress_<physics>.json and .png into
+    `folder`. Return the exit code. `where` says who asks for the engine.
+
+    Raises:
+        RunError: a file can't be written.
+    """
+    start = time.perf_counter()
+    assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
+    cfg: Any = override(policy.cfg, asked)
+    engine = engine_name(cfg.sim, device, where)
+    riser, tread = stairs
+    bench = Bench(policy, robots, riser, TREAD if tread is None else tread, asked, device, graph)
+    print(f"{len(bench.rows)} lines x {robots} robots, in {engine}", flush=True)
+    lines = bench.measure(bench.rows)
+    ground = {} if bench.on_plane else bench.on_new_ground()
+    few = [row for row in bench.rows if full or row.name in SETTING_LINES]
+    others = {}
+    for setting in settings(cfg, engine):
+        print(f"{setting.name}: {len(few)} lines", flush=True)
+        others[setting.name] = bench.measure(few, setting.changes)
+    result = {
+        **header(policy, engine, torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"),
+        "wall_s": time.perf_counter() - start,
+        "definition": {
+            "riser_m": bench.riser,
+            "tread_m": bench.tread,
+            "robots_per_line": robots,
+            "time_s": TIME_S,
+            "vx": FORWARD * bench.scale**0.5,
+            "hold_s": HOLD_S,
+            "measured_s": HOLD_S - SETTLE_S,
+            "limit": bench.limit,
+            "interval": "Wilson 95 %; of the score: mean of such shares (Zou and Donner)",
+        },
+        "score": score(lines, ground),
+        "lines": lines,
+        "ground": ground,
+        "settings": others,
+        "contact_overflows": bench.lost,
+    }
+    print_stress(result)
+    warn_of_overflows("stress", bench.lost)
+    make_folder(folder)
+    path = folder / f"stress_{engine}.json"
+    write_text(path, json.dumps(result, indent=1, allow_nan=False))
+    draw_stress(result, path.with_suffix(".png"))
+    print(f"written: {relative(path)}, {relative(path.with_suffix('.png'))}")
+    return 0
+
+
+def rows_of(result: dict[str, Any]) -> list[tuple[str, str, str, dict[str, Any] | None, dict[str, Any] | None]]:
+    """Return what there is to show, line by line: kind (of COLORS), name, what it is, and the figures of success and of the
+    flat, where there are any.
+    """
+    rows = [
+        ("combined" if line["name"] in COMBINED else "table", line["name"], line["what"], line.get("stairs"), line["flat"])
+        for line in result["lines"]
+    ]
+    for name, lines in result["settings"].items():
+        for line in lines:
+            rows.append(("settings", f"{name}: {line['name']}", line["what"], line.get("stairs"), line["flat"]))
+    for name, entry in result["ground"].items():
+        what = f"{entry['what']} {entry['size']:g} {entry['unit']}"
+        rows.append(("ground", f"{name.replace('_', ' ')}, {entry['size']:g} {entry['unit']}", what, entry, None))
+    return rows
+
+
+def score_text(result: dict[str, Any]) -> str:
+    """Return the score in words."""
+    found, rule = result["score"], result["definition"]
+    parts = ", ".join(f"{name} {100 * found[name]:.0f} %" for name in ("stairs", "flat", "ground") if name in found)
+    stairs = f"; stairs of {rule['riser_m']:g} x {rule['tread_m']:g} m" if "stairs" in found else ""
+    low, high = (100 * found[end] for end in ("low", "high"))
+    return f"stress score {100 * found['value']:.1f} % ({low:.1f} to {high:.1f} %): {parts}{stairs}"
+
+
+def print_stress(result: dict[str, Any]) -> None:
+    """Print a line for each disturbance, setting and ground, then the score."""
+    limit = result["definition"]["limit"]
+    table = Table(title=escape(f"{result['task']} ({result['checkpoint']}) in {result['physics']}"), title_justify="left")
+    table.add_column("what", max_width=48)
+    for head in (
+        "success on stairs\nor new ground",
+        "fell",
+        "stuck",
+        f"on the flat, error\nbelow {limit:.3g} m/s",
+        "fell",
+        "RMSE",
+    ):
+        table.add_column(head, justify="right")
+    last = "table"
+    for kind, name, what, stairs, flat in rows_of(result):
+        if kind != last:
+            table.add_section()
+        last = kind
+        said = f"{name}: {what}" if kind == "table" and name != NOMINAL.name else name
+        up = [share_text(stairs), str(stairs["fell"]), str(stairs["stuck"])] if stairs else ["", "", ""]
+        error = "none" if flat and flat["rmse_lin"] is None else f"{flat['rmse_lin']:.3f} m/s" if flat else ""
+        level = [share_text(flat), str(flat["fell"]), error] if flat else ["", "", ""]
+        table.add_row(escape(said), *up, *level)
+    Console(width=130).print(table)
+    print(score_text(result))
+
+
+def share_text(entry: dict[str, Any]) -> str:
+    """Return a share and its interval: '97 % (84 to 99)'."""
+    return f"{100 * entry['share']:.0f} % ({100 * entry['low']:.0f} to {100 * entry['high']:.0f})"
+
+
+def draw_stress(result: dict[str, Any], path: Path) -> None:
+    """Draw a bar a line, with its interval: success, commands followed on the flat, and the velocity's error there."""
+    rows = rows_of(result)
+    names = [name for _, name, *_ in rows]
+    colors = [COLORS[kind] for kind, *_ in rows]
+    limit = result["definition"]["limit"]
+    with figure(path, (12.5, 1.7 + 0.3 * len(rows)), columns=3, share_y=True) as (drawn, axes):
+        from matplotlib.patches import Patch
+
+        places = list(range(len(rows)))
+        for axis, column, label in ((axes[0, 0], 3, "success"), (axes[0, 1], 4, f"flat: stood, error below {limit:.3g} m/s")):
+            there = [
+                (place, row[column], color) for place, row, color in zip(places, rows, colors, strict=True) if row[column]
+            ]
+            at, entries, shades = (list(part) for part in zip(*there, strict=True)) if there else ([], [], [])
+            shares = [100 * one["share"] for one in entries]
+            ends = [
+                [100 * (one["share"] - one["low"]) for one in entries],
+                [100 * (one["high"] - one["share"]) for one in entries],
+            ]
+            axis.barh(at, shares, color=shades, xerr=ends, error_kw={"elinewidth": 1.0, "ecolor": "0.25", "capsize": 2})
+            axis.set_xlim(0.0, 102.0)
+            axis.set_xlabel(f"{label} [% of robots]")
+        flat = [(place, row[4]["rmse_lin"], color) for place, row, color in zip(places, rows, colors, strict=True) if row[4]]
+        axes[0, 2].barh([one[0] for one in flat], [one[1] or 0.0 for one in flat], color=[one[2] for one in flat])
+        axes[0, 2].axvline(limit, color="0.25", ls=":", lw=1.4)
+        axes[0, 2].set_xlabel("flat: RMSE of the velocity [m/s]")
+        for axis in axes[0]:
+            axis.spines[["top", "right"]].set_visible(False)
+            axis.grid(axis="x", alpha=0.3)
+            axis.set_axisbelow(True)
+        axes[0, 0].set_yticks(places, names)
+        axes[0, 0].set_ylim(len(rows) - 0.4, -0.6)
+        kinds = dict.fromkeys(kind for kind, *_ in rows)
+        keys = [Patch(color=COLORS[kind], label=LABELS[kind]) for kind in kinds]
+        drawn.legend(handles=keys, loc="outside lower center", ncols=len(keys), frameon=False)
+        drawn.suptitle(f"{result['task']} in {result['physics']}: {score_text(result)}", fontsize="medium")

@@ -1,0 +1,44 @@
+"""The network of an actor as policy.weights: plain numbers, which `legged.deploy.weights` and a C++ header read."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from legged.deploy.weights import ACTIVATION, ACTIVATIONS, GRU, LINEAR, LSTM, NORMALISE, Layer, pack
+
+
+def weights_of(policy: Any, activation: str, num_actions: int) -> bytes:
+    """Return the file of `policy`, rsl-rl's network of the actor, on the CPU, whose hidden layers have that activation (by
+    rsl-rl's name). Of outputs beside the means of the actions, such as standard deviations, nothing is kept.
+    """
+    layers: list[Layer] = []
+    if policy.obs_normalization:
+        normaliser = policy.obs_normalizer
+        mean, divisor = normaliser._mean.flatten(), (normaliser._std + normaliser.eps).flatten()
+        layers.append(_layer(NORMALISE, len(mean), len(mean), mean, divisor))
+    if policy.is_recurrent:
+        layers += _recurrent(policy.rnn.rnn)
+    linear = [module for module in policy.mlp if isinstance(module, nn.Linear)]
+    for module in linear:
+        # Where there is more than means, they come first.
+        rows = num_actions if module is linear[-1] else module.out_features
+        layers.append(_layer(LINEAR, module.in_features, rows, module.weight[:rows], module.bias[:rows]))
+        if module is not linear[-1]:
+            layers.append(Layer(ACTIVATION, list(ACTIVATIONS).index(activation), rows, rows, ()))
+    return pack(layers)
+
+
+def _recurrent(module: nn.LSTM | nn.GRU) -> list[Layer]:
+    """Return the layers of a recurrent module, the first one first."""
+    kind, layers = LSTM if isinstance(module, nn.LSTM) else GRU, []
+    for i in range(module.num_layers):
+        names = (f"weight_ih_l{i}", f"weight_hh_l{i}", f"bias_ih_l{i}", f"bias_hh_l{i}")
+        inputs = module.input_size if i == 0 else module.hidden_size
+        layers.append(_layer(kind, inputs, module.hidden_size, *(getattr(module, name) for name in names)))
+    return layers
+
+
+@torch.no_grad()
+def _layer(kind: int, inputs: int, outputs: int, *arrays: Tensor) -> Layer:
+    return Layer(kind, 0, inputs, outputs, tuple(array.detach().float().numpy().copy() for array in arrays))

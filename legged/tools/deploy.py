@@ -1,0 +1,173 @@
+"""The robot's program on a simulated robot: `python -m legged.tools.deploy --policy anymal_c_proprio --robot sim`.
+
+It exports the policy where that has not been done, starts the simulated robot in one process and the robot's own program
+(`python -m legged.deploy`) in another, which talk by UDP, and says how far the robot got.
+"""
+
+import argparse
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
+from legged.deploy.__main__ import add_program_arguments, limits_of
+from legged.deploy.contract import read_contract
+from legged.errors import ConfigError, RunError
+from legged.policies.export import EXPORTED, export
+from legged.policies.restore import policy_of, restore, undisturbed
+from legged.process.paths import exists, ready_to_write, relative
+from legged.process.startup import in_main_thread
+from legged.robots.robot import load_robot
+from legged.tools.simulate_robot import LISTENING, add_simulation_arguments, check_simulation, terrain_of
+from legged.tools.simulator.film import POSES, make_film
+
+ROOM_MB = 16.0
+"""What the disk must have room for: the exported policy and the log [MiB]."""
+END_S = 20.0
+"""A process that was asked to end must do so within so long [s]."""
+SIMULATED = ("terrain", "size", "cell", "sim_dt", "latency", "loss", "seed")
+PASSED_ON = ("input", "gamepad", "commands", "seconds", "stand_seconds", "max_tilt", "max_age", "max_missed")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "deploy",
+        __doc__,
+        "python -m legged.tools.deploy --policy anymal_c_proprio --robot sim",
+        "python -m legged.tools.deploy --policy anymal_c_proprio --robot sim --terrain stairs_up --size 0.17 --film",
+    )
+    parser.add_argument("--policy", required=True, help="exported folder, run folder, or task whose newest or shipped policy")
+    parser.add_argument("--robot", required=True, choices=("sim",), help="sim; a robot has its own command, legged.deploy")
+    parser.add_argument("--simulated", metavar="ROBOT", help="name or folder of the robot; the policy's by default")
+    add_simulation_arguments(parser)
+    add_program_arguments(parser)
+    parser.add_argument("--out", type=Path, help="folder for log.npz and report.json; logs/deploy/<task> by default")
+    parser.add_argument("--film", action="store_true", help="draw the first half minute as film.mp4")
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
+    limits_of(args)
+    check_simulation(args)
+    if args.commands is not None and not exists(args.commands):
+        raise ConfigError(f"--commands: there is no file {args.commands}")
+    exported = _exported(args.policy)
+    contract = read_contract(exported / "policy.json")
+    robot = load_robot(args.simulated or contract.robot, "--simulated")
+    folder = args.out or Path("logs") / "deploy" / contract.task
+    ready_to_write(folder, ROOM_MB)
+    folder.mkdir(parents=True, exist_ok=True)
+    code, report = _run_both(args, exported, str(robot.folder), folder)
+    print(f"{relative(folder / 'report.json')}: {_told(report)}")
+    if args.film:
+        make_film(robot, terrain_of(args), folder)
+    return code
+
+
+def _exported(name: str) -> Path:
+    """Return the folder with the export that `name` means; one is made of a run or of a shipped policy.
+
+    Raises:
+        ConfigError: there is none of that name.
+    """
+    for folder in (Path(name), Path(name).parent if name.endswith(".onnx") else Path(name) / EXPORTED):
+        if exists(folder / "policy.onnx"):
+            return folder
+    policy = policy_of(name)
+    folder = policy.output("deploy") / EXPORTED
+    changes = [*undisturbed(1, 1.0), ("sim.physics", "mujoco")]
+    task, act = restore(policy, changes, torch.device("cpu"), graph=False)
+    export(task, act.network, folder)
+    print(f"exported {relative(folder / 'policy.onnx')}")
+    return folder
+
+
+def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path) -> tuple[int, dict[str, Any]]:
+    """Run the simulated robot and the program to their ends; return the program's exit code and the robot's report.
+
+    Raises:
+        RunError: the simulated robot does not start, or does not end.
+    """
+    report = folder / "report.json"
+    simulator = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "legged.tools.simulate_robot", robot, "--report", str(report)),
+            *(["--poses", str(folder / POSES)] if args.film else []),
+            *_flags(args, SIMULATED),
+        ],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,  # Ctrl-C is for the program, which brakes the robot first
+    )
+    program = None
+    if in_main_thread():  # who ends this process means all three
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    try:
+        assert simulator.stdout is not None
+        line = simulator.stdout.readline()
+        if not line.startswith(LISTENING):
+            raise RunError(f"the simulated robot did not start (exit code {simulator.wait(END_S)})")
+        address = line.removeprefix(LISTENING).strip()
+        program = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "legged.deploy", "--policy", str(exported), "--robot", f"udp:{address}"),
+                *("--log", str(folder / "log.npz"), *_flags(args, PASSED_ON)),
+            ]
+        )
+        code = _wait(program)
+        try:
+            simulator.communicate(timeout=END_S)
+        except subprocess.TimeoutExpired as error:
+            raise RunError("the simulated robot did not hear the program's goodbye") from error
+    finally:
+        if program is not None and program.poll() is None:
+            program.terminate()
+            program.wait(END_S)
+        simulator.kill()
+        simulator.wait()
+    return code, json.loads(report.read_text(encoding="utf-8"))
+
+
+def _wait(program: subprocess.Popen) -> int:
+    """Wait for the program, which a Ctrl-C of the terminal reaches by itself; return its exit code."""
+    while True:
+        try:
+            return program.wait()
+        except KeyboardInterrupt:
+            continue
+
+
+def _flags(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
+    """Return the flags of those names that were given, or have a default."""
+    given = {name: getattr(args, name) for name in names}
+    return [
+        word for name, value in given.items() if value is not None for word in (f"--{name.replace('_', '-')}", str(value))
+    ]
+
+
+def _told(report: dict[str, Any]) -> str:
+    """Say in one line what became of the robot."""
+    lost = report["lost"] / max(1, report["sent"] + report["received"])
+    lean, share = report["largest_lean"], 100.0 * lost
+    return (
+        f"{'fell' if report['fell'] else 'did not fall'}, {report['time']:.1f} s, {report['distance']:.2f} m away,"
+        f" {report['climbed']:+.2f} m higher, largest lean {lean:.2f} rad, {share:.1f} % of packets lost"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

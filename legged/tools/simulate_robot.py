@@ -1,0 +1,118 @@
+"""A simulated robot for the robot's program: `python -m legged.tools.simulate_robot anymal_c [--terrain stairs_up]`.
+
+C MuJoCo in real time behind UDP on this machine, with a time step of its own, and a link that may be late and lose packets.
+It prints the port at which it listens; `python -m legged.deploy --robot udp:127.0.0.1:PORT` runs a policy on it.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from legged.commandline.command import run_main
+from legged.commandline.parser import CommandParser
+from legged.config.schema import SimConfig, TerrainConfig
+from legged.deploy.pace import take_priority
+from legged.errors import ConfigError
+from legged.process.paths import replacing, write_text
+from legged.robots.robot import load_robot
+from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, terrain_type
+from legged.tools.simulator.robot import SimulatedRobot
+from legged.tools.simulator.server import Server
+
+LISTENING = "listening at "
+"""What the line with the address begins with."""
+PRIORITY = 10
+"""Below that of the program."""
+BORDER = 10.0
+"""Level ground around the tile [m]."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "simulate_robot",
+        __doc__,
+        "python -m legged.tools.simulate_robot anymal_c",
+        "python -m legged.tools.simulate_robot go2 --terrain stairs_up --size 0.12 --latency 0.01 --loss 0.01",
+    )
+    parser.add_argument("robot", help="name of a robot, or its folder")
+    add_simulation_arguments(parser)
+    parser.add_argument("--report", type=Path, help="JSON file for what became of the robot")
+    parser.add_argument("--poses", type=Path, help=".npy file for its poses, 25 a second, of the first half minute")
+    parser.add_argument("--seconds", type=float, default=3600.0, help="end after so long; default 3600")
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
+    check_simulation(args)
+    if not args.seconds > 0.0:
+        raise ConfigError(f"--seconds: must be above 0, got {args.seconds:g}")
+    robot = load_robot(args.robot)
+    sim = SimConfig(dt=args.sim_dt, iterations=100, ls_iterations=50)
+    server = Server(SimulatedRobot(robot, terrain_of(args), sim), args.latency, args.loss, args.seed)
+    take_priority(PRIORITY)  # motors and sensors of a robot do not wait for other processes either
+    print(f"{LISTENING}127.0.0.1:{server.port}", flush=True)
+    report = server.run(args.seconds)
+    if args.poses is not None:
+        with replacing(args.poses) as part:
+            np.save(part, np.array(server.poses))
+    if args.report is not None:
+        write_text(args.report, json.dumps(report, indent=1))
+    print(json.dumps(report), flush=True)
+    return 0
+
+
+def add_simulation_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the flags that say what is simulated."""
+    parser.add_argument("--terrain", metavar="TYPE", help="type of the tile it starts on, e.g. stairs_up; a plane by default")
+    parser.add_argument("--size", type=float, help="of the tile's type, in its unit, e.g. the height of a step [m]")
+    parser.add_argument(
+        "--cell", type=float, default=0.1, help="edge of the tile's cells [m], of which treads have whole ones; default 0.1"
+    )
+    parser.add_argument("--sim-dt", type=float, default=0.002, help="physics step [s]; default 0.002")
+    parser.add_argument("--latency", type=float, default=0.0, help="of packets, in each direction [s]; default 0")
+    parser.add_argument("--loss", type=float, default=0.0, help="share of packets lost, in each direction; default 0")
+    parser.add_argument("--seed", type=int, default=1, help="of the loss; default 1")
+
+
+def check_simulation(args: argparse.Namespace) -> None:
+    """Look for numbers that make no sense.
+
+    Raises:
+        ConfigError: there is one.
+    """
+    if args.terrain is not None:
+        terrain_type(args.terrain, "--terrain")
+    elif args.size is not None:
+        raise ConfigError("--size: a plane has no size; name a type of tiles with --terrain")
+    for flag, value, low, high in (
+        ("--size", args.size, -100.0, 100.0),
+        ("--cell", args.cell, 0.02, 1.0),
+        ("--sim-dt", args.sim_dt, 1e-4, 0.02),
+        ("--latency", args.latency, 0.0, 1.0),
+        ("--loss", args.loss, 0.0, 0.9),
+    ):
+        if value is not None and not low <= value <= high:
+            raise ConfigError(f"{flag}: must be between {low:g} and {high:g}, got {value:g}")
+
+
+def terrain_of(args: argparse.Namespace) -> Terrain | None:
+    """Return the ground that the flags ask for: one tile, and level ground around it."""
+    if args.terrain is None:
+        return None
+    cfg = TerrainConfig(mesh_type="height_map", border_size=BORDER, horizontal_scale=args.cell)
+    size = TERRAIN_TYPES[args.terrain].sized(0.5, cfg.scale) if args.size is None else args.size
+    return Terrain.of_tiles([[TileSpec(args.terrain, size)]], cfg, np.random.default_rng(args.seed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,54 @@
+"""A film of what the program did with a simulated robot."""
+
+from pathlib import Path
+
+import numpy as np
+
+from legged.play.video import write_mp4
+from legged.rendering import Camera, display_model, size_of
+from legged.rendering.follower import Follower
+from legged.rendering.text import caption
+from legged.robots.robot import Robot
+from legged.terrain import Terrain
+
+POSES, FILM = "poses.npy", "film.mp4"
+"""Files in the folder of a run."""
+SIZE = (640, 360)
+"""Width and height [pixels]."""
+AWAY = 3.45
+"""Distance of the camera, in lengths of the robot."""
+GLIDE = 0.1
+"""Share of the way to a robot on a plane that the camera makes up in a picture."""
+
+
+def make_film(robot: Robot, terrain: Terrain | None, folder: Path) -> None:
+    """Draw the poses in `folder`, with the states that its log.npz has at their times.
+
+    Raises:
+        RunError: nothing can be rendered here, or the film can't be written.
+    """
+    poses = np.load(folder / POSES)
+    log = np.load(folder / "log.npz")
+    if not len(poses) or "times" not in log:
+        print(f"{folder}: nothing happened, so there is no film")
+        return
+    camera = Camera(display_model(robot, 1, *SIZE, terrain), *SIZE)
+    away = AWAY * size_of(robot).longest
+    follower = None if terrain is None else Follower(terrain.height_map, away)
+    camera.view.distance, camera.view.azimuth, camera.view.elevation = away, 130.0, -18.0
+    camera.view.lookat[:] = poses[0, 1:4]
+    frames = []
+    for time, *qpos in poses:
+        camera.data.qpos[:] = qpos
+        base = np.array(qpos[:3])
+        if follower is None:
+            camera.view.lookat[:] += GLIDE * (base - camera.view.lookat)
+        else:
+            follower.update(base)
+            follower.aim(camera.view)
+        camera.update()
+        place = min(int(np.searchsorted(log["times"], time)), len(log["times"]) - 1)
+        state = log["states"][log["state"][place]]
+        frames.append(caption(camera.render(), [f"{robot.name}: {state}", f"{time:.1f} s, {base[0]:+.1f} m forward"]))
+    camera.close()
+    write_mp4(frames, folder / FILM, (len(poses) - 1) / max(poses[-1, 0] - poses[0, 0], 1e-3))

@@ -1,0 +1,252 @@
+"""A robot behind UDP: packets there and back, what gets lost, comes late or is none of ours."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from still_robot import facts_for
+
+from legged.deploy import udp
+from legged.deploy.contract import read_contract
+from legged.deploy.safety import braking
+from legged.deploy.udp import UdpRobot
+from legged.deploy.udp_packets import (
+    BYE,
+    COMMAND,
+    FACTS,
+    HELLO,
+    STATE,
+    RobotState,
+    facts_as_json,
+    facts_of_json,
+    open_packet,
+    pack_command,
+    pack_json,
+    pack_state,
+    packet,
+    unpack_command,
+    unpack_state,
+)
+from legged.errors import ConfigError, RunError
+
+
+def state(time=1.5, **sources):
+    ramp = np.arange(12.0)
+    return RobotState(time, np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.1, 0.2, 0.3]), ramp, 2.0 * ramp, 3.0 * ramp, sources)
+
+
+def test_a_state_comes_out_as_it_went_in():
+    sent = state(heights=np.array([-0.5, 0.25]), base_lin_vel=np.array([1.0, 2.0, 4.0]))
+    found = unpack_state(pack_state(sent))
+    assert found.time == 1.5
+    for name in ("quaternion", "gyro", "positions", "velocities", "torques"):
+        np.testing.assert_allclose(getattr(found, name), getattr(sent, name), rtol=1e-6)
+    assert found.sources.keys() == {"heights", "base_lin_vel"}
+    np.testing.assert_array_equal(found.sources["heights"], [-0.5, 0.25])
+
+
+def test_no_other_bytes_are_a_state_or_a_command():
+    whole = pack_state(state(heights=np.array([1.0, 2.0])))
+    for length in range(len(whole)):
+        with pytest.raises(ValueError, match=r"."):
+            unpack_state(whole[:length])
+    with pytest.raises(ValueError, match="length"):
+        unpack_state(whole + b"x")
+    command = pack_command(7, *np.ones((3, 12)))
+    assert unpack_command(command)[0] == 7
+    for length in range(len(command)):
+        with pytest.raises(ValueError, match=r"."):
+            unpack_command(command[:length])
+    with pytest.raises(ValueError, match="numbers"):
+        unpack_command(pack_command(7, np.full(12, np.nan), *np.ones((2, 12))))
+    assert open_packet(b"") is None
+    assert open_packet(b"something else, long enough") is None
+
+
+def test_facts_come_out_as_they_went_in(policy_folder):
+    limits = read_contract(policy_folder / "policy.json").position_limits.copy()
+    limits[3] = -np.inf, np.inf
+    facts = facts_for(read_contract(policy_folder / "policy.json"), position_limits=limits, offers=frozenset({"heights"}))
+    found = facts_of_json(json.loads(json.dumps(facts_as_json(facts))))
+    assert (found.name, found.joint_names, found.imu_body, found.offers) == ("still", facts.joint_names, "base", {"heights"})
+    np.testing.assert_array_equal(found.position_limits, limits)
+    np.testing.assert_array_equal(found.torque_limits, facts.torque_limits)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"torque_limits": [1.0]},
+        {"position_limits": [[0.0, 1.0]]},
+        {"joint_names": 3},
+        {"velocity_limits": None},
+        {"name": {}},
+    ],
+    ids=["torques", "positions", "names", "velocities", "none"],
+)
+def test_what_are_no_facts_is_refused(policy_folder, changes):
+    said = facts_as_json(facts_for(read_contract(policy_folder / "policy.json")))
+    said |= changes
+    if "name" in changes:
+        del said["imu_body"]
+    with pytest.raises((ValueError, KeyError, TypeError)):
+        facts_of_json(said)
+
+
+class Answers:
+    """What greets back, and then sends what the test tells it to."""
+
+    def __init__(self, facts):
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+        self.socket.settimeout(0.02)
+        self.address = f"127.0.0.1:{self.socket.getsockname()[1]}"
+        self.facts, self.heard, self.client, self.ends = facts, [], None, False
+        self.thread = threading.Thread(target=self.listen)
+        self.thread.start()
+
+    def listen(self):
+        while not self.ends:
+            try:
+                data, self.client = self.socket.recvfrom(60_000)
+            except TimeoutError:
+                continue
+            opened = open_packet(data)
+            self.heard.append(opened)
+            if opened[0] == HELLO:
+                self.socket.sendto(packet(FACTS, 0, pack_json(facts_as_json(self.facts))), self.client)
+
+    def send(self, *packets):
+        for data in packets:
+            self.socket.sendto(data, self.client)
+        time.sleep(0.01)
+
+    def end(self):
+        self.ends = True
+        self.thread.join()
+        self.socket.close()
+
+
+@pytest.fixture
+def link(policy_folder):
+    """The program's side and the robot's."""
+    there = Answers(facts_for(read_contract(policy_folder / "policy.json"), offers=frozenset({"heights"})))
+    robot = UdpRobot(there.address)
+    yield robot, there
+    robot.close()
+    there.end()
+
+
+def test_readings_are_the_newest_states_in_order(link):
+    robot, there = link
+    assert robot.read() == []
+    later = packet(STATE, 5, pack_state(state(2.0)))
+    there.send(packet(STATE, 3, pack_state(state(1.0))), later, packet(STATE, 4, pack_state(state(1.5))), later)
+    assert [reading.time for reading in robot.read()] == [1.0, 2.0], "what comes too late or twice is left out"
+    there.send(b"noise", packet(STATE, 6, b"cut short"), packet(STATE, 7, pack_state(state(3.0))))
+    (reading,) = robot.read()
+    assert reading.time == 3.0
+    np.testing.assert_array_equal(reading.torques, 3.0 * np.arange(12.0))
+
+
+def test_a_reading_is_as_old_as_its_arrival_not_as_its_reading(link):
+    robot, there = link
+    there.send(packet(STATE, 1, pack_state(state())))
+    sent = time.perf_counter()
+    time.sleep(0.1)
+    (reading,) = robot.read()
+    assert time.perf_counter() - reading.received > 0.09
+    assert abs(sent - reading.received) < 0.05
+
+
+def test_a_robot_with_other_joints_gives_no_reading(link):
+    robot, there = link
+    four = np.zeros(4)
+    there.send(packet(STATE, 1, pack_state(RobotState(1.0, four, np.zeros(3), four, four, four, {}))))
+    assert robot.read() == []
+
+
+def test_a_source_is_kept_until_it_is_too_old(link):
+    robot, there = link
+    robot.ask({"heights": np.array([[0.5, 0.0]])})
+    there.send(packet(STATE, 1, pack_state(state(1.0, heights=np.array([-0.4])))))
+    assert robot.read()[0].sources["heights"] == pytest.approx(-0.4)
+    there.send(packet(STATE, 2, pack_state(state(1.0 + udp.SOURCE_AGE_S - 0.01))))
+    assert "heights" in robot.read()[0].sources
+    before = len(there.heard)
+    there.send(packet(STATE, 3, pack_state(state(1.0 + udp.SOURCE_AGE_S + 0.01))))
+    assert "heights" not in robot.read()[0].sources
+    time.sleep(0.1)
+    asked = [opened for opened in there.heard[before:] if opened[0] == HELLO]
+    assert json.loads(asked[0][2]) == {"sources": {"heights": [[0.5, 0.0]]}}, "it asks again: the question may be lost"
+
+
+def test_a_command_says_what_was_written(link):
+    robot, there = link
+    robot.write(np.full(12, 0.5), np.full(12, 90.0), np.full(12, 4.0))
+    time.sleep(0.1)
+    kind, sequence, body = there.heard[-1]
+    assert (kind, sequence) == (COMMAND, 1)
+    np.testing.assert_allclose(unpack_command(body)[1].mean(axis=1), [0.5, 90.0, 4.0])
+
+
+@pytest.mark.parametrize("name", ["SIGHUP", "SIGTSTP"])
+def test_a_program_that_is_asked_to_end_brakes_the_robot_for_a_second_and_says_goodbye(name, policy_folder, tmp_path):
+    """The command as a process, whose terminal is closed, or in which somebody types Ctrl-Z."""
+    contract = read_contract(policy_folder / "policy.json")
+    there = Answers(facts_for(contract))
+    (tmp_path / "lie.txt").write_text("0 damping\n")
+    command = [sys.executable, "-m", "legged.deploy", "--policy", str(policy_folder), "--robot", f"udp:{there.address}"]
+    with open(tmp_path / "out", "w") as out:
+        command += ["--commands", "lie.txt", "--log", "log.npz"]
+        program = subprocess.Popen(command, cwd=tmp_path, stdout=out, stderr=subprocess.STDOUT, start_new_session=True)
+        try:
+            for i in range(1, 5000):
+                if there.client is not None:
+                    there.send(packet(STATE, i, pack_state(state(0.01 * i))))
+                if sum(opened[0] == COMMAND for opened in there.heard) == 20:
+                    break
+                time.sleep(0.002)
+            asked = time.perf_counter()
+            program.send_signal(getattr(signal, name))
+            assert program.wait(20.0) == 0, (tmp_path / "out").read_text()
+            assert time.perf_counter() - asked > 0.9
+        finally:
+            program.kill()
+            there.end()
+    assert there.heard[-1][0] == BYE
+    braked = [unpack_command(body)[1] for kind, _, body in there.heard if kind == COMMAND][-40:]
+    assert len(braked) == 40
+    for asked_for in braked:
+        assert not asked_for[1].any()
+        np.testing.assert_allclose(asked_for[2], braking(contract), rtol=1e-6)
+    assert (tmp_path / "log.npz").is_file()
+
+
+@pytest.mark.parametrize("address", ["", "here", "127.0.0.1:", "127.0.0.1:0", "127.0.0.1:99999", ":80"])
+def test_what_is_no_address_is_refused(address):
+    with pytest.raises(ConfigError, match="expected udp:HOST:PORT"):
+        UdpRobot(address)
+
+
+def test_somebody_who_answers_with_something_else_is_no_robot(monkeypatch):
+    monkeypatch.setattr(udp, "ANSWER_S", 0.4)
+    monkeypatch.setattr(f"{__name__}.facts_as_json", lambda _: {"joint_names": ["one"]})
+    there = Answers(None)
+    with pytest.raises(RunError, match="no robot answers"):
+        UdpRobot(there.address)
+    there.end()
+
+
+def test_a_robot_that_does_not_answer_is_named(monkeypatch):
+    monkeypatch.setattr(udp, "ANSWER_S", 0.2)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
+        silent.bind(("127.0.0.1", 0))
+        with pytest.raises(RunError, match=r"no robot answers at udp:127\.0\.0\.1:\d+ within 0\.2 s"):
+            UdpRobot(f"127.0.0.1:{silent.getsockname()[1]}")

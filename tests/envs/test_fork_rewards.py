@@ -1,0 +1,283 @@
+"""Rewards of legged_gym's forks, run as they stand, and what the guard says of those that no graph could hold."""
+
+import pytest
+import torch
+from helpers import JOINTS, small_config
+from torch import Tensor
+
+from legged.envs import LeggedRobot
+from legged.errors import TermError
+from legged.math import get_euler_xyz, quat_rotate, quat_rotate_inverse, wrap_to_pi
+
+ROBOTS = 4
+
+
+class Fork(LeggedRobot):
+    """Rewards in the style of legged_gym, unitree_rl_gym, HIMLoco and their like, in the names that these use."""
+
+    def _init_buffers(self):
+        super()._init_buffers()
+        self.hip_ids = [i for i, name in enumerate(self.dof_names) if "HAA" in name]
+        self.leg_phase = torch.zeros(self.num_envs, self.feet_num, device=self.device)
+        self.desired_height = 0.52
+
+    def advance(self):
+        super().advance()
+        phase = (self.episode_length_buf * self.dt) % 0.8 / 0.8
+        self.leg_phase.copy_(torch.stack([phase, (phase + 0.5) % 1.0, (phase + 0.5) % 1.0, phase], dim=-1))
+
+    def _reward_base_height_of_root(self):
+        height = torch.mean(self.root_states[:, 2].unsqueeze(1) - self.measured_heights, dim=1)
+        return torch.square(height - self.desired_height)
+
+    def _reward_alive(self):
+        return 1.0
+
+    def _reward_hip_pos(self):
+        return torch.sum(torch.square(self.dof_pos[:, [0, 3, 6, 9]]), dim=1)
+
+    def _reward_hips_by_names(self):
+        return torch.abs(self.dof_pos[:, self.hip_ids] - self.default_dof_pos[self.hip_ids]).sum(dim=1)
+
+    def _reward_joint_power(self):
+        return torch.sum(torch.abs(self.dof_vel) * torch.abs(self.torques), dim=1)
+
+    def _reward_power_distribution(self):
+        return torch.var(torch.abs(self.torques * self.dof_vel), dim=1)
+
+    def _reward_smoothness(self):
+        return torch.sum(torch.square(self.actions - self.last_actions - self.last_actions + self.last_last_actions), dim=1)
+
+    def _reward_foot_clearance(self):
+        local = self.feet_pos - self.root_states[:, 0:3].unsqueeze(1)
+        relative = self.feet_vel - self.root_states[:, 7:10].unsqueeze(1)
+        heights = torch.zeros(self.num_envs, self.feet_num, device=self.device)
+        speeds = torch.zeros_like(heights)
+        for i in range(len(self.feet_indices)):
+            heights[:, i] = quat_rotate_inverse(self.base_quat, local[:, i, :])[:, 2]
+            speeds[:, i] = torch.norm(quat_rotate_inverse(self.base_quat, relative[:, i, :])[:, :2], dim=1)
+        return torch.sum(torch.square(heights + 0.35) * speeds, dim=1)
+
+    def _reward_contact_phase(self):
+        res = torch.zeros(self.num_envs, dtype=torch.float, device=self.device)
+        for i in range(self.feet_num):
+            is_stance = self.leg_phase[:, i] < 0.55
+            touching = self.contact_forces[:, self.feet_indices[i], 2] > 1
+            res += ~(touching ^ is_stance)
+        return res
+
+    def _reward_swing_height(self):
+        touching = torch.norm(self.contact_forces[:, self.feet_indices, :3], dim=2) > 1.0
+        return torch.sum(torch.square(self.feet_pos[:, :, 2] - 0.08) * ~touching, dim=(1))
+
+    def _reward_contact_no_vel(self):
+        touching = torch.norm(self.contact_forces[:, self.feet_indices, :3], dim=2) > 1.0
+        return torch.sum(torch.square((self.feet_vel * touching.unsqueeze(-1))[:, :, :3]), dim=(1, 2))
+
+    def _reward_collisions(self):
+        forces = torch.norm(self.contact_forces[:, self.penalised_contact_indices, :], dim=-1)
+        return torch.sum(1.0 * (forces > 0.1), dim=1)
+
+    def _reward_over_limits(self):
+        return torch.sum((torch.abs(self.torques) - self.torque_limits * 0.9).clip(min=0.0), dim=1)
+
+    def _reward_relative_torques(self):
+        return torch.sum(torch.square(self.torques / self.torque_limits.unsqueeze(0)), dim=1)
+
+    def _reward_torques_by_gains(self):
+        return torch.sum(torch.square(self.torques / self.p_gains), dim=1)
+
+    def _reward_torque_change(self):
+        return torch.sum(torch.square(self.torques - self.last_torques), dim=1)
+
+    def _reward_fell(self):
+        return self.reset_buf * ~self.time_out_buf
+
+    def _reward_joint_limits(self):
+        out = -(self.dof_pos - self.dof_pos_limits[:, 0]).clip(max=0.0)
+        out += (self.dof_pos - self.dof_pos_limits[:, 1]).clip(min=0.0)
+        return torch.sum(out, dim=1)
+
+    def _reward_base_acceleration(self):
+        change = (self.last_root_vel - self.root_states[:, 7:13]) / self.dt
+        return torch.sum(torch.square(change), dim=1)
+
+    def _reward_touch_down(self):
+        touching = self.contact_forces[:, self.feet_indices, 2] > 1.0
+        landed = torch.logical_or(touching, self.last_contacts) * (self.feet_air_time > 0.0)
+        swing = torch.sum((self.feet_air_time - 0.5) * landed, dim=1)
+        return swing * (torch.norm(self.commands[:, :2], dim=1) > 0.1)
+
+    def _reward_roll_and_pitch(self):
+        roll, pitch, _ = get_euler_xyz(self.base_quat)
+        return torch.square(wrap_to_pi(roll)) + torch.square(wrap_to_pi(pitch))
+
+    def _reward_leaning(self):
+        return torch.sum(torch.abs(self.rpy[:, :2]), dim=1)
+
+    def _reward_heading(self):
+        forward = quat_rotate(self.base_quat, self.forward_vec)
+        return torch.abs(wrap_to_pi(self.commands[:, 3] - torch.atan2(forward[:, 1], forward[:, 0])))
+
+    def _reward_upright(self):
+        return torch.square(1.0 + torch.sum(self.projected_gravity * self.gravity_vec, dim=1) * -1.0)
+
+    def _reward_near_target(self):
+        return torch.sum(torch.square(self.joint_pos_target - self.dof_pos), dim=1)
+
+    def _reward_joint_mirror(self):
+        left, right = self.dof_pos[:, [1, 2, 7, 8]], self.dof_pos[:, [4, 5, 10, 11]]
+        return torch.sum(torch.square(left - right), dim=-1)
+
+    def _reward_stumbles(self):
+        feet = self.contact_forces[:, self.feet_indices, :]
+        return torch.any(torch.norm(feet[:, :, :2], dim=2) > 5 * torch.abs(feet[:, :, 2]), dim=1)
+
+    def _reward_standing(self):
+        still = torch.norm(self.commands[:, :2], dim=1) < 0.1
+        return torch.sum(torch.abs(self.dof_pos - self.default_dof_pos), dim=1) * still
+
+    def _reward_weighted_pose(self):
+        weights = torch.tensor([1.0, 0.1, 0.1] * 4, device=self.device)
+        return torch.exp(-torch.sum(torch.square(self.dof_pos - self.default_dof_pos) * weights, dim=1))
+
+    def _reward_feet_distance(self):
+        spread = self.foot_positions[:, [0, 1], 1] - self.foot_positions[:, [2, 3], 1]
+        return torch.clip(0.05 - torch.abs(spread), 0.0, 1.0).sum(dim=1)
+
+    def _reward_time_out_share(self):
+        return (self.episode_length_buf > 0.5 * self.max_episode_length_s / self.dt).float()
+
+    def _reward_scaled_commands(self):
+        error = self.commands[:, :3] * self.commands_scale - torch.cat(
+            (self.base_lin_vel[:, :2], self.base_ang_vel[:, 2:]), 1
+        )
+        return torch.exp(-error.square().sum(dim=1) / self.cfg.rewards.tracking_sigma)
+
+    def _reward_root_velocity(self):
+        value = torch.zeros(self.num_envs, device=self.device)
+        value[:] = self.root_states[:, 9]
+        return value.square() * self.obs_scales.lin_vel
+
+
+REWARDS = sorted(Fork.terms("_reward_") - LeggedRobot.terms("_reward_"))
+
+
+def with_all_rewards(device: str, *overrides) -> Fork:
+    """All of these rewards, in a task that the guard has let pass, after ten steps."""
+    cfg = small_config(("rewards.only_positive_rewards", False), *overrides)
+    cfg.rewards.scales.update(dict.fromkeys(REWARDS, 1.0))
+    task = Fork(cfg, device)
+    torch.manual_seed(1)
+    for _ in range(10):
+        task.step(torch.randn(ROBOTS, JOINTS))
+    return task
+
+
+@pytest.fixture(scope="module")
+def fork() -> Fork:
+    return with_all_rewards("cpu")
+
+
+@pytest.mark.gpu
+def test_all_rewards_are_captured_on_a_gpu():
+    task = with_all_rewards("cuda", ("sim.physics", "mujoco_warp"))
+    assert task.captured
+    assert task.rewards.last.isfinite().all()
+    assert task.rewards.last.abs().sum(dim=1)[[task.rewards.names.index("alive"), task.rewards.names.index("hip_pos")]].all()
+    with pytest.raises(AttributeError, match="only where a term reads it"):
+        task.last_dof_pos  # noqa: B018
+
+
+def test_there_are_many_rewards():
+    assert len(REWARDS) >= 30
+
+
+@pytest.mark.parametrize("name", REWARDS)
+def test_a_reward_of_a_fork_gives_numbers(fork, name):
+    last = fork.rewards.last[fork.rewards.names.index(name)]
+    assert last.isfinite().all()
+    value = getattr(fork, f"_reward_{name}")()
+    assert value == 1.0 if isinstance(value, float) else value.shape == (ROBOTS,)
+
+
+SAME = {
+    "collisions": "collision",
+    "joint_limits": "dof_pos_limits",
+    "stumbles": "stumble",
+}
+
+
+@pytest.mark.parametrize("name", SAME)
+def test_a_reward_of_theirs_is_as_large_as_ours(fork, name):
+    found = getattr(fork, f"_reward_{name}")()
+    torch.testing.assert_close(found.float(), getattr(fork, f"_reward_{SAME[name]}")())
+
+
+def test_a_number_counts_for_every_robot(fork):
+    assert fork.rewards.last[fork.rewards.names.index("alive")].tolist() == pytest.approx([fork.dt] * ROBOTS)
+
+
+@pytest.mark.parametrize("value", [None, "1", [1.0]], ids=str)
+def test_what_is_no_reward_is_named(value):
+    task = type("Mine", (LeggedRobot,), {"_reward_lin_vel_z": lambda self: value})
+    with pytest.raises(TermError, match=r"_reward_lin_vel_z: must return a tensor \(4,\), got "):
+        task(small_config())
+
+
+# ---- what a graph would refuse, in rewards -------------------------------------------------------------------------------
+
+
+def count(task: LeggedRobot) -> Tensor:
+    task.calls = getattr(task, "calls", 0) + 1
+    return task.rew_buf * 0.0
+
+
+def rebind(task: LeggedRobot) -> Tensor:
+    change = task.contact_forces[:, 0, 2] - task.last_contact_force
+    task.last_contact_force = task.contact_forces[:, 0, 2].clone()
+    return change
+
+
+def rebind_contacts(task: LeggedRobot) -> Tensor:
+    touching = task.contact_forces[:, task.feet_indices, 2] > 1.0
+    landed = torch.logical_or(touching, task.last_contacts)
+    task.last_contacts = touching
+    return landed.sum(dim=1).float()
+
+
+def write_by_list(task: LeggedRobot) -> Tensor:
+    ids = task.reset_buf.nonzero(as_tuple=False).flatten()
+    task.rew_buf[ids] = 0.0
+    return task.rew_buf
+
+
+REFUSED = {
+    "numpy": (lambda task: torch.from_numpy(task.dof_pos.cpu().numpy()).sum(dim=1), "copies to the host"),
+    "a tensor without device": (lambda task: task.dof_pos @ torch.tensor([1.0] * JOINTS), "device=self.device"),
+    "numpy's random numbers": (lambda task: task.dof_pos[:, 0] * __import__("numpy").random.rand(), "np.random"),
+    "a branch": (lambda task: task.rew_buf if task.reset_buf.any() else -task.rew_buf, "reads a value on the host"),
+    "a mask": (lambda task: task.rew_buf * task.dof_pos[task.reset_buf].sum(), "indexes by a mask"),
+    "ids": (write_by_list, "unknown size"),
+    "a counter": (count, r"self\.calls changed"),
+    "a tensor bound anew": (rebind, "self.last_contact_force"),
+    "contacts bound anew": (rebind_contacts, "self.last_contacts"),
+    "air time counted": (lambda task: task.feet_air_time.__iadd__(task.dt).sum(dim=1), "self.contacts counts it"),
+    "Isaac Gym": (lambda task: task.gym.refresh_rigid_body_state_tensor(task.sim), "there is no Isaac Gym"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_the_guard_names_the_reward_and_says_why(name):
+    function, words = REFUSED[name]
+
+    class Mine(LeggedRobot):
+        def _init_buffers(self):
+            super()._init_buffers()
+            self.last_contact_force = torch.zeros(self.num_envs, device=self.device)
+
+        def _reward_lin_vel_z(self):
+            return function(self)
+
+    with pytest.raises(TermError, match=rf"_reward_lin_vel_z: .*{words}"):
+        Mine(small_config())

@@ -1,0 +1,153 @@
+"""`evaluate --stress`: its files, where its robots are, and its errors."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from helpers import ENGINE, POLICY, TASK, call, kept_global_state, tiny_run
+
+from legged.evaluation import success
+from legged.evaluation.stress import measuring
+from legged.evaluation.stress.measuring import GROUND, STAIRS, Bench
+from legged.evaluation.stress.table import ALONE, Disturbance
+from legged.evaluation.success import FELL, REACHED, STUCK, Scores
+from legged.policies.restore import policy_of
+from legged.tools import evaluate
+
+pytestmark = pytest.mark.usefixtures("workplace")
+FLAGS = ["--physics", "mujoco", "--stress", "sim.threads=1"]
+LINES = 1 + len(ALONE) + 2
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """The folder of one short run on a small terrain."""
+    folder = tmp_path_factory.mktemp("trained")
+    small = ["terrain.num_rows=2", "terrain.max_init_terrain_level=1", "terrain.border_size=3"]
+    with pytest.MonkeyPatch.context() as patch, kept_global_state():
+        patch.chdir(folder)
+        return folder / tiny_run("--task", "anymal_c", *small, num_envs=20, iterations=1)
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Measure for a moment."""
+    monkeypatch.setattr(success, "TIME_S", 0.06)
+    monkeypatch.setattr(measuring, "HOLD_S", 0.1)
+    monkeypatch.setattr(measuring, "SETTLE_S", 0.04)
+
+
+def test_the_stress_test_writes_a_table_and_a_picture(trained, short, tmp_path, capsys):
+    arguments = ["--task", "anymal_c", "--load_run", str(trained), "--robots-per-point", "2", "--out", str(tmp_path / "o")]
+    assert call(evaluate.main, [*arguments, *FLAGS, "--riser", "0.12"]) == 0
+    assert {path.name for path in (tmp_path / "o").iterdir()} == {"stress_mujoco.json", "stress_mujoco.png"}
+    assert (tmp_path / "o" / "stress_mujoco.png").read_bytes().startswith(b"\x89PNG")
+    result = json.loads((tmp_path / "o" / "stress_mujoco.json").read_text())
+    assert (result["task"], result["physics"], result["contact_overflows"]) == ("anymal_c", "mujoco", 0)
+    rule = result["definition"]
+    assert (rule["riser_m"], rule["tread_m"], rule["robots_per_line"], rule["limit"]) == (0.12, 0.28, 2, 0.25)
+    assert [line["name"] for line in result["lines"]][:3] == ["nominal", "payload", "friction"]
+    assert len(result["lines"]) == LINES
+    for line in result["lines"]:
+        assert (line["stairs"]["robots"], line["stairs"]["stuck"], line["stairs"]["size"]) == (2, 2, 0.12)
+        assert (line["flat"]["robots"], line["flat"]["fell"]) == (2, 0)
+        assert line["flat"]["rmse_lin"] > 0.0
+    assert {name: entry["size"] for name, entry in result["ground"].items()} == GROUND
+    assert all(entry["robots"] == 2 for entry in result["ground"].values())
+    assert result["settings"].keys() == {"half the time step", "elliptic cones", "impratio 100"}
+    for lines in result["settings"].values():
+        assert [line["name"] for line in lines] == ["nominal", "together"]
+    followed = sum(line["flat"]["successes"] for line in result["lines"][1:])
+    assert result["score"]["value"] == pytest.approx(followed / 2 / (2 * (LINES - 1) + len(GROUND)))
+    out = capsys.readouterr().out
+    for words in (
+        "weak motors: motors at 85%",
+        "impratio 100: together",
+        "dense blocks, 0.25 m",
+        "stress score",
+        "0.12 x 0.28 m",
+    ):
+        assert words in out
+
+
+def test_a_policy_of_a_plane_is_stressed_on_the_flat_only(short, tmp_path):
+    arguments = ["--task", TASK, "--load_run", str(POLICY), "--robots-per-point", "1", "--out", str(tmp_path)]
+    assert call(evaluate.main, [*arguments, *FLAGS]) == 0
+    result = json.loads((tmp_path / "stress_mujoco.json").read_text())
+    assert len(result["lines"]) == LINES
+    assert not any("stairs" in line for line in result["lines"])
+    assert result["ground"] == {}
+    assert result["score"].keys() == {"value", "low", "high", "flat"}
+
+
+def test_half_of_a_lines_robots_go_up_and_the_others_down(trained, monkeypatch):
+    """Two lines of four robots: of the first, those that go up get out; of the second, those that go down fall."""
+    bench = Bench(policy_of(str(trained)), 4, None, 0.3, ENGINE, torch.device("cpu"), False)
+    assert (bench.riser, bench.limit, bench.on_plane) == (0.17, 0.25, False)
+    seen = {}
+
+    def decide(task, act, robots):
+        seen["z"] = task.terrain.origins[::2, 0, 2]
+        seen["rows"], seen["each"] = task.rows, robots
+        ground = task.terrain.height_map
+        line = ground.heights[:, ground.heights.shape[1] // 2]
+        seen["treads"] = np.diff(np.flatnonzero(np.diff(line) < -0.1)) * ground.cell
+        scores = Scores(task.base_pos)
+        scores.outcome.copy_(torch.tensor([REACHED, REACHED, STUCK, STUCK, STUCK, STUCK, FELL, FELL]))
+        return scores, 3
+
+    monkeypatch.setattr(measuring, "run_out", decide)
+    first, second = bench.on_stairs([Disturbance("a", payload=1.0), Disturbance("b", motors=0.5)])
+    assert STAIRS == ("stairs_up", "stairs_down")
+    assert seen["z"][0] < 0.0 < seen["z"][1]
+    assert seen["each"] == 4
+    assert [row.name for row in seen["rows"]] == ["a", "a", "b", "b", "a", "a", "b", "b"]
+    assert np.sort(seen["treads"])[:5] == pytest.approx(0.3)
+    assert (first["successes"], first["fell"], first["stuck"], first["robots"]) == (2, 0, 2, 4)
+    assert (second["successes"], second["fell"], second["stuck"]) == (0, 2, 2)
+    assert bench.lost == 3
+
+
+def test_robots_take_turns_at_commands_within_the_tasks_grid(trained, monkeypatch):
+    bench = Bench(policy_of(str(trained)), 9, None, 0.28, ENGINE, torch.device("cpu"), False)
+    seen = {}
+
+    def look(task, act, commands):
+        seen["commands"], seen["plane"] = commands, task.terrain is None
+        return torch.full((len(commands),), 0.01), torch.zeros(len(commands), dtype=torch.bool)
+
+    monkeypatch.setattr(bench, "_follow", look)
+    found = bench.on_flat([Disturbance("a"), Disturbance("b", motors=0.5)])
+    assert seen["plane"]
+    assert seen["commands"].shape == (18, 3)
+    assert torch.equal(seen["commands"][:9], seen["commands"][9:])
+    assert torch.equal(seen["commands"][0], seen["commands"][8])
+    assert seen["commands"][:8].tolist()[:2] == [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]
+    assert [one["rmse_lin"] for one in found] == pytest.approx([0.1, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--stress", "--types", "pit"], ["--types", "--stress has a table of its own"]),
+        (["--stress", "--vx=0"], ["--vx", "leave it out"]),
+        (["--stress", "--all-checkpoints"], ["--all-checkpoints", "leave it out"]),
+        (["--stress", "--physics", "all"], ["--stress: looks at one engine"]),
+        (["--stress", "--tread", "0"], ["--tread: must be between 0.05 and 2 m, got 0"]),
+        (["--stress", "--riser", "nan"], ["--riser: must be between 0 and 1 m, got nan"]),
+        (["--riser", "0.1"], ["--riser", "stairs of --stress; add it"]),
+        (["--stress", "--robots-per-point", "0"], ["--robots-per-point", "at least 1, got 0"]),
+    ],
+)
+def test_wrong_flags(arguments, words, capsys):
+    assert call(evaluate.main, ["--task", TASK, "--load_run", str(POLICY), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    for word in words:
+        assert word in error
+
+
+def test_a_task_without_commands_is_not_stressed(capsys):
+    assert call(evaluate.main, ["--task", "half_cheetah", "--stress"]) == 2
+    assert "--stress: 'half_cheetah' follows no commands" in capsys.readouterr().err

@@ -1,0 +1,199 @@
+"""Each disturbance is what it says: two robots side by side, of which one has it."""
+
+import math
+
+import pytest
+import torch
+from helpers import CALM, ENGINE, JOINTS, TASK, small_config, small_task, zero_actions
+
+from legged.config import override
+from legged.evaluation.stress.stressed_task import declared, make_stressed
+from legged.evaluation.stress.table import NOMINAL, PUSH_INTERVAL, Disturbance
+from legged.evaluation.tiles import on_terrain
+from legged.physics import FIELDS, RobotScene
+from legged.registry import task_config
+from legged.terrain import Terrain, TileSpec
+
+AT_REST = [("init_state.dof_pos_factor", [1.0, 1.0]), ("init_state.base_velocity", [0.0, 0.0])]
+
+
+def stressed(*rows, terrain=None, changes=()):
+    """A task of robots that begin alike, each with its disturbance."""
+    cfg = override(small_config(*AT_REST, *changes, num_envs=len(rows)), declared(rows))
+    return make_stressed(cfg, rows, torch.device("cpu"), False, terrain)
+
+
+def with_nominal(**disturbance):
+    return stressed(NOMINAL, Disturbance("one", **disturbance))
+
+
+def torques(task, actions):
+    """Torques of the first physics step under some actions, nothing being moved."""
+    task.actions.copy_(actions)
+    task.set_controls()
+    task.apply_control()
+    return task.torques.clone()
+
+
+def test_robots_with_which_nothing_is_wrong_move_as_in_the_task_itself():
+    plain, same = small_task(*AT_REST, num_envs=2), stressed(NOMINAL, NOMINAL)
+    actions = torch.sin(torch.arange(2.0 * JOINTS)).view(2, JOINTS)
+    for task in (plain, same):
+        task.hold_commands(torch.tensor([0.5, 0.0, 0.0]))  # those that are sampled come after other random numbers
+    for _ in range(5):
+        for task in (plain, same):
+            task.step(actions)
+    assert torch.equal(plain.physics.qpos, same.physics.qpos)
+    assert torch.equal(plain.get_observations()["actor"], same.get_observations()["actor"])
+
+
+def test_a_payload_weighs_on_the_feet():
+    """8 kg are 78.5 N more, once both robots stand."""
+    task = with_nominal(payload=8.0)
+    total = torch.zeros(2)
+    for step in range(150):
+        task.step(zero_actions(task))
+        total += task.contact_forces[:, :, 2].sum(dim=1) if step >= 100 else 0.0
+    weight = total / 50
+    assert float(weight[0]) == pytest.approx(task.robot.mass * 9.81, rel=0.01)
+    assert float(weight[1] - weight[0]) == pytest.approx(8.0 * 9.81, rel=0.05)
+
+
+def test_friction_is_that_of_all_shapes():
+    task = with_nominal(friction=0.4)
+    model = task.physics.model
+    shapes = FIELDS["friction"].rows(RobotScene(task.robot, None), model)
+    found = task.physics.batch.expand("geom_friction")[:, shapes, 0]
+    assert (found[0] == model.geom_friction[shapes, 0]).all()
+    assert found[1] == pytest.approx(0.4)
+    assert len(shapes) >= 4
+
+
+def test_weak_motors_give_their_share_of_every_torque_and_of_the_limit():
+    task = with_nominal(motors=0.85)
+    mild, hard = (torques(task, torch.full((2, JOINTS), value)) for value in (0.1, 50.0))
+    assert (mild[0] != 0.0).all()
+    assert torch.allclose(mild[1], 0.85 * mild[0])
+    limits = torch.tensor(task.robot.torque_limits, dtype=torch.float32)
+    assert torch.allclose(hard[0].abs(), limits)
+    assert torch.allclose(hard[1].abs(), 0.85 * limits)
+
+
+@pytest.mark.parametrize(("seconds", "steps"), [(0.02, 1), (0.04, 2)])
+def test_a_delay_lets_targets_arrive_a_control_step_later_or_two(seconds, steps):
+    """The robot moves as one without delay to which the same was said that much later; it knows what it said."""
+    task = with_nominal(delay=seconds)
+    assert task.dt == pytest.approx(0.02)
+    said = torch.sin(torch.arange(6.0 * JOINTS)).view(6, JOINTS)
+    later = torch.cat([torch.zeros(steps, JOINTS), said])[:6]
+    for now, then in zip(said, later, strict=True):
+        task.step(torch.stack([then, now]))
+        assert torch.equal(task.physics.qpos[0], task.physics.qpos[1])
+        assert torch.equal(task.observation_terms.values[1, task.observation_terms.columns["actions"]], now)
+    task.reset()
+    task.step(torch.stack([torch.zeros(JOINTS), said[0]]))  # nothing of the episode before arrives
+    assert torch.equal(task.physics.qpos[0], task.physics.qpos[1])
+
+
+def test_zero_offsets_shift_what_is_held_and_what_is_observed():
+    """The motor pulls by stiffness times offset away, until the joint is that much off."""
+    task = with_nominal(zero_offset=0.05)
+    offset = task._zero_offset[1]
+    assert (task._zero_offset[0] == 0.0).all()
+    assert 0.02 < float(offset.abs().max()) <= 0.05
+    assert len(set(offset.tolist())) == JOINTS  # each joint has its own
+    held = torques(task, zero_actions(task))
+    assert torch.allclose(held[1] - held[0], -task.control.stiffness * offset, atol=1e-4)
+    observed = task.observation_terms.values[:, task.observation_terms.columns["dof_pos"]]
+    assert torch.allclose(observed[1] - observed[0], offset, atol=1e-6)
+    assert torch.equal(task.physics.qpos[0], task.physics.qpos[1])
+
+
+def test_a_sensor_askew_turns_gravity_and_rates():
+    task = with_nominal(tilt=0.05)
+    seen, rates = task._obs_projected_gravity(), task._obs_base_ang_vel()
+    assert torch.equal(seen[0], task.projected_gravity[0])
+    assert float(torch.linalg.vector_norm(seen[1] - task.projected_gravity[1])) == pytest.approx(
+        2 * math.sin(0.025), rel=1e-3
+    )
+    task.base_ang_vel.copy_(torch.tensor([0.0, 0.0, 2.0]).expand(2, 3))
+    rates = task._obs_base_ang_vel()
+    assert rates[0].tolist() == [0.0, 0.0, 2.0]
+    assert float(rates[1, :2].norm()) == pytest.approx(2.0 * math.sin(0.05), rel=1e-3)
+    assert float(rates[1, 2]) == pytest.approx(2.0 * math.cos(0.05), rel=1e-4)
+
+
+def test_only_those_are_pushed_who_should_be(monkeypatch):
+    task = with_nominal(push=1.0)
+    pushed = torch.zeros(2)
+    push = task.physics.push
+
+    def note(mask, delta):
+        pushed.add_(mask.float())
+        assert float((task.physics.qvel[:, :2] + delta)[mask].abs().max() if mask.any() else 0.0) <= 1.0
+        push(mask, delta)
+
+    monkeypatch.setattr(task.physics, "push", note)
+    for _ in range(round(PUSH_INTERVAL / task.dt)):
+        task.step(zero_actions(task))
+    assert pushed.tolist() == [0.0, 1.0]  # once an interval
+
+
+# ---- the height map --------------------------------------------------------------------------------------------------
+
+
+def on_steps(*rows):
+    """Robots at the bottom of stairs, which their maps show once they are near."""
+    cfg = task_config("anymal_c", [("env.num_envs", len(rows)), *ENGINE, *CALM, *AT_REST], on_cpu=True)
+    cfg = override(cfg, [*on_terrain(cfg, 8.0, 0.0), *declared(rows)])
+    terrain = Terrain.of_tiles([[TileSpec("stairs_up", 0.2, tread=0.3)]], cfg.terrain, None)
+    return make_stressed(cfg, rows, torch.device("cpu"), False, terrain)
+
+
+def move(task, by):
+    """Carry all robots by so much (2,) along x and y."""
+    qpos = task.physics.qpos.clone()
+    qpos[:, :2] += by
+    task.physics.write(torch.ones(task.num_envs, dtype=torch.bool), qpos, task.physics.qvel.clone())
+    task.sense()
+
+
+def test_the_map_is_too_high_or_too_low_by_its_offset():
+    task = on_steps(NOMINAL, *[Disturbance("one", map_height=0.05)] * 8)
+    move(task, torch.tensor([1.3, 0.0]))
+    error = task.measured_heights[1:] - task.measured_heights[0]
+    assert torch.allclose(error.abs(), torch.full_like(error, 0.05), atol=1e-6)
+    assert (error.std(dim=1) < 1e-6).all()
+    assert {round(float(one), 3) for one in error[:, 0]} == {-0.05, 0.05}  # either way
+
+
+def test_a_map_shifted_by_10_cm_shows_what_a_robot_sees_that_far_away():
+    task = on_steps(NOMINAL, Disturbance("one", map_shift=0.1))
+    shift = task._map_shift[1, :2]
+    assert float(shift.norm()) == pytest.approx(0.1)
+    start = torch.tensor([1.3, 0.2])
+    move(task, start)
+    shifted = task.measured_heights[1].clone()
+    assert not torch.equal(task.measured_heights[0], shifted)
+    assert torch.equal(task.height_scan.heights[0], task.height_scan.heights[1])  # where both stand is the same
+    move(task, shift)
+    assert torch.equal(task.measured_heights[0], shifted)
+
+
+def test_holes_in_the_map_have_the_height_below_the_base():
+    task = on_steps(NOMINAL, *[Disturbance("one", map_holes=0.2)] * 8)
+    move(task, torch.tensor([1.3, 0.0]))
+    ground = float(task.height_scan.ground[0])
+    holes = task._unseen[1:]
+    assert not task._unseen[0].any()
+    assert float(holes.float().mean()) == pytest.approx(0.2, abs=0.04)  # of 1496 points
+    whole = task.measured_heights[0].expand(8, -1)
+    assert (task.measured_heights[1:][holes] == ground).all()
+    assert torch.equal(task.measured_heights[1:][~holes], whole[~holes])
+    assert len(task.measured_heights[0].unique()) > 2  # there was something to see
+
+
+def test_disturbances_are_the_same_every_time():
+    first, second = (with_nominal(zero_offset=0.05) for _ in range(2))
+    assert torch.equal(first._zero_offset, second._zero_offset)
+    assert first.cfg.task == TASK
