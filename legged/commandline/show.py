@@ -8,8 +8,11 @@ import mujoco
 import torch
 
 from legged.config import TaskConfig, override
+from legged.config.schema import DrawConfig, LeggedDomainRandConfig
 from legged.envs import BaseTask, LeggedRobot
 from legged.mdp.control import action_scales
+from legged.mdp.draws import standard_deviation
+from legged.physics import FIELDS
 from legged.registry import make_task
 from legged.robots.similarity import Size, growth, size_of
 
@@ -28,7 +31,7 @@ def summary(cfg: TaskConfig) -> list[str]:
     if torch.get_num_threads() > 1:
         torch.set_num_threads(1)
     task = make_task(override(cfg, ALONE), "cpu", graph=False)
-    lines = [line for part in (_robot, _observations, _rewards, _terminations, _actions, _joints) for line in part(task)]
+    lines = [line for part in PARTS for line in part(task)]
     return [f"# {line}".rstrip() for line in lines]
 
 
@@ -105,6 +108,62 @@ def _terminations(task: BaseTask) -> Iterator[str]:
     yield from _table("terminations", rows)
 
 
+def _randomisation(task: BaseTask) -> Iterator[str]:
+    """Yield what differs from robot to robot, by legged_gym's names too, and what disturbs them."""
+    rows = []
+    for name, draw in task.randomization.draws.items():
+        drawn_from, distribution, moments = _drawn(draw, FIELDS[name].unit)
+        each = f", for each of {task.field_rows[name]}" if task.randomization.is_each(name) else ""
+        rows.append((name, drawn_from, distribution, moments + each, FIELDS[name].meaning))
+    rand = task.cfg.domain_rand
+    for name, on, span in _of_legged_gym(rand) if isinstance(rand, LeggedDomainRandConfig) else ():
+        if on and name not in task.randomization.draws:
+            rows.insert(0, (name, *_drawn(DrawConfig(range=span), FIELDS[name].unit), FIELDS[name].meaning))
+    if rows:
+        header = ("property", "range", "distribution", "drawn", "what it is")
+        yield from _table("randomised; play and evaluation have none of it, unless asked", [header, *rows])
+    pushes = list(_pushes(rand)) if isinstance(rand, LeggedDomainRandConfig) else []
+    if pushes:
+        yield from _table("disturbances", [("name", "how much", "when"), *pushes])
+
+
+def _of_legged_gym(rand: LeggedDomainRandConfig) -> Iterator[tuple[str, bool, tuple[float, float]]]:
+    """Yield property, whether it is drawn, and its range."""
+    yield "added_base_mass", rand.randomize_base_mass, rand.added_mass_range
+    yield "friction", rand.randomize_friction, rand.friction_range
+
+
+def _span(span: tuple[float, float], unit: str) -> str:
+    """Return a range with its unit."""
+    return f"{_number(span[0])} to {_number(span[1])}{'' if unit == '1' else f' {unit}'}"
+
+
+def _drawn(draw: DrawConfig, unit: str) -> tuple[str, str, str]:
+    """Return range, distribution and moments of a property, as texts."""
+    sigma = f", sigma {_number(standard_deviation(draw))}" if draw.distribution == "gaussian" else ""
+    moment = {"start": "once", "reset": "each episode", "interval": f"every {_number(draw.interval_s)} s"}[draw.when]
+    return _span(draw.range, unit), draw.distribution + sigma, moment + _grown(draw.grow)
+
+
+def _grown(grow: tuple[float, float]) -> str:
+    return f", grows over iterations {grow[0]:g} to {grow[1]:g}" if grow[1] else ""
+
+
+def _pushes(rand: LeggedDomainRandConfig) -> Iterator[tuple[str, str, str]]:
+    """Yield name, size and moments of what disturbs robots."""
+    if rand.push_robots:
+        size = f"sets the base's horizontal velocity, x and y +-{_number(rand.max_push_vel_xy)} m/s"
+        yield "push_robots", size, f"every {_number(rand.push_interval_s)} s"
+    for name, kick in rand.kicks.items():
+        parts = [(axis, "m/s" if axis in "xyz" else "rad/s") for axis in ("x", "y", "z", "roll", "pitch", "yaw")]
+        size = ", ".join(f"{axis} {_span(getattr(kick, axis), unit)}" for axis, unit in parts if any(getattr(kick, axis)))
+        yield name, f"adds to the base's velocity: {size}", f"every {_span(kick.interval_s, 's')}{_grown(kick.grow)}"
+    for name, force in rand.forces.items():
+        size = ", ".join(f"{axis} {_span(getattr(force, axis), 'N')}" for axis in "xyz" if any(getattr(force, axis)))
+        moments = f"for {_span(force.duration_s, 's')}, every {_span(force.interval_s, 's')}{_grown(force.grow)}"
+        yield name, f"force on {force.body or 'the base'}: {size}", moments
+
+
 def _actions(task: BaseTask) -> Iterator[str]:
     model, clip = task.physics.model, task.cfg.control.clip_actions
     rows = [("action", "actuator", "what it does")]
@@ -131,7 +190,8 @@ def _effect(task: BaseTask, i: int) -> str:
         offset = f"{middle:g} + " if middle else ""
         return f"{joint}: {offset}{float(task.control_reach[i]) * force:g} a [{'N' if slides else 'N m'}]"
     control, law = task.control, task.cfg.control
-    p, d, limit = (float(values[i]) for values in (control.stiffness, control.damping, control.torque_limits))
+    laws = (control.stiffness, control.damping, control.torque_limits)  # of the one robot there is, if robots differ
+    p, d, limit = (float(values.view(-1)[i]) for values in laws)
     scales = dict(zip(control.acted, action_scales(task.robot, law).tolist(), strict=True))
     if i not in scales:
         target = f"position {float(task.default_dof_pos[i]):g} [rad], held"
@@ -157,3 +217,7 @@ def _joints(task: BaseTask) -> Iterator[str]:
         limits = f"{joint.range[0]:.4g} to {joint.range[1]:.4g}" if joint.limited else "-"
         rows.append((joint.name or f"({i})", kinds[int(joint.type[0])], qpos, qvel, limits))
     yield from _table(f"joints: {model.nq} positions, {model.nv} velocities", rows)
+
+
+PARTS = (_robot, _observations, _rewards, _terminations, _randomisation, _actions, _joints)
+"""What is said of a task, in this order."""

@@ -6,6 +6,7 @@ ranges of what is randomised, by the unit of each.
 """
 
 import dataclasses
+import typing
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -33,10 +34,27 @@ def carry(data: Mapping[str, Any], schema: type, factor: Factor, unit_of: UnitOf
             carried[key] = times(value, factor(meta["unit"]))
         elif "unit_of" in meta:
             prefix, power = meta["unit_of"]
-            carried[key] = {term: times(number, factor(unit_of(prefix + term)) ** power) for term, number in value.items()}
+            carried[key] = {
+                term: _times_entry(number, factor(unit_of(prefix + term)) ** power) for term, number in value.items()
+            }
+        elif _of_sections(hints[key]):
+            kind = typing.get_args(hints[key])[1]
+            carried[key] = {name: carry(section, kind, factor, unit_of) for name, section in value.items()}
         else:
             carried[key] = value
     return carried
+
+
+def _of_sections(hint: Any) -> bool:
+    """Return whether a field is a map of sections."""
+    return typing.get_origin(hint) is dict and dataclasses.is_dataclass(typing.get_args(hint)[1])
+
+
+def _times_entry(value: Any, by: float) -> Any:
+    """Return an entry of a map, times a factor; of one that says more than a range what has the entry's unit."""
+    if not isinstance(value, Mapping):
+        return times(value, by)
+    return {key: times(item, by) if key in ("range", "std") else item for key, item in value.items()}
 
 
 def times(value: Any, by: float) -> Any:

@@ -119,7 +119,13 @@ def _check(kind: Any, value: Any, path: str, origins: Origins, source: str) -> A
         if value is None and type(None) in args:
             return None
         kinds = [a for a in args if a is not type(None)]
+        sections = [a for a in kinds if dataclasses.is_dataclass(a)]
+        if sections and isinstance(value, Mapping):
+            return build(sections[0], value, path, origins, source)  # type: ignore[arg-type]
+        if sections and not isinstance(value, list | tuple):
+            raise fail("[low, high], or a mapping that has it as range")
         maps = [a for a in kinds if typing.get_origin(a) is dict and isinstance(value, Mapping)]
+        maps += [a for a in kinds if sections and a not in sections]
         if len(kinds) > 1 and not maps and not isinstance(value, int | float):
             raise fail("a number, or a mapping from names to numbers")
         return _check((maps or kinds)[0], value, path, origins, source)
@@ -193,6 +199,8 @@ def _check_free(value: Any, fail: Any, depth: int = 0) -> Any:
 
 def _check_bounds(value: Any, bounds: Mapping[str, Any], path: str, origin: str) -> None:
     """Hold a checked value, and all items in it, against the bounds of its field."""
+    if dataclasses.is_dataclass(value):
+        return  # its own fields have theirs
     if isinstance(value, tuple):
         _check_length(value, bounds, f"{origin}{path}")
         for i, item in enumerate(value):

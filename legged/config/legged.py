@@ -3,8 +3,8 @@
 Defaults are legged_gym's (v1.0.2, arXiv 2109.11978) where it has the field.
 """
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, Self
 
 from legged.config.actuator import ActuatorConfig
 from legged.config.bounds import (
@@ -28,6 +28,7 @@ from legged.config.mdp import (
     RewardsConfig,
     TerminationsConfig,
 )
+from legged.config.randomization import ForceConfig, KickConfig
 from legged.config.sensors import HeightMapConfig
 from legged.config.task import TaskConfig
 
@@ -194,6 +195,18 @@ class LeggedDomainRandConfig(DomainRandConfig):
     """Time between two pushes of a robot [s]."""
     max_push_vel_xy: float = field(default=1.0, metadata=carried("m/s", between(0, 100)))
     """Range of a push's velocity, per world axis [m/s]."""
+    kicks: dict[str, KickConfig] = field(default_factory=dict)
+    """Any name -> sudden changes of the base's velocity, which they add to where push_robots sets it."""
+    forces: dict[str, ForceConfig] = field(default_factory=dict)
+    """Any name -> a force on a body of the robot for a time."""
+
+    observed_forces: dict[str, ForceConfig] = field(default_factory=dict)
+    """The same for forces that are observed (`_obs_push_force`) and do not act: play and evaluation put here what acted in
+    training."""
+
+    def nominal(self) -> Self:
+        observed = {**self.observed_forces, **self.forces}
+        return replace(super().nominal(), kicks={}, forces={}, observed_forces=observed)
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,11 @@
 """What every task has of a Markov decision process: control, observations, rewards, terminations, randomisation."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 from legged.config.actuator import LONGEST_DELAY, Steps
 from legged.config.bounds import LARGEST, NAMES, TERMS, UNIT, between, carried_by_entry, carried_by_term, positive
-
-Range = tuple[float, float]
+from legged.config.randomization import DrawConfig, Range
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,20 @@ class TerminationsConfig:
 class DomainRandConfig:
     """What differs from robot to robot."""
 
-    ranges: dict[str, Range] = field(
+    ranges: dict[str, Range | DrawConfig] = field(
         default_factory=dict, metadata=carried_by_entry("domain_rand.ranges", between(-LARGEST, LARGEST))
     )
-    """Property of the model -> range from which each robot's is drawn, evenly. Properties: legged/physics/fields.py."""
+    """Property -> range from which each robot's is drawn evenly at the start; or a mapping, which has the range as `range`,
+    and beside it how and when. Properties: legged/physics/fields.py."""
+    observed_ranges: dict[str, Range | DrawConfig] = field(
+        default_factory=dict, metadata=carried_by_entry("domain_rand.ranges", between(-LARGEST, LARGEST))
+    )
+    """Property -> the same for properties that are observed (`_obs_rand_<property>`) and not drawn, or not by that range:
+    play and evaluation put here what was drawn in training."""
+
+    def nominal(self) -> Self:
+        """Return the same with no property drawn, for showing and measuring; observations keep their scales."""
+        return replace(self, ranges={}, observed_ranges={**self.observed_ranges, **self.ranges})
 
 
 @dataclass(frozen=True)

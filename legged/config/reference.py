@@ -97,6 +97,8 @@ def kind_of(hint: Any) -> str:
         return f"a list: {kind_of(args[0])} each"
     if origin is tuple:
         return f"[low, high]: {len(args)} numbers" if len(args) == 2 else f"a list of {len(args)} numbers"
+    if dataclasses.is_dataclass(hint):
+        return "a mapping"
     if origin is dict:
         return f"a map: {kind_of(args[1])} for each name"
     return {bool: "true or false", int: "a whole number", float: "a number", str: "text", Any: "anything"}[hint]

@@ -30,6 +30,7 @@ from legged.config.mdp import (
     RewardsConfig,
     TerminationsConfig,
 )
+from legged.config.randomization import DrawConfig, ForceConfig, KickConfig
 from legged.config.sensors import HeightMapConfig
 from legged.config.task import TaskConfig
 from legged.config.world import EnvConfig, NewtonSolver, SimConfig
@@ -43,10 +44,13 @@ __all__ = [
     "CommandsConfig",
     "ControlConfig",
     "DomainRandConfig",
+    "DrawConfig",
     "EnvConfig",
     "EvaluationConfig",
+    "ForceConfig",
     "HeightMapConfig",
     "InitStateConfig",
+    "KickConfig",
     "LeggedConfig",
     "LeggedControlConfig",
     "LeggedDomainRandConfig",

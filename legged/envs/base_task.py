@@ -17,6 +17,7 @@ from legged.config.schema import TaskConfig
 from legged.envs.actions import as_actions, ordinary_tensors
 from legged.envs.checks import check_task
 from legged.envs.observing import ObservingTask
+from legged.envs.privileged_terms import PrivilegedTerms
 from legged.envs.saved import SavedTask
 from legged.envs.step_watchers import StepWatcher
 from legged.errors import ConfigError
@@ -26,16 +27,14 @@ from legged.mdp.faults import LARGEST_STATE, Faults
 from legged.mdp.metrics import Metrics
 from legged.mdp.mirror_images import MirrorImages
 from legged.mdp.observations import ObservationGroup, ObservationTerms
-from legged.mdp.randomization import Randomization
 from legged.mdp.rewards import Rewards
 from legged.mdp.terminations import Terminations
 from legged.mdp.uniform_numbers import UniformNumbers
-from legged.physics import Scene, check_ranges, make_physics
+from legged.physics import Scene
 from legged.process.ranks import Ranks
-from legged.process.startup import stage_ended
 
 
-class BaseTask(ObservingTask, SavedTask, VecEnv):
+class BaseTask(ObservingTask, PrivilegedTerms, SavedTask, VecEnv):
     """N environments on one device. A subclass says what the world is (`make_scene`), how an episode begins (`draw_reset`)
     and which terms there are; the rest are hooks.
     """
@@ -68,16 +67,13 @@ class BaseTask(ObservingTask, SavedTask, VecEnv):
         """Steps of a full episode."""
         torch.manual_seed(cfg.env.seed + Ranks.now().rank)  # other robots on each GPU, on the same ground
         self.randomization = self.make_randomization()
-        scene, fields = self.make_scene(), self.randomization.fields
-        check_ranges(cfg.domain_rand.ranges, scene, cfg.sim, cfg.origins.where)
-        self.physics = make_physics(scene, cfg.sim, n, device, fields, self.QUANTITIES, cfg.origins.where)
-        stage_ended("physics built")
-        self.randomization.apply(self.physics)
+        self._build_physics(self.make_scene())
         self.num_actions = self.physics.ctrl.shape[1]
         self._allocate()
         self._init_buffers()
         if not self._has_buffers:
             raise ConfigError(f"{type(self).__name__}._init_buffers must call super()._init_buffers()")
+        self.randomization.prepare(self.physics, self.numbers, self.dt, cfg.train.runner.num_steps_per_env)
         self._collect_terms()
         self.numbers.allocate()
         # An engine that no graph can hold runs eagerly on a GPU; on the CPU nothing is captured, only checked.
@@ -100,10 +96,6 @@ class BaseTask(ObservingTask, SavedTask, VecEnv):
     @abstractmethod
     def make_scene(self) -> Scene:
         """Say what a world consists of."""
-
-    def make_randomization(self) -> Randomization:
-        """Draw what differs from environment to environment."""
-        return Randomization(self.cfg.domain_rand.ranges, self.num_envs, self.device)
 
     def _allocate(self) -> None:
         """Allocate what every task has; D actions."""
@@ -248,6 +240,7 @@ class BaseTask(ObservingTask, SavedTask, VecEnv):
     def draw(self) -> None:
         """Draw random numbers for every environment, used by those that are reset, and noise. Runs beside the step."""
         self.numbers.draw()
+        self.randomization.draw()
         self.draw_reset()
 
     @abstractmethod
@@ -285,6 +278,8 @@ class BaseTask(ObservingTask, SavedTask, VecEnv):
 
     def reset_idx(self, mask: Tensor) -> None:
         """Begin new episodes in the environments of `mask` (N,), in the states that were drawn."""
+        if self.randomization.redrawn:
+            self.redraw(mask)
         self.physics.write(mask, self.reset_qpos, self.reset_qvel)
         self.rewards.reset(mask)
         masked_set_(self.actions, mask, 0.0)

@@ -7,9 +7,9 @@ from typing import get_args
 from legged.config.networks import check_networks
 from legged.config.schema import LeggedConfig, TaskConfig
 from legged.envs.overrides import check_overrides, check_terms
+from legged.envs.randomization_checks import check_observed, check_randomization
 from legged.errors import ConfigError, suggest
 from legged.mdp.mirror_images import MirrorKind
-from legged.physics.fields import FIELDS
 from legged.physics.quantities import LAST_STEP, STAGES
 
 RESERVED = {"falls", "episode_length", "non_finite_worlds", "contact_overflows"}
@@ -48,10 +48,8 @@ def check_task(cls: type, cfg: TaskConfig) -> None:
         if name not in (*STAGES, *LAST_STEP):
             known = suggest(name, (*STAGES, *LAST_STEP), "quantities")
             raise ConfigError(f"{cls.__name__}.QUANTITIES: there is no quantity '{name}'{known}")
-    for field in cfg.domain_rand.ranges:
-        if field not in FIELDS:
-            where = cfg.origins.where(f"domain_rand.ranges.{field}")
-            raise ConfigError(f"{where}: there is no property '{field}' to randomise{suggest(field, FIELDS, 'properties')}")
+    check_randomization(cfg)
+    check_observed(cfg)
     check_sizes(cfg)
     check_lengths(cfg)
     check_evaluation(cls, cfg)

@@ -4,6 +4,7 @@ from typing import Any
 
 from legged.config.schema import LeggedConfig
 from legged.envs.checks import check_mirror_kinds
+from legged.envs.randomization_checks import check_disturbances
 from legged.errors import ConfigError
 from legged.mdp.actuator import check_actuator
 from legged.mdp.control import acted_joints, action_scales, control_gains
@@ -29,6 +30,7 @@ def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     check_actuator(robot, cfg.control, cfg.sim.dt, cfg.origins.where)
     check_terrain(cfg.terrain, cfg.origins)
     check_base_mass(cfg, robot)
+    check_disturbances(cfg, robot)
     check_points(cfg)
     check_grid(cfg)
 

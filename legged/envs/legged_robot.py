@@ -17,6 +17,7 @@ from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts, contact_force
 from legged.mdp.control import Control, acted_joints
+from legged.mdp.disturbances import Disturbances
 from legged.mdp.height_map_errors import HeightMapErrors, is_exact
 from legged.mdp.height_scan import HeightScan
 from legged.mdp.mirror_images import MirrorImages
@@ -103,7 +104,10 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.last_dof_vel = torch.zeros_like(self.dof_vel)
 
         self.pushes = Pushes(cfg.domain_rand, n, self.dt, device, kernels, self.numbers)
+        steps = cfg.train.runner.num_steps_per_env
+        self.disturbances = Disturbances(cfg.domain_rand, self.physics, self.dt, steps, self.numbers)
         self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt, kernels, self.numbers)
+        self._vary_control()
         self.torques, self.default_dof_pos = self.control.torques, self.control.default_dof_pos
         self.command_sampler = Commands(cfg.commands, n, self.dt, device, kernels, self.numbers)
         self.commands, self.is_moving = self.command_sampler.commands, self.command_sampler.is_moving
@@ -116,7 +120,11 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.penalised_indices = torch.tensor(robot.penalised_indices, dtype=torch.long, device=device)
         self.termination_indices = torch.tensor(robot.termination_indices, dtype=torch.long, device=device)
         self._terminating_shapes = evenly_spaced(robot.termination_indices) or self.termination_indices
-        self.dof_vel_limits = torch.tensor(robot.dof_vel_limits, dtype=torch.float32, device=device)
+        self._nominal_vel_limits = torch.tensor(robot.dof_vel_limits, dtype=torch.float32, device=device)
+        self.dof_vel_limits = self._nominal_vel_limits
+        if "velocity_limit" in self.randomization.draws:
+            self.dof_vel_limits = torch.zeros_like(self.dof_vel)
+        self._vary_velocity_limits()
         self.dof_pos_limits = self._soft_limits(robot)
         self.posture_joints = torch.tensor(~robot.swings, dtype=torch.float32, device=device)
         self.height_scan = HeightScan(cfg.terrain, self.terrain, n, device, kernels)
@@ -202,6 +210,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
     def draw(self) -> None:
         super().draw()
         self.command_sampler.draw()
+        self.disturbances.draw()
 
     def draw_reset(self) -> None:
         """Draw joints near the default pose and a base at its spawn height, moving. Of a robot with passive joints, a pose is
@@ -242,9 +251,35 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.control.reset(mask)
         self.contacts.reset(mask)
 
+    def redraw(self, mask: Tensor) -> None:
+        super().redraw(mask)
+        self._vary_control(again=True)
+        self._vary_velocity_limits(again=True)
+
+    def _vary_control(self, again: bool = False) -> None:
+        """Give the control law what was drawn for it, or of that what has been drawn `again`."""
+        names = self.randomization.redrawn if again else self.randomization.draws
+        drawn = self.randomization.fields
+        self.control.vary({name: drawn[name] for name in names})
+
+    def _vary_velocity_limits(self, again: bool = False) -> None:
+        """Bring `dof_vel_limits` up to date with what was drawn, or drawn `again`."""
+        if "velocity_limit" in (self.randomization.redrawn if again else self.randomization.draws):
+            factor = self.randomization.fields["velocity_limit"].view(self.num_envs, -1)
+            torch.mul(self._nominal_vel_limits, factor, out=self.dof_vel_limits)
+
+    def apply_randomization(self) -> None:
+        super().apply_randomization()
+        self._vary_control()
+        self._vary_velocity_limits()
+
+    def pushed_by_forces(self) -> bool:
+        return bool(self.cfg.domain_rand.forces)
+
     def disturb(self, mask: Tensor) -> None:
         """Push the robots that are due."""
         self.pushes.push(self.physics, mask)
+        self.disturbances.act(self.physics, mask)
 
     def ask(self) -> None:
         """Renew commands that are due, and steer towards headings."""
@@ -280,12 +315,16 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         return {**super().log_rollout(), **ranges, **levels}
 
     def progress(self) -> dict[str, Any]:
-        progress = {"command_curriculum": self.command_curriculum.progress()}
+        progress = super().progress() | {"command_curriculum": self.command_curriculum.progress()}
+        if self.disturbances.STATE:
+            progress["disturbances"] = self.disturbances.progress()
         if self.terrain_curriculum is not None:
             progress["terrain_curriculum"] = self.terrain_curriculum.progress()
         return progress
 
     def load_progress(self, progress: dict[str, Any]) -> None:
+        super().load_progress(progress)
+        self.disturbances.load_progress(progress.get("disturbances", {}))
         self.command_curriculum.load_progress(progress["command_curriculum"])
         self.command_curriculum.write_ranges(self.command_sampler.ranges)
         if self.terrain_curriculum is not None and "terrain_curriculum" in progress:
@@ -301,6 +340,8 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
             "height_scan": self.height_scan,
             "pushes": self.pushes,
         }
+        if self.disturbances.STATE:
+            parts["disturbances"] = self.disturbances
         if self.terrain_curriculum is not None:
             parts["terrain_curriculum"] = self.terrain_curriculum
         if self.control.actuator is not None:

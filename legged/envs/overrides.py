@@ -18,7 +18,7 @@ _START = (
 _BUILD = "the robot is its MJCF (robot: in the task's YAML), the ground is terrain: or what make_terrain() returns"
 _DRAWING = "nothing is drawn while training; play.py makes pictures (legged/rendering)"
 _TORQUES = "control.control_type, control.stiffness and control.damping choose the law; others go into legged/mdp/control.py"
-_RANDOM = "domain_rand.ranges names what is drawn for each robot (docs/tasks.md, Randomisation)"
+_RANDOM = "domain_rand.ranges names what is drawn for each robot (docs/randomisation.md)"
 
 HOOKS = {
     # legged_gym and its forks
@@ -54,12 +54,12 @@ HOOKS = {
     "compute_self_observations": _OBSERVE,
     "compute_termination_observations": "a task whose episodes end keeps what they ended with where somebody asks for it"
     " (legged/envs/step_watchers.py)",
-    "_disturbance_robots": "domain_rand.push_robots pushes; others override disturb(mask), with self.physics.push",
+    "_disturbance_robots": "domain_rand.forces and kicks push; others override disturb(mask), with self.physics.push",
     "_step_contact_targets": "override advance(), call super().advance() and write your own tensors in place",
     "_call_train_eval": _STEP,
     "_randomize_dof_props": _RANDOM,
     "_randomize_rigid_body_props": _RANDOM,
-    "_randomize_gravity": "gravity is the same for all robots: that of the MJCF",
+    "_randomize_gravity": "domain_rand.ranges.gravity_x, _y and _z are added to it (docs/randomisation.md)",
     "refresh_actor_rigid_shape_props": _RANDOM,
     "_draw_debug_vis": _DRAWING,
     "render": _DRAWING,

@@ -5,20 +5,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from legged.envs.randomized import RandomizedTask
 from legged.mdp.faults import Faults
 from legged.mdp.observations import ObservationGroup, ObservationTerms
-from legged.mdp.randomization import Randomization
 from legged.mdp.rewards import Rewards
-from legged.physics import Physics
 from legged.state import load_state, state_of, take
 
 
-class SavedTask:
+class SavedTask(RandomizedTask):
     """The half of a task that takes and gives its state."""
 
-    num_envs: int
-    physics: Physics
-    randomization: Randomization
     rewards: Rewards
     faults: Faults
     observation_groups: dict[str, ObservationGroup]
@@ -26,10 +22,12 @@ class SavedTask:
 
     def progress(self) -> dict[str, Any]:
         """Return how far the curricula have got: what every checkpoint holds, whatever the number of environments."""
-        return {}
+        grown = self.randomization.progress()
+        return {"randomization": grown} if grown else {}
 
     def load_progress(self, progress: dict[str, Any]) -> None:
         """Go on from there; to be followed by `reset`."""
+        self.randomization.load_progress(progress.get("randomization", {}))
 
     def parts(self) -> dict[str, Any]:
         """Return what has a state of its own (`STATE`), by name. A subclass adds its own."""
@@ -61,7 +59,7 @@ class SavedTask:
                 load_state(part, state.get(name, {}))
             take(self._own_tensors(), state.get("task", {}), type(self).__name__)
         finally:
-            self.randomization.apply(self.physics)  # what is drawn and what the engine has must not part
+            self.apply_randomization()  # what is drawn and what the engine has must not part
         self.physics.load_state(state.get("physics", {}))
 
     def _own_tensors(self) -> dict[str, Tensor]:

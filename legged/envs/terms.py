@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from legged.config.schema import LeggedConfig
+from legged.envs.privileged_terms import MIRROR_KINDS
 from legged.math import squared_difference
 from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
@@ -39,6 +40,7 @@ class Terms:
         "heights": "heights",
         "passive_pos": "passive",
         "passive_vel": "passive",
+        **MIRROR_KINDS,
     }
     """Observation term -> how its numbers change when left and right are exchanged; a subclass adds its own terms'."""
     cfg: LeggedConfig
@@ -121,7 +123,7 @@ class Terms:
 
     def _obs_dof_pos(self) -> Tensor:
         """Joint angle minus default_joint_angles, by joint [rad]."""
-        return self.dof_pos - self.default_dof_pos
+        return self.dof_pos - self.control.zero_dof_pos
 
     def _obs_dof_vel(self) -> Tensor:
         """Joint velocity, by joint [rad/s]."""

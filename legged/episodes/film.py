@@ -42,7 +42,7 @@ class Projector:
             ConfigError: that task is not there any more.
         """
         self.episodes = episodes
-        nominal = replace(cfg, domain_rand=replace(cfg.domain_rand, ranges={}))
+        nominal = replace(cfg, domain_rand=cfg.domain_rand.nominal())
         alone = [("env.num_envs", 1), ("sim.physics", "mujoco"), ("sim.solver", "mujoco"), ("sim.threads", 1)]
         terrain = ground_of(cfg, episodes.about.get("ground"))
         self.task: BaseTask = make_task(override(nominal, alone), "cpu", False, terrain)

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from legged.config import LeggedConfig, TaskConfig, override
+from legged.config.loader import to_dict
 from legged.envs import BaseTask, LeggedRobot
 from legged.episodes.quantities import joints_of
 from legged.episodes.recorder import StepRecord, record_episodes
@@ -138,7 +139,8 @@ def _changes(policy: TrainedPolicy, wish: Wish, playground: Playground | None) -
     cfg = policy.cfg
     own: list[tuple[str, Any]] = [("env.num_envs", wish.robots)]
     if wish.as_trained:
-        own.append(("domain_rand.ranges", cfg.domain_rand.ranges))
+        drawn = to_dict(cfg.domain_rand)
+        own += [(f"domain_rand.{name}", drawn[name]) for name in ("ranges", "kicks", "forces") if drawn.get(name)]
     elif isinstance(cfg, LeggedConfig):
         # Episodes end as in the training, unlike those in which something else is measured.
         own += [change for change in undisturbed(wish.robots, 0.0) if change[0] != "env.episode_length_s"]

@@ -1,6 +1,6 @@
 """Action -> joint torque."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -59,13 +59,18 @@ class Control:
         """Of all actions, or (A,)."""
         stiffness, damping = control_gains(robot, cfg)
         self.stiffness, self.damping = tensor(stiffness), tensor(damping)
-        """(D,) gains [N m/rad], [N m s/rad]."""
+        """(D,) gains [N m/rad], [N m s/rad]; (N, D) once something `vary` was given differs from robot to robot, as are the
+        `torque_limits` [N m] then."""
         self.default_dof_pos = tensor(robot.default_dof_pos)
         self.torque_limits = tensor(robot.torque_limits)
         self._lowest_torques = -self.torque_limits
         self.torques = torques
         """(N, D) torques of the last physics step [N m]."""
         self._zero = torch.zeros((), device=torques.device)
+        self.zero_dof_pos = self.default_dof_pos
+        """(D,) or (N, D) true joint angles at which encoders show the default ones [rad]."""
+        self._nominal = {"p_gain": self.stiffness, "d_gain": self.damping, "torque_limit": self.torque_limits}
+        self._varied = False
         self._target = torch.zeros_like(self.torques)  # joint angles, velocities or torques
         self._columns = None if len(self.acted) == robot.num_dof else torch.tensor(self.acted, device=torques.device)
         self._last_dof_vel = torch.zeros_like(self.torques)
@@ -77,11 +82,39 @@ class Control:
             self.actuator = Actuator(robot, cfg, middle, (len(torques), robot.num_dof), sim_dt, drawn, kernels)
             self._target = self.actuator.newest
 
+    def vary(self, drawn: Mapping[str, Tensor]) -> None:
+        """Take what differs from robot to robot: factors on gains and limits, and the angle that encoders show too much [rad]
+        (fields of `physics.FIELDS`), (N,) or (N, D) each. The first call allocates, and says which they are; later ones
+        write in place.
+        """
+        each = {
+            name: values.view(len(values), -1) for name, values in drawn.items() if name in (*self._nominal, "joint_offset")
+        }
+        if not each:
+            return
+        if not self._varied:
+            self._varied = True
+            self.stiffness, self.damping, self.torque_limits, self._lowest_torques = (
+                torch.zeros_like(self.torques) + nominal for nominal in (*self._nominal.values(), self._lowest_torques)
+            )
+            self.zero_dof_pos = torch.zeros_like(self.torques) + self.default_dof_pos
+            if self.actuator is not None and self.control_type == "P":
+                self.actuator.middle = self.zero_dof_pos
+        written = {"p_gain": self.stiffness, "d_gain": self.damping, "torque_limit": self.torque_limits}
+        for name, values in each.items():
+            if name in written:
+                torch.mul(self._nominal[name], values, out=written[name])
+        if "torque_limit" in each:
+            torch.neg(self.torque_limits, out=self._lowest_torques)
+        if "joint_offset" in each:
+            # The law sees q + offset where the joint is at q: as if it was asked for an angle that is less by the offset.
+            torch.sub(self.default_dof_pos, each["joint_offset"], out=self.zero_dof_pos)
+
     def set_actions(self, actions: Tensor) -> None:
         """Take the actions (N, A) that the following calls of `compute` realise."""
         if self.actuator is not None:
             self.actuator.advance()
-        middle = self.default_dof_pos if self.control_type == "P" else self._zero
+        middle = self.zero_dof_pos if self.control_type == "P" else self._zero
         if self._columns is None and isinstance(self.action_scale, float):
             torch.add(middle, actions, alpha=self.action_scale, out=self._target)
             return
@@ -99,7 +132,7 @@ class Control:
             self.actuator.drive(dof_pos, dof_vel, law, of_law, self.torque_limits, self.torques)
             return self.torques
         if self.control_type == "P" and self._kernels is not None:
-            gains = (self.stiffness, self.damping, self.torque_limits)
+            gains = (each.expand_as(self.torques) for each in (self.stiffness, self.damping, self.torque_limits))
             shape = tuple(self.torques.shape)
             self._kernels.hold_joints(shape, self._target, dof_pos, dof_vel, *gains, self.torques)
             return self.torques

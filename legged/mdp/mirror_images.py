@@ -10,10 +10,25 @@ from legged.errors import ConfigError
 from legged.mdp.observations import ObservationGroup
 from legged.robots.mirror import Mirror
 
-MirrorKind = Literal["same", "vector", "rotation", "command", "joints", "actions", "passive", "feet", "heights"]
+MirrorKind = Literal[
+    "same",
+    "vector",
+    "rotation",
+    "command",
+    "joints",
+    "actions",
+    "passive",
+    "feet",
+    "heights",
+    "scalar",
+    "sideways",
+    "vectors",
+    "of_joints",
+]
 """How the numbers of an observation change. `vector`: (x, y, z) of a velocity or direction; `rotation`: of an angular
 velocity; `command`: (vx, vy, yaw rate); `joints`, `actions`, `passive` (joints), `feet`: a number for each; `heights`: the
-height scan; `same`: numbers that know no side."""
+height scan; `same`: numbers that know no side; `scalar`: one such; `sideways`: one number that is positive to the left;
+`vectors`: several of them, (x, y, z) each; `of_joints`: a property without sides of each joint, or one for all."""
 SIGNS = {"vector": (1.0, -1.0, 1.0), "rotation": (-1.0, 1.0, -1.0), "command": (1.0, -1.0, -1.0)}
 """Kind of term -> signs of its three numbers. A rotation is a pseudo-vector: it keeps its y."""
 
@@ -85,8 +100,16 @@ class MirrorImages:
             if image is None:
                 raise ConfigError(f"{self._owner}: control.held: joints are held on one side only, so actions have no image")
             return torch.tensor(image[0]), torch.tensor(image[1])
-        if kind == "same":
+        if kind == "sideways":
+            return torch.zeros(1, dtype=torch.long), torch.tensor([-1.0])
+        if kind == "vectors":
+            return torch.arange(width - width % 3), torch.tensor(SIGNS["vector"]).repeat(width // 3)
+        if kind == "same" or (kind == "of_joints" and width == 1):
             columns = torch.arange(width)
+        elif kind == "scalar":
+            columns = torch.zeros(1, dtype=torch.long)
+        elif kind == "of_joints":
+            columns = torch.tensor(self._mirror.joints)
         elif kind == "feet":
             columns = torch.tensor(self._mirror.feet)
         elif kind == "heights":

@@ -1,48 +1,184 @@
-"""What differs from world to world, and pushes."""
+"""What differs from world to world, drawn at the start, at resets or at intervals; and legged_gym's pushes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
+from itertools import accumulate
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from legged.config.randomization import DrawConfig, Range, draw_of
 from legged.config.schema import LeggedDomainRandConfig
 from legged.math import masked_set_, uniform
+from legged.mdp.draws import Draws
 from legged.mdp.uniform_numbers import UniformNumbers
-from legged.physics import Physics
+from legged.physics import FIELDS, MODEL_FIELDS, Physics
 
 if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
 
+VARIANTS = 1024
+"""Models among which worlds choose where masses, inertias or armatures are drawn again: constants are derived from them when
+they are drawn, which is not done within a step."""
+
 
 class Randomization:
-    """Draws properties of the model once, a number per world and field."""
+    """Draws properties of the model and of the control law, a number per world and field, or one for each row of it."""
 
     STATE: tuple[str, ...] = ("drawn",)
 
-    def __init__(self, ranges: Mapping[str, Sequence[float]], num_envs: int, device: torch.device) -> None:
-        """Draw uniformly from `ranges`: field of `physics.FIELDS` -> lowest and highest value."""
-        self._names = tuple(ranges)
-        self.drawn = torch.zeros(num_envs, len(self._names), device=device)
-        """(N, F) what was drawn for each field, in the order of the ranges."""
-        for column, (low, high) in enumerate(ranges.values()):
-            self.drawn[:, column] = uniform(low, high, (num_envs,), device)
+    def __init__(self, ranges: Mapping[str, Range | DrawConfig], num_envs: int, device: torch.device) -> None:
+        """Draw from `ranges`: field of `physics.FIELDS` -> lowest and highest value, or how it is drawn."""
+        self.draws = {name: draw_of(entry) for name, entry in ranges.items()}
+        """Field -> how it is drawn."""
+        self.columns = {name: slice(k, k + 1) for k, name in enumerate(ranges)}
+        """Field -> where in `drawn` its numbers are."""
+        self.drawn = torch.zeros(num_envs, len(ranges), device=device)
+        """(N, V) what each world has of each field, in the order of the ranges."""
+        for column, (name, entry) in enumerate(ranges.items()):
+            if isinstance(entry, DrawConfig):
+                self.drawn[:, column] = self._draws([name]).at_once(num_envs)[:, 0]
+            else:
+                self.drawn[:, column] = uniform(*entry, (num_envs,), device)
+        again = [name for name, draw in self.draws.items() if draw.when != "start"]
+        self.redrawn = tuple(again)
+        """Fields that are drawn again within steps."""
+        self.chosen_fields = tuple(name for name in again if FIELDS[name].derived)
+        """Those of them from which constants are derived, of which worlds choose a variant of all together."""
+        if again:
+            self.steps = torch.zeros((), device=device)
+            """Control steps since training began, by which ranges grow."""
+            self.STATE = ("drawn", "steps")
+
+    def _draws(self, names: Collection[str], widths: Mapping[str, int] | None = None, pace: int = 1) -> Draws:
+        """Return what draws the columns of some fields."""
+        wide = [name for name in names for _ in range((widths or {}).get(name, 1))]
+        neutral = [FIELDS[name].neutral for name in wide]
+        return Draws([self.draws[name] for name in wide], neutral, self.drawn.device, pace)
+
+    def widen(self, rows: Mapping[str, int]) -> None:
+        """Draw numbers for each row of the fields that ask for it, now that it is known how many `rows` they have."""
+        widths = {name: rows[name] if self.is_each(name) else 1 for name in self.draws}
+        if any(self.is_each(name) for name in widths) or self.chosen_fields:
+            parts, start = [], 0
+            for name, width in widths.items():
+                parts.append(self._of(name) if width == 1 else self._draws([name], widths).at_once(len(self.drawn)))
+                self.columns[name] = slice(start, start + width)
+                start += width
+            self.drawn = torch.cat(parts, dim=1)
+        if self.chosen_fields:
+            self.variants = self._draws(self.chosen_fields, widths).at_once(VARIANTS)
+            """(K, W) numbers of the fields of which worlds choose, by variant."""
+            self.chosen = torch.randint(VARIANTS, (len(self.drawn),), device=self.drawn.device)
+            """(N,) the variant of each world."""
+            found, start = self.variants[self.chosen], 0
+            for name in self.chosen_fields:
+                self._of(name).copy_(found[:, start : start + widths[name]])
+                start += widths[name]
+            self._given: Tensor | None = None
+            self.STATE = (*self.STATE, "variants", "chosen")
+
+    def is_each(self, name: str) -> bool:
+        """Whether a field has a number for each row."""
+        each = self.draws[name].each
+        return FIELDS[name].each if each is None else each
+
+    def _of(self, name: str) -> Tensor:
+        """Return the columns of a field, (N, 1) or (N, rows), a view."""
+        return self.drawn[:, self.columns[name]]
 
     @property
     def fields(self) -> dict[str, Tensor]:
-        """What is randomised of the physics, and what was drawn for it, (N,) each."""
-        return {name: self.drawn[:, column] for column, name in enumerate(self._names)}
+        """What is randomised, and what was drawn for it: (N,), or (N, rows)."""
+        return {name: self._of(name) if self.is_each(name) else self._of(name)[:, 0] for name in self.draws}
 
     def apply(self, physics: Physics) -> None:
         """Give the physics what was drawn, at start-up and when a state was put back."""
         for field, values in self.fields.items():
-            physics.randomize(field, values)
+            if field in MODEL_FIELDS and field not in self.chosen_fields:
+                physics.randomize(field, values)
+        if self.chosen_fields:
+            if self._given is None or not torch.equal(self._given, self.variants):  # to derive constants takes a while
+                widths = [self.columns[name].stop - self.columns[name].start for name in self.chosen_fields]
+                physics.set_variants(dict(zip(self.chosen_fields, self.variants.split(widths, dim=1), strict=True)))
+                self._given = self.variants.clone()
+            physics.choose_variants(torch.ones_like(self.chosen, dtype=torch.bool), self.chosen)
+
+    def prepare(self, physics: Physics, numbers: UniformNumbers, dt: float, steps_per_iteration: int) -> None:
+        """Prepare for draws within steps of `dt` [s], from `numbers`; nothing is done where there are none."""
+        if not self.redrawn:
+            return
+        device, worlds = self.drawn.device, len(self.drawn)
+        own = [name for name in self.redrawn if name not in self.chosen_fields]
+        widths = {name: columns.stop - columns.start for name, columns in self.columns.items()}
+        self._own = self._draws(own, widths, steps_per_iteration) if own else None
+        self._even = self._own.ask(numbers) if self._own is not None else None
+        self._choice = numbers.between(0.0, float(VARIANTS), 1) if self.chosen_fields else None
+        self._new_chosen = torch.zeros(worlds, dtype=torch.long, device=device)
+        # What is new lies in the order of `own`, then of the chosen fields; the first moment is never, the second a reset.
+        intervals = sorted({self.draws[name].interval_s for name in self.redrawn if self.draws[name].when == "interval"})
+        order, place, moment = [*own, *self.chosen_fields], [], []
+        starts = dict(zip(order, accumulate((widths[name] for name in order), initial=0), strict=False))
+        for name, draw in self.draws.items():
+            kind = 0 if draw.when == "start" else 1 if draw.when == "reset" else 2 + intervals.index(draw.interval_s)
+            for k in range(widths[name]):
+                place.append(starts[name] + k if kind else 0)
+                moment.append(kind)
+        self._place, self._moment = (torch.tensor(values, device=device) for values in (place, moment))
+        self._fresh = torch.zeros_like(self.drawn)
+        self._due = torch.zeros(worlds, 2 + len(intervals), dtype=torch.bool, device=device)
+        self._interval = torch.tensor([float(max(1, round(each / dt))) for each in intervals], device=device)
+        self.steps_left = torch.floor(torch.rand(worlds, len(intervals), device=device) * self._interval) + 1.0
+        """(N, I) control steps until the next draw of each interval; the first ones are spread over a whole interval."""
+        self.STATE = (*self.STATE, "steps_left")
+        if self.chosen_fields:
+            draw = self.draws[self.chosen_fields[0]]
+            self._chosen_at = 1 if draw.when == "reset" else 2 + intervals.index(draw.interval_s)
+        known = {n: c for n, c in self.columns.items() if n in MODEL_FIELDS and n not in self.chosen_fields}
+        self._of_model = [name for name in own if name in MODEL_FIELDS]
+        if self._of_model:
+            physics.prepare_redraws(self.drawn, known, self._of_model)
+
+    def draw(self) -> None:
+        """Draw for every world what those that are due will take. Runs beside the step."""
+        if not self.redrawn:
+            return
+        parts = []
+        if self._own is not None and self._even is not None:
+            parts.append(self._own.values(self._even.values, self.steps))
+        if self._choice is not None:
+            self._new_chosen.copy_(self._choice.values[:, 0]).clamp_(max=VARIANTS - 1)
+            parts.append(self.variants.index_select(0, self._new_chosen))
+        torch.index_select(torch.cat(parts, dim=1), 1, self._place, out=self._fresh)
+
+    def redraw(self, physics: Physics, reset: Tensor) -> None:
+        """Let the worlds that are due take what was drawn, within a step, where episodes begin in those of `reset` (N,)."""
+        self._due[:, 1].copy_(reset)
+        if len(self._interval):
+            self.steps_left.sub_(1.0)
+            due = torch.le(self.steps_left, 0.0, out=self._due[:, 2:])
+            torch.where(due, self._interval, self.steps_left, out=self.steps_left)
+        torch.where(self._due.index_select(1, self._moment), self._fresh, self.drawn, out=self.drawn)
+        if self.chosen_fields:
+            chosen = self._due[:, self._chosen_at].contiguous()
+            masked_set_(self.chosen, chosen, self._new_chosen)
+            physics.choose_variants(chosen, self.chosen)
+        if self._of_model:
+            physics.redraw(self._due.any(dim=1) if len(self._interval) else reset)
+        self.steps.add_(1.0)
+
+    def progress(self) -> dict[str, Tensor]:
+        """Return how far ranges have grown, whatever the number of worlds; empty if none does."""
+        return {"steps": self.steps.clone()} if any(draw.grow[1] > 0.0 for draw in self.draws.values()) else {}
+
+    def load_progress(self, progress: Mapping[str, Tensor]) -> None:
+        """Go on from there."""
+        if "steps" in progress and self.redrawn:
+            self.steps.copy_(progress["steps"])
 
 
 class RobotRandomization(Randomization):
     """Randomization with the friction and the base mass of a legged robot."""
-
-    STATE = ("friction", "added_mass", "drawn")
 
     def __init__(
         self,
@@ -61,6 +197,7 @@ class RobotRandomization(Randomization):
         self.added_mass = uniform(*cfg.added_mass_range, (num_envs,), device)
         """(N,) mass added to each base [kg], if randomised."""
         super().__init__(cfg.ranges, num_envs, device)
+        self.STATE = ("friction", "added_mass", *self.STATE)
 
     @property
     def fields(self) -> dict[str, Tensor]:

@@ -9,8 +9,9 @@ import torch
 from legged.config.schema import SimConfig
 from legged.errors import ConfigError, suggest
 from legged.physics.base import Physics
-from legged.physics.fields import FIELDS, check_ranges
+from legged.physics.fields import FIELDS, MODEL_FIELDS, NEWTONS_FIELDS, row_counts
 from legged.physics.quantities import check_quantities
+from legged.physics.randomized_model import check_ranges
 from legged.physics.robot_state import RobotState
 from legged.physics.scene import ModelScene, RobotScene, Scene
 from legged.process.startup import importing
@@ -18,6 +19,7 @@ from legged.process.startup import importing
 __all__ = [
     "FIELDS",
     "MANY_WORLDS",
+    "MODEL_FIELDS",
     "ModelScene",
     "Physics",
     "RobotScene",
@@ -29,6 +31,7 @@ __all__ = [
     "kernel_cache",
     "make_physics",
     "resolve_physics",
+    "row_counts",
 ]
 
 
@@ -61,10 +64,6 @@ def engine_name(sim: SimConfig, device: torch.device, where: str = "sim.physics"
     return f"newton_{sim.solver}" if engine == "newton" else engine
 
 
-NEWTONS_FIELDS = ("friction", "added_base_mass")
-"""What can be randomised in newton: its model has names and arrays of its own."""
-
-
 def check_engine(
     scene: Scene,
     sim: SimConfig,
@@ -81,8 +80,8 @@ def check_engine(
         ValueError: there is no such field or quantity.
     """
     for field in randomized:
-        if field not in FIELDS:
-            raise ValueError(f"there is no field '{field}' to randomise{suggest(field, FIELDS, 'fields')}")
+        if field not in MODEL_FIELDS:
+            raise ValueError(f"there is no field '{field}' of the model to randomise{suggest(field, MODEL_FIELDS, 'fields')}")
     check_quantities(quantities)
     if resolve_physics(sim.physics, device, where("sim.physics")) != "newton":
         return
@@ -97,9 +96,10 @@ def check_engine(
             f" (passive_joints), and their loops; {others} do"
         )
     for field in randomized:
-        if field not in NEWTONS_FIELDS:
+        if sim.solver != "mujoco" and field not in NEWTONS_FIELDS:
             can = suggest(field, NEWTONS_FIELDS, "newton can")
-            raise ConfigError(f"{where(f'domain_rand.ranges.{field}')}: newton cannot randomise it{can}; {others} can")
+            path = where(f"domain_rand.ranges.{field}")
+            raise ConfigError(f"{path}: newton's {sim.solver} cannot randomise it{can}; sim.solver=mujoco and {others} can")
     if quantities:
         names = ", ".join(quantities)
         raise ConfigError(f"{where('sim.physics')}: newton does not compute {names} for the task; {others} does")
@@ -113,6 +113,7 @@ def make_physics(
     randomized: Collection[str] = (),
     quantities: Collection[str] = (),
     where: Callable[[str], str] = str,
+    pushed: bool = False,
 ) -> Physics:
     """Return `num_envs` worlds of `scene` in the engine that `sim.physics` names. Engines are imported here, so that none
     is needed but the one used.
@@ -125,6 +126,7 @@ def make_physics(
         randomized: fields (`fields.FIELDS`) that `Physics.randomize` will be given.
         quantities: arrays of MuJoCo's data that `Physics.quantity` will be asked for.
         where: makes of a dotted path of the configuration how an error about it begins.
+        pushed: whether forces act on bodies from outside (`Physics.forces`).
 
     Raises:
         ConfigError, ValueError: as `check_engine`.
@@ -137,20 +139,20 @@ def make_physics(
             from legged.physics.newton.physics import NewtonPhysics
 
         assert isinstance(scene, RobotScene)
-        return NewtonPhysics(scene, sim, num_envs, device, randomized)
+        return NewtonPhysics(scene, sim, num_envs, device, randomized, pushed)
     if engine == "mujoco_warp":
         with importing():
             from legged.physics.warp.mujoco_warp import MujocoWarpPhysics, NoBlocks
 
         if sim.physics == "mujoco_warp" or device.type == "cuda":
-            return MujocoWarpPhysics(scene, sim, num_envs, device, randomized, quantities)
+            return MujocoWarpPhysics(scene, sim, num_envs, device, randomized, quantities, pushed=pushed)
         try:
-            return MujocoWarpPhysics(scene, sim, num_envs, device, randomized, quantities, only_blocks=True)
+            return MujocoWarpPhysics(scene, sim, num_envs, device, randomized, quantities, only_blocks=True, pushed=pushed)
         except (NoBlocks, ConfigError) as reason:
             why_c_engine = str(reason)
     from legged.physics.mujoco import MujocoPhysics
 
-    physics = MujocoPhysics(scene, sim, num_envs, device, randomized, quantities)
+    physics = MujocoPhysics(scene, sim, num_envs, device, randomized, quantities, pushed)
     physics.why_c_engine = why_c_engine
     return physics
 

@@ -1,7 +1,7 @@
 """The interface that every physics engine is put behind."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -38,6 +38,9 @@ class Physics(ABC):
     ctrl: Tensor
     """(N, nu) float32 controls, in the unit that the model's actuators take ([N m] for motors of gear 1); the task writes
     them in place before a step, and they are held until written again."""
+    forces: Tensor | None = None
+    """(N, B, 6) forces and torques on the bodies of `model` [N], [N m], world frame, at their centres of mass, which the task
+    writes in place; held until written again, or until a world is. None where the physics was not told of any."""
     robot_state: RobotState | None = None
     """What is seen of a robot with a floating base and feet; None for any other model."""
     why_library: str = ""
@@ -86,6 +89,29 @@ class Physics(ABC):
 
         Raises:
             ValueError: the field is none of those that the physics was made for, or the values have another shape.
+        """
+
+    @abstractmethod
+    def prepare_redraws(self, drawn: Tensor, columns: Mapping[str, slice], fields: Collection[str]) -> None:
+        """Prepare for `redraw` of `fields`, none of them one that others are derived from: `columns` says where in `drawn`
+        (N, V), always the same tensor, the values of each field are, one for a world or one for each row. Those of all
+        fields are there that `fields` share an array with.
+        """
+
+    @abstractmethod
+    def redraw(self, mask: Tensor) -> None:
+        """Let the worlds of `mask` (N,) have what is in `drawn` now: within a step, which may be captured."""
+
+    @abstractmethod
+    def set_variants(self, values: Mapping[str, Tensor]) -> None:
+        """Derive the constants of K models, each with the `values` (K, 1) or (K, rows) of fields from which others are
+        derived: C MuJoCo does it for all engines, within some 0.05 ms each.
+        """
+
+    @abstractmethod
+    def choose_variants(self, mask: Tensor, chosen: Tensor) -> None:
+        """Let the worlds of `mask` (N,) have the masses, inertias and constants of the models `chosen` (N,) int64: within a
+        step, which may be captured.
         """
 
     def quantity(self, name: str) -> Tensor:

@@ -1,16 +1,12 @@
 """What can be randomised: one table, field -> arrays of MuJoCo's model, for all engines that bear MuJoCo's names."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Literal
 
 import mujoco
 import numpy as np
-import torch
-from torch import Tensor
 
-from legged.config.schema import SimConfig
-from legged.errors import ConfigError, suggest
 from legged.physics.scene import Scene
 
 DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_invweight0", "actuator_acc0")
@@ -45,6 +41,16 @@ def per_gear(model: mujoco.MjModel) -> np.ndarray:
     return np.divide(1.0, gear, out=np.zeros_like(gear), where=gear != 0.0)
 
 
+def limited_actuators(model: mujoco.MjModel) -> np.ndarray:
+    """Return the actuators whose force has a limit."""
+    return np.flatnonzero(model.actuator_forcelimited)
+
+
+def damping_ratio(model: mujoco.MjModel) -> np.ndarray:
+    """Return the damping ratio of each shape's contacts, (ngeom,)."""
+    return model.geom_solref[:, 1]
+
+
 def mirrored_per_gear(model: mujoco.MjModel) -> np.ndarray:
     """Return the same for the bias on position, of those actuators that have one, (nu,)."""
     return -per_gear(model) * (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
@@ -62,6 +68,8 @@ class Change:
     """Factor on the values for each row of the array; 1 without."""
     least: float | None = 0.0
     """What the array must not fall below, if anything."""
+    bounce: Literal["", "ratio", "inverse"] = ""
+    """Whether the values are restitution, of which the array takes the damping ratio or its inverse."""
 
 
 @dataclass(frozen=True)
@@ -77,9 +85,20 @@ class Field:
     changes: tuple[Change, ...]
     derived: bool = False
     """Whether constants of the model must be derived again."""
+    neutral: float = 0.0
+    """The value that changes nothing, or is usual."""
+    lowest: float | None = None
+    """The lowest value that has a meaning, if there is one."""
+    highest: float | None = None
+    """And the highest."""
+    law: bool = False
+    """Whether the control law of legged robots takes it, for each joint."""
+    each: bool = False
+    """Whether each row has a number of its own, unless the configuration says otherwise."""
 
 
 LEAST_MASS = 1e-6
+GRAVITY = "gravity"
 FIELDS = {
     "friction": Field(
         "sliding friction of the robot's shapes, or of all shapes of a scene without robot",
@@ -87,6 +106,20 @@ FIELDS = {
         "shapes",
         lambda scene, model: scene.shapes(model),
         (Change("geom_friction", "set", column=0),),
+        neutral=1.0,
+    ),
+    "restitution": Field(
+        "share of its speed that a shape keeps when it bounces, made by less damping of its contacts at the same stiffness;"
+        " below 0.135 the damping stays the model's",
+        "1",
+        "shapes",
+        lambda scene, model: scene.shapes(model),
+        (
+            Change("geom_solref", "scale", column=0, weight=damping_ratio, least=None, bounce="inverse"),
+            Change("geom_solref", "set", column=1, least=None, bounce="ratio"),
+        ),
+        lowest=0.0,
+        highest=1.0,
     ),
     "link_mass": Field(
         "factor on mass and inertia of each moving body",
@@ -95,6 +128,7 @@ FIELDS = {
         lambda _, model: moving_bodies(model),
         (Change("body_mass", "scale", least=LEAST_MASS), Change("body_inertia", "scale")),
         derived=True,
+        neutral=1.0,
     ),
     "added_base_mass": Field(
         "mass added to the floating body",
@@ -104,6 +138,27 @@ FIELDS = {
         (Change("body_mass", "add", least=LEAST_MASS),),
         derived=True,
     ),
+    **{
+        f"base_com_{axis}": Field(
+            f"shift of the floating body's centre of mass along its {axis} axis",
+            "m",
+            "floating base",
+            lambda _, model: floating_bodies(model)[:1],
+            (Change("body_ipos", "add", column=column, least=None),),
+            derived=True,
+        )
+        for column, axis in enumerate("xyz")
+    },
+    **{
+        f"gravity_{axis}": Field(
+            f"acceleration added to gravity along the world's {axis} axis; `projected_gravity` stays the vertical",
+            "m/s^2",
+            "gravity",
+            lambda _, model: np.zeros(1, dtype=int),
+            (Change(GRAVITY, "add", column=column, least=None),),
+        )
+        for column, axis in enumerate("xyz")
+    },
     "joint_armature": Field(
         "rotor inertia added to each hinge and slide",
         "kg m^2 or kg",
@@ -126,6 +181,24 @@ FIELDS = {
         lambda _, model: joint_dofs(model),
         (Change("dof_frictionloss", "add"),),
     ),
+    "joint_offset": Field(
+        "what each joint's encoder shows beside the true angle, to the control law and in `dof_pos`",
+        "rad",
+        "joints with a motor",
+        lambda _, model: np.arange(model.nu),
+        (),
+        law=True,
+        each=True,
+    ),
+    "motor_strength": Field(
+        "factor on the force or torque that each actuator makes of what is asked of it",
+        "1",
+        "actuators",
+        lambda _, model: linear_actuators(model),
+        (Change("actuator_gainprm", "scale", column=0, least=None), Change("actuator_biasprm", "scale", least=None)),
+        neutral=1.0,
+        lowest=0.0,
+    ),
     "actuator_gain": Field(
         "force or torque added per unit of control; a position servo's pull towards its target grows alike",
         "N m or N",
@@ -136,90 +209,53 @@ FIELDS = {
             Change("actuator_biasprm", "add", column=1, weight=mirrored_per_gear, least=None),
         ),
     ),
+    **{
+        name: Field(
+            f"factor on {of}",
+            "1",
+            "joints with a motor",
+            lambda _, model: np.arange(model.nu),
+            (),
+            neutral=1.0,
+            lowest=0.0,
+            law=True,
+        )
+        for name, of in (
+            ("p_gain", "the stiffness of each joint's control law"),
+            ("d_gain", "the damping of each joint's control law"),
+            ("velocity_limit", "each joint's velocity limit, of which rewards and torque-speed curves know"),
+        )
+    },
+    "torque_limit": Field(
+        "factor on the largest force or torque of each actuator",
+        "1",
+        "actuators with a limit",
+        lambda _, model: limited_actuators(model),
+        (Change("actuator_forcerange", "scale", least=None),),
+        neutral=1.0,
+        lowest=0.0,
+        law=True,
+    ),
 }
 """Field -> what it changes. Those that scale an array come before those that add to it."""
+MODEL_FIELDS = {name: field for name, field in FIELDS.items() if field.changes}
+"""Those that change the model, and that `Physics.randomize` takes; the others are the control law's alone."""
+
+NEWTONS_FIELDS = ("friction", "added_base_mass")
+"""What can be randomised in all of newton's solvers: its model has names and arrays of its own. Its MuJoCo solver takes
+all."""
+
+
+def row_counts(scene: Scene, model: mujoco.MjModel) -> dict[str, int]:
+    """Return of each field how many rows of its arrays change, or how many joints have it."""
+    return {name: len(field.rows(scene, model)) for name, field in FIELDS.items()}
+
+
+def own_array(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """Return an array of the model by the name that it has in changes; gravity as a row, (1, 3)."""
+    return model.opt.gravity[None] if name == GRAVITY else getattr(model, name)
 
 
 def changed_arrays(fields: Collection[str]) -> tuple[str, ...]:
     """Return the names of the arrays that `fields` change, each once; those that are derived are not among them."""
     return tuple(dict.fromkeys(change.array for name in fields for change in FIELDS[name].changes))
-
-
-class RandomizedModel:
-    """The arrays of a model, per world, from the values given for its fields."""
-
-    def __init__(
-        self, scene: Scene, model: mujoco.MjModel, fields: Collection[str], dtype: torch.dtype, device: torch.device
-    ) -> None:
-        """Let those `fields` be given; arrays are made of `dtype` on `device`, as the engine keeps them."""
-        self._model, self._dtype, self._device = model, dtype, device
-        self._rows = {name: field.rows(scene, model) for name, field in FIELDS.items() if name in fields}
-        self._values: dict[str, Tensor] = {}
-
-    def give(self, field: str, values: Tensor) -> dict[str, Tensor]:
-        """Take `values` (N,) of a field, one per world, or (N, rows); return the arrays that it changes, (N, ...).
-
-        They are made from the model's own numbers and all values given so far: to give a field again replaces its values.
-
-        Raises:
-            ValueError: the field is none of those that may be given, or the values have another shape.
-        """
-        if field not in self._rows:
-            told = suggest(field, self._rows, "those are")
-            raise ValueError(f"randomize: '{field}' is none of the fields that make_physics was told of{told}")
-        rows = len(self._rows[field])
-        if values.dim() != 1 and values.shape[1:] != (rows,):
-            raise ValueError(f"randomize: values of {field} must be (N,) or (N, {rows}), not {tuple(values.shape)}")
-        self._values[field] = values.to(self._device, self._dtype).reshape(len(values), -1).expand(-1, rows)
-        return {change.array: self._array(change.array, len(values)) for change in FIELDS[field].changes}
-
-    def _array(self, array: str, worlds: int) -> Tensor:
-        """Return one array, (N, ...)."""
-        own = torch.from_numpy(getattr(self._model, array)).to(self._device, self._dtype)
-        result = own.expand(worlds, *own.shape).clone()
-        for name, field in FIELDS.items():
-            for change in field.changes:
-                if change.array == array and name in self._values:
-                    self._apply(change, torch.from_numpy(self._rows[name]).to(self._device), self._values[name], result)
-        return result
-
-    def _apply(self, change: Change, rows: Tensor, values: Tensor, array: Tensor) -> None:
-        """Change `rows` of one array (N, ...) by `values` (N, R)."""
-        if change.weight is not None:
-            weight = torch.from_numpy(change.weight(self._model)).to(self._device, self._dtype)
-            values = values * weight[rows]
-        part = array if change.column is None else array[:, :, change.column]  # a view
-        values = values.reshape(*values.shape, *[1] * (part.dim() - 2))
-        old = part[:, rows]
-        part[:, rows] = {"set": values.expand_as(old), "add": old + values, "scale": old * values}[change.how]
-
-
-def check_ranges(
-    ranges: Mapping[str, Sequence[float]], scene: Scene, sim: SimConfig, where: Callable[[str], str] = str
-) -> None:
-    """Check `ranges`, field -> lowest and highest value, against a scene; `where` says who set a dotted path.
-
-    Raises:
-        ConfigError: there is no such field, the scene has nothing that it changes, or the lowest values leave no mass.
-    """
-    model = scene.model(sim, "none") if ranges else None  # no field is the ground's, which takes long to build
-    for name in ranges:
-        if name not in FIELDS:
-            path = where("domain_rand.ranges")
-            raise ConfigError(f"{path}: there is no field '{name}'{suggest(name, FIELDS, 'fields')}")
-    given = RandomizedModel(scene, model, ranges, torch.float64, torch.device("cpu")) if model else None
-    for name, field in FIELDS.items():
-        if given is None or name not in ranges:
-            continue
-        path, low = where(f"domain_rand.ranges.{name}"), float(ranges[name][0])
-        if not len(field.rows(scene, model)):
-            raise ConfigError(f"{path}: {scene.name} has no {field.what}")
-        changed = given.give(name, torch.tensor([low], dtype=torch.float64))
-        for change in field.changes:
-            rows = changed[change.array][:, field.rows(scene, model)]
-            numbers = rows if change.column is None else rows[:, :, change.column]
-            if change.least is not None and numbers.min() < change.least:
-                raise ConfigError(
-                    f"{path}: its lowest value, {low:g} ({field.meaning}), makes a {change.array} of {numbers.min():g};"
-                    f" at least {change.least:g} must be left"
-                )

@@ -13,8 +13,9 @@ from legged.math import quat_rotate_inverse
 from legged.physics.base import Physics
 from legged.physics.engine_warnings import keep_out_of_files
 from legged.physics.feet import FeetKinematics
-from legged.physics.fields import FIELDS, RandomizedModel
+from legged.physics.fields import FIELDS, GRAVITY, changed_arrays
 from legged.physics.quantities import LAST_STEP, STAGES, stage_of
+from legged.physics.randomized_model import RandomizedModel, keep_centres_apart
 from legged.physics.robot_state import DrivenJoints, RobotState, robot_state
 from legged.physics.scene import Scene
 from legged.physics.scene.robot_scene import contact_sensor_columns
@@ -38,6 +39,7 @@ class MujocoPhysics(Physics):
         device: torch.device,
         randomized: Collection[str] = (),
         quantities: Collection[str] = (),
+        pushed: bool = False,
     ) -> None:
         """Build the scene and place all worlds at the model's initial state; `device` must be the CPU."""
         if device.type != "cpu":
@@ -49,11 +51,18 @@ class MujocoPhysics(Physics):
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         # A world holds one robot; looking for parts that do not touch each other costs 6 % of a step.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
+        keep_centres_apart(self.model, randomized)
         self._randomized = RandomizedModel(scene, self.model, randomized, torch.float64, device)
+        self._redrawn: tuple[str, ...] = ()
+        """Names of the arrays that a redraw changes."""
+        self._variants: dict[str, np.ndarray] = {}
         self.qpos, self.qvel = torch.zeros(num_envs, self.model.nq), torch.zeros(num_envs, self.model.nv)
         self.ctrl = torch.zeros(num_envs, self.model.nu)
         self.overflowed = torch.zeros(num_envs, dtype=torch.bool)
         self.batch = Batch(self.model, num_envs, sim.threads or max(1, available_cores() // Ranks.now().local_count))
+        self.forces = torch.zeros(num_envs, self.model.nbody, 6) if pushed else None
+        if pushed:
+            self._forces = torch.from_numpy(self.batch.bind("xfrc_applied")).view(num_envs, -1, 6)
         names = ("qpos", "qvel", "ctrl", "act", "qacc_warmstart")
         self._qpos, self._qvel, self._ctrl, self._act, self._warmstart = (
             torch.from_numpy(self.batch.bind(name)) for name in names
@@ -71,6 +80,8 @@ class MujocoPhysics(Physics):
 
     def step(self) -> None:
         self._ctrl.copy_(self.ctrl)
+        if self.forces is not None:
+            self._forces.copy_(self.forces)
         self.batch.step()
         if self._robot is not None:
             self._robot.stepped = True
@@ -98,6 +109,8 @@ class MujocoPhysics(Physics):
         self._qvel.copy_(torch.where(rows, qvel.to(torch.float64), self._qvel))
         for cleared in (self.ctrl, self._act, self._warmstart):
             cleared.masked_fill_(rows, 0.0)
+        if self.forces is not None:
+            self.forces.masked_fill_(mask.view(-1, 1, 1), 0.0)
         if self.robot_state is not None:
             self.robot_state.contact_forces.masked_fill_(mask.view(-1, 1, 1), 0.0)
         self._reader.note_write(mask)
@@ -108,10 +121,36 @@ class MujocoPhysics(Physics):
 
     def randomize(self, field: str, values: Tensor) -> None:
         for name, array in self._randomized.give(field, values).items():
-            self.batch.expand(name)[:] = array.numpy()
+            self._array(name)[:] = array.numpy()
         if FIELDS[field].derived:
             self.batch.set_const()
         self._reader.stale.fill_(True)
+
+    def _array(self, name: str) -> np.ndarray:
+        """Return an array of the model, (N, ...), that worlds have for themselves."""
+        return self.batch.expand(f"opt.{name}")[:, None] if name == GRAVITY else self.batch.expand(name)
+
+    def prepare_redraws(self, drawn: Tensor, columns: Mapping[str, slice], fields: Collection[str]) -> None:
+        self._drawn, self._columns, self._redrawn = drawn, dict(columns), changed_arrays(fields)
+
+    def redraw(self, mask: Tensor) -> None:
+        worlds = mask.nonzero().flatten()
+        if len(worlds):
+            values = {name: self._drawn[worlds, columns] for name, columns in self._columns.items()}
+            for name, array in self._randomized.arrays(self._redrawn, values).items():
+                self._array(name)[worlds.numpy()] = array.numpy()
+            self._reader.stale |= mask
+
+    def set_variants(self, values: Mapping[str, Tensor]) -> None:
+        self._variants = {name: array.numpy() for name, array in self._randomized.variants(values).items()}
+
+    def choose_variants(self, mask: Tensor, chosen: Tensor) -> None:
+        worlds = mask.nonzero().flatten()
+        if len(worlds):
+            models = chosen[worlds].numpy()
+            for name, array in self._variants.items():
+                self._array(name)[worlds.numpy()] = array[models]
+            self._reader.stale |= mask
 
     def state_tensors(self) -> dict[str, Tensor]:
         state = {"qpos": self._qpos, "qvel": self._qvel, "act": self._act, "warmstart": self._warmstart}

@@ -107,7 +107,7 @@ def nominal(cfg: TaskConfig, changes: Iterable[tuple[str, Any]]) -> TaskConfig:
         ConfigError: the changes do not fit it.
     """
     few_robots_do = ("train.algorithm.num_mini_batches", 1)  # nothing is trained
-    cfg = override(replace(cfg, domain_rand=replace(cfg.domain_rand, ranges={})), [*changes, few_robots_do])
+    cfg = override(replace(cfg, domain_rand=cfg.domain_rand.nominal()), [*changes, few_robots_do])
     task_class(cfg.task).check(cfg)
     return cfg
 

@@ -138,3 +138,30 @@ def test_what_is_no_plain_motor_is_told_as_a_control(tmp_path, monkeypatch):
     lines = summary(task_config("half_cheetah", on_cpu=True))
     effects = [row[2] for row in rows(lines, "actions: 3 numbers")]
     assert effects == ["control 0 + 1 a", "control 0 + 1 a", "y: 2 + 4 a [N]"]
+
+
+def test_what_is_randomised_is_listed_with_range_distribution_and_moments():
+    ranges = {
+        "joint_offset": {"range": [-0.02, 0.02], "when": "reset", "grow": [0, 300]},
+        "motor_strength": {"range": [0.8, 1.2], "distribution": "gaussian", "when": "interval", "interval_s": 4.0},
+    }
+    pull = {"body": "LF_THIGH", "x": [-30.0, 30.0], "interval_s": [4.0, 8.0], "duration_s": [0.1, 0.5]}
+    lines = summary(
+        small_config(
+            ("domain_rand.ranges", ranges),
+            ("domain_rand.randomize_friction", True),
+            ("domain_rand.friction_range", [0.5, 1.25]),
+            ("domain_rand.kicks", {"trip": {"y": [-0.5, 0.5], "interval_s": [5.0, 10.0]}}),
+            ("domain_rand.forces", {"pull": pull}),
+        )
+    )
+    assert [row[:4] for row in rows(lines, "randomised")] == [
+        ["friction", "0.5 to 1.25", "uniform", "once"],
+        ["joint_offset", "-0.02 to 0.02 rad", "uniform", "each episode, grows over iterations 0 to 300, for each of 12"],
+        ["motor_strength", "0.8 to 1.2", "gaussian, sigma 0.1", "every 4 s"],
+    ]
+    assert rows(lines, "disturbances") == [
+        ["trip", "adds to the base's velocity: y -0.5 to 0.5 m/s", "every 5 to 10 s"],
+        ["pull", "force on LF_THIGH: x -30 to 30 N", "for 0.1 to 0.5 s, every 4 to 8 s"],
+    ]
+    assert not any("disturbances" in line or "randomised" in line for line in summary(small_config()))

@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import math
+import types
 import typing
 from pathlib import Path
 
@@ -52,6 +53,8 @@ NUMBERS = {path: found for path, found in FIELDS.items() if numbers_in(found[0])
 def holding(kind: typing.Any, number: float) -> tuple[str, typing.Any]:
     """(what follows the path in an error, the value of a field of that type) for one number in it."""
     origin = typing.get_origin(kind)
+    if origin is types.UnionType and any(dataclasses.is_dataclass(part) for part in typing.get_args(kind)):
+        return holding(typing.get_args(kind)[0], number)  # the short form
     if origin is dict:
         at, value = holding(typing.get_args(kind)[1], number)
         return f".torques{at}", {"torques": value}

@@ -7,21 +7,29 @@ import pytest
 from legged.config import TaskConfig
 from legged.config.loader import from_dict, nest, to_dict
 from legged.config.reference import FieldText, bounds_of, fields, unit_of
-from legged.config.schema import LeggedConfig, TerrainConfig
+from legged.config.schema import ForceConfig, KickConfig, LeggedConfig, TerrainConfig
 from legged.config.units import exponents
 from legged.errors import ConfigError
 
+EMPTY = {
+    "domain_rand.kicks": KickConfig,
+    "domain_rand.forces": ForceConfig,
+    "domain_rand.observed_forces": ForceConfig,
+}
+"""Maps of sections that are empty by default."""
 FIELDS = {text.path: text for text in fields(LeggedConfig)}
 
 
 def leaves(data: dict, prefix: str = "") -> set[str]:
-    """Dotted paths of a configuration's values; those of observation groups once."""
+    """Dotted paths of a configuration's values; those of observation groups, and of what else is a map of sections, once."""
     found = set()
     for key, value in data.items():
         path = f"{prefix}{key}"
         sections = isinstance(value, dict) and path in FIELDS and FIELDS[path].is_section
         if path == "observations.groups":
             found |= leaves(value["actor"], f"{path}.<name>.")
+        elif path in EMPTY:
+            found |= {f"{path}.<name>.{field.name}" for field in dataclasses.fields(EMPTY[path])}
         elif sections:
             found |= leaves(value, f"{path}.")
         else:

@@ -121,6 +121,7 @@ def test_what_the_table_names_is_there():
         "commands.curriculum",
         "domain_rand.push_robots",
         "domain_rand.ranges",
+        "domain_rand.forces",
         "domain_rand.randomize_friction",
         "domain_rand.randomize_base_mass",
         "terrain.curriculum",

@@ -290,9 +290,11 @@ def test_newton_simulates_robots_only(robot):
         check_engine(ModelScene(ASSETS / "half_cheetah.xml"), sim, CPU, "mine.yaml: {}".format)
     with pytest.raises(ConfigError, match=r"sim.physics: newton does not compute cinert"):
         check_engine(RobotScene(robot), sim, CPU, quantities=["cinert"])
-    with pytest.raises(ConfigError, match=r"domain_rand.ranges.joint_damping: newton cannot .*added_base_mass, friction"):
-        make_physics(RobotScene(robot), sim, 1, CPU, randomized=["friction", "joint_damping"])
-    check_engine(RobotScene(robot), sim, CPU, randomized=["friction"])
+    steel = SimConfig(physics="newton", solver="steel")
+    with pytest.raises(ConfigError, match=r"ranges.joint_damping: newton's steel cannot .*added_base_mass, friction"):
+        make_physics(RobotScene(robot), steel, 1, CPU, randomized=["friction", "joint_damping"])
+    check_engine(RobotScene(robot), steel, CPU, randomized=["friction"])
+    check_engine(RobotScene(robot), sim, CPU, randomized=["friction", "joint_damping"])
 
 
 @pytest.mark.parametrize(

@@ -86,6 +86,17 @@ def spring_of(solref: np.ndarray, solimp: np.ndarray, timestep: float, safe: boo
     return np.array([stiffness, damping, least, greatest, width, middle, power])
 
 
+def alike_springs(model: mujoco.MjModel, pairs: Sequence[tuple[int, int, int]]) -> bool:
+    """Whether the contacts of each of the pairs have the spring of one shape, even if worlds differ in it: of the one with
+    priority, or of two that have the same.
+    """
+    for first, second, pair in pairs:
+        solref, priority = model.geom_solref[[first, second]], model.geom_priority[[first, second]]
+        if pair < 0 and priority[0] == priority[1] and (solref[0] != solref[1]).any():
+            return False
+    return True
+
+
 def is_safe(model: mujoco.MjModel) -> bool:
     """Whether the time constants of the model's constraints are kept above two steps."""
     return not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE

@@ -31,6 +31,7 @@ class StageArrays:
     touch_friction: wp.array[Vector5]
     touch_spring: wp.array2d[float]
     touch_sliding: wp.array[float]
+    touch_bounce: wp.array[wp.vec2]
     dof_spring: wp.array2d[float]
     joint_spring: wp.array2d[float]
     jnt_limited: wp.array[int]
@@ -38,6 +39,7 @@ class StageArrays:
     impratio_invsqrt: wp.array[float]
     geom_bodyid: wp.array[int]
     geom_friction: wp.array2d[wp.vec3]
+    geom_solref: wp.array2d[wp.vec2]
     body_rootid: wp.array[int]
     body_invweight0: wp.array2d[wp.vec2]
     body_isdofancestor: wp.array2d[int]
@@ -253,15 +255,15 @@ def shared_bytes(constants: dict[str, int | bool]) -> int:
 
 
 def stage_constants(
-    model: mujoco.MjModel, rows: int, slots: int, dim: int, frictions: bool, limits: bool
+    model: mujoco.MjModel, rows: int, slots: int, dim: int, frictions: bool, limits: bool, bounces: bool = False
 ) -> dict[str, int | bool]:
     """Return what contact_stage.h asks for, of a model with room for so many rows and contacts in each world, of at most
-    `dim` directions, with dry friction and limits or without.
+    `dim` directions, with dry friction and limits or without, and with springs of contacts that differ from world to world.
     """
     return {
         **{"NV": model.nv, "NJ": model.njnt, "ROWS": rows, "SLOTS": slots, "DIMS": dim},
         "PLAIN": max(1, frictions * model.nv + limits * model.njnt),
-        **{"FRICTIONS": frictions, "LIMITS": limits},
+        **{"FRICTIONS": frictions, "LIMITS": limits, "BOUNCES": bounces},
         "BALLS": bool(np.any(model.jnt_type == mujoco.mjtJoint.mjJNT_BALL)),
         "EQUALITIES": model.neq > 0 and not model.opt.disableflags & FLAGS.mjDSBL_EQUALITY,
         "ELLIPTIC": model.opt.cone == CONES.mjCONE_ELLIPTIC,

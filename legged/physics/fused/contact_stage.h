@@ -1,7 +1,8 @@
 // Rows of the constraints of one world: of dry friction, joint limits, and the `found` contacts that lie in the world's slots;
 // behind those of equalities, which are there. Constants: NV, NJ (degrees of freedom, joints), ROWS, SLOTS (most rows, most
 // contacts), PLAIN (most rows of friction and limits), DIMS (most directions of a contact), FRICTIONS, LIMITS, BALLS,
-// EQUALITIES (what there is of them), ELLIPTIC (friction cones, instead of pyramids), and MuJoCo's numbers: BALL, CONSTRAINT
+// EQUALITIES (what there is of them), BOUNCES (whether worlds differ in the springs of contacts), ELLIPTIC (friction cones,
+// instead of pyramids), and MuJoCo's numbers: BALL, CONSTRAINT
 // (a type of contact), FRICTIONLESS, FRICTIONAL (types of rows), NARROWPHASE (a flag of overflow).
 
 // Of a contact: its offsets from the two trees' centres of mass, its axes, friction, and what its rows are made of.
@@ -155,9 +156,17 @@ for (int from = 0; from < contacts; from += LANES) {
     const float impeded = impedance(spring, depth);
     if (!ELLIPTIC && dim > 1) weight = (weight + mu * mu * weight) * 2.0f * mu * mu * root_ratio * root_ratio;
     out[STIFFNESS] = stiffness_of(weight, impeded);
-    out[PULL] = -spring[0] * impeded * depth;
-    out[DAMPING] = spring[1];
-    out[SLIDING] = arrays.touch_sliding.data[touch];
+    float stiff = spring[0], damp = spring[1], slide = arrays.touch_sliding.data[touch];
+    if (BOUNCES && rough[0] >= 0) {
+        const float* bounce = reinterpret_cast<const float*>(arrays.touch_bounce.data) + 2 * touch;
+        const float* of_world = row_of(arrays.geom_solref, 2 * arrays.geom_solref.shape[1]) + 2 * rough[0];
+        const float time = bounce[1] * most(of_world[0], bounce[0]);
+        stiff = 1.0f / (time * of_world[1] * time * of_world[1]);
+        damp = slide = 2.0f / time;
+    }
+    out[PULL] = -stiff * impeded * depth;
+    out[DAMPING] = damp;
+    out[SLIDING] = slide;
     arrays.contact_dim.data[slot] = dim;
     arrays.contact_includemargin.data[slot] = margin;
     arrays.contact_worldid.data[slot] = world;

@@ -32,7 +32,7 @@ from legged.physics.fused.contact_kernel import (
 from legged.physics.fused.native import LANES, SHARED_BYTES
 
 FIXED = (
-    *("geom_size", "geom_margin", "geom_priority", "geom_solmix", "geom_solref", "geom_solimp", "jnt_solref", "jnt_solimp"),
+    *("geom_size", "geom_margin", "geom_priority", "geom_solmix", "geom_solimp", "jnt_solref", "jnt_solimp"),
     *("dof_solref", "dof_solimp", "pair_margin", "pair_friction", "pair_solref", "pair_solimp"),
 )
 """Arrays of the model that are read once, in which worlds may not differ."""
@@ -82,7 +82,9 @@ class ContactStage:
         self.inputs = [self._arrays, items, *ground_of]
         """What the launch takes, beside the number of lanes."""
         dim, slots = max((touch.dim for touch in self.touches), default=1), d.naconmax // d.nworld
-        self.constants = stage_constants(model, d.njmax, slots, dim, frictions, bool(limited.any()))
+        self.constants = stage_constants(
+            model, d.njmax, slots, dim, frictions, bool(limited.any()), "geom_solref" in randomized
+        )
         """What contact_stage.h was asked for."""
         self.kinds = bool(points), bool(round_pairs), bool(probes)
         """Whether points on planes, pairs of round shapes and probes of the ground may touch."""
@@ -96,6 +98,8 @@ class ContactStage:
         """
         if drawn := [name for name in FIXED if name in randomized]:
             return f"{drawn[0]} differs between worlds"
+        if "geom_solref" in randomized and not touches.alike_springs(model, touches.pairs_of(m)):
+            return "restitution differs between worlds, and shapes that touch have springs of their own"
         if m.is_sparse:
             return "mujoco-warp keeps Jacobians sparse"
         if model.nflex or np.any(model.tendon_limited) or np.any(model.tendon_frictionloss):
@@ -148,6 +152,8 @@ class ContactStage:
         arrays.touch_friction = wp.array([t.friction for t in every], dtype=Vector5)
         arrays.touch_spring = springs([t.solref for t in every], [t.solimp for t in every])
         arrays.touch_sliding = wp.array(sliding, dtype=float)
+        bounces = [(2.0 * timestep * safe, float(np.clip(t.solimp[1], touches.LEAST, touches.GREATEST))) for t in every]
+        arrays.touch_bounce = wp.array(bounces, dtype=wp.vec2)
         arrays.dof_spring = springs(model.dof_solref, model.dof_solimp)
         arrays.joint_spring = springs(model.jnt_solref, model.jnt_solimp)
         arrays.contact_touch = wp.zeros(d.naconmax, dtype=int)

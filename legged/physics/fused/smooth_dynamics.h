@@ -1,7 +1,7 @@
 // Poses, inertias and forces but those of constraints, of one world: trees of free, ball, slide and hinge joints in any order.
 // Constants: NB, NV, NJ, NG, NT (bodies, degrees of freedom, joints, shapes, trees), DEPTH (levels of bodies below the world),
 // BALLS, SLIDES, ONE_MOTOR, SPRINGS, BALL_SPRINGS, DAMPERS, GEARS, GAINS, AFFINE_BIAS, CONTROL_LIMITS, FORCE_LIMITS,
-// JOINT_LIMITS, EQUALITIES, SITES (what there is of them; the latter two: bodies and sites that equality constraints hold),
+// JOINT_LIMITS, PUSHED (whether forces act on bodies from outside), EQUALITIES, SITES (what there is of them; the latter two: bodies and sites that equality constraints hold),
 // FREE, BALL, SLIDE, AFFINE (MuJoCo's numbers of types), and for each array of the model VARIES_<array>: whether worlds may
 // differ in it. What a model has not is left out by the compiler.
 
@@ -247,6 +247,15 @@ EACH(b, NB) {
     for (int k = 0; k < 3; ++k) force[b * 6 + k] = along[k] + c[k] + d[k];
     cross(velocity + b * 6, p + 3, c);
     for (int k = 0; k < 3; ++k) force[b * 6 + 3 + k] = along[3 + k] + c[k];
+    if (PUSHED) {  // at its centre of mass: force, then torque
+        const float* push = reinterpret_cast<const float*>(arrays.xfrc_applied.data) + ((long long)world * NB + b) * 6;
+        const float* com = com_of(b);
+        float arm[3];
+        for (int k = 0; k < 3; ++k) arm[k] = centre[b * 3 + k] - com[k];
+        cross(arm, push, c);
+        for (int k = 0; k < 3; ++k) force[b * 6 + k] -= c[k] + push[3 + k];
+        for (int k = 0; k < 3; ++k) force[b * 6 + 3 + k] -= push[k];
+    }
 }
 meet();
 EACH(i, NV) {

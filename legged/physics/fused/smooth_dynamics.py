@@ -48,6 +48,8 @@ COUNTED = {
 """What else it does not compute, by the counts of a model."""
 NEEDED_STAGES = ("ACTUATION", "CLAMPCTRL", "DAMPER", "EULERDAMP", "GRAVITY", "SPRING", "WARMSTART")
 """Stages that a model may ask to leave out, and that are not left out here."""
+PUSHED = "xfrc_applied"
+"""What forces that act from outside are called among the arrays in which worlds differ."""
 MOST_BLOCKS = 32
 """Blocks that a multiprocessor holds at most: with few enough registers for so many, 4096 worlds run at once on an H100."""
 
@@ -111,6 +113,7 @@ class DynamicsArrays:
     qpos: wp.array2d[float]
     qvel: wp.array2d[float]
     ctrl: wp.array2d[float]
+    xfrc_applied: wp.array2d[wp.spatial_vector]
     geom_xpos: wp.array2d[wp.vec3]
     geom_xmat: wp.array2d[wp.mat33]
     subtree_com: wp.array2d[wp.vec3]
@@ -155,6 +158,7 @@ def dynamics_constants(model: mujoco.MjModel, randomized: Collection[str] = ()) 
         "CONTROL_LIMITS": bool(np.any(model.actuator_ctrllimited)),
         "FORCE_LIMITS": bool(np.any(model.actuator_forcelimited)),
         "JOINT_LIMITS": bool(np.any(model.jnt_actfrclimited)),
+        "PUSHED": PUSHED in randomized,
         "EQUALITIES": bool(np.isin(model.eq_type, (CONNECT, WELD)).any()),
         "SITES": model.nsite if bool(np.any(model.eq_objtype == SITE)) else 0,
         **{"FREE": FREE, "BALL": BALL, "SLIDE": SLIDE, "AFFINE": AFFINE},

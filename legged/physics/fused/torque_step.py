@@ -3,8 +3,8 @@
 mujoco-warp launches a stage for everything that a model might have: gravity compensation, external forces, muscles with
 lengths and activations, fluids, tendons. At 4096 worlds a launch costs microseconds whether it finds anything or not;
 together these are a fifth of a step. Here are trees of joints with springs and dampers, moved by motors; `why_not` says what
-else a model has. Forces applied from outside (`qfrc_applied`, `xfrc_applied`), sensors, and the poses of bodies, sites and
-cameras are not computed.
+else a model has. Forces on bodies from outside (`xfrc_applied`) are there if they were asked for; `qfrc_applied`,
+sensors, and the poses of bodies, sites and cameras are not computed.
 """
 
 from collections.abc import Collection

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from legged.physics.newton.fields import SolverFields
 from legged.physics.newton.simulation import Simulation
 from legged.physics.robot_state import RobotState
 from legged.physics.warp.exchange import EngineArrays, RobotExchange, rotate, rotate_inverse
@@ -22,6 +23,20 @@ def write_torques(torques: wp.array2d[float], dof_qd: wp.array[int], joint_f: wp
     """One thread a joint."""
     world, dof = wp.tid()
     joint_f[world, dof_qd[dof]] = torques[world, dof]
+
+
+@wp.kernel
+def write_varied_torques(
+    torques: wp.array2d[float],
+    gains: wp.array3d[float],
+    limits: wp.array3d[float],
+    dof_qd: wp.array[int],
+    joint_f: wp.array2d[float],
+):
+    """One thread a joint: what a motor makes of the torque that it is asked for, as MuJoCo's actuators do."""
+    world, dof = wp.tid()
+    given = gains[world, dof, 0] * torques[world, dof]
+    joint_f[world, dof_qd[dof]] = wp.clamp(given, limits[world, dof, 0], limits[world, dof, 1])
 
 
 @wp.kernel
@@ -152,8 +167,13 @@ class NewtonExchange(RobotExchange):
         self._joint_f = simulation.control.joint_f.reshape((count, layout.dofs))
         self._dof_qd = wp.array(layout.dof_qd, dtype=int)
         base_com = simulation.model.body_com.numpy().reshape(count, layout.bodies, 3)[:, layout.base]
+        of_base = wp.array(base_com, dtype=wp.vec3)
+        self.base_com = wp.to_torch(of_base)
+        """(N, 3) centre of mass of the base, in its frame [m]."""
+        self.motors: SolverFields | None = None
+        """What makes other torques of those that are asked for, if something does."""
         self._convention = [
-            wp.array(base_com, dtype=wp.vec3),
+            of_base,
             layout.root_q,
             layout.root_qd,
             wp.array(layout.dof_q, dtype=int),
@@ -166,6 +186,11 @@ class NewtonExchange(RobotExchange):
 
     def apply_torques(self) -> None:
         """Task -> generalised forces of the joints."""
+        if self.motors is not None and self.motors.motors:
+            varied = [wp.from_torch(self.motors.gains), wp.from_torch(self.motors.limits)]
+            inputs = [self._torques, *varied, self._dof_qd]
+            wp.launch(write_varied_torques, dim=self._torques.shape, inputs=inputs, outputs=[self._joint_f])
+            return
         wp.launch(write_torques, dim=self._torques.shape, inputs=[self._torques, self._dof_qd], outputs=[self._joint_f])
 
     def read(self) -> None:

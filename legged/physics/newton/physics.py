@@ -9,7 +9,9 @@ from torch import Tensor
 
 from legged.config.schema import SimConfig
 from legged.errors import suggest
+from legged.physics.fields import NEWTONS_FIELDS
 from legged.physics.newton.exchange import NewtonExchange
+from legged.physics.newton.fields import SolverFields
 from legged.physics.newton.simulation import Simulation
 from legged.physics.robot_state import robot_state
 from legged.physics.scene import RobotScene
@@ -31,6 +33,7 @@ class NewtonPhysics(WarpPhysics):
         num_envs: int,
         device: torch.device,
         randomized: Collection[str] = (),
+        pushed: bool = False,
     ) -> None:
         """Build the scene on `device` and place all robots at the model's initial state; compiles on first use."""
         super().__init__(num_envs, sim.dt, device)
@@ -41,7 +44,10 @@ class NewtonPhysics(WarpPhysics):
         self.qvel = torch.zeros(num_envs, 6 + robot.num_dof, device=device)
         self.robot_state = robot_state(self.qpos, self.qvel, robot)
         self._quantities = {}
-        self._randomized = tuple(randomized)
+        self._randomized, self._scene = tuple(randomized), scene
+        self._fields: SolverFields | None = None
+        """What is randomised beside friction and the base's mass, or within steps; the MuJoCo solver's."""
+        self.forces = torch.zeros(num_envs, self.model.nbody, 6, device=device) if pushed else None
         # Newton's masks have one place more than there are worlds: for what is in none of them.
         self._mask = torch.zeros(num_envs + 1, dtype=torch.bool, device=device)
         self._wp_mask = wp.from_torch(self._mask)
@@ -49,6 +55,10 @@ class NewtonPhysics(WarpPhysics):
             self._simulation = Simulation(robot, sim, num_envs, scene.terrain, self._wp_device)
             task = tuple(wp.from_torch(tensor) for tensor in (self.qpos, self.qvel, self.ctrl))
             self._exchange = NewtonExchange(self._simulation, task, self.overflowed, self.model, robot, self.robot_state)
+            if set(randomized) - set(NEWTONS_FIELDS):
+                self._exchange.motors = self._solvers_fields()
+            if self.forces is not None:
+                self._simulation.push_with(self.forces, self.model)
             self._exchange.read()
             start = self.qpos.clone()
         exchanges = (self._exchange.kinematics, self._exchange.contact_forces, self.kernels.name_module)
@@ -84,6 +94,8 @@ class NewtonPhysics(WarpPhysics):
             self._forget()
             self._exchange.write(mask, qpos, qvel)
             self._put()
+        if self.forces is not None:
+            self.forces.masked_fill_(mask.view(-1, 1, 1), 0.0)
 
     def load_state(self, saved: Mapping[str, Tensor]) -> None:
         """As every engine, but a solver's own memory (warm starts, matched contacts) begins anew."""
@@ -104,7 +116,34 @@ class NewtonPhysics(WarpPhysics):
         if field not in self._randomized:
             told = suggest(field, self._randomized, "those are")
             raise ValueError(f"randomize: '{field}' is none of the fields that make_physics was told of{told}")
-        {"friction": self._set_friction, "added_base_mass": self._add_base_mass}[field](values.to(self.device))
+        if self._fields is None:
+            {"friction": self._set_friction, "added_base_mass": self._add_base_mass}[field](values.to(self.device))
+            return
+        with wp.ScopedDevice(self._wp_device):
+            self._fields.give(field, values)
+
+    def prepare_redraws(self, drawn: Tensor, columns: Mapping[str, slice], fields: Collection[str]) -> None:
+        with wp.ScopedDevice(self._wp_device):
+            self._solvers_fields().prepare(drawn, columns, fields)
+
+    def redraw(self, mask: Tensor) -> None:
+        with self._on_device():
+            self._solvers_fields().redraw(mask)
+
+    def set_variants(self, values: Mapping[str, Tensor]) -> None:
+        with wp.ScopedDevice(self._wp_device):
+            self._solvers_fields().set_variants(values)
+
+    def choose_variants(self, mask: Tensor, chosen: Tensor) -> None:
+        with self._on_device():
+            self._solvers_fields().choose(mask, chosen)
+
+    def _solvers_fields(self) -> SolverFields:
+        """Return the arrays of the solver that fields change, which are made when they are first asked for."""
+        if self._fields is None:
+            base_com, robot = self._exchange.base_com, self._scene
+            self._fields = SolverFields(robot, self.model, self._simulation, base_com, self._randomized)
+        return self._fields
 
     def _set_friction(self, values: Tensor) -> None:
         model, layout = self._simulation.model, self._simulation.layout

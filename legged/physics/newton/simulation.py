@@ -3,8 +3,10 @@
 import warnings
 from typing import Any
 
+import mujoco
 import newton
 import numpy as np
+import torch
 import warp as wp
 from newton.solvers import SolverBase, SolverMuJoCo, SolverSteel
 
@@ -17,6 +19,16 @@ from legged.physics.warp.exchange import LOST
 from legged.robots.robot import Robot
 from legged.robots.robot_model import FLOOR
 from legged.terrain import Terrain
+
+
+@wp.kernel
+def push_bodies(forces: wp.array3d[float], bodies: wp.array[int], count: int, body_f: wp.array[wp.spatial_vector]) -> None:
+    """One thread a world and body: MuJoCo's order and names -> Newton's."""
+    world, body = wp.tid()  # type: ignore[misc]
+    if bodies[body] >= 0:
+        force = wp.vec3(forces[world, body, 0], forces[world, body, 1], forces[world, body, 2])
+        torque = wp.vec3(forces[world, body, 3], forces[world, body, 4], forces[world, body, 5])
+        body_f[world * count + bodies[body]] = wp.spatial_vector(force, torque)
 
 
 class Simulation:
@@ -49,6 +61,8 @@ class Simulation:
         """(N,) or longer: the solver's flags of contacts or constraint rows that were dropped, if it has any."""
         self.lost_bits = 1
         """Those bits of `lost` that mean this."""
+        self._pushes: list[Any] | None = None
+        """Forces on bodies from outside, if there are any, and what tells which bodies these are."""
         self._observables = self._request()
         if self._observables is None or setup.springs is not None:
             self.force = wp.zeros(capacity, dtype=wp.spatial_vector)
@@ -81,12 +95,23 @@ class Simulation:
             self.lost = solver.constraint_overflow
         return observables
 
+    def push_with(self, forces: torch.Tensor, model: mujoco.MjModel) -> None:
+        """Let `forces` (N, B, 6), forces and torques at centres of mass in the world frame, act on the bodies that have the
+        names of those of `model`.
+        """
+        labels = [label.rpartition("/")[2] for label in self.model.body_label[: self.layout.bodies]]
+        number = {name: k for k, name in enumerate(labels)}
+        bodies = [number.get(model.body(k).name, -1) for k in range(model.nbody)]
+        self._pushes = [wp.from_torch(forces), wp.array(bodies, dtype=int), self.layout.bodies]
+
     def step(self, dt: float) -> None:
         """Advance `state` by dt [s] under `control`."""
         setup, before, after = self.setup, self.state, self._next
         extra = {} if self._observables is None else {"observables": self._observables}
         for substep in range(setup.substeps):
             before.clear_forces()
+            if self._pushes is not None:
+                wp.launch(push_bodies, dim=self._pushes[0].shape[:2], inputs=[*self._pushes, before.body_f])
             if self._pipeline is not None:
                 self._pipeline.collide(before, self.contacts)
             if setup.springs is not None and substep == setup.substeps - 1:

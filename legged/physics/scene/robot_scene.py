@@ -47,6 +47,11 @@ def robot_source(robot: Robot, self_collisions: bool) -> str:
     return str(spec.to_xml())
 
 
+def body_names(robot: Robot) -> list[str]:
+    """Return the names of a robot's bodies, as in its model."""
+    return [body.name for body in robot_spec_of(robot.model_path).bodies if body.name and body.name != "world"]
+
+
 def _contact_settings(geom: mujoco.MjsGeom) -> tuple[int, int, int, int]:
     return geom.contype, geom.conaffinity, geom.priority, geom.condim
 

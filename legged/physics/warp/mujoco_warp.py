@@ -1,6 +1,6 @@
 """Batched MuJoCo on a GPU by mujoco-warp; also on Warp's CPU device, for tests and for comparison."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import mujoco
@@ -13,17 +13,20 @@ from torch import Tensor
 from legged.config.schema import SimConfig
 from legged.errors import ConfigError
 from legged.physics.collider.terrain_contact import TerrainContact
-from legged.physics.fields import DERIVED, FIELDS, RandomizedModel, changed_arrays
+from legged.physics.fields import DERIVED, FIELDS, GRAVITY, changed_arrays
 from legged.physics.fused.block_step import BlockStep
 from legged.physics.fused.constraint_solver import ConstraintSolver, ask_for_dense_rows
 from legged.physics.fused.contact_stage import ContactStage
+from legged.physics.fused.smooth_dynamics import PUSHED
 from legged.physics.fused.torque_step import TorqueStep
 from legged.physics.quantities import LAST_STEP, stage_of
+from legged.physics.randomized_model import RandomizedModel, keep_centres_apart
 from legged.physics.robot_state import DrivenJoints, robot_state
 from legged.physics.scene import Scene
 from legged.physics.warp.compile import compile_ahead
 from legged.physics.warp.exchange import MujocoWarpExchange, StateExchange, arrays_of
 from legged.physics.warp.physics import WarpPhysics
+from legged.physics.warp.redraws import Redraws, Variants
 from legged.process.cores import available_cores
 from legged.process.ranks import Ranks
 from legged.robots.robot_model import FLOOR
@@ -64,6 +67,7 @@ class MujocoWarpPhysics(WarpPhysics):
         randomized: Collection[str] = (),
         quantities: Collection[str] = (),
         only_blocks: bool = False,
+        pushed: bool = False,
     ) -> None:
         """Build the scene on `device` and place all worlds at the model's initial state; compiles on first use, for
         `randomized` fields too.
@@ -78,7 +82,10 @@ class MujocoWarpPhysics(WarpPhysics):
         self.model = scene.model(sim, "none" if cells else "height_field")
         if sim.step != "library":
             ask_for_dense_rows(self.model)
+        keep_centres_apart(self.model, randomized)
         self._randomized = RandomizedModel(scene, self.model, randomized, torch.float32, device)
+        self._redraws: Redraws | None = None
+        self._variants: Variants | None = None
         self._per_world = changed_arrays(randomized)
         """Names of the model's arrays that are given per world."""
         with wp.ScopedDevice(self._wp_device):
@@ -98,6 +105,8 @@ class MujocoWarpPhysics(WarpPhysics):
                 self.robot_state = robot_state(self.qpos, self.qvel, scene.robot)
                 self._joints = DrivenJoints(self.qpos, self.qvel, self.robot_state, scene.robot)
                 self._exchange = MujocoWarpExchange(self._m, d, self.overflowed, self.model, scene.robot, self.robot_state)
+            if pushed:
+                self.forces = wp.to_torch(d.xfrc_applied).view(num_envs, self.model.nbody, 6)
             sample = mujoco.MjData(self.model)
             self._quantities = {
                 name: wp.to_torch(getattr(d, name)).view(num_envs, *getattr(sample, name).shape) for name in quantities
@@ -119,11 +128,14 @@ class MujocoWarpPhysics(WarpPhysics):
 
     def _put_model(self, scene: str) -> Any:
         """Return mujoco-warp's model, with room for what differs per world."""
-        sizes = {name: self.num_envs for name in (*PER_WORLD, *self._per_world) if getattr(self.model, name).size}
+        names = [name for name in (*PER_WORLD, *self._per_world) if name != GRAVITY and getattr(self.model, name).size]
         try:
-            return mjw.put_model(self.model, batch_sizes=sizes)
+            m = mjw.put_model(self.model, batch_sizes=dict.fromkeys(names, self.num_envs))
         except NotImplementedError as error:
             raise ConfigError(f"sim.physics: mujoco_warp cannot simulate {scene}, mujoco might: {error}") from error
+        if GRAVITY in self._per_world:
+            m.opt.gravity = wp.array(np.tile(self.model.opt.gravity, (self.num_envs, 1)), dtype=wp.vec3)
+        return m
 
     def refresh(self) -> None:
         super().refresh()
@@ -144,6 +156,8 @@ class MujocoWarpPhysics(WarpPhysics):
         super().write(mask, qpos, qvel)
         for forces in self._of_last_step().values():
             forces.masked_fill_(mask.view(-1, 1), 0.0)
+        if self.forces is not None:
+            self.forces.masked_fill_(mask.view(-1, 1, 1), 0.0)
 
     def _of_last_step(self) -> dict[str, Tensor]:
         """Return those quantities that only a step computes."""
@@ -182,7 +196,7 @@ class MujocoWarpPhysics(WarpPhysics):
         if step == "library":
             self.why_library = "sim.step=library"
             return
-        per_world = (*PER_WORLD, *self._per_world)
+        per_world = (*PER_WORLD, *self._per_world, *(() if self.forces is None else (PUSHED,)))
         no_solver = ConstraintSolver.why_not(self._m, self._d)
         self.why_library = no_solver or TorqueStep.why_not(self.model, per_world)
         if step == "fused" and self.why_library:
@@ -238,7 +252,34 @@ class MujocoWarpPhysics(WarpPhysics):
 
     def randomize(self, field: str, values: Tensor) -> None:
         for name, array in self._randomized.give(field, values).items():
-            wp.to_torch(getattr(self._m, name)).copy_(array)
+            self._array(name).copy_(array.view_as(self._array(name)))
         if FIELDS[field].derived:
             with wp.ScopedDevice(self._wp_device):
                 self._set_constants()
+
+    def _array(self, name: str) -> Tensor:
+        """Return an array of the model, (N, ...), that worlds have for themselves."""
+        return wp.to_torch(self._m.opt.gravity if name == GRAVITY else getattr(self._m, name))
+
+    def prepare_redraws(self, drawn: Tensor, columns: Mapping[str, slice], fields: Collection[str]) -> None:
+        arrays = {name: self._array(name) for name in changed_arrays(fields)}
+        with wp.ScopedDevice(self._wp_device):
+            self._redraws = Redraws(self._randomized, drawn, columns, arrays)
+
+    def redraw(self, mask: Tensor) -> None:
+        if self._redraws is not None:
+            with self._on_device():
+                self._redraws.launch(mask)
+
+    def set_variants(self, values: Mapping[str, Tensor]) -> None:
+        made = self._randomized.variants(values)
+        with wp.ScopedDevice(self._wp_device):
+            if self._variants is None:
+                self._variants = Variants({name: (array, self._array(name)) for name, array in made.items()})
+            else:
+                self._variants.replace(made)
+
+    def choose_variants(self, mask: Tensor, chosen: Tensor) -> None:
+        if self._variants is not None:
+            with self._on_device():
+                self._variants.launch(mask, chosen)

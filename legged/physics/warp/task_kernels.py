@@ -22,19 +22,20 @@ def hold_joints(
     target: wp.array2d[float],
     dof_pos: wp.array2d[float],
     dof_vel: wp.array2d[float],
-    stiffness: wp.array[float],
-    damping: wp.array[float],
-    limit: wp.array[float],
+    stiffness: wp.array2d[float],
+    damping: wp.array2d[float],
+    limit: wp.array2d[float],
     torques: wp.array2d[float],
 ):
     """One thread a robot and joint: a torque that is no number stays none."""
     robot, joint = wp.tid()
-    spring = stiffness[joint] * (target[robot, joint] - dof_pos[robot, joint])
-    torque = spring - damping[joint] * dof_vel[robot, joint]
-    if torque > limit[joint]:
-        torque = limit[joint]
-    if torque < -limit[joint]:
-        torque = -limit[joint]
+    spring = stiffness[robot, joint] * (target[robot, joint] - dof_pos[robot, joint])
+    torque = spring - damping[robot, joint] * dof_vel[robot, joint]
+    most = limit[robot, joint]
+    if torque > most:
+        torque = most
+    if torque < -most:
+        torque = -most
     torques[robot, joint] = torque
 
 

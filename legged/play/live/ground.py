@@ -83,7 +83,7 @@ def build(
     Raises:
         ConfigError: the configuration can't be built, or tiles are too small.
     """
-    nominal = replace(cfg, domain_rand=replace(cfg.domain_rand, ranges={}))
+    nominal = replace(cfg, domain_rand=cfg.domain_rand.nominal())
     few_robots_do = ("train.algorithm.num_mini_batches", 1)  # nothing is trained
     changed = override(nominal, [*changes, few_robots_do])
     if not isinstance(changed, LeggedConfig) or ground.kind == PLANE or len(grounds_of(cfg)) == 1:

@@ -167,7 +167,7 @@ ELSEWHERE: dict[str, str] = {
 SECTIONS_ELSEWHERE = {
     "viewer.": _DRAWING,
     "sim.physx.": _PHYSX,
-    "domain_rand.": "domain_rand.ranges draws of the model what docs/tasks.md, Randomisation, lists",
+    "domain_rand.": "domain_rand.ranges draws of the model what docs/randomisation.md lists",
 }
 """The same, for all that begin so."""
 

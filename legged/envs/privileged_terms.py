@@ -1,0 +1,101 @@
+"""Observations of what is randomised: what a critic or a teacher may be told, and a robot does not measure."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from legged.config.randomization import DrawConfig, ForceConfig, draw_of
+from legged.config.schema import LeggedConfig
+from legged.errors import ConfigError
+from legged.mdp.mirror_images import MirrorKind
+from legged.mdp.randomization import Randomization
+from legged.physics.fields import FIELDS, Field
+
+PREFIX = "rand_"
+
+
+class PrivilegedTerms:
+    """The methods `_obs_rand_<field>`, one for each field of `physics.FIELDS`, and `_obs_push_force`; (N, 1) each, or
+    (N, rows) where every row has its own number. -1 and 1 are the ends of the range that the configuration names, however
+    far it has grown; with `log_uniform` in the logarithm. A field that only `domain_rand.observed_ranges` names has its
+    neutral value.
+    """
+
+    cfg: Any
+    randomization: Randomization
+    field_rows: dict[str, int]
+    num_envs: int
+    device: Any
+    disturbances: Any
+
+    def _obs_push_force(self) -> Tensor:
+        """Forces that act on bodies from outside (domain_rand.forces), x, y and z of each in the world frame, as a share of
+        the largest that is drawn [1].
+        """
+        found = []
+        for name, cfg in observed_forces(self.cfg).items():
+            acting = self.disturbances.forces.get(name)
+            largest = max(abs(end) for axis in (cfg.x, cfg.y, cfg.z) for end in axis)
+            found.append(torch.zeros(self.num_envs, 3, device=self.device) if acting is None else acting.force / largest)
+        return torch.cat(found, dim=1)
+
+
+def _mirror_kind(name: str, field: Field) -> MirrorKind:
+    """Return how a field changes when left and right are exchanged. What bodies and shapes have of their own has no image."""
+    if name == "joint_offset":
+        return "joints"
+    if name.endswith("_y"):
+        return "sideways"
+    return "of_joints" if field.law or name.startswith(("joint_", "motor_", "actuator_")) else "scalar"
+
+
+MIRROR_KINDS: dict[str, MirrorKind] = {f"{PREFIX}{name}": _mirror_kind(name, field) for name, field in FIELDS.items()}
+"""Privileged observation -> its kind."""
+MIRROR_KINDS["push_force"] = "vectors"
+
+
+def observed_forces(cfg: LeggedConfig) -> dict[str, ForceConfig]:
+    """Return the forces that are observed, whether they act or not."""
+    return {**cfg.domain_rand.observed_forces, **cfg.domain_rand.forces}
+
+
+def observed(cfg: Any, name: str) -> DrawConfig | None:
+    """Return by what range a field is observed; None if the configuration names none."""
+    rand = cfg.domain_rand
+    entry = rand.observed_ranges.get(name, rand.ranges.get(name))
+    if entry is None and name == "friction" and getattr(rand, "randomize_friction", False):
+        entry = rand.friction_range
+    if entry is None and name == "added_base_mass" and getattr(rand, "randomize_base_mass", False):
+        entry = rand.added_mass_range
+    return None if entry is None else draw_of(entry)
+
+
+def normalised(values: Tensor, draw: DrawConfig) -> Tensor:
+    """Return values as -1 to 1 over the range of a draw; 0 for a range without width."""
+    low, high = draw.range
+    if draw.distribution == "log_uniform":
+        values, low, high = values.clamp(min=1e-9).log(), math.log(low), math.log(high)
+    return (values - 0.5 * (low + high)) * (2.0 / (high - low) if high > low else 0.0)
+
+
+def _observer(name: str, field: Field) -> Callable[[Any], Tensor]:
+    def observe(self: Any) -> Tensor:
+        draw = observed(self.cfg, name)
+        if draw is None:
+            raise ConfigError(f"_obs_{PREFIX}{name}: domain_rand.ranges does not draw it, so there is nothing to observe")
+        drawn = self.randomization.fields.get(name)
+        if drawn is None:
+            each = field.each if draw.each is None else draw.each
+            drawn = torch.full((self.num_envs, self.field_rows[name] if each else 1), field.neutral, device=self.device)
+        return normalised(drawn.view(self.num_envs, -1), draw)
+
+    observe.__name__ = f"_obs_{PREFIX}{name}"
+    observe.__doc__ = f"{field.meaning[0].upper()}{field.meaning[1:]}, from -1 to 1 over its range [1]."
+    return observe
+
+
+for _name, _field in FIELDS.items():
+    setattr(PrivilegedTerms, f"_obs_{PREFIX}{_name}", _observer(_name, _field))

@@ -1,0 +1,149 @@
+"""What of `domain_rand` is right by itself and does not fit the property, the task or the robot."""
+
+from collections.abc import Callable
+
+from legged.config.randomization import DrawConfig, ForceConfig, KickConfig, draw_of
+from legged.config.schema import LeggedConfig, TaskConfig
+from legged.envs.privileged_terms import PREFIX, observed, observed_forces
+from legged.errors import ConfigError, suggest
+from legged.physics.fields import FIELDS
+from legged.physics.scene.robot_scene import body_names
+from legged.robots.robot import Robot
+
+
+def check_randomization(cfg: TaskConfig) -> None:
+    """Look for what can be wrong with the properties that are drawn, before anything is built.
+
+    Raises:
+        ConfigError: there is something.
+    """
+    rand, legged = cfg.domain_rand, isinstance(cfg, LeggedConfig)
+    for key, ranges in (("ranges", rand.ranges), ("observed_ranges", rand.observed_ranges)):
+        for name, entry in ranges.items():
+            _check_draw(name, draw_of(entry), legged, f"domain_rand.{key}.{name}", cfg.origins.where)
+    _check_derived(cfg)
+    if cfg.sim.physics == "newton" and cfg.sim.solver != "mujoco":
+        for name, entry in rand.ranges.items():
+            if draw_of(entry).when != "start":
+                where = cfg.origins.where(f"domain_rand.ranges.{name}.when")
+                raise ConfigError(f"{where}: newton's {cfg.sim.solver} draws at the start only; sim.solver=mujoco does not")
+    if isinstance(cfg, LeggedConfig) and cfg.control.control_type == "T":
+        for name in ("p_gain", "d_gain", "joint_offset"):
+            if name in rand.ranges:
+                where = cfg.origins.where(f"domain_rand.ranges.{name}")
+                raise ConfigError(
+                    f"{where}: control.control_type T takes actions for torques, and has no {FIELDS[name].meaning}"
+                )
+    if isinstance(cfg, LeggedConfig) and cfg.control.control_type != "P" and "joint_offset" in rand.ranges:
+        where = cfg.origins.where("domain_rand.ranges.joint_offset")
+        raise ConfigError(f"{where}: control.control_type V does not look at angles, of which encoders show too much")
+
+
+def _check_draw(name: str, draw: DrawConfig, legged: bool, path: str, where: Callable[[str], str]) -> None:
+    """Look at one property."""
+    if name not in FIELDS:
+        known = suggest(name, FIELDS, "properties")
+        raise ConfigError(f"{where(path)}: there is no property '{name}' to randomise{known}")
+    field, (low, high) = FIELDS[name], draw.range
+    unit = "" if field.unit == "1" else f" [{field.unit}]"
+    if not field.changes and not legged:
+        raise ConfigError(f"{where(path)}: only the control law of legged robots has it ({field.meaning})")
+    for bound, wrong, word in ((field.lowest, low, "least"), (field.highest, high, "most")):
+        if bound is not None and (wrong < bound if word == "least" else wrong > bound):
+            raise ConfigError(f"{where(path)}: must be at {word} {bound:g}{unit} ({field.meaning}), got {wrong:g}")
+    if draw.distribution == "log_uniform" and low <= 0.0:
+        given = where(f"{path}.distribution")
+        raise ConfigError(f"{given}: log_uniform draws from ranges above 0, not from [{low:g}, {high:g}]; uniform from any")
+    if draw.std and draw.distribution != "gaussian":
+        raise ConfigError(f"{where(f'{path}.std')}: only gaussian has a standard deviation, {draw.distribution} has none")
+    if draw.when == "interval" and not draw.interval_s:
+        raise ConfigError(f"{where(f'{path}.when')}: interval needs an interval_s above 0 [s], such as interval_s: 4.0")
+    if draw.when != "interval" and draw.interval_s:
+        told = f"is of `when: interval` only, got {draw.interval_s:g} with `when: {draw.when}`"
+        raise ConfigError(f"{where(f'{path}.interval_s')}: {told}")
+    _check_grow(draw, path, where)
+    if draw.grow[1] and draw.when == "start":
+        raise ConfigError(f"{where(f'{path}.grow')}: what is drawn at the start can't grow; `when: reset` draws it again")
+    if draw.grow[1] and field.derived:
+        raise ConfigError(
+            f"{where(f'{path}.grow')}: can't grow: MuJoCo derives constants from it, which is done at the start, for models"
+            " that robots choose from"
+        )
+
+
+def _check_grow(of: DrawConfig | KickConfig | ForceConfig, path: str, where: Callable[[str], str]) -> None:
+    """Look at between which iterations something grows."""
+    if of.grow != (0.0, 0.0) and of.grow[0] == of.grow[1]:
+        told = "expected [first, last] with first < last, or [0, 0] for none"
+        raise ConfigError(f"{where(f'{path}.grow')}: {told}, got {list(of.grow)}")
+
+
+def _check_derived(cfg: TaskConfig) -> None:
+    """Look whether everything from which MuJoCo derives constants is drawn at the same moments."""
+    moments = {}
+    for name, entry in cfg.domain_rand.ranges.items():
+        if FIELDS[name].derived:
+            draw = draw_of(entry)
+            moments[name] = draw.when, draw.interval_s
+    if isinstance(cfg, LeggedConfig) and cfg.domain_rand.randomize_base_mass:
+        moments.setdefault("added_base_mass", ("start", 0.0))
+    for name, moment in moments.items():
+        first = next(iter(moments))
+        if moment != moments[first]:
+            a, b = ("at the start" if when == "start" else f"at {when}" for when, _ in (moments[first], moment))
+            path = name if name in cfg.domain_rand.ranges else first
+            names = ", ".join(moments)
+            text = f"MuJoCo derives constants from {names} together, so they must have the same `when` and interval_s"
+            if "added_base_mass" in moments and "added_base_mass" not in cfg.domain_rand.ranges:
+                text += " (randomize_base_mass draws at the start; added_base_mass among the ranges takes its place)"
+            raise ConfigError(f"{cfg.origins.where(f'domain_rand.ranges.{path}')}: {first} is drawn {a}, {name} {b}: {text}")
+
+
+def check_disturbances(cfg: LeggedConfig, robot: Robot) -> None:
+    """Look for what can be wrong with kicks and forces.
+
+    Raises:
+        ConfigError: there is something.
+    """
+    where = cfg.origins.where
+    for name, kick in cfg.domain_rand.kicks.items():
+        _check_grow(kick, f"domain_rand.kicks.{name}", where)
+        if all(getattr(kick, axis) == (0.0, 0.0) for axis in ("x", "y", "z", "roll", "pitch", "yaw")):
+            raise ConfigError(
+                f"{where(f'domain_rand.kicks.{name}')}: it kicks nothing; x, y, z, roll, pitch or yaw say how far"
+            )
+    for name, force in cfg.domain_rand.forces.items():
+        path = f"domain_rand.forces.{name}"
+        _check_grow(force, path, where)
+        if all(getattr(force, axis) == (0.0, 0.0) for axis in ("x", "y", "z")):
+            raise ConfigError(f"{where(path)}: it pushes nothing; x, y or z say how hard [N]")
+        bodies = body_names(robot)
+        if force.body and force.body not in bodies:
+            told = suggest(force.body, bodies, "bodies")
+            raise ConfigError(f"{where(f'{path}.body')}: '{robot.name}' has no body '{force.body}'{told}")
+
+
+def check_observed(cfg: TaskConfig) -> None:
+    """Look whether what groups observe of the randomisation is randomised.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    for group, section in cfg.observations.groups.items():
+        for term in section.terms:
+            path = f"observations.groups.{group}.terms"
+            name = term.removeprefix(PREFIX)
+            if term.startswith(PREFIX) and name in FIELDS and observed(cfg, name) is None:
+                where = cfg.origins.where(path)
+                raise ConfigError(
+                    f"{where}: {term}: domain_rand.ranges does not draw '{name}', so there is nothing to observe"
+                )
+            if term == "push_force" and isinstance(cfg, LeggedConfig) and not observed_forces(cfg):
+                raise ConfigError(f"{cfg.origins.where(path)}: push_force: domain_rand.forces names no force to observe")
+            if term == "push_force" and isinstance(cfg, LeggedConfig) and cfg.train.algorithm.symmetry:
+                aside = [force.body for force in observed_forces(cfg).values() if force.body]
+                if aside:
+                    raise ConfigError(
+                        f"{cfg.origins.where(path)}: push_force: of a force on '{aside[0]}' there is no mirror image, only of"
+                        " those on the base; train.algorithm.symmetry=false learns without"
+                    )

@@ -1,0 +1,92 @@
+"""Numbers in one range after another, each with a distribution of its own, from even ones."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from legged.config.schema import DrawConfig
+from legged.mdp.uniform_numbers import Drawn, UniformNumbers
+
+KINDS = ("uniform", "log_uniform", "gaussian")
+
+
+def standard_deviation(draw: DrawConfig) -> float:
+    """Return that of a normal distribution before it is cut off: as told, or a quarter of the range's width."""
+    return draw.std or 0.25 * (draw.range[1] - draw.range[0])
+
+
+class Draws:
+    """V columns of numbers, some of which are drawn evenly, some evenly in their logarithm, some normally."""
+
+    def __init__(
+        self,
+        columns: Sequence[DrawConfig],
+        neutral: Sequence[float],
+        device: torch.device,
+        steps_per_iteration: int = 1,
+    ) -> None:
+        """Say how each of V columns is drawn, and from what value on it grows over iterations of so many steps."""
+        self._order = sorted(range(len(columns)), key=lambda i: KINDS.index(columns[i].distribution))
+        ordered = [columns[i] for i in self._order]
+        self._counts = [sum(draw.distribution == kind for draw in ordered) for kind in KINDS]
+        self._back = None
+        if self._order != list(range(len(columns))):
+            self._back = torch.tensor([self._order.index(i) for i in range(len(columns))], device=device)
+
+        def tensor(values: Sequence[float] | Sequence[tuple[float, float]]) -> Tensor:
+            return torch.tensor(values, dtype=torch.float32, device=device)
+
+        normal = [draw for draw in ordered if draw.distribution == "gaussian"]
+        self._middle = tensor([0.5 * sum(draw.range) for draw in normal])
+        self._spread = tensor([math.sqrt(2.0) * standard_deviation(draw) for draw in normal])
+        ends = [_ends(draw) for draw in ordered]
+        self.low, self.high = (tensor([end[k] for end in ends]) for k in range(2))
+        """(V,) bounds of the even numbers, in an order of their own."""
+        self._least, self._most = (tensor([draw.range[k] for draw in columns]) for k in range(2))
+        self._pace: tuple[Tensor, Tensor] | None = None
+        """(V,) how much wider a range gets in a step, and how wide it is at the first one, as shares; None if none grows."""
+        if any(draw.grow[1] > 0.0 for draw in columns):
+            paces = [1.0 / (draw.grow[1] - draw.grow[0]) if draw.grow[1] > 0.0 else 0.0 for draw in columns]
+            first = [-draw.grow[0] * pace if pace else 1.0 for draw, pace in zip(columns, paces, strict=True)]
+            self._pace = tensor([pace / steps_per_iteration for pace in paces]), tensor(first)
+        self._neutral = torch.minimum(torch.maximum(tensor(neutral), self._least), self._most)
+
+    def ask(self, numbers: UniformNumbers) -> Drawn:
+        """Ask for the even numbers that `values` is made of."""
+        return numbers.between(self.low, self.high, len(self.low))
+
+    def at_once(self, count: int) -> Tensor:
+        """Draw (count, V) numbers, not within a step; those that grow have not yet."""
+        even = self.low + torch.rand(count, len(self.low), device=self.low.device) * (self.high - self.low)
+        return self.values(even, torch.zeros((), device=even.device))
+
+    def values(self, even: Tensor, steps: Tensor) -> Tensor:
+        """Return (N, V) numbers from even ones, (N, V) within `low` and `high`, after so many `steps` of training, ()."""
+        parts = list(even.split(self._counts, dim=1))
+        if self._counts[1]:
+            parts[1] = parts[1].exp()
+        if self._counts[2]:
+            parts[2] = torch.erfinv(parts[2]) * self._spread + self._middle
+        drawn = torch.cat(parts, dim=1) if any(self._counts[1:]) else even
+        if self._back is not None:
+            drawn = drawn.index_select(1, self._back)
+        if any(self._counts[1:]):
+            drawn = torch.clamp(drawn, self._least, self._most)  # rounding must not leave the range
+        if self._pace is None:
+            return drawn
+        share = torch.addcmul(self._pace[1], self._pace[0], steps).clamp_(0.0, 1.0)
+        return torch.lerp(self._neutral.expand_as(drawn), drawn, share.expand_as(drawn))
+
+
+def _ends(draw: DrawConfig) -> tuple[float, float]:
+    """Return between what even numbers are drawn of which a column is made."""
+    low, high = draw.range
+    if draw.distribution == "log_uniform":
+        return math.log(low), math.log(high)
+    if draw.distribution == "gaussian":  # of which torch.erfinv makes normal ones; at +-1 they would be infinite
+        reach = 0.5 * (high - low) / standard_deviation(draw) if high > low else 0.0
+        end = min(math.erf(reach / math.sqrt(2.0)), 1.0 - 1e-6)
+        return -end, end
+    return low, high

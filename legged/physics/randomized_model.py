@@ -1,0 +1,140 @@
+"""The arrays of a model that differ from world to world, from the values given for its fields."""
+
+import copy
+from collections.abc import Callable, Collection, Mapping
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from legged.config.randomization import DrawConfig, Range, draw_of
+from legged.config.schema import SimConfig
+from legged.errors import ConfigError, suggest
+from legged.physics.fields import DERIVED, FIELDS, MODEL_FIELDS, Change, changed_arrays, own_array
+from legged.physics.restitution import DampingOfBounces
+from legged.physics.scene import Scene
+
+
+class RandomizedModel:
+    """The arrays of a model, per world, from the values given for its fields."""
+
+    def __init__(
+        self, scene: Scene, model: mujoco.MjModel, fields: Collection[str], dtype: torch.dtype, device: torch.device
+    ) -> None:
+        """Let those `fields` be given; arrays are made of `dtype` on `device`, as the engine keeps them."""
+        self.model, self._scene, self._dtype, self._device = model, scene, dtype, device
+        self.rows = {name: field.rows(scene, model) for name, field in MODEL_FIELDS.items() if name in fields}
+        """Rows of the arrays that each field changes."""
+        self._values: dict[str, Tensor] = {}
+        self.bounces = DampingOfBounces(device, dtype) if "restitution" in fields else None
+        """What makes damping of restitution, where that is among the fields."""
+
+    def give(self, field: str, values: Tensor) -> dict[str, Tensor]:
+        """Take `values` (N,) of a field, one per world, or (N, rows); return the arrays that it changes, (N, ...).
+
+        They are made from the model's own numbers and all values given so far: to give a field again replaces its values.
+
+        Raises:
+            ValueError: the field is none of those that may be given, or the values have another shape.
+        """
+        if field not in self.rows:
+            told = suggest(field, self.rows, "those are")
+            raise ValueError(f"randomize: '{field}' is none of the fields that make_physics was told of{told}")
+        rows = len(self.rows[field])
+        if values.dim() != 1 and values.shape[1:] != (rows,):
+            raise ValueError(f"randomize: values of {field} must be (N,) or (N, {rows}), not {tuple(values.shape)}")
+        self._values[field] = values.to(self._device, self._dtype).reshape(len(values), -1).expand(-1, rows)
+        return self.arrays(changed_arrays([field]), self._values)
+
+    def arrays(self, names: Collection[str], values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return arrays by their names, (N, ...), for `values` of fields, (N, 1) or (N, rows)."""
+        worlds = len(next(iter(values.values())))
+        found = {}
+        for array in names:
+            own = torch.from_numpy(own_array(self.model, array)).to(self._device, self._dtype)
+            found[array] = own.expand(worlds, *own.shape).clone()
+            for name in self.rows:
+                for change in FIELDS[name].changes:
+                    if change.array == array and name in values:
+                        rows = torch.from_numpy(self.rows[name]).to(self._device)
+                        self._apply(change, rows, values[name].to(self._device, self._dtype), found[array])
+        return found
+
+    def _apply(self, change: Change, rows: Tensor, values: Tensor, array: Tensor) -> None:
+        """Change `rows` of one array (N, ...) by `values` (N, 1) or (N, R)."""
+        if change.bounce:
+            assert self.bounces is not None
+            values = self.bounces.ratio(values)
+            values = 1.0 / values if change.bounce == "inverse" else values
+        if change.weight is not None:
+            weight = torch.from_numpy(change.weight(self.model)).to(self._device, self._dtype)
+            values = values * weight[rows]
+        part = array if change.column is None else array[:, :, change.column]  # a view
+        values = values.reshape(*values.shape, *[1] * (part.dim() - 2))
+        old = part[:, rows]
+        part[:, rows] = {"set": values.expand_as(old), "add": old + values, "scale": old * values}[change.how]
+
+    def variants(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return, for values (K, 1) or (K, rows) of fields that others are derived from, the arrays that they change and
+        those that C MuJoCo derives from them (`DERIVED`), (K, ...) each: as many models as worlds may choose from, so that
+        none is derived within a step.
+        """
+        on_host = RandomizedModel(self._scene, self.model, values, torch.float64, torch.device("cpu"))
+        changed = on_host.arrays(changed_arrays(values), values)
+        model = copy.copy(self.model)
+        data = mujoco.MjData(model)
+        count = len(next(iter(changed.values())))
+        derived = {name: np.empty((count, *getattr(model, name).shape)) for name in DERIVED if getattr(model, name).size}
+        for k in range(count):
+            for name, array in changed.items():
+                getattr(model, name)[:] = array[k].numpy()
+            mujoco.mj_setConst(model, data)
+            for name, rows in derived.items():
+                rows[k] = getattr(model, name)
+        found = changed | {name: torch.from_numpy(rows) for name, rows in derived.items()}
+        return {name: array.to(self._device, self._dtype) for name, array in found.items()}
+
+
+def keep_centres_apart(model: mujoco.MjModel, fields: Collection[str]) -> None:
+    """Tell MuJoCo, of a model whose centres of mass are going to move, that they are not where bodies have their origin: it
+    leaves out what that saves.
+    """
+    if "body_ipos" in changed_arrays(fields):
+        model.body_sameframe[:] = 0
+        model.body_simple[:] = 0
+        model.dof_simplenum[:] = 0
+
+
+def check_ranges(
+    ranges: Mapping[str, Range | DrawConfig], scene: Scene, sim: SimConfig, where: Callable[[str], str] = str
+) -> None:
+    """Check `ranges`, field -> lowest and highest value, or more, against a scene; `where` says who set a dotted path.
+
+    Raises:
+        ConfigError: there is no such field, the scene has nothing that it changes, or the lowest values leave no mass.
+    """
+    model = scene.model(sim, "none") if ranges else None  # no field is the ground's, which takes long to build
+    for name in ranges:
+        if name not in FIELDS:
+            path = where("domain_rand.ranges")
+            raise ConfigError(f"{path}: there is no field '{name}'{suggest(name, FIELDS, 'fields')}")
+    given = RandomizedModel(scene, model, ranges, torch.float64, torch.device("cpu")) if model else None
+    for name, field in FIELDS.items():
+        if given is None or model is None or name not in ranges:
+            continue
+        path, low = where(f"domain_rand.ranges.{name}"), float(draw_of(ranges[name]).range[0])
+        if not len(field.rows(scene, model)):
+            raise ConfigError(f"{path}: {scene.name} has no {field.what}")
+        if name == "restitution" and (model.geom_solref[field.rows(scene, model), 0] <= 0.0).any():
+            told = "contacts have a stiffness of their own (a negative solref), in place of a time constant"
+            raise ConfigError(f"{path}: {scene.name}: {told}")
+        changed = given.give(name, torch.tensor([low], dtype=torch.float64)) if field.changes else {}
+        for change in field.changes:
+            rows = changed[change.array][:, field.rows(scene, model)]
+            numbers = rows if change.column is None else rows[:, :, change.column]
+            if change.least is not None and numbers.min() < change.least:
+                raise ConfigError(
+                    f"{path}: its lowest value, {low:g} ({field.meaning}), makes a {change.array} of {numbers.min():g};"
+                    f" at least {change.least:g} must be left"
+                )

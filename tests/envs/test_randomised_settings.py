@@ -1,0 +1,137 @@
+"""Who may know what is randomised, and which settings of it are refused."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import small_config, small_task
+
+from legged.errors import ConfigError
+from legged.registry import make_task
+
+FORCES = {
+    "pull": {"body": "LF_THIGH", "interval_s": [0.02, 0.06], "duration_s": [0.04, 0.1], "y": [-50.0, 50.0]},
+    "lift": {"interval_s": [0.02, 0.06], "duration_s": [0.04, 0.1], "z": [0.0, 50.0]},
+}
+
+
+def with_ranges(**ranges):
+    return ("domain_rand.ranges", ranges)
+
+
+# ---- observed ------------------------------------------------------------------------------------------------------------
+
+
+def observing(*terms):
+    return ("observations.groups.critic.terms", ["dof_pos", *terms])
+
+
+def test_what_is_drawn_can_be_observed_from_minus_one_to_one():
+    ranges = {
+        "friction": [0.4, 1.2],
+        "joint_offset": [-0.02, 0.02],
+        "p_gain": {"range": [0.5, 2.0], "distribution": "log_uniform"},
+    }
+    task = small_task(("domain_rand.ranges", ranges), observing("rand_friction", "rand_joint_offset", "rand_p_gain"))
+    task.randomization.drawn[0, 0], task.randomization.drawn[1, 0] = 0.4, 1.0
+    assert task._obs_rand_friction()[:2].flatten().tolist() == pytest.approx([-1.0, 0.5])
+    assert task._obs_rand_joint_offset().shape == (4, 12)
+    task.randomization.drawn[0, task.randomization.columns["p_gain"]] = 1.0
+    assert task._obs_rand_p_gain()[0].item() == pytest.approx(0.0, abs=1e-6)  # the middle of the logarithms
+    assert task.observation_groups["critic"].buffer.shape == (4, 12 + 1 + 12 + 1)
+
+
+def test_a_nominal_robot_is_observed_by_the_ranges_of_training():
+    """Where a teacher is shown nothing is drawn: friction is 1, and an offset 0, on the scale that it has learned."""
+    cfg = small_config(
+        with_ranges(friction=[0.0, 2.0], joint_offset=[-0.1, 0.3]),
+        ("domain_rand.forces", FORCES),
+        observing("rand_friction", "rand_joint_offset", "push_force"),
+        ("train.algorithm.symmetry", False),
+    )
+    task = make_task(replace(cfg, domain_rand=cfg.domain_rand.nominal()))
+    assert task.randomization.fields == {}
+    assert task.physics.forces is None
+    assert task._obs_rand_friction().flatten().tolist() == [0.0] * 4
+    torch.testing.assert_close(task._obs_rand_joint_offset(), torch.full((4, 12), -0.5))
+    assert task._obs_push_force().shape == (4, 6)
+    assert not task._obs_push_force().any()
+
+
+def test_forces_are_observed_as_shares_of_the_largest():
+    task = small_task(("domain_rand.forces", FORCES), observing("push_force"), ("train.algorithm.symmetry", False))
+    task.disturbances.forces["pull"].force[0] = torch.tensor([0.0, 25.0, 0.0])
+    assert task._obs_push_force()[0].tolist() == pytest.approx([0.0, 0.5, 0.0, *task._obs_push_force()[0, 3:].tolist()])
+
+
+def test_privileged_observations_have_mirror_images():
+    """Left and right joints change places, what points to the left changes its sign, and numbers of the whole robot stay."""
+    ranges = {"friction": [0.4, 1.2], "base_com_y": [-0.1, 0.1], "motor_strength": {"range": [0.8, 1.1], "each": True}}
+    terms = ["rand_friction", "rand_base_com_y", "rand_motor_strength", "push_force"]
+    forces = {"pull": {"x": [-1.0, 1.0]}, "lift": {"z": [0.0, 1.0]}}
+    cfg = ("domain_rand.ranges", ranges), ("domain_rand.forces", forces), ("observations.groups.critic.terms", terms)
+    columns, signs = small_task(*cfg, num_envs=1).mirror_images().groups["critic"]
+    assert columns.tolist() == [0, 1, 5, 6, 7, 2, 3, 4, 11, 12, 13, 8, 9, 10, 14, 15, 16, 17, 18, 19]
+    assert signs.tolist() == [1.0, -1.0, *[1.0] * 12, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0]
+    each = {"link_mass": {"range": [0.9, 1.1], "each": True}}
+    task = small_task(("domain_rand.ranges", each), ("observations.groups.critic.terms", ["rand_link_mass"]), num_envs=1)
+    with pytest.raises(ConfigError, match=r"'rand_link_mass' has 13 numbers, but its kind 'scalar' is for 1"):
+        task.mirror_images()
+
+
+# ---- what is refused -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "draw", "error"),
+    [
+        ("frictoin", [0.0, 1.0], r"ranges\.frictoin: there is no property 'frictoin' .*did you mean 'friction'"),
+        ("friction", {"range": [0.5, 1.0], "wen": "reset"}, r"friction\.wen: unknown key 'wen'; did you mean 'when'"),
+        (
+            "friction",
+            {"range": [0.5, 1.0], "when": "resets"},
+            r"friction\.when: unknown value 'resets'; did you mean 'reset'",
+        ),
+        ("friction", "much", r"ranges\.friction: expected \[low, high\], or a mapping that has it as range, got 'much'"),
+        ("friction", {"range": [0.0, 1.0], "distribution": "log_uniform"}, r"friction\.distribution: log_uniform draws from"),
+        ("friction", {"range": [0.2, 1.0], "std": 0.1}, r"friction\.std: only gaussian has a standard deviation"),
+        ("friction", {"range": [0.2, 1.0], "when": "interval"}, r"friction\.when: interval needs an interval_s above 0"),
+        ("friction", {"range": [0.2, 1.0], "interval_s": 3.0}, r"friction\.interval_s: is of `when: interval` only, got 3"),
+        ("friction", {"range": [0.2, 1.0], "grow": [0, 5]}, r"friction\.grow: what is drawn at the start can't grow"),
+        ("friction", {"range": [0.2, 1.0], "when": "reset", "grow": [5, 5]}, r"friction\.grow: expected \[first, last\]"),
+        ("link_mass", {"range": [0.9, 1.0], "when": "reset", "grow": [0, 5]}, r"link_mass\.grow: can't grow: MuJoCo derives"),
+        ("restitution", [0.0, 1.5], r"ranges\.restitution: must be at most 1 .*got 1\.5"),
+        ("motor_strength", [-0.5, 1.0], r"ranges\.motor_strength: must be at least 0 .*got -0\.5"),
+    ],
+)
+def test_mistakes_are_named(name, draw, error):
+    with pytest.raises(ConfigError, match=rf"command line: domain_rand\.(ranges\.)?{error}"):
+        small_config((f"domain_rand.ranges.{name}", draw))
+
+
+@pytest.mark.parametrize(
+    ("settings", "error"),
+    [
+        (
+            [with_ranges(link_mass={"range": [0.9, 1.1], "when": "reset"}, joint_armature=[0.0, 0.1])],
+            r"link_mass is drawn at reset, joint_armature at the start: MuJoCo derives constants from link_mass, joint",
+        ),
+        (
+            [with_ranges(link_mass={"range": [0.9, 1.1], "when": "reset"}), ("domain_rand.randomize_base_mass", True)],
+            r"link_mass is drawn at reset, added_base_mass at the start: .*randomize_base_mass draws at the start",
+        ),
+        ([("control.control_type", "T"), with_ranges(p_gain=[0.9, 1.1])], r"ranges\.p_gain: control\.control_type T takes"),
+        ([("control.control_type", "V"), with_ranges(joint_offset=[0.0, 0.1])], r"ranges\.joint_offset: .*V does not look"),
+        ([("domain_rand.kicks", {"k": {}})], r"domain_rand\.kicks\.k: it kicks nothing"),
+        ([("domain_rand.forces", {"f": {}})], r"domain_rand\.forces\.f: it pushes nothing"),
+        (
+            [("domain_rand.forces", {"f": {"x": [0, 1], "body": "LF_THIG"}})],
+            r"domain_rand\.forces\.f\.body: 'anymal_c' has no body 'LF_THIG'; did you mean 'LF_THIGH'",
+        ),
+        ([observing("rand_p_gain")], r"groups\.critic\.terms: rand_p_gain: domain_rand\.ranges does not draw 'p_gain'"),
+        ([observing("push_force")], r"groups\.critic\.terms: push_force: domain_rand\.forces names no force"),
+    ],
+)
+def test_settings_that_do_not_fit_each_other_are_named(settings, error):
+    with pytest.raises(ConfigError, match=error):
+        small_config(*settings)
