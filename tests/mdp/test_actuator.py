@@ -167,6 +167,21 @@ def test_a_reset_forgets_the_targets_on_their_way():
     assert found[~mask].unique().tolist() == [50.0]
 
 
+@KERNELS
+def test_after_a_reset_joints_hold_what_their_encoders_show_as_default(kernels):
+    """An encoder that shows 0.1 rad too much, gains 100: at the true angle 0 the law sees 0.1 rad and asks for -10 N m, until
+    a target arrives.
+    """
+    made = control(kernels, delay=(4, 4))
+    made.vary({"joint_offset": torch.full((N,), 0.1)})
+    made.reset(torch.ones(N, dtype=torch.bool))
+    made.set_actions(full(0.5))
+    torch.testing.assert_close(made.compute(full(0.0), full(0.0)), full(-10.0))
+    for _ in range(3):
+        made.compute(full(0.0), full(0.0))
+    torch.testing.assert_close(made.compute(full(0.0), full(0.0)), full(40.0))
+
+
 def test_kernels_and_torch_agree():
     """Bit by bit but for the friction, whose exponential and tangent are other libraries'."""
     plain = dict(model="dc_motor", joints=("HFE", "KFE"), no_load_speed={"H": 6.0, "K": 4.0}, delay=(0, 9))
