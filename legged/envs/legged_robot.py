@@ -263,10 +263,12 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.control.vary({name: drawn[name] for name in names})
 
     def _vary_velocity_limits(self, again: bool = False) -> None:
-        """Bring `dof_vel_limits` up to date with what was drawn, or drawn `again`."""
+        """Bring `dof_vel_limits`, and the speeds of motors, up to date with what was drawn, or drawn `again`."""
         if "velocity_limit" in (self.randomization.redrawn if again else self.randomization.draws):
             factor = self.randomization.fields["velocity_limit"].view(self.num_envs, -1)
             torch.mul(self._nominal_vel_limits, factor, out=self.dof_vel_limits)
+            if self.control.actuator is not None:
+                self.control.actuator.curve.vary(factor)
 
     def apply_randomization(self) -> None:
         super().apply_randomization()

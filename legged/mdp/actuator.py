@@ -41,6 +41,15 @@ class MotorCurve:
         speed makes a motor ideal.
         """
         self.stall_torque, self.no_load_speed = stall_torque, no_load_speed
+        """(D,) each; no-load speeds (N, D) once they `vary` from robot to robot."""
+        self.nominal_speed = no_load_speed
+
+    def vary(self, factor: Tensor) -> None:
+        """Multiply no-load speeds by a factor (N, 1) or (N, D). The first call allocates, later ones write in place."""
+        if self.no_load_speed is self.nominal_speed:
+            self.no_load_speed = factor * self.nominal_speed
+            return
+        torch.mul(self.nominal_speed, factor, out=self.no_load_speed)
 
     def limits(self, dof_vel: Tensor, effort: Tensor) -> tuple[Tensor, Tensor]:
         """Return the lowest and the highest torque (N, D) [N m] at velocities (N, D) [rad/s], where joints bear `effort`,
@@ -138,7 +147,7 @@ class Actuator:
         curve, friction, parts = self.curve, self.friction, []
         if self.network is not None and bool(self._by_network[joint]):
             parts.append(f"torque by a network ({self.network.kind})")
-        stall, fastest = float(curve.stall_torque[joint]), float(curve.no_load_speed[joint])
+        stall, fastest = float(curve.stall_torque[joint]), float(curve.nominal_speed[joint])
         if math.isfinite(fastest):
             parts.append(f"{stall:g} N m at rest, none at {fastest:g} rad/s")
         dry, extra, viscous = (float(of[joint]) for of in (friction.coulomb, friction.extra, friction.viscous))
@@ -186,7 +195,7 @@ class Actuator:
             by_robot = (each.expand_as(out) for each in (*gains, effort))
             now: tuple[Tensor | float, ...] = (self.targets, self.delay, self._steps, self.decimation, dof_pos, dof_vel)
             rough = (friction.coulomb, friction.extra, friction.viscous, friction.stribeck_velocity, friction.smoothing)
-            motor = (curve.stall_torque, curve.no_load_speed)
+            motor = (curve.stall_torque, curve.no_load_speed.expand_as(out))
             self._kernels.drive_joints(tuple(out.shape), *now, *by_robot, *motor, *rough, self._has_friction, out)
             self._steps += 1
             return

@@ -70,6 +70,28 @@ def test_torques_stay_on_the_line_of_the_motor(kernels):
     assert made.compute(angle, full(1.0)).unique().tolist() == pytest.approx([8.0], abs=1e-4)  # 10 - 2 is within the limits
 
 
+@KERNELS
+def test_no_load_speeds_may_differ_from_robot_to_robot(kernels):
+    """120 N m at rest and none at 7.5 rad/s, or at 3.75 of every second robot: at 2.5 rad/s 80, or 40."""
+    made = control(kernels, model="dc_motor", stall_torque={"H": 120.0, "K": 120.0}, no_load_speed={"H": 7.5, "K": 7.5})
+    factor = torch.ones(N, 1)
+    for changed in (0.7, 0.5):  # the second time in place
+        factor[1::2] = changed
+        made.actuator.curve.vary(factor)
+    made.reset(torch.ones(N, dtype=torch.bool))
+    made.set_actions(full(5.0))
+    found = made.compute(full(0.0), full(2.5))
+    torch.testing.assert_close(found[::2], full(80.0)[::2])
+    torch.testing.assert_close(found[1::2], full(40.0)[1::2])
+
+
+def test_velocity_limits_that_are_drawn_are_the_motors_own():
+    task = small_task(("control.actuator.model", "dc_motor"), ("domain_rand.ranges", {"velocity_limit": [0.5, 0.5]}))
+    curve = task.control.actuator.curve
+    torch.testing.assert_close(curve.no_load_speed, 0.5 * curve.nominal_speed.expand_as(task.dof_vel))
+    torch.testing.assert_close(curve.no_load_speed, task.dof_vel_limits)
+
+
 def test_stall_torque_and_no_load_speed_are_the_robots_unless_named():
     made = control(model="dc_motor", joints=("HFE",), no_load_speed={"LF_HFE": 5.0})
     curve = made.actuator.curve

@@ -32,7 +32,7 @@ def drive_joints(
     damping: wp.array2d[float],
     effort: wp.array2d[float],
     stall_torque: wp.array[float],
-    no_load_speed: wp.array[float],
+    no_load_speed: wp.array2d[float],
     coulomb: wp.array[float],
     extra: wp.array[float],
     viscous: wp.array[float],
@@ -49,7 +49,7 @@ def drive_joints(
     spring = stiffness[robot, joint] * (targets[age, robot, joint] - dof_pos[robot, joint])
     torque = spring - damping[robot, joint] * velocity
     limit, stall = effort[robot, joint], stall_torque[joint]
-    share = velocity / no_load_speed[joint]
+    share = velocity / no_load_speed[robot, joint]
     torque = above(torque, above(below(stall * (-1.0 - share), limit), -limit))
     torque = below(torque, below(above(stall * (1.0 - share), -limit), limit))
     if has_friction:
