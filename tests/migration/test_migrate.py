@@ -95,7 +95,13 @@ def test_a_fork_with_history_computed_values_and_rewards_of_its_own(migrated):
     assert data["commands"]["ranges"]["lin_vel_x"] == [-2.0, 2.0]
     assert data["commands"]["ranges"]["ang_vel_yaw"] == pytest.approx([-1.5707963, 1.5707963])
     assert data["domain_rand"] == {
-        "ranges": {"link_mass": [0.9, 1.1], "actuator_gain": [-0.2, 0.2]},
+        "ranges": {
+            "link_mass": [0.9, 1.1],
+            "motor_strength": [0.8, 1.2],
+            "base_com_x": [-0.05, 0.05],
+            "base_com_y": [-0.05, 0.05],
+            "base_com_z": [-0.05, 0.05],
+        },
         "friction_range": [0.75, 1.125],
         "randomize_base_mass": True,
         "added_mass_range": [-1, 2],
@@ -120,8 +126,6 @@ def test_a_fork_with_history_computed_values_and_rewards_of_its_own(migrated):
         "control.hip_reduction",
         "commands.ranges.body_pitch",
         "asset.penalize_contacts_on",
-        "domain_rand.randomize_com_displacement",
-        "domain_rand.com_displacement_range",
         "env.num_one_step",
         "rewards.scales.joint_power",
         "runner_class_name",

@@ -252,17 +252,29 @@ def _learning(result: Translation) -> None:
             result.lose(path, f"training here is rsl-rl's {usual}")
 
 
+RANDOM_MODEL = (
+    ("link_mass", "link_mass", ("link_mass",)),
+    ("motor_strength", "motor_strength", ("motor_strength",)),
+    ("restitution", "restitution", ("restitution",)),
+    ("com_displacement", "com_displacement", ("base_com_x", "base_com_y", "base_com_z")),
+    ("kp", "kp", ("p_gain",)),
+    ("kd", "kd", ("d_gain",)),
+    ("gains", "stiffness_multiplier", ("p_gain",)),
+    ("gains", "damping_multiplier", ("d_gain",)),
+    ("motor_offset", "motor_offset", ("joint_offset",)),
+)
+"""What forks draw of the model: randomize_<first> switches on <second>_range; and the properties here with that meaning."""
+
+
 def _random_model(result: Translation) -> None:
     """Map what forks draw of the model, as far as it means the same; leave out what they have switched off."""
     prefix = "domain_rand."
-    drawn = {"link_mass": ("link_mass", 0.0), "motor_strength": ("actuator_gain", -1.0)}
-    for name, (field_of_model, shift) in drawn.items():
+    for switch, name, fields in RANDOM_MODEL:
         path = f"{prefix}{name}_range"
         values = result.numbers(path, [])
-        if result.get(f"{prefix}randomize_{name}", False) and len(values) == 2:
-            shifted = [round(value + shift, 6) for value in values]
-            comment = "added to a gain of 1" if shift else ""
-            result.put(f"domain_rand.ranges.{field_of_model}", shifted, path, comment)
+        if result.get(f"{prefix}randomize_{switch}", False) and len(values) == 2:
+            for field_of_model in fields:
+                result.put(f"domain_rand.ranges.{field_of_model}", list(values), path)
     angles = result.get(f"{prefix}initial_joint_pos_range")
     if result.get(f"{prefix}randomize_initial_joint_pos", False) and angles is not None:
         result.put("init_state.dof_pos_factor", angles, f"{prefix}initial_joint_pos_range")
