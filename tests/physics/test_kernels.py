@@ -1,5 +1,6 @@
 """Kernels are compiled ahead: all that a model launches, and no others; once, though several processes ask."""
 
+import gc
 import os
 import re
 import signal
@@ -148,6 +149,30 @@ def test_what_cannot_be_compiled_ahead_is_left_to_warp(tmp_path, monkeypatch, ca
     assert "compiled 0 kernel modules" in capfd.readouterr().out
     run()
     assert x.numpy().tolist() == [7.0, 8.0, 9.0, 10.0]
+
+
+def test_compiling_processes_collect_no_garbage_of_their_parent(monkeypatch, tmp_path):
+    """An object in a cycle, which may have to wait for a thread that no forked process has, is its parent's to end."""
+    ended = tmp_path / "ended"
+
+    class Session:
+        def __init__(self) -> None:
+            self.itself = self
+
+        def __del__(self) -> None:
+            with ended.open("a") as file:
+                file.write(f"{os.getpid()} ")
+
+    @wp.kernel(module=wp.get_module("compiled_beside_garbage"), enable_backward=False)
+    def count(x: wp.array[float]):
+        x[wp.tid()] = float(wp.tid()) + 7.0
+
+    x = wp.zeros(4, dtype=float, device="cpu")
+    monkeypatch.setattr(Build, "compile", lambda *_: gc.isenabled() and gc.collect())
+    Session()
+    compile_ahead(wp.get_device("cpu"), [lambda: wp.launch(count, dim=4, inputs=[x], device="cpu")])
+    gc.collect()
+    assert set(ended.read_text().split()) == {str(os.getpid())}
 
 
 def test_a_terminal_sees_one_line(monkeypatch, capsys):

@@ -8,6 +8,7 @@ other ranks of a training on several GPUs for instance, waits for the first inst
 All of this only saves time: a module that is missing afterwards is compiled by Warp when it is launched.
 """
 
+import gc
 import math
 import os
 import struct
@@ -156,6 +157,9 @@ def _fork(work: int, builds: list[Build], device: Any, scratch: str) -> int:
     if child:
         return child
     try:
+        # What the parent left to the garbage collector is not ours: objects with threads of their own, sessions of onnxruntime
+        # or worlds of MuJoCo's, would wait for ever for threads that no fork takes along.
+        gc.disable()
         tempfile.tempdir = scratch
         while (item := os.read(work, 2)) and os.getppid() == parent:
             builds[struct.unpack("=H", item)[0]].compile(device)
