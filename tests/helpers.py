@@ -4,6 +4,7 @@ import contextlib
 import io
 import re
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -118,3 +119,14 @@ def wait_for(condition: Callable[[], object], process: subprocess.Popen, seconds
         assert process.poll() is None, said
         assert time.monotonic() < end, said
         time.sleep(0.01)
+
+
+def forget_modules_of(folder: Path) -> None:
+    """Forget the modules that were imported from a folder. Others stay: what imports a library twice has two classes of one
+    name.
+    """
+    for name, module in list(sys.modules.items()):
+        spec = getattr(module, "__spec__", None)
+        places = [*(spec.submodule_search_locations or ()), spec.origin] if spec is not None else []
+        if any(isinstance(place, str) and Path(place).is_relative_to(folder) for place in places):
+            del sys.modules[name]

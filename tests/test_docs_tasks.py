@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers import call
+from helpers import call, forget_modules_of
 
 from legged import registry, user_modules
 from legged.physics import FIELDS
@@ -59,13 +59,11 @@ def files(workplace, tmp_path, monkeypatch):
     monkeypatch.setattr(registry, "_REGISTERED", {})
     monkeypatch.setattr(user_modules, "_IMPORTED", set())
     monkeypatch.setattr(sys, "path", list(sys.path))
-    before = set(sys.modules)
     for name, text in MODULES.items():
         (tmp_path / name).write_text(text, encoding="utf-8")
     (tmp_path / "resources").symlink_to(ROOT / "resources")
     yield tmp_path
-    for name in set(sys.modules) - before:
-        del sys.modules[name]
+    forget_modules_of(tmp_path)
 
 
 def run(command: str) -> int:

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers import TASK, call, tiny_run
+from helpers import TASK, call, forget_modules_of, tiny_run
 
 from legged import LeggedRobot, registry, user_modules
 from legged.config import from_dict
@@ -18,15 +18,13 @@ pytestmark = pytest.mark.usefixtures("workplace", "own_registry")
 
 
 @pytest.fixture
-def own_registry(monkeypatch):
+def own_registry(monkeypatch, tmp_path):
     """The registry, path and modules, without what a test adds to them."""
     monkeypatch.setattr(registry, "_REGISTERED", {})
     monkeypatch.setattr(user_modules, "_IMPORTED", set())
     monkeypatch.setattr(sys, "path", list(sys.path))
-    before = set(sys.modules)
     yield
-    for name in set(sys.modules) - before:
-        del sys.modules[name]
+    forget_modules_of(tmp_path)
 
 
 @pytest.fixture

@@ -157,8 +157,8 @@ def _fork(work: int, builds: list[Build], device: Any, scratch: str) -> int:
     if child:
         return child
     try:
-        # What the parent left to the garbage collector is not ours: objects with threads of their own, sessions of onnxruntime
-        # or worlds of MuJoCo's, would wait for ever for threads that no fork takes along.
+        # What the parent left to the garbage collector is not ours: objects with threads of their own, such as onnxruntime's
+        # sessions, would wait for ever for threads that no fork takes along.
         gc.disable()
         tempfile.tempdir = scratch
         while (item := os.read(work, 2)) and os.getppid() == parent:
