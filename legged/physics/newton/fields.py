@@ -29,11 +29,11 @@ CENTRES, BASE_CENTRE = "body_com", "base_com"
 class _SolversScene(Scene):
     """What the solver's model consists of, in its own order of shapes."""
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    def __init__(self, name: str, solvers: mujoco.MjModel) -> None:
+        self.name, self._solvers = name, solvers
 
     def model(self, *_: Any, **__: Any) -> mujoco.MjModel:
-        raise NotImplementedError("the solver has its own")
+        return self._solvers
 
     def shapes(self, model: mujoco.MjModel) -> np.ndarray:
         return np.flatnonzero(model.geom_bodyid)
@@ -52,7 +52,7 @@ class SolverFields:
         self._m, self._d, worlds, device = solver.mjw_model, solver.mjw_data, len(base_com), base_com.device
         motors = [name for name in fields if name in MOTORS]
         others = [name for name in fields if name not in MOTORS]
-        inside = _SolversScene(scene.name)
+        inside = _SolversScene(scene.name, solver.mj_model)
         self._models = {
             True: RandomizedModel(scene, model, motors, torch.float32, device),
             False: RandomizedModel(inside, solver.mj_model, others, torch.float32, device),
