@@ -11,7 +11,7 @@ import warp as wp
 from torch.utils._python_dispatch import TorchDispatchMode
 
 NO_LAUNCH = ("detach", "empty", "empty_strided", "empty_like", "new_empty", "lift_fresh", "alias", "_unsafe_view")
-OURS = (*(f"legged.physics.warp.{of}_kernels" for of in ("task", "actuator", "network")), "add_velocities")
+OURS = (*(f"legged.physics.warp.{of}_kernels" for of in ("task", "actuator", "network", "random")), "add_velocities")
 """Kernels that stand for torch's launches: their module, or their name."""
 
 

@@ -71,6 +71,8 @@ class Control:
         """(D,) or (N, D) true joint angles at which encoders show the default ones [rad]."""
         self._nominal = {"p_gain": self.stiffness, "d_gain": self.damping, "torque_limit": self.torque_limits}
         self._varied = False
+        self._factors = {name: torch.ones(1, 1, device=torques.device) for name in self._nominal}
+        self._factors["joint_offset"] = torch.zeros(1, 1, device=torques.device)
         self._target = torch.zeros_like(self.torques)  # joint angles, velocities or torques
         self._columns = None if len(self.acted) == robot.num_dof else torch.tensor(self.acted, device=torques.device)
         self._last_dof_vel = torch.zeros_like(self.torques)
@@ -94,12 +96,19 @@ class Control:
             return
         if not self._varied:
             self._varied = True
+            self._nominal_law = torch.stack([*self._nominal.values(), self.default_dof_pos])
             self.stiffness, self.damping, self.torque_limits, self._lowest_torques = (
                 torch.zeros_like(self.torques) + nominal for nominal in (*self._nominal.values(), self._lowest_torques)
             )
             self.zero_dof_pos = torch.zeros_like(self.torques) + self.default_dof_pos
             if self.actuator is not None and self.control_type == "P":
                 self.actuator.middle = self.zero_dof_pos
+        if self._kernels is not None:
+            self._factors |= each
+            wide = (values.expand_as(self.torques) for values in self._factors.values())
+            law = (self.stiffness, self.damping, self.torque_limits, self._lowest_torques, self.zero_dof_pos)
+            self._kernels.vary_control(*wide, self._nominal_law, *law)
+            return
         written = {"p_gain": self.stiffness, "d_gain": self.damping, "torque_limit": self.torque_limits}
         for name, values in each.items():
             if name in written:

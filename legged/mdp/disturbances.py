@@ -38,6 +38,7 @@ class Kicks:
         self.time_left = uniform(0.0, cfg.interval_s[1], (num_envs,), device)
         """(N,) time until the next kick [s]."""
         self._velocity, self._next = torch.zeros(num_envs, 6, device=device), torch.zeros(num_envs, device=device)
+        self._due = torch.zeros(num_envs, dtype=torch.bool, device=device)
 
     def draw(self, steps: Tensor) -> None:
         """Draw a kick for every robot, after so many `steps` of training. Runs beside the step."""
@@ -47,6 +48,10 @@ class Kicks:
 
     def act(self, physics: Physics, mask: Tensor) -> None:
         """Kick the robots of `mask` (N,) that are due."""
+        if physics.kernels is not None:
+            physics.kernels.find_kicks(mask, self._next, self._dt, 0.5 * self._dt, self.time_left, self._due)
+            physics.push(self._due, self._velocity)
+            return
         self.time_left.sub_(self._dt)
         due = (self.time_left <= 0.5 * self._dt) & mask
         physics.push(due, self._velocity)
@@ -82,13 +87,18 @@ class Forces:
     def act(self, physics: Physics, mask: Tensor) -> None:
         """Begin and end pushes; those of robots that are not in `mask` (N,) end."""
         assert physics.forces is not None
+        on_body = physics.forces[:, self._body, :3]
+        if physics.kernels is not None:
+            moment = (self._dt, 0.5 * self._dt)
+            physics.kernels.push_bodies(mask, self._fresh, self._times, *moment, self.left, self.force, on_body)
+            return
         self.left.sub_(self._dt)
         passed = self.left <= 0.5 * self._dt
         due = passed[:, 1] & mask
         self.force.masked_fill_((passed[:, 0] | ~mask).unsqueeze(1), 0.0)
         masked_set_(self.force, due, self._fresh)
         masked_set_(self.left, due, self._times)
-        physics.forces[:, self._body, :3].add_(self.force)
+        on_body.add_(self.force)
 
 
 class Disturbances:

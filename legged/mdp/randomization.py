@@ -127,6 +127,8 @@ class Randomization:
         self._place, self._moment = (torch.tensor(values, device=device) for values in (place, moment))
         self._fresh = torch.zeros_like(self.drawn)
         self._due = torch.zeros(worlds, 2 + len(intervals), dtype=torch.bool, device=device)
+        self._any_due = torch.zeros(worlds, dtype=torch.bool, device=device)
+        self._kernels = physics.kernels
         self._interval = torch.tensor([float(max(1, round(each / dt))) for each in intervals], device=device)
         self.steps_left = torch.floor(torch.rand(worlds, len(intervals), device=device) * self._interval) + 1.0
         """(N, I) control steps until the next draw of each interval; the first ones are spread over a whole interval."""
@@ -153,18 +155,28 @@ class Randomization:
 
     def redraw(self, physics: Physics, reset: Tensor) -> None:
         """Let the worlds that are due take what was drawn, within a step, where episodes begin in those of `reset` (N,)."""
-        self._due[:, 1].copy_(reset)
-        if len(self._interval):
-            self.steps_left.sub_(1.0)
-            due = torch.le(self.steps_left, 0.0, out=self._due[:, 2:])
-            torch.where(due, self._interval, self.steps_left, out=self.steps_left)
-        torch.where(self._due.index_select(1, self._moment), self._fresh, self.drawn, out=self.drawn)
+        if self._kernels is not None:
+            found = (self.steps_left, self._due, self._any_due, self.steps.view(1))
+            self._kernels.find_moments(reset, self._interval, *found)
+            self._kernels.take_fresh(self._due, self._moment, self._fresh, self.drawn)
+        else:
+            self._find_moments(reset)
+            torch.where(self._due.index_select(1, self._moment), self._fresh, self.drawn, out=self.drawn)
         if self.chosen_fields:
             chosen = self._due[:, self._chosen_at].contiguous()
             masked_set_(self.chosen, chosen, self._new_chosen)
             physics.choose_variants(chosen, self.chosen)
         if self._of_model:
-            physics.redraw(self._due.any(dim=1) if len(self._interval) else reset)
+            physics.redraw(self._any_due)
+
+    def _find_moments(self, reset: Tensor) -> None:
+        """Find out of what each world takes new numbers now, and count the steps."""
+        self._due[:, 1].copy_(reset)
+        if len(self._interval):
+            self.steps_left.sub_(1.0)
+            due = torch.le(self.steps_left, 0.0, out=self._due[:, 2:])
+            torch.where(due, self._interval, self.steps_left, out=self.steps_left)
+        torch.any(self._due, dim=1, out=self._any_due)
         self.steps.add_(1.0)
 
     def progress(self) -> dict[str, Tensor]:

@@ -13,14 +13,17 @@ from legged.config.legged import (
     LeggedDomainRandConfig,
     TerrainConfig,
 )
+from legged.config.randomization import DrawConfig, ForceConfig, KickConfig
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
+from legged.mdp.disturbances import Forces, Kicks
 from legged.mdp.height_scan import HeightScan
-from legged.mdp.randomization import Pushes
+from legged.mdp.randomization import Pushes, Randomization
 from legged.mdp.rewards import Rewards
 from legged.mdp.terrain_curriculum import TerrainCurriculum
+from legged.mdp.uniform_numbers import UniformNumbers
 from legged.physics.warp.task_kernels import TaskKernels
 from legged.robots.robot import load_robot
 from legged.state import state_of
@@ -184,3 +187,84 @@ def test_rewards_are_added_alike(only_positive):
         assert parts[0].last.equal(parts[1].last)
         torch.testing.assert_close(parts[0].total, parts[1].total, rtol=1e-6, atol=1e-6)
     assert not parts[0].fine[3, :4].any()
+
+
+def varying(*names, when="interval"):
+    """Entries of `domain_rand.ranges` that are drawn again."""
+    return {name: DrawConfig(range=(0.5, 1.5), when=when, interval_s=0.1 if when == "interval" else 0.0) for name in names}
+
+
+class NoPhysics:
+    """What the parts below ask of an engine."""
+
+    def __init__(self, kernels) -> None:
+        self.kernels, self.forces, self.pushed = kernels, torch.zeros(N, 3, 6), torch.zeros(N, 7)
+
+    def push(self, mask, delta):
+        self.pushed[:, 0] = mask
+        self.pushed[:, 1:] = delta
+
+
+def test_numbers_are_drawn_again_alike():
+    ranges = {**varying("p_gain", "velocity_limit"), **varying("d_gain", when="reset"), "joint_offset": (0.5, 1.5)}
+    numbers, parts, engines = [], [], []
+    for kernels in (None, TaskKernels(nullcontext)):
+        torch.manual_seed(3)
+        numbers.append(UniformNumbers(N, CPU))
+        engines.append(NoPhysics(kernels))
+        parts.append(Randomization(ranges, N, CPU))
+        parts[-1].prepare(engines[-1], numbers[-1], DT, 24)
+    for step in range(20):
+        reset = chance(0.1, N)
+        for part, drawn, engine in zip(parts, numbers, engines, strict=True):
+            torch.manual_seed(step)
+            drawn.draw()
+            part.draw()
+            before = part.drawn.clone()
+            part.redraw(engine, reset)
+        assert_same(parts)
+        changed = (parts[1].drawn != before).any(dim=1)
+        torch.testing.assert_close(changed, parts[1]._any_due)
+    assert 0 < changed.sum() < N
+    assert parts[1].steps == 20.0
+
+
+def test_the_control_law_varies_alike_and_keeps_what_was_drawn_at_the_start():
+    robot = load_robot("anymal_c")
+    laws = pair(lambda kernels: Control(robot, LeggedControlConfig(), torch.zeros(N, 12), 0.005, kernels))
+    drawn = {"p_gain": 0.5 + torch.rand(N), "torque_limit": 0.5 + torch.rand(N, 12), "joint_offset": 0.1 * torch.rand(N, 12)}
+    again = {"d_gain": 0.5 + torch.rand(N, 1)}
+    for law in laws:
+        law.vary(drawn)
+        law.vary(again)
+    for name in ("stiffness", "damping", "torque_limits", "_lowest_torques", "zero_dof_pos"):
+        torch.testing.assert_close(*(getattr(law, name) for law in laws), rtol=0.0, atol=0.0)
+    torch.testing.assert_close(laws[1].stiffness, drawn["p_gain"][:, None] * torch.as_tensor(robot.stiffness).float())
+
+
+def test_kicks_and_forces_come_and_end_alike():
+    kick = KickConfig(interval_s=(0.1, 0.3), x=(-1.0, 1.0), yaw=(-0.5, 0.5))
+    force = ForceConfig(body="", interval_s=(0.05, 0.2), duration_s=(0.04, 0.1), y=(-50.0, 50.0))
+    numbers, parts, engines = [], [], []
+    for kernels in (None, TaskKernels(nullcontext)):
+        torch.manual_seed(3)
+        numbers.append(UniformNumbers(N, CPU))
+        engines.append(NoPhysics(kernels))
+        parts.append([Kicks(kick, DT, 24, numbers[-1]), Forces(force, 1, DT, 24, numbers[-1])])
+    kicked = 0
+    for step in range(40):
+        mask = chance(0.9, N)
+        for both, drawn, engine in zip(parts, numbers, engines, strict=True):
+            torch.manual_seed(step)
+            drawn.draw()
+            engine.forces.zero_()
+            for part in both:
+                part.draw(torch.zeros(()))
+                part.act(engine, mask)
+        for part in zip(*parts, strict=True):
+            assert_same(part)
+        for name in ("forces", "pushed"):
+            torch.testing.assert_close(*(getattr(engine, name) for engine in engines), rtol=0.0, atol=0.0)
+        kicked += int(engines[1].pushed[:, 0].sum())
+    assert 40 * N * DT / 0.3 * 0.7 < kicked < 40 * N * DT / 0.1
+    assert (engines[1].forces[:, 1, 1] != 0.0).any()

@@ -3,16 +3,14 @@
 Each stands beside the same formula in torch, in `legged/mdp/`, which the C engine runs; a test compares both bit by bit.
 """
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
-from typing import Any
-
 import torch
 import warp as wp
 from torch import Tensor
 
 from legged.physics.warp.actuator_kernels import drive_joints
+from legged.physics.warp.launcher import Launcher
 from legged.physics.warp.network_kernels import run_lstm, run_mlp
+from legged.physics.warp.random_kernels import find_kicks, find_moments, push_bodies, take_fresh, vary_control
 
 PI = wp.constant(wp.float32(torch.pi))
 
@@ -286,18 +284,8 @@ def add_rewards(
     total[robot] = wp.max(clipped, 0.0) + whole
 
 
-MOST_PREPARED = 200
-"""Launches that are kept for one task."""
-
-
-class TaskKernels:
+class TaskKernels(Launcher):
     """Launches them on an engine's device, on the stream that torch uses now. All arguments are torch's tensors."""
-
-    def __init__(self, on_device: Callable[[], AbstractContextManager[Any]]) -> None:
-        """Launch within `on_device`."""
-        self._on_device = on_device
-        self._prepared: dict[tuple[Any, ...], Any] = {}
-        """Launches on a CPU by what they are of, ready to be made again."""
 
     def name_module(self) -> None:
         """Launch one of them, for a dry run that asks which modules are needed: they are all in one."""
@@ -305,84 +293,69 @@ class TaskKernels:
 
     def hold_joints(self, dim: tuple[int, ...], *arguments: Tensor) -> None:
         """As `Control.compute` of joints that are held by P gains: the last argument is written."""
-        self._launch(hold_joints, dim, arguments)
+        self.launch(hold_joints, dim, arguments)
 
     def drive_joints(self, dim: tuple[int, ...], *arguments: Tensor | float) -> None:
         """As `Actuator.drive` of joints with P gains: the last argument is written."""
-        self._launch(drive_joints, dim, arguments)
+        self.launch(drive_joints, dim, arguments)
 
     def run_mlp(self, error: Tensor, *arguments: Tensor | float) -> None:
         """As `ActuatorNetwork.torques` of an MLP: the last argument is written."""
-        self._launch(run_mlp, tuple(error.shape), (error, *arguments))
+        self.launch(run_mlp, tuple(error.shape), (error, *arguments))
 
     def run_lstm(self, error: Tensor, *arguments: Tensor | float) -> None:
         """The same of an LSTM."""
-        self._launch(run_lstm, tuple(error.shape), (error, *arguments))
+        self.launch(run_lstm, tuple(error.shape), (error, *arguments))
 
     def advance_feet(self, forces: Tensor, *arguments: Tensor | float) -> None:
         """As `FeetContacts.update`."""
-        self._launch(advance_feet, tuple(forces.shape[:2]), (forces, *arguments), vectors=1)
+        self.launch(advance_feet, tuple(forces.shape[:2]), (forces, *arguments), vectors=1)
 
     def renew_commands(self, *arguments: Tensor | float) -> None:
         """As `Commands.update`."""
-        self._launch(renew_commands, len(arguments[0]), arguments)  # type: ignore[arg-type]
+        self.launch(renew_commands, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def find_pushes(self, *arguments: Tensor | float) -> None:
         """As the first half of `Pushes.push`."""
-        self._launch(find_pushes, len(arguments[0]), arguments)  # type: ignore[arg-type]
+        self.launch(find_pushes, len(arguments[0]), arguments)  # type: ignore[arg-type]
+
+    def find_moments(self, *arguments: Tensor) -> None:
+        """As the first half of `Randomization.redraw`."""
+        self.launch(find_moments, len(arguments[0]), arguments)
+
+    def take_fresh(self, *arguments: Tensor) -> None:
+        """As its second half: the last argument is written."""
+        self.launch(take_fresh, tuple(arguments[-1].shape), arguments)
+
+    def vary_control(self, *arguments: Tensor) -> None:
+        """As `Control.vary`."""
+        self.launch(vary_control, tuple(arguments[-1].shape), arguments)
+
+    def find_kicks(self, *arguments: Tensor | float) -> None:
+        """As `Kicks.act`, but for the kick itself."""
+        self.launch(find_kicks, len(arguments[0]), arguments)  # type: ignore[arg-type]
+
+    def push_bodies(self, *arguments: Tensor | float) -> None:
+        """As `Forces.act`: the last argument (N, 3) has the sum of forces on a body."""
+        self.launch(push_bodies, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def follow_commands(self, commands: Tensor, *arguments: Tensor) -> None:
         """As the first half of `CommandCurriculum.update`."""
-        self._launch(follow_commands, tuple(commands.shape), (commands, *arguments))
+        self.launch(follow_commands, tuple(commands.shape), (commands, *arguments))
 
     def widen_commands(self, *arguments: Tensor | float) -> None:
         """As its second half."""
-        self._launch(widen_commands, 1, arguments)
+        self.launch(widen_commands, 1, arguments)
 
     def scan_heights(self, base_pos: Tensor, base_quat: Tensor, points_x: Tensor, *arguments: Tensor | float) -> None:
         """As `HeightScan.update`."""
         dim = (len(base_pos), len(points_x))
-        self._launch(scan_heights, dim, (base_pos, base_quat, points_x, *arguments))
+        self.launch(scan_heights, dim, (base_pos, base_quat, points_x, *arguments))
 
     def move_levels(self, *arguments: Tensor | float) -> None:
         """As `TerrainCurriculum.update`, but for the sums over robots."""
-        self._launch(move_levels, len(arguments[0]), arguments)  # type: ignore[arg-type]
+        self.launch(move_levels, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def add_rewards(self, values: Tensor, *arguments: Tensor | float) -> None:
         """As `Rewards.compute`, once the terms are known."""
-        self._launch(add_rewards, values.shape[1], (values, *arguments))
-
-    def _launch(
-        self, kernel: Any, dim: int | tuple[int, ...], arguments: tuple[Tensor | float, ...], vectors: int = 0
-    ) -> None:
-        """Launch a kernel, of whose arguments the first `vectors` are arrays of vectors (..., 3).
-
-        On a CPU the launch is kept for the next step, whose tensors are the same: to prepare it takes longer than to make it.
-        """
-        with self._on_device():
-            key = None
-            if wp.get_device().is_cpu:
-                key = (kernel, dim, *(_identity(a) for a in arguments))
-                if prepared := self._prepared.get(key):
-                    prepared.launch()
-                    return
-            inputs = [_of_torch(argument, k < vectors) for k, argument in enumerate(arguments)]
-            wp.launch(kernel, dim=dim, inputs=inputs)
-            if key is not None and (prepared := wp.launch(kernel, dim=dim, inputs=inputs, record_cmd=True)):
-                if len(self._prepared) >= MOST_PREPARED:  # of tensors that are made anew in each step
-                    self._prepared.clear()
-                self._prepared[key] = prepared
-
-
-def _identity(argument: Tensor | float) -> Any:
-    """Return by what a kernel would know an argument."""
-    if isinstance(argument, Tensor):
-        return argument.data_ptr(), argument.shape, argument.stride(), argument.dtype
-    return argument
-
-
-def _of_torch(argument: Tensor | float, vectors: bool) -> Any:
-    """Return what a kernel takes of an argument."""
-    if not isinstance(argument, Tensor):
-        return argument
-    return wp.from_torch(argument, dtype=wp.vec3) if vectors else wp.from_torch(argument)
+        self.launch(add_rewards, values.shape[1], (values, *arguments))

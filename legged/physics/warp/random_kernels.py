@@ -1,0 +1,115 @@
+"""What is drawn again within a step, kicks and forces, in a launch or two each; legged/mdp has the same in torch.
+
+A module of its own: who randomises nothing never compiles it.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def find_moments(
+    reset: wp.array[wp.bool],
+    interval: wp.array[float],
+    steps_left: wp.array2d[float],
+    due: wp.array2d[wp.bool],
+    any_due: wp.array[wp.bool],
+    steps: wp.array[float],
+):
+    """One thread a robot. The first moment is never, the second a reset, the others are intervals."""
+    robot = wp.tid()
+    something = wp.bool(reset[robot])
+    due[robot, 1] = something
+    for k in range(interval.shape[0]):
+        left = steps_left[robot, k] - 1.0
+        now = left <= 0.0
+        if now:
+            left = wp.float32(interval[k])
+            something = True
+        steps_left[robot, k] = left
+        due[robot, 2 + k] = now
+    any_due[robot] = something
+    if robot == 0:
+        steps[0] = steps[0] + 1.0
+
+
+@wp.kernel
+def take_fresh(due: wp.array2d[wp.bool], moment: wp.array[wp.int64], fresh: wp.array2d[float], drawn: wp.array2d[float]):
+    """One thread a robot and number."""
+    robot, column = wp.tid()
+    if due[robot, wp.int32(moment[column])]:
+        drawn[robot, column] = fresh[robot, column]
+
+
+@wp.kernel
+def vary_control(
+    p_gain: wp.array2d[float],
+    d_gain: wp.array2d[float],
+    torque_limit: wp.array2d[float],
+    offset: wp.array2d[float],
+    nominal: wp.array2d[float],
+    stiffness: wp.array2d[float],
+    damping: wp.array2d[float],
+    highest: wp.array2d[float],
+    lowest: wp.array2d[float],
+    zero: wp.array2d[float],
+):
+    """One thread a robot and joint; `nominal` has stiffness, damping, torque limit and default angle, by joint."""
+    robot, joint = wp.tid()
+    stiffness[robot, joint] = nominal[0, joint] * p_gain[robot, joint]
+    damping[robot, joint] = nominal[1, joint] * d_gain[robot, joint]
+    most = nominal[2, joint] * torque_limit[robot, joint]
+    highest[robot, joint] = most
+    lowest[robot, joint] = -most
+    zero[robot, joint] = nominal[3, joint] - offset[robot, joint]
+
+
+@wp.kernel
+def find_kicks(
+    mask: wp.array[wp.bool],
+    following: wp.array[float],
+    dt: float,
+    last_moment: float,
+    time_left: wp.array[float],
+    due: wp.array[wp.bool],
+):
+    """One thread a robot."""
+    robot = wp.tid()
+    left = time_left[robot] - dt
+    now = left <= last_moment and mask[robot]
+    if now:
+        left = wp.float32(following[robot])
+    time_left[robot] = left
+    due[robot] = now
+
+
+@wp.kernel
+def push_bodies(
+    mask: wp.array[wp.bool],
+    fresh: wp.array2d[float],
+    times: wp.array2d[float],
+    dt: float,
+    last_moment: float,
+    left: wp.array2d[float],
+    force: wp.array2d[float],
+    total: wp.array2d[float],
+):
+    """One thread a robot."""
+    robot = wp.tid()
+    lasting, pause = left[robot, 0] - dt, left[robot, 1] - dt
+    ends = lasting <= last_moment or not mask[robot]
+    begins = pause <= last_moment and mask[robot]
+    if begins:
+        lasting = wp.float32(times[robot, 0])
+        pause = wp.float32(times[robot, 1])
+    left[robot, 0] = lasting
+    left[robot, 1] = pause
+    for i in range(3):
+        now = wp.float32(force[robot, i])
+        if ends:
+            now = 0.0
+        if begins:
+            now = wp.float32(fresh[robot, i])
+        force[robot, i] = now
+        total[robot, i] = total[robot, i] + now
