@@ -50,9 +50,9 @@ def check_networks(cfg: TaskConfig) -> None:
     if algorithm.mirror_loss_coeff > 0.0 and not algorithm.symmetry:
         where = origins.where("train.algorithm.mirror_loss_coeff")
         raise ConfigError(f"{where}: must be 0 without mirror images; train.algorithm.symmetry=true")
+    _check_estimator(cfg)
     if policy.rnn_type != "none":
         _check_recurrent(cfg)
-    _check_estimator(cfg)
 
 
 def _check_estimator(cfg: TaskConfig) -> None:
@@ -76,7 +76,7 @@ def _check_estimator(cfg: TaskConfig) -> None:
         ("train.policy.rnn_type", policy.rnn_type, "none"),
         ("train.policy.state_dependent_std", policy.state_dependent_std, False),
         ("train.algorithm.optimizer", algorithm.optimizer, "adam"),
-        ("train.algorithm.mirror_loss_coeff", algorithm.mirror_loss_coeff, 0.0),
+        ("train.algorithm.mirror_loss_coeff", algorithm.mirror_loss_coeff, 0),
         ("train.runner.loop", cfg.train.runner.loop, "captured"),
     ):
         if value != wanted:

@@ -67,6 +67,8 @@ class EstimatingModel(MLPModel):
         """
         if self._policy_gradient:
             return torch.cat([x, found], dim=-1)
+        if not self._latent:
+            return torch.cat([x, found.detach()], dim=-1)
         return torch.cat([x, found[..., : self.estimates].detach(), found[..., self.estimates :]], dim=-1)
 
     def estimate(self, obs: TensorDict) -> Tensor:
