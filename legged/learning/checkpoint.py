@@ -236,7 +236,8 @@ def network_of(state: dict[str, Any]) -> dict[str, Any]:
         if name in state:
             std = {"noise_std_type": kind, "state_dependent_std": False}
     normalises = any("obs_normalizer" in name for name in state)
-    return {"hidden_dims": hidden, "estimator.hidden_dims": estimator, "obs_normalization": normalises, **rnn, **std}
+    estimating = {"estimator.hidden_dims": estimator} if estimator else {}
+    return {"hidden_dims": hidden, **estimating, "obs_normalization": normalises, **rnn, **std}
 
 
 def described_networks(saved: Saved) -> dict[str, dict[str, Any]]:
@@ -303,7 +304,7 @@ def check_networks_fit(name: str, saved: Saved, cfg: TaskConfig) -> None:
     described = described_networks(saved)
     for network in described:
         wanted = networks(cfg)[network]
-        found = {"observations": [network], **described[network]}
+        found = {"observations": [network], "estimator.hidden_dims": [], **described[network]}
         for key, value in wanted.items():
             if key in found and found[key] != value and key != "history":
                 own = key in ("hidden_dims", "observations")

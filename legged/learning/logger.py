@@ -105,6 +105,7 @@ class QuietLogger(Logger):
         self._log_return_std(it)
         with contextlib.redirect_stdout(io.StringIO()):
             super().log(it, start_it, total_it, collect_time, learn_time, loss_dict=losses, **kwargs)
+        self.ep_extras.clear()  # rsl-rl leaves them where nothing is written, as in all processes but the first
         self.watch.judge(values, left_out)
         self.latest = names | {name: value for name, value in self.latest.items() if not name.startswith(FAULT)} | values
         self.loop_s += collect_time + learn_time

@@ -216,6 +216,13 @@ def test_the_error_is_logged_and_printed_in_the_unit_of_the_term(capsys):
     assert f"estimated base lin vel rmse {found[-1]:.3f}" in capsys.readouterr().out
 
 
+def test_errors_are_taken_in_where_nothing_is_written_too():
+    """As in all processes but the first, whose iterations go on after the one that has an error to tell."""
+    runner = CapturedRunner(small_task(*SMALL, ("train.runner.num_steps_per_env", 4), num_envs=4), None, "cpu")
+    runner.learn(3)
+    assert 0.0 < runner.logger.latest["Estimator/base_lin_vel_rmse"] < 1.0
+
+
 def test_it_is_evaluated_in_the_unit_of_the_term():
     """Velocities of 0.3 m/s forward and 0.4 to the left, of which a policy that estimates 0 knows nothing; the robot that is
     not counted moves faster. Six numbers: the root of (0.09 + 0.16) / 6.
