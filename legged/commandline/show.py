@@ -8,6 +8,7 @@ import mujoco
 import torch
 
 from legged.config import TaskConfig, override
+from legged.config.networks import groups_in
 from legged.config.schema import DrawConfig, LeggedDomainRandConfig
 from legged.envs import BaseTask, LeggedRobot
 from legged.mdp.control import action_scales
@@ -79,7 +80,7 @@ def _observations(task: BaseTask) -> Iterator[str]:
             scales = term.scale.tolist()
             scales = scales[:1] if len(set(scales)) == 1 else scales
             noise = f"+-{_number(term.noise)}" if term.noise else "-"
-            sensors = task.observation_terms.sensors if task.cfg.observations.groups[name].noise else None
+            sensors = task.observation_terms.sensors if groups_in(task.cfg)[name].noise else None
             if sensors is not None and term.name in sensors.names:
                 noise = sensors.describe(term.name)
             columns = f"{term.columns.start}:{term.columns.stop}"

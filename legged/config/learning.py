@@ -3,9 +3,27 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from legged.config.bounds import LONGEST_S, NAME, NAMES, UNIT, between, items, positive
+from legged.config.bounds import LONGEST_S, NAME, NAMES, TERMS, UNIT, between, items, positive
 
 HIDDEN = items(64, between(1, 16384))
+
+
+@dataclass(frozen=True)
+class EstimatorConfig:
+    """First part of a policy: it estimates what only the simulator knows from what the policy observes, and is trained by
+    supervision in every iteration (Ji et al., arXiv 2202.05481). The policy is given the estimates beside its observations.
+    """
+
+    targets: tuple[str, ...] = field(default=(), metadata=TERMS)
+    """Observation terms that are estimated, scaled and without noise; without any there is no estimator."""
+    hidden_dims: tuple[int, ...] = field(default=(256, 128), metadata=HIDDEN)
+    """Widths of the estimator's hidden layers."""
+    learning_rate: float = field(default=1e-3, metadata=positive(1, low=1e-12))
+    """Step size of the optimiser for the estimator; it stays as it is."""
+    latent: int = field(default=0, metadata=between(0, 16384))
+    """Outputs beside the estimates, which no target trains: the policy's gradient does, and the hidden layers with them."""
+    policy_gradient: bool = False
+    """The policy's gradient trains the estimates too; otherwise the targets alone do."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +58,8 @@ class PolicyConfig:
     """Width of a recurrent layer."""
     rnn_num_layers: int = field(default=1, metadata=between(1, 64))
     """Recurrent layers, one on top of the other."""
+    estimator: EstimatorConfig = EstimatorConfig()
+    """What the policy estimates before it acts."""
 
 
 @dataclass(frozen=True)

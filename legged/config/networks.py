@@ -1,9 +1,11 @@
 """Which observations the networks read, and what they ask of the rest of a configuration."""
 
-from legged.config.schema import TaskConfig
+from legged.config.schema import ObservationGroupConfig, TaskConfig
 from legged.errors import ConfigError, suggest
 
 NETWORKS = ("actor", "critic")
+ESTIMATED = "estimated"
+"""Observation group of what an estimator learns to estimate."""
 
 
 def groups_of(cfg: TaskConfig, network: str) -> tuple[str, ...]:
@@ -11,12 +13,24 @@ def groups_of(cfg: TaskConfig, network: str) -> tuple[str, ...]:
     return getattr(cfg.train.policy, f"{network}_observations")
 
 
+def groups_in(cfg: TaskConfig) -> dict[str, ObservationGroupConfig]:
+    """Return all observation groups of a task: those that the configuration names, and the targets of an estimator."""
+    targets = cfg.train.policy.estimator.targets
+    return {**cfg.observations.groups, **({ESTIMATED: ObservationGroupConfig(targets)} if targets else {})}
+
+
+def path_of_terms(cfg: TaskConfig, group: str) -> str:
+    """Return the dotted path of the setting that names the terms of an observation group."""
+    is_targets = group == ESTIMATED and bool(cfg.train.policy.estimator.targets)
+    return "train.policy.estimator.targets" if is_targets else f"observations.groups.{group}.terms"
+
+
 def check_networks(cfg: TaskConfig) -> None:
     """Compare the networks with the observations, with each other's settings and with the learner.
 
     Raises:
         ConfigError: they read a group that there is not, the bounds of the standard deviation leave out its start, a mirror
-            loss comes without symmetry, or a recurrent policy with what it can't learn from.
+            loss comes without symmetry, or a recurrent policy or an estimator with what it can't learn from.
     """
     policy, algorithm, origins = cfg.train.policy, cfg.train.algorithm, cfg.origins
     known = cfg.observations.groups
@@ -36,8 +50,40 @@ def check_networks(cfg: TaskConfig) -> None:
     if algorithm.mirror_loss_coeff > 0.0 and not algorithm.symmetry:
         where = origins.where("train.algorithm.mirror_loss_coeff")
         raise ConfigError(f"{where}: must be 0 without mirror images; train.algorithm.symmetry=true")
+    _check_estimator(cfg)
     if policy.rnn_type != "none":
         _check_recurrent(cfg)
+
+
+def _check_estimator(cfg: TaskConfig) -> None:
+    """Compare an estimator with the other settings.
+
+    Raises:
+        ConfigError: it has outputs and no targets, the name of its observation group is taken, or it has settings beside it
+            that only rsl-rl's own update learns with, which knows no estimator.
+    """
+    policy, algorithm, origins = cfg.train.policy, cfg.train.algorithm, cfg.origins
+    path = "train.policy.estimator.targets"
+    if not policy.estimator.targets:
+        if policy.estimator.latent:
+            where = origins.where("train.policy.estimator.latent")
+            raise ConfigError(f"{where}: must be 0 without an estimator; {path}=[base_lin_vel] makes one")
+        return
+    if ESTIMATED in cfg.observations.groups:
+        where = origins.where(f"observations.groups.{ESTIMATED}")
+        raise ConfigError(f"{where}: '{ESTIMATED}' is the group of the estimator's targets ({path}); give it another name")
+    for field, value, wanted in (
+        ("train.policy.rnn_type", policy.rnn_type, "none"),
+        ("train.policy.state_dependent_std", policy.state_dependent_std, False),
+        ("train.algorithm.optimizer", algorithm.optimizer, "adam"),
+        ("train.algorithm.mirror_loss_coeff", algorithm.mirror_loss_coeff, 0),
+        ("train.runner.loop", cfg.train.runner.loop, "captured"),
+    ):
+        if value != wanted:
+            given, needed = (str(each).lower() if isinstance(each, bool) else f"{each}" for each in (value, wanted))
+            raise ConfigError(
+                f"{origins.where(field)}: must be {needed} with an estimator ({path}, {origins.of(path)}), got {given}"
+            )
 
 
 def _check_recurrent(cfg: TaskConfig) -> None:

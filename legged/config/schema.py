@@ -5,7 +5,7 @@ legged robot that follows commands in legged.py.
 """
 
 from legged.config.actuator import ActuatorConfig
-from legged.config.learning import AlgorithmConfig, PolicyConfig, RunnerConfig, TrainConfig
+from legged.config.learning import AlgorithmConfig, EstimatorConfig, PolicyConfig, RunnerConfig, TrainConfig
 from legged.config.legged import (
     STATE_TERMS,
     CommandCurriculumConfig,
@@ -46,6 +46,7 @@ __all__ = [
     "DomainRandConfig",
     "DrawConfig",
     "EnvConfig",
+    "EstimatorConfig",
     "EvaluationConfig",
     "ForceConfig",
     "HeightMapConfig",

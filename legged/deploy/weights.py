@@ -8,6 +8,9 @@ and float32 numbers, matrices row by row:
 - `ACTIVATION`: none; `detail` is its place in `ACTIVATIONS`.
 - `LSTM`: matrices (4 outputs, inputs) and (4 outputs, outputs) and two biases (4 outputs); gates i, f, g, o.
 - `GRU`: the same with 3 in place of 4; gates r, z, n. Both are as in torch.nn.
+- `KEEP`: none; what comes in goes on, and is kept for the next `JOIN`.
+- `JOIN`: none; what was kept, and after it what comes in: outputs are as many as both together. With these two a policy is
+  given what an estimator has found beside its observations.
 """
 
 import itertools
@@ -21,7 +24,7 @@ import numpy as np
 MAGIC = b"LEGGEDW1"
 COUNT = struct.Struct("<I")
 HEAD = struct.Struct("<4I")
-NORMALISE, LINEAR, ACTIVATION, LSTM, GRU = range(5)
+NORMALISE, LINEAR, ACTIVATION, LSTM, GRU, KEEP, JOIN = range(7)
 SELU_ALPHA, SELU_SCALE = 1.6732632423543772, 1.0507009873554805
 _erf = np.vectorize(math.erf, otypes=[float])
 
@@ -71,7 +74,7 @@ def shapes(kind: int, inputs: int, outputs: int) -> list[tuple[int, ...]]:
         return [(inputs,), (inputs,)]
     if kind == LINEAR:
         return [(outputs, inputs), (outputs,)]
-    if kind == ACTIVATION:
+    if kind in (ACTIVATION, KEEP, JOIN):
         return []
     if kind in (LSTM, GRU):
         rows = (4 if kind == LSTM else 3) * outputs
@@ -126,9 +129,16 @@ def _check_chain(layers: list[Layer]) -> None:
     """
     if not layers:
         raise ValueError("has no layers")
+    kept = 0
     for layer, following in itertools.pairwise([*layers, None]):
         assert layer is not None
-        if layer.kind in (NORMALISE, ACTIVATION) and layer.inputs != layer.outputs:
+        if layer.kind == KEEP:
+            kept = layer.inputs
+        if layer.kind == JOIN:
+            if not kept or layer.outputs != kept + layer.inputs:
+                raise ValueError("has a layer that joins what was not kept")
+            kept = 0
+        if layer.kind in (NORMALISE, ACTIVATION, KEEP) and layer.inputs != layer.outputs:
             raise ValueError("has a layer that changes a width it cannot change")
         if layer.kind == ACTIVATION and layer.detail >= len(ACTIVATIONS):
             raise ValueError("has a layer that this program does not know")
@@ -158,7 +168,7 @@ class NumpyNetwork:
 
     def run(self, observations: np.ndarray) -> np.ndarray:
         """Return actions (N, A) for observations (N, width)."""
-        x = np.asarray(observations, dtype=float)
+        x = kept = np.asarray(observations, dtype=float)
         for place, layer in enumerate(self._layers):
             if layer.kind == NORMALISE:
                 x = (x - layer.arrays[0]) / layer.arrays[1]
@@ -166,6 +176,10 @@ class NumpyNetwork:
                 x = x @ layer.arrays[0].T + layer.arrays[1]
             elif layer.kind == ACTIVATION:
                 x = self._functions[layer.detail](x)
+            elif layer.kind == KEEP:
+                kept = x
+            elif layer.kind == JOIN:
+                x = np.concatenate([kept, x], axis=1)
             else:
                 x = self._recurrent(place, layer, x)
         return x

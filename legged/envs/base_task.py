@@ -13,6 +13,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged.config.networks import groups_in
 from legged.config.schema import TaskConfig
 from legged.envs.actions import as_actions, ordinary_tensors
 from legged.envs.checks import check_task
@@ -162,7 +163,7 @@ class BaseTask(ObservingTask, PrivilegedTerms, SavedTask, VecEnv):
             self.time_out_buf,
             self.reset_buf,
         )
-        groups = cfg.observations.groups
+        groups = groups_in(cfg)
         # Those of the largest group first, so that it finds them side by side.
         in_order = [name for group in sorted(groups.values(), key=lambda g: -len(g.terms)) for name in group.terms]
         self.observation_terms = ObservationTerms(self._methods("_obs_", dict.fromkeys(in_order)))

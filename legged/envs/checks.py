@@ -126,12 +126,16 @@ def check_sizes(cfg: TaskConfig) -> None:
             f"{cfg.origins.where('train.runner.num_steps_per_env')}: {steps} steps of {robots} robots (env.num_envs:"
             f" {cfg.origins.of('env.num_envs')}) are {robots * steps:,} samples an iteration, more than {MOST_SAMPLES:,}"
         )
-    for network in ("actor", "critic"):
-        field = f"train.policy.{network}_hidden_dims"
-        widths = getattr(cfg.train.policy, f"{network}_hidden_dims")
+    policy = cfg.train.policy
+    for field, widths in (
+        ("actor_hidden_dims", policy.actor_hidden_dims),
+        ("critic_hidden_dims", policy.critic_hidden_dims),
+        ("estimator.hidden_dims", policy.estimator.hidden_dims),
+    ):
         weights = sum(a * b for a, b in pairwise(widths))
         if weights > MOST_WEIGHTS:
-            raise ConfigError(f"{cfg.origins.where(field)}: these are {weights:,} weights, more than {MOST_WEIGHTS:,}")
+            where = cfg.origins.where(f"train.policy.{field}")
+            raise ConfigError(f"{where}: these are {weights:,} weights, more than {MOST_WEIGHTS:,}")
 
 
 def check_mirror_kinds(task: str, mirrored: Mapping[str, str], used: Iterable[str], where: str) -> None:

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from legged.config.networks import groups_in, path_of_terms
 from legged.config.schema import LeggedConfig
 from legged.envs.checks import check_mirror_kinds
 from legged.envs.randomization_checks import check_disturbances
@@ -47,7 +48,7 @@ def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
         raise ConfigError(f"{where}: '{robot.name}' is lopsided (joints and feet at zero angles); {otherwise}")
     if mirror_of_actions(robot.mirror, acted_joints(robot, cfg.control, origins.where)) is None:
         raise ConfigError(f"{origins.where('control.held')}: joints are held on one side only; {otherwise} ({where})")
-    used = [term for group in cfg.observations.groups.values() for term in group.terms]
+    used = [term for group in groups_in(cfg).values() for term in group.terms]
     check_mirror_kinds(cls.__name__, cls.MIRRORED, used, where)
     y = cfg.terrain.measured_points_y
     if sorted(y) != sorted(-value for value in y):
@@ -62,10 +63,10 @@ def check_passive(cfg: LeggedConfig, robot: Robot) -> None:
         ConfigError: it has none.
     """
     names = ("passive_pos", "passive_vel")
-    for group, terms in ((name, group.terms) for name, group in cfg.observations.groups.items()):
+    for group, terms in ((name, group.terms) for name, group in groups_in(cfg).items()):
         for term in terms:
             if term in names and (robot.passive is None or not robot.passive.names):
-                where = cfg.origins.where(f"observations.groups.{group}.terms")
+                where = cfg.origins.where(path_of_terms(cfg, group))
                 raise ConfigError(f"{where}: {term}: '{robot.name}' has no passive hinges or slides (passive_joints)")
 
 

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from legged.config.networks import groups_in
 from legged.config.schema import TaskConfig
 from legged.mdp.height_map_errors import HeightMapErrors
 from legged.mdp.observations import ObservationGroup, ObservationTerms
@@ -47,7 +48,7 @@ class ObservingTask:
     def _group(self, name: str) -> ObservationGroup:
         """Make the observation group `name`."""
         cfg, terms = self.cfg.observations, self.observation_terms
-        group = cfg.groups[name]
+        group = groups_in(self.cfg)[name]
         noisy = group.noise and cfg.add_noise
         noise = self._noise() if noisy else {}
         measured = terms.sensors if noisy else None

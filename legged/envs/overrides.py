@@ -4,6 +4,7 @@ import inspect
 from pathlib import Path
 from typing import Any
 
+from legged.config.networks import groups_in, path_of_terms
 from legged.config.origins import Origins
 from legged.config.schema import TaskConfig
 from legged.errors import ConfigError, suggest
@@ -133,8 +134,8 @@ KINDS = {"_reward_": "reward", "_obs_": "observation", "_terminate_": "terminati
 def named_terms(cfg: TaskConfig) -> list[tuple[str, str, str]]:
     """Return the terms that a configuration names, each with the prefix of its method and the dotted path of its name."""
     named = [("_reward_", name, f"rewards.scales.{name}") for name in cfg.rewards.scales]
-    for group, content in cfg.observations.groups.items():
-        named += [("_obs_", name, f"observations.groups.{group}.terms") for name in content.terms]
+    for group, content in groups_in(cfg).items():
+        named += [("_obs_", name, path_of_terms(cfg, group)) for name in content.terms]
     for part in ("scales", "noise", "bias", "delay", "dropped"):
         named += [("_obs_", name, f"observations.{part}.{name}") for name in getattr(cfg.observations, part)]
     for part in ("failures", "time_outs"):

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from legged.config.networks import groups_in, path_of_terms
 from legged.config.randomization import DrawConfig, ForceConfig, KickConfig, draw_of
 from legged.config.schema import LeggedConfig, TaskConfig
 from legged.envs.privileged_terms import PREFIX, observed, observed_forces
@@ -129,9 +130,9 @@ def check_observed(cfg: TaskConfig) -> None:
     Raises:
         ConfigError: it is not.
     """
-    for group, section in cfg.observations.groups.items():
+    for group, section in groups_in(cfg).items():
         for term in section.terms:
-            path = f"observations.groups.{group}.terms"
+            path = path_of_terms(cfg, group)
             name = term.removeprefix(PREFIX)
             if term.startswith(PREFIX) and name in FIELDS and observed(cfg, name) is None:
                 where = cfg.origins.where(path)

@@ -30,6 +30,9 @@ def print_tracking(result: dict[str, Any]) -> None:
             continue
         table.add_row(f"{name} RMSE, mean", f"{errors['mean']:.3f} {unit}", cells)
         table.add_row(f"{name} RMSE, worst cell", f"{errors['worst']:.3f} {unit}", _command(errors["worst_cell"]))
+    for name, error in result.get("estimates", {}).items():
+        value = "none" if error["rmse"] is None else f"{error['rmse']:.3f} {error['unit'] or ''}".rstrip()
+        table.add_row(f"estimated {name.replace('_', ' ')} RMSE", value, "over all cells")
     table.add_row("falls", f"{100 * result['falls']:.2f} %", "of the robots, within the hold")
     if result["cost_of_transport"] is not None:
         table.add_row("cost of transport", f"{result['cost_of_transport']:.2f}", "sum |torque * speed| / (weight * speed)")

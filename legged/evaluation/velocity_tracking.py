@@ -10,6 +10,7 @@ from torch import Tensor
 
 from legged.config import LeggedConfig, override
 from legged.envs import LeggedRobot
+from legged.evaluation.estimation import EstimateMeter
 from legged.evaluation.overflows import Overflows
 from legged.evaluation.tiles import ROUGH_SPAWN, on_terrain, rough_ground, rough_side
 from legged.evaluation.velocity_grid import Grid, mean_and_worst, number_or_null
@@ -56,14 +57,15 @@ def measure_tracking(task: LeggedRobot, act: Callable[[TensorDict], Tensor], gri
     """Run the grid on a task of grid.num_envs robots; return plain numbers and lists, one entry a cell in "cells".
 
     A robot that falls counts as a fall and is measured up to its fall. Errors are instantaneous, per control step.
-    `contact_overflows` counts the robots and steps in which contacts were lost for want of memory.
+    `contact_overflows` counts the robots and steps in which contacts were lost for want of memory; `estimates` are the errors
+    of a policy that estimates something.
     """
     cells = grid.cells
     device = torch.device(task.device)
     commands = torch.tensor(cells, dtype=torch.float32, device=device).repeat_interleave(grid.robots, dim=0)
     task.reset()
     observations = task.hold_commands(commands)
-    sums, overflows = _Sums(task), Overflows()
+    sums, overflows, estimates = _Sums(task), Overflows(), EstimateMeter(task, act)
     alive = torch.ones(task.num_envs, dtype=torch.bool, device=device)
     settle, steps = round(grid.settle_s / task.dt), round(grid.hold_s / task.dt)
     for step in range(steps):
@@ -72,9 +74,10 @@ def measure_tracking(task: LeggedRobot, act: Callable[[TensorDict], Tensor], gri
         alive &= ~task.terminated_buf
         if step >= settle:
             sums.add(task, alive)
+            estimates.add(observations, alive)
     fell = (~alive).float()
     result = summarize(task, grid, cells, sums, fell, (steps - settle) * task.dt)
-    return {**result, "contact_overflows": overflows.total(task)}
+    return {**result, **estimates.found(), "contact_overflows": overflows.total(task)}
 
 
 class _Sums:

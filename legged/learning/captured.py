@@ -9,9 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from legged.config.networks import ESTIMATED
 from legged.envs import BaseTask
 from legged.graph.step_graph import StepGraph
 from legged.learning.display import Display
+from legged.learning.estimator import EstimatingModel, EstimationErrors
 from legged.learning.ppo import DevicePPO
 from legged.learning.rollout import Rollout
 from legged.learning.runner import Runner
@@ -38,6 +40,9 @@ class CapturedRunner(Runner):
     ) -> None:
         super().__init__(env, log_dir, device, display)
         self._rollout: Rollout | None = None
+        if isinstance(self.alg.actor, EstimatingModel):
+            errors = EstimationErrors(env.observation_groups[ESTIMATED])
+            self.alg.learn_to_estimate(errors, env.cfg.train.policy.estimator.learning_rate)
         self.why_stock = self.alg.why_stock
         """What keeps training on rsl-rl's own loop; empty if nothing does."""
         if torch.device(device) != torch.device(env.device):  # type: ignore[arg-type]

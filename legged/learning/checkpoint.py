@@ -209,27 +209,35 @@ def networks(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
         "rnn_num_layers": policy.rnn_num_layers if recurrent else 0,
     }
     std = {"noise_std_type": policy.noise_std_type, "state_dependent_std": policy.state_dependent_std}
+    estimator = policy.estimator
+    estimating: dict[str, Any] = {"estimator.hidden_dims": list(estimator.hidden_dims) if estimator.targets else []}
+    if estimator.targets:
+        estimating |= {"estimator.targets": list(estimator.targets), "estimator.latent": estimator.latent}
     groups = cfg.observations.groups
     described = {}
     for name in NETWORKS:
         read = groups_of(cfg, name)
         own = {"observations": list(read), "history": groups[read[0]].history}  # the latter for versions that know no other
         hidden = list(getattr(policy, f"{name}_hidden_dims"))
-        described[name] = {"hidden_dims": hidden, **own, **shared, **(std if name == "actor" else {})}
+        described[name] = {"hidden_dims": hidden, **own, **shared, **({**std, **estimating} if name == "actor" else {})}
     return described
 
 
 def network_of(state: dict[str, Any]) -> dict[str, Any]:
     """Return the same, as far as weights tell, of a checkpoint that does not say it."""
-    layers = [tensor for name, tensor in state.items() if name.startswith("mlp.") and name.endswith(".weight")]
-    hidden = [(*layer.shape, 0)[0] for layer in layers[:-1]]
+    hidden, estimator = (
+        [(*tensor.shape, 0)[0] for name, tensor in state.items() if name.startswith(part) and name.endswith(".weight")][:-1]
+        for part in ("mlp.", "estimator.")
+    )
     rnn = dict(zip(("rnn_type", "rnn_hidden_dim", "rnn_num_layers"), rnn_of(state), strict=True))
     kinds = {"scalar": "distribution.std_param", "log": "distribution.log_std_param"}
     std: dict[str, Any] = {}
     for kind, name in kinds.items():
         if name in state:
             std = {"noise_std_type": kind, "state_dependent_std": False}
-    return {"hidden_dims": hidden, "obs_normalization": any("obs_normalizer" in name for name in state), **rnn, **std}
+    normalises = any("obs_normalizer" in name for name in state)
+    estimating = {"estimator.hidden_dims": estimator} if estimator else {}
+    return {"hidden_dims": hidden, **estimating, "obs_normalization": normalises, **rnn, **std}
 
 
 def described_networks(saved: Saved) -> dict[str, dict[str, Any]]:
@@ -296,7 +304,7 @@ def check_networks_fit(name: str, saved: Saved, cfg: TaskConfig) -> None:
     described = described_networks(saved)
     for network in described:
         wanted = networks(cfg)[network]
-        found = {"observations": [network], **described[network]}
+        found = {"observations": [network], "estimator.hidden_dims": [], **described[network]}
         for key, value in wanted.items():
             if key in found and found[key] != value and key != "history":
                 own = key in ("hidden_dims", "observations")

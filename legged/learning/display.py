@@ -11,6 +11,7 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
+from legged.learning.estimator import SECTION as ESTIMATES
 from legged.learning.evaluations import SECTION
 
 PLAIN_LINES_EVERY_S = 2.0
@@ -86,7 +87,7 @@ class Progress:
         return (
             f"it {self.iteration}/{self.total}  {_time(self.elapsed_s)} < {_time(self.eta_s)}  "
             f"{self.steps_per_s:,.0f} steps/s ({self.collect_s:.2f}+{self.learn_s:.2f} s)  reward {self._reward()}"
-            f"{shown}  std {self.action_std:.2f}" + self.level() + self.evaluated() + self.warnings()
+            f"{shown}  std {self.action_std:.2f}" + self.level() + self.estimated() + self.evaluated() + self.warnings()
         )
 
     def _word(self, name: str, value: float) -> str:
@@ -109,6 +110,11 @@ class Progress:
         """Return the first figure of the last evaluation during training, if there was one."""
         found = [(key, value) for key, value in self.values.items() if key.startswith(SECTION)]
         return "".join(f"  evaluated {plain(key.removeprefix(SECTION))} {value:.3f}" for key, value in found[:1])
+
+    def estimated(self) -> str:
+        """Return the errors of an estimator, if there is one."""
+        found = [(key.removeprefix(ESTIMATES), value) for key, value in self.values.items() if key.startswith(ESTIMATES)]
+        return "".join(f"  estimated {plain(name)} {value:.3f}" for name, value in found)
 
     def levels(self) -> dict[str, str]:
         """Return for each terrain type its mean level, and the shares of episodes that moved up and down."""

@@ -15,6 +15,7 @@ from torch.utils.tensorboard import SummaryWriter
 from legged.learning.display import Display, Progress
 from legged.learning.distributed import any_rank
 from legged.learning.divergence_meter import DivergenceMeter
+from legged.learning.estimator import SECTION as ESTIMATES
 from legged.learning.evaluations import SECTION, Ended
 from legged.learning.trackers import Tracker, open_writer
 from legged.learning.watch import FAULT, MINI_BATCHES, Diverged, FaultWatch
@@ -91,16 +92,20 @@ class QuietLogger(Logger):
             values.update({key: value for key, value in zip(entry, stacked, strict=True) if value == value})
         evaluated = self.evaluate(it + 1, total_it)
         values.update({f"{SECTION}{name}": value for name, value in evaluated.items() if math.isfinite(value)})
+        given = kwargs.pop("loss_dict")
+        estimated = {name: error for name, error in given.items() if name.startswith(ESTIMATES)}
+        values.update({name: error for name, error in estimated.items() if math.isfinite(error)})
         left_out = self._left_out()
         if left_out > 0.0:
             values[MINI_BATCHES] = left_out
         self.ep_extras[:] = [dict(values)] if values else []  # a copy: rsl-rl puts tensors in
         kl = self.divergence.flush() if self.divergence else None
-        losses = kwargs.pop("loss_dict") | ({} if kl is None else {"kl": kl})
+        losses = {name: loss for name, loss in given.items() if name not in estimated} | ({} if kl is None else {"kl": kl})
         losses = {name: loss for name, loss in losses.items() if math.isfinite(loss)}
         self._log_return_std(it)
         with contextlib.redirect_stdout(io.StringIO()):
             super().log(it, start_it, total_it, collect_time, learn_time, loss_dict=losses, **kwargs)
+        self.ep_extras.clear()  # rsl-rl leaves them where nothing is written, as in all processes but the first
         self.watch.judge(values, left_out)
         self.latest = names | {name: value for name, value in self.latest.items() if not name.startswith(FAULT)} | values
         self.loop_s += collect_time + learn_time

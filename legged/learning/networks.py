@@ -10,7 +10,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.config import TaskConfig
-from legged.config.networks import NETWORKS, groups_of
+from legged.config.networks import ESTIMATED, NETWORKS, groups_of
+from legged.learning.estimator import TARGETS
 
 UNBOUNDED = (1e-6, 1e6)
 """Bounds of the standard deviation that rsl-rl has in any case."""
@@ -19,6 +20,7 @@ UNBOUNDED = (1e-6, 1e6)
 def network_settings(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
     """Return the dictionaries `actor`, `critic` and `obs_groups` that rsl-rl wants."""
     policy = cfg.train.policy
+    estimator = policy.estimator
     shared = {
         "class_name": "MLPModel",
         "activation": policy.activation,
@@ -33,9 +35,24 @@ def network_settings(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
         "std_type": policy.noise_std_type,
         "std_range": (policy.min_noise_std, policy.max_noise_std),
     }
+    groups = {network: list(groups_of(cfg, network)) for network in NETWORKS}
+    estimating: dict[str, Any] = {}
+    if estimator.targets:
+        groups[TARGETS] = [ESTIMATED]
+        estimating = {
+            "class_name": "legged.learning.estimator:EstimatingModel",
+            "estimator_hidden_dims": list(estimator.hidden_dims),
+            "latent": estimator.latent,
+            "policy_gradient": estimator.policy_gradient,
+        }
     return {
-        "obs_groups": {network: list(groups_of(cfg, network)) for network in NETWORKS},
-        "actor": {**shared, "hidden_dims": list(policy.actor_hidden_dims), "distribution_cfg": distribution},
+        "obs_groups": groups,
+        "actor": {
+            **shared,
+            "hidden_dims": list(policy.actor_hidden_dims),
+            "distribution_cfg": distribution,
+            **estimating,
+        },
         "critic": {**shared, "hidden_dims": list(policy.critic_hidden_dims)},
     }
 

@@ -1,5 +1,6 @@
 """rsl-rl's PPO, updated without a host read: the same losses and steps, in closed form, on data shuffled once."""
 
+import math
 from typing import Any
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from legged.learning.cpu_layers import apply_layers
 from legged.learning.distributed import sum_over_ranks_
+from legged.learning.estimator import SECTION, EstimatingModel, EstimationErrors
 from legged.learning.networks import action_std
 from legged.learning.scaled_rewards import ScaledRewards
 
@@ -30,7 +32,7 @@ class DevicePPO(ScaledRewards):
     What differs is where and how often: the learning rate is a tensor on the device; samples are shuffled into contiguous
     memory once an update, not gathered for every mini-batch; log-probability, entropy and divergence of the Gaussian are
     written out; the optimiser is fused; and losses are summed on the device and read once. Where a feature needs rsl-rl's
-    own update (`why_stock`), that runs.
+    own update (`why_stock`), that runs. Where the actor has an estimator, that learns from the same mini-batches.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -40,19 +42,48 @@ class DevicePPO(ScaledRewards):
         """What keeps the update on rsl-rl's own path; empty if nothing does."""
         if not self.why_stock:
             self._rate = torch.tensor(self._initial_rate, device=self.device)
-            parameters = [p for p in (*self.actor.parameters(), *self.critic.parameters()) if p.requires_grad]
+            parameters = [p for part in self._parts() for p in part]
             capturable = self._rate.is_cuda
-            self.optimizer = torch.optim.Adam(parameters, lr=self._rate, fused=True, capturable=capturable)
+            self.optimizer = torch.optim.Adam(self._optimized(), lr=self._rate, fused=True, capturable=capturable)
             # Where this is 1, a fused step changes nothing: neither parameters nor moments nor its count.
             self.optimizer.found_inf = torch.zeros((), device=self.device)  # type: ignore[attr-defined]
             if self.is_multi_gpu:
                 self._shared = SharedGradients(parameters, self.gpu_world_size)
         count = len(LOSSES) if self.symmetry else len(LOSSES) - 1
+        self._errors: EstimationErrors | None = None
         self._losses = torch.zeros(count + 1, device=self.device)
-        """Means over the mini-batches of the last update, by `LOSSES`, and the share of them that were taken."""
+        """Means over the mini-batches of the last update, by `LOSSES`, of the estimates' square errors, if there are any, by
+        term, and the share of mini-batches that were taken."""
         self._one = torch.ones((), device=self.device)
         self.left_out = 0.0
         """Share of the last update's mini-batches that changed nothing, because a gradient was no number."""
+
+    def learn_to_estimate(self, errors: EstimationErrors, learning_rate: float) -> None:
+        """Say how errors of the actor's estimates are measured, and the step size with which its estimator learns; to be
+        called once, before the first update of an actor that has one.
+        """
+        self._errors = errors
+        self._losses = torch.zeros(len(self._losses) + len(errors.names), device=self.device)
+        self.optimizer.param_groups[-1]["lr"] = learning_rate
+
+    def _parts(self) -> list[list[torch.nn.Parameter]]:
+        """Return the parameters that learn, of the actor, of the critic, and of the actor's estimator if it has one: each of
+        them has a norm of gradients of its own.
+        """
+        of_actor = list(self.actor.parameters())
+        parts = [of_actor, list(self.critic.parameters())]
+        if isinstance(self.actor, EstimatingModel):
+            estimator = list(self.actor.estimator.parameters())
+            those = {id(parameter) for parameter in estimator}
+            parts = [[parameter for parameter in of_actor if id(parameter) not in those], parts[1], estimator]
+        return [[parameter for parameter in part if parameter.requires_grad] for part in parts]
+
+    def _optimized(self) -> list[dict[str, Any]]:
+        """Return the optimiser's groups of parameters: actor and critic, whose rate adapts, and the estimator if there is
+        one, whose rate is a plain number.
+        """
+        actor, critic, *estimator = self._parts()
+        return [{"params": [*actor, *critic]}, *({"params": part, "lr": 1e-3} for part in estimator)]
 
     def tensors(self) -> list[Tensor]:
         """Everything that an update changes: parameters, normalisers, moments of the optimiser, learning rate."""
@@ -66,7 +97,7 @@ class DevicePPO(ScaledRewards):
         if self.symmetry and self.symmetry.use_mirror_loss:
             return "a mirror loss"
         for name, model in (("actor", self.actor), ("critic", self.critic)):
-            if type(model) is not MLPModel:
+            if type(model) not in (MLPModel, EstimatingModel):
                 return f"the {name} is a {type(model).__name__}"
         if type(self.actor.distribution) is not GaussianDistribution:
             return f"actions are {type(self.actor.distribution).__name__}"
@@ -88,11 +119,13 @@ class DevicePPO(ScaledRewards):
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """As rsl-rl, of a checkpoint of either class."""
+        rates = [group["lr"] for group in self.optimizer.param_groups]
         iteration = super().load(loaded_dict, load_cfg, strict)
         if self._rate is not None:  # loading puts the saved number in place of the tensor
-            for group in self.optimizer.param_groups:
-                self._rate.fill_(group["lr"])
-                group.update(lr=self._rate, fused=True, capturable=self._rate.is_cuda)
+            groups = self.optimizer.param_groups
+            self._rate.fill_(groups[0]["lr"])
+            for group, rate in zip(groups, (self._rate, *rates[1:]), strict=True):
+                group.update(lr=rate, fused=True, capturable=self._rate.is_cuda)
             for state in self.optimizer.state.values():
                 state["step"] = state["step"].to(self.device, torch.float32)
         return iteration
@@ -102,10 +135,10 @@ class DevicePPO(ScaledRewards):
         saved = super().save()
         if self._rate is not None:
             optimizer = saved["optimizer_state_dict"]
-            plain = {"lr": self.learning_rate, "fused": None, "capturable": False}
+            plain = {"fused": None, "capturable": False}
             saved["optimizer_state_dict"] = {
                 "state": {key: {**state, "step": state["step"].cpu()} for key, state in optimizer["state"].items()},
-                "param_groups": [{**group, **plain} for group in optimizer["param_groups"]],
+                "param_groups": [{**group, "lr": float(group["lr"]), **plain} for group in optimizer["param_groups"]],
             }
         return saved
 
@@ -129,17 +162,23 @@ class DevicePPO(ScaledRewards):
         self._update_normalizers()
 
     def losses(self) -> dict[str, float]:
-        """Mean losses of the last update, read from the device, as is `left_out`; NaN if no mini-batch had any."""
+        """Mean losses of the last update, read from the device, as is `left_out`; NaN if no mini-batch had any. Beside them
+        the root mean square errors of the estimates by term, `Estimator/<term>_rmse`, each in the term's unit.
+        """
         *losses, taken = self._losses.tolist()
         self.left_out = 1.0 - taken
-        return dict(zip(LOSSES, losses, strict=False))
+        terms = self._errors.names if self._errors else ()
+        squares = [losses.pop() for _ in terms][::-1]
+        errors = {f"{SECTION}{term}_rmse": math.sqrt(square) for term, square in zip(terms, squares, strict=True)}
+        return {**dict(zip(LOSSES, losses, strict=False)), **errors}
 
     @torch.no_grad()
     def _mini_batches(self) -> list[tuple[Tensor, ...]]:
         """Return the rollout, shuffled: for each mini-batch of n samples the networks' inputs, actions (n, D), old
         log-probabilities, advantages, old values, returns (n,) each, and the old Gaussian's mean (n, D) and std (n, D).
 
-        With symmetry, each but the last two also holds the mirror images, after the samples: 2 n.
+        With symmetry, each but the last two also holds the mirror images, after the samples: 2 n. With an estimator, its
+        targets (2 n or n, E) come at the end.
         """
         st = self.storage
         observations, actions = st.observations.flatten(0, 1), st.actions.flatten(0, 1)
@@ -161,6 +200,8 @@ class DevicePPO(ScaledRewards):
             *((column.flatten(), repeated) for column in single),
             *((column.flatten(0, 1), order) for column in st.distribution_params),
         ]
+        if isinstance(self.actor, EstimatingModel):
+            columns.append((torch.cat([observations[name] for name in self.actor.target_groups], dim=-1), imaged))
         shuffled = [column.index_select(0, index.flatten()).split(index.shape[1]) for column, index in columns]
         return list(zip(*shuffled, strict=True))
 
@@ -179,6 +220,7 @@ class DevicePPO(ScaledRewards):
         returns: Tensor,
         old_mean: Tensor,
         old_std: Tensor,
+        targets: Tensor | None = None,
     ) -> Tensor:
         """One mini-batch: adapt the learning rate, step down the gradient; returns its losses, as in `LOSSES`, and 1. If a
         gradient is no number, nothing is changed, and all that is returned is 0.
@@ -187,7 +229,7 @@ class DevicePPO(ScaledRewards):
         if self.normalize_advantage_per_mini_batch:
             own = advantages[:samples]
             advantages = (advantages - own.mean()) / (own.std() + FEW)
-        mean = self._output(self.actor, actor_input)
+        mean, estimates = self._act(actor_input)
         values = self._output(self.critic, critic_input).squeeze(-1)
         std = self.action_std()
         log_prob = gaussian_log_prob(actions, mean, std)
@@ -201,6 +243,12 @@ class DevicePPO(ScaledRewards):
             value_loss = torch.max(value_loss, (near - returns).square())
         value_loss = value_loss.mean()
         loss = surrogate + self.value_loss_coef * value_loss - self.entropy_coef * entropy
+        errors: tuple[Tensor, ...] = ()
+        if targets is not None and estimates is not None:
+            # Both losses in one backward pass: they meet in no parameter but the hidden layers of an estimator with a latent.
+            loss = loss + (estimates - targets).square().mean()
+            assert self._errors is not None
+            errors = self._errors.squares(estimates[:samples].detach(), targets[:samples]).mean(dim=0).unbind()
 
         losses = [value_loss, surrogate, entropy]
         if self.symmetry:
@@ -222,17 +270,14 @@ class DevicePPO(ScaledRewards):
         fine = (self._clip_gradients() + value_loss.detach()) < torch.inf
         torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
         self.optimizer.step()
-        return torch.where(fine, torch.stack([*losses, self._one]).detach(), 0.0)
+        return torch.where(fine, torch.stack([*losses, *errors, self._one]).detach(), 0.0)
 
     def _clip_gradients(self) -> Tensor:
-        """Clip the gradients of actor and critic, each to the norm `max_grad_norm`, as torch's clip_grad_norm_ does one after
-        the other; returns the sum () of both norms before.
+        """Clip the gradients of actor, critic and estimator, each to the norm `max_grad_norm`, as torch's clip_grad_norm_
+        does one after the other; returns the sum () of the norms before.
         """
-        gradients = [
-            [parameter.grad for parameter in model.parameters() if parameter.grad is not None]
-            for model in (self.actor, self.critic)
-        ]
-        of_each = torch.stack(torch._foreach_norm([*gradients[0], *gradients[1]]))
+        gradients = [[parameter.grad for parameter in part if parameter.grad is not None] for part in self._parts()]
+        of_each = torch.stack(torch._foreach_norm([gradient for some in gradients for gradient in some]))
         norms = torch.stack([torch.linalg.vector_norm(n) for n in of_each.split([len(some) for some in gradients])])
         factors = (self.max_grad_norm / (norms + 1e-6)).clamp(max=1.0)
         for some, factor in zip(gradients, factors.unbind(), strict=True):
@@ -246,10 +291,23 @@ class DevicePPO(ScaledRewards):
         kind, enabled = inputs.device.type, self.use_mixed_precision
         # A graph must cast the weights anew at every replay, so none may come from autocast's cache.
         with torch.autocast(kind, torch.bfloat16, enabled, cache_enabled=False):
-            x = model.obs_normalizer(inputs)
-            if kind == "cpu" and not enabled:
-                return apply_layers(model.mlp, x)
-            return model.mlp(x).float()
+            return self._layers(model.mlp, model.obs_normalizer(inputs))
+
+    def _act(self, inputs: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Return the mean actions (n, D) for the actor's inputs (n, width), and its estimates (n, E) if it makes any."""
+        actor = self.actor
+        if not isinstance(actor, EstimatingModel):
+            return self._output(actor, inputs), None
+        with torch.autocast(inputs.device.type, torch.bfloat16, self.use_mixed_precision, cache_enabled=False):
+            x = actor.obs_normalizer(inputs)
+            found = self._layers(actor.estimator, x)
+            return self._layers(actor.mlp, actor.joined(x, found)), found[:, : actor.estimates]
+
+    def _layers(self, layers: torch.nn.Sequential, x: Tensor) -> Tensor:
+        """Return what layers make of `x` (n, width): (n, outputs), float32."""
+        if x.device.type == "cpu" and not self.use_mixed_precision:
+            return apply_layers(layers, x)
+        return layers(x).float()
 
     def action_std(self) -> Tensor:
         """Return the standard deviation (D,) of the actions."""

@@ -1,10 +1,6 @@
 """A rollout without a host read: policy, sampling, task and returns, written straight into rsl-rl's storage."""
 
-from collections.abc import Mapping
-
 import torch
-from rsl_rl.models import MLPModel
-from tensordict import TensorDict
 from torch import Tensor
 
 from legged.envs import BaseTask
@@ -58,7 +54,7 @@ class Rollout:
         env, alg, st = self.env, self.alg, self.alg.storage
         for name, now in self._observations.items():
             st.observations[name][t].copy_(now)
-        mean = alg.actor.mlp(self._input(alg.actor, self._observations))
+        mean = alg.actor.mlp(alg.actor.get_latent(self._observations))
         actions = torch.addcmul(mean, alg.action_std(), torch.randn_like(mean))
         st.actions[t].copy_(actions)
         st.distribution_params[0][t].copy_(mean)
@@ -76,7 +72,7 @@ class Rollout:
         std = alg.action_std()
         st.distribution_params[1].copy_(std.expand_as(st.actions))
         st.actions_log_prob.copy_(gaussian_log_prob(st.actions, st.distribution_params[0], std).unsqueeze(-1))
-        st.values.copy_(alg.critic.mlp(self._input(alg.critic, st.observations)))
+        st.values.copy_(alg.critic.mlp(alg.critic.get_latent(st.observations)))
         if alg.reward_scale != 1.0:
             st.rewards.mul_(alg.reward_scale)
         # The value of the state that was acted on stands for the one that a time-out cut off, as in rsl-rl.
@@ -99,15 +95,10 @@ class Rollout:
         moved = self._return_at - self.ended[1] / self.ended[0]
         self.ended[3].copy_(torch.where(self.alg.storage.dones.squeeze(-1).bool(), moved.square(), self._zero).sum())
 
-    @staticmethod
-    def _input(model: MLPModel, observations: Mapping[str, Tensor] | TensorDict) -> Tensor:
-        """Return what a network is given of `observations` by group (..., width): its groups side by side, normalised."""
-        return model.obs_normalizer(torch.cat([observations[name] for name in model.obs_groups], dim=-1))
-
     def _returns(self) -> None:
         """Generalised advantage estimation (Schulman et al., arXiv 1506.02438), backwards over the storage."""
         alg, st = self.alg, self.alg.storage
-        last = alg.critic.mlp(self._input(alg.critic, self._observations))
+        last = alg.critic.mlp(alg.critic.get_latent(self._observations))
         following = torch.cat([st.values[1:], last.unsqueeze(0)])
         alive = 1.0 - st.dones.float()
         sums = st.rewards + alive * alg.gamma * following - st.values  # temporal differences, to which later ones are added

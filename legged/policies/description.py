@@ -4,7 +4,7 @@ import inspect
 import math
 from typing import Any
 
-from legged.config.networks import groups_of
+from legged.config.networks import ESTIMATED, groups_of
 from legged.config.units import unit_in
 from legged.deploy.contract import CONTRACT_VERSION, need_of
 from legged.envs import BaseTask, LeggedRobot
@@ -34,6 +34,7 @@ def describe(task: BaseTask) -> dict[str, Any]:
         "observation_groups": groups,
         "observation_clip": cfg.observations.clip,
         "recurrent": describe_memory(task),
+        **describe_estimator(task),
         **(describe_robot(task) if isinstance(task, LeggedRobot) else describe_control(task)),
     }
 
@@ -132,6 +133,18 @@ def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any]) 
     if isinstance(task, LeggedRobot) and term.name in ("passive_pos", "passive_vel") and task.robot.passive is not None:
         entry |= {"joints": list(task.robot.passive.names), "default": task.passive_default_pos.tolist()}
     return entry
+
+
+def describe_estimator(task: BaseTask) -> dict[str, Any]:
+    """Return what a policy with an estimator estimates inside, as `estimator`; nothing for others."""
+    if ESTIMATED not in task.observation_groups:
+        return {}
+    targets = []
+    for term in task.observation_groups[ESTIMATED].terms:
+        docstring, size = inspect.getdoc(getattr(type(task), f"_obs_{term.name}")), term.columns.stop - term.columns.start
+        scale = [float(value) for value in term.scale]
+        targets.append({"name": term.name, "size": size, "scale": scale, "unit": unit_in(docstring)})
+    return {"estimator": {"targets": targets, "latent": task.cfg.train.policy.estimator.latent}}
 
 
 def describe_memory(task: BaseTask) -> dict[str, Any] | None:

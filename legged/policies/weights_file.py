@@ -5,7 +5,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from legged.deploy.weights import ACTIVATION, ACTIVATIONS, GRU, LINEAR, LSTM, NORMALISE, Layer, pack
+from legged.deploy.weights import ACTIVATION, ACTIVATIONS, GRU, JOIN, KEEP, LINEAR, LSTM, NORMALISE, Layer, pack
+from legged.learning.estimator import EstimatingModel
 
 
 def weights_of(policy: Any, activation: str, num_actions: int) -> bytes:
@@ -19,14 +20,26 @@ def weights_of(policy: Any, activation: str, num_actions: int) -> bytes:
         layers.append(_layer(NORMALISE, len(mean), len(mean), mean, divisor))
     if policy.is_recurrent:
         layers += _recurrent(policy.rnn.rnn)
-    linear = [module for module in policy.mlp if isinstance(module, nn.Linear)]
+    if isinstance(policy, EstimatingModel):
+        width = policy.obs_dim
+        found = _dense(policy.estimator, activation)
+        more = found[-1].outputs
+        layers += [Layer(KEEP, 0, width, width, ()), *found, Layer(JOIN, 0, more, width + more, ())]
+    return pack([*layers, *_dense(policy.mlp, activation, num_actions)])
+
+
+def _dense(mlp: nn.Sequential, activation: str, outputs: int | None = None) -> list[Layer]:
+    """Return the layers of an MLP, of the last one the first `outputs` only: where there is more than means, they come
+    first.
+    """
+    layers: list[Layer] = []
+    linear = [module for module in mlp if isinstance(module, nn.Linear)]
     for module in linear:
-        # Where there is more than means, they come first.
-        rows = num_actions if module is linear[-1] else module.out_features
+        rows = module.out_features if outputs is None or module is not linear[-1] else outputs
         layers.append(_layer(LINEAR, module.in_features, rows, module.weight[:rows], module.bias[:rows]))
         if module is not linear[-1]:
             layers.append(Layer(ACTIVATION, list(ACTIVATIONS).index(activation), rows, rows, ()))
-    return pack(layers)
+    return layers
 
 
 def _recurrent(module: nn.LSTM | nn.GRU) -> list[Layer]:

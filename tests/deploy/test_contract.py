@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import CALM, ENGINE
-from still_robot import PROPRIOCEPTION, SMALL, exported, facts_for
+from still_robot import BLIND, PROPRIOCEPTION, SMALL, exported, facts_for
 
 from legged.deploy.contract import CONTRACT_VERSION, need_of, read_contract
 from legged.deploy.interface import Reading
@@ -270,3 +270,15 @@ def test_it_needs_numpy_and_onnxruntime_alone(folder):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.split("\n")[:2] == ["90 torch is blocked", "[]"], done.stdout + done.stderr
+
+
+def test_a_policy_that_estimates_a_velocity_needs_nothing_that_gives_it(tmp_path):
+    """The estimator is within the network: the robot's program reads what it always does."""
+    estimating = ("train.policy.estimator.targets", ["base_lin_vel"]), ("train.policy.estimator.hidden_dims", [8])
+    policy = Policy(exported(tmp_path, *BLIND, *estimating))
+    assert not policy.contract.sources
+    assert policy.contract.width == 90
+    still = np.zeros(12)
+    targets = policy.act(Reading(0.0, 0.0, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), still, still), np.zeros(3))
+    assert np.isfinite(targets).all()
+    assert not np.array_equal(targets, policy.contract.default)

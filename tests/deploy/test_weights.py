@@ -12,7 +12,7 @@ from helpers import small_task
 from still_robot import SMALL
 
 import legged.deploy
-from legged.deploy.weights import ACTIVATIONS, LINEAR, Layer, NumpyNetwork, pack, unpack
+from legged.deploy.weights import ACTIVATIONS, JOIN, KEEP, LINEAR, Layer, NumpyNetwork, pack, unpack
 from legged.learning.runner import Runner
 from legged.policies.export import export
 
@@ -52,6 +52,12 @@ VARIANTS = {
     "normalised, with a spread that depends on the state": [
         ("train.policy.obs_normalization", True),
         ("train.policy.state_dependent_std", True),
+    ],
+    "estimator": [
+        ("train.policy.obs_normalization", True),
+        ("train.policy.estimator.targets", ["base_lin_vel"]),
+        ("train.policy.estimator.hidden_dims", [24]),
+        ("train.policy.estimator.latent", 7),
     ],
     "LSTM": [("train.policy.rnn_type", "lstm"), *RECURRENT],
     "GRU": [("train.policy.rnn_type", "gru"), *RECURRENT],
@@ -133,6 +139,10 @@ def linear(inputs, outputs):
     return Layer(LINEAR, 0, inputs, outputs, (np.ones((outputs, inputs)), np.ones(outputs)))
 
 
+KEPT = Layer(KEEP, 0, 3, 3, ())
+JOINS = ["nothing kept", "joined to another width", "joined twice", "kept with another width"]
+
+
 @pytest.mark.parametrize(
     ("data", "says"),
     [
@@ -141,8 +151,12 @@ def linear(inputs, outputs):
         (pack([linear(3, 2), Layer(2, 99, 2, 2, ())]), "has a layer that this program does not know"),
         (pack([linear(3, 2), Layer(2, 0, 2, 9, ())]), "has a layer that changes a width it cannot change"),
         (pack([linear(3, 2)]) + b"x", "is longer than it says"),
+        (pack([linear(3, 2), Layer(JOIN, 0, 2, 5, ())]), "has a layer that joins what was not kept"),
+        (pack([KEPT, linear(3, 2), Layer(JOIN, 0, 2, 6, ())]), "has a layer that joins what was not kept"),
+        (pack([KEPT, Layer(JOIN, 0, 3, 6, ()), Layer(JOIN, 0, 6, 9, ())]), "has a layer that joins what was not kept"),
+        (pack([Layer(KEEP, 0, 3, 4, ()), linear(4, 2)]), "has a layer that changes a width it cannot change"),
     ],
-    ids=["no layers", "do not fit", "unknown activation", "another width", "longer"],
+    ids=["no layers", "do not fit", "unknown activation", "another width", "longer", *JOINS],
 )
 def test_layers_that_make_no_network_are_refused_by_both(data, says, program, tmp_path):
     (tmp_path / "policy.weights").write_bytes(data)
@@ -160,3 +174,15 @@ def test_a_layer_by_hand():
         Layer(2, 0, 1, 1, ()),
     ]
     assert NumpyNetwork(pack(layers)).run(np.array([[2.0]]))[0, 0] == pytest.approx(np.exp(-0.25) - 1.0)
+
+
+def test_what_was_kept_comes_before_what_was_found_in_it(program, tmp_path):
+    """(2, 3) are kept, their sum plus 1 is found; the matrix picks 2, 30 and 600 of them."""
+    found = Layer(LINEAR, 0, 2, 1, (np.ones((1, 2)), np.ones(1)))
+    picked = Layer(LINEAR, 0, 3, 3, (np.diag([1.0, 10.0, 100.0]), np.zeros(3)))
+    data = pack([Layer(KEEP, 0, 2, 2, ()), found, Layer(JOIN, 0, 1, 3, ()), picked])
+    assert NumpyNetwork(data).run(np.array([[2.0, 3.0]])).tolist() == [[2.0, 30.0, 600.0]]
+    (tmp_path / "policy.weights").write_bytes(data)
+    (tmp_path / "in").write_bytes(np.array([2.0, 3.0], np.float32).tobytes())
+    subprocess.run([str(program), *(str(tmp_path / name) for name in ("policy.weights", "in", "out"))], check=True)
+    assert np.frombuffer((tmp_path / "out").read_bytes(), np.float32).tolist() == [2.0, 30.0, 600.0]

@@ -64,7 +64,9 @@ def weights(folder: Path, iteration: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    ("task", "iterations"), [(TASK, 4), ("half_cheetah", 2), ("humanoid", 2)], ids=[TASK, "half_cheetah", "humanoid"]
+    ("task", "iterations"),
+    [(TASK, 4), ("half_cheetah", 2), ("humanoid", 2), ("anymal_c_estimator", 2)],
+    ids=[TASK, "half_cheetah", "humanoid", "anymal_c_estimator"],
 )
 def test_a_training_is_captured_and_its_weights_are_finite(task, iterations, graphs):
     folder, printed = trained(task=task, iterations=iterations)

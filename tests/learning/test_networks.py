@@ -38,6 +38,13 @@ VARIANTS = {
     "log std": ["train.policy.noise_std_type=log", "train.policy.min_noise_std=0.3", "train.policy.obs_normalization=true"],
     "std by state": ["train.policy.state_dependent_std=true", "train.policy.noise_std_type=log"],
     "sgd": ["train.algorithm.optimizer=sgd", "train.algorithm.normalize_advantage_per_mini_batch=true"],
+    "estimator": [
+        "train.policy.estimator.targets=[base_lin_vel]",
+        "train.policy.estimator.hidden_dims=[8]",
+        "train.policy.estimator.latent=2",
+        "train.policy.obs_normalization=true",
+        *UNLIKE,
+    ],
     "lstm": ["train.policy.rnn_type=lstm", "train.policy.obs_normalization=true", *RECURRENT],
     "gru": [
         "train.policy.rnn_type=gru",
@@ -289,6 +296,7 @@ def test_what_the_captured_loop_cannot_hold_trains_on_rsl_rls_and_says_why(chang
     [
         VARIANTS["several groups"],
         VARIANTS["log std"],
+        VARIANTS["estimator"],
         ["train.algorithm.normalize_advantage_per_mini_batch=true"],
     ],
 )

@@ -23,6 +23,7 @@ VARIANTS = {
     "torques from velocities": ["control.control_type=V"],
     "terrain": ["--task", "anymal_c"],
     "history": ["--task", "anymal_c_proprio"],
+    "estimator": ["--task", "anymal_c_estimator", "train.policy.estimator.latent=2"],
     "bounds of the std": ["train.policy.min_noise_std=0.498", "train.policy.noise_std_type=log"],
     "std by state": ["train.policy.state_dependent_std=true"],
     "rmsprop": ["train.algorithm.optimizer=rmsprop"],

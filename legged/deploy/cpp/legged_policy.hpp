@@ -32,6 +32,7 @@ public:
         if (std::memcmp(magic, "LEGGEDW1", sizeof magic) != 0) throw std::runtime_error(path + ": is no policy.weights");
         std::uint32_t count = 0;
         read(file, path, &count, sizeof count);
+        std::size_t kept = 0;  // numbers that the next layer of the kind join finds
         for (std::uint32_t i = 0; i < count; ++i) {
             std::uint32_t head[4];
             read(file, path, head, sizeof head);
@@ -40,12 +41,19 @@ public:
             layer.detail = head[1];
             layer.inputs = head[2];
             layer.outputs = head[3];
-            if (layer.kind > gru || layer.inputs > largest || layer.outputs > largest)
+            if (layer.kind > join || layer.inputs > largest || layer.outputs > largest)
                 throw std::runtime_error(path + ": has a layer that this program does not know");
             if (layer.kind == activation && layer.detail >= activations)
                 throw std::runtime_error(path + ": has a layer that this program does not know");
-            if ((layer.kind == activation || layer.kind == normalise) && layer.inputs != layer.outputs)
+            if ((layer.kind == activation || layer.kind == normalise || layer.kind == keep) && layer.inputs != layer.outputs)
                 throw std::runtime_error(path + ": has a layer that changes a width it cannot change");
+            if (layer.kind == keep) kept = layer.inputs;
+            if (layer.kind == join) {
+                if (kept == 0 || layer.outputs != kept + layer.inputs)
+                    throw std::runtime_error(path + ": has a layer that joins what was not kept");
+                kept = 0;
+            }
+            if (kept_.size() < kept) kept_.resize(kept);
             if (!layers_.empty() && layer.inputs != layers_.back().outputs)
                 throw std::runtime_error(path + ": has layers that do not fit together");
             layer.numbers.resize(layer.size());
@@ -87,6 +95,11 @@ public:
                 x_.swap(y_);
             } else if (layer.kind == activation) {
                 for (std::size_t i = 0; i < n; ++i) x_[i] = static_cast<float>(activate(layer.detail, x_[i]));
+            } else if (layer.kind == keep) {
+                std::copy(x_.begin(), x_.begin() + n, kept_.begin());
+            } else if (layer.kind == join) {
+                std::copy_backward(x_.begin(), x_.begin() + m, x_.begin() + n);
+                std::copy(kept_.begin(), kept_.begin() + (n - m), x_.begin());
             } else {
                 advance(layer);
                 std::copy(layer.hidden.begin(), layer.hidden.end(), x_.begin());
@@ -96,7 +109,7 @@ public:
     }
 
 private:
-    enum Kind : std::uint32_t { normalise, linear, activation, lstm, gru };
+    enum Kind : std::uint32_t { normalise, linear, activation, lstm, gru, keep, join };
     static constexpr std::uint32_t largest = 1u << 14, activations = 10;
 
     struct Layer {
@@ -108,7 +121,7 @@ private:
             const std::size_t rows = (kind == lstm ? 4 : 3) * outputs;
             if (kind == normalise) return 2 * inputs;
             if (kind == linear) return outputs * (inputs + 1);
-            return kind == activation ? 0 : rows * (inputs + outputs + 2);
+            return kind == lstm || kind == gru ? rows * (inputs + outputs + 2) : 0;
         }
     };
 
@@ -172,7 +185,7 @@ private:
     }
 
     std::vector<Layer> layers_;
-    std::vector<float> x_, y_, gates_;
+    std::vector<float> x_, y_, gates_, kept_;
 };
 
 }  // namespace legged
