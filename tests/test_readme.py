@@ -106,7 +106,7 @@ def test_every_flag_that_is_shown_exists(name, main, capsys):
 def test_links_and_pictures_are_there():
     for page, text in PAGES.items():
         for target in re.findall(r"\]\((?!http)([^)]+)\)", text):
-            path = (page.parent / target).resolve()
+            path = (page.parent / target.partition("#")[0]).resolve()
             assert path.is_file(), f"{page.name}: {target}"
 
 
