@@ -82,6 +82,9 @@ class AlgorithmConfig:
     """Learn from every sample also as its mirror image, left for right (Mittal et al., arXiv 2403.04359)."""
     mirror_loss_coeff: float = field(default=0.0, metadata=between(0, 1000))
     """Weight, with symmetry, of a loss for actions that differ from the mirrored ones of the mirror image; 0 for none."""
+    critic_warmup_iterations: int = field(default=0, metadata=between(0, 1_000_000_000))
+    """Iterations at the start in which the value function learns alone: the policy stays as it is, with its std and its
+    normaliser. `--transfer` takes the policy alone then; value function, optimiser and std are new."""
 
 
 @dataclass(frozen=True)

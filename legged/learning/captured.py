@@ -54,7 +54,8 @@ class CapturedRunner(Runner):
             self.alg.broadcast_parameters()
         self._rollout = rollout = Rollout(self.env, self.alg)
         stage_ended("learner built")
-        collect, update = self._capture(rollout)
+        warmup = self.env.cfg.train.algorithm.critic_warmup_iterations
+        collect, update, update_critic = self._capture(rollout, self.current_learning_iteration < warmup)
         stage_ended("training captured")
         if not self._go_on() and init_at_random_ep_len:
             length = self.env.episode_length_buf
@@ -68,7 +69,7 @@ class CapturedRunner(Runner):
             collect()
             clock.lap()
             with threads.use():
-                update()
+                (update_critic if iteration < warmup else update)()
             clock.lap()
             self.current_learning_iteration = iteration
             self._log(iteration, first, total, rollout, clock)
@@ -80,15 +81,21 @@ class CapturedRunner(Runner):
             self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
             self.logger.stop_logging_writer()
 
-    def _capture(self, rollout: Rollout) -> tuple[Callable[[], None], Callable[[], None]]:
-        """Rollout and update as graphs, where the task's step is one; networks and task are as before afterwards."""
+    def _capture(self, rollout: Rollout, warms_up: bool) -> tuple[Callable[[], None], Callable[[], None], Callable[[], None]]:
+        """Rollout, update and, if training begins with some of them (`warms_up`), update of the value function alone as
+        graphs, where the task's step is one; networks and task are as before afterwards.
+        """
         device = torch.device(self.device)
         enabled = self.env.captured
         progress = self.env.progress()
         collect = StepGraph(rollout.collect, device, enabled, ROLLOUTS_TO_WARM_UP, lambda: rollout.collect(1))
+        if warms_up:
+            self.alg.fill_moments()
         before = list(zip(self.alg.tensors(), copies(self.alg.tensors()), strict=True))
         fresh = not self.alg.optimizer.state
-        update = StepGraph(self.alg.learn, device, enabled, rehearse=lambda: self.alg.learn(1))
+        update = update_critic = StepGraph(self.alg.learn, device, enabled, rehearse=lambda: self.alg.learn(1))
+        if warms_up:
+            update_critic = StepGraph(self.alg.learn_critic, device, enabled, rehearse=lambda: self.alg.learn_critic(1))
         with torch.no_grad():
             for tensor, value in before:
                 tensor.copy_(value)
@@ -101,7 +108,7 @@ class CapturedRunner(Runner):
             self.env.reset_curricula()
             self.env.load_progress(progress)
             self.env.reset()
-        return collect, update
+        return collect, update, update_critic
 
     def _episodes(self) -> dict[str, Tensor]:
         return super()._episodes() if self._rollout is None else self._rollout.episodes

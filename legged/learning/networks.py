@@ -1,5 +1,6 @@
 """Actor and critic as a configuration describes them, in rsl-rl's terms."""
 
+import math
 from typing import Any
 
 import torch
@@ -58,6 +59,17 @@ def action_std(actor: MLPModel) -> Tensor:
     if distribution.std_type == "scalar":
         return distribution.std_param.clamp(*distribution.std_range)
     return distribution.log_std_param.clamp(*distribution.log_std_range).exp()
+
+
+@torch.no_grad()
+def begin_std(actor: MLPModel, cfg: TaskConfig) -> None:
+    """Set the standard deviation of a policy's actions, where it does not depend on the state, to that of a new policy."""
+    distribution, std = actor.distribution, cfg.train.policy.init_noise_std
+    if type(distribution) is GaussianDistribution:
+        if distribution.std_type == "scalar":
+            distribution.std_param.fill_(std)
+        else:
+            distribution.log_std_param.fill_(math.log(std))
 
 
 def keep_std_in_bounds(actor: MLPModel, optimizer: torch.optim.Optimizer) -> None:

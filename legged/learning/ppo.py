@@ -9,9 +9,9 @@ from rsl_rl.modules.normalization import EmpiricalNormalization
 from torch import Tensor
 
 from legged.learning.cpu_layers import apply_layers
+from legged.learning.critic_warmup import CriticWarmup
 from legged.learning.distributed import sum_over_ranks_
 from legged.learning.networks import action_std
-from legged.learning.scaled_rewards import ScaledRewards
 
 LOWEST_RATE, HIGHEST_RATE, RATE_STEP = 1e-5, 1e-2, 1.5
 """Bounds of the adaptive learning rate and the factor by which it moves, as in rsl-rl."""
@@ -24,7 +24,7 @@ HALF_LOG_2PI = 0.9189385332046727
 """0.5 * log(2 pi)."""
 
 
-class DevicePPO(ScaledRewards):
+class DevicePPO(CriticWarmup):
     """PPO (Schulman et al., arXiv 1707.06347) as rsl-rl computes it, for Gaussian MLP policies.
 
     What differs is where and how often: the learning rate is a tensor on the device; samples are shuffled into contiguous
@@ -51,6 +51,8 @@ class DevicePPO(ScaledRewards):
         self._losses = torch.zeros(count + 1, device=self.device)
         """Means over the mini-batches of the last update, by `LOSSES`, and the share of them that were taken."""
         self._one = torch.ones((), device=self.device)
+        self._critic_alone = False
+        """Whether the update that runs, or is captured, changes the value function alone."""
         self.left_out = 0.0
         """Share of the last update's mini-batches that changed nothing, because a gradient was no number."""
 
@@ -113,9 +115,26 @@ class DevicePPO(ScaledRewards):
         """All epochs over the stored rollout; returns the mean losses."""
         if self.why_stock:
             return super().update()
-        self.learn()
+        (self.learn_critic if self.warming_up() else self.learn)()
         self.storage.clear()
         return self.losses()
+
+    def learn_critic(self, epochs: int | None = None) -> None:
+        """As `learn`, but all that changes is the value function: the policy is kept, with its normaliser."""
+        self._critic_alone = True
+        self.learn(epochs)
+        self._critic_alone = False
+
+    def fill_moments(self) -> None:
+        """Give every parameter that has no moments yet the ones that the optimiser would begin with, so that a graph knows
+        where they are before the first step that uses them.
+        """
+        for group in self.optimizer.param_groups:
+            for parameter in group["params"]:
+                if not self.optimizer.state[parameter]:
+                    step = torch.zeros((), device=parameter.device)
+                    moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
+                    self.optimizer.state[parameter].update({"step": step, **moments})
 
     def learn(self, epochs: int | None = None) -> None:
         """All epochs over the stored rollout, or the first `epochs`: no host read, so that one graph can hold it."""
@@ -209,6 +228,8 @@ class DevicePPO(ScaledRewards):
 
         kl = divergence(old_mean, old_std, mean[:samples].detach(), std.detach())
         losses.insert(LOSSES.index("kl"), kl)  # the tensor, into which several processes put their mean below
+        if self._critic_alone:
+            loss = self.value_loss_coef * value_loss
         if self.is_multi_gpu:
             self._shared.zero_()
             loss.backward()
@@ -216,12 +237,28 @@ class DevicePPO(ScaledRewards):
         else:
             self.optimizer.zero_grad()
             loss.backward()
+        if self._critic_alone:
+            return self._step_critic(losses)
         if self.desired_kl is not None and self.schedule == "adaptive":
             self._adapt_rate(kl)
         # The clipped value loss passes no gradient on for a value that is NaN, so it is looked at by itself.
         fine = (self._clip_gradients() + value_loss.detach()) < torch.inf
         torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
         self.optimizer.step()
+        return torch.where(fine, torch.stack([*losses, self._one]).detach(), 0.0)
+
+    def _step_critic(self, losses: list[Tensor]) -> Tensor:
+        """End a mini-batch of which the value function alone learns; returns what `_step` does. The optimiser passes over
+        parameters without a gradient: gradients of 0 would count as steps, and the first real ones would be too large.
+        """
+        of_actor = [(parameter, parameter.grad) for parameter in self.actor.parameters()]
+        for parameter, _ in of_actor:
+            parameter.grad = None
+        fine = (self._clip_gradients() + losses[0].detach()) < torch.inf
+        torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
+        self.optimizer.step()
+        for parameter, gradient in of_actor:  # of several processes, a part of the buffer that they share
+            parameter.grad = gradient
         return torch.where(fine, torch.stack([*losses, self._one]).detach(), 0.0)
 
     def _clip_gradients(self) -> Tensor:
@@ -236,7 +273,8 @@ class DevicePPO(ScaledRewards):
         norms = torch.stack([torch.linalg.vector_norm(n) for n in of_each.split([len(some) for some in gradients])])
         factors = (self.max_grad_norm / (norms + 1e-6)).clamp(max=1.0)
         for some, factor in zip(gradients, factors.unbind(), strict=True):
-            torch._foreach_mul_(some, factor)
+            if some:
+                torch._foreach_mul_(some, factor)
         return norms.sum()
 
     def _output(self, model: MLPModel, inputs: Tensor) -> Tensor:
@@ -265,7 +303,7 @@ class DevicePPO(ScaledRewards):
         self._rate.copy_(torch.where(kl > 2.0 * self.desired_kl, slower, rate))
 
     def _update_normalizers(self) -> None:
-        for model in (self.actor, self.critic):
+        for model in (self.critic,) if self._critic_alone else (self.actor, self.critic):
             if isinstance(model.obs_normalizer, EmpiricalNormalization):
                 inputs = torch.cat([self.storage.observations[name] for name in model.obs_groups], dim=-1)
                 update_normalizer(model.obs_normalizer, inputs.flatten(0, 1))

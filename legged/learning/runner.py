@@ -27,13 +27,13 @@ from legged.learning.distributed import RankLost, join, leave
 from legged.learning.divergence_meter import DivergenceMeter
 from legged.learning.evaluations import Ended, Evaluations
 from legged.learning.logger import Interrupted, QuietLogger
-from legged.learning.networks import keep_std_in_bounds, network_settings, use_matmul
+from legged.learning.networks import begin_std, keep_std_in_bounds, network_settings, use_matmul
 from legged.learning.recurrent import hidden_states
 from legged.learning.run_folder import BEST_MODEL
 from legged.learning.run_state import generators, read_run_state, remove_older, set_generators, write_run_state
 from legged.learning.step_guard import StepGuard
 from legged.learning.symmetry import augment, images_of
-from legged.learning.transfer import check_built, tell_taken
+from legged.learning.transfer import check_built, tell_taken, what_is_taken
 from legged.learning.watch import Diverged
 from legged.process.paths import relative
 from legged.process.ranks import Ranks
@@ -49,8 +49,9 @@ def runner_config(task: BaseTask, algorithm_class: str) -> dict[str, Any]:
     """
     cfg, runner = task.cfg, task.cfg.train.runner
     settings = dict(vars(cfg.train.algorithm))
-    if settings.pop("reward_scale") != 1.0 and algorithm_class == "PPO":
-        algorithm_class = "legged.learning.scaled_rewards:ScaledRewards"
+    ours = settings.pop("reward_scale") != 1.0, settings.pop("critic_warmup_iterations") > 0
+    if any(ours) and algorithm_class == "PPO":
+        algorithm_class = "legged.learning.critic_warmup:CriticWarmup"
     symmetry, mirror_loss = settings.pop("symmetry"), settings.pop("mirror_loss_coeff")
     if symmetry:
         settings["symmetry_cfg"] = {
@@ -183,6 +184,8 @@ class Runner(OnPolicyRunner):
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train for a number of iterations; robots that go on where they stopped keep their episodes."""
+        warmup = self.env.cfg.train.algorithm.critic_warmup_iterations
+        self.alg.warmup_left = max(0, warmup - self.current_learning_iteration)
         goes_on = self._go_on()
         super().learn(num_learning_iterations, init_at_random_ep_len and not goes_on)
 
@@ -254,11 +257,13 @@ class Runner(OnPolicyRunner):
         Raises:
             ConfigError: they do not fit.
         """
-        parts = parts or dict.fromkeys(("actor", "critic", "iteration"), True)
+        parts = parts or {"actor": True, "critic": "critic_state_dict" in saved, "iteration": True}
         parts = {"optimizer": "optimizer_state_dict" in saved, **parts}
         if parts["optimizer"]:
             wanted, where = saved["optimizer_state_dict"], f"{relative(path)}: its optimiser"
-            saved["optimizer_state_dict"] = fit_optimizer(wanted, self.alg.optimizer, where)
+            warmup = self.env.cfg.train.algorithm.critic_warmup_iterations
+            waiting = len([*self.alg.get_policy().parameters()]) if saved["iter"] < warmup else 0
+            saved["optimizer_state_dict"] = fit_optimizer(wanted, self.alg.optimizer, where, waiting)
         try:
             self.alg.load(saved, parts, strict)
             self.alg.learning_rate = float(saved["infos"].get("learning_rate", self.alg.learning_rate))
@@ -273,12 +278,14 @@ class Runner(OnPolicyRunner):
         Raises:
             ConfigError: the file is no checkpoint, or its observations, actions or networks are others.
         """
-        saved = read_checkpoint(Path(path), self.device)
+        saved = what_is_taken(read_checkpoint(Path(path), self.device), self.env.cfg)
         check_built(Path(path), saved, self.env)
         settings = self.env.cfg.train.algorithm
         if saved["infos"].get("optimizer", "adam") != settings.optimizer:
             saved.pop("optimizer_state_dict", None)
         self._load_learner(Path(path), saved)
+        if "critic_state_dict" not in saved:
+            begin_std(self.alg.get_policy(), self.env.cfg)
         if settings.schedule == "fixed":
             self.alg.learning_rate = settings.learning_rate
         for group in self.alg.optimizer.param_groups:
