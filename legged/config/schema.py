@@ -5,7 +5,7 @@ legged robot that follows commands in legged.py.
 """
 
 from legged.config.actuator import ActuatorConfig
-from legged.config.learning import AlgorithmConfig, PolicyConfig, RunnerConfig, TrainConfig
+from legged.config.learning import AlgorithmConfig, DistillationConfig, PolicyConfig, RunnerConfig, TrainConfig
 from legged.config.legged import (
     STATE_TERMS,
     CommandCurriculumConfig,
@@ -43,6 +43,7 @@ __all__ = [
     "CommandRanges",
     "CommandsConfig",
     "ControlConfig",
+    "DistillationConfig",
     "DomainRandConfig",
     "DrawConfig",
     "EnvConfig",

@@ -13,7 +13,7 @@ from legged.envs import BaseTask
 from legged.graph.step_graph import StepGraph
 from legged.learning.display import Display
 from legged.learning.ppo import DevicePPO
-from legged.learning.rollout import Rollout
+from legged.learning.rollout import Rollout, Steps
 from legged.learning.runner import Runner
 from legged.learning.update_threads import UpdateThreads
 from legged.process.cores import available_cores
@@ -37,7 +37,7 @@ class CapturedRunner(Runner):
         self, env: BaseTask, log_dir: Path | None = None, device: str = "cpu", display: Display | None = None
     ) -> None:
         super().__init__(env, log_dir, device, display)
-        self._rollout: Rollout | None = None
+        self._rollout: Steps | None = None
         self.why_stock = self.alg.why_stock
         """What keeps training on rsl-rl's own loop; empty if nothing does."""
         if torch.device(device) != torch.device(env.device):  # type: ignore[arg-type]
@@ -52,7 +52,7 @@ class CapturedRunner(Runner):
         self.alg.train_mode()
         if self.is_distributed:
             self.alg.broadcast_parameters()
-        self._rollout = rollout = Rollout(self.env, self.alg)
+        self._rollout = rollout = self._steps()
         stage_ended("learner built")
         warmup = self.env.cfg.train.algorithm.critic_warmup_iterations
         collect, update, update_critic = self._capture(rollout, self.current_learning_iteration < warmup)
@@ -81,7 +81,11 @@ class CapturedRunner(Runner):
             self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
             self.logger.stop_logging_writer()
 
-    def _capture(self, rollout: Rollout, warms_up: bool) -> tuple[Callable[[], None], Callable[[], None], Callable[[], None]]:
+    def _steps(self) -> Steps:
+        """Return what makes the steps of an iteration."""
+        return Rollout(self.env, self.alg)
+
+    def _capture(self, rollout: Steps, warms_up: bool) -> tuple[Callable[[], None], Callable[[], None], Callable[[], None]]:
         """Rollout, update and, if training begins with some of them (`warms_up`), update of the value function alone as
         graphs, where the task's step is one; networks and task are as before afterwards.
         """
@@ -93,7 +97,8 @@ class CapturedRunner(Runner):
             self.alg.fill_moments()
         before = list(zip(self.alg.tensors(), copies(self.alg.tensors()), strict=True))
         fresh = not self.alg.optimizer.state
-        update = update_critic = StepGraph(self.alg.learn, device, enabled, rehearse=lambda: self.alg.learn(1))
+        fits = enabled and self.alg.fits_graph
+        update = update_critic = StepGraph(self.alg.learn, device, fits, rehearse=lambda: self.alg.learn(1))
         if warms_up:
             update_critic = StepGraph(self.alg.learn_critic, device, enabled, rehearse=lambda: self.alg.learn_critic(1))
         with torch.no_grad():
@@ -113,7 +118,7 @@ class CapturedRunner(Runner):
     def _episodes(self) -> dict[str, Tensor]:
         return super()._episodes() if self._rollout is None else self._rollout.episodes
 
-    def _log(self, iteration: int, first: int, total: int, rollout: Rollout, clock: "Clock") -> None:
+    def _log(self, iteration: int, first: int, total: int, rollout: Steps, clock: "Clock") -> None:
         """Read what is logged, which waits for the iteration to end."""
         logger = self.logger
         ended, returns, lengths, squares = rollout.ended.tolist()

@@ -92,7 +92,7 @@ PLAIN = (bool, int, float, str, type(None))
 PARTS: dict[str, Kind] = {
     "iter": int,
     "infos": (dict, type(None)),
-    **{f"{network}_state_dict": dict for network in NETWORKS},
+    **{f"{network}_state_dict": dict for network in (*NETWORKS, "teacher")},
     "optimizer_state_dict": {str: (dict, list)},
 }
 INFOS: dict[str, Kind] = {
@@ -106,6 +106,7 @@ INFOS: dict[str, Kind] = {
     "optimizer": str,
     "robot": {str: (str, list)},
     "transferred_from": {str: (str, int)},
+    "teacher": {str: (str, int)},
     "learning_rate": float,
     "wall_s": float,
     "evaluation": {str: float},

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from legged.config import TaskConfig
 from legged.config.networks import NETWORKS, groups_of
+from legged.config.schema import PolicyConfig
 
 UNBOUNDED = (1e-6, 1e6)
 """Bounds of the standard deviation that rsl-rl has in any case."""
@@ -20,7 +21,16 @@ UNBOUNDED = (1e-6, 1e6)
 def network_settings(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
     """Return the dictionaries `actor`, `critic` and `obs_groups` that rsl-rl wants."""
     policy = cfg.train.policy
-    shared = {
+    return {
+        "obs_groups": {network: list(groups_of(cfg, network)) for network in NETWORKS},
+        "actor": actor_settings(policy),
+        "critic": {**_shared(policy), "hidden_dims": list(policy.critic_hidden_dims)},
+    }
+
+
+def _shared(policy: PolicyConfig) -> dict[str, Any]:
+    """Return what actor and critic have in common."""
+    shared: dict[str, Any] = {
         "class_name": "MLPModel",
         "activation": policy.activation,
         "obs_normalization": policy.obs_normalization,
@@ -28,17 +38,18 @@ def network_settings(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
     if policy.rnn_type != "none":
         shared["class_name"] = "RNNModel"
         shared |= {name: getattr(policy, name) for name in ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")}
+    return shared
+
+
+def actor_settings(policy: PolicyConfig) -> dict[str, Any]:
+    """Return the dictionary of a network that acts: an actor, a student, a teacher."""
     distribution = {
         "class_name": "HeteroscedasticGaussianDistribution" if policy.state_dependent_std else "GaussianDistribution",
         "init_std": policy.init_noise_std,
         "std_type": policy.noise_std_type,
         "std_range": (policy.min_noise_std, policy.max_noise_std),
     }
-    return {
-        "obs_groups": {network: list(groups_of(cfg, network)) for network in NETWORKS},
-        "actor": {**shared, "hidden_dims": list(policy.actor_hidden_dims), "distribution_cfg": distribution},
-        "critic": {**shared, "hidden_dims": list(policy.critic_hidden_dims)},
-    }
+    return {**_shared(policy), "hidden_dims": list(policy.actor_hidden_dims), "distribution_cfg": distribution}
 
 
 def build_actor(cfg: TaskConfig, observations: TensorDict, num_actions: int) -> MLPModel:

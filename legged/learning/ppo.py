@@ -56,6 +56,9 @@ class DevicePPO(CriticWarmup):
         self.left_out = 0.0
         """Share of the last update's mini-batches that changed nothing, because a gradient was no number."""
 
+    fits_graph = True
+    """Whether an update can be captured; what can't be captured at all has rsl-rl's own loop."""
+
     def tensors(self) -> list[Tensor]:
         """Everything that an update changes: parameters, normalisers, moments of the optimiser, learning rate."""
         models = [tensor for model in (self.actor, self.critic) for tensor in model.state_dict(keep_vars=True).values()]
@@ -206,8 +209,8 @@ class DevicePPO(CriticWarmup):
         if self.normalize_advantage_per_mini_batch:
             own = advantages[:samples]
             advantages = (advantages - own.mean()) / (own.std() + FEW)
-        mean = self._output(self.actor, actor_input)
-        values = self._output(self.critic, critic_input).squeeze(-1)
+        mean = output_of(self.actor, actor_input, self.use_mixed_precision)
+        values = output_of(self.critic, critic_input, self.use_mixed_precision).squeeze(-1)
         std = self.action_std()
         log_prob = gaussian_log_prob(actions, mean, std)
         entropy = std.log().sum() + actions.shape[1] * (0.5 + HALF_LOG_2PI)
@@ -277,18 +280,6 @@ class DevicePPO(CriticWarmup):
                 torch._foreach_mul_(some, factor)
         return norms.sum()
 
-    def _output(self, model: MLPModel, inputs: Tensor) -> Tensor:
-        """Return what a network makes of its inputs (n, width): (n, outputs), float32. With mixed precision its layers
-        compute in bfloat16.
-        """
-        kind, enabled = inputs.device.type, self.use_mixed_precision
-        # A graph must cast the weights anew at every replay, so none may come from autocast's cache.
-        with torch.autocast(kind, torch.bfloat16, enabled, cache_enabled=False):
-            x = model.obs_normalizer(inputs)
-            if kind == "cpu" and not enabled:
-                return apply_layers(model.mlp, x)
-            return model.mlp(x).float()
-
     def action_std(self) -> Tensor:
         """Return the standard deviation (D,) of the actions."""
         return action_std(self.actor)
@@ -307,6 +298,19 @@ class DevicePPO(CriticWarmup):
             if isinstance(model.obs_normalizer, EmpiricalNormalization):
                 inputs = torch.cat([self.storage.observations[name] for name in model.obs_groups], dim=-1)
                 update_normalizer(model.obs_normalizer, inputs.flatten(0, 1))
+
+
+def output_of(model: MLPModel, inputs: Tensor, mixed_precision: bool) -> Tensor:
+    """Return what a network makes of its inputs (n, width): (n, outputs), float32. With mixed precision its layers compute
+    in bfloat16.
+    """
+    kind = inputs.device.type
+    # A graph must cast the weights anew at every replay, so none may come from autocast's cache.
+    with torch.autocast(kind, torch.bfloat16, mixed_precision, cache_enabled=False):
+        x = model.obs_normalizer(inputs)
+        if kind == "cpu" and not mixed_precision:
+            return apply_layers(model.mlp, x)
+        return model.mlp(x).float()
 
 
 @torch.no_grad()

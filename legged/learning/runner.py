@@ -12,6 +12,7 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 from torch import Tensor
 
+from legged.config.schema import RunnerConfig
 from legged.envs import BaseTask
 from legged.errors import ConfigError, RunError
 from legged.learning.checkpoint import (
@@ -48,7 +49,7 @@ def runner_config(task: BaseTask, algorithm_class: str) -> dict[str, Any]:
         ConfigError: the task is to learn from mirror images, and has none.
     """
     cfg, runner = task.cfg, task.cfg.train.runner
-    settings = dict(vars(cfg.train.algorithm))
+    settings = {name: value for name, value in vars(cfg.train.algorithm).items() if name != "class_name"}
     ours = settings.pop("reward_scale") != 1.0, settings.pop("critic_warmup_iterations") > 0
     if any(ours) and algorithm_class == "PPO":
         algorithm_class = "legged.learning.critic_warmup:CriticWarmup"
@@ -61,13 +62,20 @@ def runner_config(task: BaseTask, algorithm_class: str) -> dict[str, Any]:
             "mirror_loss_coeff": mirror_loss,
         }
     return {
+        **loop_settings(runner),
+        **network_settings(cfg),
+        "algorithm": {"class_name": algorithm_class, **settings},
+    }
+
+
+def loop_settings(runner: RunnerConfig) -> dict[str, Any]:
+    """Return what rsl-rl wants to know of the training loop."""
+    return {
         "num_steps_per_env": runner.num_steps_per_env,
         "save_interval": runner.save_interval,
         "run_name": runner.run_name,
         "logger": runner.logger,
         "check_for_nan": False,  # it would wait for the GPU at every step; the task terminates and counts such robots
-        **network_settings(cfg),
-        "algorithm": {"class_name": algorithm_class, **settings},
     }
 
 
@@ -82,7 +90,7 @@ class Runner(OnPolicyRunner):
         self, env: BaseTask, log_dir: Path | None = None, device: str = "cpu", display: Display | None = None
     ) -> None:
         """`log_dir` is where checkpoints and TensorBoard files go; without one nothing is written."""
-        config = runner_config(env, self.ALGORITHM)
+        config = self._configuration(env)
         use_matmul(env.cfg)
         with contextlib.redirect_stdout(io.StringIO()):
             super().__init__(env, config, str(log_dir) if log_dir else None, device)
@@ -107,6 +115,14 @@ class Runner(OnPolicyRunner):
             left_out=self._left_out,
         )
         self.logger.divergence = DivergenceMeter(self.alg.actor)
+
+    def _configuration(self, env: BaseTask) -> dict[str, Any]:
+        """Return the dictionary rsl-rl wants for a task."""
+        return runner_config(env, self.ALGORITHM)
+
+    def _networks(self) -> dict[str, Any]:
+        """Return the networks by their names in a checkpoint."""
+        return {"actor": self.alg.actor, "critic": self.alg.critic}
 
     def _left_out(self) -> float:
         """Return the share of the last update's mini-batches that changed nothing: their gradients were no numbers."""
@@ -214,7 +230,7 @@ class Runner(OnPolicyRunner):
         """
         saved = self.alg.save()
         try:
-            for network in ("actor", "critic"):
+            for network in self._networks():
                 check_weights(saved[f"{network}_state_dict"], f"{path}: is not written: the {network}")
         except ConfigError as error:
             raise RunError(str(error)) from error
@@ -335,4 +351,4 @@ class Runner(OnPolicyRunner):
 
     def _memory(self) -> dict[str, Tensor]:
         """Return what recurrent networks remember of their robots, (layers, N, width) each; nothing without any."""
-        return hidden_states({"actor": self.alg.actor, "critic": self.alg.critic}, self.env.num_envs)
+        return hidden_states(self._networks(), self.env.num_envs)

@@ -8,7 +8,7 @@ from typing import Any
 
 from legged.commandline.arguments import overrides
 from legged.config import LeggedConfig, TaskConfig
-from legged.config.networks import groups_of
+from legged.config.networks import groups_of, learns_from_teacher
 from legged.envs import BaseTask
 from legged.errors import ConfigError
 from legged.learning.checkpoint import (
@@ -48,6 +48,8 @@ def transferred(args: argparse.Namespace, on_cpu: bool) -> tuple[TaskConfig, Pat
     if args.load_run is None:
         raise ConfigError("--transfer: needs --load_run, the run or shipped policy whose networks are taken")
     cfg = task_config(args.task, overrides(args), on_cpu)
+    if learns_from_teacher(cfg):
+        raise ConfigError(f"--transfer: '{cfg.task}' learns from a teacher, and begins anew; --teacher names that one")
     path = find_checkpoint(find_run_of_any_task(cfg, args.load_run), args.checkpoint)
     check_source(path, read_checkpoint(path), cfg)
     return cfg, path
