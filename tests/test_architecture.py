@@ -121,6 +121,7 @@ def test_rsl_rl_is_known_to_its_boundary_only():
     users = {name_of(path) for path in FILES if uses(path, "rsl_rl")}
     assert users <= {
         "legged.envs.base_task",
+        "legged.learning.distillation",
         "legged.learning.estimator",
         "legged.learning.logger",
         "legged.learning.networks",

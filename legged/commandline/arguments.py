@@ -59,6 +59,7 @@ def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
         "experiment_name": "train.runner.experiment_name",
         "run_name": "train.runner.run_name",
         "runner": "train.runner.loop",
+        "teacher": "train.distillation.teacher",
         "physics": "sim.physics",
         "solver": "sim.solver",
     }

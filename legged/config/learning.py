@@ -64,8 +64,10 @@ class PolicyConfig:
 
 @dataclass(frozen=True)
 class AlgorithmConfig:
-    """PPO, by rsl-rl's names."""
+    """PPO, by rsl-rl's names. Distillation has a section of its own, and of this one `optimizer`, `use_mixed_precision`."""
 
+    class_name: Literal["PPO", "Distillation"] = "PPO"
+    """`PPO` learns from rewards; `Distillation` learns to act as a teacher would: train.distillation."""
     value_loss_coef: float = field(default=1.0, metadata=between(0, 1000))
     """Weight of the value function's error in the loss."""
     use_clipped_value_loss: bool = True
@@ -102,6 +104,30 @@ class AlgorithmConfig:
     """Learn from every sample also as its mirror image, left for right (Mittal et al., arXiv 2403.04359)."""
     mirror_loss_coeff: float = field(default=0.0, metadata=between(0, 1000))
     """Weight, with symmetry, of a loss for actions that differ from the mirrored ones of the mirror image; 0 for none."""
+    critic_warmup_iterations: int = field(default=0, metadata=between(0, 1_000_000_000))
+    """Iterations at the start in which the value function learns alone: the policy stays as it is, with its std and its
+    normaliser. `--transfer` takes the policy alone then; value function, optimiser and std are new."""
+
+
+@dataclass(frozen=True)
+class DistillationConfig:
+    """How a student learns from a teacher, by rsl-rl's names: the student acts, and learns what the teacher would have done
+    (Ross et al., arXiv 1011.0686).
+    """
+
+    teacher: str = ""
+    """Run folder, experiment under logs/, checkpoint, or task whose shipped policy is the teacher; `--teacher` sets it."""
+    loss_type: Literal["mse", "huber"] = "mse"
+    """Loss of the difference between the student's mean action and the teacher's: squared, or beyond 1 linear."""
+    gradient_length: int = field(default=8, metadata=between(1, 100_000))
+    """Control steps of all robots from which one step of the optimiser is made, and through which the gradient of a recurrent
+    student goes back; a divisor of train.runner.num_steps_per_env."""
+    num_learning_epochs: int = field(default=2, metadata=between(1, 1000))
+    """Passes over the steps of an iteration."""
+    learning_rate: float = field(default=1e-3, metadata=positive(1, low=1e-12))
+    """Step size of the optimiser."""
+    max_grad_norm: float = field(default=1.0, metadata=positive(1e9))
+    """Norm at which gradients are clipped."""
 
 
 @dataclass(frozen=True)
@@ -158,6 +184,8 @@ class TrainConfig:
     policy: PolicyConfig = PolicyConfig()
     """Networks."""
     algorithm: AlgorithmConfig = AlgorithmConfig()
-    """Settings of PPO."""
+    """Settings of PPO, and which algorithm it is."""
+    distillation: DistillationConfig = DistillationConfig()
+    """Settings of distillation."""
     runner: RunnerConfig = RunnerConfig()
     """Length of training, checkpoints and names."""

@@ -25,12 +25,18 @@ def path_of_terms(cfg: TaskConfig, group: str) -> str:
     return "train.policy.estimator.targets" if is_targets else f"observations.groups.{group}.terms"
 
 
+def learns_from_teacher(cfg: TaskConfig) -> bool:
+    """Return whether a policy is a student, which learns to act as a teacher would."""
+    return cfg.train.algorithm.class_name == "Distillation"
+
+
 def check_networks(cfg: TaskConfig) -> None:
     """Compare the networks with the observations, with each other's settings and with the learner.
 
     Raises:
         ConfigError: they read a group that there is not, the bounds of the standard deviation leave out its start, a mirror
-            loss comes without symmetry, or a recurrent policy or an estimator with what it can't learn from.
+            loss comes without symmetry, a recurrent policy or an estimator with what it can't learn from, or a student with
+            another one.
     """
     policy, algorithm, origins = cfg.train.policy, cfg.train.algorithm, cfg.origins
     known = cfg.observations.groups
@@ -47,6 +53,9 @@ def check_networks(cfg: TaskConfig) -> None:
         )
         where, given = origins.where("train.policy.init_noise_std"), policy.init_noise_std
         raise ConfigError(f"{where}: must lie between {bounds}, got {given:g}")
+    if learns_from_teacher(cfg):
+        _check_student(cfg)
+        return
     if algorithm.mirror_loss_coeff > 0.0 and not algorithm.symmetry:
         where = origins.where("train.algorithm.mirror_loss_coeff")
         raise ConfigError(f"{where}: must be 0 without mirror images; train.algorithm.symmetry=true")
@@ -84,6 +93,27 @@ def _check_estimator(cfg: TaskConfig) -> None:
             raise ConfigError(
                 f"{origins.where(field)}: must be {needed} with an estimator ({path}, {origins.of(path)}), got {given}"
             )
+
+
+def _check_student(cfg: TaskConfig) -> None:
+    """Compare a student with the settings of distillation.
+
+    Raises:
+        ConfigError: its standard deviation or an estimator would have to be learned, or steps would be left over.
+    """
+    policy, origins = cfg.train.policy, cfg.origins
+    if policy.state_dependent_std:
+        where = origins.where("train.policy.state_dependent_std")
+        raise ConfigError(f"{where}: a student learns the mean of the actions alone; must be false")
+    if policy.estimator.targets:
+        where = origins.where("train.policy.estimator.targets")
+        raise ConfigError(f"{where}: a student learns no estimator; must be []")
+    length, steps = cfg.train.distillation.gradient_length, cfg.train.runner.num_steps_per_env
+    if steps % length:
+        where = origins.where("train.distillation.gradient_length")
+        given = f"train.runner.num_steps_per_env={steps} ({origins.of('train.runner.num_steps_per_env')})"
+        nearest = min((n for n in range(1, steps + 1) if steps % n == 0), key=lambda n: abs(n - length))
+        raise ConfigError(f"{where}: must divide {given}, got {length} (nearest: {nearest})")
 
 
 def _check_recurrent(cfg: TaskConfig) -> None:

@@ -5,7 +5,14 @@ legged robot that follows commands in legged.py.
 """
 
 from legged.config.actuator import ActuatorConfig
-from legged.config.learning import AlgorithmConfig, EstimatorConfig, PolicyConfig, RunnerConfig, TrainConfig
+from legged.config.learning import (
+    AlgorithmConfig,
+    DistillationConfig,
+    EstimatorConfig,
+    PolicyConfig,
+    RunnerConfig,
+    TrainConfig,
+)
 from legged.config.legged import (
     STATE_TERMS,
     CommandCurriculumConfig,
@@ -43,6 +50,7 @@ __all__ = [
     "CommandRanges",
     "CommandsConfig",
     "ControlConfig",
+    "DistillationConfig",
     "DomainRandConfig",
     "DrawConfig",
     "EnvConfig",

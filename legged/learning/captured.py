@@ -15,7 +15,7 @@ from legged.graph.step_graph import StepGraph
 from legged.learning.display import Display
 from legged.learning.estimator import EstimatingModel, EstimationErrors
 from legged.learning.ppo import DevicePPO
-from legged.learning.rollout import Rollout
+from legged.learning.rollout import Rollout, Steps
 from legged.learning.runner import Runner
 from legged.learning.update_threads import UpdateThreads
 from legged.process.cores import available_cores
@@ -39,7 +39,7 @@ class CapturedRunner(Runner):
         self, env: BaseTask, log_dir: Path | None = None, device: str = "cpu", display: Display | None = None
     ) -> None:
         super().__init__(env, log_dir, device, display)
-        self._rollout: Rollout | None = None
+        self._rollout: Steps | None = None
         if isinstance(self.alg.actor, EstimatingModel):
             errors = EstimationErrors(env.observation_groups[ESTIMATED])
             self.alg.learn_to_estimate(errors, env.cfg.train.policy.estimator.learning_rate)
@@ -57,9 +57,10 @@ class CapturedRunner(Runner):
         self.alg.train_mode()
         if self.is_distributed:
             self.alg.broadcast_parameters()
-        self._rollout = rollout = Rollout(self.env, self.alg)
+        self._rollout = rollout = self._steps()
         stage_ended("learner built")
-        collect, update = self._capture(rollout)
+        warmup = self.env.cfg.train.algorithm.critic_warmup_iterations
+        collect, update, update_critic = self._capture(rollout, self.current_learning_iteration < warmup)
         stage_ended("training captured")
         if not self._go_on() and init_at_random_ep_len:
             length = self.env.episode_length_buf
@@ -73,7 +74,7 @@ class CapturedRunner(Runner):
             collect()
             clock.lap()
             with threads.use():
-                update()
+                (update_critic if iteration < warmup else update)()
             clock.lap()
             self.current_learning_iteration = iteration
             self._log(iteration, first, total, rollout, clock)
@@ -85,15 +86,26 @@ class CapturedRunner(Runner):
             self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
             self.logger.stop_logging_writer()
 
-    def _capture(self, rollout: Rollout) -> tuple[Callable[[], None], Callable[[], None]]:
-        """Rollout and update as graphs, where the task's step is one; networks and task are as before afterwards."""
+    def _steps(self) -> Steps:
+        """Return what makes the steps of an iteration."""
+        return Rollout(self.env, self.alg)
+
+    def _capture(self, rollout: Steps, warms_up: bool) -> tuple[Callable[[], None], Callable[[], None], Callable[[], None]]:
+        """Rollout, update and, if training begins with some of them (`warms_up`), update of the value function alone as
+        graphs, where the task's step is one; networks and task are as before afterwards.
+        """
         device = torch.device(self.device)
         enabled = self.env.captured
         progress = self.env.progress()
         collect = StepGraph(rollout.collect, device, enabled, ROLLOUTS_TO_WARM_UP, lambda: rollout.collect(1))
+        if warms_up:
+            self.alg.fill_moments()
         before = list(zip(self.alg.tensors(), copies(self.alg.tensors()), strict=True))
         fresh = not self.alg.optimizer.state
-        update = StepGraph(self.alg.learn, device, enabled, rehearse=lambda: self.alg.learn(1))
+        fits = enabled and self.alg.fits_graph
+        update = update_critic = StepGraph(self.alg.learn, device, fits, rehearse=lambda: self.alg.learn(1))
+        if warms_up:
+            update_critic = StepGraph(self.alg.learn_critic, device, enabled, rehearse=lambda: self.alg.learn_critic(1))
         with torch.no_grad():
             for tensor, value in before:
                 tensor.copy_(value)
@@ -106,12 +118,12 @@ class CapturedRunner(Runner):
             self.env.reset_curricula()
             self.env.load_progress(progress)
             self.env.reset()
-        return collect, update
+        return collect, update, update_critic
 
     def _episodes(self) -> dict[str, Tensor]:
         return super()._episodes() if self._rollout is None else self._rollout.episodes
 
-    def _log(self, iteration: int, first: int, total: int, rollout: Rollout, clock: "Clock") -> None:
+    def _log(self, iteration: int, first: int, total: int, rollout: Steps, clock: "Clock") -> None:
         """Read what is logged, which waits for the iteration to end."""
         logger = self.logger
         ended, returns, lengths, squares = rollout.ended.tolist()

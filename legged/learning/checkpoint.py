@@ -92,7 +92,7 @@ PLAIN = (bool, int, float, str, type(None))
 PARTS: dict[str, Kind] = {
     "iter": int,
     "infos": (dict, type(None)),
-    **{f"{network}_state_dict": dict for network in NETWORKS},
+    **{f"{network}_state_dict": dict for network in (*NETWORKS, "teacher")},
     "optimizer_state_dict": {str: (dict, list)},
 }
 INFOS: dict[str, Kind] = {
@@ -106,6 +106,7 @@ INFOS: dict[str, Kind] = {
     "optimizer": str,
     "robot": {str: (str, list)},
     "transferred_from": {str: (str, int)},
+    "teacher": {str: (str, int)},
     "learning_rate": float,
     "wall_s": float,
     "evaluation": {str: float},
@@ -150,9 +151,9 @@ def check_weights(state: dict[str, Any], where: str) -> None:
             raise ConfigError(f"{where} is damaged ({name} holds NaN or infinite numbers)")
 
 
-def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str) -> dict[str, Any]:
+def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str, waiting: int = 0) -> dict[str, Any]:
     """Return the state of an optimiser from a checkpoint, with the moments checked and everything but the learning rate
-    as it is set up here.
+    as it is set up here. The first `waiting` parameters may have no moments yet.
 
     Raises:
         ConfigError: it is not that of an optimiser of these parameters; begins with `where`.
@@ -169,7 +170,7 @@ def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str) -> d
             shape = () if name == "step" else parameters[i].shape
             if tensor.shape != shape or not bool(torch.isfinite(tensor).all()):
                 raise ConfigError(f"{where} is damaged ({name} of parameter {i})")
-    names = [{*state.get(i, {})} for i in range(len(parameters))]
+    names = [{*state.get(i, {})} for i in range(len(parameters)) if i in state or i >= waiting]
     if any(each != names[0] for each in names):
         raise ConfigError(f"{where} is damaged (the moments of some parameters are missing)")
     return {"state": state, "param_groups": [{**group, "lr": rate} for group, rate in zip(groups, rates, strict=True)]}

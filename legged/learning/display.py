@@ -64,6 +64,8 @@ class Progress:
     action_std: float
     values: dict[str, float]
     """The task's log: `rew_<term>` per second of a full episode, `Metrics/...` and other sections; NaN for no value yet."""
+    behavior: float | None = None
+    """Of a student, the mean loss between its actions and its teacher's."""
 
     def metrics(self) -> dict[str, float]:
         """Return the metrics of the task by name, those with a style of their own first."""
@@ -84,10 +86,11 @@ class Progress:
     def line(self) -> str:
         """Return the iteration on one line."""
         shown = "".join(self._word(name, value) for name, value in [*self.metrics().items()][:ON_THE_LINE])
+        loss = "" if self.behavior is None else f"  behaviour loss {self.behavior:.4f}"
         return (
             f"it {self.iteration}/{self.total}  {_time(self.elapsed_s)} < {_time(self.eta_s)}  "
             f"{self.steps_per_s:,.0f} steps/s ({self.collect_s:.2f}+{self.learn_s:.2f} s)  reward {self._reward()}"
-            f"{shown}  std {self.action_std:.2f}" + self.level() + self.estimated() + self.evaluated() + self.warnings()
+            f"{loss}{shown}  std {self.action_std:.2f}" + self.level() + self.estimated() + self.evaluated() + self.warnings()
         )
 
     def _word(self, name: str, value: float) -> str:
@@ -141,6 +144,8 @@ class Progress:
             "collect + learn": f"{self.collect_s:.2f} + {self.learn_s:.2f} s",
             "mean return": self._reward(),
         }
+        if self.behavior is not None:
+            left["behaviour loss"] = f"{self.behavior:.4f}"
         metrics = self.metrics()
         for name, style in STYLES.items():
             if name in metrics:

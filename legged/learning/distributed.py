@@ -59,3 +59,28 @@ def any_rank(asked: bool, device: torch.device) -> bool:
     if not dist.is_initialized():
         return asked
     return bool(sum_over_ranks_(torch.tensor(float(asked), device=device)).item())
+
+
+class SharedGradients:
+    """The gradients of all parameters side by side in one buffer, which is averaged over processes in one go, and at the
+    end of it the divergence from which the learning rate follows: so all processes take the same step.
+    """
+
+    def __init__(self, parameters: list[torch.nn.Parameter], count: int) -> None:
+        """Make the parameters' gradients views of the buffer; there are `count` processes."""
+        self._count = count
+        self._buffer = torch.zeros(sum(p.numel() for p in parameters) + 1, device=parameters[0].device)
+        pieces = self._buffer[:-1].split([p.numel() for p in parameters])
+        for parameter, piece in zip(parameters, pieces, strict=True):
+            parameter.grad = piece.view_as(parameter)
+
+    def zero_(self) -> None:
+        """Begin a mini-batch; what follows adds to the gradients in place."""
+        self._buffer.zero_()
+
+    def average_(self, kl: Tensor) -> None:
+        """Gradients and `kl` () of this process become those of all."""
+        self._buffer[-1] = kl
+        sum_over_ranks_(self._buffer)
+        self._buffer /= self._count
+        kl.copy_(self._buffer[-1])

@@ -122,6 +122,7 @@ class QuietLogger(Logger):
                     reward=sum(self.rewbuffer) / len(self.rewbuffer) if self.rewbuffer else float("nan"),
                     action_std=float(kwargs["action_std"].detach().mean()),
                     values=dict(self.latest),
+                    behavior=losses.get("behavior"),
                 )
             )
         if any_rank(bool(self.watch.why_stop), torch.device(self.device)):

@@ -1,16 +1,21 @@
-"""Actor and critic as a configuration describes them, in rsl-rl's terms."""
+"""Actor and critic as a configuration describes them, in rsl-rl's terms, and what they make of their inputs."""
 
+import math
 from typing import Any
 
 import torch
 from rsl_rl.models import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
+from rsl_rl.modules.normalization import EmpiricalNormalization
 from rsl_rl.utils import resolve_class
 from tensordict import TensorDict
 from torch import Tensor
 
 from legged.config import TaskConfig
 from legged.config.networks import ESTIMATED, NETWORKS, groups_of
+from legged.config.schema import PolicyConfig
+from legged.learning.cpu_layers import apply_layers
+from legged.learning.distributed import sum_over_ranks_
 from legged.learning.estimator import TARGETS
 
 UNBOUNDED = (1e-6, 1e6)
@@ -20,8 +25,32 @@ UNBOUNDED = (1e-6, 1e6)
 def network_settings(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
     """Return the dictionaries `actor`, `critic` and `obs_groups` that rsl-rl wants."""
     policy = cfg.train.policy
+    groups = {network: list(groups_of(cfg, network)) for network in NETWORKS}
+    if policy.estimator.targets:
+        groups[TARGETS] = [ESTIMATED]
+    return {
+        "obs_groups": groups,
+        "actor": {**actor_settings(policy), **_estimating(policy)},
+        "critic": {**_shared(policy), "hidden_dims": list(policy.critic_hidden_dims)},
+    }
+
+
+def _estimating(policy: PolicyConfig) -> dict[str, Any]:
+    """Return what an actor with an estimator has beside the others' settings: nothing without one."""
     estimator = policy.estimator
-    shared = {
+    if not estimator.targets:
+        return {}
+    return {
+        "class_name": "legged.learning.estimator:EstimatingModel",
+        "estimator_hidden_dims": list(estimator.hidden_dims),
+        "latent": estimator.latent,
+        "policy_gradient": estimator.policy_gradient,
+    }
+
+
+def _shared(policy: PolicyConfig) -> dict[str, Any]:
+    """Return what actor and critic have in common."""
+    shared: dict[str, Any] = {
         "class_name": "MLPModel",
         "activation": policy.activation,
         "obs_normalization": policy.obs_normalization,
@@ -29,32 +58,18 @@ def network_settings(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
     if policy.rnn_type != "none":
         shared["class_name"] = "RNNModel"
         shared |= {name: getattr(policy, name) for name in ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")}
+    return shared
+
+
+def actor_settings(policy: PolicyConfig) -> dict[str, Any]:
+    """Return the dictionary of a network that acts: an actor, a student, a teacher."""
     distribution = {
         "class_name": "HeteroscedasticGaussianDistribution" if policy.state_dependent_std else "GaussianDistribution",
         "init_std": policy.init_noise_std,
         "std_type": policy.noise_std_type,
         "std_range": (policy.min_noise_std, policy.max_noise_std),
     }
-    groups = {network: list(groups_of(cfg, network)) for network in NETWORKS}
-    estimating: dict[str, Any] = {}
-    if estimator.targets:
-        groups[TARGETS] = [ESTIMATED]
-        estimating = {
-            "class_name": "legged.learning.estimator:EstimatingModel",
-            "estimator_hidden_dims": list(estimator.hidden_dims),
-            "latent": estimator.latent,
-            "policy_gradient": estimator.policy_gradient,
-        }
-    return {
-        "obs_groups": groups,
-        "actor": {
-            **shared,
-            "hidden_dims": list(policy.actor_hidden_dims),
-            "distribution_cfg": distribution,
-            **estimating,
-        },
-        "critic": {**shared, "hidden_dims": list(policy.critic_hidden_dims)},
-    }
+    return {**_shared(policy), "hidden_dims": list(policy.actor_hidden_dims), "distribution_cfg": distribution}
 
 
 def build_actor(cfg: TaskConfig, observations: TensorDict, num_actions: int) -> MLPModel:
@@ -75,6 +90,17 @@ def action_std(actor: MLPModel) -> Tensor:
     if distribution.std_type == "scalar":
         return distribution.std_param.clamp(*distribution.std_range)
     return distribution.log_std_param.clamp(*distribution.log_std_range).exp()
+
+
+@torch.no_grad()
+def begin_std(actor: MLPModel, cfg: TaskConfig) -> None:
+    """Set the standard deviation of a policy's actions, where it does not depend on the state, to that of a new policy."""
+    distribution, std = actor.distribution, cfg.train.policy.init_noise_std
+    if type(distribution) is GaussianDistribution:
+        if distribution.std_type == "scalar":
+            distribution.std_param.fill_(std)
+        else:
+            distribution.log_std_param.fill_(math.log(std))
 
 
 def keep_std_in_bounds(actor: MLPModel, optimizer: torch.optim.Optimizer) -> None:
@@ -109,3 +135,39 @@ def use_matmul(cfg: TaskConfig) -> None:
     if onednn is not None and hasattr(onednn, "fp32_precision"):
         exact_anyway = torch.backends.cpu.get_cpu_capability() == "AVX512" and not torch.cpu._is_amx_tile_supported()
         onednn.fp32_precision = "bf16" if rounded and exact_anyway else "ieee"
+
+
+def output_of(model: MLPModel, inputs: Tensor, mixed_precision: bool) -> Tensor:
+    """Return what a network makes of its inputs (n, width): (n, outputs), float32. With mixed precision its layers compute
+    in bfloat16.
+    """
+    # A graph must cast the weights anew at every replay, so none may come from autocast's cache.
+    with torch.autocast(inputs.device.type, torch.bfloat16, mixed_precision, cache_enabled=False):
+        return layers_of(model.mlp, model.obs_normalizer(inputs), mixed_precision)
+
+
+def layers_of(layers: torch.nn.Sequential, x: Tensor, mixed_precision: bool) -> Tensor:
+    """Return what layers make of `x` (n, width): (n, outputs), float32."""
+    if x.device.type == "cpu" and not mixed_precision:
+        return apply_layers(layers, x)
+    return layers(x).float()
+
+
+@torch.no_grad()
+def update_normalizer(normalizer: EmpiricalNormalization, x: Tensor) -> None:
+    """Take samples (n, width) of all processes into the running mean and variance, as rsl-rl does, but in place: a graph
+    knows addresses.
+    """
+    mean, variance = x.mean(dim=0, keepdim=True), x.var(dim=0, unbiased=False, keepdim=True)
+    count = len(x)
+    if torch.distributed.is_initialized():
+        count *= torch.distributed.get_world_size()
+        own_mean = mean
+        mean = sum_over_ranks_(own_mean * len(x)) / count
+        variance = sum_over_ranks_((variance + (own_mean - mean).square()) * len(x)) / count
+    normalizer.count += count
+    rate = count / normalizer.count
+    moved = mean - normalizer._mean
+    normalizer._mean += rate * moved
+    normalizer._var += rate * (variance - normalizer._var + moved * (mean - normalizer._mean))
+    torch.sqrt(normalizer._var, out=normalizer._std)

@@ -9,11 +9,10 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.modules.normalization import EmpiricalNormalization
 from torch import Tensor
 
-from legged.learning.cpu_layers import apply_layers
-from legged.learning.distributed import sum_over_ranks_
+from legged.learning.critic_warmup import CriticWarmup
+from legged.learning.distributed import SharedGradients
 from legged.learning.estimator import SECTION, EstimatingModel, EstimationErrors
-from legged.learning.networks import action_std
-from legged.learning.scaled_rewards import ScaledRewards
+from legged.learning.networks import action_std, layers_of, output_of, update_normalizer
 
 LOWEST_RATE, HIGHEST_RATE, RATE_STEP = 1e-5, 1e-2, 1.5
 """Bounds of the adaptive learning rate and the factor by which it moves, as in rsl-rl."""
@@ -26,7 +25,7 @@ HALF_LOG_2PI = 0.9189385332046727
 """0.5 * log(2 pi)."""
 
 
-class DevicePPO(ScaledRewards):
+class DevicePPO(CriticWarmup):
     """PPO (Schulman et al., arXiv 1707.06347) as rsl-rl computes it, for Gaussian MLP policies.
 
     What differs is where and how often: the learning rate is a tensor on the device; samples are shuffled into contiguous
@@ -55,8 +54,13 @@ class DevicePPO(ScaledRewards):
         """Means over the mini-batches of the last update, by `LOSSES`, of the estimates' square errors, if there are any, by
         term, and the share of mini-batches that were taken."""
         self._one = torch.ones((), device=self.device)
+        self._critic_alone = False
+        """Whether the update that runs, or is captured, changes the value function alone."""
         self.left_out = 0.0
         """Share of the last update's mini-batches that changed nothing, because a gradient was no number."""
+
+    fits_graph = True
+    """Whether an update can be captured; what can't be captured at all has rsl-rl's own loop."""
 
     def learn_to_estimate(self, errors: EstimationErrors, learning_rate: float) -> None:
         """Say how errors of the actor's estimates are measured, and the step size with which its estimator learns; to be
@@ -146,9 +150,26 @@ class DevicePPO(ScaledRewards):
         """All epochs over the stored rollout; returns the mean losses."""
         if self.why_stock:
             return super().update()
-        self.learn()
+        (self.learn_critic if self.warming_up() else self.learn)()
         self.storage.clear()
         return self.losses()
+
+    def learn_critic(self, epochs: int | None = None) -> None:
+        """As `learn`, but all that changes is the value function: the policy is kept, with its normaliser."""
+        self._critic_alone = True
+        self.learn(epochs)
+        self._critic_alone = False
+
+    def fill_moments(self) -> None:
+        """Give every parameter that has no moments yet the ones that the optimiser would begin with, so that a graph knows
+        where they are before the first step that uses them.
+        """
+        for group in self.optimizer.param_groups:
+            for parameter in group["params"]:
+                if not self.optimizer.state[parameter]:
+                    step = torch.zeros((), device=parameter.device)
+                    moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
+                    self.optimizer.state[parameter].update({"step": step, **moments})
 
     def learn(self, epochs: int | None = None) -> None:
         """All epochs over the stored rollout, or the first `epochs`: no host read, so that one graph can hold it."""
@@ -230,7 +251,7 @@ class DevicePPO(ScaledRewards):
             own = advantages[:samples]
             advantages = (advantages - own.mean()) / (own.std() + FEW)
         mean, estimates = self._act(actor_input)
-        values = self._output(self.critic, critic_input).squeeze(-1)
+        values = output_of(self.critic, critic_input, self.use_mixed_precision).squeeze(-1)
         std = self.action_std()
         log_prob = gaussian_log_prob(actions, mean, std)
         entropy = std.log().sum() + actions.shape[1] * (0.5 + HALF_LOG_2PI)
@@ -257,6 +278,8 @@ class DevicePPO(ScaledRewards):
 
         kl = divergence(old_mean, old_std, mean[:samples].detach(), std.detach())
         losses.insert(LOSSES.index("kl"), kl)  # the tensor, into which several processes put their mean below
+        if self._critic_alone:
+            loss = self.value_loss_coef * value_loss
         if self.is_multi_gpu:
             self._shared.zero_()
             loss.backward()
@@ -264,6 +287,8 @@ class DevicePPO(ScaledRewards):
         else:
             self.optimizer.zero_grad()
             loss.backward()
+        if self._critic_alone:
+            return self._step_critic([*losses, *errors])
         if self.desired_kl is not None and self.schedule == "adaptive":
             self._adapt_rate(kl)
         # The clipped value loss passes no gradient on for a value that is NaN, so it is looked at by itself.
@@ -271,6 +296,20 @@ class DevicePPO(ScaledRewards):
         torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
         self.optimizer.step()
         return torch.where(fine, torch.stack([*losses, *errors, self._one]).detach(), 0.0)
+
+    def _step_critic(self, figures: list[Tensor]) -> Tensor:
+        """End a mini-batch of which the value function alone learns; returns what `_step` does. The optimiser passes over
+        parameters without a gradient: gradients of 0 would count as steps, and the first real ones would be too large.
+        """
+        of_actor = [(parameter, parameter.grad) for parameter in self.actor.parameters()]
+        for parameter, _ in of_actor:
+            parameter.grad = None
+        fine = (self._clip_gradients() + figures[0].detach()) < torch.inf
+        torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
+        self.optimizer.step()
+        for parameter, gradient in of_actor:  # of several processes, a part of the buffer that they share
+            parameter.grad = gradient
+        return torch.where(fine, torch.stack([*figures, self._one]).detach(), 0.0)
 
     def _clip_gradients(self) -> Tensor:
         """Clip the gradients of actor, critic and estimator, each to the norm `max_grad_norm`, as torch's clip_grad_norm_
@@ -281,33 +320,19 @@ class DevicePPO(ScaledRewards):
         norms = torch.stack([torch.linalg.vector_norm(n) for n in of_each.split([len(some) for some in gradients])])
         factors = (self.max_grad_norm / (norms + 1e-6)).clamp(max=1.0)
         for some, factor in zip(gradients, factors.unbind(), strict=True):
-            torch._foreach_mul_(some, factor)
+            if some:
+                torch._foreach_mul_(some, factor)
         return norms.sum()
-
-    def _output(self, model: MLPModel, inputs: Tensor) -> Tensor:
-        """Return what a network makes of its inputs (n, width): (n, outputs), float32. With mixed precision its layers
-        compute in bfloat16.
-        """
-        kind, enabled = inputs.device.type, self.use_mixed_precision
-        # A graph must cast the weights anew at every replay, so none may come from autocast's cache.
-        with torch.autocast(kind, torch.bfloat16, enabled, cache_enabled=False):
-            return self._layers(model.mlp, model.obs_normalizer(inputs))
 
     def _act(self, inputs: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return the mean actions (n, D) for the actor's inputs (n, width), and its estimates (n, E) if it makes any."""
-        actor = self.actor
+        actor, mixed = self.actor, self.use_mixed_precision
         if not isinstance(actor, EstimatingModel):
-            return self._output(actor, inputs), None
-        with torch.autocast(inputs.device.type, torch.bfloat16, self.use_mixed_precision, cache_enabled=False):
+            return output_of(actor, inputs, mixed), None
+        with torch.autocast(inputs.device.type, torch.bfloat16, mixed, cache_enabled=False):
             x = actor.obs_normalizer(inputs)
-            found = self._layers(actor.estimator, x)
-            return self._layers(actor.mlp, actor.joined(x, found)), found[:, : actor.estimates]
-
-    def _layers(self, layers: torch.nn.Sequential, x: Tensor) -> Tensor:
-        """Return what layers make of `x` (n, width): (n, outputs), float32."""
-        if x.device.type == "cpu" and not self.use_mixed_precision:
-            return apply_layers(layers, x)
-        return layers(x).float()
+            found = layers_of(actor.estimator, x, mixed)
+            return layers_of(actor.mlp, actor.joined(x, found), mixed), found[:, : actor.estimates]
 
     def action_std(self) -> Tensor:
         """Return the standard deviation (D,) of the actions."""
@@ -323,30 +348,10 @@ class DevicePPO(ScaledRewards):
         self._rate.copy_(torch.where(kl > 2.0 * self.desired_kl, slower, rate))
 
     def _update_normalizers(self) -> None:
-        for model in (self.actor, self.critic):
+        for model in (self.critic,) if self._critic_alone else (self.actor, self.critic):
             if isinstance(model.obs_normalizer, EmpiricalNormalization):
                 inputs = torch.cat([self.storage.observations[name] for name in model.obs_groups], dim=-1)
                 update_normalizer(model.obs_normalizer, inputs.flatten(0, 1))
-
-
-@torch.no_grad()
-def update_normalizer(normalizer: EmpiricalNormalization, x: Tensor) -> None:
-    """Take samples (n, width) of all processes into the running mean and variance, as rsl-rl does, but in place: a graph
-    knows addresses.
-    """
-    mean, variance = x.mean(dim=0, keepdim=True), x.var(dim=0, unbiased=False, keepdim=True)
-    count = len(x)
-    if torch.distributed.is_initialized():
-        count *= torch.distributed.get_world_size()
-        own_mean = mean
-        mean = sum_over_ranks_(own_mean * len(x)) / count
-        variance = sum_over_ranks_((variance + (own_mean - mean).square()) * len(x)) / count
-    normalizer.count += count
-    rate = count / normalizer.count
-    moved = mean - normalizer._mean
-    normalizer._mean += rate * moved
-    normalizer._var += rate * (variance - normalizer._var + moved * (mean - normalizer._mean))
-    torch.sqrt(normalizer._var, out=normalizer._std)
 
 
 @torch.no_grad()
@@ -354,31 +359,6 @@ def divergence(old_mean: Tensor, old_std: Tensor, mean: Tensor, std: Tensor) -> 
     """Mean () of KL(old || new) over Gaussians of means (n, D) and standard deviations (n, D), new ones (D,)."""
     moved = (old_std.square() + (old_mean - mean).square()) / (2.0 * std.square())
     return (torch.log(std / old_std) + moved - 0.5).sum(dim=1).mean()
-
-
-class SharedGradients:
-    """The gradients of all parameters side by side in one buffer, which is averaged over processes in one go, and at the
-    end of it the divergence from which the learning rate follows: so all processes take the same step.
-    """
-
-    def __init__(self, parameters: list[torch.nn.Parameter], count: int) -> None:
-        """Make the parameters' gradients views of the buffer; there are `count` processes."""
-        self._count = count
-        self._buffer = torch.zeros(sum(p.numel() for p in parameters) + 1, device=parameters[0].device)
-        pieces = self._buffer[:-1].split([p.numel() for p in parameters])
-        for parameter, piece in zip(parameters, pieces, strict=True):
-            parameter.grad = piece.view_as(parameter)
-
-    def zero_(self) -> None:
-        """Begin a mini-batch; what follows adds to the gradients in place."""
-        self._buffer.zero_()
-
-    def average_(self, kl: Tensor) -> None:
-        """Gradients and `kl` () of this process become those of all."""
-        self._buffer[-1] = kl
-        sum_over_ranks_(self._buffer)
-        self._buffer /= self._count
-        kl.copy_(self._buffer[-1])
 
 
 def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:

@@ -40,3 +40,41 @@ def rnn_of(state: dict[str, Tensor]) -> tuple[str, int, int]:
         return "none", 0, 0
     rows, width = (*state[layers[0]].shape, 0, 0)[:2]
     return GATES.get(rows // max(width, 1), "of no known kind"), width, len(layers)
+
+
+class Memory:
+    """What one of rsl-rl's networks remembers of N robots; nothing of a network without recurrent layers, which acts too. The
+    tensors keep their addresses in `take` and `forget_`, for a graph; the others are for who differentiates.
+    """
+
+    def __init__(self, network: Any, num_envs: int, parts: list[Tensor] | None = None) -> None:
+        """Be what the network itself remembers, or other `parts`, (layers, N, width) each."""
+        self.network = network
+        self.parts = [*hidden_states({"": network}, num_envs).values()] if parts is None else parts
+
+    def copy(self, parts: list[Tensor]) -> "Memory":
+        """Return a memory of the same network that holds `parts`."""
+        return Memory(self.network, 0, [*parts])
+
+    def act(self, inputs: Tensor) -> Tensor:
+        """Return the mean actions (N, D) for `inputs` (N, W), and remember them."""
+        x = self.network.obs_normalizer(inputs)
+        if self.parts:
+            x, after = self.network.rnn.rnn(x.unsqueeze(0), tuple(self.parts) if len(self.parts) > 1 else self.parts[0])
+            self.parts = [*after] if isinstance(after, tuple) else [after]
+            x = x.squeeze(0)
+        return self.network.distribution.deterministic_output(self.network.mlp(x))
+
+    def forget(self, ended: Tensor) -> None:
+        """Remember nothing of the robots in `ended` (N, 1)."""
+        self.parts = [part.masked_fill(ended, 0.0) for part in self.parts]
+
+    def detach(self) -> None:
+        """Pass no gradient on to what was before."""
+        self.parts = [part.detach() for part in self.parts]
+
+    @torch.no_grad()
+    def take(self, parts: list[Tensor]) -> None:
+        """Remember what another memory holds, in place."""
+        for part, value in zip(self.parts, parts, strict=True):
+            part.copy_(value)

@@ -16,6 +16,9 @@ from legged.registry import task_class, task_config
 OF_A_RUN = ("train.runner.run_name", "train.runner.max_iterations", "train.runner.experiment_name")
 """Settings that say nothing of how is trained."""
 
+KEPT = ("train.algorithm.class_name", "train.distillation.teacher")
+"""Settings that a resumed training can't change."""
+
 
 def resumed(args: argparse.Namespace) -> tuple[TaskConfig, Path, list[str]]:
     """Find the configuration to go on with, the checkpoint to go on from, and a line for each setting that the command line
@@ -35,6 +38,10 @@ def resumed(args: argparse.Namespace) -> tuple[TaskConfig, Path, list[str]]:
         raise ConfigError(
             f"{cfg.origins.where('robot')}: a resumed training keeps its robot, '{before.robot}'; got '{cfg.robot}'"
         )
+    for key in KEPT:
+        old, new = (value_at(to_dict(one), key) for one in (before, cfg))
+        if old != new:
+            raise ConfigError(f"{cfg.origins.where(key)}: a resumed training keeps its own, '{old}'; got '{new}'")
     task_class(cfg.task).check(cfg)
     path = find_checkpoint(folder, args.checkpoint)
     saved = read_checkpoint(path)

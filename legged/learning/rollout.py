@@ -1,21 +1,22 @@
 """A rollout without a host read: policy, sampling, task and returns, written straight into rsl-rl's storage."""
 
 import torch
+from rsl_rl.storage import RolloutStorage
 from torch import Tensor
 
 from legged.envs import BaseTask
 from legged.learning.ppo import DevicePPO, gaussian_log_prob
 
 
-class Rollout:
-    """The T control steps of an iteration, as rsl-rl's training loop makes them, in one function that a graph can hold."""
+class Steps:
+    """The T control steps of an iteration, as rsl-rl's training loop makes them, in one function that a graph can hold. A
+    subclass says who acts (`_act`), and what follows from all steps together (`_judge`).
+    """
 
-    def __init__(self, env: BaseTask, alg: DevicePPO) -> None:
-        """For a task and a learner on the same device."""
-        self.env, self.alg = env, alg
-        st = alg.storage
-        if st.distribution_params is None:
-            st.distribution_params = (torch.zeros_like(st.actions), torch.zeros_like(st.actions))
+    def __init__(self, env: BaseTask, storage: RolloutStorage) -> None:
+        """For a task and what is stored of it, on the same device."""
+        self.env, self.storage = env, storage
+        st = storage
         self._observations = {name: group.buffer for name, group in env.observation_groups.items()}
         self._cut_off = torch.zeros_like(st.rewards)
         """(T, N, 1) whether the step ended its episode by time."""
@@ -41,23 +42,28 @@ class Rollout:
 
     @torch.no_grad()
     def collect(self, steps: int | None = None) -> None:
-        """T steps into the storage, with returns and advantages; `steps`, to rehearse, takes fewer of them."""
+        """T steps into the storage, and what follows from them; `steps`, to rehearse, takes fewer of them."""
         self._ended.zero_()
-        for t in range(steps or self.alg.storage.num_transitions_per_env):
+        for t in range(steps or self.storage.num_transitions_per_env):
             self._step(t)
         torch.sum(self._ended, dim=1, out=self.ended[:3])
         self._spread()
         self._judge()
-        self._returns()
+
+    def _act(self, t: int) -> Tensor:
+        """Return the actions (N, D) of step `t`."""
+        raise NotImplementedError
+
+    def _judge(self) -> None:
+        """Compute what acting did not need, for all steps at once."""
+        raise NotImplementedError
 
     def _step(self, t: int) -> None:
-        env, alg, st = self.env, self.alg, self.alg.storage
+        env, st = self.env, self.storage
         for name, now in self._observations.items():
             st.observations[name][t].copy_(now)
-        mean = alg.actor.mlp(alg.actor.get_latent(self._observations))
-        actions = torch.addcmul(mean, alg.action_std(), torch.randn_like(mean))
+        actions = self._act(t)
         st.actions[t].copy_(actions)
-        st.distribution_params[0][t].copy_(mean)
 
         env.step_in_place(actions.to(env.device))
 
@@ -65,18 +71,6 @@ class Rollout:
         st.dones[t].copy_(env.reset_buf.unsqueeze(1))
         self._cut_off[t].copy_(env.time_out_buf.unsqueeze(1))
         self._count(t)
-
-    def _judge(self) -> None:
-        """Compute what acting did not need, for all steps at once: log-probabilities, values, what they add to rewards."""
-        alg, st = self.alg, self.alg.storage
-        std = alg.action_std()
-        st.distribution_params[1].copy_(std.expand_as(st.actions))
-        st.actions_log_prob.copy_(gaussian_log_prob(st.actions, st.distribution_params[0], std).unsqueeze(-1))
-        st.values.copy_(alg.critic.mlp(alg.critic.get_latent(st.observations)))
-        if alg.reward_scale != 1.0:
-            st.rewards.mul_(alg.reward_scale)
-        # The value of the state that was acted on stands for the one that a time-out cut off, as in rsl-rl.
-        st.rewards.add_(alg.gamma * self._cut_off * st.values)
 
     def _count(self, t: int) -> None:
         """Record returns and lengths of episodes after step `t`, for the log."""
@@ -93,7 +87,40 @@ class Rollout:
         squares would lose them in float32 where the mean is large.
         """
         moved = self._return_at - self.ended[1] / self.ended[0]
-        self.ended[3].copy_(torch.where(self.alg.storage.dones.squeeze(-1).bool(), moved.square(), self._zero).sum())
+        self.ended[3].copy_(torch.where(self.storage.dones.squeeze(-1).bool(), moved.square(), self._zero).sum())
+
+
+class Rollout(Steps):
+    """The steps from which PPO learns."""
+
+    def __init__(self, env: BaseTask, alg: DevicePPO) -> None:
+        """For a task and a learner on the same device."""
+        super().__init__(env, alg.storage)
+        self.alg = alg
+        st = alg.storage
+        if st.distribution_params is None:
+            st.distribution_params = (torch.zeros_like(st.actions), torch.zeros_like(st.actions))
+
+    def _act(self, t: int) -> Tensor:
+        """Return the policy's actions (N, D) with its noise."""
+        alg = self.alg
+        mean = alg.actor.mlp(alg.actor.get_latent(self._observations))
+        actions = torch.addcmul(mean, alg.action_std(), torch.randn_like(mean))
+        alg.storage.distribution_params[0][t].copy_(mean)
+        return actions
+
+    def _judge(self) -> None:
+        """Compute log-probabilities, values, what they add to rewards, returns and advantages."""
+        alg, st = self.alg, self.alg.storage
+        std = alg.action_std()
+        st.distribution_params[1].copy_(std.expand_as(st.actions))
+        st.actions_log_prob.copy_(gaussian_log_prob(st.actions, st.distribution_params[0], std).unsqueeze(-1))
+        st.values.copy_(alg.critic.mlp(alg.critic.get_latent(st.observations)))
+        if alg.reward_scale != 1.0:
+            st.rewards.mul_(alg.reward_scale)
+        # The value of the state that was acted on stands for the one that a time-out cut off, as in rsl-rl.
+        st.rewards.add_(alg.gamma * self._cut_off * st.values)
+        self._returns()
 
     def _returns(self) -> None:
         """Generalised advantage estimation (Schulman et al., arXiv 1506.02438), backwards over the storage."""

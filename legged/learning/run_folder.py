@@ -137,9 +137,10 @@ def find_run(cfg: TaskConfig, load_run: str | None) -> Path:
     raise ConfigError(f"--load_run: there is no run '{load_run}'{suggest(str(load_run), [p.name for p in runs], 'runs')}")
 
 
-def find_run_of_any_task(cfg: TaskConfig, load_run: str) -> Path:
+def find_run_of_any_task(cfg: TaskConfig, load_run: str, where: str = "--load_run") -> Path:
     """Return the run folder that `load_run` names: as `find_run` does; or below logs/ as <experiment>/<run>; or the newest of
-    an experiment; or a policy that comes with this package, by the name of its task or as resources/policies/<task>.
+    an experiment; or a policy that comes with this package, by the name of its task or as resources/policies/<task>. An error
+    begins with `where`.
 
     Raises:
         ConfigError: there is none.
@@ -157,7 +158,7 @@ def find_run_of_any_task(cfg: TaskConfig, load_run: str) -> Path:
                 return max(runs, key=_last_saved)
     known = [f"{run.parent.name}/{run.name}" for run in LOGS.glob("*/*") if checkpoints(run)]
     known += [policy.name for policy in (shipped / "policies").glob("*") if checkpoints(policy)]
-    raise ConfigError(f"--load_run: there is no run '{load_run}'{suggest(load_run, known, 'runs')}")
+    raise ConfigError(f"{where}: there is no run '{load_run}'{suggest(load_run, known, 'runs')}")
 
 
 def find_checkpoint(folder: Path, checkpoint: int | str | None) -> Path:

@@ -12,6 +12,7 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 from torch import Tensor
 
+from legged.config.schema import RunnerConfig
 from legged.envs import BaseTask
 from legged.errors import ConfigError, RunError
 from legged.learning.checkpoint import (
@@ -27,13 +28,13 @@ from legged.learning.distributed import RankLost, join, leave
 from legged.learning.divergence_meter import DivergenceMeter
 from legged.learning.evaluations import Ended, Evaluations
 from legged.learning.logger import Interrupted, QuietLogger
-from legged.learning.networks import keep_std_in_bounds, network_settings, use_matmul
+from legged.learning.networks import begin_std, keep_std_in_bounds, network_settings, use_matmul
 from legged.learning.recurrent import hidden_states
 from legged.learning.run_folder import BEST_MODEL
 from legged.learning.run_state import generators, read_run_state, remove_older, set_generators, write_run_state
 from legged.learning.step_guard import StepGuard
 from legged.learning.symmetry import augment, images_of
-from legged.learning.transfer import check_built, tell_taken
+from legged.learning.transfer import check_built, tell_taken, what_is_taken
 from legged.learning.watch import Diverged
 from legged.process.paths import relative
 from legged.process.ranks import Ranks
@@ -48,9 +49,10 @@ def runner_config(task: BaseTask, algorithm_class: str) -> dict[str, Any]:
         ConfigError: the task is to learn from mirror images, and has none.
     """
     cfg, runner = task.cfg, task.cfg.train.runner
-    settings = dict(vars(cfg.train.algorithm))
-    if settings.pop("reward_scale") != 1.0 and algorithm_class == "PPO":
-        algorithm_class = "legged.learning.scaled_rewards:ScaledRewards"
+    settings = {name: value for name, value in vars(cfg.train.algorithm).items() if name != "class_name"}
+    ours = settings.pop("reward_scale") != 1.0, settings.pop("critic_warmup_iterations") > 0
+    if any(ours) and algorithm_class == "PPO":
+        algorithm_class = "legged.learning.critic_warmup:CriticWarmup"
     symmetry, mirror_loss = settings.pop("symmetry"), settings.pop("mirror_loss_coeff")
     if symmetry:
         settings["symmetry_cfg"] = {
@@ -60,13 +62,20 @@ def runner_config(task: BaseTask, algorithm_class: str) -> dict[str, Any]:
             "mirror_loss_coeff": mirror_loss,
         }
     return {
+        **loop_settings(runner),
+        **network_settings(cfg),
+        "algorithm": {"class_name": algorithm_class, **settings},
+    }
+
+
+def loop_settings(runner: RunnerConfig) -> dict[str, Any]:
+    """Return what rsl-rl wants to know of the training loop."""
+    return {
         "num_steps_per_env": runner.num_steps_per_env,
         "save_interval": runner.save_interval,
         "run_name": runner.run_name,
         "logger": runner.logger,
         "check_for_nan": False,  # it would wait for the GPU at every step; the task terminates and counts such robots
-        **network_settings(cfg),
-        "algorithm": {"class_name": algorithm_class, **settings},
     }
 
 
@@ -81,7 +90,7 @@ class Runner(OnPolicyRunner):
         self, env: BaseTask, log_dir: Path | None = None, device: str = "cpu", display: Display | None = None
     ) -> None:
         """`log_dir` is where checkpoints and TensorBoard files go; without one nothing is written."""
-        config = runner_config(env, self.ALGORITHM)
+        config = self._configuration(env)
         use_matmul(env.cfg)
         with contextlib.redirect_stdout(io.StringIO()):
             super().__init__(env, config, str(log_dir) if log_dir else None, device)
@@ -106,6 +115,14 @@ class Runner(OnPolicyRunner):
             left_out=self._left_out,
         )
         self.logger.divergence = DivergenceMeter(self.alg.actor)
+
+    def _configuration(self, env: BaseTask) -> dict[str, Any]:
+        """Return the dictionary rsl-rl wants for a task."""
+        return runner_config(env, self.ALGORITHM)
+
+    def _networks(self) -> dict[str, Any]:
+        """Return the networks by their names in a checkpoint."""
+        return {"actor": self.alg.actor, "critic": self.alg.critic}
 
     def _left_out(self) -> float:
         """Return the share of the last update's mini-batches that changed nothing: their gradients were no numbers."""
@@ -183,6 +200,8 @@ class Runner(OnPolicyRunner):
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train for a number of iterations; robots that go on where they stopped keep their episodes."""
+        warmup = self.env.cfg.train.algorithm.critic_warmup_iterations
+        self.alg.warmup_left = max(0, warmup - self.current_learning_iteration)
         goes_on = self._go_on()
         super().learn(num_learning_iterations, init_at_random_ep_len and not goes_on)
 
@@ -211,7 +230,7 @@ class Runner(OnPolicyRunner):
         """
         saved = self.alg.save()
         try:
-            for network in ("actor", "critic"):
+            for network in self._networks():
                 check_weights(saved[f"{network}_state_dict"], f"{path}: is not written: the {network}")
         except ConfigError as error:
             raise RunError(str(error)) from error
@@ -254,11 +273,13 @@ class Runner(OnPolicyRunner):
         Raises:
             ConfigError: they do not fit.
         """
-        parts = parts or dict.fromkeys(("actor", "critic", "iteration"), True)
+        parts = parts or {"actor": True, "critic": "critic_state_dict" in saved, "iteration": True}
         parts = {"optimizer": "optimizer_state_dict" in saved, **parts}
         if parts["optimizer"]:
             wanted, where = saved["optimizer_state_dict"], f"{relative(path)}: its optimiser"
-            saved["optimizer_state_dict"] = fit_optimizer(wanted, self.alg.optimizer, where)
+            warmup = self.env.cfg.train.algorithm.critic_warmup_iterations
+            waiting = len([*self.alg.get_policy().parameters()]) if saved["iter"] < warmup else 0
+            saved["optimizer_state_dict"] = fit_optimizer(wanted, self.alg.optimizer, where, waiting)
         try:
             self.alg.load(saved, parts, strict)
             self.alg.learning_rate = float(saved["infos"].get("learning_rate", self.alg.learning_rate))
@@ -273,12 +294,14 @@ class Runner(OnPolicyRunner):
         Raises:
             ConfigError: the file is no checkpoint, or its observations, actions or networks are others.
         """
-        saved = read_checkpoint(Path(path), self.device)
+        saved = what_is_taken(read_checkpoint(Path(path), self.device), self.env.cfg)
         check_built(Path(path), saved, self.env)
         settings = self.env.cfg.train.algorithm
         if saved["infos"].get("optimizer", "adam") != settings.optimizer:
             saved.pop("optimizer_state_dict", None)
         self._load_learner(Path(path), saved)
+        if "critic_state_dict" not in saved:
+            begin_std(self.alg.get_policy(), self.env.cfg)
         if settings.schedule == "fixed":
             self.alg.learning_rate = settings.learning_rate
         for group in self.alg.optimizer.param_groups:
@@ -328,4 +351,4 @@ class Runner(OnPolicyRunner):
 
     def _memory(self) -> dict[str, Tensor]:
         """Return what recurrent networks remember of their robots, (layers, N, width) each; nothing without any."""
-        return hidden_states({"actor": self.alg.actor, "critic": self.alg.critic}, self.env.num_envs)
+        return hidden_states(self._networks(), self.env.num_envs)

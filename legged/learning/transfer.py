@@ -1,14 +1,14 @@
 """What `train.py --transfer` begins with: the networks that were trained on another task."""
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 from legged.commandline.arguments import overrides
 from legged.config import LeggedConfig, TaskConfig
-from legged.config.networks import NETWORKS, groups_of
+from legged.config.networks import groups_of, learns_from_teacher
 from legged.envs import BaseTask
 from legged.errors import ConfigError
 from legged.learning.checkpoint import (
@@ -17,6 +17,7 @@ from legged.learning.checkpoint import (
     check_networks_fit,
     described_networks,
     histories,
+    networks_in,
     observation_layout,
     read_checkpoint,
 )
@@ -47,6 +48,8 @@ def transferred(args: argparse.Namespace, on_cpu: bool) -> tuple[TaskConfig, Pat
     if args.load_run is None:
         raise ConfigError("--transfer: needs --load_run, the run or shipped policy whose networks are taken")
     cfg = task_config(args.task, overrides(args), on_cpu)
+    if learns_from_teacher(cfg):
+        raise ConfigError(f"--transfer: '{cfg.task}' learns from a teacher, and begins anew; --teacher names that one")
     path = find_checkpoint(find_run_of_any_task(cfg, args.load_run), args.checkpoint)
     check_source(path, read_checkpoint(path), cfg)
     return cfg, path
@@ -58,9 +61,11 @@ def check_source(path: Path, saved: Saved, cfg: TaskConfig) -> None:
     Raises:
         ConfigError: its robot, observations or networks are others.
     """
-    if "critic_state_dict" not in saved:
+    saved = what_is_taken(saved, cfg)
+    if "critic_state_dict" not in saved and not cfg.train.algorithm.critic_warmup_iterations:
         raise ConfigError(
             f"{relative(path)}: holds a policy alone, without a value function; it can be played, not trained on"
+            " (train.algorithm.critic_warmup_iterations=50 would train a new value function first)"
         )
     check_joints(relative(path), made_for(path, saved), cfg)
     there = terms_of(path, saved)
@@ -68,8 +73,18 @@ def check_source(path: Path, saved: Saved, cfg: TaskConfig) -> None:
     here = {name: dict.fromkeys(group.terms) for name, group in cfg.observations.groups.items()}
     here = {name: {term: widths.get(term) for term in terms} for name, terms in here.items()}
     steps = {name: group.history for name, group in cfg.observations.groups.items()}
-    _check_observations(path, cfg, here, there, steps, histories(saved))
+    _check_observations(path, cfg, here, there, steps, histories(saved), networks_in(saved))
     check_networks_fit(relative(path), saved, cfg)
+
+
+def what_is_taken(saved: Saved, cfg: TaskConfig) -> Saved:
+    """Return the parts of a checkpoint that a training of `cfg` begins with: all of them; or where its value function learns
+    alone at first, the policy.
+    """
+    if not cfg.train.algorithm.critic_warmup_iterations:
+        return saved
+    infos = {name: said for name, said in saved["infos"].items() if name != "learning_rate"}
+    return {"actor_state_dict": saved["actor_state_dict"], "iter": saved["iter"], "infos": infos}
 
 
 def check_built(path: Path, saved: Saved, task: BaseTask) -> None:
@@ -81,7 +96,7 @@ def check_built(path: Path, saved: Saved, task: BaseTask) -> None:
     cfg = task.cfg
     here: dict[str, Terms] = {name: {**terms} for name, terms in observation_layout(task).items()}
     steps = {name: group.history for name, group in task.observation_groups.items()}
-    _check_observations(path, cfg, here, terms_of(path, saved), steps, histories(saved))
+    _check_observations(path, cfg, here, terms_of(path, saved), steps, histories(saved), networks_in(saved))
     layers = [name for name in saved["actor_state_dict"] if name.startswith("mlp.") and name.endswith(".bias")]
     outputs = (*saved["actor_state_dict"][layers[-1]].shape, 0)[0] if layers else 0
     found = outputs // 2 if cfg.train.policy.state_dependent_std else outputs
@@ -118,14 +133,15 @@ def _check_observations(
     there: Mapping[str, Terms],
     steps_here: Mapping[str, int],
     steps_there: Mapping[str, int],
+    networks: Iterable[str],
 ) -> None:
-    """Compare the groups that the networks read, term by term.
+    """Compare the groups that `networks` read, term by term.
 
     Raises:
         ConfigError: some differ; with the first difference of each.
     """
     differences = []
-    for name in dict.fromkeys(group for network in NETWORKS for group in groups_of(cfg, network)):
+    for name in dict.fromkeys(group for network in networks for group in groups_of(cfg, network)):
         difference = first_difference(here[name], there.get(name, {}))
         history, before = steps_here[name], steps_there.get(name, 1)
         if difference:
@@ -155,11 +171,19 @@ def _shown(term: tuple[str, int | None] | None) -> str:
 def tell_taken(path: Path, saved: Saved, actor: Any, cfg: TaskConfig, learning_rate: float) -> str:
     """Return in words what was taken from a checkpoint, as it is in the networks now, and what begins anew."""
     sizes = [_sizes(network) for network in described_networks(saved).values()]
-    networks = f"actor and critic {sizes[0]}" if len({*sizes}) == 1 else f"actor {sizes[0]} and critic {sizes[1]}"
+    alone = len(sizes) == 1
+    networks = f"actor and critic {sizes[0]}" if len({*sizes}) == 1 else f"actor {sizes[0]} and critic {sizes[-1]}"
+    networks = f"actor {sizes[0]}" if alone else networks
     taken = [networks]
     if cfg.train.policy.obs_normalization:
         taken.append("observation normaliser")
     ours, theirs = cfg.train.algorithm.optimizer, saved["infos"].get("optimizer", "adam")
+    if alone:
+        warmup = cfg.train.algorithm.critic_warmup_iterations
+        first = f"the value function is new and learns alone for {warmup} iterations"
+        with_std = "" if cfg.train.policy.state_dependent_std else f", with the std {cfg.train.policy.init_noise_std:g}"
+        anew = f"optimiser, iterations, curricula and robots begin anew{with_std}"
+        return f"{_from(path, saved)}: {', '.join(taken)}\n{first}; {anew}"
     if "optimizer_state_dict" in saved and ours == theirs:
         taken.append(f"{OPTIMIZERS[ours]}'s state")
     else:
@@ -172,8 +196,13 @@ def tell_taken(path: Path, saved: Saved, actor: Any, cfg: TaskConfig, learning_r
         std = action_std(actor).detach()
         taken.append(f"std {float(std.min()):.2f} to {float(std.max()):.2f}")
         anew += "; the std is the learned one, not train.policy.init_noise_std"
+    return f"{_from(path, saved)}: {', '.join(taken)}\n{anew}"
+
+
+def _from(path: Path, saved: Saved) -> str:
+    """Return in words which checkpoint was taken from."""
     task = saved["infos"].get("task", "no task named")
-    return f"took from {relative(path.parent)} ({task}, iteration {saved['iter']}): {', '.join(taken)}\n{anew}"
+    return f"took from {relative(path.parent)} ({task}, iteration {saved['iter']})"
 
 
 def _sizes(network: Mapping[str, Any]) -> str:

@@ -28,15 +28,19 @@ from legged.commandline.parser import CommandParser
 from legged.commandline.show import summary
 from legged.commandline.stopping import quiet_writers, stopping_on_signals
 from legged.config import TaskConfig, to_yaml
+from legged.config.networks import learns_from_teacher
 from legged.errors import ConfigError, RunError
 from legged.evaluation.during_training import TrainingEvaluation, check_commands
 from legged.learning.captured import CapturedRunner
+from legged.learning.checkpoint import read_checkpoint
 from legged.learning.display import Display
 from legged.learning.distributed import RankLost, check_reachable
 from legged.learning.evaluations import Evaluations
 from legged.learning.resume import resumed
 from legged.learning.run_folder import NOTE_FILE, create_run, discard_run, experiment_folder, find_run
 from legged.learning.runner import Runner
+from legged.learning.student_runner import StudentRunner
+from legged.learning.teacher import Teacher, find_teacher, teacher_in, with_teacher
 from legged.learning.timing import Timing, write_timing
 from legged.learning.trackers import check_tracker
 from legged.learning.transfer import transferred
@@ -68,11 +72,13 @@ def build_parser() -> CommandParser:
         "python train.py --task anymal_c_flat",
         "python train.py --task anymal_c --num_envs 8192 --seed 3 rewards.scales.torques=-1e-4",
         "python train.py --task anymal_c --resume",
+        "python train.py --task anymal_c_student --teacher anymal_c",
     )
     add_task_arguments(parser)
     add_run_arguments(parser)
     parser.add_argument("--resume", action="store_true", help="go on from a checkpoint, in a new run folder")
     parser.add_argument("--transfer", action="store_true", help="begin with the networks of --load_run, also of another task")
+    parser.add_argument("--teacher", help="run or shipped policy that a student learns from (train.distillation.teacher)")
     parser.add_argument("--run_name", help="appended to the run folder's name")
     parser.add_argument("--max_iterations", type=int, help="length of the whole training")
     parser.add_argument("--note", help="a sentence about this run, for its report and the list of all runs")
@@ -111,6 +117,7 @@ def _main(argv: list[str] | None, prepared: Prepared | None = None) -> int:
         cfg, checkpoint, changed = resumed(args)
     else:
         cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
+    teacher = teacher_of(cfg, checkpoint, args)
     resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics"))
     check_commands(cfg)
     check_tracker(cfg)
@@ -122,9 +129,9 @@ def _main(argv: list[str] | None, prepared: Prepared | None = None) -> int:
         print(f"going on with the settings of {relative(checkpoint.parent)}" + "".join(f"; {text}" for text in changed))
     settle_on(device)
     if Ranks.now().first:
-        return _train(args, cfg, device, rl_device, checkpoint, start, prepared)
+        return _train(args, cfg, device, rl_device, checkpoint, teacher, start, prepared)
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-        return _train(args, cfg, device, rl_device, checkpoint, start, prepared)
+        return _train(args, cfg, device, rl_device, checkpoint, teacher, start, prepared)
 
 
 def _train(
@@ -133,6 +140,7 @@ def _train(
     device: torch.device,
     rl_device: torch.device,
     checkpoint: Path | None,
+    teacher: Teacher | None,
     start: float,
     prepared: Prepared | None,
 ) -> int:
@@ -142,7 +150,7 @@ def _train(
     if first:
         ready_to_write(experiment_folder(cfg), ROOM_MB)
         print(describe(cfg, device), flush=True)
-    task = make_task(cfg, device, graph=not args.no_graph)
+    task = make_task(cfg if teacher is None else with_teacher(cfg, teacher), device, graph=not args.no_graph)
     if first and task.physics.why_c_engine:
         print(f"C MuJoCo instead, which is faster here: {task.physics.why_c_engine}", flush=True)
     if first and task.physics.why_library:
@@ -151,7 +159,11 @@ def _train(
         print(f"{task.robot.file.model}: {line}", flush=True)
     with Display(cfg.task) if first else contextlib.nullcontext() as display:
         kind = CapturedRunner if cfg.train.runner.loop == "captured" else Runner
-        runner = kind(task, None, str(rl_device), display)
+        if teacher is None:
+            runner = kind(task, None, str(rl_device), display)
+        else:
+            runner = StudentRunner(task, teacher, None, str(rl_device), display)
+            print(f"teacher: {teacher.told()}", flush=True)
         if checkpoint and args.transfer:
             print(runner.transfer(str(checkpoint)), flush=True)
         elif checkpoint:
@@ -191,6 +203,21 @@ def _train(
         return 0
     # Without a signal of its own it is the output that went away, or another process that was asked to stop.
     return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
+
+
+def teacher_of(cfg: TaskConfig, checkpoint: Path | None, args: argparse.Namespace) -> Teacher | None:
+    """Return the teacher of a task that learns from one: of a training that is resumed the one in its `checkpoint`, else the
+    one that the configuration names.
+
+    Raises:
+        ConfigError: there is none, it does not fit, or one is named for a task that learns from none.
+    """
+    if not learns_from_teacher(cfg):
+        if args.teacher is not None:
+            learns = "train.algorithm.class_name=Distillation would"
+            raise ConfigError(f"--teacher: '{cfg.task}' learns from rewards, not from a teacher; {learns}")
+        return None
+    return find_teacher(cfg) if checkpoint is None else teacher_in(checkpoint, read_checkpoint(checkpoint))
 
 
 def _evaluate_during(runner: Runner, resumed_from: Path | None) -> None:

@@ -74,7 +74,8 @@ def test_flags_are_those_of_the_tool(complete):
 
 def test_keys_are_offered_section_by_section(complete):
     assert complete("./train.py --task anymal_c trai") == {"train."}
-    assert complete("python train.py train.") == {"train.policy.", "train.algorithm.", "train.runner."}
+    sections = {"train.policy.", "train.algorithm.", "train.distillation.", "train.runner."}
+    assert complete("python train.py train.") == sections
     assert complete("python train.py train.runner.max") == {"train.runner.max_iterations="}
     assert complete("python train.py rewards.scales.tracking_") == {
         "rewards.scales.tracking_lin_vel=",

@@ -27,6 +27,7 @@ CURRICULUM = (
 LEARNER = (
     ("Policy/mean_std", "standard deviation of actions (noise)", 1.0),
     ("Loss/value", "loss of the value function", 1.0),
+    ("Loss/behavior", "behaviour loss: student's actions against its teacher's", 1.0),
 )
 NOT_OF_THE_TASK = (LENGTH, "Metrics/contact_overflows", "Metrics/non_finite_worlds")
 WATCHED = "Evaluation/"

@@ -1,0 +1,167 @@
+"""rsl-rl's distillation, updated without a host read: the student acts, the teacher says what it would have done."""
+
+import warnings
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import Distillation
+from rsl_rl.models import MLPModel
+from rsl_rl.utils import resolve_optimizer
+from torch import Tensor, nn
+
+from legged.learning.distributed import SharedGradients
+from legged.learning.networks import action_std, output_of, update_normalizer
+from legged.learning.recurrent import Memory
+
+
+class DeviceDistillation(Distillation):
+    """DAgger (Ross et al., arXiv 1011.0686) as rsl-rl computes it, of students with or without a memory.
+
+    What differs is how often the host waits: losses are summed on the device and read once an iteration; without a memory
+    the steps of a gradient are one batch; the optimiser is fused. A teacher with a memory keeps it from one iteration to the
+    next, where rsl-rl's begins anew. With `stock`, rsl-rl's own update and loop run.
+    """
+
+    def __init__(self, student: MLPModel, teacher: MLPModel, *args: Any, stock: bool = False, **kwargs: Any) -> None:
+        for parameter in student.distribution.parameters():  # no loss depends on the noise with which the student acts
+            parameter.requires_grad_(False)
+        with warnings.catch_warnings():  # of steps that are left over, of which the configuration allows none
+            warnings.simplefilter("ignore")
+            super().__init__(student, teacher, *args, **kwargs)
+        name = kwargs.get("optimizer", "adam")
+        parameters = [parameter for parameter in self.student.parameters() if parameter.requires_grad]
+        self.why_stock = "train.runner.loop is stock" if stock else "" if name == "adam" else f"the optimiser is {name}"
+        """What keeps the update on rsl-rl's own path; empty if nothing does."""
+        if self.why_stock:
+            self.optimizer = resolve_optimizer(name)(parameters, lr=self.learning_rate)  # type: ignore[operator]
+        else:
+            on_gpu = parameters[0].is_cuda
+            self.optimizer = torch.optim.Adam(parameters, lr=self.learning_rate, fused=True, capturable=on_gpu)
+            # Where this is 1, a fused step changes nothing: neither parameters nor moments nor its count.
+            self.optimizer.found_inf = torch.zeros((), device=self.device)  # type: ignore[attr-defined]
+            if self.is_multi_gpu:
+                self._shared = SharedGradients(parameters, self.gpu_world_size)
+        self.memory = Memory(self.student, self.storage.num_envs)
+        """What the student remembers of each robot, where it acts."""
+        self.memory_before = [part.clone() for part in self.memory.parts]
+        """The same before the first step of the stored rollout."""
+        self._losses = torch.zeros(2, device=self.device)
+        """Mean loss of the last update, and the share of its gradients that were taken."""
+        self.left_out = 0.0
+        """Share of the last update's gradients that were no numbers, and changed nothing."""
+
+    @property
+    def actor(self) -> MLPModel:
+        """The student."""
+        return self._raw_student
+
+    @property
+    def fits_graph(self) -> bool:
+        """Whether an update can be captured: not of recurrent layers, whose launches the GPU's library chooses."""
+        return not self.student.is_recurrent
+
+    def tensors(self) -> list[Tensor]:
+        """Everything that an update changes: parameters, normaliser, moments of the optimiser."""
+        moments = [tensor for state in self.optimizer.state.values() for tensor in state.values()]
+        return [*self.student.state_dict(keep_vars=True).values(), *moments]
+
+    def action_std(self) -> Tensor:
+        """Return the standard deviation (D,) of the student's actions."""
+        return action_std(self.student)
+
+    def update(self) -> dict[str, float]:
+        """All epochs over the stored rollout; returns the mean loss."""
+        if self.why_stock:
+            return super().update()
+        self.learn()
+        self.storage.clear()
+        return self.losses()
+
+    def learn(self, epochs: int | None = None) -> None:
+        """All epochs over the stored rollout, or the first `epochs`, without a host read."""
+        self._losses.zero_()
+        epochs = epochs or self.num_learning_epochs
+        observations = self.storage.observations
+        inputs = torch.cat([observations[name] for name in self.student.obs_groups], dim=-1)
+        for _ in range(epochs):
+            (self._epoch_with_memory if self.student.is_recurrent else self._epoch)(inputs)
+        self._losses[:1] /= self._losses[1:].clone()
+        self._losses[1:] /= epochs * len(inputs) // self.gradient_length
+        if self.student.obs_normalization:
+            update_normalizer(self.student.obs_normalizer, inputs.flatten(0, 1))
+
+    def losses(self) -> dict[str, float]:
+        """Mean loss of a step in the last update, read from the device, as is `left_out`; NaN if no gradient was taken."""
+        loss, taken = self._losses.tolist()
+        self.left_out = 1.0 - taken
+        return {"behavior": loss}
+
+    def _epoch(self, inputs: Tensor) -> None:
+        """Learn from all steps of `inputs` (T, N, W) once: those of a gradient side by side."""
+        labels = self.storage.privileged_actions
+        for x, wanted in zip(inputs.split(self.gradient_length), labels.split(self.gradient_length), strict=True):
+            actions = output_of(self.student, x.flatten(0, 1), self.use_mixed_precision)
+            # The mean over all of them, where rsl-rl adds the means of single steps.
+            self._descend(len(x) * self.loss_fn(actions, wanted.flatten(0, 1)))
+
+    def _epoch_with_memory(self, inputs: Tensor) -> None:
+        """The same step by step, from what the student remembered before the first one."""
+        memory = self.memory.copy(self.memory_before)
+        loss = torch.zeros((), device=self.device)
+        for t, x in enumerate(inputs):
+            with torch.autocast(x.device.type, torch.bfloat16, self.use_mixed_precision):
+                actions = memory.act(x)
+            loss = loss + self.loss_fn(actions.float(), self.storage.privileged_actions[t])
+            if (t + 1) % self.gradient_length == 0:
+                self._descend(loss)
+                memory.detach()
+                loss = torch.zeros((), device=self.device)
+            memory.forget(self.storage.dones[t].bool())
+        self.memory.take(memory.parts)
+
+    def _descend(self, loss: Tensor) -> None:
+        """Step down the gradient of a `loss` () of `gradient_length` steps; not if a gradient is no number."""
+        mean = loss.detach() / self.gradient_length
+        if self.is_multi_gpu:
+            self._shared.zero_()
+            loss.backward()
+            self._shared.average_(mean)
+        else:
+            self.optimizer.zero_grad()
+            loss.backward()
+        norm = nn.utils.clip_grad_norm_(self.student.parameters(), self.max_grad_norm or torch.inf)
+        fine = (norm + mean) < torch.inf
+        torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
+        self.optimizer.step()
+        self._losses += torch.where(fine, torch.stack([mean, torch.ones_like(mean)]), 0.0)
+
+    def save(self) -> dict:
+        """Return the student as the `actor` of a checkpoint, the teacher, and the optimiser as rsl-rl has it, which is not
+        fused and counts its steps on the host.
+        """
+        saved = self.optimizer.state_dict()
+        state = {
+            key: {name: tensor.cpu() if name == "step" else tensor for name, tensor in tensors.items()}
+            for key, tensors in saved["state"].items()
+        }
+        groups = saved["param_groups"]
+        if not self.why_stock:
+            groups = [{**group, "fused": None, "capturable": False} for group in groups]
+        return {
+            "actor_state_dict": self._raw_student.state_dict(),
+            "teacher_state_dict": self._raw_teacher.state_dict(),
+            "optimizer_state_dict": {"state": state, "param_groups": groups},
+        }
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
+        """Take student, teacher and optimiser of a checkpoint; the learning rate is the configuration's."""
+        parts = load_cfg or {"optimizer": True, "iteration": True}
+        self._raw_student.load_state_dict(loaded_dict["actor_state_dict"], strict=strict)
+        self._raw_teacher.load_state_dict(loaded_dict["teacher_state_dict"], strict=strict)
+        self.teacher_loaded = True
+        if parts.get("optimizer"):
+            rates = [group["lr"] for group in self.optimizer.param_groups]
+            self.optimizer.load_state_dict(loaded_dict["optimizer_state_dict"])
+            for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
+                group["lr"] = rate
+        return parts.get("iteration", False)

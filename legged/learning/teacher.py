@@ -1,0 +1,167 @@
+"""The teacher of a student: any policy of ours, with the observations that it was trained on."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from legged.config import LeggedConfig, TaskConfig
+from legged.config.networks import groups_of
+from legged.config.schema import ObservationGroupConfig, PolicyConfig
+from legged.errors import ConfigError, suggest
+from legged.learning.checkpoint import (
+    Saved,
+    check_joints,
+    check_networks_fit,
+    check_weights,
+    networks,
+    read_checkpoint,
+)
+from legged.learning.run_folder import find_checkpoint, find_run_of_any_task, run_config
+from legged.learning.transfer import made_for
+from legged.process.paths import exists, relative
+from legged.registry import task_class
+
+FIELD = "train.distillation.teacher"
+PREFIX = "teacher_"
+"""What precedes the names of a teacher's observation groups in the task of its student."""
+OF_A_NETWORK = ("activation", "obs_normalization", "noise_std_type", "state_dependent_std", "rnn_type")
+OF_ACTIONS = ("control_type", "action_scale", "held", "clip_actions")
+"""Fields of `control` that say what an action means."""
+
+
+@dataclass(frozen=True)
+class Teacher:
+    """A policy that says what it would have done."""
+
+    origin: Mapping[str, str | int]
+    """Its file, task and iteration."""
+    groups: Mapping[str, ObservationGroupConfig]
+    """The observation groups that it reads, by their names in the student's task, in order; without noise."""
+    network: Mapping[str, Any]
+    """What its network is made of, as checkpoints describe networks; `observations` names its groups here."""
+    weights: Mapping[str, Tensor]
+
+    @property
+    def policy(self) -> PolicyConfig:
+        """Its network as a configuration would say it."""
+        said = {name: self.network[name] for name in OF_A_NETWORK if name in self.network}
+        if said["rnn_type"] != "none":
+            said |= {name: self.network[name] for name in ("rnn_hidden_dim", "rnn_num_layers")}
+        hidden, groups = self.network["hidden_dims"], self.network["observations"]
+        return PolicyConfig(actor_hidden_dims=tuple(hidden), actor_observations=tuple(groups), **said)
+
+    def told(self) -> str:
+        """Return in words who it is."""
+        return f"{self.origin['file']} ({self.origin['task']}, iteration {self.origin['iteration']})"
+
+
+def find_teacher(cfg: TaskConfig) -> Teacher:
+    """Find the teacher that a student's configuration names, and look whether the student's task can show it what it was
+    trained to see.
+
+    Raises:
+        ConfigError: there is none, or it sees or does something else.
+    """
+    name, where = cfg.train.distillation.teacher, cfg.origins.where(FIELD)
+    if not name:
+        raise ConfigError(f"{where}: '{cfg.task}' learns from a teacher, and none is named; --teacher RUN does")
+    file = Path(name) if name.endswith(".pt") and exists(Path(name)) else None
+    path = file or find_checkpoint(find_run_of_any_task(cfg, name, where), None)
+    there, saved = run_config(path.parent), read_checkpoint(path)
+    check_joints(f"{where}: {relative(path)}", made_for(path, saved), cfg)
+    check_networks_fit(relative(path), {name: part for name, part in saved.items() if name != "critic_state_dict"}, there)
+    if there.train.policy.estimator.targets:
+        raise ConfigError(f"{where}: {relative(path)} has an estimator, and no teacher can have one")
+    read = groups_of(there, "actor")
+    groups = {PREFIX + group: replace(there.observations.groups[group], noise=False) for group in read}
+    terms = dict.fromkeys(term for group in groups.values() for term in group.terms)
+    missing = [term for term in terms if not hasattr(task_class(cfg.task), f"_obs_{term}") and not term.startswith("rand_")]
+    if missing:
+        known = suggest(missing[0], task_class(cfg.task).terms("_obs_"), "observations")
+        unknown = ", ".join(f"'{term}'" for term in missing)
+        raise ConfigError(f"{where}: {relative(path)} observes {unknown}, which '{cfg.task}' has not{known}")
+    found = differences(cfg, there, terms)
+    if found:
+        raise ConfigError(f"{where}: {relative(path)} was made for other numbers than '{cfg.task}': {'; '.join(found)}")
+    network = {**networks(there)["actor"], "observations": list(groups)}
+    origin: dict[str, str | int] = {"file": relative(path), "task": there.task, "iteration": saved["iter"]}
+    teacher = Teacher(origin, groups, network, saved["actor_state_dict"])
+    task_class(cfg.task).check(with_teacher(cfg, teacher))
+    return teacher
+
+
+def differences(here: TaskConfig, there: TaskConfig, terms: Iterable[str]) -> list[str]:
+    """Say 'observations.clip 100 there, 10 here' for what makes the same terms other numbers in the tasks of a student and of
+    its teacher, or the same actions other movements.
+    """
+    pairs: dict[str, tuple[Any, Any]] = {"the control step": (here.dt, there.dt)}
+    for name in OF_ACTIONS:
+        pairs[f"control.{name}"] = tuple(getattr(cfg.control, name, None) for cfg in (here, there))  # type: ignore[assignment]
+    pairs["observations.clip"] = (here.observations.clip, there.observations.clip)
+    for term in terms:
+        pairs[f"observations.scales.{term}"] = (scale_of(here, term), scale_of(there, term))
+    if "heights" in terms and isinstance(here, LeggedConfig) and isinstance(there, LeggedConfig):
+        for name in ("measured_points_x", "measured_points_y"):
+            pairs[f"terrain.{name}"] = (getattr(here.terrain, name), getattr(there.terrain, name))
+        for name in ("heights_offset", "heights_limit"):
+            pairs[f"observations.{name}"] = (getattr(here.observations, name), getattr(there.observations, name))
+    return [f"{name} {_shown(theirs)} there, {_shown(ours)} here" for name, (ours, theirs) in pairs.items() if ours != theirs]
+
+
+def _shown(value: Any) -> str:
+    """Return a value as an error shows it: a list of many numbers by their count and its ends."""
+    if isinstance(value, tuple) and len(value) > 3:
+        return f"{len(value)} from {value[0]:g} to {value[-1]:g}" if isinstance(value[0], float) else f"{len(value)} names"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def scale_of(cfg: TaskConfig, term: str) -> float | tuple[float, float]:
+    """Return the factor on an observation term; commands are scaled like the velocities that they ask for, linear and about
+    the vertical, unless told otherwise.
+    """
+    scales = cfg.observations.scales
+    if term == "commands" and term not in scales and isinstance(cfg, LeggedConfig):
+        return scales.get("base_lin_vel", 1.0), scales.get("base_ang_vel", 1.0)
+    return scales.get(term, 1.0)
+
+
+def with_teacher(cfg: TaskConfig, teacher: Teacher) -> TaskConfig:
+    """Return the configuration of a student's task that also shows the teacher what it sees.
+
+    Raises:
+        ConfigError: a group of the student's has the name of one of those.
+    """
+    groups = cfg.observations.groups
+    for name, group in teacher.groups.items():
+        if groups.get(name, group) != group:
+            where = cfg.origins.where(f"observations.groups.{name}")
+            raise ConfigError(f"{where}: this is what the teacher's group is called; give the student's another name")
+    # A student has no value function, and learns from no mirror images: no observation of the teacher's needs to have one.
+    algorithm = replace(cfg.train.algorithm, symmetry=False, critic_warmup_iterations=0)
+    return replace(
+        cfg,
+        observations=replace(cfg.observations, groups={**groups, **teacher.groups}),
+        train=replace(cfg.train, algorithm=algorithm),
+    )
+
+
+def teacher_in(path: Path, saved: Saved) -> Teacher:
+    """Return the teacher that a checkpoint of a student holds.
+
+    Raises:
+        ConfigError: it holds none.
+    """
+    infos, name = saved["infos"], relative(path)
+    try:
+        network, weights = infos["networks"]["teacher"], saved["teacher_state_dict"]
+        layouts, histories = infos["observations"], infos["histories"]
+        groups = {group: ObservationGroupConfig(tuple(layouts[group]), histories[group]) for group in network["observations"]}
+        teacher = Teacher({"file": name, "task": "", "iteration": 0, **infos["teacher"]}, groups, network, weights)
+        teacher.policy  # noqa: B018 (it is complete)
+    except (KeyError, TypeError) as error:
+        raise ConfigError(f"{name}: holds no teacher to go on learning from ({error})") from error
+    check_weights(saved["teacher_state_dict"], f"{name}: its teacher")
+    return teacher
