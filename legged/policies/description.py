@@ -75,6 +75,8 @@ def conventions(task: LeggedRobot) -> dict[str, str]:
         " measures that is turned or sits elsewhere must be turned into it",
         "needs": "what a term is made of: a sensor of the robot, the command, what the program remembers, or a source"
         " beside these",
+        "scan": "what a point of the heights reads of a map of cells: the lowest of its cell and the next ones in x and y,"
+        " its own, or the highest of the three",
         "noise": "half width of the uniform noise that the policy was trained with, in the term's unit before scaling",
         "crouch_joint_angles": "a robot that lies stands up by way of these angles; null if it has no such pose",
         "command_dead_zone": "horizontal commands that are shorter were never asked for, but 0 [m/s]",
@@ -129,6 +131,7 @@ def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any]) 
         points = [[round(value, 6) for value in point] for point in task.height_scan.points.tolist()]
         legged = task.cfg.observations
         entry |= {"points": points, "offset": legged.heights_offset, "limit": legged.heights_limit}
+        entry["scan"] = task.cfg.terrain.scan
     if isinstance(task, LeggedRobot) and term.name in ("passive_pos", "passive_vel") and task.robot.passive is not None:
         entry |= {"joints": list(task.robot.passive.names), "default": task.passive_default_pos.tolist()}
     return entry

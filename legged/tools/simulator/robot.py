@@ -21,8 +21,10 @@ FALLEN = 1.2
 class SimulatedRobot:
     """A robot that stands in its default pose on a plane, or in the middle of the first tile of a terrain."""
 
-    def __init__(self, robot: Robot, terrain: Terrain | None, sim: SimConfig) -> None:
-        """Build the world with the solver options of `sim`; the motors ask for nothing yet."""
+    def __init__(self, robot: Robot, terrain: Terrain | None, sim: SimConfig, scan: str = "lowest") -> None:
+        """Build the world with the solver options of `sim`; the motors ask for nothing yet. `scan` says what a point of the
+        heights reads (terrain.scan).
+        """
         self.robot, self._terrain = robot, terrain
         self.model = RobotScene(robot, terrain).model(sim)
         self.data = mujoco.MjData(self.model)
@@ -30,7 +32,7 @@ class SimulatedRobot:
         start = np.zeros(3) if terrain is None else terrain.origins[0, 0]
         self.data.qpos[:] = robot.default_qpos
         self.data.qpos[:3] = start + np.array([0.0, 0.0, robot.height])
-        self._scan = None if terrain is None else terrain.height_map.scan_map()
+        self._scan = None if terrain is None else terrain.height_map.scan_map(scan)
         mujoco.mj_forward(self.model, self.data)
         count = robot.num_dof
         self.asked = np.zeros((3, count))
