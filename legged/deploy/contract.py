@@ -120,6 +120,10 @@ class Contract:
     """Horizontal commands slower than this were never asked for in training [m/s]."""
     control_dt: float
     """Time for which an action is held [s]."""
+    sim_dt: float
+    """Physics step of the training, in which the actuator's delay is counted [s]."""
+    actuator: Mapping[str, Any]
+    """Section control.actuator of the training's configuration; empty for an export that does not say."""
     memory: Memory | None
 
     @property
@@ -238,6 +242,8 @@ def _contract(path: Path, said: Mapping[str, Any]) -> Contract:
         ),
         dead_zone=float(said["command_dead_zone"]),
         control_dt=float(said["control_dt"]),
+        sim_dt=float(said.get("sim_dt", said["control_dt"])),
+        actuator=dict(said.get("actuator", {})),
         memory=_memory(said["recurrent"]),
     )
 

@@ -4,6 +4,7 @@ import inspect
 import math
 from typing import Any
 
+from legged.config.loader import to_dict
 from legged.config.networks import groups_of
 from legged.config.units import unit_in
 from legged.deploy.contract import CONTRACT_VERSION, need_of
@@ -64,6 +65,7 @@ def describe_robot(task: LeggedRobot) -> dict[str, Any]:
         "velocity_limits": robot.dof_vel_limits.tolist(),
         "control_dt": task.dt,
         "sim_dt": cfg.sim.dt,
+        "actuator": to_dict(cfg.control.actuator),
     }
 
 
@@ -94,6 +96,7 @@ def conventions(task: LeggedRobot) -> dict[str, str]:
         "action": "actions = policy(observation), then clipped at plus and minus action_clip, one for each of"
         " action_joints; action_scale is one number, or one for each of them; a joint without action has 0 in its place",
         "torque": f"clip({law}, -torque_limits, torque_limits), anew every sim_dt",
+        "actuator": "the motors of the training: the section control.actuator of its configuration; delay in steps of sim_dt",
         "time": "every control_dt: observe, run the policy, hold its action for control_dt",
     }
 
