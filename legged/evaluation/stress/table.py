@@ -85,6 +85,9 @@ TOGETHER = ("payload", "friction", "weak motors", "delay 20 ms")
 """What is wrong in the line `together`: what hardware differs in by itself. The line `everything` has all but the longer
 delay."""
 
+NAMES = (NOMINAL.name, *(one.name for one in ALONE), "together", "everything")
+"""Of all lines."""
+
 
 def table(robot: Size, anymal: Size, payload: float | None = None) -> tuple[Disturbance, ...]:
     """Return all lines for a robot of that size: nothing, each alone, some together, everything. `anymal` is the size of the
