@@ -37,7 +37,7 @@ class Disturbance:
     map_shift: float = 0.0
     """By how much the height map is shifted to a side, in a direction of its own [m]."""
     map_holes: float = 0.0
-    """Share of the points of the height map that no sensor sees: they have the height of the ground under the base [1]."""
+    """Share of the points of the height map that no sensor sees: they read 0, as level ground does [1]."""
 
     @property
     def changes(self) -> dict[str, float]:
