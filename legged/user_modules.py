@@ -29,8 +29,7 @@ def import_tasks(name: str) -> None:
         raise ConfigError(f"--import: there is no file {shown(name)}")
     folder = str(path.resolve().parent if is_file else Path.cwd())
     _FOLDERS.add(folder)
-    if folder not in sys.path:
-        sys.path.insert(0, folder)
+    find_modules_in(folder)
     before = set(sys.modules)
     try:
         _run(path) if is_file else importlib.import_module(name)
@@ -40,6 +39,14 @@ def import_tasks(name: str) -> None:
             if file and str(Path(file).parent) == folder:
                 del sys.modules[module]
         raise _described(name, is_file, folder, error) from error
+
+
+def find_modules_in(folder: str) -> None:
+    """Let modules of users be found in a folder. Python looks into the working directory by itself, but not for a program
+    that is called by its path.
+    """
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
 
 
 def is_of_a_module(file: str) -> bool:

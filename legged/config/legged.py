@@ -78,6 +78,9 @@ class TerrainConfig:
     """Where heights are measured, forward of the base [m]."""
     measured_points_y: tuple[float, ...] = field(default=tuple(round(0.1 * i - 0.5, 1) for i in range(11)), metadata=MEASURED)
     """Where heights are measured, to the left of the base [m]."""
+    scan: Literal["lowest", "own", "highest"] = "lowest"
+    """What a measured point reads of the height map: the `lowest` of its cell and the next ones in x and y, as in legged_gym;
+    its cell's `own` height; or the `highest` of the three."""
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,9 @@ SENSORS = {
 """Observation term -> what a robot needs for it, of the terms that every robot of ours can measure or remembers."""
 SOURCE = "source "
 """What the need of any other term begins with: a source of that name beside the sensors, such as an estimator or a map."""
+SCANS = ("lowest", "own", "highest")
+"""What a point of the heights can read: the lowest of its cell and the next ones in x and y, its own, or the highest of the
+three."""
 TOLERANCE = 1e-3
 """Limits that differ by less, or by less than this share, are the same."""
 
@@ -51,6 +54,8 @@ class Term:
     """Observed heights are relative to this far below the base [m]."""
     limit: float
     """Observed heights are at most this large [m]."""
+    scan: str
+    """What a point reads of a map of cells, one of `SCANS`."""
 
     @property
     def source(self) -> str | None:
@@ -115,6 +120,10 @@ class Contract:
     """Horizontal commands slower than this were never asked for in training [m/s]."""
     control_dt: float
     """Time for which an action is held [s]."""
+    sim_dt: float
+    """Physics step of the training, in which the actuator's delay is counted [s]."""
+    actuator: Mapping[str, Any]
+    """Section control.actuator of the training's configuration; empty for an export that does not say."""
     memory: Memory | None
 
     @property
@@ -233,6 +242,8 @@ def _contract(path: Path, said: Mapping[str, Any]) -> Contract:
         ),
         dead_zone=float(said["command_dead_zone"]),
         control_dt=float(said["control_dt"]),
+        sim_dt=float(said.get("sim_dt", said["control_dt"])),
+        actuator=dict(said.get("actuator", {})),
         memory=_memory(said["recurrent"]),
     )
 
@@ -256,6 +267,7 @@ def _term(said: Mapping[str, Any]) -> Term:
         points=None if points is None else np.array(points, dtype=float).reshape(-1, 2),
         offset=float(said.get("offset", 0.0)),
         limit=float(said.get("limit", np.inf)),
+        scan=str(said.get("scan", SCANS[0])),
     )
 
 
@@ -283,6 +295,10 @@ def _check_sizes(contract: Contract) -> None:
             raise ConfigError(f"{path}: observation: '{term.name}' has {term.size} numbers and {len(term.scale)} scales")
         if term.source == "heights" and (term.points is None or len(term.points) != term.size):
             raise ConfigError(f"{path}: observation: 'heights' has {term.size} numbers and no point for each")
+        if term.scan not in SCANS:
+            raise ConfigError(
+                f"{path}: observation: scan of '{term.name}': must be one of {', '.join(SCANS)}, got '{term.scan}'"
+            )
     _check_numbers(contract)
     filled = {name: sum(term.size for term in contract.terms if term.group == name) for name in groups}
     for name, group in groups.items():

@@ -27,6 +27,8 @@ OF_EVERY_TASK = (
 NO_CURVES = ("Metrics/episode_length", "Metrics/contact_overflows", "Metrics/non_finite_worlds")
 """Metrics that say nothing of what a task is about."""
 LEVEL = "Terrain/level_"
+SAME_TIME = 0.05
+"""Share by which times of an iteration may differ for runs to have one axis of time."""
 Scalars = dict[str, tuple[np.ndarray, np.ndarray]]
 """Tag -> (iterations, values)."""
 
@@ -117,6 +119,7 @@ def draw_runs(runs: dict[str, Scalars], path: Path, always: Collection[float] = 
     first = next(iter(runs.values()))
     types = [tag.removeprefix(LEVEL) for tag in first if tag.startswith(LEVEL)]
     curves = curves_of(runs.values())
+    per_iteration = common_time(runs.values())
     rows = -(-len(curves) // 2) + bool(types)
     with figure(path, (10.0, 3.0 * rows), rows, 2) as (_, axes):
         for axis, (tag, label, factor) in zip(axes.flat, curves, strict=False):
@@ -141,7 +144,8 @@ def draw_runs(runs: dict[str, Scalars], path: Path, always: Collection[float] = 
             if axis.get_xlim()[0] >= axis.get_xlim()[1] or max(len(steps) for steps, _ in first.values()) < 2:
                 axis.set_xlim(0.0, 2.0)  # one iteration has no extent
             axis.grid(alpha=0.3)
-            _time_axis(axis, first)
+            if per_iteration is not None:
+                _time_axis(axis, per_iteration)
 
 
 def _draw_ways_out(axis: Any, runs: dict[str, Scalars], name: str) -> None:
@@ -178,14 +182,18 @@ def mean_of(runs: list[Scalars], tag: str) -> tuple[np.ndarray, np.ndarray]:
     return np.array(steps) + 1, np.array([np.mean([values[step] for values in found]) for step in steps])
 
 
-def _time_axis(axis: Any, scalars: Scalars) -> None:
-    """Add a second axis on top: seconds of training loop at the mean time of an iteration."""
-    if not {"Perf/collection_time", "Perf/learning_time"} <= scalars.keys():  # of a run that was killed in between
-        return
-    per_iteration = float(np.mean(scalars["Perf/collection_time"][1]) + np.mean(scalars["Perf/learning_time"][1]))
+def common_time(runs: Collection[Scalars]) -> float | None:
+    """Return the mean time of an iteration of the first run that has times [s]. There is none in common where another takes
+    more or less than that by more than `SAME_TIME`, nor where no run has times, as one that was killed in between.
+    """
+    parts = ("Perf/collection_time", "Perf/learning_time")
+    found = [sum(float(np.mean(scalars[part][1])) for part in parts) for scalars in runs if set(parts) <= scalars.keys()]
+    alike = bool(found) and min(found) > 0.0 and max(found) <= (1.0 + SAME_TIME) * min(found)
+    return found[0] if alike else None
 
-    if not per_iteration > 0.0:
-        return
+
+def _time_axis(axis: Any, per_iteration: float) -> None:
+    """Add a second axis on top: seconds of training loop, where an iteration takes so long."""
 
     def seconds(iterations: np.ndarray) -> np.ndarray:
         return iterations * per_iteration

@@ -13,6 +13,7 @@ from torch.utils.tensorboard import SummaryWriter
 from legged.config import TaskConfig, to_dict
 from legged.config.checks import shown
 from legged.errors import ConfigError, RunError, suggest
+from legged.user_modules import find_modules_in
 
 TENSORBOARD = "tensorboard"
 FLUSH_S = 10
@@ -51,6 +52,7 @@ def _writer_class(cfg: TaskConfig) -> type[LogWriter]:
     if not colon:
         allowed = suggest(name[:100], (TENSORBOARD, *known))
         raise ConfigError(f"{where}: there is no tracker {shown(name)}{allowed}, or module:Class of a writer of your own")
+    find_modules_in(str(Path.cwd()))
     try:
         found = getattr(import_module(module), attribute)
     except Exception as error:  # whatever a user's module does

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 class HeightScan:
     """A grid of P points around each robot, turned with its heading. On a plane all heights are 0.
 
-    As in legged_gym a point's height is the lowest of three neighbouring cells (HeightMap.scan_map).
+    What a point reads of the cells around it, and the base of the ground below it, is terrain.scan (HeightMap.scan_map).
     """
 
     STATE: tuple[str, ...] = ()  # heights follow from where the robots are
@@ -41,11 +41,11 @@ class HeightScan:
         """(N,) height of the ground under each base [m]."""
         if terrain is not None:
             ground = terrain.height_map
-            lowest = torch.tensor(ground.scan_map(), device=device)
-            self._cell, (self._rows, self._columns) = ground.cell, lowest.shape
+            found = torch.tensor(ground.scan_map(cfg.scan), device=device)
+            self._cell, (self._rows, self._columns) = ground.cell, found.shape
             self._origin = torch.tensor(ground.origin, dtype=torch.float32, device=device)
-            self._last = [float(size - 1) for size in lowest.shape]
-            self._map = lowest.flatten()
+            self._last = [float(size - 1) for size in found.shape]
+            self._map = found.flatten()
             # In cells, and with the base's own place as the last point, so that one lookup finds all.
             self._x, self._y = (torch.cat([self.points, torch.zeros(1, 2, device=device)]) / ground.cell).T.contiguous()
 

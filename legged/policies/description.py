@@ -4,6 +4,7 @@ import inspect
 import math
 from typing import Any
 
+from legged.config.loader import to_dict
 from legged.config.networks import ESTIMATED, groups_of
 from legged.config.units import unit_in
 from legged.deploy.contract import CONTRACT_VERSION, need_of
@@ -65,6 +66,7 @@ def describe_robot(task: LeggedRobot) -> dict[str, Any]:
         "velocity_limits": robot.dof_vel_limits.tolist(),
         "control_dt": task.dt,
         "sim_dt": cfg.sim.dt,
+        "actuator": to_dict(cfg.control.actuator),
     }
 
 
@@ -76,6 +78,8 @@ def conventions(task: LeggedRobot) -> dict[str, str]:
         " measures that is turned or sits elsewhere must be turned into it",
         "needs": "what a term is made of: a sensor of the robot, the command, what the program remembers, or a source"
         " beside these",
+        "scan": "what a point of the heights reads of a map of cells: the lowest of its cell and the next ones in x and y,"
+        " its own, or the highest of the three",
         "noise": "half width of the uniform noise that the policy was trained with, in the term's unit before scaling",
         "crouch_joint_angles": "a robot that lies stands up by way of these angles; null if it has no such pose",
         "command_dead_zone": "horizontal commands that are shorter were never asked for, but 0 [m/s]",
@@ -93,6 +97,7 @@ def conventions(task: LeggedRobot) -> dict[str, str]:
         "action": "actions = policy(observation), then clipped at plus and minus action_clip, one for each of"
         " action_joints; action_scale is one number, or one for each of them; a joint without action has 0 in its place",
         "torque": f"clip({law}, -torque_limits, torque_limits), anew every sim_dt",
+        "actuator": "the motors of the training: the section control.actuator of its configuration; delay in steps of sim_dt",
         "time": "every control_dt: observe, run the policy, hold its action for control_dt",
     }
 
@@ -130,6 +135,7 @@ def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any]) 
         points = [[round(value, 6) for value in point] for point in task.height_scan.points.tolist()]
         legged = task.cfg.observations
         entry |= {"points": points, "offset": legged.heights_offset, "limit": legged.heights_limit}
+        entry["scan"] = task.cfg.terrain.scan
     if isinstance(task, LeggedRobot) and term.name in ("passive_pos", "passive_vel") and task.robot.passive is not None:
         entry |= {"joints": list(task.robot.passive.names), "default": task.passive_default_pos.tolist()}
     return entry

@@ -63,12 +63,15 @@ class HeightMap:
             top = windows.max(axis=-1)
         return top.astype(np.float32)
 
-    def scan_map(self) -> np.ndarray:
-        """Return (X, Y) float32: for every cell the lowest of its own height and those of its next neighbours in x and y,
-        which is what legged_gym's height measurements return at a vertical face.
+    def scan_map(self, scan: str) -> np.ndarray:
+        """Return (X, Y) float32: what a measured point in each cell reads, by `scan` (terrain.scan). "lowest" of the cell and
+        its next neighbours in x and y is what legged_gym's height measurements return at a vertical face.
         """
+        if scan == "own":
+            return self.heights.astype(np.float32)
+        pick = {"lowest": np.minimum, "highest": np.maximum}[scan]
         heights = np.pad(self.heights, ((0, 1), (0, 1)), mode="edge")
-        return np.minimum(np.minimum(heights[:-1, :-1], heights[1:, :-1]), heights[:-1, 1:]).astype(np.float32)
+        return pick(pick(heights[:-1, :-1], heights[1:, :-1]), heights[:-1, 1:]).astype(np.float32)
 
 
 def join(heights: np.ndarray, rise: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ from legged.policies.restore import policy_of, restore, undisturbed
 from legged.process.paths import exists, ready_to_write, relative
 from legged.process.startup import in_main_thread
 from legged.robots.robot import load_robot
-from legged.tools.simulate_robot import LISTENING, add_simulation_arguments, check_simulation, terrain_of
+from legged.tools.simulate_robot import LISTENING, add_simulation_arguments, check_simulation, motors_of, terrain_of
 from legged.tools.simulator.film import POSES, make_film
 
 ROOM_MB = 16.0
@@ -47,6 +47,7 @@ def build_parser() -> CommandParser:
         __doc__,
         "python -m legged.tools.deploy --policy anymal_c_proprio --robot sim",
         "python -m legged.tools.deploy --policy anymal_c_proprio --robot sim --terrain stairs_up --size 0.17 --film",
+        "python -m legged.tools.deploy --policy anymal_c_proprio --robot sim 'control.actuator.delay=[4, 4]'",
     )
     parser.add_argument("--policy", required=True, help="exported folder, run folder, or task whose newest or shipped policy")
     parser.add_argument("--robot", required=True, choices=("sim",), help="sim; a robot has its own command, legged.deploy")
@@ -59,7 +60,7 @@ def build_parser() -> CommandParser:
 
 
 def _main(argv: list[str] | None) -> int:
-    args = build_parser().parse_args(argv)
+    args = build_parser().parse_intermixed_args(argv)
     limits_of(args)
     check_simulation(args)
     if args.commands is not None and not exists(args.commands):
@@ -67,6 +68,7 @@ def _main(argv: list[str] | None) -> int:
     exported = _exported(args.policy)
     contract = read_contract(exported / "policy.json")
     robot = load_robot(args.simulated or contract.robot, "--simulated")
+    motors_of(args, robot, contract)
     folder = args.out or Path("logs") / "deploy" / contract.task
     ready_to_write(folder, ROOM_MB)
     folder.mkdir(parents=True, exist_ok=True)
@@ -106,7 +108,8 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         [
             *(sys.executable, "-m", "legged.tools.simulate_robot", robot, "--report", str(report)),
             *(["--poses", str(folder / POSES)] if args.film else []),
-            *_flags(args, SIMULATED),
+            *(["--ideal-motors"] if args.ideal_motors else []),
+            *("--contract", str(exported / "policy.json"), *_flags(args, SIMULATED), *args.overrides),
         ],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,

@@ -29,7 +29,7 @@ from legged.commandline.command import run_main
 from legged.commandline.parser import CommandParser
 from legged.config import LeggedConfig, override
 from legged.envs import LeggedRobot
-from legged.errors import ConfigError
+from legged.errors import ConfigError, suggest
 from legged.evaluation.all_checkpoints import WALKING_FALLS, WALKING_RMSE, check_limits, evaluate_all_checkpoints
 from legged.evaluation.crossing import EVERYWHERE, cross
 from legged.evaluation.episodes import MOST_EPISODES, evaluate_episodes
@@ -37,6 +37,7 @@ from legged.evaluation.following import evaluate_following
 from legged.evaluation.gymnasium_episodes import EPISODES, environment_of, evaluate_in_gymnasium
 from legged.evaluation.stress.measuring import RISER, TREAD, Wish
 from legged.evaluation.stress.report import evaluate_stress
+from legged.evaluation.stress.table import NAMES
 from legged.evaluation.success import chosen_types
 from legged.evaluation.velocity_grid import AXES, MOST_ROBOTS, Grid, axes_of, axis_values, check_size
 from legged.physics import resolve_physics
@@ -50,7 +51,7 @@ ROBOTS = 16
 """Robots a cell, if nobody says how many."""
 ENVIRONMENTS = 256
 """Episodes, each of an environment of its own, if nobody says how many."""
-OF_STRESS = ("riser", "tread", "payload")
+OF_STRESS = ("riser", "tread", "payload", "lines")
 """Flags of --stress."""
 OF_COMMANDS = (
     *AXES,
@@ -108,6 +109,7 @@ def build_parser() -> CommandParser:
     parser.add_argument(
         "--payload", type=float, help="mass on the base in --stress [kg]; 8 kg for an ANYmal C, for others like it"
     )
+    parser.add_argument("--lines", help="lines of --stress to measure, e.g. 'nominal,payload,together'; all, and a score")
     many = f"of a task without commands; {ENVIRONMENTS}, {EPISODES} with --gymnasium"
     parser.add_argument("--episodes", type=int, help=many)
     parser.add_argument("--gymnasium", action="store_true", help="the exported policy in Gymnasium's environment")
@@ -192,7 +194,7 @@ def _follow_commands(args: argparse.Namespace) -> int:
     asked = [("sim.physics", resolve_physics("auto", device)), *policy_overrides(args)]
     where = "--physics" if args.physics else "sim.physics"
     if args.stress:
-        wish = Wish(args.riser, TREAD if args.tread is None else args.tread, args.payload)
+        wish = Wish(args.riser, TREAD if args.tread is None else args.tread, args.payload, stress_lines(args.lines))
         return evaluate_stress(policy, a_point, args.full, wish, asked, device, graph, folder, where)
     if args.all_checkpoints:
         return evaluate_all_checkpoints(policy, grid, asked, device, graph, folder, rmse, falls)
@@ -209,6 +211,7 @@ def _check_stress(args: argparse.Namespace) -> None:
     if not args.stress:
         _refuse(args, OF_STRESS, "is of --stress; add it")
         return
+    stress_lines(args.lines)
     own = "--stress has a table of its own; leave it out"
     _refuse(args, (*AXES, "robots", "types", "all_checkpoints"), own)
     if args.physics == EVERYWHERE:
@@ -217,6 +220,19 @@ def _check_stress(args: argparse.Namespace) -> None:
         value = getattr(args, flag)
         if value is not None and not low <= value <= high:
             raise ConfigError(f"--{flag}: must be between {low:g} and {high:g} {unit}, got {value:g}")
+
+
+def stress_lines(text: str | None) -> tuple[str, ...]:
+    """Return the names of lines in the comma-separated list of --lines.
+
+    Raises:
+        ConfigError: there is no such line.
+    """
+    names = tuple(name.strip() for name in text.split(",")) if text is not None else ()
+    for name in names:
+        if name not in NAMES:
+            raise ConfigError(f"--lines: there is no line '{name}'{suggest(name, NAMES)}")
+    return names
 
 
 def _run_episodes(args: argparse.Namespace) -> int:

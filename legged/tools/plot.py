@@ -1,8 +1,8 @@
 """Learning curves of runs: `python -m legged.tools.plot logs/anymal_c_flat/<run> [<run> ...] --out curve.png`.
 
-Reads the TensorBoard files; draws tracking error, return and falls over iterations, one line a run, and a time axis
-from the first run's iteration times. Of runs on terrain, also the mean level of each type and the shares of episodes after
-which robots moved up and down, as means over the runs.
+Reads the TensorBoard files; draws tracking error, return and falls over iterations, one line a run, and an axis of time on
+top, unless runs differ in the time of an iteration by more than 5 %. Of runs on terrain, also the mean level of each type and
+the shares of episodes after which robots moved up and down, as means over the runs.
 """
 
 import sys

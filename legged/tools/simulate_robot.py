@@ -13,12 +13,15 @@ import numpy as np
 
 from legged.commandline.command import run_main
 from legged.commandline.parser import CommandParser
+from legged.config import parse_override
 from legged.config.schema import SimConfig, TerrainConfig
+from legged.deploy.contract import SCANS, Contract, read_contract
 from legged.deploy.pace import take_priority
 from legged.errors import ConfigError
 from legged.process.paths import replacing, write_text
-from legged.robots.robot import load_robot
+from legged.robots.robot import Robot, load_robot
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, terrain_type
+from legged.tools.simulator.motors import Motors, motors_config
 from legged.tools.simulator.robot import SimulatedRobot
 from legged.tools.simulator.server import Server
 
@@ -42,9 +45,13 @@ def build_parser() -> CommandParser:
         __doc__,
         "python -m legged.tools.simulate_robot anymal_c",
         "python -m legged.tools.simulate_robot go2 --terrain stairs_up --size 0.12 --latency 0.01 --loss 0.01",
+        "python -m legged.tools.simulate_robot go2 control.actuator.model=dc_motor 'control.actuator.delay=[5, 10]'",
     )
     parser.add_argument("robot", help="name of a robot, or its folder")
     add_simulation_arguments(parser)
+    parser.add_argument(
+        "--contract", type=Path, help="policy.json whose motors and map the robot has; ideal motors without one"
+    )
     parser.add_argument("--report", type=Path, help="JSON file for what became of the robot")
     parser.add_argument("--poses", type=Path, help=".npy file for its poses, 25 a second, of the first half minute")
     parser.add_argument("--seconds", type=float, default=3600.0, help="end after so long; default 3600")
@@ -52,13 +59,15 @@ def build_parser() -> CommandParser:
 
 
 def _main(argv: list[str] | None) -> int:
-    args = build_parser().parse_args(argv)
+    args = build_parser().parse_intermixed_args(argv)
     check_simulation(args)
     if not args.seconds > 0.0:
         raise ConfigError(f"--seconds: must be above 0, got {args.seconds:g}")
     robot = load_robot(args.robot)
     sim = SimConfig(dt=args.sim_dt, iterations=100, ls_iterations=50)
-    server = Server(SimulatedRobot(robot, terrain_of(args), sim), args.latency, args.loss, args.seed)
+    contract = None if args.contract is None else read_contract(args.contract)
+    motors, scan = motors_of(args, robot, contract), scan_of(contract)
+    server = Server(SimulatedRobot(robot, terrain_of(args), sim, motors, scan), args.latency, args.loss, args.seed)
     take_priority(PRIORITY)  # motors and sensors of a robot do not wait for other processes either
     print(f"{LISTENING}127.0.0.1:{server.port}", flush=True)
     report = server.run(args.seconds)
@@ -81,7 +90,11 @@ def add_simulation_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sim-dt", type=float, default=0.002, help="physics step [s]; default 0.002")
     parser.add_argument("--latency", type=float, default=0.0, help="of packets, in each direction [s]; default 0")
     parser.add_argument("--loss", type=float, default=0.0, help="share of packets lost, in each direction; default 0")
-    parser.add_argument("--seed", type=int, default=1, help="of the loss; default 1")
+    parser.add_argument("--seed", type=int, default=1, help="of the loss, and of the motors' delay; default 1")
+    parser.add_argument("--ideal-motors", action="store_true", help="whatever the policy was trained with")
+    parser.add_argument(
+        "overrides", nargs="*", metavar="key=value", help="of control.actuator, e.g. control.actuator.model=ideal"
+    )
 
 
 def check_simulation(args: argparse.Namespace) -> None:
@@ -103,6 +116,23 @@ def check_simulation(args: argparse.Namespace) -> None:
     ):
         if value is not None and not low <= value <= high:
             raise ConfigError(f"{flag}: must be between {low:g} and {high:g}, got {value:g}")
+
+
+def motors_of(args: argparse.Namespace, robot: Robot, contract: Contract | None) -> Motors:
+    """Return the motors that the flags ask for: those of the training of the policy in `contract`, unless told otherwise.
+
+    Raises:
+        ConfigError: as `motors_config`.
+    """
+    changes = [parse_override(text) for text in args.overrides]
+    cfg, counted = motors_config(robot, contract, args.ideal_motors, changes, args.sim_dt)
+    return Motors(robot, cfg, args.sim_dt, counted, args.seed)
+
+
+def scan_of(contract: Contract | None) -> str:
+    """Return what a point of the heights reads for the policy in `contract`."""
+    term = None if contract is None else contract.sources.get("heights")
+    return SCANS[0] if term is None else term.scan
 
 
 def terrain_of(args: argparse.Namespace) -> Terrain | None:

@@ -28,6 +28,8 @@ SMALL = [
     ("terrain.proportions", {**EVEN, "stairs_down": 0.0, "obstacles": 0.0}),
 ]
 
+NOISY = ("observations.add_noise", True)
+
 
 def config(name="anymal_c", *changes, num_envs=8):
     return task_config(name, [("env.num_envs", num_envs), *ENGINE, *CALM, *SMALL, *changes], on_cpu=True)
@@ -74,6 +76,26 @@ def test_scan_points_turn_with_the_heading_and_read_the_lower_of_neighbours():
     torch.testing.assert_close(scan.ground, torch.full((3,), low))
 
 
+@pytest.mark.parametrize(("scan", "seen"), [("lowest", [-0.4, -0.4, 0.0]), ("own", [-0.4, 0.0, 0.0]), ("highest", [0.0] * 3)])
+def test_what_a_point_reads_beside_a_riser_is_a_setting(scan, seen):
+    """The pit ends at y = -2 and x = 2. Points lie at y = 0.05, in the last cell of the pit, x = 1.95, and beyond it; seen
+    from the pit's other side, at y = -2.05, the cell next to it belongs to the ground and has the pit as its neighbour.
+    """
+    cfg = TerrainConfig(measured_points_x=(0.0,), measured_points_y=(0.0,), scan=scan)
+    reading = HeightScan(cfg, step_terrain(), 3, CPU)
+    reading.update(torch.tensor([[1.95, 0.05, 0.0], [0.05, -2.05, 0.0], [2.05, 0.05, 0.0]]), yawed(0.0, 0.0, 0.0))
+    torch.testing.assert_close(reading.heights[:, 0], torch.tensor(seen))
+    torch.testing.assert_close(reading.ground, torch.tensor(seen))
+
+
+def test_every_map_of_a_task_reads_what_its_configuration_says():
+    """The true one, and the displaced one of a robot that drifts, on the same ground as before."""
+    task = terrain_task("anymal_c", ("terrain.scan", "highest"), ("observations.height_map.shift", 0.05), NOISY)
+    expected = task.terrain.height_map.scan_map("highest")
+    for scan in (task.height_scan, task.observation_terms.sensors._map._scan):
+        assert np.array_equal(scan._map.view(*expected.shape).numpy(), expected)
+
+
 def test_scan_beyond_the_map_and_of_a_robot_that_blew_up_reads_the_border():
     scan = HeightScan(TerrainConfig(), step_terrain(), 2, CPU)
     scan.update(torch.tensor([[1e9, -1e9, 0.0], [math.nan, math.inf, 0.0]]), yawed(0.0, 0.0))
@@ -96,7 +118,7 @@ def test_heights_observation(task):
     y = task.base_pos[:, 1:2] + torch.sin(yaw(task)) * POINTS[:, 0] + torch.cos(yaw(task)) * POINTS[:, 1]
     ground = task.terrain.height_map
     i, j = ground.index(x.numpy(), y.numpy())
-    lowest = torch.tensor(ground.scan_map()[i, j])
+    lowest = torch.tensor(ground.scan_map("lowest")[i, j])
     expected = 5.0 * (task.base_pos[:, 2:3] - 0.5 - lowest).clamp(-1.0, 1.0)
     same = (observations[:, 48:] - expected).abs() < 1e-5
     assert same.float().mean() > 0.99  # a point on a border of cells may round to either

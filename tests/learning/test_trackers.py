@@ -1,5 +1,6 @@
 """Trackers beside TensorBoard: what they are given, and that a training does without them."""
 
+import subprocess
 import sys
 import types
 from pathlib import Path
@@ -70,8 +71,9 @@ def own_tracker(fails_at: int = -1) -> str:
 
 
 @pytest.fixture(autouse=True)
-def _found_here(monkeypatch):
-    monkeypatch.syspath_prepend(".")
+def _not_found_by_python_itself(monkeypatch):
+    """As for a program that is called by its path: the working directory is not where Python looks for modules."""
+    monkeypatch.setattr(sys, "path", [folder for folder in sys.path if folder not in ("", ".")])
 
 
 def scalars(folder: Path) -> dict[str, list[int]]:
@@ -156,6 +158,16 @@ def test_a_tracker_that_is_not_there_is_one_line_before_anything_is_built(logger
     err = capsys.readouterr().err
     assert words in err
     assert len(err.splitlines()) == 1
+
+
+def test_a_writer_beside_the_user_is_found_by_a_program_that_lies_elsewhere():
+    """The module is imported: what is wrong with it is that it has no writer."""
+    Path("my_lines.py").write_text("Nothing = 3")
+    program = Path(legged.__file__).parents[1] / "train.py"
+    arguments = [sys.executable, str(program), *ARGUMENTS, "train.runner.logger=my_lines:Nothing"]
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 2
+    assert "'my_lines:Nothing' does not extend rsl_rl.utils.log_writer.LogWriter" in done.stderr
 
 
 def test_a_tracker_that_does_not_start_leaves_no_folder(capsys):

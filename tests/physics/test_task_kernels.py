@@ -119,9 +119,10 @@ def ground() -> Terrain:
     return Terrain.build(replace(TerrainConfig(), mesh_type="height_map", proportions=names, num_rows=4, num_cols=8), 1)
 
 
-def test_the_ground_is_scanned_alike_on_it_beyond_it_and_nowhere():
+@pytest.mark.parametrize("scan", ["lowest", "own", "highest"])
+def test_the_ground_is_scanned_alike_on_it_beyond_it_and_nowhere(scan):
     terrain = ground()
-    parts = pair(lambda kernels: HeightScan(TerrainConfig(), terrain, N, CPU, kernels))
+    parts = pair(lambda kernels: HeightScan(TerrainConfig(scan=scan), terrain, N, CPU, kernels))
     base_pos, base_quat = 100.0 * torch.rand(N, 3) - 30.0, torch.nn.functional.normalize(torch.randn(N, 4), dim=1)
     base_pos[1, 0], base_pos[2, 1], base_quat[3] = torch.nan, torch.inf, torch.nan
     for part in parts:

@@ -137,13 +137,34 @@ def test_ceiling_is_the_highest_corner_around(reach):
         assert found[i, j] == near.max()
 
 
-def test_scan_map_is_the_lowest_of_a_cell_and_its_next_neighbours():
+@pytest.mark.parametrize(("scan", "pick"), [("lowest", min), ("highest", max), ("own", lambda *three: three[0])])
+def test_scan_map_reads_of_a_cell_and_its_next_neighbours_what_is_asked_for(scan, pick):
     ground = random_map()
-    found = ground.scan_map()
+    found = ground.scan_map(scan)
+    assert found.dtype == np.float32
     h = ground.heights.astype(np.float32)
     rows, columns = h.shape
     for i, j in product(range(rows), range(columns)):
-        assert found[i, j] == min(h[i, j], h[min(i + 1, rows - 1), j], h[i, min(j + 1, columns - 1)])
+        assert found[i, j] == pick(h[i, j], h[min(i + 1, rows - 1), j], h[i, min(j + 1, columns - 1)])
+
+
+def test_a_single_raised_cell_is_seen_not_at_all_as_it_is_or_by_three_cells():
+    """Cell (1, 1) is 0.3 m high: it is the next one of (0, 1) in x and of (1, 0) in y."""
+    heights = np.zeros((3, 3))
+    heights[1, 1] = 0.3
+    ground = map_of(heights, steepest=0.1)
+    found = {scan: [tuple(cell) for cell in np.argwhere(ground.scan_map(scan))] for scan in ("lowest", "own", "highest")}
+    assert found == {"lowest": [], "own": [(1, 1)], "highest": [(0, 1), (1, 0), (1, 1)]}
+
+
+def test_the_edge_of_a_step_moves_by_at_most_one_cell():
+    """Three cells low, three high, along x: `lowest` sees a step down one cell early, `highest` a step up."""
+    up = map_of([[0.0]] * 3 + [[0.2]] * 3, steepest=0.1)
+    down = map_of([[0.2]] * 3 + [[0.0]] * 3, steepest=0.1)
+    high = {
+        scan: ((up.scan_map(scan) > 0.1).sum(), (down.scan_map(scan) > 0.1).sum()) for scan in ("lowest", "own", "highest")
+    }
+    assert high == {"lowest": (3, 2), "own": (3, 3), "highest": (4, 3)}
 
 
 # ---- layout ----------------------------------------------------------------------------------------------------------

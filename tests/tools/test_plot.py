@@ -142,6 +142,29 @@ def test_a_run_that_was_killed_while_it_logged_is_drawn(tmp_path):
     assert Image.open(tmp_path / "curve.png").size[0] > 100
 
 
+def timed(seconds):
+    """A run whose iterations took so long, a quarter of it to learn."""
+    times = {"Perf/collection_time": 0.75 * seconds, "Perf/learning_time": 0.25 * seconds}
+    return {
+        "Metrics/lin_vel_rmse": (np.arange(3), np.ones(3)),
+        **{k: (np.arange(3), np.full(3, v)) for k, v in times.items()},
+    }
+
+
+@pytest.mark.parametrize(
+    ("times", "shown"),
+    [([2.0], 2.0), ([2.0, 2.08, 1.99], 2.0), ([2.0, 2.12], None), ([2.0, 1.8], None), ([None, 2.0], 2.0), ([None], None)],
+)
+def test_runs_have_an_axis_of_time_if_they_were_equally_fast(times, shown, tmp_path, monkeypatch):
+    untimed = {"Metrics/lin_vel_rmse": (np.arange(3), np.ones(3))}
+    runs = {str(i): untimed if each is None else timed(each) for i, each in enumerate(times)}
+    assert learning_curves.common_time(runs.values()) == (None if shown is None else pytest.approx(shown))
+    axes = []
+    monkeypatch.setattr(learning_curves, "_time_axis", lambda axis, each: axes.append(each))
+    learning_curves.draw_runs(runs, tmp_path / "x.png")
+    assert axes == ([] if shown is None else [pytest.approx(shown)] * 4)
+
+
 def test_curves_are_those_of_the_kind_of_task():
     values = (np.arange(3), np.ones(3))
     other = (

@@ -6,27 +6,46 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from legged.config import LeggedConfig
+from legged.config import LeggedConfig, override
 from legged.envs import LeggedRobot
 from legged.evaluation.stress.table import PUSH_INTERVAL, Disturbance
-from legged.math import masked_set_, quat_rotate
+from legged.math import quat_rotate
+from legged.mdp.height_map_errors import HeightMapErrors, is_exact
 from legged.mdp.height_scan import HeightScan
-from legged.physics import FIELDS, Scene
+from legged.mdp.uniform_numbers import UniformNumbers
+from legged.physics import FIELDS, MODEL_FIELDS, Scene
 from legged.registry import task_class
 from legged.terrain import Terrain
 
+MOST = ("push", "map_height", "map_shift", "map_holes")
+"""Disturbances of which the configuration states the largest."""
+
 
 def declared(rows: Sequence[Disturbance]) -> list[tuple[str, Any]]:
-    """Return overrides that a task needs for these disturbances: what will be given to the physics, and pushes."""
-    pushes = max(row.push for row in rows)
-    changes: list[tuple[str, Any]] = [("domain_rand.ranges", {"friction": [1.0, 1.0], "added_base_mass": [0.0, 0.0]})]
-    if pushes > 0.0:
+    """Return overrides that a task needs for these disturbances: the fields of the configuration that they are of. What each
+    robot has of them is its row's, and is given to it once the task is built.
+    """
+    given = {"friction": True, "added_base_mass": True}
+    given |= {"motor_strength": any(row.motors != 1.0 for row in rows), "joint_offset": any(row.zero_offset for row in rows)}
+    push, offset, shift, holes = (max(getattr(row, name) for row in rows) for name in MOST)
+    changes: list[tuple[str, Any]] = [
+        ("domain_rand.ranges", {name: [FIELDS[name].neutral] * 2 for name, wanted in given.items() if wanted}),
+        ("observations.height_map", {"offset": offset, "shift": shift, "holes": holes, "drift": 0.0, "shift_drift": 0.0}),
+    ]
+    if push > 0.0:
         changes += [
             ("domain_rand.push_robots", True),
             ("domain_rand.push_interval_s", PUSH_INTERVAL),
-            ("domain_rand.max_push_vel_xy", pushes),
+            ("domain_rand.max_push_vel_xy", push),
         ]
     return changes
+
+
+def late(rows: Sequence[Disturbance], cfg: LeggedConfig) -> list[tuple[str, Any]]:
+    """Return overrides by which targets of a task can be as late as those of these robots."""
+    most = max(round(row.delay / cfg.sim.dt) for row in rows)
+    own = cfg.control.actuator.delay[1]
+    return [("control.actuator.delay", [max(most, own)] * 2), ("control.actuator.delay_varies", False)] if most else []
 
 
 def make_stressed(
@@ -34,9 +53,21 @@ def make_stressed(
 ) -> LeggedRobot:
     """Build the task of a configuration with robots of `rows`, one each (N)."""
     kind: Any = task_class(cfg.task)
-    stressed: Any = type(f"Stressed{kind.__name__}", (StressedTask, kind), {"rows": tuple(rows), "__module__": __name__})
+    own = {"rows": tuple(rows), "own_delay": cfg.control.actuator.delay, "__module__": __name__}
+    stressed: Any = type(f"Stressed{kind.__name__}", (StressedTask, kind), own)
     other_ground = {} if terrain is None else {"terrain": terrain}  # a user's constructor may not know the argument
-    return stressed(cfg, device, graph, **other_ground)
+    return stressed(override(cfg, late(rows, cfg)), device, graph, **other_ground)
+
+
+class GivenMap(HeightMapErrors):
+    """A map of heights that is wrong by what it is given, in every episode."""
+
+    given: tuple[Tensor, Tensor]
+    """As `error` and `holes`."""
+
+    def advance(self, begun: Tensor) -> None:
+        for own, given in zip((self.error, self.holes), self.given, strict=True):
+            own.copy_(given[:, : own.shape[1]])
 
 
 class StressedTask(LeggedRobot):
@@ -46,12 +77,18 @@ class StressedTask(LeggedRobot):
 
     rows: tuple[Disturbance, ...] = ()
     """One for each of the N robots."""
+    own_delay: tuple[int, int] = (0, 0)
+    """Range of the delay, in physics steps, of robots whose row says nothing of it: the task's."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        """Build the task, then give the physics frictions and masses, which nothing changes afterwards."""
+        """Build the task, then give the physics what differs from robot to robot, which nothing changes afterwards."""
         super().__init__(*args, **kwargs)
-        self.physics.randomize("friction", self._frictions())
-        self.physics.randomize("added_base_mass", self._per_robot("payload"))
+        given = {"added_base_mass": self._per_robot("payload"), "motor_strength": self._per_robot("motors")}
+        given |= {"friction": self._frictions(), "joint_offset": self.zero_offset}
+        given = {name: given[name] for name in self.cfg.domain_rand.ranges}
+        self.control.vary(given)
+        for name in given.keys() & MODEL_FIELDS:
+            self.physics.randomize(name, given[name])
         self.reset()
 
     def _per_robot(self, name: str) -> Tensor:
@@ -80,68 +117,40 @@ class StressedTask(LeggedRobot):
             """Return U(-1, 1), the same on every device."""
             return (2.0 * torch.rand(n, *shape, generator=random) - 1.0).to(device)
 
-        self._strength = self._per_robot("motors").unsqueeze(1)
         self._pushed = self._per_robot("push") > 0.0
-        late = (self._per_robot("delay") / self.dt).round().long()
-        self._sent = torch.zeros(n, int(late.max()) + 1, self.num_actions, device=device)
-        """(N, K + 1, D) the last actions of the policy, newest first."""
-        self._late = late.view(n, 1, 1).expand(n, 1, self.num_actions).contiguous()
-        self._policy_actions = torch.zeros_like(self.actions)
-        self._true_dof_pos = self.dof_pos
-        self._zero_offset = self._per_robot("zero_offset").unsqueeze(1) * draw(self.robot.num_dof)
-        self.dof_pos = self._true_dof_pos + self._zero_offset
-        """(N, D) joint angles as the encoders report them [rad]."""
+        self.zero_offset = self._per_robot("zero_offset").unsqueeze(1) * draw(self.robot.num_dof)
+        """(N, D) what encoders show beside the true angle [rad]."""
         half, axis = 0.5 * self._per_robot("tilt"), torch.pi * draw()
         level = (half.sin() * axis.cos(), half.sin() * axis.sin())
         self._mounting = torch.stack([half.cos(), *level, torch.zeros_like(half)], dim=1)
-        self._map = HeightScan(self.cfg.terrain, self.terrain, n, device, self.physics.kernels)
         direction, sign = torch.pi * draw(), torch.where(draw() < 0.0, -1.0, 1.0)
-        shift = torch.stack([direction.cos(), direction.sin(), torch.zeros_like(direction)], dim=1)
-        self._map_shift = self._per_robot("map_shift").unsqueeze(1) * shift
-        self._map_place = torch.zeros_like(self._map_shift)  # launches know it by its address
-        self._map_height = (sign * self._per_robot("map_height")).unsqueeze(1)
+        shift = self._per_robot("map_shift")
+        self._map_error = torch.stack(
+            [shift * direction.cos(), shift * direction.sin(), sign * self._per_robot("map_height")], dim=1
+        )
         points = self.measured_heights.shape[1]
-        self._unseen = 0.5 * (draw(points) + 1.0) < self._per_robot("map_holes").unsqueeze(1)
-        self.measured_heights = torch.zeros_like(self.measured_heights)
-        """(N, P) heights of the ground as the robot's map has them [m]."""
+        self._map_holes = 0.5 * (draw(points) + 1.0) < self._per_robot("map_holes").unsqueeze(1)
+        if self.control.actuator is not None and self.control.actuator.longest:
+            steps = (self._per_robot("delay") / self.cfg.sim.dt).round()
+            low, high = self.own_delay
+            own = (low + 0.5 * (draw() + 1.0) * (high + 1 - low)).floor().clamp_(max=high)
+            self.control.actuator.delay.copy_(torch.where(steps > 0.0, steps, own))
 
-    # ---- motors ------------------------------------------------------------------------------------------------------
-
-    def set_controls(self) -> None:
-        """Give the motors what the policy wanted some steps ago. What it observes of its last action is what it sent."""
-        self._sent[:, 1:].copy_(self._sent[:, :-1].clone())
-        self._sent[:, 0].copy_(self.actions)
-        self._policy_actions.copy_(self.actions)
-        self.actions.copy_(self._sent.gather(1, self._late).squeeze(1))
-        super().set_controls()
-        self.actions.copy_(self._policy_actions)
-
-    def apply_control(self) -> None:
-        """Let the law of control see what encoders report, and weaken what comes of it."""
-        self._read_encoders()
-        super().apply_control()
-        self.physics.ctrl.mul_(self._strength)
-
-    def reset_idx(self, mask: Tensor) -> None:
-        super().reset_idx(mask)
-        masked_set_(self._sent, mask, 0.0)
+    def make_height_map(self) -> HeightMapErrors | None:
+        """Return a map with the errors of the rows, and none of the task's own."""
+        cfg, n = self.cfg.observations.height_map, self.num_envs
+        if is_exact(cfg):
+            return None
+        scan = self.height_scan
+        if cfg.shift:
+            scan = HeightScan(self.cfg.terrain, self.terrain, n, torch.device(self.device), self.physics.kernels)
+        pose, numbers = (self.base_pos, self.base_quat), UniformNumbers(n, torch.device(self.device))
+        found = GivenMap(cfg, scan, pose, self.heights_seen, self.dt, numbers)
+        found.given = self._map_error, self._map_holes
+        return found
 
     def disturb(self, mask: Tensor) -> None:
         super().disturb(mask & self._pushed)
-
-    # ---- sensors -----------------------------------------------------------------------------------------------------
-
-    def _read_encoders(self) -> None:
-        torch.add(self._true_dof_pos, self._zero_offset, out=self.dof_pos)
-
-    def sense(self) -> None:
-        super().sense()
-        self._read_encoders()
-        torch.add(self.base_pos, self._map_shift, out=self._map_place)
-        self._map.update(self._map_place, self.base_quat)
-        torch.add(self._map.heights, self._map_height, out=self.measured_heights)
-        under = self.height_scan.ground.unsqueeze(1)
-        self.measured_heights.copy_(torch.where(self._unseen, under, self.measured_heights))
 
     def _obs_projected_gravity(self) -> Tensor:
         return quat_rotate(self._mounting, super()._obs_projected_gravity())

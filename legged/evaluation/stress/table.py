@@ -37,7 +37,7 @@ class Disturbance:
     map_shift: float = 0.0
     """By how much the height map is shifted to a side, in a direction of its own [m]."""
     map_holes: float = 0.0
-    """Share of the points of the height map that no sensor sees: they have the height of the ground under the base [1]."""
+    """Share of the points of the height map that no sensor sees: they read 0, as level ground does [1]."""
 
     @property
     def changes(self) -> dict[str, float]:
@@ -84,6 +84,9 @@ ALONE = (
 TOGETHER = ("payload", "friction", "weak motors", "delay 20 ms")
 """What is wrong in the line `together`: what hardware differs in by itself. The line `everything` has all but the longer
 delay."""
+
+NAMES = (NOMINAL.name, *(one.name for one in ALONE), "together", "everything")
+"""Of all lines."""
 
 
 def table(robot: Size, anymal: Size, payload: float | None = None) -> tuple[Disturbance, ...]:

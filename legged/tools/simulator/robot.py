@@ -5,12 +5,14 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
-from legged.config.schema import SimConfig
+from legged.config.schema import ActuatorConfig, SimConfig
+from legged.deploy.contract import SCANS
 from legged.deploy.interface import RobotFacts
 from legged.deploy.udp_packets import RobotState
 from legged.physics import RobotScene
 from legged.robots.robot import Robot
 from legged.terrain import Terrain
+from legged.tools.simulator.motors import Motors
 
 OFFERS = frozenset({"base_lin_vel", "heights"})
 """Sources beside the sensors: what a simulator knows and a robot would have to estimate."""
@@ -21,16 +23,26 @@ FALLEN = 1.2
 class SimulatedRobot:
     """A robot that stands in its default pose on a plane, or in the middle of the first tile of a terrain."""
 
-    def __init__(self, robot: Robot, terrain: Terrain | None, sim: SimConfig) -> None:
-        """Build the world with the solver options of `sim`; the motors ask for nothing yet."""
+    def __init__(
+        self,
+        robot: Robot,
+        terrain: Terrain | None,
+        sim: SimConfig,
+        motors: Motors | None = None,
+        scan: str = SCANS[0],
+    ) -> None:
+        """Build the world with the solver options of `sim`; the `motors`, ideal ones by default, have been asked for nothing
+        yet. `scan` says what a point of the heights reads (terrain.scan).
+        """
         self.robot, self._terrain = robot, terrain
         self.model = RobotScene(robot, terrain).model(sim)
         self.data = mujoco.MjData(self.model)
+        self._motors = Motors(robot, ActuatorConfig(), sim.dt, sim.dt) if motors is None else motors
         self._qpos, self._qvel = list(robot.qpos_columns), list(robot.qvel_columns)
         start = np.zeros(3) if terrain is None else terrain.origins[0, 0]
         self.data.qpos[:] = robot.default_qpos
         self.data.qpos[:3] = start + np.array([0.0, 0.0, robot.height])
-        self._scan = None if terrain is None else terrain.height_map.scan_map()
+        self._scan = None if terrain is None else terrain.height_map.scan_map(scan)
         mujoco.mj_forward(self.model, self.data)
         count = robot.num_dof
         self.asked = np.zeros((3, count))
@@ -55,10 +67,8 @@ class SimulatedRobot:
 
     def step(self) -> None:
         """Make one physics step, with the torques that the motors give now."""
-        targets, stiffness, damping = self.asked
         data = self.data
-        torques = stiffness * (targets - data.qpos[self._qpos]) - damping * data.qvel[self._qvel]
-        data.ctrl[:] = np.clip(torques, -self.robot.torque_limits, self.robot.torque_limits)
+        data.ctrl[:] = self._motors.torques(self.asked, data.qpos[self._qpos], data.qvel[self._qvel])
         mujoco.mj_step(self.model, data)
         self.lowest, self.highest = min(self.lowest, data.qpos[2]), max(self.highest, data.qpos[2])
         _, x, y, _ = data.qpos[3:7]

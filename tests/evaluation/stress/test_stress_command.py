@@ -15,6 +15,7 @@ from legged.evaluation.success import FELL, REACHED, STUCK, Scores
 from legged.policies.restore import policy_of
 from legged.tools import evaluate
 
+make = measuring._make
 pytestmark = pytest.mark.usefixtures("workplace")
 FLAGS = ["--physics", "mujoco", "--stress", "sim.threads=1"]
 LINES = 1 + len(ALONE) + 2
@@ -69,6 +70,26 @@ def test_the_stress_test_writes_a_table_and_a_picture(trained, short, tmp_path, 
         "0.12 x 0.28 m",
     ):
         assert words in out
+
+
+def test_some_lines_are_measured_alone_at_solver_settings_of_one_s_own(trained, short, tmp_path, capsys, monkeypatch):
+    """Both the lines and, with --full, the other solvers; those are others than the one that was asked for."""
+    steps = []
+    monkeypatch.setattr(measuring, "_make", lambda *given: steps.append(given[1].sim.dt) or make(*given))
+    arguments = ["--task", "anymal_c", "--load_run", str(trained), "--robots-per-point", "2", "--lines", "nominal, together"]
+    own = ["sim.dt=0.004", "control.decimation=5", "sim.cone=elliptic"]
+    assert call(evaluate.main, [*arguments, *FLAGS, *own, "--out", str(tmp_path / "a")]) == 0
+    result = json.loads((tmp_path / "a" / "stress_mujoco.json").read_text())
+    assert [line["name"] for line in result["lines"]] == ["nominal", "together"]
+    assert (result["ground"], result["settings"], result["score"]) == ({}, {}, None)
+    assert result["changes"] == {"sim.threads": 1, "sim.dt": 0.004, "control.decimation": 5, "sim.cone": "elliptic"}
+    assert "stairs of 0.17 x 0.28 m" in capsys.readouterr().out
+    assert steps == [0.004] * 2
+    steps.clear()
+    assert call(evaluate.main, [*arguments, *FLAGS, *own, "--full", "--out", str(tmp_path / "b")]) == 0
+    result = json.loads((tmp_path / "b" / "stress_mujoco.json").read_text())
+    assert list(result["settings"]) == ["half the time step", "elliptic cones", "impratio 100"]
+    assert steps == [0.004] * 2 + [0.002] * 2 + [0.004] * 4
 
 
 def test_a_policy_of_a_plane_is_stressed_on_the_flat_only(short, tmp_path):
@@ -138,6 +159,8 @@ def test_robots_take_turns_at_commands_within_the_tasks_grid(trained, monkeypatc
         (["--stress", "--tread", "0"], ["--tread: must be between 0.05 and 2 m, got 0"]),
         (["--stress", "--riser", "nan"], ["--riser: must be between 0 and 1 m, got nan"]),
         (["--stress", "--payload", "-1"], ["--payload: must be between 0 and 1000 kg, got -1"]),
+        (["--stress", "--lines", "nominal,paylaod"], ["--lines: there is no line 'paylaod'; did you mean 'payload'?"]),
+        (["--lines", "nominal"], ["--lines", "is of --stress; add it"]),
         (["--riser", "0.1"], ["--riser", "is of --stress; add it"]),
         (["--stress", "--robots-per-point", "0"], ["--robots-per-point", "at least 1, got 0"]),
     ],

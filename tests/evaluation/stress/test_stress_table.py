@@ -2,14 +2,20 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from helpers import small_config
 
+from legged.config import override
 from legged.evaluation.intervals import mean_of_shares, wilson
-from legged.evaluation.stress.measuring import followed, score, settings
+from legged.evaluation.stress.measuring import STAIRS, followed, score, settings
 from legged.evaluation.stress.table import ALONE, NOMINAL, Disturbance, combined, scaled, table
+from legged.evaluation.success import to_run_out
+from legged.evaluation.tiles import dividing_cell, tiles_apart
+from legged.registry import task_config
 from legged.robots.similarity import Size
+from legged.terrain import TileSpec
 
 ANYMAL = Size(50.0, 0.5)
 
@@ -45,6 +51,23 @@ def test_lines_say_what_they_are_in_physical_units():
     ]
     both = combined("both", [Disturbance("a", push=1.0), Disturbance("b", zero_offset=0.05)])
     assert both.text == "velocity set to up to 1 m/s every 5 s, encoders up to 0.05 rad off"
+
+
+@pytest.mark.parametrize(("task", "riser"), [("anymal_c", 0.17), ("go2", 0.12)])
+def test_stairs_have_the_risers_and_treads_that_are_asked_for(task, riser):
+    """Along the middle line of the tiles up and down, in cells that divide 0.28 m."""
+    cfg = task_config(task, [], on_cpu=True)
+    cell = dividing_cell(0.28, cfg.terrain.horizontal_scale)
+    cfg = override(cfg, [*to_run_out(cfg, 2), ("terrain.horizontal_scale", cell)])
+    ground = tiles_apart([TileSpec(name, riser, 0.28) for name in STAIRS], cfg.terrain, 1).height_map
+    rises = np.diff(ground.heights[:, ground.heights.shape[1] // 2])
+    steps = np.flatnonzero(np.abs(rises) > 0.01)
+    assert len(steps) >= 24  # two flights on each of two tiles
+    np.testing.assert_allclose(np.abs(rises[steps]), riser)
+    between = np.diff(steps) * ground.cell
+    treads = between[between < 1.0]
+    assert len(treads) >= 20
+    np.testing.assert_allclose(treads, 0.28)
 
 
 def test_solvers_that_are_tried():

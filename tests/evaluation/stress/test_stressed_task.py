@@ -70,13 +70,16 @@ def test_friction_is_that_of_all_shapes():
 
 
 def test_weak_motors_give_their_share_of_every_torque_and_of_the_limit():
+    """What is asked of them stays, and so does its limit; what the engine makes of it is 0.85 of it."""
     task = with_nominal(motors=0.85)
-    mild, hard = (torques(task, torch.full((2, JOINTS), value)) for value in (0.1, 50.0))
-    assert (mild[0] != 0.0).all()
-    assert torch.allclose(mild[1], 0.85 * mild[0])
-    limits = torch.tensor(task.robot.torque_limits, dtype=torch.float32)
-    assert torch.allclose(hard[0].abs(), limits)
-    assert torch.allclose(hard[1].abs(), 0.85 * limits)
+    for value in (0.1, 50.0):
+        asked = torques(task, torch.full((2, JOINTS), value))
+        assert torch.equal(asked[0], asked[1])
+        assert (asked[0] != 0.0).all()
+    assert torch.allclose(asked[0].abs(), torch.tensor(task.robot.torque_limits, dtype=torch.float32))
+    gains = task.physics.batch.expand("actuator_gainprm")[:, :, 0]
+    assert gains[1] == pytest.approx(0.85 * gains[0])
+    assert gains[0] == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(("seconds", "steps"), [(0.02, 1), (0.04, 2)])
@@ -98,8 +101,8 @@ def test_a_delay_lets_targets_arrive_a_control_step_later_or_two(seconds, steps)
 def test_zero_offsets_shift_what_is_held_and_what_is_observed():
     """The motor pulls by stiffness times offset away, until the joint is that much off."""
     task = with_nominal(zero_offset=0.05)
-    offset = task._zero_offset[1]
-    assert (task._zero_offset[0] == 0.0).all()
+    offset = task.zero_offset[1]
+    assert (task.zero_offset[0] == 0.0).all()
     assert 0.02 < float(offset.abs().max()) <= 0.05
     assert len(set(offset.tolist())) == JOINTS  # each joint has its own
     held = torques(task, zero_actions(task))
@@ -144,7 +147,8 @@ def test_only_those_are_pushed_who_should_be(monkeypatch):
 
 def on_steps(*rows):
     """Robots at the bottom of stairs, which their maps show once they are near."""
-    cfg = task_config("anymal_c", [("env.num_envs", len(rows)), *ENGINE, *CALM, *AT_REST], on_cpu=True)
+    exact = [("observations.add_noise", True), ("observations.noise_level", 0.0)]
+    cfg = task_config("anymal_c", [("env.num_envs", len(rows)), *ENGINE, *CALM, *AT_REST, *exact], on_cpu=True)
     cfg = override(cfg, [*on_terrain(cfg, 8.0, 0.0), *declared(rows)])
     terrain = Terrain.of_tiles([[TileSpec("stairs_up", 0.2, tread=0.3)]], cfg.terrain, None)
     return make_stressed(cfg, rows, torch.device("cpu"), False, terrain)
@@ -158,10 +162,21 @@ def move(task, by):
     task.sense()
 
 
+def seen(task):
+    """Heights of the ground as the robots' maps have them (N, P) [m]; on these stairs no limit cuts them."""
+    found = task.observation_terms.sensors._map
+    found.advance(torch.zeros(task.num_envs, dtype=torch.bool))
+    observed = found.read()
+    found.cut_holes(observed)
+    return task.base_pos[:, 2:] - task.cfg.observations.heights_offset - observed
+
+
 def test_the_map_is_too_high_or_too_low_by_its_offset():
     task = on_steps(NOMINAL, *[Disturbance("one", map_height=0.05)] * 8)
     move(task, torch.tensor([1.3, 0.0]))
-    error = task.measured_heights[1:] - task.measured_heights[0]
+    heights = seen(task)
+    assert torch.allclose(heights[0], task.measured_heights[0], atol=1e-6)
+    error = heights[1:] - heights[0]
     assert torch.allclose(error.abs(), torch.full_like(error, 0.05), atol=1e-6)
     assert (error.std(dim=1) < 1e-6).all()
     assert {round(float(one), 3) for one in error[:, 0]} == {-0.05, 0.05}  # either way
@@ -169,31 +184,43 @@ def test_the_map_is_too_high_or_too_low_by_its_offset():
 
 def test_a_map_shifted_by_10_cm_shows_what_a_robot_sees_that_far_away():
     task = on_steps(NOMINAL, Disturbance("one", map_shift=0.1))
-    shift = task._map_shift[1, :2]
+    shift = task._map_error[1, :2]
     assert float(shift.norm()) == pytest.approx(0.1)
-    start = torch.tensor([1.3, 0.2])
-    move(task, start)
-    shifted = task.measured_heights[1].clone()
-    assert not torch.equal(task.measured_heights[0], shifted)
+    move(task, torch.tensor([1.35, 1.25]))
+    heights = seen(task)
+    assert not torch.equal(heights[0], heights[1])
     assert torch.equal(task.height_scan.heights[0], task.height_scan.heights[1])  # where both stand is the same
-    move(task, shift)
-    assert torch.equal(task.measured_heights[0], shifted)
+    move(task, -shift)  # the map has at a place what the ground has where the map should have been
+    assert torch.equal(seen(task)[0], heights[1])
 
 
-def test_holes_in_the_map_have_the_height_below_the_base():
+def test_holes_in_the_map_are_seen_as_level_ground():
     task = on_steps(NOMINAL, *[Disturbance("one", map_holes=0.2)] * 8)
     move(task, torch.tensor([1.3, 0.0]))
-    ground = float(task.height_scan.ground[0])
-    holes = task._unseen[1:]
-    assert not task._unseen[0].any()
+    heights, level = seen(task), task.base_pos[:, 2:] - task.cfg.observations.heights_offset
+    holes = task._map_holes[1:]
+    assert not task._map_holes[0].any()
     assert float(holes.float().mean()) == pytest.approx(0.2, abs=0.04)  # of 1496 points
-    whole = task.measured_heights[0].expand(8, -1)
-    assert (task.measured_heights[1:][holes] == ground).all()
-    assert torch.equal(task.measured_heights[1:][~holes], whole[~holes])
-    assert len(task.measured_heights[0].unique()) > 2  # there was something to see
+    assert (heights[1:][holes] == level[1:].expand(8, 187)[holes]).all()
+    assert torch.equal(heights[1:][~holes], heights[0].expand(8, -1)[~holes])
+    assert len(heights[0].unique()) > 2  # there was something to see
+
+
+def test_delays_of_the_task_stay_where_a_row_says_nothing():
+    """Each robot keeps one of 1 to 3 physics steps; that of 20 ms has four, and eight of half the length."""
+    rows = [NOMINAL] * 30 + [Disturbance("one", delay=0.02)]
+    own = ("control.actuator.delay", [1, 3])
+    task = stressed(*rows, changes=[own])
+    assert set(task.control.actuator.delay[:30].tolist()) == {1, 2, 3}
+    assert int(task.control.actuator.delay[30]) == 4
+    before = task.control.actuator.delay.clone()
+    task.reset()
+    assert torch.equal(task.control.actuator.delay, before)
+    halved = stressed(*rows, changes=[own, ("sim.dt", 0.0025), ("control.decimation", 8)])
+    assert int(halved.control.actuator.delay[30]) == 8
 
 
 def test_disturbances_are_the_same_every_time():
     first, second = (with_nominal(zero_offset=0.05) for _ in range(2))
-    assert torch.equal(first._zero_offset, second._zero_offset)
+    assert torch.equal(first.zero_offset, second.zero_offset)
     assert first.cfg.task == TASK
