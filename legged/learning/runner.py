@@ -304,9 +304,9 @@ class Runner(OnPolicyRunner):
             begin_std(self.alg.get_policy(), self.env.cfg)
         if settings.schedule == "fixed":
             self.alg.learning_rate = settings.learning_rate
-        for group in self.alg.optimizer.param_groups:
-            if not isinstance(group["lr"], Tensor):
-                group["lr"] = self.alg.learning_rate
+        first = self.alg.optimizer.param_groups[0]  # an estimator's, which comes after it, has a rate of its own
+        if not isinstance(first["lr"], Tensor):
+            first["lr"] = self.alg.learning_rate
         task = saved["infos"].get("task", "")
         self._transferred_from = {"file": relative(Path(path)), "task": task, "iteration": saved["iter"]}
         return tell_taken(Path(path), saved, self.alg.get_policy(), self.env.cfg, self.alg.learning_rate)

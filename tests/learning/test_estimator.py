@@ -245,6 +245,17 @@ def test_it_is_evaluated_in_the_unit_of_the_term():
 # ---- files -----------------------------------------------------------------------------------------------------------
 
 
+def test_a_transferred_estimator_learns_at_the_rate_of_the_configuration(tmp_path):
+    """PPO's rate goes on where it was; the estimator's is not PPO's."""
+    first = CapturedRunner(small_task(*SMALL, num_envs=2))
+    first.alg.learning_rate = 3e-4
+    first.save(str(tmp_path / "model_0.pt"))
+    runner = CapturedRunner(small_task(*SMALL, ("train.policy.estimator.learning_rate", 4e-3), num_envs=2))
+    runner.transfer(str(tmp_path / "model_0.pt"))
+    assert runner.alg.learning_rate == pytest.approx(3e-4)
+    assert runner.alg.optimizer.param_groups[1]["lr"] == 4e-3
+
+
 def test_the_exported_file_holds_the_estimator_and_says_what_it_estimates(tmp_path):
     """The estimate inside the ONNX file is torch's, of observations that are normalised."""
     normalised = ("train.policy.obs_normalization", True)
