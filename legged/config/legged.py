@@ -28,7 +28,7 @@ from legged.config.mdp import (
     RewardsConfig,
     TerminationsConfig,
 )
-from legged.config.randomization import ForceConfig, KickConfig
+from legged.config.randomization import DrawConfig, ForceConfig, KickConfig
 from legged.config.sensors import HeightMapConfig
 from legged.config.task import TaskConfig
 
@@ -208,8 +208,15 @@ class LeggedDomainRandConfig(DomainRandConfig):
     training."""
 
     def nominal(self) -> Self:
-        observed = {**self.observed_forces, **self.forces}
-        return replace(super().nominal(), kicks={}, forces={}, observed_forces=observed)
+        plain = super().nominal()
+        by_flag: dict[str, Range | DrawConfig] = {}  # who measures switches these two off by their flags
+        if self.randomize_friction:
+            by_flag["friction"] = self.friction_range
+        if self.randomize_base_mass:
+            by_flag["added_base_mass"] = self.added_mass_range
+        ranges = {**by_flag, **plain.observed_ranges}
+        forces = {**self.observed_forces, **self.forces}
+        return replace(plain, kicks={}, forces={}, observed_ranges=ranges, observed_forces=forces)
 
 
 @dataclass(frozen=True)

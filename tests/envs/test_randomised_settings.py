@@ -7,6 +7,7 @@ import torch
 from helpers import small_config, small_task
 
 from legged.errors import ConfigError
+from legged.policies.restore import nominal, undisturbed
 from legged.registry import make_task
 
 FORCES = {
@@ -56,6 +57,20 @@ def test_a_nominal_robot_is_observed_by_the_ranges_of_training():
     torch.testing.assert_close(task._obs_rand_joint_offset(), torch.full((4, 12), -0.5))
     assert task._obs_push_force().shape == (4, 6)
     assert not task._obs_push_force().any()
+
+
+def test_friction_and_mass_that_a_flag_draws_are_observed_by_their_ranges_where_nothing_is_drawn():
+    """Who measures switches the flags off: friction 1 is the middle of 0.5 to 1.5, no mass a quarter of -1 to 3 kg."""
+    cfg = small_config(
+        ("domain_rand.randomize_friction", True),
+        ("domain_rand.friction_range", [0.5, 1.5]),
+        ("domain_rand.randomize_base_mass", True),
+        ("domain_rand.added_mass_range", [-1.0, 3.0]),
+        observing("rand_friction", "rand_added_base_mass"),
+    )
+    task = make_task(nominal(cfg, undisturbed(2, 1.0)))
+    assert task._obs_rand_friction().flatten().tolist() == [0.0] * 2
+    assert task._obs_rand_added_base_mass().flatten().tolist() == [-0.5] * 2
 
 
 def test_forces_are_observed_as_shares_of_the_largest():
