@@ -12,9 +12,10 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.config import LeggedConfig, override
+from legged.errors import ConfigError
 from legged.evaluation.intervals import mean_of_shares, wilson
 from legged.evaluation.overflows import Overflows
-from legged.evaluation.stress.stressed_task import StressedTask, declared, make_stressed
+from legged.evaluation.stress.stressed_task import GIVEN, StressedTask, declared, make_stressed
 from legged.evaluation.stress.table import NOMINAL, WRITTEN_FOR, Disturbance, table
 from legged.evaluation.success import point, run_out, to_run_out
 from legged.evaluation.tiles import dividing_cell, tiles_apart
@@ -68,7 +69,9 @@ class Setting:
 
 def settings(cfg: LeggedConfig, engine: str) -> list[Setting]:
     """Return the settings of the solver that are tried beside the task's own: those that the engine knows."""
-    halved = (("sim.dt", 0.5 * cfg.sim.dt), ("control.decimation", 2 * cfg.control.decimation))
+    halved: tuple[tuple[str, Any], ...] = (("sim.dt", 0.5 * cfg.sim.dt), ("control.decimation", 2 * cfg.control.decimation))
+    if cfg.control.actuator.delay[1]:  # is counted in physics steps
+        halved = (*halved, ("control.actuator.delay", [2 * steps for steps in cfg.control.actuator.delay]))
     found = [Setting("half the time step", halved)]
     if engine in ("mujoco", "mujoco_warp", "newton_mujoco"):
         found += [
@@ -76,6 +79,20 @@ def settings(cfg: LeggedConfig, engine: str) -> list[Setting]:
             Setting("impratio 100", (("sim.impratio", 100.0), ("sim.iterations", max(50, cfg.sim.iterations)))),
         ]
     return found
+
+
+def check_asked(changes: Sequence[tuple[str, Any]]) -> None:
+    """Look whether the command line draws a property that robots have by their line of the table.
+
+    Raises:
+        ConfigError: it does.
+    """
+    ranges = "domain_rand.ranges"
+    for key, value in changes:
+        names = value if key == ranges and isinstance(value, dict) else (key.removeprefix(f"{ranges}.").split(".")[0],)
+        for name in names if key.startswith(ranges) else ():
+            if name in GIVEN:
+                raise ConfigError(f"command line: {ranges}.{name}: --stress gives each of its lines its own; leave it out")
 
 
 class Bench:
@@ -93,8 +110,9 @@ class Bench:
         """Take `robots` for each line of the table; `asked` is what the command line changes of the configuration.
 
         Raises:
-            ConfigError: the robot cannot be loaded.
+            ConfigError: the robot cannot be loaded, or what is `asked` draws what the table gives.
         """
+        check_asked(asked)
         assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
         self.cfg: LeggedConfig = policy.cfg
         rows = table(size_of(policy.cfg.robot), size_of(WRITTEN_FOR), wish.payload)

@@ -17,6 +17,8 @@ from legged.physics import FIELDS, MODEL_FIELDS, Scene
 from legged.registry import task_class
 from legged.terrain import Terrain
 
+GIVEN = ("friction", "added_base_mass", "motor_strength", "joint_offset")
+"""Properties (domain_rand.ranges) that a robot has by its row."""
 MOST = ("push", "map_height", "map_shift", "map_holes")
 """Disturbances of which the configuration states the largest."""
 
@@ -85,7 +87,7 @@ class StressedTask(LeggedRobot):
         super().__init__(*args, **kwargs)
         given = {"added_base_mass": self._per_robot("payload"), "motor_strength": self._per_robot("motors")}
         given |= {"friction": self._frictions(), "joint_offset": self.zero_offset}
-        given = {name: given[name] for name in self.cfg.domain_rand.ranges}
+        given = {name: values for name, values in given.items() if name in self.cfg.domain_rand.ranges}
         self.control.vary(given)
         for name in given.keys() & MODEL_FIELDS:
             self.physics.randomize(name, given[name])

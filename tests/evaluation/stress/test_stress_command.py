@@ -162,6 +162,11 @@ def test_robots_take_turns_at_commands_within_the_tasks_grid(trained, monkeypatc
         (["--stress", "--lines", "nominal,paylaod"], ["--lines: there is no line 'paylaod'; did you mean 'payload'?"]),
         (["--lines", "nominal"], ["--lines", "is of --stress; add it"]),
         (["--riser", "0.1"], ["--riser", "is of --stress; add it"]),
+        (
+            ["--stress", "domain_rand.ranges.friction=[0.5,0.6]"],
+            ["domain_rand.ranges.friction: --stress gives", "leave it out"],
+        ),
+        (["--stress", "domain_rand.ranges={joint_offset: [0,0.1]}"], ["domain_rand.ranges.joint_offset: --stress gives"]),
         (["--stress", "--robots-per-point", "0"], ["--robots-per-point", "at least 1, got 0"]),
     ],
 )

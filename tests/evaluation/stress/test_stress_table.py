@@ -74,6 +74,9 @@ def test_solvers_that_are_tried():
     cfg = small_config()
     found = {one.name: dict(one.changes) for one in settings(cfg, "mujoco")}
     assert found["half the time step"] == {"sim.dt": 0.0025, "control.decimation": 8}
+    late = override(cfg, [("control.actuator.delay", [1, 6])])
+    halved = dict(settings(late, "mujoco")[0].changes)
+    assert halved["control.actuator.delay"] == [2, 12]  # counted in physics steps, which are half as long
     assert found["elliptic cones"] == {"sim.cone": "elliptic"}
     assert found["impratio 100"] == {"sim.impratio": 100.0, "sim.iterations": 50}
     assert [one.name for one in settings(cfg, "newton_xpbd")] == ["half the time step"]

@@ -10,6 +10,7 @@ from legged.config import override
 from legged.evaluation.stress.stressed_task import declared, make_stressed
 from legged.evaluation.stress.table import NOMINAL, PUSH_INTERVAL, Disturbance
 from legged.evaluation.tiles import on_terrain
+from legged.mdp.control import control_gains
 from legged.physics import FIELDS, RobotScene
 from legged.registry import task_config
 from legged.terrain import Terrain, TileSpec
@@ -218,6 +219,16 @@ def test_delays_of_the_task_stay_where_a_row_says_nothing():
     assert torch.equal(task.control.actuator.delay, before)
     halved = stressed(*rows, changes=[own, ("sim.dt", 0.0025), ("control.decimation", 8)])
     assert int(halved.control.actuator.delay[30]) == 8
+
+
+def test_what_else_is_drawn_differs_from_robot_to_robot_beside_the_rows():
+    """The user asks for it after what the rows need."""
+    rows = [NOMINAL, Disturbance("one", payload=4.0)]
+    cfg = override(small_config(num_envs=2), [*declared(rows), ("domain_rand.ranges.p_gain", [0.5, 0.6])])
+    task = make_stressed(cfg, rows, torch.device("cpu"), False, None)
+    share = task.control.stiffness / torch.tensor(control_gains(task.robot, cfg.control)[0])
+    assert bool(((share >= 0.5) & (share <= 0.6)).all())
+    assert share[0, 0] != share[1, 0]
 
 
 def test_disturbances_are_the_same_every_time():
