@@ -153,7 +153,7 @@ def check_weights(state: dict[str, Any], where: str) -> None:
 
 def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str, waiting: int = 0) -> dict[str, Any]:
     """Return the state of an optimiser from a checkpoint, with the moments checked and everything but the learning rate
-    as it is set up here. The first `waiting` parameters may have no moments yet.
+    as it is set up here. The first `waiting` parameters may have no moments yet, if none of them has any.
 
     Raises:
         ConfigError: it is not that of an optimiser of these parameters; begins with `where`.
@@ -170,7 +170,8 @@ def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str, wait
             shape = () if name == "step" else parameters[i].shape
             if tensor.shape != shape or not bool(torch.isfinite(tensor).all()):
                 raise ConfigError(f"{where} is damaged ({name} of parameter {i})")
-    names = [{*state.get(i, {})} for i in range(len(parameters)) if i in state or i >= waiting]
+    waiting = waiting if state.keys().isdisjoint(range(waiting)) else 0
+    names = [{*state.get(i, {})} for i in range(waiting, len(parameters))]
     if any(each != names[0] for each in names):
         raise ConfigError(f"{where} is damaged (the moments of some parameters are missing)")
     return {"state": state, "param_groups": [{**group, "lr": rate} for group, rate in zip(groups, rates, strict=True)]}

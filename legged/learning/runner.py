@@ -277,8 +277,7 @@ class Runner(OnPolicyRunner):
         parts = {"optimizer": "optimizer_state_dict" in saved, **parts}
         if parts["optimizer"]:
             wanted, where = saved["optimizer_state_dict"], f"{relative(path)}: its optimiser"
-            warmup = self.env.cfg.train.algorithm.critic_warmup_iterations
-            waiting = len([*self.alg.get_policy().parameters()]) if saved["iter"] < warmup else 0
+            waiting = len([*self.alg.get_policy().parameters()])  # of the policy, while a value function learned alone
             saved["optimizer_state_dict"] = fit_optimizer(wanted, self.alg.optimizer, where, waiting)
         try:
             self.alg.load(saved, parts, strict)

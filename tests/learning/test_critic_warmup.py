@@ -79,6 +79,13 @@ def test_training_warms_up_and_is_resumed_in_the_middle_bit_by_bit(loop):
 
 
 @pytest.mark.parametrize("loop", ["stock", "captured"])
+def test_a_resumed_training_may_end_its_warmup(loop):
+    run = tiny_run("--runner", loop, "train.algorithm.critic_warmup_iterations=9", iterations=1)
+    rest = tiny_run("--resume", "--load_run", str(run), "train.algorithm.critic_warmup_iterations=0", iterations=2)
+    assert not same(content(rest, 1)["actor_state_dict"], content(run, 0)["actor_state_dict"])
+
+
+@pytest.mark.parametrize("loop", ["stock", "captured"])
 def test_a_transfer_with_warmup_takes_the_policy_alone(loop, capsys):
     """Of a file with other hidden layers in its critic, or with none at all, with the standard deviation of a new policy."""
     source = tiny_run("train.policy.critic_hidden_dims=[6]", "train.algorithm.max_grad_norm=0.5")
