@@ -38,8 +38,8 @@ class PrivilegedTerms:
         found = []
         for name, cfg in observed_forces(self.cfg).items():
             acting = self.disturbances.forces.get(name)
-            largest = max(abs(end) for axis in (cfg.x, cfg.y, cfg.z) for end in axis)
-            found.append(torch.zeros(self.num_envs, 3, device=self.device) if acting is None else acting.force / largest)
+            nothing = torch.zeros(self.num_envs, 3, device=self.device)
+            found.append(nothing if acting is None else acting.force / largest_of(cfg))
         return torch.cat(found, dim=1)
 
 
@@ -60,6 +60,11 @@ MIRROR_KINDS["push_force"] = "vectors"
 def observed_forces(cfg: LeggedConfig) -> dict[str, ForceConfig]:
     """Return the forces that are observed, whether they act or not."""
     return {**cfg.domain_rand.observed_forces, **cfg.domain_rand.forces}
+
+
+def largest_of(force: ForceConfig) -> float:
+    """Return the force of which an observed one is a share [N]."""
+    return max(abs(end) for axis in (force.x, force.y, force.z) for end in axis)
 
 
 def observed(cfg: Any, name: str) -> DrawConfig | None:

@@ -10,6 +10,8 @@ from torch import Tensor
 from legged.config import LeggedConfig, TaskConfig
 from legged.config.networks import groups_of
 from legged.config.schema import ObservationGroupConfig, PolicyConfig
+from legged.envs.privileged_terms import PREFIX as DRAWN
+from legged.envs.privileged_terms import largest_of, observed, observed_forces
 from legged.errors import ConfigError, suggest
 from legged.learning.checkpoint import (
     Saved,
@@ -78,7 +80,7 @@ def find_teacher(cfg: TaskConfig) -> Teacher:
     read = groups_of(there, "actor")
     groups = {PREFIX + group: replace(there.observations.groups[group], noise=False) for group in read}
     terms = dict.fromkeys(term for group in groups.values() for term in group.terms)
-    missing = [term for term in terms if not hasattr(task_class(cfg.task), f"_obs_{term}") and not term.startswith("rand_")]
+    missing = [term for term in terms if not hasattr(task_class(cfg.task), f"_obs_{term}") and not term.startswith(DRAWN)]
     if missing:
         known = suggest(missing[0], task_class(cfg.task).terms("_obs_"), "observations")
         unknown = ", ".join(f"'{term}'" for term in missing)
@@ -103,12 +105,32 @@ def differences(here: TaskConfig, there: TaskConfig, terms: Iterable[str]) -> li
     pairs["observations.clip"] = (here.observations.clip, there.observations.clip)
     for term in terms:
         pairs[f"observations.scales.{term}"] = (scale_of(here, term), scale_of(there, term))
+        drawn = term.removeprefix(DRAWN)
+        if drawn != term:
+            pairs[f"domain_rand.observed_ranges.{drawn}"] = (_observed_as(here, drawn), _observed_as(there, drawn))
+    if "push_force" in terms:
+        pairs["domain_rand.forces"] = (_largest_forces(here), _largest_forces(there))
     if "heights" in terms and isinstance(here, LeggedConfig) and isinstance(there, LeggedConfig):
-        for name in ("measured_points_x", "measured_points_y"):
+        for name in ("measured_points_x", "measured_points_y", "scan"):
             pairs[f"terrain.{name}"] = (getattr(here.terrain, name), getattr(there.terrain, name))
         for name in ("heights_offset", "heights_limit"):
             pairs[f"observations.{name}"] = (getattr(here.observations, name), getattr(there.observations, name))
     return [f"{name} {_shown(theirs)} there, {_shown(ours)} here" for name, (ours, theirs) in pairs.items() if ours != theirs]
+
+
+def _observed_as(cfg: TaskConfig, name: str) -> str:
+    """Return in words the range of which an observed property is a share."""
+    draw = observed(cfg, name)
+    if draw is None:
+        return "not drawn"
+    low, high = draw.range
+    return f"[{low:g}, {high:g}]" + (" log_uniform" if draw.distribution == "log_uniform" else "")
+
+
+def _largest_forces(cfg: TaskConfig) -> str:
+    """Return in words the forces of which observed ones are shares."""
+    forces = observed_forces(cfg) if isinstance(cfg, LeggedConfig) else {}
+    return ", ".join(f"{name} up to {largest_of(force):g} N" for name, force in forces.items()) or "none"
 
 
 def _shown(value: Any) -> str:

@@ -220,6 +220,30 @@ def test_a_teacher_needs_the_same_points_of_the_ground(capsys):
     assert "terrain.measured_points_x 17 from -0.8 to 0.8 there, (0.0, 0.5) here" in line
 
 
+def test_a_teacher_needs_the_same_reading_of_the_ground(capsys):
+    flags = ["--task", "anymal_c_student", "--teacher", "anymal_c", *TINY_TRAINING, "--sim_device", "cpu"]
+    assert call(train.main, [*flags, "train.distillation.gradient_length=2", "terrain.scan=highest"]) == 2
+    assert "terrain.scan lowest there, highest here" in capsys.readouterr().err
+
+
+def test_what_a_teacher_knows_of_the_randomisation_must_be_on_its_scale(capsys):
+    """A property is observed as a share of its range, a force as one of the largest."""
+    privileged = "observations.groups.actor.terms=[base_lin_vel,commands,dof_pos,dof_vel,actions,rand_friction,push_force]"
+    symmetry = "train.algorithm.symmetry=false"
+    mild = ["domain_rand.ranges.friction=[0.5,1.5]", "domain_rand.forces.pull={x: [-20,20]}"]
+    teacher = str(tiny_run("--task", TASK, privileged, symmetry, *mild, iterations=1))
+    strong = ["domain_rand.ranges.friction=[0.1,1.5]", "domain_rand.forces.pull={x: [-20,50]}"]
+    flags = [*STUDENT, "--teacher", teacher, *TINY_TRAINING, "--sim_device", "cpu"]
+    assert call(train.main, [*flags, *strong]) == 2
+    error = capsys.readouterr().err
+    assert "domain_rand.observed_ranges.friction [0.5, 1.5] there, [0.1, 1.5] here" in error
+    assert "domain_rand.forces pull up to 20 N there, pull up to 50 N here" in error
+    assert call(train.main, [*flags, *mild[1:], "domain_rand.randomize_friction=false"]) == 2
+    assert "domain_rand.observed_ranges.friction [0.5, 1.5] there, not drawn here" in capsys.readouterr().err
+    shown = "domain_rand.observed_ranges.friction=[0.5,1.5]"
+    assert student(strong[0], shown, *mild[1:], teacher=teacher, iterations=1).is_dir()
+
+
 def test_a_policy_with_an_estimator_is_no_teacher(capsys):
     folder = tiny_run("--task", TASK, "train.policy.estimator.targets=[base_lin_vel]", iterations=1)
     assert call(train.main, [*STUDENT, "--teacher", str(folder), *TINY_TRAINING, "--sim_device", "cpu"]) == 2
