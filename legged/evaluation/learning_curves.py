@@ -96,7 +96,9 @@ def _at(config: Any, *keys: str) -> Any:
 
 
 def smooth(values: np.ndarray, width: int = 9) -> np.ndarray:
-    """Return the running mean over `width` values, shorter at the ends."""
+    """Return the running mean over `width` values, shorter at the ends; of no values, none."""
+    if not len(values):
+        return values
     width = min(width, len(values))
     kernel = np.ones(width)
     return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")

@@ -69,7 +69,7 @@ def find_teacher(cfg: TaskConfig) -> Teacher:
     """
     name, where = cfg.train.distillation.teacher, cfg.origins.where(FIELD)
     if not name:
-        raise ConfigError(f"{where}: '{cfg.task}' learns from a teacher, and none is named; --teacher RUN does")
+        raise ConfigError(f"--teacher: '{cfg.task}' learns from a teacher, and none is named; --teacher RUN does")
     file = Path(name) if name.endswith(".pt") and exists(Path(name)) else None
     path = file or find_checkpoint(find_run_of_any_task(cfg, name, where), None)
     there, saved = run_config(path.parent), read_checkpoint(path)

@@ -142,6 +142,15 @@ def test_a_run_that_was_killed_while_it_logged_is_drawn(tmp_path):
     assert Image.open(tmp_path / "curve.png").size[0] > 100
 
 
+def test_a_run_in_which_no_episode_ended_on_some_type_is_drawn(tmp_path):
+    """Such a run is short: it has levels, and no share of episodes yet after which robots moved."""
+    iterations = np.arange(2), np.ones(2)
+    runs = {"short": {f"Terrain/level_{name}": iterations for name in ("pit", "gap")}}
+    runs["short"] |= {"Terrain/promoted_pit": iterations, "Terrain/demoted_pit": iterations}
+    learning_curves.draw_runs(runs, tmp_path / "curve.png")
+    assert Image.open(tmp_path / "curve.png").size[0] > 100
+
+
 def timed(seconds):
     """A run whose iterations took so long, a quarter of it to learn."""
     times = {"Perf/collection_time": 0.75 * seconds, "Perf/learning_time": 0.25 * seconds}
