@@ -38,7 +38,7 @@ learn = Runner.train
 def spy(runner, until):
     start = runner.alg.get_policy().state_dict()["mlp.0.weight"].clone()
     finished = learn(runner, until)
-    states = {"actor": runner.alg.actor.state_dict(), "critic": runner.alg.critic.state_dict()}
+    states = {name: network.state_dict() for name, network in runner._networks().items()}
     extra = {"start": start, "friction": runner.env.randomization.friction, "rate": runner.alg.learning_rate}
     torch.save({**states, **extra}, f"rank{Ranks.now().rank}.pt")
     return finished
@@ -122,6 +122,31 @@ def test_two_processes_learn_one_policy_from_different_robots():
     assert all(tensor.equal(first["actor"][name]) for name, tensor in saved.items())
     assert out.count("it 2/2") == out.count("finished after 2 iterations: 128 steps") == 1
     assert "8 robots on each of 2 processes" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "networks"),
+    [
+        (
+            ["train.policy.estimator.targets=[base_lin_vel]", "train.algorithm.critic_warmup_iterations=1"],
+            ["actor", "critic"],
+        ),
+        (["train.algorithm.class_name=Distillation", "--teacher", TASK], ["actor", "teacher"]),
+    ],
+    ids=["an estimator, the value function alone at first", "a student"],
+)
+def test_two_processes_learn_one_policy_in_other_ways_too(arguments, networks):
+    """In the second iteration all of it learns; what is sent round at the start is equal without."""
+    Path("spy.py").write_text(SPY)
+    two = ["--max_iterations", "2", "train.distillation.gradient_length=4"]
+    with two_processes("spy.py", *TRAIN, *two, *arguments) as process:
+        ended(process, 0)
+    first, second = (torch.load(f"rank{r}.pt", weights_only=True) for r in (0, 1))
+    for network in networks:
+        for name, tensor in first[network].items():
+            assert tensor.equal(second[network][name]), name
+    assert not first["friction"].equal(second["friction"])
+    assert not first["start"].equal(first["actor"]["mlp.0.weight"])
 
 
 def commands_of_the_page() -> list[list[str]]:

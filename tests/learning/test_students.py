@@ -263,7 +263,7 @@ def test_flags_that_do_not_go_together_are_refused(capsys):
     assert call(train.main, [*STUDENT, "--transfer", "--load_run", TASK, *small]) == 2
     assert "--transfer: 'anymal_c_student' learns from a teacher, and begins anew" in capsys.readouterr().err
     assert call(train.main, [*STUDENT, "--teacher", "", *small]) == 2
-    assert "error: --teacher: 'anymal_c_student' learns from a teacher, and none is named; --teacher RUN does" in capsys.readouterr().err
+    assert "error: --teacher: 'anymal_c_student' learns from a teacher, and none is named" in capsys.readouterr().err
     folder = student()
     resume = [*STUDENT[:2], "--resume", "--load_run", str(folder), "--max_iterations", "9", *small]
     assert call(train.main, [*resume, "--teacher", "anymal_c"]) == 2
