@@ -4,6 +4,7 @@ is used on the CPU.
 
 import contextlib
 import io
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -13,10 +14,11 @@ from helpers import CALM, TASK, checkpoints, run_folders
 from tensordict import TensorDict
 
 from legged.envs import LeggedRobot
+from legged.evaluation.learning_curves import read_scalars
 from legged.graph.step_graph import StepGraph
 from legged.learning.captured import CapturedRunner
 from legged.learning.checkpoint import read_checkpoint
-from legged.learning.rollout import Rollout
+from legged.learning.rollout import Rollout, Steps
 from legged.learning.run_folder import run_config
 from legged.policies.export import export
 from legged.policies.restore import TrainedPolicy, restore
@@ -43,14 +45,16 @@ def trained(*arguments: str, task: str = TASK, iterations: int = 3, device: str 
 
 @pytest.fixture
 def graphs(monkeypatch) -> list[StepGraph]:
-    """Those of the trainings to come: for each the rollout's and the update's."""
+    """Those of the trainings to come: for each the rollout's and the update's, and that of the value function alone if there
+    is one.
+    """
     made: list[StepGraph] = []
     capture = CapturedRunner._capture
 
-    def note(runner: CapturedRunner, rollout: Rollout) -> tuple[StepGraph, StepGraph]:
-        both = capture(runner, rollout)
-        made.extend(both)
-        return both
+    def note(runner: CapturedRunner, rollout: Steps, warms_up: bool) -> tuple[StepGraph, ...]:
+        found = capture(runner, rollout, warms_up)
+        made.extend(dict.fromkeys(found))
+        return found
 
     monkeypatch.setattr(CapturedRunner, "_capture", note)
     return made
@@ -84,6 +88,41 @@ def test_a_training_is_captured_and_its_weights_are_finite(task, iterations, gra
     assert {int(state["step"]) for state in saved["optimizer_state_dict"]["state"].values()} == {updates}
 
 
+def test_a_value_function_warms_up_in_a_graph_of_its_own(graphs):
+    """Two iterations of it, then two of both: the policy stays bit by bit, and its moments begin with its own first step."""
+    warmup = ["train.algorithm.critic_warmup_iterations=2", "train.runner.save_interval=1"]
+    folder, _ = trained(*warmup, iterations=4)
+    assert [graph.captured for graph in graphs] == [True] * 3
+    saved = [read_checkpoint(folder / f"model_{iteration}.pt") for iteration in range(4)]
+    policies = [torch.cat([tensor.flatten() for tensor in one["actor_state_dict"].values()]) for one in saved]
+    critics = [one["critic_state_dict"]["mlp.0.weight"] for one in saved]
+    assert policies[0].equal(policies[1])
+    for before, after in ((policies[1], policies[2]), (policies[2], policies[3]), *pairwise(critics)):
+        assert after.isfinite().all()
+        assert not before.equal(after)
+    cfg = run_config(folder).train.algorithm
+    updates = cfg.num_learning_epochs * cfg.num_mini_batches
+    moments = saved[-1]["optimizer_state_dict"]["state"]
+    of_policy = len(saved[0]["actor_state_dict"])
+    assert {int(moments[i]["step"]) for i in range(of_policy)} == {2 * updates}
+    assert {int(moments[i]["step"]) for i in range(of_policy, len(moments))} == {4 * updates}
+
+
+@pytest.mark.parametrize("recurrent", [False, True], ids=["feedforward", "recurrent"])
+def test_a_student_is_trained_in_graphs(recurrent, graphs):
+    """Of a recurrent one the rollout alone is a graph."""
+    memory = ["train.policy.rnn_type=lstm", "train.policy.rnn_hidden_dim=16"] if recurrent else []
+    student = ["train.algorithm.class_name=Distillation", "--teacher", TASK, *memory]
+    folder, printed = trained(*student, iterations=4)
+    assert [graph.captured for graph in graphs] == [True, not recurrent]
+    assert "rsl-rl's own training loop" not in printed
+    first, last = (read_checkpoint(folder / f"model_{i}.pt")["actor_state_dict"]["mlp.0.weight"] for i in (0, 3))
+    assert last.isfinite().all()
+    assert (last != first).float().mean() > 0.9
+    losses = read_scalars(folder)["Loss/behavior"][1]
+    assert losses[-1] < losses[0]
+
+
 class InTheAir(LeggedRobot):
     """Robots far above the ground, where no contacts come in another order each time."""
 
@@ -105,7 +144,7 @@ def test_captured_iterations_are_the_eager_ones():
         runner = CapturedRunner(task, None, CUDA)
         assert runner.why_stock == ""
         runner.alg.train_mode()
-        collect, update = runner._capture(Rollout(task, runner.alg))
+        collect, update, _ = runner._capture(Rollout(task, runner.alg), False)
         assert (collect.captured, update.captured) == (task.captured, task.captured)
         found.append((runner.alg, collect, update))
     tasks[0].load_state_dict(tasks[1].state_dict())
