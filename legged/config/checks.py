@@ -101,6 +101,27 @@ def _origin(path: str, origins: Origins, source: str) -> str:
     return origins.of(path) if path and origins else source
 
 
+WORDS = {
+    float: "a number",
+    tuple: "[low, high]",
+    dict: "a mapping from names to numbers",
+    Mapping: "a mapping that has it as range",
+}
+"""What an alternative of a field takes, by its shape."""
+
+
+def _shape(kind: Any) -> Any:
+    """Return of which shape values of a type are, a key of WORDS: one number, a list, a map, or a section."""
+    origin = typing.get_origin(kind)
+    return Mapping if dataclasses.is_dataclass(kind) else origin if origin in (tuple, dict) else float
+
+
+def _has_shape(kind: Any, value: Any) -> bool:
+    """Return whether a value looks like one of a type."""
+    looks_like: dict[Any, Any] = {float: (int, float), tuple: (list, tuple), dict: Mapping, Mapping: Mapping}
+    return isinstance(value, looks_like[_shape(kind)])
+
+
 def _check(kind: Any, value: Any, path: str, origins: Origins, source: str) -> Any:
     """Return `value` as `kind`, or raise ConfigError. Integers count as floats, lists as tuples; nothing else changes."""
     origin, args = typing.get_origin(kind), typing.get_args(kind)
@@ -119,16 +140,12 @@ def _check(kind: Any, value: Any, path: str, origins: Origins, source: str) -> A
         if value is None and type(None) in args:
             return None
         kinds = [a for a in args if a is not type(None)]
-        sections = [a for a in kinds if dataclasses.is_dataclass(a)]
-        if sections and isinstance(value, Mapping):
-            return build(sections[0], value, path, origins, source)  # type: ignore[arg-type]
-        if sections and not isinstance(value, list | tuple):
-            raise fail("[low, high], or a mapping that has it as range")
-        maps = [a for a in kinds if typing.get_origin(a) is dict and isinstance(value, Mapping)]
-        maps += [a for a in kinds if sections and a not in sections]
-        if len(kinds) > 1 and not maps and not isinstance(value, int | float):
-            raise fail("a number, or a mapping from names to numbers")
-        return _check((maps or kinds)[0], value, path, origins, source)
+        fitting = [a for a in kinds if _has_shape(a, value)] if len(kinds) > 1 else kinds
+        if not fitting:
+            raise fail(", or ".join(WORDS[_shape(a)] for a in sorted(kinds, key=lambda a: list(WORDS).index(_shape(a)))))
+        if dataclasses.is_dataclass(fitting[0]):
+            return build(fitting[0], value, path, origins, source)  # type: ignore[arg-type]
+        return _check(fitting[0], value, path, origins, source)
     if origin is tuple:
         if not isinstance(value, list | tuple):
             raise fail("a list")

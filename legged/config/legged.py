@@ -54,8 +54,9 @@ class TerrainConfig:
     """Factor on all lengths that the types are made of, treads and sizes alike; 1 suits a robot half a metre high."""
     proportions: dict[str, float] = field(default_factory=dict, metadata=UNIT)
     """Terrain type -> share of the columns; sums to 1. Types: legged/terrain/generators.py, TERRAIN_TYPES."""
-    sizes: dict[str, float] = field(default_factory=dict, metadata=carried_by_entry("terrain.sizes", positive(100)))
-    """Terrain type -> size of all its tiles, in its unit, in place of sizes that grow from row to row."""
+    sizes: dict[str, float | Range] = field(default_factory=dict, metadata=carried_by_entry("terrain.sizes", positive(100)))
+    """Terrain type -> size of all its tiles, in its unit, or the lowest and highest size: evenly from the easier one in the
+    first row to the harder one at difficulty 1. In place of the type's own."""
     num_rows: int = field(default=10, metadata=between(1, 1000))
     """Levels of difficulty: row / num_rows."""
     num_cols: int = field(default=20, metadata=between(1, 1000))

@@ -108,7 +108,14 @@ class Terrain:
 
 def tile_size(cfg: TerrainConfig, name: str, difficulty: float) -> float:
     """Return the size of a tile of the type `name` in a row of that difficulty, in the type's unit [m or degrees]."""
-    return cfg.sizes.get(name, TERRAIN_TYPES[name].sized(difficulty, cfg.scale))
+    asked, kind = cfg.sizes.get(name), TERRAIN_TYPES[name]
+    if asked is None:
+        return kind.sized(difficulty, cfg.scale)
+    if not isinstance(asked, tuple):
+        return asked
+    gets_smaller = kind.sized(1.0, cfg.scale) < kind.sized(0.0, cfg.scale)  # as stones do to step on
+    easier, harder = asked[::-1] if gets_smaller else asked
+    return easier + (harder - easier) * difficulty
 
 
 def hardest_difficulty(cfg: TerrainConfig) -> float:

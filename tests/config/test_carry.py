@@ -122,12 +122,13 @@ def test_the_robot_of_the_command_line_counts(tasks):
 def test_sizes_of_tiles_and_ranges_of_properties_grow_by_the_unit_of_each(tasks):
     """Heights of steps and added masses do, angles of slopes and factors do not."""
     ranges = {"added_base_mass": [-1.0, 2.0], "link_mass": [0.9, 1.1], "joint_friction": [0.0, 0.5]}
-    sizes = {"step": 0.15, "slope_up": 20.0}
+    sizes = {"step": 0.15, "stairs_up": [0.1, 0.2], "slope_up": 20.0}
     tasks("carry_entries", {"written_for": "anymal_c", "domain_rand": {"ranges": ranges}, "terrain": {"sizes": sizes}})
     tasks("carry_entries_go2", {"extends": "carry_entries", "robot": "go2"})
     cfg = task_config("carry_entries_go2")
     mass, height = 15.019 / 52.13485, 0.3235036 / 0.5488202
-    assert cfg.terrain.sizes == {"step": pytest.approx(0.15 * height, rel=1e-4), "slope_up": 20.0}
+    stairs = pytest.approx((0.1 * height, 0.2 * height), rel=1e-4)
+    assert cfg.terrain.sizes == {"step": pytest.approx(0.15 * height, rel=1e-4), "stairs_up": stairs, "slope_up": 20.0}
     assert cfg.domain_rand.ranges["added_base_mass"] == pytest.approx((-mass, 2.0 * mass), rel=1e-4)
     assert cfg.domain_rand.ranges["link_mass"] == (0.9, 1.1)
     assert cfg.domain_rand.ranges["joint_friction"] == pytest.approx((0.0, 0.5 * mass * height), rel=1e-4)

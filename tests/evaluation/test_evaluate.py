@@ -12,6 +12,7 @@ from legged import make_task
 from legged.config import override
 from legged.errors import RunError
 from legged.evaluation import crossing, following
+from legged.evaluation.tracking_report import draw_tracking
 from legged.evaluation.velocity_grid import Grid, axes_of, axis_values
 from legged.evaluation.velocity_tracking import measure_tracking
 from legged.play import schedule
@@ -103,6 +104,14 @@ def test_a_cell_in_which_nobody_stands_long_enough_to_be_measured_does_not_count
         assert cell["rmse_lin"] is None or cell["rmse_lin"] > 0.3
     assert not result["rmse_lin"]["mean"] or result["rmse_lin"]["mean"] > 0.3
     json.dumps(result, allow_nan=False)
+
+
+def test_a_picture_of_nothing_measured_is_drawn_without_a_warning(tmp_path, recwarn):
+    cells = [{"rmse_lin": None, "rmse_ang": None}] * 2
+    result = {"grid": {"vx": [0.5, 1.0], "vy": [0.0], "yaw": [0.0]}, "cells": cells}
+    draw_tracking({**result, "task": TASK, "physics": "mujoco", "ground": False, "falls": 1.0}, tmp_path / "none.png")
+    assert (tmp_path / "none.png").is_file()
+    assert not [str(warning.message) for warning in recwarn]
 
 
 # ---- the commands ----------------------------------------------------------------------------------------------------

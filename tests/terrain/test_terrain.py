@@ -325,6 +325,16 @@ def test_a_size_of_ones_own_takes_the_place_of_those_that_grow():
     assert terrain.height_map.heights.max() == pytest.approx(0.15)
 
 
+def test_sizes_between_two_go_from_the_easier_to_the_harder():
+    sizes = {"stairs_up": (0.1, 0.3), "stepping_stones": (0.4, 1.2)}
+    cfg = TerrainConfig(mesh_type="height_map", proportions={"stairs_up": 1.0}, sizes=sizes, num_rows=4, num_cols=1)
+    assert [tile_size(cfg, "stairs_up", d) for d in (0.0, 0.5, 1.0)] == pytest.approx([0.1, 0.2, 0.3])
+    assert [tile_size(cfg, "stepping_stones", d) for d in (0.0, 0.5, 1.0)] == pytest.approx([1.2, 0.8, 0.4])
+    heights = Terrain.build(replace(cfg, border_size=0.0), 1).height_map.heights
+    steps = np.diff(heights[:, heights.shape[1] // 2])
+    assert np.unique(np.abs(steps[steps != 0.0]).round(3)) == pytest.approx([0.1, 0.15, 0.2, 0.25])
+
+
 def test_a_size_of_a_type_that_there_is_not_is_refused():
     cfg = TerrainConfig(mesh_type="height_map", proportions={"step": 1.0}, sizes={"stpe": 0.15})
     with pytest.raises(ConfigError, match=r"terrain\.sizes\.stpe: there is no terrain type 'stpe'; did you mean 'step'"):
