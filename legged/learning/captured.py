@@ -91,8 +91,8 @@ class CapturedRunner(Runner):
         return Rollout(self.env, self.alg)
 
     def _capture(self, rollout: Steps, warms_up: bool) -> tuple[Callable[[], None], Callable[[], None], Callable[[], None]]:
-        """Rollout, update and, if training begins with some of them (`warms_up`), update of the value function alone as
-        graphs, where the task's step is one; networks and task are as before afterwards.
+        """Return rollout, update, and update of the value function alone if training begins with some of those (`warms_up`;
+        else the update again), as graphs where the task's step is one. Networks and task are as before afterwards.
         """
         device = torch.device(self.device)
         enabled = self.env.captured

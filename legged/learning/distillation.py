@@ -70,7 +70,7 @@ class DeviceDistillation(Distillation):
         return action_std(self.student)
 
     def update(self) -> dict[str, float]:
-        """All epochs over the stored rollout; returns the mean loss."""
+        """Learn in all epochs over the stored rollout; return the mean loss."""
         if self.why_stock:
             return super().update()
         self.learn()
@@ -78,7 +78,7 @@ class DeviceDistillation(Distillation):
         return self.losses()
 
     def learn(self, epochs: int | None = None) -> None:
-        """All epochs over the stored rollout, or the first `epochs`, without a host read."""
+        """Learn in all epochs over the stored rollout, or in the first `epochs`, without a host read."""
         self._losses.zero_()
         epochs = epochs or self.num_learning_epochs
         observations = self.storage.observations
@@ -91,7 +91,7 @@ class DeviceDistillation(Distillation):
             update_normalizer(self.student.obs_normalizer, inputs.flatten(0, 1))
 
     def losses(self) -> dict[str, float]:
-        """Mean loss of a step in the last update, read from the device, as is `left_out`; NaN if no gradient was taken."""
+        """Return the mean loss of a step in the last update, read from the device, as is `left_out`; NaN if nothing was taken."""
         loss, taken = self._losses.tolist()
         self.left_out = 1.0 - taken
         return {"behavior": loss}
@@ -105,7 +105,7 @@ class DeviceDistillation(Distillation):
             self._descend(len(x) * self.loss_fn(actions, wanted.flatten(0, 1)))
 
     def _epoch_with_memory(self, inputs: Tensor) -> None:
-        """The same step by step, from what the student remembered before the first one."""
+        """Learn from them step by step, from what the student remembered before the first one."""
         memory = self.memory.copy(self.memory_before)
         loss = torch.zeros((), device=self.device)
         for t, x in enumerate(inputs):

@@ -155,7 +155,7 @@ class DevicePPO(CriticWarmup):
         return self.losses()
 
     def learn_critic(self, epochs: int | None = None) -> None:
-        """As `learn`, but all that changes is the value function: the policy is kept, with its normaliser."""
+        """Learn as `learn` does, but change the value function alone: the policy is kept, with its normaliser."""
         self._critic_alone = True
         self.learn(epochs)
         self._critic_alone = False

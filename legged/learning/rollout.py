@@ -14,7 +14,7 @@ class Steps:
     """
 
     def __init__(self, env: BaseTask, storage: RolloutStorage) -> None:
-        """For a task and what is stored of it, on the same device."""
+        """Roll out a task into a storage on the same device."""
         self.env, self.storage = env, storage
         st = storage
         self._observations = {name: group.buffer for name, group in env.observation_groups.items()}
@@ -37,12 +37,12 @@ class Steps:
         return {"return": self._return, "length": self._length}
 
     def forget(self) -> None:
-        """All episodes begin anew."""
+        """Begin all episodes anew."""
         self._so_far.zero_()
 
     @torch.no_grad()
     def collect(self, steps: int | None = None) -> None:
-        """T steps into the storage, and what follows from them; `steps`, to rehearse, takes fewer of them."""
+        """Make T steps into the storage, and what follows from them; `steps`, to rehearse, are fewer of them."""
         self._ended.zero_()
         for t in range(steps or self.storage.num_transitions_per_env):
             self._step(t)
@@ -94,7 +94,7 @@ class Rollout(Steps):
     """The steps from which PPO learns."""
 
     def __init__(self, env: BaseTask, alg: DevicePPO) -> None:
-        """For a task and a learner on the same device."""
+        """Roll out a task for a learner on the same device."""
         super().__init__(env, alg.storage)
         self.alg = alg
         st = alg.storage

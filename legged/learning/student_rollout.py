@@ -13,13 +13,13 @@ class StudentRollout(Steps):
     """The steps from which a student learns."""
 
     def __init__(self, env: BaseTask, alg: DeviceDistillation) -> None:
-        """For a task and a learner on the same device."""
+        """Roll out a task for a learner on the same device."""
         super().__init__(env, alg.storage)
         self.alg = alg
         self.student, self.teacher = alg.memory, Memory(alg.teacher, env.num_envs)
 
     def forget(self) -> None:
-        """All episodes begin anew."""
+        """Begin all episodes anew."""
         super().forget()
         for memory in (self.student, self.teacher):
             for part in memory.parts:
@@ -27,7 +27,7 @@ class StudentRollout(Steps):
 
     @torch.no_grad()
     def collect(self, steps: int | None = None) -> None:
-        """T steps into the storage, with what the teacher would have done; `steps`, to rehearse, takes fewer of them."""
+        """Make T steps into the storage, with what the teacher would have done; `steps`, to rehearse, are fewer of them."""
         for before, now in zip(self.alg.memory_before, self.student.parts, strict=True):
             before.copy_(now)
         super().collect(steps)
