@@ -91,7 +91,7 @@ class DeviceDistillation(Distillation):
             update_normalizer(self.student.obs_normalizer, inputs.flatten(0, 1))
 
     def losses(self) -> dict[str, float]:
-        """Return the mean loss of a step in the last update, read from the device, as is `left_out`; NaN if nothing was taken."""
+        """Return the mean loss of a step in the last update, read from the device like `left_out`; NaN if none was taken."""
         loss, taken = self._losses.tolist()
         self.left_out = 1.0 - taken
         return {"behavior": loss}
