@@ -8,11 +8,12 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from helpers import TASK, TINY_TRAINING, call, run_folders, small_config, small_task
+from helpers import TASK, TINY_TRAINING, call, run_folders, small_config, small_task, tiny_run
 from learners import LEARNING, ROBOTS, STEPS
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
+from test_resume import content, same
 
 from legged.errors import ConfigError
 from legged.evaluation.estimation import EstimateMeter
@@ -243,6 +244,17 @@ def test_it_is_evaluated_in_the_unit_of_the_term():
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------
+
+
+def test_two_and_two_iterations_are_four():
+    """Weights and moments of policy, value function and estimator, bit by bit."""
+    flags = [f"{TARGETS[0]}=[base_lin_vel]", "train.policy.estimator.latent=2", "train.policy.obs_normalization=true"]
+    four, two = (tiny_run(*flags, iterations=count) for count in (4, 2))
+    rest = tiny_run("--resume", "--load_run", str(two), iterations=4)
+    wanted, found = content(four, 3), content(rest, 3)
+    assert any(name.startswith("estimator.") for name in wanted["actor_state_dict"])
+    for part in ("actor_state_dict", "critic_state_dict", "optimizer_state_dict"):
+        assert same(found[part], wanted[part]), part
 
 
 def test_a_transferred_estimator_learns_at_the_rate_of_the_configuration(tmp_path):
