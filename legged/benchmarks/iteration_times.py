@@ -3,17 +3,33 @@
 import contextlib
 import io
 import tempfile
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+from legged.config import TaskConfig
 from legged.envs import BaseTask
 from legged.learning.captured import CapturedRunner
 from legged.learning.display import Progress
 from legged.learning.runner import Runner
+from legged.learning.student_runner import StudentRunner
+from legged.learning.teacher import Teacher
 
-LOOPS: dict[str, type[Runner]] = {"stock": Runner, "captured": CapturedRunner}
+LOOPS: dict[str, Callable[..., Runner]] = {"stock": Runner, "captured": CapturedRunner}
 """Training loops that are timed."""
+
+
+def loops_of(cfg: TaskConfig, teacher: Teacher | None, asked: str | None) -> dict[str, Callable[..., Runner]]:
+    """Return by name what trains a task in the loop that is `asked` for, else in each of them; a student of `teacher` and a
+    policy with an estimator in the configuration's own loop alone.
+    """
+    own = cfg.train.runner.loop
+    if teacher is not None:
+        return {own: partial(StudentRunner, teacher=teacher)}
+    one = own if cfg.train.policy.estimator.targets else asked
+    return {one: LOOPS[one]} if one else LOOPS
 
 
 class Recorder:
@@ -27,13 +43,13 @@ class Recorder:
         self.progress.append(progress)
 
 
-def time_iterations(kind: type[Runner], task: BaseTask, count: int) -> dict[str, Any]:
+def time_iterations(kind: Callable[..., Runner], task: BaseTask, count: int) -> dict[str, Any]:
     """Train for `count` iterations with a training loop, from new networks; return milliseconds of rollout, update and both
     (medians, and the range of both), the first iteration left out.
     """
     recorder = Recorder()
     with tempfile.TemporaryDirectory() as folder:
-        runner = kind(task, Path(folder), str(task.device), recorder)  # type: ignore[arg-type]
+        runner = kind(task, log_dir=Path(folder), device=str(task.device), display=recorder)
         with contextlib.redirect_stdout(io.StringIO()) as said:
             runner.learn(count + 1, init_at_random_ep_len=True)
     seen = recorder.progress[1:]

@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from legged.benchmarks.iteration_times import LOOPS, time_iterations
+from legged.benchmarks.iteration_times import LOOPS, loops_of, time_iterations
 from legged.benchmarks.kernel_times import kernel_times, table
 from legged.benchmarks.report import report
 from legged.benchmarks.scale import scale
@@ -27,7 +27,9 @@ from legged.commandline.arguments import add_task_arguments, overrides, pick_dev
 from legged.commandline.command import run_main
 from legged.commandline.parser import CommandParser
 from legged.config import LeggedConfig, override
+from legged.config.networks import learns_from_teacher
 from legged.errors import ConfigError
+from legged.learning.teacher import find_teacher, with_teacher
 from legged.physics import resolve_physics
 from legged.process.paths import make_folder, ready_to_write_file, write_text
 from legged.registry import make_task, task_config
@@ -102,6 +104,8 @@ def _main(argv: list[str] | None) -> int:
     if args.grounds and (not isinstance(cfg, LeggedConfig) or cfg.terrain.mesh_type == "plane"):
         raise ConfigError(f"--grounds: the task '{cfg.task}' has no terrain")
     count = args.iterations if args.iterations is not None else (3 if device.type == "cpu" else 20)
+    teacher = find_teacher(cfg) if learns_from_teacher(cfg) and count > 0 and not args.grounds else None
+    cfg = cfg if teacher is None else with_teacher(cfg, teacher)
     results = {}
     for name, changes in (GROUNDS if args.grounds else {"": []}).items():
         start = time.perf_counter()
@@ -114,7 +118,7 @@ def _main(argv: list[str] | None) -> int:
             result["kernels"] = [vars(time) for time in times]
             print(table(times, args.kernels), flush=True)
         if not args.grounds and count > 0:
-            loops = {args.runner: LOOPS[args.runner]} if args.runner else LOOPS
+            loops = loops_of(cfg, teacher, args.runner)
             result["iterations"] = {loop: time_iterations(kind, task, count) for loop, kind in loops.items()}
         if device.type == "cuda":
             free, whole = torch.cuda.mem_get_info(device)

@@ -3,15 +3,17 @@
 import json
 
 import pytest
-from helpers import call, small_config, small_task
+from helpers import TASK, call, small_config, small_task
 
 from legged import registry
-from legged.benchmarks.iteration_times import time_iterations
+from legged.benchmarks.iteration_times import loops_of, time_iterations
 from legged.benchmarks.report import report
 from legged.benchmarks.scale import others
 from legged.benchmarks.step_times import time_steps
 from legged.learning.captured import CapturedRunner
 from legged.learning.runner import Runner
+from legged.learning.student_runner import StudentRunner
+from legged.learning.teacher import find_teacher, with_teacher
 from legged.registry import make_task
 from legged.tools import benchmark
 
@@ -66,6 +68,26 @@ def test_iterations_are_counted_without_the_first(kind):
     assert low <= times["iteration_ms"] <= high
     assert times["rollout_ms"] + times["update_ms"] == pytest.approx(times["iteration_ms"], rel=0.7)
     assert times["note"] == ""
+
+
+def test_students_and_estimators_are_timed_as_they_are_trained():
+    """Both loops for others; a student by its own runner, with its teacher's observations beside the task's."""
+    plain, estimating = small_config(), small_config(("train.policy.estimator.targets", ["base_lin_vel"]))
+    assert [*loops_of(plain, None, None)] == ["stock", "captured"]
+    assert [*loops_of(plain, None, "stock")] == ["stock"]
+    assert loops_of(estimating, None, None) == {"captured": CapturedRunner}
+    student = small_config(
+        ("train.algorithm.class_name", "Distillation"),
+        ("train.distillation", {"teacher": TASK, "gradient_length": 4}),
+        ("train.runner.num_steps_per_env", 4),
+        num_envs=4,
+    )
+    teacher = find_teacher(student)
+    kinds = loops_of(student, teacher, None)
+    assert [*kinds] == ["captured"]
+    task = make_task(with_teacher(student, teacher))
+    assert isinstance(kinds["captured"](task), StudentRunner)
+    assert time_iterations(kinds["captured"], task, 1)["update_ms"] > 0.0
 
 
 @pytest.mark.parametrize(
