@@ -55,6 +55,18 @@ def check(ranks, **options):
     assert all(other.equal(mine) for other in others), "processes have come apart"
 
 
+def check_guard(ranks):
+    """Values of the second process that were no numbers, and pass no gradient on, keep both from taking a step."""
+    groups = {"global_rank": ranks.rank, "local_rank": ranks.local_rank, "world_size": ranks.count}
+    alg = learner(DevicePPO, multi_gpu_cfg=groups)
+    fill(alg, seed=ranks.rank)
+    if ranks.rank == 1:
+        alg.storage.values[:] = torch.nan
+    before = parameters(alg)
+    alg.learn()
+    assert parameters(alg).equal(before)
+
+
 def main():
     """All cases; then what processes agree on."""
     torch.set_num_threads(1)
@@ -65,6 +77,8 @@ def main():
         check(ranks, **options)
         torch.randperm = randperm
         print(f"rank {ranks.rank} {case} equal", flush=True)
+    check_guard(ranks)
+    print(f"rank {ranks.rank} guard equal", flush=True)
     asked = [any_rank(ranks.rank == who, torch.device("cpu")) for who in (0, 1, 2)]
     assert asked == [True, True, False], asked
     leave()

@@ -63,14 +63,18 @@ def any_rank(asked: bool, device: torch.device) -> bool:
 
 class SharedGradients:
     """The gradients of all parameters side by side in one buffer, which is averaged over processes in one go, and at the
-    end of it the divergence from which the learning rate follows: so all processes take the same step.
+    end of it the numbers on which a step depends, such as the divergence from which the learning rate follows: so all
+    processes take the same step, or none.
     """
+
+    MOST_NUMBERS = 2
 
     def __init__(self, parameters: list[torch.nn.Parameter], count: int) -> None:
         """Make the parameters' gradients views of the buffer; there are `count` processes."""
         self._count = count
-        self._buffer = torch.zeros(sum(p.numel() for p in parameters) + 1, device=parameters[0].device)
-        pieces = self._buffer[:-1].split([p.numel() for p in parameters])
+        sizes = [p.numel() for p in parameters]
+        self._buffer = torch.zeros(sum(sizes) + self.MOST_NUMBERS, device=parameters[0].device)
+        *pieces, self._numbers = self._buffer.split([*sizes, self.MOST_NUMBERS])
         for parameter, piece in zip(parameters, pieces, strict=True):
             parameter.grad = piece.view_as(parameter)
 
@@ -78,9 +82,11 @@ class SharedGradients:
         """Begin a mini-batch; what follows adds to the gradients in place."""
         self._buffer.zero_()
 
-    def average_(self, kl: Tensor) -> None:
-        """Gradients and `kl` () of this process become those of all."""
-        self._buffer[-1] = kl
+    def average_(self, *numbers: Tensor) -> None:
+        """Make the mean over all processes of this one's gradients and `numbers` () each."""
+        for place, number in zip(self._numbers, numbers, strict=False):
+            place.copy_(number)
         sum_over_ranks_(self._buffer)
         self._buffer /= self._count
-        kl.copy_(self._buffer[-1])
+        for place, number in zip(self._numbers, numbers, strict=False):
+            number.copy_(place)

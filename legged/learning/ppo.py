@@ -278,33 +278,35 @@ class DevicePPO(CriticWarmup):
 
         kl = divergence(old_mean, old_std, mean[:samples].detach(), std.detach())
         losses.insert(LOSSES.index("kl"), kl)  # the tensor, into which several processes put their mean below
+        # The clipped value loss passes no gradient on for a value that is NaN, so it is looked at by itself.
+        valued = value_loss.detach().clone()
         if self._critic_alone:
             loss = self.value_loss_coef * value_loss
         if self.is_multi_gpu:
             self._shared.zero_()
             loss.backward()
-            self._shared.average_(kl)
+            self._shared.average_(kl, valued)
         else:
             self.optimizer.zero_grad()
             loss.backward()
         if self._critic_alone:
-            return self._step_critic([*losses, *errors])
+            return self._step_critic([*losses, *errors], valued)
         if self.desired_kl is not None and self.schedule == "adaptive":
             self._adapt_rate(kl)
-        # The clipped value loss passes no gradient on for a value that is NaN, so it is looked at by itself.
-        fine = (self._clip_gradients() + value_loss.detach()) < torch.inf
+        fine = (self._clip_gradients() + valued) < torch.inf
         torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
         self.optimizer.step()
         return torch.where(fine, torch.stack([*losses, *errors, self._one]).detach(), 0.0)
 
-    def _step_critic(self, figures: list[Tensor]) -> Tensor:
-        """End a mini-batch of which the value function alone learns; returns what `_step` does. The optimiser passes over
-        parameters without a gradient: gradients of 0 would count as steps, and the first real ones would be too large.
+    def _step_critic(self, figures: list[Tensor], valued: Tensor) -> Tensor:
+        """End a mini-batch of which the value function alone learns, whose loss was `valued` (); returns what `_step` does,
+        of `figures`. The optimiser passes over parameters without a gradient: gradients of 0 would count as steps, and the
+        first real ones would be too large.
         """
         of_actor = [(parameter, parameter.grad) for parameter in self.actor.parameters()]
         for parameter, _ in of_actor:
             parameter.grad = None
-        fine = (self._clip_gradients() + figures[0].detach()) < torch.inf
+        fine = (self._clip_gradients() + valued) < torch.inf
         torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
         self.optimizer.step()
         for parameter, gradient in of_actor:  # of several processes, a part of the buffer that they share

@@ -199,7 +199,7 @@ def test_updates_of_several_processes_are_those_of_rsl_rl():
     with two_processes(TESTS / "ranks_learn.py") as process:
         out = ended(process, 0)
     for rank in (0, 1):
-        for case in ("plain", "normalised", "per mini-batch", "fixed rate", "symmetric"):
+        for case in ("plain", "normalised", "per mini-batch", "fixed rate", "symmetric", "guard"):
             assert f"rank {rank} {case} equal" in out
 
 
