@@ -13,6 +13,9 @@ from legged.mdp.observations import ObservationTerm
 from legged.policies.model_description import describe_control
 from legged.robots.crouch import crouch
 
+MOTORS = "motors.npz"
+"""File of an export beside policy.json with the motors' network of the training, where they have one."""
+
 LAWS = {
     "P": "stiffness * (action_scale * action + default_joint_angles - q) - damping * dq",
     "V": "stiffness * (action_scale * action - dq) - damping * ddq, ddq over one sim_dt",
@@ -66,7 +69,7 @@ def describe_robot(task: LeggedRobot) -> dict[str, Any]:
         "velocity_limits": robot.dof_vel_limits.tolist(),
         "control_dt": task.dt,
         "sim_dt": cfg.sim.dt,
-        "actuator": to_dict(cfg.control.actuator),
+        "actuator": {**to_dict(cfg.control.actuator), "network": MOTORS if cfg.control.actuator.network else ""},
     }
 
 

@@ -15,9 +15,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.deploy.weights import NumpyNetwork
-from legged.envs import BaseTask
+from legged.envs import BaseTask, LeggedRobot
 from legged.errors import RunError
-from legged.policies.description import describe
+from legged.policies.description import MOTORS, describe
 from legged.policies.weights_file import weights_of
 from legged.process.paths import make_folder, write_bytes, write_text
 
@@ -43,7 +43,8 @@ def export(task: BaseTask, policy: Any, folder: Path, training: Mapping[str, Any
     All take one flat observation (batch, width) and give actions (batch, joints), without noise: the groups that the policy
     reads side by side, and of each with a history of H steps H times its layout, oldest step first. Of a recurrent policy
     the TorchScript keeps the hidden state of a batch of 1 inside, until its reset(); the ONNX takes it and gives it back. The
-    metadata is in the ONNX file and beside it in policy.json, with what is said of its `training`.
+    metadata is in the ONNX file and beside it in policy.json, with what is said of its `training`. A network of the motors is
+    copied beside it.
 
     Raises:
         ExportError: a file computes something else.
@@ -88,6 +89,8 @@ def export(task: BaseTask, policy: Any, folder: Path, training: Mapping[str, Any
     write_bytes(folder / "policy.pt", script)
     write_bytes(folder / "policy.onnx", network)
     write_bytes(folder / "policy.weights", weights)
+    if isinstance(task, LeggedRobot) and (motors := task.cfg.control.actuator.network):
+        write_bytes(folder / MOTORS, Path(motors).read_bytes())
     write_text(folder / "policy.json", json.dumps(metadata, indent=1))
     return differences
 

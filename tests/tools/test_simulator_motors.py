@@ -1,6 +1,7 @@
 """The simulated robot's motors: those of a task, in numbers worked by hand and beside the task's own class."""
 
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -128,6 +129,22 @@ def test_a_simulated_robot_has_the_motors_that_its_policy_was_trained_with(contr
     assert motors_config(ROBOT, contract, True, [], 0.002)[0] == ActuatorConfig()
     own, counted = motors_config(ROBOT, None, False, [("control.actuator.delay", [3, 3])], 0.002)
     assert (own.delay, counted) == ((3, 3), 0.002)
+
+
+def test_the_network_of_the_motors_travels_with_the_policy(tmp_path):
+    """The export is moved to another machine, which has no file of the training."""
+    (tmp_path / "training").mkdir()
+    learned = network(tmp_path / "training")
+    task = small_task(
+        ("control.actuator.network", learned), ("train.policy.actor_hidden_dims", [8]), ("sim.dt", DT), num_envs=1
+    )
+    export(task, Runner(task).alg.get_policy(), tmp_path / "export")
+    (tmp_path / "export").rename(tmp_path / "moved")
+    Path(learned).unlink()
+    there = read_contract(tmp_path / "moved" / "policy.json")
+    cfg, _ = motors_config(ROBOT, there, False, [], DT)
+    assert cfg.network == str(tmp_path / "moved" / "motors.npz")
+    assert np.isfinite(Motors(ROBOT, cfg, DT, DT).torques(command(0.5, 80.0, 2.0), np.zeros(JOINTS), np.zeros(JOINTS))).all()
 
 
 def test_the_command_gives_the_robot_what_the_contract_says(contract):

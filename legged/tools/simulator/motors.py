@@ -43,7 +43,10 @@ def motors_config(
     source, own = "command line", {}
     counted = dt if contract is None else contract.sim_dt
     if contract is not None and not ideal:
-        source, own = f"{contract.path}: actuator", {"control": {"actuator": dict(contract.actuator)}}
+        trained_with = dict(contract.actuator)
+        if network := trained_with.get("network"):
+            trained_with["network"] = str(contract.path.parent / str(network))
+        source, own = f"{contract.path}: actuator", {"control": {"actuator": trained_with}}
     cfg = override(from_dict({"task": "simulated", "robot": str(robot.folder), **own}, source=source), changes)
     assert isinstance(cfg, LeggedConfig)
     try:
