@@ -7,6 +7,8 @@ from typing import Literal
 
 from legged.config.bounds import LARGEST, TERMS, between, positive
 
+MOTORS = "motors.npz"
+"""What a copy of `network` is called in a run folder, and beside the policy.json of an export."""
 LONGEST_DELAY = 1000
 """Steps of a delay, at most."""
 Steps = tuple[int, int]

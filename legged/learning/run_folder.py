@@ -6,14 +6,17 @@ import re
 import subprocess
 import tomllib
 from contextlib import suppress
+from dataclasses import replace
 from datetime import datetime
 from importlib import metadata
 from pathlib import Path
 
 from legged.config import TaskConfig, from_dict, to_yaml
-from legged.config.loader import read_yaml
+from legged.config.actuator import MOTORS
+from legged.config.legged import LeggedConfig
+from legged.config.loader import actuator_path, read_yaml
 from legged.errors import ConfigError, suggest
-from legged.process.paths import data_folder, make_folder, not_made, relative, write_text
+from legged.process.paths import data_folder, make_folder, not_made, relative, write_bytes, write_text
 from legged.registry import task_schema
 
 LOGS = Path("logs")
@@ -52,6 +55,9 @@ def create_run(cfg: TaskConfig) -> Path:
             folder = parent / f"{stamped(cfg)}-{number}"
         except (OSError, ValueError) as error:
             raise not_made(folder, error) from error
+    if isinstance(cfg, LeggedConfig) and cfg.control.actuator.network:  # which may be moved while the run is kept
+        write_bytes(folder / MOTORS, Path(cfg.control.actuator.network).read_bytes())
+        cfg = replace(cfg, control=replace(cfg.control, actuator=replace(cfg.control.actuator, network=MOTORS)))
     write_text(folder / CONFIG_FILE, to_yaml(cfg))
     write_text(folder / CODE_FILE, code_state())
     return folder
@@ -69,7 +75,7 @@ def discard_run(folder: Path) -> None:
     """
     if checkpoints(folder) or (folder / BEST_MODEL).is_file():
         return
-    ours = [folder / name for name in (CONFIG_FILE, CODE_FILE, NOTE_FILE)]
+    ours = [folder / name for name in (CONFIG_FILE, CODE_FILE, NOTE_FILE, MOTORS)]
     ours += [*folder.glob("events.out.tfevents.*"), *folder.glob("state_*.pt")]
     with suppress(OSError):
         for path in ours:
@@ -200,6 +206,7 @@ def run_config(folder: Path) -> TaskConfig:
     if not path.is_file():
         raise ConfigError(f"--load_run: {relative(folder)} is no run folder (it has no {CONFIG_FILE})")
     data = read_yaml(path)
+    actuator_path(data, folder)
     return from_dict(data, source=str(path), schema=task_schema(str(data.get("task", ""))))
 
 

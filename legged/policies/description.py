@@ -4,6 +4,7 @@ import inspect
 import math
 from typing import Any
 
+from legged.config.actuator import MOTORS
 from legged.config.loader import to_dict
 from legged.config.networks import ESTIMATED, groups_of
 from legged.config.units import unit_in
@@ -12,9 +13,6 @@ from legged.envs import BaseTask, LeggedRobot
 from legged.mdp.observations import ObservationTerm
 from legged.policies.model_description import describe_control
 from legged.robots.crouch import crouch
-
-MOTORS = "motors.npz"
-"""File of an export beside policy.json with the motors' network of the training, where they have one."""
 
 LAWS = {
     "P": "stiffness * (action_scale * action + default_joint_angles - q) - damping * dq",

@@ -14,10 +14,11 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged.config.actuator import MOTORS
 from legged.deploy.weights import NumpyNetwork
 from legged.envs import BaseTask, LeggedRobot
 from legged.errors import RunError
-from legged.policies.description import MOTORS, describe
+from legged.policies.description import describe
 from legged.policies.weights_file import weights_of
 from legged.process.paths import make_folder, write_bytes, write_text
 

@@ -5,6 +5,7 @@ import subprocess
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from helpers import TASK, TINY_TRAINING, call, run_folders, small_config, tiny_run
@@ -12,7 +13,9 @@ from helpers import TASK, TINY_TRAINING, call, run_folders, small_config, tiny_r
 import legged.tools.train
 from legged.errors import ConfigError, RunError
 from legged.learning import run_folder as runs
-from legged.learning.run_folder import checkpoints, code_state, create_run, discard_run, find_checkpoint
+from legged.learning.run_folder import checkpoints, code_state, create_run, discard_run, find_checkpoint, run_config
+from legged.mdp.actuator_network import NetworkWeights
+from legged.policies.restore import TrainedPolicy
 from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
@@ -241,3 +244,23 @@ def test_a_run_of_an_odd_name_is_not_there(name):
     tiny_run(iterations=1)
     with pytest.raises(ConfigError, match="there is no run") if name != "../.." else pytest.raises(ConfigError):
         runs.run_config(runs.find_run(small_config(), name))
+
+
+def test_a_run_keeps_the_network_of_its_motors(tmp_path):
+    """Its file may be moved or fitted anew; the run is restored from its own folder, wherever that is put."""
+    rng = np.random.default_rng(5)
+    layers = [{"weight": rng.normal(size=shape), "bias": rng.normal(size=shape[0])} for shape in ((8, 4), (1, 8))]
+    NetworkWeights("mlp", 0.005, 2, np.array([2.0, 0.2, 20.0]), tuple(layers)).save(tmp_path / "net.npz")
+    folder = tiny_run(f"control.actuator.network={tmp_path / 'net.npz'}", iterations=1)
+    (tmp_path / "net.npz").unlink()
+    moved = folder.rename(tmp_path / "elsewhere")
+    assert "network: motors.npz" in (moved / "config.yaml").read_text()
+    cfg = run_config(moved)
+    assert cfg.control.actuator.network == str(moved / "motors.npz")
+    TrainedPolicy(cfg, find_checkpoint(moved, None))
+    discard_run(moved)
+    assert (moved / "motors.npz").is_file()
+    for checkpoint in moved.glob("model_*.pt"):
+        checkpoint.unlink()
+    discard_run(moved)
+    assert not (moved / "motors.npz").exists()

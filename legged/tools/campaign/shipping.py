@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from legged.config.actuator import MOTORS
 from legged.errors import RunError
 from legged.evaluation.judged_run import JudgedRun
 from legged.evaluation.result_file import file_name
@@ -40,7 +41,7 @@ def ship(runs: Sequence[JudgedRun], folder: Path) -> list[str]:
             continue
         others = [run for run in seeds if run is not first]
         size = _ship_model(find_checkpoint(first.folder, None), folder / task / SHIPPED_MODEL)
-        _copy(first, folder / task, (CONFIG_FILE,))
+        _copy(first, folder / task, (CONFIG_FILE, MOTORS))
         for other in others:
             _copy(other, folder / task / f"seed_{other.seed}")
         more = "".join(f", evaluations of seed {other.seed}" for other in others)
