@@ -130,3 +130,20 @@ def forget_modules_of(folder: Path) -> None:
         places = [*(spec.submodule_search_locations or ()), spec.origin] if spec is not None else []
         if any(isinstance(place, str) and Path(place).is_relative_to(folder) for place in places):
             del sys.modules[name]
+
+
+def assert_goes_on_alike(settings: Sequence[tuple[str, Any]], actions: torch.Tensor) -> LeggedRobot:
+    """Check that a small task that is saved half-way through `actions` (T, N, D), and one that takes its state over, observe
+    the same bit by bit from there on; returns the first one.
+    """
+    task, half = small_task(*settings), len(actions) // 2  # the guard looks at its steps
+    for action in actions[:half]:
+        task.step(action)
+    saved, random = task.state_dict(), torch.get_rng_state()
+    wanted = [task.step(action)[0]["actor"] for action in actions[half:]]
+    other = small_task(*settings)
+    other.load_state_dict(saved)
+    torch.set_rng_state(random)
+    for action, right in zip(actions[half:], wanted, strict=True):
+        torch.testing.assert_close(other.step(action)[0]["actor"], right, rtol=0.0, atol=0.0)
+    return task

@@ -71,8 +71,6 @@ class Control:
         """(D,) or (N, D) true joint angles at which encoders show the default ones [rad]."""
         self._nominal = {"p_gain": self.stiffness, "d_gain": self.damping, "torque_limit": self.torque_limits}
         self._varied = False
-        self._factors = {name: torch.ones(1, 1, device=torques.device) for name in self._nominal}
-        self._factors["joint_offset"] = torch.zeros(1, 1, device=torques.device)
         self._target = torch.zeros_like(self.torques)  # joint angles, velocities or torques
         self._columns = None if len(self.acted) == robot.num_dof else torch.tensor(self.acted, device=torques.device)
         self._last_dof_vel = torch.zeros_like(self.torques)
@@ -97,6 +95,8 @@ class Control:
         if not self._varied:
             self._varied = True
             self._nominal_law = torch.stack([*self._nominal.values(), self.default_dof_pos])
+            one = torch.ones_like(self.torques[:1])
+            self._factors = {**dict.fromkeys(self._nominal, one), "joint_offset": torch.zeros_like(one)}
             self.stiffness, self.damping, self.torque_limits, self._lowest_torques = (
                 torch.zeros_like(self.torques) + nominal for nominal in (*self._nominal.values(), self._lowest_torques)
             )

@@ -3,18 +3,24 @@
 import pytest
 import torch
 from launches import counting
+from test_randomised_task import ALL
 
 from legged.registry import make_task, task_config
 
 
-@pytest.mark.parametrize(("name", "most"), [("anymal_c_flat", 120), ("anymal_c", 136)])
-def test_a_step_is_few_launches(name, most):
-    small = [("env.num_envs", 2), ("sim.physics", "mujoco_warp")]
-    task = make_task(task_config(name, small), "cpu")
+def launches_of(name, settings=()):
+    """What a step of a task launches, by the part of it."""
+    task = make_task(task_config(name, [("env.num_envs", 2), ("sim.physics", "mujoco_warp"), *settings]), "cpu")
     actions = torch.zeros(2, task.num_actions)
     task.step(actions)
     with torch.no_grad(), counting() as launches:
         task.step_in_place(actions)
+    return launches
+
+
+@pytest.mark.parametrize(("name", "most"), [("anymal_c_flat", 120), ("anymal_c", 136)])
+def test_a_step_is_few_launches(name, most):
+    launches = launches_of(name)
     assert launches.total() <= most, launches
 
 
@@ -30,15 +36,16 @@ def test_motors_and_sensors_with_all_their_errors_are_few_launches_more():
         ("observations.dropped", {"heights": 0.1, "dof_pos": 0.01, "dof_vel": 0.01, "base_ang_vel": 0.01}),
         ("observations.height_map", {"offset": 0.05, "shift": 0.1, "drift": 0.01, "shift_drift": 0.02, "holes": 0.1}),
     ]
-    found = []
-    for settings in ([], errors):
-        task = make_task(task_config("anymal_c", [("env.num_envs", 2), ("sim.physics", "mujoco_warp"), *settings]), "cpu")
-        actions = torch.zeros(2, task.num_actions)
-        task.step(actions)
-        with torch.no_grad(), counting() as launches:
-            task.step_in_place(actions)
-        found.append(launches.total())
-    assert 0 < found[1] - found[0] <= 50
+    assert 0 < launches_of("anymal_c", errors).total() - launches_of("anymal_c").total() <= 50
+
+
+def test_everything_random_is_few_launches_more_and_most_of_them_run_beside_the_step():
+    """All properties, kicks and two forces: at most 36, and 13 of them not in `draw`, which runs beside the physics."""
+    without, everything = launches_of("anymal_c_flat"), launches_of("anymal_c_flat", ALL)
+    beside = everything["draw"] - without["draw"]
+    more = everything.total() - without.total()
+    assert 0 < more <= 36
+    assert more - beside <= 13
 
 
 def test_the_count_is_of_what_runs():

@@ -182,8 +182,9 @@ class Bench:
         ]
         task, act = self._build(per_robot, own, changes, None)
         error, fell = self._follow(task, act, commands[turns].repeat(len(rows), 1))
-        limit = LIMIT * sqrt(self.scale)
-        return [followed(*of_row, limit) for of_row in zip(error.view(len(rows), -1), fell.view(len(rows), -1), strict=True)]
+        return [
+            followed(*of_row, self.limit) for of_row in zip(error.view(len(rows), -1), fell.view(len(rows), -1), strict=True)
+        ]
 
     def _build(
         self,
