@@ -202,7 +202,8 @@ def _effect(task: BaseTask, i: int) -> str:
         target = f"{'velocity' if law.control_type == 'V' else 'torque'} {scales[i]:g} a"
     gains = "" if law.control_type == "T" else f", stiffness {p:g}, damping {d:g}"
     motor = "" if control.actuator is None else f"; {control.actuator.describe(i)}"
-    return f"{joint}: {target}{gains}, torque at most {limit:g} N m{motor}"
+    rotor = f", rotor {task.robot.armature[i]:g} kg m^2" if task.robot.armature[i] else ""
+    return f"{joint}: {target}{gains}, torque at most {limit:g} N m{rotor}{motor}"
 
 
 def _joints(task: BaseTask) -> Iterator[str]:

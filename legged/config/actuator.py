@@ -33,6 +33,9 @@ class ActuatorConfig:
     no_load_speed: dict[str, float] = field(default_factory=dict, metadata=positive(LARGEST))
     """Joint-name pattern -> speed at which the motor gives no torque (dc_motor) [rad/s]; joints that are not named have their
     velocity limit."""
+    armature: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
+    """Joint-name pattern -> inertia of rotor and gear as the joint turns them, in any `model` [kg m^2]; that of the robot's
+    file where not named."""
     coulomb_friction: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
     """Joint-name pattern -> friction of a moving joint at any speed [N m]; 0 where not named."""
     breakaway_friction: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))

@@ -13,6 +13,7 @@ from legged.envs.legged_gym_names import LeggedGymNames
 from legged.envs.overrides import check_overrides
 from legged.envs.terms import Terms
 from legged.math import evenly_spaced, quat_rotate
+from legged.mdp.actuator import with_rotors
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts, contact_force
@@ -74,7 +75,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
 
     def make_scene(self) -> Scene:
         """Put the robot on its ground."""
-        self.robot: Robot = load_robot(self.cfg.robot)
+        self.robot: Robot = with_rotors(load_robot(self.cfg.robot), self.cfg.control.actuator)
         self.terrain = self.terrain or self.make_terrain()
         return RobotScene(self.robot, self.terrain)
 

@@ -26,6 +26,9 @@ from legged.robots.robot import Robot
 if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
 
+LARGEST_GAIN = 2.0
+"""Change of a joint's speed within a physics step that its torque-speed line may cause, over how far the speed is off."""
+
 
 def is_ideal(cfg: ActuatorConfig) -> bool:
     """Return whether motors give what the control law asks for, at once, up to their effort limit."""
@@ -261,6 +264,18 @@ def motor_numbers(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str]
     return np.where(driven, stall, robot.torque_limits), np.where(driven, speed, np.inf)
 
 
+def with_rotors(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str) -> Robot:
+    """Return the robot with the rotors that the configuration states, the same one if there are none. `where` is as for
+    `modelled_joints`.
+
+    Raises:
+        ConfigError: a pattern that matches no joint.
+    """
+    if not cfg.armature:
+        return robot
+    return robot.with_armature(by_joint(cfg.armature, robot, where("control.actuator.armature"), robot.armature))
+
+
 def friction_numbers(
     robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -293,15 +308,32 @@ def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where:
     """Look whether the actuators fit the robot, its control law and the physics step. `where` is as for `modelled_joints`.
 
     Raises:
-        ConfigError: a pattern matches no joint, a speed is missing, or a network is not there, is none, needs another law
-        than P
-            or another time step.
+        ConfigError: a pattern matches no joint, a speed is missing, a motor is too strong for the physics step, or a network
+            is not there, is none, needs another law than P or another time step.
     """
     actuator = cfg.actuator
-    motor_numbers(robot, actuator, where)
+    _check_line(with_rotors(robot, actuator, where), *motor_numbers(robot, actuator, where), sim_dt, where)
     friction_numbers(robot, actuator, where)
     if actuator.network:
         path = where("control.actuator.network")
         if cfg.control_type != "P":
             raise ConfigError(f"{path}: a learned actuator takes joint angles (control_type P), not {cfg.control_type}")
         NetworkWeights.load(actuator.network, path).steps_between(sim_dt, path)
+
+
+def _check_line(robot: Robot, stall: np.ndarray, speed: np.ndarray, sim_dt: float, where: Callable[[str], str]) -> None:
+    """Raise ConfigError where a torque-speed line is so steep that a joint in the air gains or loses more than twice the
+    speed that it is off within a physics step: on its line such a motor pushes and brakes in turn, and gets nowhere.
+    """
+    allowed = LARGEST_GAIN * robot.inertia * speed / stall  # [s]
+    if np.all(allowed >= sim_dt):
+        return
+    i = int(np.argmin(allowed))
+    name, inertia = robot.joint_names[i], robot.inertia[i]
+    rotor = robot.armature[i] + stall[i] * sim_dt / (LARGEST_GAIN * speed[i]) - inertia
+    raise ConfigError(
+        f"{where('control.actuator.stall_torque')}: '{name}' turns {inertia:.2g} kg m^2 with the leg in the air, by a motor "
+        f"of {stall[i]:g} N m at rest and none at {speed[i]:g} rad/s: in physics steps of {sim_dt:g} s it would push and "
+        f"brake in turn. Give its rotor's inertia (control.actuator.armature, {1.06 * rotor:.2g} kg m^2 or more), or make "
+        f"sim.dt {0.94 * allowed[i]:.2g} s or less"  # of two digits, to the safe side
+    )

@@ -60,6 +60,17 @@ def gains(
     return stiffness, damping * min(1.0, MARGIN / fastest)
 
 
+def inertia_in_air(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int]) -> np.ndarray:
+    """Return the inertia (D,) that the motor of each of the hinges `joints` (ids) turns with the robot in the air in the pose
+    `qpos`, where all other joints move freely [kg m^2].
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    dofs = model.jnt_dofadr[list(joints)]
+    return np.asarray(1.0 / np.linalg.inv(mass_matrix(model, data))[dofs, dofs])
+
+
 def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """Return the joint-space inertia, (V, V) for V degrees of freedom, of a state whose positions were computed."""
     columns = np.zeros((model.nv, model.nv))

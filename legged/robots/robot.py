@@ -1,7 +1,7 @@
 """A robot folder (robot.yaml and MJCF) -> names, indices, limits and gains."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, exists
-from legged.robots.gains import VELOCITY_LIMIT, gains
+from legged.robots.gains import VELOCITY_LIMIT, gains, inertia_in_air
 from legged.robots.importing.adapted import adaptations
 from legged.robots.mirror import Mirror
 from legged.robots.passive_joints import PassiveJoints, default_qpos
@@ -73,6 +73,10 @@ class Robot:
     stiffness: np.ndarray
     """(D,) P gains [N m/rad], and D gains [N m s/rad]."""
     damping: np.ndarray
+    armature: np.ndarray
+    """(D,) inertia of rotor and gear as the joint turns them [kg m^2]."""
+    inertia: np.ndarray
+    """(D,) what the motor of each joint turns with the robot in the air in its default pose [kg m^2]."""
     swings: np.ndarray
     """(D,) whether a joint swings a leg forward and back, in the default pose."""
     height: float
@@ -124,6 +128,12 @@ class Robot:
         """
         return match_values(table, self.joint_names, where)
 
+    def with_armature(self, armature: np.ndarray) -> "Robot":
+        """Return the same robot with other rotors, (D,) [kg m^2]. Its `inertia` then is that in which none but a joint's own
+        rotor has changed: the true one is a little larger where others have become heavier.
+        """
+        return replace(self, armature=armature, inertia=self.inertia + armature - self.armature)
+
 
 def load_robot(name: str, where: str = "robot") -> Robot:
     """Return the robot of that name under resources/robots/, or in the folder `name`; `where` says who asks for it.
@@ -171,6 +181,8 @@ def load_robot(name: str, where: str = "robot") -> Robot:
         torque_limits=torque_limits,
         stiffness=stiffness,
         damping=damping,
+        armature=model.dof_armature[[int(joint.dofadr[0]) for joint in joints]],
+        inertia=inertia_in_air(model, qpos, numbers),
         swings=swinging_joints(model, qpos, numbers, foot_ids),
         height=height,
         qpos_columns=tuple(int(joint.qposadr[0]) for joint in joints),

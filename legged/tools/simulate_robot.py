@@ -18,6 +18,7 @@ from legged.config.schema import SimConfig, TerrainConfig
 from legged.deploy.contract import SCANS, Contract, read_contract
 from legged.deploy.pace import take_priority
 from legged.errors import ConfigError
+from legged.mdp.actuator import with_rotors
 from legged.process.paths import replacing, write_text
 from legged.robots.robot import Robot, load_robot
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, terrain_type
@@ -66,7 +67,7 @@ def _main(argv: list[str] | None) -> int:
     robot = load_robot(args.robot)
     sim = SimConfig(dt=args.sim_dt, iterations=100, ls_iterations=50)
     contract = None if args.contract is None else read_contract(args.contract)
-    motors, scan = motors_of(args, robot, contract), scan_of(contract)
+    (robot, motors), scan = motors_of(args, robot, contract), scan_of(contract)
     server = Server(SimulatedRobot(robot, terrain_of(args), sim, motors, scan), args.latency, args.loss, args.seed)
     take_priority(PRIORITY)  # motors and sensors of a robot do not wait for other processes either
     print(f"{LISTENING}127.0.0.1:{server.port}", flush=True)
@@ -118,15 +119,16 @@ def check_simulation(args: argparse.Namespace) -> None:
             raise ConfigError(f"{flag}: must be between {low:g} and {high:g}, got {value:g}")
 
 
-def motors_of(args: argparse.Namespace, robot: Robot, contract: Contract | None) -> Motors:
-    """Return the motors that the flags ask for: those of the training of the policy in `contract`, unless told otherwise.
+def motors_of(args: argparse.Namespace, robot: Robot, contract: Contract | None) -> tuple[Robot, Motors]:
+    """Return the robot with the motors that the flags ask for, their rotors and their laws: those of the training of the
+    policy in `contract`, unless told otherwise.
 
     Raises:
         ConfigError: as `motors_config`.
     """
     changes = [parse_override(text) for text in args.overrides]
     cfg, counted = motors_config(robot, contract, args.ideal_motors, changes, args.sim_dt)
-    return Motors(robot, cfg, args.sim_dt, counted, args.seed)
+    return with_rotors(robot, cfg), Motors(robot, cfg, args.sim_dt, counted, args.seed)
 
 
 def scan_of(contract: Contract | None) -> str:

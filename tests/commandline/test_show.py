@@ -53,6 +53,7 @@ def test_motors_and_sensors_that_are_not_ideal_are_told():
             ("observations.dropped", {"dof_vel": 0.01}),
             ("control.actuator.model", "dc_motor"),
             ("control.actuator.no_load_speed", {"KFE": 12.0}),
+            ("control.actuator.armature", {"KFE": 0.05}),
             ("control.actuator.coulomb_friction", {"KFE": 1.5}),
             ("control.actuator.delay", [0, 4]),
         )
@@ -62,7 +63,7 @@ def test_motors_and_sensors_that_are_not_ideal_are_told():
     assert [row[3] for row in critic] == ["-"] * 7
     actions = rows(lines, "actions: 12 numbers")
     motor = "80 N m at rest, none at 12 rad/s, friction 1.5 N m (1.5 to break away) + 0 N m s/rad, delay 0 to 4 physics steps"
-    assert actions[2][2].endswith(f"torque at most 80 N m; {motor}")
+    assert actions[2][2].endswith(f"torque at most 80 N m, rotor 0.05 kg m^2; {motor}")
 
 
 def test_rewards_terminations_actions_and_joints_of_a_legged_robot():

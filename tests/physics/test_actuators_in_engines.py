@@ -10,6 +10,7 @@ from legged.registry import make_task, task_config
 MOTORS = [
     ("control.actuator.model", "dc_motor"),
     ("control.actuator.no_load_speed", {"HAA": 8.0, "HFE": 8.0, "KFE": 9.0}),
+    ("control.actuator.armature", {"KFE": 0.05}),
     ("control.actuator.coulomb_friction", {"KFE": 1.0}),
     ("control.actuator.viscous_friction", {"K": 0.1}),
     ("control.actuator.delay", [3, 3]),

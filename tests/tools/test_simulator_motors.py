@@ -23,7 +23,12 @@ from legged.tools.simulator.robot import SimulatedRobot
 
 ROBOT = load_robot("anymal_c")
 DT = 0.005
-DC = {"model": "dc_motor", "stall_torque": {"H": 120.0, "K": 110.0}, "no_load_speed": {"H": 7.5, "K": 9.0}}
+DC = {
+    "model": "dc_motor",
+    "stall_torque": {"H": 120.0, "K": 110.0},
+    "no_load_speed": {"H": 7.5, "K": 9.0},
+    "armature": {"K": 0.1},
+}
 ROUGH = {"coulomb_friction": {"KFE": 1.2}, "breakaway_friction": {"KFE": 2.0}, "viscous_friction": {"H": 0.25}}
 JOINTS = ROBOT.num_dof
 
@@ -149,9 +154,11 @@ def test_the_network_of_the_motors_travels_with_the_policy(tmp_path):
 
 def test_the_command_gives_the_robot_what_the_contract_says(contract):
     args = simulate_robot.build_parser().parse_intermixed_args(["anymal_c", "control.actuator.delay=[4, 4]"])
-    built = simulate_robot.motors_of(args, ROBOT, contract)
+    robot, built = simulate_robot.motors_of(args, ROBOT, contract)
     assert built.delay == 10
-    simulated = SimulatedRobot(ROBOT, None, SimConfig(dt=0.002), built)
+    simulated = SimulatedRobot(robot, None, SimConfig(dt=0.002), built)
+    rotors = simulated.model.dof_armature[list(ROBOT.qvel_columns)]
+    assert np.array_equal(rotors, np.where(["K" in name for name in ROBOT.joint_names], DC["armature"]["K"], 0.0))
     simulated.asked = command(ROBOT.default_dof_pos[0] + 1.0, 80.0, 2.0)
     for _ in range(10):
         simulated.step()

@@ -19,9 +19,12 @@ ROBOT, GROUND = 1, 2
 
 def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
     """The robot alone. Whatever its file says, its shapes meet the ground, and each other only with `self_collisions`, except
-    those of neighbouring bodies; and contacts take the friction of the robot, which is what randomisation changes.
+    those of neighbouring bodies; contacts take the friction of the robot, which is what randomisation changes; and its motors
+    have the rotors of `robot`.
     """
     spec = robot_spec_of(robot.model_path)
+    for name, armature in zip(robot.joint_names, robot.armature, strict=True):
+        spec.joint(name).armature = armature
     for geom in spec.geoms:
         if geom.name in robot.shape_names:
             geom.contype, geom.conaffinity = ROBOT, GROUND | ROBOT if self_collisions else GROUND
@@ -37,9 +40,9 @@ def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
 def robot_source(robot: Robot, self_collisions: bool) -> str:
     """The robot as MJCF for an engine that reads it by itself: the file, or a text where `robot_spec` changes it."""
     own = robot_spec_of(robot.model_path)
-    before = {geom.name: _contact_settings(geom) for geom in own.geoms}
+    before = _settings(own, robot)
     spec = robot_spec(robot, self_collisions)
-    same = all(before[geom.name] == _contact_settings(geom) for geom in spec.geoms) and len(own.pairs) == len(spec.pairs)
+    same = before == _settings(spec, robot) and len(own.pairs) == len(spec.pairs)
     if same and is_plain_file(robot.model_path):
         return str(robot.model_path)
     for folder in ("meshdir", "texturedir"):
@@ -52,8 +55,10 @@ def body_names(robot: Robot) -> list[str]:
     return [body.name for body in robot_spec_of(robot.model_path).bodies if body.name and body.name != "world"]
 
 
-def _contact_settings(geom: mujoco.MjsGeom) -> tuple[int, int, int, int]:
-    return geom.contype, geom.conaffinity, geom.priority, geom.condim
+def _settings(spec: mujoco.MjSpec, robot: Robot) -> tuple[dict[str, tuple[int, int, int, int]], list[float]]:
+    """Return what `robot_spec` may change: how each shape meets others, and the rotors of the robot's joints."""
+    shapes = {geom.name: (geom.contype, geom.conaffinity, geom.priority, geom.condim) for geom in spec.geoms}
+    return shapes, [float(spec.joint(name).armature) for name in robot.joint_names]
 
 
 def contact_sensor_columns(model: mujoco.MjModel, robot: Robot) -> tuple[int, int]:

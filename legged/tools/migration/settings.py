@@ -147,7 +147,7 @@ ELSEWHERE: dict[str, str] = {
     "asset.collapse_fixed_joints": _MODEL,
     "asset.replace_cylinder_with_capsule": _MODEL,
     "asset.flip_visual_attachments": _MODEL,
-    "asset.armature": f"{_MODEL}, and domain_rand.ranges.joint_armature adds some",
+    "asset.armature": f"{_MODEL}; control.actuator.armature sets another one",
     "asset.density": _MODEL,
     "asset.default_dof_drive_mode": "control.control_type says what drives the joints",
     "asset.angular_damping": _PHYSX,
