@@ -56,6 +56,16 @@ def test_wilson_interval(successes, trials, low, high):
     assert wilson(successes, trials) == pytest.approx((low, high), abs=6e-4)
 
 
+def test_a_share_lies_in_its_interval_whatever_is_rounded():
+    """An error bar of length -1e-16 ended the picture of 128 robots that all came through."""
+    for trials in range(1, 300):
+        assert wilson(0, trials)[0] == 0.0
+        assert wilson(trials, trials)[1] == 1.0
+        for successes in range(trials + 1):
+            low, high = wilson(successes, trials)
+            assert 0.0 <= low <= successes / trials <= high <= 1.0
+
+
 def test_the_first_event_counts():
     start = torch.tensor([[1.0, 2.0, 0.5]]).repeat(6, 1)
     scores = Scores(start)
