@@ -188,10 +188,10 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         cfg = self.cfg.observations.height_map
         if is_exact(cfg):
             return None
-        scan = self.height_scan
+        scan, kernels, pose = self.height_scan, self.physics.kernels, (self.base_pos, self.base_quat)
         if cfg.shift or cfg.shift_drift:
-            scan = HeightScan(self.cfg.terrain, self.terrain, self.num_envs, self.device, self.physics.kernels)  # type: ignore[arg-type]
-        return HeightMapErrors(cfg, scan, (self.base_pos, self.base_quat), self.heights_seen, self.dt, self.numbers)
+            scan = HeightScan(self.cfg.terrain, self.terrain, self.num_envs, self.device, kernels)  # type: ignore[arg-type]
+        return HeightMapErrors(cfg, scan, pose, self.heights_seen, self.dt, self.numbers, kernels)
 
     def mirror_images(self) -> MirrorImages | None:
         mirror, points = self.robot.mirror, self.height_scan.points

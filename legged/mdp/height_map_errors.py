@@ -1,6 +1,7 @@
 """What is wrong with a map of heights that a robot makes while it walks."""
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -9,6 +10,9 @@ from legged.config.schema import HeightMapConfig
 from legged.math import masked_set_
 from legged.mdp.height_scan import HeightScan
 from legged.mdp.uniform_numbers import UniformNumbers
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
 
 
 def is_exact(cfg: HeightMapConfig) -> bool:
@@ -29,22 +33,24 @@ class HeightMapErrors:
         seen: Callable[[Tensor], Tensor],
         dt: float,
         numbers: UniformNumbers,
+        kernels: "TaskKernels | None" = None,
     ) -> None:
         """Read heights around the `pose` of bases, positions (N, 3) and orientations (N, 4) in the world. Where the map may
         be displaced, they are looked up by `scan`, which nobody else uses then; else they are those that it has. `seen` makes
         the observation of ground heights (N, P) in the world; `dt` is the control step [s].
         """
-        self._scan, self._seen, self._dt = scan, seen, dt
+        self._scan, self._seen, self._kernels = scan, seen, kernels
         self._position, self._orientation = pose
         num_envs, device = scan.heights.shape[0], scan.heights.device
         self._moved = cfg.shift > 0.0 or cfg.shift_drift > 0.0
         self._drifts = cfg.drift > 0.0 or cfg.shift_drift > 0.0
-        half = torch.tensor([cfg.shift, cfg.shift, cfg.offset, cfg.shift_drift, cfg.shift_drift, cfg.drift], device=device)
+        moves = dt * cfg.shift_drift
+        half = torch.tensor([cfg.shift, cfg.shift, cfg.offset, moves, moves, dt * cfg.drift], device=device)
         self._drawn = numbers.between(-half, half, 6)
         self.error = torch.zeros(num_envs, 3, device=device)
         """(N, 3) where the map lies, world frame [m]."""
         self.rate = torch.zeros_like(self.error)
-        """(N, 3) how fast it moves there [m/s]."""
+        """(N, 3) how far it moves there in a control step [m]."""
         self._place = torch.zeros_like(self.error)
         self._share = cfg.holes
         points = scan.heights.shape[1]
@@ -54,8 +60,13 @@ class HeightMapErrors:
 
     def advance(self, begun: Tensor) -> None:
         """Let a control step pass, in which the episodes of `begun` (N,) are new."""
+        if self._kernels is not None:
+            chances = self._holes_drawn.values if self._holes_drawn is not None else self._drawn.values[:, :0]
+            drawn = (begun, self._drawn.values, chances, self._share)
+            self._kernels.advance_map(self.holes, *drawn, self.error, self.rate)
+            return
         if self._drifts:
-            self.error.add_(self.rate, alpha=self._dt)
+            self.error.add_(self.rate)
         masked_set_(self.error, begun, self._drawn.values[:, :3])
         masked_set_(self.rate, begun, self._drawn.values[:, 3:])
         if self._holes_drawn is not None:

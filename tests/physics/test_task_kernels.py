@@ -14,11 +14,13 @@ from legged.config.legged import (
     TerrainConfig,
 )
 from legged.config.randomization import DrawConfig, ForceConfig, KickConfig
+from legged.config.sensors import HeightMapConfig
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
 from legged.mdp.disturbances import Forces, Kicks
+from legged.mdp.height_map_errors import HeightMapErrors
 from legged.mdp.height_scan import HeightScan
 from legged.mdp.randomization import Pushes, Randomization
 from legged.mdp.rewards import Rewards
@@ -269,3 +271,34 @@ def test_kicks_and_forces_come_and_end_alike():
         kicked += int(engines[1].pushed[:, 0].sum())
     assert 40 * N * DT / 0.3 * 0.7 < kicked < 40 * N * DT / 0.1
     assert (engines[1].forces[:, 1, 1] != 0.0).any()
+
+
+@pytest.mark.parametrize(
+    "errors",
+    [
+        {"offset": 0.05, "shift": 0.1, "drift": 0.01, "shift_drift": 0.02, "holes": 0.1},
+        {"offset": 0.05, "holes": 0.3},
+        {"shift": 0.1, "drift": 0.02},
+    ],
+    ids=["all", "constant", "without holes"],
+)
+def test_maps_go_wrong_alike(errors):
+    cfg = TerrainConfig(measured_points_x=(-0.1, 0.1, 0.3), measured_points_y=(0.0,))
+    numbers, maps = [], []
+    for kernels in (None, TaskKernels(nullcontext)):
+        numbers.append(UniformNumbers(N, CPU))
+        pose = (torch.zeros(N, 3), torch.zeros(N, 4))
+        scan = HeightScan(cfg, None, N, CPU, kernels)
+        maps.append(HeightMapErrors(HeightMapConfig(**errors), scan, pose, torch.neg, DT, numbers[-1], kernels))
+    for step in range(5):
+        begun = chance(1.0 if step == 0 else 0.3, N)
+        for one, drawn in zip(maps, numbers, strict=True):
+            torch.manual_seed(step)
+            drawn.draw()
+            one.advance(begun)
+        for name in ("error", "rate", "holes"):
+            torch.testing.assert_close(*(getattr(one, name) for one in maps), rtol=0.0, atol=0.0)
+    error, holes = maps[1].error, maps[1].holes
+    assert (error[:, 2].abs().max() > 0.0) == (errors.get("offset", 0.0) + errors.get("drift", 0.0) > 0.0)
+    assert holes.shape == (N, 3 if "holes" in errors else 0)
+    assert not holes.numel() or 0.3 * errors["holes"] < holes.float().mean() < 3.0 * errors["holes"]

@@ -1,4 +1,5 @@
-"""What is drawn again within a step, kicks and forces, in a launch or two each; legged/mdp has the same in torch.
+"""What is drawn again within a step, kicks, forces and errors of maps, in a launch or two each; legged/mdp has the same in
+torch.
 
 A module of its own: who randomises nothing never compiles it.
 """
@@ -113,3 +114,28 @@ def push_bodies(
             now = wp.float32(fresh[robot, i])
         force[robot, i] = now
         total[robot, i] = total[robot, i] + now
+
+
+@wp.kernel
+def advance_map(
+    begun: wp.array[wp.bool],
+    drawn: wp.array2d[float],
+    chances: wp.array2d[float],
+    share: float,
+    error: wp.array2d[float],
+    rate: wp.array2d[float],
+    holes: wp.array2d[wp.bool],
+):
+    """One thread a robot and point of its map, or a robot alone where maps have no holes."""
+    robot, point = wp.tid()
+    fresh = wp.bool(begun[robot])
+    if point < holes.shape[1] and fresh:
+        holes[robot, point] = chances[robot, point] < share
+    if point > 0:
+        return
+    for k in range(3):
+        if fresh:
+            error[robot, k] = drawn[robot, k]
+            rate[robot, k] = drawn[robot, 3 + k]
+        else:
+            error[robot, k] = error[robot, k] + rate[robot, k]

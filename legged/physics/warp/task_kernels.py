@@ -10,7 +10,14 @@ from torch import Tensor
 from legged.physics.warp.actuator_kernels import drive_joints
 from legged.physics.warp.launcher import Launcher
 from legged.physics.warp.network_kernels import run_lstm, run_mlp
-from legged.physics.warp.random_kernels import find_kicks, find_moments, push_bodies, take_fresh, vary_control
+from legged.physics.warp.random_kernels import (
+    advance_map,
+    find_kicks,
+    find_moments,
+    push_bodies,
+    take_fresh,
+    vary_control,
+)
 
 PI = wp.constant(wp.float32(torch.pi))
 
@@ -338,6 +345,10 @@ class TaskKernels(Launcher):
     def push_bodies(self, *arguments: Tensor | float) -> None:
         """As `Forces.act`: the last argument (N, 3) has the sum of forces on a body."""
         self.launch(push_bodies, len(arguments[0]), arguments)  # type: ignore[arg-type]
+
+    def advance_map(self, holes: Tensor, *arguments: Tensor | float) -> None:
+        """As `HeightMapErrors.advance`: the last three arguments are written, `holes` (N, P) among them."""
+        self.launch(advance_map, (len(holes), max(holes.shape[1], 1)), (*arguments, holes))
 
     def follow_commands(self, commands: Tensor, *arguments: Tensor) -> None:
         """As the first half of `CommandCurriculum.update`."""
