@@ -143,10 +143,13 @@ class Sensors:
     def _measured(self) -> Tensor:
         """Return the terms of now (N, C), with bias and noise."""
         source = self._source.values
-        now = source[:, self._slice] if self._slice is not None else source.index_select(1, self._columns)
-        if self._of_map is not None and self._map is not None:
-            now = now.clone()
-            now[:, self._of_map].copy_(self._map.read())
+        if self._map is not None and self.names == (HEIGHTS,):
+            now = self._map.read()
+        else:
+            now = source[:, self._slice] if self._slice is not None else source.index_select(1, self._columns)
+            if self._of_map is not None and self._map is not None:
+                now = now.clone()
+                now[:, self._of_map].copy_(self._map.read())
         if self._bias_drawn is not None:
             now = now + self.bias
         if self._noise is not None:
