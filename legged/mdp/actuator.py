@@ -325,15 +325,15 @@ def _check_line(robot: Robot, stall: np.ndarray, speed: np.ndarray, sim_dt: floa
     """Raise ConfigError where a torque-speed line is so steep that a joint in the air gains or loses more than twice the
     speed that it is off within a physics step: on its line such a motor pushes and brakes in turn, and gets nowhere.
     """
-    allowed = LARGEST_GAIN * robot.inertia * speed / stall  # [s]
-    if np.all(allowed >= sim_dt):
+    gain = sim_dt * stall / (robot.inertia * speed)  # 0 of ideal motors, whose speed is infinite
+    i = int(np.argmax(gain))
+    if gain[i] <= LARGEST_GAIN:
         return
-    i = int(np.argmin(allowed))
     name, inertia = robot.joint_names[i], robot.inertia[i]
     rotor = robot.armature[i] + stall[i] * sim_dt / (LARGEST_GAIN * speed[i]) - inertia
     raise ConfigError(
         f"{where('control.actuator.stall_torque')}: '{name}' turns {inertia:.2g} kg m^2 with the leg in the air, by a motor "
         f"of {stall[i]:g} N m at rest and none at {speed[i]:g} rad/s: in physics steps of {sim_dt:g} s it would push and "
         f"brake in turn. Give its rotor's inertia (control.actuator.armature, {1.06 * rotor:.2g} kg m^2 or more), or make "
-        f"sim.dt {0.94 * allowed[i]:.2g} s or less"  # of two digits, to the safe side
+        f"sim.dt {0.94 * sim_dt * LARGEST_GAIN / gain[i]:.2g} s or less"  # of two digits, to the safe side
     )

@@ -347,7 +347,7 @@ class TaskKernels(Launcher):
         self.launch(push_bodies, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def advance_map(self, holes: Tensor, *arguments: Tensor | float) -> None:
-        """As `HeightMapErrors.advance`: the last three arguments are written, `holes` (N, P) among them."""
+        """As `HeightMapErrors.advance`: `holes` (N, P) and the last two arguments are written."""
         self.launch(advance_map, (len(holes), max(holes.shape[1], 1)), (*arguments, holes))
 
     def follow_commands(self, commands: Tensor, *arguments: Tensor) -> None:
