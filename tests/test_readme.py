@@ -212,6 +212,19 @@ def test_numbers_of_the_blind_policies_are_those_of_the_shipped_evaluations():
     assert f"RMSE on rough ground | {' | '.join(cells)} |" in RESULTS
 
 
+@pytest.mark.parametrize(("task", "row"), [("g1_flat", "G1"), ("h1_flat", "H1"), ("cassie_flat", "Cassie")])
+def test_numbers_of_the_bipeds_are_those_of_the_shipped_evaluations(task, row):
+    files = [ROUGH.parent / task / f"evaluation_{engine}.json" for engine in ("mujoco_warp", "mujoco")]
+    results = [json.loads(file.read_text()) for file in files]
+    cells = [
+        f"{result[error]['mean']:.3f} ({result[error]['worst']:.3f})"
+        for error in ("rmse_lin", "rmse_ang")
+        for result in results
+    ]
+    falls = {f"{100.0 * result['falls']:.2f} %" for result in results}
+    assert f"| {row} | {' | '.join([*cells, *falls])} | {results[1]['gait']['steps_per_s']:.1f}, " in RESULTS
+
+
 @pytest.mark.parametrize(("row", "folder"), [("1", "seed_1"), ("2, shipped", ""), ("3", "seed_3")])
 def test_numbers_of_the_humanoid_are_those_of_the_shipped_evaluations(row, folder):
     files = [ROUGH.parent / "humanoid" / folder / f"evaluation_{engine}.json" for engine in ("mujoco_warp", "mujoco")]
