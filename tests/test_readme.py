@@ -222,7 +222,11 @@ def test_numbers_of_the_bipeds_are_those_of_the_shipped_evaluations(task, row):
         for result in results
     ]
     falls = {f"{100.0 * result['falls']:.2f} %" for result in results}
-    assert f"| {row} | {' | '.join([*cells, *falls])} | {results[1]['gait']['steps_per_s']:.1f}, " in RESULTS
+    gait = results[1]["gait"]
+    assert f"| {row} | {' | '.join([*cells, *falls])} | {gait['duty_factor']:.2f}, {gait['steps_per_s']:.2f} |" in RESULTS
+    rmse = results[1]["rmse_lin"]["mean"]
+    low, high = map(float, re.findall(r"\| flat: velocity RMSE ([\d.]+) to ([\d.]+) m/s \|", README)[0])
+    assert low <= round(rmse, 2) <= high
 
 
 @pytest.mark.parametrize(("row", "folder"), [("1", "seed_1"), ("2, shipped", ""), ("3", "seed_3")])

@@ -43,7 +43,6 @@ class HeightMapErrors:
         self._position, self._orientation = pose
         num_envs, device = scan.heights.shape[0], scan.heights.device
         self._moved = cfg.shift > 0.0 or cfg.shift_drift > 0.0
-        self._drifts = cfg.drift > 0.0 or cfg.shift_drift > 0.0
         moves = dt * cfg.shift_drift
         half = torch.tensor([cfg.shift, cfg.shift, cfg.offset, moves, moves, dt * cfg.drift], device=device)
         self._drawn = numbers.between(-half, half, 6)
@@ -65,8 +64,7 @@ class HeightMapErrors:
             drawn = (begun, self._drawn.values, chances, self._share)
             self._kernels.advance_map(self.holes, *drawn, self.error, self.rate)
             return
-        if self._drifts:
-            self.error.add_(self.rate)
+        self.error.add_(self.rate)
         masked_set_(self.error, begun, self._drawn.values[:, :3])
         masked_set_(self.rate, begun, self._drawn.values[:, 3:])
         if self._holes_drawn is not None:

@@ -144,12 +144,12 @@ class Sensors:
         """Return the terms of now (N, C), with bias and noise."""
         source = self._source.values
         if self._map is not None and self.names == (HEIGHTS,):
-            now = self._map.read()
+            now = self._map.read()  # all that is measured
+        elif self._map is not None and self._of_map is not None:
+            now = source.index_select(1, self._columns)
+            now[:, self._of_map].copy_(self._map.read())
         else:
             now = source[:, self._slice] if self._slice is not None else source.index_select(1, self._columns)
-            if self._of_map is not None and self._map is not None:
-                now = now.clone()
-                now[:, self._of_map].copy_(self._map.read())
         if self._bias_drawn is not None:
             now = now + self.bias
         if self._noise is not None:

@@ -39,10 +39,7 @@ def gains(
     `qpos` is the pose in which the robot stands, `feet` are the shapes (ids) that it stands on, `effort` (D,) the limits of
     its motors [N m], and `height` is that of its base above the ground [m].
     """
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    mujoco.mj_forward(model, data)
-    inverse = np.linalg.inv(mass_matrix(model, data))
+    data, inverse = _inverse_inertia(model, qpos)
     dofs = model.jnt_dofadr[list(joints)]
     jacobian = np.vstack([_jacobian(model, data, foot) for foot in feet])
     at_feet = jacobian @ inverse
@@ -64,11 +61,8 @@ def inertia_in_air(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int
     """Return the inertia (D,) that the motor of each of the hinges `joints` (ids) turns with the robot in the air in the pose
     `qpos`, where all other joints move freely [kg m^2].
     """
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    mujoco.mj_forward(model, data)
     dofs = model.jnt_dofadr[list(joints)]
-    return np.asarray(1.0 / np.linalg.inv(mass_matrix(model, data))[dofs, dofs])
+    return np.asarray(1.0 / _inverse_inertia(model, qpos)[1][dofs, dofs])
 
 
 def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
@@ -77,6 +71,14 @@ def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     for i, unit in enumerate(np.eye(model.nv)):
         mujoco.mj_mulM(model, data, columns[i], unit)
     return columns
+
+
+def _inverse_inertia(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[mujoco.MjData, np.ndarray]:
+    """Return the state at rest in the pose `qpos`, and the inverse of its joint-space inertia, (V, V)."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    return data, np.linalg.inv(mass_matrix(model, data))
 
 
 def _jacobian(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
