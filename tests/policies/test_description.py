@@ -131,9 +131,9 @@ def test_a_controller_that_reads_only_the_exported_files_does_the_same(name, tmp
             return 0.0
         heights = task.terrain.height_map
         row, column = np.floor((np.array([x, y]) - heights.origin) / heights.cell).astype(int)
-        return float(lowest[row, column])
+        return float(scanned[row, column])
 
-    lowest = None if task.terrain is None else task.terrain.height_map.scan_map("lowest")
+    scanned = None if task.terrain is None else task.terrain.height_map.scan_map("own")
     task.reset()
     observations = task.hold_commands(torch.tensor([[0.5, 0.2, -0.3], [-0.4, 0.0, 0.8], [0.0, 0.0, 0.0]]))
     controllers = [Controller(tmp_path) for _ in range(3)]

@@ -102,7 +102,7 @@ def test_its_sensors_and_sources_measure_what_the_tasks_do(name):
     changes = [("env.num_envs", 3), ("init_state.yaw", [-3.0, 3.0]), *ENGINE, *CALM, *(SMALL_TERRAIN if rough else [])]
     task = make_task(task_config(name, changes, on_cpu=True))
     task.reset()
-    simulated = SimulatedRobot(task.robot, task.terrain, SimConfig(dt=0.005))
+    simulated = SimulatedRobot(task.robot, task.terrain, SimConfig(dt=0.005), scan=task.cfg.terrain.scan)
     points = task.height_scan.points.double().numpy()
     for robot in range(3):
         simulated.data.qpos[:], simulated.data.qvel[:] = task.physics._qpos[robot], task.physics._qvel[robot]
