@@ -211,4 +211,9 @@ def _folder(name: str, where: str) -> Path:
     for folder in (robots / name, Path(name)):
         if exists(folder / "robot.yaml"):
             return folder.resolve()
+    if len(Path(name).parts) > 1:  # of a run that was brought from another machine, its configuration names the folder there
+        raise ConfigError(
+            f"{where}: there is no robot {shown(name)}: that folder has no robot.yaml. "
+            "If the robot was moved, say where it lies now, as in robot=FOLDER"
+        )
     raise ConfigError(f"{where}: there is no robot {shown(name)}{known}")

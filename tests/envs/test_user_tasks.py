@@ -206,7 +206,9 @@ def test_a_robot_on_the_command_line_is_relative_to_the_working_directory(show, 
     expected = str(robot_at("spotty").resolve())
     assert show("--task", TASK, "robot=./spotty").robot == show("--task", TASK, "robot=spotty").robot == expected
     assert show("--task", TASK, "robot=anymal_c").robot == "anymal_c"
-    assert "command line: robot: there is no robot" in error("--task", TASK, "robot=./other")
+    message = error("--task", TASK, "robot=./other")
+    assert "command line: robot: there is no robot" in message
+    assert "that folder has no robot.yaml. If the robot was moved, say where it lies now, as in robot=FOLDER" in message
 
 
 def test_a_robot_of_a_registered_mapping_lies_beside_its_module(show, monkeypatch):
