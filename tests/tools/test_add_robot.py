@@ -129,6 +129,22 @@ def test_legs_that_nothing_touches_get_feet(added):
     np.testing.assert_allclose(model.geom("fl_foot").pos, [0, 0, -0.12], atol=1e-9)
 
 
+def test_a_shank_whose_mesh_has_the_foot_in_it_ends_above_the_foot(added, tmp_path):
+    """Half lengths 0.02, 0.01 and 0.11 m down to -0.21; the foot's middle is at -0.2, so the end goes to -0.2 + 0.02."""
+    corners = [f"v {x} {y} {z}" for x in (-0.02, 0.02) for y in (-0.01, 0.01) for z in (-0.11, 0.11)]
+    faces = ["f 1 2 4 3", "f 5 7 8 6", "f 1 5 6 2", "f 3 4 8 7", "f 1 3 7 5", "f 2 6 8 4"]
+    (tmp_path / "calf.obj").write_text("\n".join([*corners, *faces]))
+    cylinder = '<collision><origin xyz="0 0 -0.09"/><geometry><cylinder radius="0.01" length="0.16"/></geometry>'
+    mesh = '<collision><origin xyz="0 0 -0.1"/><geometry><mesh filename="calf.obj"/></geometry>'
+    out = added(urdf().replace(cylinder, mesh), "--name", "thirteenth_toy")
+    assert "a mesh that has the foot in it end above the foot: fl_calf, fr_calf, hl_calf, hr_calf" in out
+    model = mujoco.MjModel.from_xml_path("mine/thirteenth_toy/thirteenth_toy.xml")
+    np.testing.assert_allclose(sorted(model.geom("fl_calf").size), [0.01, 0.02, 0.095], atol=1e-6)
+    np.testing.assert_allclose(model.geom("fl_calf").pos, [0, 0, -0.085], atol=1e-6)
+    untouched = added(urdf().replace(cylinder, mesh.replace("-0.1", "-0.07")), "--name", "fourteenth_toy")
+    assert "end above the foot" not in untouched  # it ends at -0.18
+
+
 def test_a_robot_that_looks_along_y_is_turned(added):
     """Its left legs are at -x: a quarter turn clockwise brings them to +y."""
     places = {"fl": (-0.1, 0.2), "fr": (0.1, 0.2), "hl": (-0.1, -0.2), "hr": (0.1, -0.2)}

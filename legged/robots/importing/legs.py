@@ -137,6 +137,7 @@ def find_legs(tree: Tree) -> list[Leg]:
     for leg in legs:
         leg.feet = _feet(tree, leg, flat=len(legs) == 2 and len(leg.hinges) >= ANKLE)
         leg.tip = np.mean([shape.pos for shape in leg.feet], axis=0) if leg.feet else leg.tip
+        _uncover(tree, leg)
     return legs
 
 
@@ -206,6 +207,29 @@ def _feet(tree: Tree, leg: Leg, flat: bool) -> list[Shape]:
     if balls or (flat and low):
         return low if flat else balls
     return [_add_ball(tree, leg, low)]
+
+
+def _uncover(tree: Tree, leg: Leg) -> None:
+    """Draw back what was fitted to the mesh of a shank and reaches around its foot, a ball, or else the shank would touch the
+    ground before the foot does. It ends above the middle of the foot by its own half width, so that a leg can lean by 45
+    degrees.
+    """
+    if len(leg.feet) != 1 or leg.feet[0].kind != "sphere":
+        return
+    for shape in tree.links[leg.end].shapes:
+        half = half_lengths(shape)
+        if shape is leg.feet[0] or not shape.collides or not shape.fits or half is None:
+            continue
+        axis, width = int(half.argmax()), float(np.sort(half)[1])
+        down = matrix(shape.quat)[:, axis]
+        down = down * (np.sign(down @ (leg.tip - shape.pos)) or 1.0)
+        excess = float(down @ (shape.pos - leg.tip)) + float(half[axis]) + width
+        if 0.0 < excess < half[axis]:  # more than half of it stays
+            slot = 1 if shape.kind in ("capsule", "cylinder") else axis
+            shape.size = shape.size.copy()
+            shape.size[slot] -= excess / 2.0
+            shape.pos, shape.fits = shape.pos - down * excess / 2.0, {}
+            tree.say("shapes fitted to a mesh that has the foot in it end above the foot", shape.link)
 
 
 def _is_low(shape: Shape, leg: Leg, shapes: list[Shape]) -> bool:
