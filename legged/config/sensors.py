@@ -22,3 +22,6 @@ class HeightMapConfig:
     holes: float = field(default=0.0, metadata=between(0, 1))
     """Share of the points, drawn for each episode, of which the map knows nothing: they read 0, as level ground does
     under a robot that stands `heights_offset` high."""
+    lost: float = field(default=0.0, metadata=between(0, 1))
+    """Share of the robots, drawn for each episode, whose map knows nothing at all, so that they have to walk as blind ones
+    do. Success on terrain is measured with robots that have a map."""

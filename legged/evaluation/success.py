@@ -139,6 +139,7 @@ def to_run_out(cfg: LeggedConfig, num_envs: int) -> list[tuple[str, Any]]:
         *undisturbed(num_envs, TIME_S),
         *on_terrain(cfg, TILE * cfg.terrain.scale, SPAWN_RANGE * cfg.terrain.scale),
         ("observations.add_noise", cfg.observations.add_noise),
+        ("observations.height_map.lost", 0.0),
         ("commands.heading_command", True),
         ("init_state.yaw", [-np.pi, np.pi]),
     ]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def is_exact(cfg: HeightMapConfig) -> bool:
     """Return whether the map has no errors."""
-    return not (cfg.offset or cfg.shift or cfg.drift or cfg.shift_drift or cfg.holes)
+    return not (cfg.offset or cfg.shift or cfg.drift or cfg.shift_drift or cfg.holes or cfg.lost)
 
 
 class HeightMapErrors:
@@ -51,24 +51,25 @@ class HeightMapErrors:
         self.rate = torch.zeros_like(self.error)
         """(N, 3) how far it moves there in a control step [m]."""
         self._place = torch.zeros_like(self.error)
-        self._share = cfg.holes
-        points = scan.heights.shape[1]
-        self._holes_drawn = numbers.between(0.0, 1.0, points) if cfg.holes else None
-        self.holes = torch.zeros(num_envs, points if cfg.holes else 0, dtype=torch.bool, device=device)
+        self._share, self._lost = cfg.holes, cfg.lost
+        points = scan.heights.shape[1] if cfg.holes or cfg.lost else 0
+        self._holes_drawn = numbers.between(0.0, 1.0, points + 1) if points else None
+        self.holes = torch.zeros(num_envs, points, dtype=torch.bool, device=device)
         """(N, P) points of which nothing is known, if there are any."""
 
     def advance(self, begun: Tensor) -> None:
         """Let a control step pass, in which the episodes of `begun` (N,) are new."""
         if self._kernels is not None:
             chances = self._holes_drawn.values if self._holes_drawn is not None else self._drawn.values[:, :0]
-            drawn = (begun, self._drawn.values, chances, self._share)
+            drawn = (begun, self._drawn.values, chances, self._share, self._lost)
             self._kernels.advance_map(self.holes, *drawn, self.error, self.rate)
             return
         self.error.add_(self.rate)
         masked_set_(self.error, begun, self._drawn.values[:, :3])
         masked_set_(self.rate, begun, self._drawn.values[:, 3:])
         if self._holes_drawn is not None:
-            masked_set_(self.holes, begun, self._holes_drawn.values < self._share)
+            chances = self._holes_drawn.values
+            masked_set_(self.holes, begun, (chances[:, :-1] < self._share) | (chances[:, -1:] < self._lost))
 
     def read(self) -> Tensor:
         """Return the observation of the heights that the map has (N, P)."""

@@ -162,7 +162,8 @@ def test_a_step_with_all_errors_is_checked_and_resumes():
         ("observations.bias", {"base_ang_vel": 0.05, "dof_pos": 0.02}),
         ("observations.delay", {"dof_pos": [0, 2], "heights": [1, 3]}),
         ("observations.dropped", {"heights": 0.3, "projected_gravity": 0.1}),
-        ("observations.height_map", {"offset": 0.05, "shift": 0.1, "drift": 0.01, "shift_drift": 0.02, "holes": 0.1}),
+        ("observations.height_map", {"offset": 0.05, "shift": 0.1, "drift": 0.01, "shift_drift": 0.02}),
+        ("observations.height_map", {"holes": 0.1, "lost": 0.3}),
     ]
     assert_goes_on_alike(settings, torch.randn(14, 4, 12))
 
@@ -211,6 +212,20 @@ def test_holes_read_0_and_stay_for_the_episode():
         assert (obs["actor"][kept][holes[kept]] == 0.0).all()
         seen = task.base_pos[:, 2:] - 0.5 - task.measured_heights
         torch.testing.assert_close(obs["actor"][kept][~holes[kept]], seen[kept][~holes[kept]], rtol=1e-5, atol=1e-5)
+
+
+def test_a_lost_map_reads_0_everywhere_and_the_others_are_whole():
+    task, count = heights_task(lost=0.5), 0
+    for _ in range(10):
+        task.reset()
+        obs, *_ = task.step(torch.zeros(4, 12))
+        holes = task.observation_terms.sensors._map.holes
+        lost = holes.any(dim=1)
+        assert (lost == holes.all(dim=1)).all()
+        seen = (task.base_pos[:, 2:] - 0.5 - task.measured_heights).masked_fill(lost.unsqueeze(1), 0.0)
+        torch.testing.assert_close(obs["actor"], seen.clamp(-1.0, 1.0), rtol=1e-5, atol=1e-5)
+        count += int(lost.sum())
+    assert 8 < count < 32
 
 
 @pytest.mark.parametrize(

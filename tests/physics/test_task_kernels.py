@@ -276,11 +276,12 @@ def test_kicks_and_forces_come_and_end_alike():
 @pytest.mark.parametrize(
     "errors",
     [
-        {"offset": 0.05, "shift": 0.1, "drift": 0.01, "shift_drift": 0.02, "holes": 0.1},
+        {"offset": 0.05, "shift": 0.1, "drift": 0.01, "shift_drift": 0.02, "holes": 0.1, "lost": 0.2},
         {"offset": 0.05, "holes": 0.3},
+        {"lost": 0.4},
         {"shift": 0.1, "drift": 0.02},
     ],
-    ids=["all", "constant", "without holes"],
+    ids=["all", "constant", "lost", "without holes"],
 )
 def test_maps_go_wrong_alike(errors):
     cfg = TerrainConfig(measured_points_x=(-0.1, 0.1, 0.3), measured_points_y=(0.0,))
@@ -300,5 +301,11 @@ def test_maps_go_wrong_alike(errors):
             torch.testing.assert_close(*(getattr(one, name) for one in maps), rtol=0.0, atol=0.0)
     error, holes = maps[1].error, maps[1].holes
     assert (error[:, 2].abs().max() > 0.0) == (errors.get("offset", 0.0) + errors.get("drift", 0.0) > 0.0)
-    assert holes.shape == (N, 3 if "holes" in errors else 0)
-    assert not holes.numel() or 0.3 * errors["holes"] < holes.float().mean() < 3.0 * errors["holes"]
+    missing = {"holes": 0.0, "lost": 0.0} | errors
+    assert holes.shape == (N, 3 if missing["holes"] or missing["lost"] else 0)
+    share = missing["holes"] + (1.0 - missing["holes"]) * missing["lost"]
+    assert not holes.numel() or 0.3 * share < holes.float().mean() < 3.0 * share
+    if missing["lost"]:
+        whole = holes.all(dim=1)
+        assert 0.3 * missing["lost"] < whole.float().mean() < 3.0 * missing["lost"]
+        assert missing["holes"] or (holes.any(dim=1) == whole).all()

@@ -30,9 +30,10 @@ def declared(rows: Sequence[Disturbance]) -> list[tuple[str, Any]]:
     given = {"friction": True, "added_base_mass": True}
     given |= {"motor_strength": any(row.motors != 1.0 for row in rows), "joint_offset": any(row.zero_offset for row in rows)}
     push, offset, shift, holes = (max(getattr(row, name) for row in rows) for name in MOST)
+    none = {"drift": 0.0, "shift_drift": 0.0, "lost": 0.0}
     changes: list[tuple[str, Any]] = [
         ("domain_rand.ranges", {name: [FIELDS[name].neutral] * 2 for name, wanted in given.items() if wanted}),
-        ("observations.height_map", {"offset": offset, "shift": shift, "holes": holes, "drift": 0.0, "shift_drift": 0.0}),
+        ("observations.height_map", {"offset": offset, "shift": shift, "holes": holes, **none}),
     ]
     if push > 0.0:
         changes += [

@@ -79,11 +79,13 @@ ALONE = (
     Disturbance("askew sensor", tilt=0.05),
     Disturbance("map offset", map_height=0.05, map_shift=0.1),
     Disturbance("map holes", map_holes=0.2),
+    Disturbance("no map", map_holes=1.0),
 )
 """One thing wrong at a time, of an ANYmal C."""
 TOGETHER = ("payload", "friction", "weak motors", "delay 20 ms")
-"""What is wrong in the line `together`: what hardware differs in by itself. The line `everything` has all but the longer
-delay."""
+"""What is wrong in the line `together`: what hardware differs in by itself."""
+WORST = ("delay 40 ms", "no map")
+"""What the line `everything` does not have, for it has a smaller disturbance of the same kind."""
 
 NAMES = (NOMINAL.name, *(one.name for one in ALONE), "together", "everything")
 """Of all lines."""
@@ -96,7 +98,7 @@ def table(robot: Size, anymal: Size, payload: float | None = None) -> tuple[Dist
     alone = [scaled(one, robot, anymal) for one in ALONE]
     if payload is not None:
         alone = [replace(one, payload=payload) if one.payload else one for one in alone]
-    all_but = [one for one in alone if one.name != "delay 40 ms"]
+    all_but = [one for one in alone if one.name not in WORST]
     together = combined("together", [one for one in alone if one.name in TOGETHER])
     return NOMINAL, *alone, together, combined("everything", all_but)
 

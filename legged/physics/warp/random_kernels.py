@@ -122,15 +122,16 @@ def advance_map(
     drawn: wp.array2d[float],
     chances: wp.array2d[float],
     share: float,
+    lost: float,
     error: wp.array2d[float],
     rate: wp.array2d[float],
     holes: wp.array2d[wp.bool],
 ):
-    """One thread a robot and point of its map, or a robot alone where maps have no holes."""
+    """One thread a robot and point of its map, or a robot alone where maps have no holes. The last chance is the map's."""
     robot, point = wp.tid()
     fresh = wp.bool(begun[robot])
     if point < holes.shape[1] and fresh:
-        holes[robot, point] = chances[robot, point] < share
+        holes[robot, point] = chances[robot, point] < share or chances[robot, holes.shape[1]] < lost
     if point > 0:
         return
     for k in range(3):

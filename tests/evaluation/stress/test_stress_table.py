@@ -26,7 +26,7 @@ def test_lines_for_the_robot_they_are_written_for():
     assert lines[0] == NOMINAL
     assert lines[1:-2] == ALONE
     assert lines[-2] == Disturbance("together", payload=8.0, friction=0.4, motors=0.85, delay=0.02)
-    assert lines[-1].delay == 0.02
+    assert (lines[-1].delay, lines[-1].map_holes) == (0.02, 0.2)
     assert set(lines[-1].changes) == {name for line in ALONE for name in line.changes}
 
 
@@ -36,7 +36,8 @@ def test_masses_and_lengths_are_those_of_the_robot():
     assert small["payload"].payload == pytest.approx(1.6)
     assert small["pushes"].push == pytest.approx(0.71)
     assert (small["map offset"].map_height, small["map offset"].map_shift) == pytest.approx((0.025, 0.05))
-    for name in ("friction", "weak motors", "delay 20 ms", "delay 40 ms", "zero offsets", "askew sensor", "map holes"):
+    of_any_size = ("friction", "weak motors", "delay 20 ms", "delay 40 ms", "zero offsets", "askew sensor", "map holes")
+    for name in (*of_any_size, "no map"):
         assert small[name] == next(line for line in ALONE if line.name == name)
     assert scaled(NOMINAL, Size(1.0, 0.1), ANYMAL) == NOMINAL
 
