@@ -212,19 +212,52 @@ def test_numbers_of_the_blind_policies_are_those_of_the_shipped_evaluations():
     assert f"RMSE on rough ground | {' | '.join(cells)} |" in RESULTS
 
 
+def over_seeds(task: str) -> tuple[str, list[list[dict]]]:
+    """The beginning of a row of the page of results, and the evaluations of all seeds by engine: seeds, means of the errors
+    (worst cell of all), falls."""
+    folders = [ROUGH.parent / task, *sorted((ROUGH.parent / task).glob("seed_*"))]
+    files = [[folder / f"evaluation_{engine}.json" for folder in folders] for engine in ("mujoco_warp", "mujoco")]
+    results = [[json.loads(file.read_text()) for file in of_engine] for of_engine in files]
+    cells = []
+    for error in ("rmse_lin", "rmse_ang"):
+        for each in ([result[error] for result in of_engine] for of_engine in results):
+            mean, worst = sum(one["mean"] for one in each) / len(each), max(one["worst"] for one in each)
+            cells.append(f"{mean:.3f} ({worst:.3f})")
+    (falls,) = {f"{100.0 * sum(result['falls'] for result in each) / len(each):.2f} %" for each in results}
+    return f"| {len(folders)} | {' | '.join([*cells, falls])} |", results
+
+
+QUADRUPEDS = {
+    "a1_flat": "A1",
+    "go1_flat": "Go1",
+    "go2_flat": "Go2",
+    "anymal_b_flat": "ANYmal B",
+    "anymal_d_flat": "ANYmal D",
+    "spot_flat": "Spot",
+}
+
+
+@pytest.mark.parametrize("task", QUADRUPEDS)
+def test_numbers_of_the_quadrupeds_are_those_of_the_shipped_evaluations(task):
+    """And they are what the rewards that scale promise: no cell above 0.15 m/s, no fall in 500."""
+    row, results = over_seeds(task)
+    assert f"| {QUADRUPEDS[task]} {row}\n" in RESULTS
+    low, high = map(float, re.findall(r"\| velocity RMSE ([\d.]+) to ([\d.]+) m/s, no falls \|", README)[0])
+    assert low <= round(results[1][0]["rmse_lin"]["mean"], 2) <= high
+    assert results[1][0]["falls"] == 0.0
+    for result in results[1]:
+        assert result["rmse_lin"]["mean"] <= 0.07
+        assert result["rmse_lin"]["worst"] <= 0.15
+        assert result["rmse_ang"]["mean"] <= 0.09
+        assert result["falls"] < 0.002
+
+
 @pytest.mark.parametrize(("task", "row"), [("g1_flat", "G1"), ("h1_flat", "H1"), ("cassie_flat", "Cassie")])
 def test_numbers_of_the_bipeds_are_those_of_the_shipped_evaluations(task, row):
-    files = [ROUGH.parent / task / f"evaluation_{engine}.json" for engine in ("mujoco_warp", "mujoco")]
-    results = [json.loads(file.read_text()) for file in files]
-    cells = [
-        f"{result[error]['mean']:.3f} ({result[error]['worst']:.3f})"
-        for error in ("rmse_lin", "rmse_ang")
-        for result in results
-    ]
-    falls = {f"{100.0 * result['falls']:.2f} %" for result in results}
-    gait = results[1]["gait"]
-    assert f"| {row} | {' | '.join([*cells, *falls])} | {gait['duty_factor']:.2f}, {gait['steps_per_s']:.2f} |" in RESULTS
-    rmse = results[1]["rmse_lin"]["mean"]
+    cells, results = over_seeds(task)
+    gait = results[1][0]["gait"]
+    assert f"| {row} {cells} {gait['duty_factor']:.2f}, {gait['steps_per_s']:.2f} |" in RESULTS
+    rmse = results[1][0]["rmse_lin"]["mean"]
     low, high = map(float, re.findall(r"\| flat: velocity RMSE ([\d.]+) to ([\d.]+) m/s \|", README)[0])
     assert low <= round(rmse, 2) <= high
 
