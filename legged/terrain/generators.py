@@ -35,6 +35,8 @@ KERB, KERB_SPACING = 0.2, 1.0
 """Width of a kerb, and from where one begins to where the next one does [m]."""
 BLOCK_SIDES = (0.3, 0.8)
 """Shortest and longest side of the blocks of dense ground [m]."""
+GRID = 0.45
+"""Side of the squares of a random grid [m]."""
 STONE_SIDES = (0.2, 0.5)
 """Shortest and longest side of a stone of rubble [m]."""
 NARROWEST_DITCH = 0.5
@@ -178,6 +180,17 @@ def dense_blocks(tile: Tile, height: float, platform: float = 2.0, cover: float 
     tile.heights[tile.middle(platform)] = 0.0
 
 
+def random_grid(tile: Tile, height: float, platform: float = 2.0, side: float = GRID) -> None:
+    """Cover the tile with squares, each at a quarter of the height between -height / 2 and height / 2, after Isaac Lab's
+    boxes. Up and down follow each other closer than on stairs and obstacles, and no edge says what comes next.
+    """
+    across = max(1, tile.cells(side))
+    rows, columns = (-(-n // across) for n in tile.heights.shape)
+    heights = 0.25 * height * tile.rng.integers(-2, 3, (rows, columns))
+    tile.heights[:] = heights.repeat(across, 0).repeat(across, 1)[: tile.heights.shape[0], : tile.heights.shape[1]]
+    tile.heights[tile.middle(platform)] = 0.0
+
+
 def kerbs(tile: Tile, height: float, platform: float = 2.0, width: float = KERB, spacing: float = KERB_SPACING) -> None:
     """Make rings of kerbs that stand out of level ground, all around the platform, one every `spacing`."""
     across, every, inner = max(1, tile.cells(width)), max(2, tile.cells(spacing)), tile.cells(platform)
@@ -259,6 +272,7 @@ OF_WAVES, OF_STAIRS = (WAVE / 4, "quarter of a wave"), (TREAD, "tread of a step"
 OF_LEDGE = (LEDGE, "ledge of a step")
 OF_BLOCKS, OF_STONES = (SMALLEST_BLOCK, "side of a block"), (JOINT, "gap between two stones")
 OF_NARROW_STAIRS, OF_KERB = (NARROW_TREAD, "tread of a narrow step"), (KERB, "width of a kerb")
+OF_GRID = (GRID, "side of a square")
 OF_DENSE_BLOCKS, OF_RUBBLE = (BLOCK_SIDES[0], "side of a block"), (STONE_SIDES[0], "side of a stone")
 OF_DITCH = (NARROWEST_DITCH, "width of a ditch")
 
@@ -288,6 +302,9 @@ TERRAIN_TYPES: dict[str, TerrainType] = {
     "step": TerrainType(step, _riser, METRES, "height", stepped=True, platform=3.0 + 2.0 * LEDGE, finest=OF_LEDGE),
     "obstacles": TerrainType(
         obstacles, lambda d: 0.05 + 0.2 * d, METRES, "height", stepped=True, regular=False, finest=OF_BLOCKS
+    ),
+    "random_grid": TerrainType(
+        random_grid, lambda d: 0.05 + 0.2 * d, METRES, "height", stepped=True, regular=False, platform=2.0, finest=OF_GRID
     ),
     "stepping_stones": TerrainType(
         stepping_stones,

@@ -15,6 +15,7 @@ from legged.terrain.generators import (
     kerbs,
     obstacles,
     pit,
+    random_grid,
     rough_slope,
     rubble,
     slope,
@@ -182,7 +183,7 @@ def test_every_type_is_made_of_its_size():
     assert middle["pit"] == pytest.approx(-0.5)
     assert middle["narrow_stairs_up"] == pytest.approx(-13 * 0.14)  # treads of 2 cells: after 24 there are 32 left, then 30
     assert middle["narrow_stairs_down"] == pytest.approx(13 * 0.14)
-    assert middle["dense_blocks"] == middle["kerbs"] == middle["rubble"] == 0.0
+    assert middle["dense_blocks"] == middle["kerbs"] == middle["rubble"] == middle["random_grid"] == 0.0
     assert middle["gap"] == middle["obstacles"] == middle["stepping_stones"] == middle["flat"] == 0.0
 
 
@@ -192,7 +193,7 @@ def test_every_type_is_made_of_its_size():
         (["slope_up", "slope_down", "rough_slope_up", "rough_slope_down"], (0.0, 0.2, 0.36)),  # rise over run
         (["stairs_up", "stairs_down"], (0.05, 0.14, 0.212)),
         (["narrow_stairs_up", "narrow_stairs_down", "kerbs"], (0.05, 0.14, 0.212)),
-        (["obstacles", "dense_blocks", "rubble"], (0.05, 0.15, 0.23)),
+        (["obstacles", "random_grid", "dense_blocks", "rubble"], (0.05, 0.15, 0.23)),
         (["stepping_stones"], (1.575, 0.825, 0.225)),
         (["gap"], (0.0, 0.5, 0.9)),
         (["pit"], (0.0, 0.5, 0.9)),
@@ -300,6 +301,21 @@ def test_a_single_dense_block_has_sides_of_3_to_8_cells():
             if low.min() > 0 and high.max() < 80:  # the tile's edge cuts off no part
                 sides |= set((high - low).tolist())
     assert sides == {3, 4, 5, 6, 7}  # 8 would be drawn as 0.8 m exactly
+
+
+def test_squares_of_a_random_grid_have_heights_of_their_own():
+    """0.45 m are 4 cells: 20 by 20 squares at quarters from -0.1 to 0.1 m, around a platform of 20 cells."""
+    heights = made(random_grid, 0.2, seed=3)
+    squares = heights.reshape(20, 4, 20, 4).swapaxes(1, 2).reshape(20, 20, 16)
+    outside = np.ones((20, 20), dtype=bool)
+    outside[7:13, 7:13] = False  # squares 7 and 12 are half in the platform, cells 30 to 49
+    assert not heights[30:50, 30:50].any()
+    assert (np.ptp(squares, axis=2) == 0.0)[outside].all()
+    levels, counts = np.unique((squares[outside, 0] / 0.05).round(6), return_counts=True)
+    assert levels.tolist() == [-2.0, -1.0, 0.0, 1.0, 2.0]
+    assert counts.min() > 364 / 5 * 0.7
+    same = squares[:, 1:, 0] == squares[:, :-1, 0]
+    assert same.mean() == pytest.approx(0.2, abs=0.07)  # neighbours are independent, but for the 15 in the platform
 
 
 def test_kerbs_stand_out_of_level_ground():
