@@ -16,6 +16,7 @@ from legged.config.loader import to_dict
 from legged.config.schema import LeggedConfig
 from legged.envs import LeggedRobot
 from legged.envs.legged_gym_names import COMPUTED, CONSTANT, KEPT, PLAIN
+from legged.terrain import TERRAIN_TYPES
 from legged.tools import train
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -87,7 +88,7 @@ def test_terms_and_settings_beside_those_of_others_are_there(table):
             collect(value) if isinstance(value, dict) else None
 
     collect(to_dict(LeggedConfig()))
-    settings |= {"robot", "link_mass", "terminate_after_contacts_on", "dof_names", "_init_buffers", "std"}
+    settings |= {"robot", "link_mass", "terminate_after_contacts_on", "dof_names", "_init_buffers", "std", *TERRAIN_TYPES}
     named_here = {part for name in column(table, 2) for part in re.findall(r"\w+", name)} - {"self"}
     assert named_here
     assert named_here <= terms | settings

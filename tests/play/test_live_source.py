@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from helpers import POLICY, TASK
 
+from legged import registry
 from legged.errors import ConfigError
 from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL
 from legged.play.live.source import BEST, BEST_MODEL, CheckpointFollower, Watched, find_watched
@@ -48,12 +49,14 @@ def test_the_newest_run_of_all_is_shown_also_while_it_has_no_checkpoint():
     assert asked().folder == older
 
 
-def test_a_task_without_a_run_shows_its_shipped_policy():
+def test_a_task_without_a_run_shows_its_shipped_policy(monkeypatch):
     assert asked(task=TASK).folder == POLICY
     run = begin(f"{TASK}/run", 50, when=1.0)
     assert asked(task=TASK).folder == run
-    with pytest.raises(ConfigError, match="there is no run in logs/go2_flat; train one first"):
-        asked(task="go2_flat")
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    registry.register("untrained", {"extends": TASK})
+    with pytest.raises(ConfigError, match="there is no run in logs/untrained; train one first"):
+        asked(task="untrained")
 
 
 @pytest.mark.parametrize("name", ["logs/{0}/run", "{0}/run", "run"])
