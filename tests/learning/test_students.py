@@ -1,10 +1,11 @@
 """Students: a training by distillation from any policy of ours, what it writes, how it goes on, and what does not fit."""
 
 import shutil
+from pathlib import Path
 
 import pytest
 import torch
-from helpers import TASK, TINY_TRAINING, call, checkpoints, tiny_run
+from helpers import POLICY, TASK, TINY_TRAINING, call, checkpoints, tiny_run
 from test_resume import EVENTFUL, content, same
 
 from legged.config import to_dict
@@ -224,6 +225,13 @@ def test_a_teacher_needs_the_same_reading_of_the_ground(capsys):
     flags = ["--task", "anymal_c_student", "--teacher", "anymal_c", *TINY_TRAINING, "--sim_device", "cpu"]
     assert call(train.main, [*flags, "train.distillation.gradient_length=2", "terrain.scan=highest"]) == 2
     assert "terrain.scan lowest there, highest here" in capsys.readouterr().err
+
+
+def test_the_teacher_that_comes_with_the_package_fits_the_task_that_names_it():
+    """A new default of rough ground, terrain.scan, once ended `train.py --task anymal_c_student` at its start."""
+    teacher = find_teacher(task_config("anymal_c_student", on_cpu=True))
+    assert teacher.origin["task"] == "anymal_c"
+    assert Path(str(teacher.origin["file"])).parent.resolve() == POLICY.parent / "anymal_c"
 
 
 def test_what_a_teacher_knows_of_the_randomisation_must_be_on_its_scale(capsys):

@@ -135,9 +135,11 @@ def find_legs(tree: Tree) -> list[Leg]:
         hinges = [hinge.name for j in chains[i] for hinge in tree.links[j].hinges]
         legs.append(Leg(chains[i], hinges, _tip(tree, i), []))
     for leg in legs:
+        shapes = len(tree.links[leg.end].shapes)
         leg.feet = _feet(tree, leg, flat=len(legs) == 2 and len(leg.hinges) >= ANKLE)
         leg.tip = np.mean([shape.pos for shape in leg.feet], axis=0) if leg.feet else leg.tip
-        _uncover(tree, leg)
+        if len(tree.links[leg.end].shapes) == shapes:  # else the ball was added, and the rod is drawn back
+            _uncover(tree, leg)
     return legs
 
 
@@ -218,18 +220,33 @@ def _uncover(tree: Tree, leg: Leg) -> None:
         return
     for shape in tree.links[leg.end].shapes:
         half = half_lengths(shape)
-        if shape is leg.feet[0] or not shape.collides or not shape.fits or half is None:
+        if shape is leg.feet[0] or not shape.collides or not shape.fits or half is None or shape.kind == "sphere":
             continue
-        axis, width = int(half.argmax()), float(np.sort(half)[1])
-        down = matrix(shape.quat)[:, axis]
-        down = down * (np.sign(down @ (leg.tip - shape.pos)) or 1.0)
-        excess = float(down @ (shape.pos - leg.tip)) + float(half[axis]) + width
-        if 0.0 < excess < half[axis]:  # more than half of it stays
-            slot = 1 if shape.kind in ("capsule", "cylinder") else axis
-            shape.size = shape.size.copy()
-            shape.size[slot] -= excess / 2.0
-            shape.pos, shape.fits = shape.pos - down * excess / 2.0, {}
+        down, slot = _long_side(shape, leg.tip)
+        excess = float(down @ (shape.pos - leg.tip)) + float(half.max()) + float(np.sort(half)[1])
+        if 0.0 < excess < shape.size[slot]:  # more than half of it stays
+            _draw_back(shape, leg.tip, excess)
+            shape.fits = {}
             tree.say("shapes fitted to a mesh that has the foot in it end above the foot", shape.link)
+
+
+def _long_side(shape: Shape, tip: Vector) -> tuple[Vector, int]:
+    """Return the direction (3,) of a shape's longest side towards a point (3,) of its link, and which of its sizes is half
+    that side; of a capsule it is that of the part between its ends.
+    """
+    half = half_lengths(shape)
+    assert half is not None
+    axis = int(half.argmax())
+    along = matrix(shape.quat)[:, axis]
+    return along * (np.sign(along @ (tip - shape.pos)) or 1.0), 1 if shape.kind in ("capsule", "cylinder") else axis
+
+
+def _draw_back(shape: Shape, tip: Vector, length: float) -> None:
+    """Make a shape shorter by so much [m] at the end that is nearer to a point (3,) of its link, in place."""
+    along, slot = _long_side(shape, tip)
+    shape.size = shape.size.copy()
+    shape.size[slot] -= length / 2.0
+    shape.pos = shape.pos - along * length / 2.0
 
 
 def _is_low(shape: Shape, leg: Leg, shapes: list[Shape]) -> bool:
@@ -248,13 +265,8 @@ def _add_ball(tree: Tree, leg: Leg, shapes: list[Shape]) -> Shape:
         if half is None:
             continue
         radius = float(np.sort(half)[1])
-        axis, along = int(half.argmax()), matrix(shape.quat)[:, int(half.argmax())]
-        sign = np.sign(along @ (leg.tip - shape.pos)) or 1.0
-        if half[axis] > 2.0 * radius and shape.kind in ("box", "capsule", "cylinder"):
-            slot = 1 if shape.kind in ("capsule", "cylinder") else axis
-            shape.size = shape.size.copy()
-            shape.size[slot] -= radius / 2.0
-            shape.pos = shape.pos - sign * along * radius / 2.0
+        if half.max() > 2.0 * radius and shape.kind in ("box", "capsule", "cylinder"):
+            _draw_back(shape, leg.tip, radius)
     ball = Shape("sphere", np.array([radius, 0.0, 0.0]), leg.tip.copy(), np.array(IDENTITY), True, link.name)
     ball.name = f"{FOOT.sub('', link.name).strip('_-. ') or link.name}_foot"
     link.shapes.append(ball)
