@@ -143,7 +143,7 @@ def test_a_shank_whose_mesh_has_the_foot_in_it_ends_above_the_foot(added, tmp_pa
     np.testing.assert_allclose(model.geom("fl_calf").pos, [0, 0, -0.085], atol=1e-6)
     untouched = added(urdf().replace(cylinder, mesh.replace("-0.1", "-0.07")), "--name", "fourteenth_toy")
     assert "end above the foot" not in untouched  # it ends at -0.18
-    rods = urdf().replace(cylinder, mesh).replace("<collision><geometry><sphere radius=\"0.02\"/></geometry></collision>", "")
+    rods = urdf().replace(cylinder, mesh).replace('<collision><geometry><sphere radius="0.02"/></geometry></collision>', "")
     out = added(rods, "--name", "fifteenth_toy")
     assert "a ball is added at the end of" in out
     assert "end above the foot" not in out  # the rod was drawn back once already
