@@ -223,8 +223,9 @@ def over_seeds(task: str) -> tuple[str, list[list[dict]]]:
         for each in ([result[error] for result in of_engine] for of_engine in results):
             mean, worst = sum(one["mean"] for one in each) / len(each), max(one["worst"] for one in each)
             cells.append(f"{mean:.3f} ({worst:.3f})")
-    (falls,) = {f"{100.0 * sum(result['falls'] for result in each) / len(each):.2f} %" for each in results}
-    return f"| {len(folders)} | {' | '.join([*cells, falls])} |", results
+    falls = [f"{100.0 * sum(result['falls'] for result in each) / len(each):.2f} %" for each in results]
+    both = falls[0] if falls[0] == falls[1] else f"{falls[0]}, in C {falls[1]}"
+    return f"| {len(folders)} | {' | '.join([*cells, both])} |", results
 
 
 QUADRUPEDS = {
