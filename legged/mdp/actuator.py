@@ -40,8 +40,8 @@ class MotorCurve:
     """Between what torques the motors of D joints can choose at a velocity."""
 
     def __init__(self, stall_torque: Tensor, no_load_speed: Tensor) -> None:
-        """Take what a motor gives at rest [N m] and at what speed it gives nothing [rad/s], (D,) each. An infinite no-load
-        speed makes a motor ideal.
+        """Take what a motor gives at rest [N m] and at what speed it gives nothing [rad/s], (D,) each. A motor is ideal where
+        both are infinite: it gives what the joint bears, whatever is drawn for that.
         """
         self.stall_torque, self.no_load_speed = stall_torque, no_load_speed
         """(D,) each; no-load speeds (N, D) once they `vary` from robot to robot."""
@@ -118,7 +118,7 @@ class Actuator:
         self.middle = middle
         """(D,), (N, D) or () the target of action 0."""
         stall, fastest = map(tensor, motor_numbers(robot, actuator))
-        self.curve = MotorCurve(stall, fastest)
+        self.curve = MotorCurve(torch.where(fastest.isfinite(), stall, torch.inf), fastest)
         coulomb, breakaway, viscous = map(tensor, friction_numbers(robot, actuator))
         speeds = (actuator.stribeck_velocity, actuator.friction_smoothing)
         self.friction = Friction(coulomb, breakaway, viscous, *speeds)

@@ -96,12 +96,23 @@ def test_velocity_limits_that_are_drawn_are_the_motors_own():
     torch.testing.assert_close(curve.no_load_speed, task.dof_vel_limits)
 
 
+@KERNELS
+def test_ideal_motors_give_what_is_drawn_for_their_joints(kernels):
+    made = control(kernels, model="dc_motor", joints=("KFE",))
+    made.vary({"torque_limit": torch.full((N,), 1.5)})
+    made.set_actions(full(2.0))  # 200 asked for
+    ideal = torch.tensor(["KFE" not in name for name in ROBOT.joint_names])
+    found = made.compute(made.default_dof_pos.expand(N, D), full(0.0))
+    assert found[:, ideal].unique().tolist() == [1.5 * EFFORT]
+    assert found[:, ~ideal].unique().tolist() == [EFFORT], "a motor's stall torque is not the joint's limit"
+
+
 def test_stall_torque_and_no_load_speed_are_the_robots_unless_named():
     made = control(model="dc_motor", joints=("HFE",), no_load_speed={"LF_HFE": 5.0})
     curve = made.actuator.curve
     of = dict(zip(ROBOT.joint_names, curve.no_load_speed.tolist(), strict=True))
     assert (of["LF_HFE"], of["RF_HFE"], of["LF_HAA"]) == (5.0, 20.0, np.inf)
-    assert curve.stall_torque.tolist() == ROBOT.torque_limits.tolist()
+    assert curve.stall_torque.tolist() == [EFFORT if "HFE" in name else np.inf for name in ROBOT.joint_names]
 
 
 def test_friction_by_hand():
