@@ -296,7 +296,7 @@ class BaseTask(ObservingTask, PrivilegedTerms, SavedTask, VecEnv):
         """Write the observation groups."""
         self.observation_terms.evaluate(self.reset_buf)
         with self._beside.fork():
-            self.faults.check_observations()
+            self.faults.check_observations(self.reset_buf)
         for group in self.observation_groups.values():
             group.advance()
             group.compute()

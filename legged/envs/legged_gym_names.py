@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from legged.math import get_euler_xyz, quat_rotate
+from legged.math import get_euler_xyz, masked_set_, quat_rotate
 
 FORWARD, DOWN, LEVEL = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 0.0, 0.0, 1.0)
 """The x axis, the direction of gravity, and the orientation (x, y, z, w) that turns nothing."""
@@ -213,6 +213,8 @@ class LeggedGymNames:
     (rows, columns, 3), `noise_scale_vec` of the actor's columns; the others are as their counterparts here.
     """
 
+    reset_buf: Tensor
+
     if not TYPE_CHECKING:  # a type checker should go on seeing what is not there
 
         def __getattr__(self, name: str) -> Any:
@@ -260,4 +262,6 @@ class LeggedGymNames:
         """Keep what was asked for of this step, before the task itself overwrites what it keeps."""
         for name in vars(self).get("_kept_names", ()):
             vars(self)[name].copy_(KEPT[name](self))
+            if name == "last_last_actions":  # a new episode has none before it
+                masked_set_(vars(self)[name], self.reset_buf, 0.0)
         super().remember()  # type: ignore[misc]

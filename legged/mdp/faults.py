@@ -47,9 +47,12 @@ class Faults:
         torch.all(whole, dim=0, out=self.sound)
         self._rewards_whole.logical_and_(whole)
 
-    def check_observations(self) -> None:
-        """Look at the terms' values, before they are scaled and clipped; after `check_rewards`."""
+    def check_observations(self, begun: Tensor) -> None:
+        """Look at the terms' values, before they are scaled and clipped; after `check_rewards`. Robots of `begun` (N,) have
+        new episodes, which are not to blame for the rewards of those that ended.
+        """
         size = self._terms.raw.abs()
+        self.sound.logical_or_(begun)
         self.sound.logical_and_(size.amax(dim=1) < LARGEST)  # NaN is the largest of all, and not below
         torch.maximum(self._largest, size, out=self._largest)
 

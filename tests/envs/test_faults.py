@@ -105,6 +105,22 @@ def test_a_reward_that_is_no_number_counts_as_nothing():
     assert rewards[2] == pytest.approx(float(task.rewards.sums[:, 2].sum()), rel=1e-6)
 
 
+@pytest.mark.parametrize("ends", ["time", "reset"])
+def test_a_bad_reward_at_the_end_of_an_episode_does_not_end_the_next_one(ends):
+    task = broken_task(reward=NAN)
+    task.reset()
+    if ends == "time":
+        task.episode_length_buf = torch.full((5,), task.max_episode_length - 1)
+    _, _, dones, _ = task.step(torch.zeros(5, 12))
+    assert dones.all() or ends == "reset"
+    assert not task.terminated_buf.any()
+    if ends == "reset":
+        task.reset()
+    task.cfg.custom["reward"] = "0.0"  # the next one is a good one
+    _, _, dones, _ = task.step(torch.zeros(5, 12))
+    assert not dones.any()
+
+
 @pytest.mark.parametrize(("value", "faults"), [(NAN, {"Faults/action": 1.0}), (INF, {}), (-INF, {}), (1e30, {})])
 def test_a_bad_action_moves_nothing(value, faults):
     """An infinite one is clipped, as a large one is; NaN asks for the default pose, and the robot begins anew."""

@@ -198,6 +198,29 @@ def test_what_is_kept_is_that_of_the_step_before():
     assert {"last_root_vel", "last_torques", "last_last_actions"} <= set(fork.state_dict()["task"])
 
 
+def test_actions_of_the_last_episode_are_not_those_before_the_first_ones():
+    class Fork(LeggedRobot):
+        def _reward_lin_vel_z(self):
+            self.seen.copy_(self.last_last_actions)
+            return self.rew_buf * 0.0
+
+        def _init_buffers(self):
+            super()._init_buffers()
+            self.seen = torch.ones(self.num_envs, JOINTS, device=self.device)
+
+    fork = Fork(small_config())
+    for begins in (True, False, False, True, False):
+        if begins:
+            fork.reset()
+        fork.step(torch.full((ROBOTS, JOINTS), 0.3))
+        if begins:
+            assert not fork.seen.any()
+    fork.episode_length_buf = torch.full((ROBOTS,), fork.max_episode_length - 1)
+    for seen in (0.3, 0.0, 0.0, 0.3):  # of the step that ends the episode, then of three of the next one
+        fork.step(torch.full((ROBOTS, JOINTS), 0.3))
+        assert fork.seen.unique().tolist() == pytest.approx([seen])
+
+
 def test_air_time_is_that_of_swings_which_go_on_or_end(task):
     contacts = task.contacts
     air = torch.where(contacts.first_contact, contacts.last_air_time, contacts.air_time)
