@@ -252,6 +252,10 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.control.reset(mask)
         self.contacts.reset(mask)
 
+    def reset(self) -> TensorDict:
+        self.disturbances.end(self.physics)
+        return super().reset()
+
     def redraw(self, mask: Tensor) -> None:
         super().redraw(mask)
         self._vary_control(again=True)

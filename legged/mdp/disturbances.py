@@ -19,7 +19,8 @@ def _draws(
     """Return what draws the components `names` of a disturbance, which may grow, then its `times`, which do not."""
     columns = [DrawConfig(range=getattr(cfg, name), grow=cfg.grow) for name in names]
     columns += [DrawConfig(range=getattr(cfg, name)) for name in times]
-    return Draws(columns, [0.0] * len(names) + [getattr(cfg, name)[0] for name in times], numbers.device, pace)
+    start = [0.0] * len(names) + [getattr(cfg, name)[0] for name in times]
+    return Draws(columns, start, numbers.device, pace, within=False)
 
 
 class Kicks:
@@ -146,6 +147,13 @@ class Disturbances:
             part.act(physics, mask)
         if self._all:
             self.steps.add_(1.0)
+
+    def end(self, physics: Physics) -> None:
+        """Let go of all robots: episodes begin anew in each of them, outside of a step."""
+        if physics.forces is not None:
+            physics.forces.zero_()
+        for force in self.forces.values():
+            force.force.zero_()
 
     def progress(self) -> dict[str, Tensor]:
         """Return how far they have grown; empty where there are none."""

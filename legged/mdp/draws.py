@@ -26,8 +26,11 @@ class Draws:
         neutral: Sequence[float],
         device: torch.device,
         steps_per_iteration: int = 1,
+        within: bool = True,
     ) -> None:
-        """Say how each of V columns is drawn, and from what value on it grows over iterations of so many steps."""
+        """Say how each of V columns is drawn, and from what `neutral` value on it grows over iterations of so many steps:
+        from the end of its range that is nearest to it, or (not `within`) from that value itself.
+        """
         self._order = sorted(range(len(columns)), key=lambda i: KINDS.index(columns[i].distribution))
         ordered = [columns[i] for i in self._order]
         self._counts = [sum(draw.distribution == kind for draw in ordered) for kind in KINDS]
@@ -51,7 +54,9 @@ class Draws:
             paces = [1.0 / (draw.grow[1] - draw.grow[0]) if draw.grow[1] > 0.0 else 0.0 for draw in columns]
             first = [-draw.grow[0] * pace if pace else 1.0 for draw, pace in zip(columns, paces, strict=True)]
             self._pace = tensor([pace / steps_per_iteration for pace in paces]), tensor(first)
-        self._neutral = torch.minimum(torch.maximum(tensor(neutral), self._least), self._most)
+        self._neutral = tensor(neutral)
+        if within:
+            self._neutral = torch.minimum(torch.maximum(self._neutral, self._least), self._most)
 
     def ask(self, numbers: UniformNumbers) -> Drawn:
         """Ask for the even numbers that `values` is made of."""

@@ -156,6 +156,8 @@ class MujocoPhysics(Physics):
         state = {"qpos": self._qpos, "qvel": self._qvel, "act": self._act, "warmstart": self._warmstart}
         if self.robot_state is not None:
             state["contact_forces"] = self.robot_state.contact_forces
+        if self.forces is not None:
+            state["forces"] = self.forces
         return {**state, **self._reader.of_last_step}
 
     def load_state(self, saved: Mapping[str, Tensor]) -> None:

@@ -327,3 +327,37 @@ def test_everything_adds_few_launches():
 
 def test_every_field_is_among_those_that_are_drawn_here():
     assert set(EVERYTHING) == set(FIELDS)
+
+
+def test_a_force_does_not_go_on_into_episodes_that_begin_outside_of_a_step():
+    """It lasts for 5 s; `reset()` ends it before, and the next step, too short for another one, is free of it."""
+    force = {"x": [100.0, 200.0], "interval_s": [0.02, 0.04], "duration_s": [5.0, 5.0]}
+    task = small_task(("domain_rand.forces", {"pull": force}))
+    for _ in range(5):
+        task.step(torch.zeros(4, 12))
+    pulled = task.disturbances.forces["pull"].force
+    assert (pulled[:, 0] >= 100.0).all()
+    task.reset()
+    assert not pulled.any()
+    assert not task.physics.forces.any()
+    task.step(torch.zeros(4, 12))
+    assert not task.physics.forces.any()
+
+
+def test_what_grows_begins_with_nothing_also_where_its_range_leaves_out_0():
+    """Halfway from iteration 100 to 200 it is half of what is drawn: 0.25 to 0.5 m/s, -150 to -100 N."""
+    steps = 24
+    kick = {"x": [0.5, 1.0], "interval_s": [0.02, 0.02], "grow": [100, 200]}
+    force = {"z": [-300.0, -200.0], "interval_s": [0.02, 0.02], "grow": [100, 200]}
+    task = small_task(
+        ("domain_rand.kicks", {"kick": kick}),
+        ("domain_rand.forces", {"pull": force}),
+        ("train.runner.num_steps_per_env", steps),
+    )
+    kicks, forces = task.disturbances.kicks["kick"], task.disturbances.forces["pull"]
+    for begun, share in ((0, 0.0), (150, 0.5), (200, 1.0)):
+        task.disturbances.steps.fill_(begun * steps)
+        task.disturbances.draw()
+        for drawn, low, high in ((kicks._velocity[:, 0], 0.5, 1.0), (forces._fresh[:, 2], -300.0, -200.0)):
+            assert (drawn >= share * low - 1e-5).all()
+            assert (drawn <= share * high + 1e-5).all()

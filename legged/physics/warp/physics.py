@@ -94,6 +94,8 @@ class WarpPhysics(Physics):
         state = {"qpos": self.qpos, "qvel": self.qvel}
         if self.robot_state is not None:
             state["contact_forces"] = self.robot_state.contact_forces
+        if self.forces is not None:
+            state["forces"] = self.forces
         return state
 
     def copy_to(self, env_id: int, data: mujoco.MjData) -> None:
