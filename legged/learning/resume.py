@@ -3,13 +3,13 @@
 import argparse
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from legged.commandline.arguments import overrides
 from legged.config import LeggedConfig, TaskConfig, override, to_dict
 from legged.errors import ConfigError
 from legged.learning.checkpoint import check_fits, check_optimizer, read_checkpoint
 from legged.learning.run_folder import find_checkpoint, find_run, run_config
+from legged.learning.run_state import value_at
 from legged.process.paths import relative
 from legged.registry import task_class, task_config
 
@@ -65,10 +65,3 @@ def changes(before: TaskConfig, after: TaskConfig, asked: Iterable[str]) -> list
         if old != new and path not in OF_A_RUN:
             found.append(f"{path} {old} -> {new}")
     return found
-
-
-def value_at(values: Any, path: str) -> Any:
-    """Look up a dotted path in nested mappings; None where there is nothing."""
-    for key in path.split("."):
-        values = values.get(key) if isinstance(values, dict) else None
-    return values

@@ -14,12 +14,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from legged.config import TaskConfig, to_dict
 from legged.errors import ConfigError
 from legged.learning.checkpoint import load_plain, write_checkpoint
 from legged.process.paths import relative
 from legged.state import StateError
 
 FORMAT = 2
+OF_THE_STATE = (
+    "terrain",
+    "domain_rand",
+    "init_state",
+    "control",
+    "commands.curriculum",
+    "rewards.soft_dof_pos_limit",
+    "rewards.soft_dof_vel_limit",
+    "env.seed",
+)
+"""Settings that are in the state as numbers: robots that went on where they were would go on with the old ones."""
 
 
 def state_path(checkpoint: Path) -> Path:
@@ -60,6 +72,34 @@ def read_run_state(checkpoint: Path, checkpoint_id: str) -> dict[str, Any]:
     if state["id"] != checkpoint_id:
         raise StateError(f"{relative(path)} belongs to another checkpoint")
     return state
+
+
+def check_same_world(before: TaskConfig, after: TaskConfig) -> None:
+    """Find out whether the robots of a run can go on where they were, under the configuration `after`.
+
+    Raises:
+        StateError: they can't: a setting that their state is made of is another one.
+    """
+    old, new = to_dict(before), to_dict(after)
+    for path in OF_THE_STATE:
+        for name, was, now in _differing(path, value_at(old, path), value_at(new, path)):
+            raise StateError(f"{name} was {was}, and is {now} now")
+
+
+def _differing(path: str, was: Any, now: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Yield path and both values of the leaves in which two nested mappings differ."""
+    if isinstance(was, dict) and isinstance(now, dict):
+        for key in dict.fromkeys([*was, *now]):
+            yield from _differing(f"{path}.{key}", was.get(key), now.get(key))
+    elif was != now:
+        yield path, was, now
+
+
+def value_at(values: Any, path: str) -> Any:
+    """Look up a dotted path in nested mappings; None where there is nothing."""
+    for key in path.split("."):
+        values = values.get(key) if isinstance(values, dict) else None
+    return values
 
 
 def generators() -> dict[str, Any]:

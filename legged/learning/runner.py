@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import math
 import time
 from functools import partial
 from pathlib import Path
@@ -30,8 +31,15 @@ from legged.learning.evaluations import Ended, Evaluations
 from legged.learning.logger import Interrupted, QuietLogger
 from legged.learning.networks import begin_std, keep_std_in_bounds, network_settings, use_matmul
 from legged.learning.recurrent import hidden_states
-from legged.learning.run_folder import BEST_MODEL
-from legged.learning.run_state import generators, read_run_state, remove_older, set_generators, write_run_state
+from legged.learning.run_folder import BEST_MODEL, CONFIG_FILE, run_config
+from legged.learning.run_state import (
+    check_same_world,
+    generators,
+    read_run_state,
+    remove_older,
+    set_generators,
+    write_run_state,
+)
 from legged.learning.step_guard import StepGuard
 from legged.learning.symmetry import augment, images_of
 from legged.learning.transfer import check_built, tell_taken, what_is_taken
@@ -147,7 +155,8 @@ class Runner(OnPolicyRunner):
             return {}
         steps = logger.tot_timesteps + logger.steps_per_iteration
         best = evaluations.evaluate(self.alg.get_policy(), iterations, logger.loop_s, steps)
-        found = dict(evaluations.history[-1].figures)
+        figures = evaluations.history[-1].figures
+        found = {name: value for name, value in figures.items() if math.isfinite(value)}  # of others a checkpoint holds none
         if best and logger.writer is not None:
             path = Path(logger.log_dir) / BEST_MODEL
             write_checkpoint(path, self._content(path, {"evaluation": found}))
@@ -281,10 +290,18 @@ class Runner(OnPolicyRunner):
             saved["optimizer_state_dict"] = fit_optimizer(wanted, self.alg.optimizer, where, waiting)
         try:
             self.alg.load(saved, parts, strict)
-            self.alg.learning_rate = float(saved["infos"].get("learning_rate", self.alg.learning_rate))
+            self._set_rate(float(saved["infos"].get("learning_rate", self.alg.learning_rate)))
         except (RuntimeError, ValueError, KeyError, TypeError) as error:
             policy = self.alg.get_policy().state_dict()
             raise ConfigError(describe_mismatch(path, saved, policy, self.env.cfg.task)) from error
+
+    def _set_rate(self, saved: float) -> None:
+        """Go on with the learning rate of a checkpoint where it adapts, with that of the configuration where it is fixed."""
+        settings = self.env.cfg.train.algorithm
+        self.alg.learning_rate = settings.learning_rate if settings.schedule == "fixed" else saved
+        first = self.alg.optimizer.param_groups[0]  # an estimator's, which comes after it, has a rate of its own
+        if not isinstance(first["lr"], Tensor):
+            first["lr"] = self.alg.learning_rate
 
     def transfer(self, path: str) -> str:
         """Take networks, normaliser and optimiser of another task's checkpoint, to begin a training with them: iterations,
@@ -301,18 +318,14 @@ class Runner(OnPolicyRunner):
         self._load_learner(Path(path), saved)
         if "critic_state_dict" not in saved:
             begin_std(self.alg.get_policy(), self.env.cfg)
-        if settings.schedule == "fixed":
-            self.alg.learning_rate = settings.learning_rate
-        first = self.alg.optimizer.param_groups[0]  # an estimator's, which comes after it, has a rate of its own
-        if not isinstance(first["lr"], Tensor):
-            first["lr"] = self.alg.learning_rate
         task = saved["infos"].get("task", "")
         self._transferred_from = {"file": relative(Path(path)), "task": task, "iteration": saved["iter"]}
         return tell_taken(Path(path), saved, self.alg.get_policy(), self.env.cfg, self.alg.learning_rate)
 
     def resume(self, path: str) -> str:
         """Load a checkpoint to train on from. Robots, random numbers and episodes go on where they were, if their state lies
-        beside it; else all robots begin anew on the tiles that they had reached. Returns why they do, or nothing.
+        beside it and the ground and what is drawn for robots are as they were; else all robots begin anew on the tiles that
+        they had reached. Returns why they do, or nothing.
         """
         infos = self.load(path)
         if self.is_distributed:
@@ -320,6 +333,8 @@ class Runner(OnPolicyRunner):
         else:
             try:
                 state = read_run_state(Path(path), infos.get("id", ""))
+                if (Path(path).parent / CONFIG_FILE).is_file():
+                    check_same_world(run_config(Path(path).parent), self.env.cfg)
                 self._take(state)
                 self._state = state  # taken once more when training begins, after the trial steps of a capture
                 return ""

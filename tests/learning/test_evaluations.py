@@ -11,6 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import nn
 
 from legged.config.schema import RunnerConfig
+from legged.evaluation.during_training import TrainingEvaluation
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.evaluations import Evaluations
 from legged.learning.timing import read_timing
@@ -122,6 +123,15 @@ def test_a_training_learns_the_same_with_evaluations_and_without(loop):
     assert all(torch.equal(best["actor_state_dict"][name], weights[name]) for name in weights)
     assert read_timing(evaluated).evaluation_s > 0.0
     assert read_timing(plain).evaluation_s == 0.0
+
+
+def test_a_figure_that_is_no_number_is_left_out_of_the_best_checkpoint(monkeypatch):
+    measure = TrainingEvaluation.measure
+    monkeypatch.setattr(TrainingEvaluation, "measure", lambda *args: measure(*args) | {"return": float("nan")})
+    folder = tiny_run(*EVERY, iterations=1)
+    found = read_checkpoint(folder / "model_best.pt")["infos"]["evaluation"]
+    assert "lin_vel_rmse" in found
+    assert "return" not in found
 
 
 def test_a_training_ends_at_its_target_and_counts_as_finished(capsys):

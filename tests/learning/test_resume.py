@@ -28,6 +28,7 @@ VARIANTS = {
     "std by state": ["train.policy.state_dependent_std=true"],
     "rmsprop": ["train.algorithm.optimizer=rmsprop"],
     "lstm": ["train.policy.rnn_type=lstm", "train.policy.rnn_hidden_dim=6", "train.algorithm.symmetry=false"],
+    "forces": ["domain_rand.forces={pull: {y: [-80, 80], interval_s: [0.02, 0.06], duration_s: [0.06, 0.1]}}"],
     "gru": ["train.policy.rnn_type=gru", "train.policy.rnn_num_layers=2", "train.algorithm.symmetry=false"],
 }
 
@@ -208,3 +209,42 @@ def test_a_state_is_taken_once(loop):
             runner.current_learning_iteration += 1
     assert same(parts.alg.actor.state_dict(), whole.alg.actor.state_dict())
     assert same(parts.env.state_dict(), whole.env.state_dict())
+
+
+def resumed_with(path: str, before, after):
+    """A task that goes on with a run for which a setting was another one, and why its robots begin anew."""
+    from legged.config import override
+    from legged.learning.runner import Runner
+    from legged.registry import make_task
+
+    of = ["--task", "anymal_c"] if path.startswith("terrain") else []
+    folder = tiny_run(*of, f"{path}={before}", num_envs=8)
+    task = make_task(override(run_config(folder), [(path, after)]))
+    return task, Runner(task).resume(str(folder / "model_1.pt"))
+
+
+def test_robots_do_not_go_on_with_gains_that_were_drawn_from_another_range():
+    task, why = resumed_with("domain_rand.ranges.p_gain.range", [0.5, 0.6], [1.5, 1.6])
+    assert why == "domain_rand.ranges.p_gain.range was [0.5, 0.6], and is [1.5, 1.6] now"
+    assert task.randomization.fields["p_gain"].min() >= 1.5
+
+
+def test_a_command_curriculum_that_is_turned_off_leaves_no_narrow_ranges():
+    task, why = resumed_with("commands.curriculum.enabled", "true", False)
+    assert why == "commands.curriculum.enabled was True, and is False now"
+    assert task.command_curriculum.share.tolist() == [1.0] * 3
+
+
+def test_robots_are_spread_over_the_columns_of_a_new_ground():
+    task, why = resumed_with("terrain.num_cols", 20, 10)
+    assert why == "terrain.num_cols was 20, and is 10 now"
+    assert task.terrain_curriculum.columns.tolist() == [0, 1, 2, 3, 5, 6, 7, 8]
+
+
+@pytest.mark.parametrize("loop", ["captured", "stock"])
+def test_a_fixed_learning_rate_can_be_changed(loop):
+    folder = tiny_run("train.algorithm.schedule=fixed", "train.algorithm.learning_rate=0.001", f"train.runner.loop={loop}")
+    rest = tiny_run("--resume", "--load_run", str(folder), "train.algorithm.learning_rate=0.00001", iterations=4)
+    saved = content(rest, 3)
+    assert saved["infos"]["learning_rate"] == pytest.approx(1e-5)
+    assert float(saved["optimizer_state_dict"]["param_groups"][0]["lr"]) == pytest.approx(1e-5)
