@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from typing import get_args
 
-from legged.config.networks import check_networks
+from legged.config.networks import check_networks, learns_from_teacher
 from legged.config.schema import LeggedConfig, TaskConfig
 from legged.envs.overrides import check_overrides, check_terms
 from legged.envs.randomization_checks import check_observed, check_randomization
@@ -100,7 +100,7 @@ def check_lengths(cfg: TaskConfig) -> None:
             f"{where}: must be at least a control step of {cfg.dt:g} s (sim.dt * control.decimation), got {given:g}"
         )
     samples = cfg.env.num_envs * cfg.train.runner.num_steps_per_env
-    if cfg.train.algorithm.num_mini_batches > samples:
+    if cfg.train.algorithm.num_mini_batches > samples and not learns_from_teacher(cfg):
         where, given = origins.where("train.algorithm.num_mini_batches"), cfg.train.algorithm.num_mini_batches
         raise ConfigError(
             f"{where}: must be at most the {samples} samples of an iteration (num_envs * num_steps_per_env), got {given}"

@@ -101,7 +101,6 @@ class CapturedRunner(Runner):
         if warms_up:
             self.alg.fill_moments()
         before = list(zip(self.alg.tensors(), copies(self.alg.tensors()), strict=True))
-        fresh = not self.alg.optimizer.state
         fits = enabled and self.alg.fits_graph
         update = update_critic = StepGraph(self.alg.learn, device, fits, rehearse=lambda: self.alg.learn(1))
         if warms_up:
@@ -109,9 +108,10 @@ class CapturedRunner(Runner):
         with torch.no_grad():
             for tensor, value in before:
                 tensor.copy_(value)
-            if fresh:  # the optimiser's moments came to be while warming up
-                for state in self.alg.optimizer.state.values():
-                    for tensor in state.values():
+            known = {id(tensor) for tensor, _ in before}
+            for state in self.alg.optimizer.state.values():
+                for tensor in state.values():
+                    if id(tensor) not in known:  # it came to be in the trial steps
                         tensor.zero_()
         if enabled:
             rollout.forget()

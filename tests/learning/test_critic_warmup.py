@@ -6,9 +6,13 @@ from helpers import TASK, TINY_TRAINING, call, tiny_run
 from learners import fill, learner
 from test_resume import content, same
 
+from legged.envs import BaseTask
+from legged.learning.captured import CapturedRunner
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.critic_warmup import CriticWarmup
 from legged.learning.ppo import DevicePPO
+from legged.learning.run_folder import run_config
+from legged.registry import make_task
 from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
@@ -105,3 +109,23 @@ def test_a_transfer_with_warmup_takes_the_policy_alone(loop, capsys):
     refused = ["--task", TASK, "--transfer", "--load_run", str(source), "--checkpoint", "2", "--sim_device", "cpu"]
     assert call(train.main, [*refused, *TINY_TRAINING]) == 2
     assert "train.algorithm.critic_warmup_iterations=50 would train a new value function" in capsys.readouterr().err
+
+
+def test_trial_steps_of_a_capture_leave_no_moments(monkeypatch):
+    """The value function's were saved in the middle of a warm-up; those of the policy come to be while graphs are tried."""
+    half = tiny_run("train.algorithm.critic_warmup_iterations=2", "train.runner.loop=stock", iterations=1)
+    runner = CapturedRunner(make_task(run_config(half)), None, "cpu")
+    assert runner.resume(str(half / "model_0.pt")) == ""
+    values = {id(parameter) for parameter in runner.alg.critic.parameters()}
+    before = {key: state["exp_avg"].clone() for key, state in runner.alg.optimizer.state.items()}
+    assert {id(key) for key in before} == values
+    monkeypatch.setattr(BaseTask, "captured", True)  # steps are tried as on a GPU
+    runner.alg.train_mode()
+    runner._capture(runner._steps(), True)
+    tried = [key for key in runner.alg.optimizer.state if id(key) not in values]
+    assert tried, "or there is nothing to see here"
+    for key, state in runner.alg.optimizer.state.items():
+        if id(key) in values:
+            assert torch.equal(state["exp_avg"], before[key])
+        else:
+            assert not any(tensor.any() for tensor in state.values())

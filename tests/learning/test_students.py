@@ -9,6 +9,7 @@ from helpers import POLICY, TASK, TINY_TRAINING, call, checkpoints, tiny_run
 from test_resume import EVENTFUL, content, same
 
 from legged.config import to_dict
+from legged.envs.checks import check_lengths
 from legged.errors import ConfigError
 from legged.evaluation.learning_curves import read_scalars
 from legged.learning.run_folder import run_config
@@ -302,3 +303,11 @@ def test_a_checkpoint_file_can_be_the_teacher():
     assert teacher.origin["iteration"] == 0
     assert same(dict(teacher.weights), content(folder, 0)["actor_state_dict"])
     assert to_dict(with_teacher(cfg, teacher))["observations"]["groups"]["teacher_actor"]["noise"] is False
+
+
+def test_mini_batches_of_ppo_are_nothing_to_a_student():
+    """Three robots and one step make fewer samples than PPO's four mini-batches want."""
+    small = [("env.num_envs", 3), ("train.runner.num_steps_per_env", 1)]
+    check_lengths(task_config("anymal_c_student", [*small, ("train.distillation.gradient_length", 1)]))
+    with pytest.raises(ConfigError, match="num_mini_batches: must be at most the 3 samples"):
+        check_lengths(task_config("anymal_c_proprio", small))
