@@ -117,6 +117,22 @@ def test_a_world_link_is_not_the_base(read, kind):
     assert read(urdf(f'<link name="world"/>{joint}')).links[0].name == "trunk"
 
 
+def test_empty_links_above_the_base_are_passed_over_and_named(read):
+    """As `base_footprint`, on the ground. A quarter turn to the left brings a hip at (0.2, 0.1) to (-0.1, 0.2)."""
+    joints = (
+        '<joint name="j1" type="fixed"><parent link="base_footprint"/><child link="base_link"/>'
+        '<origin xyz="0 0 0.3"/></joint>'
+        '<joint name="j2" type="fixed"><parent link="base_link"/><child link="trunk"/>'
+        '<origin xyz="0 0 0.1" rpy="0 0 1.5707963267948966"/></joint>'
+    )
+    tree = read(urdf(f'<link name="base_footprint"/><link name="base_link"/>{joints}'))
+    assert (tree.links[0].name, tree.links[0].mass) == ("trunk", 6.0)
+    np.testing.assert_allclose(tree.links[0].com, [0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(tree.links[1].pos, [-0.1, 0.2, 0.0], atol=1e-12)
+    np.testing.assert_allclose(np.diag(tree.links[0].inertia), [0.08, 0.03, 0.1], atol=1e-12)
+    assert said(tree, "guess: the base is link 'trunk'").endswith(": base_link, base_footprint")
+
+
 def test_links_without_mass(read):
     """At the end of a hinge: it is held. In a chain: it moves, and is given a hundredth of the next link's mass."""
     tree = read(urdf(arm()))

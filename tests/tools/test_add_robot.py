@@ -89,6 +89,18 @@ def test_the_stance_is_that_of_a_two_link_leg(added):
         np.testing.assert_allclose(data.geom(f"{leg}_foot").xpos[:2], [x, y], atol=0.005)
 
 
+def test_a_frame_on_the_ground_is_not_the_base(added):
+    """0.3 m below it, the base would stand at a tenth of its height, and torque limits by its height be a tenth too."""
+    weak = urdf().replace('effort="30"', 'effort="0"')
+    joint = '<joint name="j" type="fixed"><parent link="foot_print"/><child link="trunk"/><origin xyz="0 0 0.3"/></joint>'
+    out = added(weak.replace("</robot>", f'<link name="foot_print"/>{joint}</robot>'), "--name", "sixteenth_toy")
+    assert "guess: the base is link 'trunk', and empty links above it on fixed joints are passed over: foot_print" in out
+    added(weak, "--name", "seventeenth_toy")
+    robot, plain = load_robot("mine/sixteenth_toy"), load_robot("mine/seventeenth_toy")
+    assert (robot.file.base, robot.file.spawn_height) == ("trunk", plain.file.spawn_height)
+    np.testing.assert_array_equal(robot.torque_limits, plain.torque_limits)
+
+
 def test_what_a_file_does_not_say_is_guessed_and_named(added):
     """Torque limits: 0.4 m g h. A robot.yaml holds every guess as a comment."""
     out = added(urdf().replace('effort="30"', 'effort="0"'), "--name", "third_toy")

@@ -32,7 +32,7 @@ def read_urdf(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tre
     tree = Tree(root.get("name") or path.stem, path, [], 0.0)
     elements = {link.get("name", ""): link for link in root.findall("link")}
     joints = [_Joint(element, path, elements) for element in root.findall("joint")]
-    top = _top(elements, joints, path)
+    top, above = _top(elements, joints, path)
     named = {
         material.get("name", ""): _colour(material)
         for material in root.iter("material")
@@ -55,6 +55,7 @@ def read_urdf(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tre
         missing = sorted(set(elements) - {link.name for link in tree.links})
         raise ConfigError(f"{path}: joints form a circle; not reached from '{top}': {', '.join(missing)[:200]}")
     tree.mass = sum(link.mass for link in tree.links)
+    _pass_over(tree, above)
     return tree
 
 
@@ -76,8 +77,10 @@ def _parsed(path: Path) -> ET.Element:
     return root
 
 
-def _top(elements: dict[str, ET.Element], joints: list["_Joint"], path: Path) -> str:
-    """Return the link that is nobody's child; an empty link in its place, such as `world`, is passed over."""
+def _top(elements: dict[str, ET.Element], joints: list["_Joint"], path: Path) -> tuple[str, list["_Joint"]]:
+    """Return the link that is the base, and the joints above it. It is the link that is nobody's child; empty ones there that
+    carry a single link on a fixed or floating joint, such as `world` and `base_footprint`, are taken out with their joints.
+    """
     children = [joint.child for joint in joints]
     twice = next((name for name in children if children.count(name) > 1), None)
     if twice is not None:
@@ -86,13 +89,25 @@ def _top(elements: dict[str, ET.Element], joints: list["_Joint"], path: Path) ->
     if len(tops) != 1:
         named = ", ".join(tops) or "none"
         raise ConfigError(f"{path}: expected one link that is no joint's child, found {len(tops)}: {named[:200]}")
-    top = tops[0]
-    below = [joint for joint in joints if joint.parent == top]
-    if len(elements[top]) == 0 and len(below) == 1 and (below[0].kind == "floating" or top == "world"):
+    top, above = tops[0], []
+    while len(elements[top]) == 0:
+        below = [joint for joint in joints if joint.parent == top]
+        if len(below) != 1 or (below[0].kind not in ("fixed", "floating") and top != "world"):
+            break
         del elements[top]
         joints.remove(below[0])
-        return below[0].child
-    return top
+        above.append(below[0])
+        top = below[0].child
+    return top, above
+
+
+def _pass_over(tree: Tree, above: Sequence["_Joint"]) -> None:
+    """Let the robot look as it does in the frame of the links above its base, and say that these are passed over."""
+    for joint in reversed(above):
+        tree.turn(_origin(joint.element, joint.path)[1])
+        if joint.kind == "fixed" and joint.parent != "world":
+            what = f"guess: the base is link '{tree.links[0].name}', and empty links above it on fixed joints are passed over"
+            tree.say(what, joint.parent)
 
 
 def _say_dont_collapse(tree: Tree, joints: list["_Joint"]) -> None:
