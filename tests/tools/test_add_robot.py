@@ -113,6 +113,21 @@ def test_what_a_file_does_not_say_is_guessed_and_named(added):
     assert "stiffness" not in yaml.safe_load(text)
 
 
+def test_shapes_whose_names_are_parts_of_others_have_their_roles(added):
+    """`trunk` is a part of fl_trunk_thigh, whose contact ends no episode; fr_thigh of fr_thigh0, a hip."""
+    text = urdf().replace('"fl_thigh"', '"fl_trunk_thigh"').replace('"fr_hip"', '"fr_thigh0"')
+    ball = '<collision><geometry><sphere radius="0.03"/></geometry></collision>'
+    out = added(text.replace('<link name="fr_thigh0">', f'<link name="fr_thigh0">{ball}'), "--name", "eighteenth_toy")
+    changed = "trunk -> trunk_itself, fr_thigh -> fr_thigh_itself"
+    assert f"shapes whose names are parts of others' are called differently: {changed}" in out
+    robot = load_robot("mine/eighteenth_toy")
+    names = np.array(robot.contact_names)
+    assert set(names[list(robot.termination_indices)]) == {"trunk_itself"}
+    rods = {f"{leg}_{part}" for leg in ("fl", "fr", "hl", "hr") for part in ("thigh", "calf")}
+    expected = rods - {"fl_thigh", "fr_thigh"} | {"fl_trunk_thigh", "fr_thigh_itself"}
+    assert set(names[list(robot.penalised_indices)]) == expected
+
+
 def test_gains_may_be_given_and_joints_held(added):
     limit, inertia = '<limit lower="1" upper="2" effort="1" velocity="1"/>', 'ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"'
     arm = f'<joint name="arm" type="revolute"><parent link="trunk"/><child link="arm_link"/>{limit}</joint>'

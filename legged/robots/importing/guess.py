@@ -68,7 +68,7 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
     feet = [shape.name for leg in legs for shape in leg.feet]
     kind = "quadruped" if len(legs) > 2 else "biped"
     tree.say(f"guess: a {kind} with feet", ", ".join(feet))
-    ending, penalized = _roles(tree, legs, feet)
+    ending, penalized = (_named_apart(tree, role) for role in _roles(tree, legs, feet))
     if not ending:
         tree.say("guess: neither base nor trunk has a shape, so no contact ends an episode")
     return Guesses(
@@ -112,8 +112,23 @@ def _name_passive(tree: Tree, legs: list[Leg]) -> None:
             tree.home[hinge.name] = tree.home.pop(old)
 
 
+def _named_apart(tree: Tree, role: Sequence[str]) -> list[str]:
+    """Give the shapes of a role names that are parts of no other shape's, for the same reason; return the names of all."""
+    named = {shape.name: shape for shape in tree.shapes}
+    shapes = [named[name] for name in role]
+    for shape in shapes:
+        others = [other.name for other in tree.shapes if all(other is not own for own in shapes)]
+        if any(shape.name in name for name in others):
+            taken = {other.name for other in tree.shapes}
+            old, shape.name = shape.name, free_name(f"{shape.name}_itself", taken)
+            tree.say("shapes whose names are parts of others' are called differently", f"{old} -> {shape.name}")
+    return [shape.name for shape in shapes]
+
+
 def _exact(tree: Tree, names: Sequence[str]) -> list[str]:
-    """Return patterns that match these shapes and no others: a part that all have alone, else the names."""
+    """Return patterns that match these shapes and no others: a part that all have alone, else the names, which are parts of
+    no other shape's.
+    """
     others = [shape.name for shape in tree.shapes if shape.name not in names]
     for word in ("foot", "FOOT", "Foot", "toe", "calf", "shank"):
         if names and all(word in name for name in names) and not any(word in name for name in others):
