@@ -57,6 +57,7 @@ def _main(argv: list[str] | None) -> int:
     if not is_plain_name(name):
         raise ConfigError(f"--name: the name of a robot must be {PLAIN}; got {shown(name)}")
     folder, task = _places(name, args.out)
+    _check_apart(path, folder)
     if not args.force and (exists(folder) or exists(task)):
         taken = folder if exists(folder) else task
         raise ConfigError(f"--name: there is {relative(taken)} already; another name, or --force to write over it")
@@ -64,6 +65,9 @@ def _main(argv: list[str] | None) -> int:
         _check_task(args.extends, task)
     ready_to_write(folder, ROOM_MB)
     tree = read_robot(path, [root.resolve() for root in args.packages])
+    for mesh in (shape.mesh for link in tree.links for shape in link.shapes):
+        if mesh is not None and mesh.file is not None:
+            _check_apart(mesh.file, folder)
     tree.name = name
     guesses = make_ready(tree, args.hold, gains)
     megabytes = write_folder(folder, tree, guesses, source, licence)
@@ -99,6 +103,14 @@ def _source(given: str) -> tuple[Path, str, str]:
         raise ConfigError(f"{shown(given)}: there is no such file; a URDF, an MJCF file, or {PREFIX}NAME is wanted")
     beside = [other.name for folder in (path.parent, path.parent.parent) for other in sorted(folder.glob("LICENSE*"))]
     return path.absolute(), path.name, f"see {beside[0]} beside the source" if beside else "that of the source; look it up"
+
+
+def _check_apart(source: Path, folder: Path) -> None:
+    """Look whether a file that is read lies outside the folder that is written, where it could be written over."""
+    if source.resolve().is_relative_to(folder.resolve()):
+        raise ConfigError(
+            f"{relative(source)}: lies in {relative(folder)}, the folder that the robot goes to; another --name or --out"
+        )
 
 
 def _check_task(name: str, beside: Path) -> None:

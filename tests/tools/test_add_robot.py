@@ -260,6 +260,25 @@ def test_nothing_is_written_over_unless_asked(added, capsys):
     assert "ninth_toy" in added(urdf(), "--name", "ninth_toy", "--force")
 
 
+@pytest.mark.parametrize("force", [[], ["--force"]])
+def test_a_source_in_the_robots_own_folder_is_left_alone(tmp_path, capsys, force):
+    """The model would be written over by what becomes of it, and meshes be copied onto themselves."""
+    cube = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    mesh = '<visual><geometry><mesh filename="go/meshes/cube.obj"/></geometry></visual>'
+    text = urdf().replace("</inertial>", f"</inertial>{mesh}", 1)
+    (tmp_path / "go" / "meshes").mkdir(parents=True)
+    for file in ("go/go.xml", "go.urdf"):
+        (tmp_path / file).write_text(text)
+    (tmp_path / "go/meshes/cube.obj").write_text(cube)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
+    assert call(add_robot.main, ["go/go.xml", "--out", ".", *force]) == 2
+    assert "go/go.xml: lies in go, the folder that the robot goes to; another --name or --out" in capsys.readouterr().err
+    assert call(add_robot.main, ["go.urdf", "--out", ".", *force]) == 2
+    message = "go/meshes/cube.obj: lies in go, the" if force else "there is go already"
+    assert message in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
+
+
 def test_tables_are_shortened_only_where_they_say_the_same():
     assert _compact({"fl_hip": 1.0, "fr_hip": 1.0, "fl_knee": 2.0}) == {"hip": 1.0, "knee": 2.0}
     different = {"fl_hip": 1.0, "fr_hip": 2.0}
