@@ -12,8 +12,10 @@ import yaml
 from helpers import ENGINE, call
 from importing_fixtures import URDF_LEG, urdf
 
+from legged.config.yaml_files import read_yaml
 from legged.registry import make_task, register_file, task_config
-from legged.robots.importing.folder import _compact
+from legged.robots.importing.folder import Guesses, _compact, robot_yaml, task_yaml
+from legged.robots.importing.tree import Tree
 from legged.robots.robot import load_robot
 from legged.tools import add_robot
 
@@ -277,6 +279,20 @@ def test_a_source_in_the_robots_own_folder_is_left_alone(tmp_path, capsys, force
     message = "go/meshes/cube.obj: lies in go, the" if force else "there is go already"
     assert message in capsys.readouterr().err
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
+
+
+@pytest.mark.parametrize("name", ["2024", "1e3", "null", "toy: a #1"])
+def test_a_name_that_yaml_reads_as_something_else_is_in_quotes(name, tmp_path):
+    """In its task, and in robot.yaml where joints have such names too."""
+    path = tmp_path / "task.yaml"
+    path.write_text(task_yaml(name, name, name, symmetric=True))
+    assert read_yaml(path) == {"extends": name, "robot": name}
+    tree = Tree(name, path, [], 0.0)
+    guesses = Guesses(name, 0.3, {name: 0.5}, "", [name], [name], [name], [name], {}, {}, {}, "quadruped")
+    path.write_text(robot_yaml(tree, guesses))
+    read = read_yaml(path)
+    assert (read["model"], read["base"], read["feet"]) == (f"{name}.xml", name, [name])
+    assert read["default_joint_angles"] == {name: 0.5}
 
 
 def test_tables_are_shortened_only_where_they_say_the_same():

@@ -1,5 +1,6 @@
 """A robot folder out of a Tree: MJCF, meshes, robot.yaml, PROVENANCE.md, and a task that trains it."""
 
+import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -89,7 +90,7 @@ def robot_yaml(tree: Tree, guesses: Guesses) -> str:
         f"# {tree.name}: how the task uses {tree.name}.xml. Written by legged.tools.add_robot; sources: PROVENANCE.md.",
         "# Lines marked 'guess' were not in the file: look at them. Patterns are parts of names; the longest match wins.",
         *(f"# {line}" for line in tree.said),
-        f"model: {tree.name}.xml",
+        f"model: {_name(f'{tree.name}.xml')}",
         f"base: {_name(g.base)}",
         f"spawn_height: {g.spawn_height:g}  # m; guess: the lowest point of the default pose, and a little more",
         *([f"passive_joints: {_list(g.passive)}  # no motor; where they are follows"] if g.passive else []),
@@ -128,7 +129,9 @@ def _compact(values: dict[str, float]) -> dict[str, float]:
 
 def _name(text: str) -> str:
     """Return a text as YAML, in quotes where it would be something else without."""
-    return yaml.safe_dump(text, default_flow_style=True, width=10_000).split("\n", 1)[0]
+    if re.fullmatch(r"[-+\d._]+[eE][-+]?\d+", text):  # 1e3 is a number for our reader, and none for YAML 1.1
+        return f"'{text}'"
+    return yaml.safe_dump(text, default_flow_style=True, width=10_000, allow_unicode=True).split("\n", 1)[0]
 
 
 def _list(names: Sequence[str]) -> str:
@@ -157,8 +160,8 @@ def task_yaml(name: str, robot: str, extends: str, symmetric: bool) -> str:
     """Return the text of a task on flat ground; `robot` is a name, or a path relative to the task's file."""
     lines = [
         f"# {name} follows velocity commands on flat ground. Written by legged.tools.add_robot.",
-        f"extends: {extends}",
-        f"robot: {robot}",
+        f"extends: {_name(extends)}",
+        f"robot: {_name(robot)}",
     ]
     if not symmetric:
         lines += ["# Its left side is not the mirror image of its right one.", "train: {algorithm: {symmetry: false}}"]
