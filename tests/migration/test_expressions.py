@@ -10,12 +10,14 @@ from legged.errors import ConfigError
 from legged.tools.migration.expressions import CannotEvaluateError, Evaluator, Numbers
 from legged.tools.migration.found import Found, members
 from legged.tools.migration.modules import Tree
+from legged.tools.migration.translation import plain
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
 
 def evaluated(text: str) -> object:
-    names = {"np": Numbers(), "math": Numbers(), "A": [1, 2, 3], "B": {"a": 0.5}, "n": 4, "max": max, "sum": sum, "str": str}
+    names = {"np": Numbers(), "math": Numbers(), "A": [1, 2, 3], "B": {"a": 0.5}, "n": 4}
+    names |= {known.__name__: known for known in (list, max, str, sum)}
 
     def lookup(name: str) -> object:
         if name not in names:
@@ -54,7 +56,24 @@ VALUES = {
     "{(i, j): i * j for i, j in [(1, 2)]}": {(1, 2): 2},
     "field(default_factory=lambda: [1, 2])": [1, 2],
     "os.path.join('a', 'b.urdf')": "a/b.urdf",
-    "'{ROOT}/x'.format(ROOT='y')": "{ROOT}/x",
+    "np.linspace(-0.5, 0.5, 5) * 2": [-1.0, -0.5, 0.0, 0.5, 1.0],
+    "2 * np.arange(3) - 1": [-1, 1, 3],
+    "np.array([1, 2, 3]) + np.array([0.5, 0.5, 0.5])": [1.5, 2.5, 3.5],
+    "A + np.array([1, 1, 1])": [2, 3, 4],
+    "-np.array((1, 2)) / [2, 4]": [-0.5, -0.5],
+    "1 - np.array([[1, 2], [3, 4]])[:, 1]": [-1, -3],
+    "[row * 2 for row in np.array([[1, 2], [3, 4]])]": [[2, 4], [6, 8]],
+    "np.array([1, 2, 3])[1:] * 2": [4, 6],
+    "[*np.array([1, 2])] * 2": [1, 2, 1, 2],
+    "np.array([1, 2]).tolist() * 2": [1, 2, 1, 2],
+    "list(np.array([1, 2])) + [3]": [1, 2, 3],
+    "np.array(A).copy() * 100000": [100000, 200000, 300000],
+    "[0, *np.arange(2), 1]": [0, 0, 1, 1],
+    "2 in np.arange(3)": True,
+    "'{}_{}'.format('a', n)": "a_4",
+    "'{leg}_{0:.2f}'.format(0.5, leg='FL')": "FL_0.50",
+    "'{ROOT}/x'.format(ROOT='y')": "y/x",
+    "'{MY_ROOT_DIR}/x'.format(MY_ROOT_DIR=MY_ROOT_DIR)": "{MY_ROOT_DIR}/x",
 }
 
 
@@ -76,6 +95,15 @@ WITHOUT = {
     "np.linspace(0, 1, 10**6)": "more than 10000 items",
     "A.__class__": "not run",
     "unknown_thing * 2": "uses unknown_thing, which is set nowhere",
+    "np.arange(3) + np.arange(2)": "fails: ",
+    "np.arange(3) / 0": "fails: ",
+    "np.arange(200) * np.array([[i] for i in np.arange(200)])": "more than 10000 items",
+    "np.array(['a']) * 2": "something else than numbers",
+    "np.arange(3) > 1": "compares arrays",
+    "'{}_{}'.format('a')": "fails: ",
+    "'{}'.format(A)": "something else than texts and numbers",
+    "'{}'.format(unknown_thing)": "uses unknown_thing",
+    "'{a}'.format(**B)": "not followed",
     "str(n)(3)": "calls str\\(n\\)",
 }
 
@@ -210,6 +238,24 @@ def test_augmented_assignments_conditions_and_annotations():
         "    table['y'] = 2\n",
     )
     assert of_class(file, "A") == {"feet": ["a", "b"], "p": 1, "q": [2], "r": "yes", "table": {"x": 1, "y": 2}}
+
+
+def test_names_of_arrays_are_arrays():
+    """Their arithmetic is numpy's wherever it is done, and what is taken of them are lists."""
+    file = written(
+        "a.py",
+        "import numpy as np\n"
+        "X = np.linspace(0.0, 1.0, 3)\n"
+        "class A:\n"
+        "    twice = X * 2\n"
+        "    more = np.array([1, 2])\n"
+        "    more += [1, 1]\n"
+        "    first, second = np.array([1, 2]) * 3\n",
+    )
+    found = of_class(file, "A")
+    assert found == {"twice": [0.0, 1.0, 2.0], "more": [2, 3], "first": 3, "second": 6}
+    assert all(type(item) is float for item in found["twice"])
+    assert type(plain(found["twice"])) is list  # as it is written
 
 
 @pytest.mark.parametrize(

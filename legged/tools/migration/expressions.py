@@ -6,8 +6,8 @@ import operator
 from collections.abc import Callable, Mapping
 from typing import Any
 
-MOST_ITEMS = 10_000
-"""Items of a list that an expression makes."""
+from legged.tools.migration.arrays import MOST_ITEMS, Array
+
 LARGEST_EXPONENT = 1000
 ROOT = "LEGGED_GYM_ROOT_DIR"
 """Name of the folder that legged_gym lies in; unknown here, so it stays a name in braces."""
@@ -40,28 +40,28 @@ class Numbers:
             "linspace": _linspace,
             "arange": _arange,
             **{other: getattr(math, other) for other in self.ONE_TO_ONE},
-            **{other: _as_given for other in self.LISTS},
+            **{other: _array for other in self.LISTS},
         }
         if name in functions:
             return functions[name]
         raise CannotEvaluateError(f"uses {name} of a library, which is not run")
 
 
-def _as_given(value: Any, **_: Any) -> Any:
-    """Return an array as the list that it is made of."""
-    return value
+def _array(value: Any, **_: Any) -> Any:
+    """Return an array of a list, and a number as it is."""
+    return Array(value) if isinstance(value, list | tuple) else value
 
 
-def _linspace(start: float, stop: float, num: int = 50) -> list[float]:
+def _linspace(start: float, stop: float, num: int = 50) -> Array:
     _bounded(num)
-    return [start + (stop - start) * i / max(num - 1, 1) for i in range(num)]
+    return Array(start + (stop - start) * i / max(num - 1, 1) for i in range(num))
 
 
-def _arange(start: float, stop: float | None = None, step: float = 1) -> list[float]:
+def _arange(start: float, stop: float | None = None, step: float = 1) -> Array:
     first, last = (0, start) if stop is None else (start, stop)
     count = max(0, math.ceil((last - first) / step))
     _bounded(count)
-    return [first + i * step for i in range(count)]
+    return Array(first + i * step for i in range(count))
 
 
 def _bounded(count: int) -> None:
@@ -105,7 +105,7 @@ def _power(base: Any, exponent: Any) -> Any:
 
 def _times(left: Any, right: Any) -> Any:
     for sequence, count in ((left, right), (right, left)):
-        if isinstance(sequence, str | list | tuple) and isinstance(count, int):
+        if isinstance(sequence, str | list | tuple) and not isinstance(sequence, Array) and isinstance(count, int):
             _bounded(len(sequence) * count)
     return left * right
 
@@ -195,6 +195,8 @@ class Evaluator:
         left = self(node.left)
         for op, other in zip(node.ops, node.comparators, strict=True):
             right = self(other)
+            if isinstance(left, Array) or (isinstance(right, Array) and not isinstance(op, ast.In | ast.NotIn)):
+                raise CannotEvaluateError("compares arrays, which is not evaluated")
             if not COMPARE[type(op)](left, right):
                 return False
             left = right
@@ -206,7 +208,7 @@ class Evaluator:
     def _items(self, nodes: list[ast.expr]) -> list[Any]:
         found: list[Any] = []
         for node in nodes:
-            found += self(node.value) if isinstance(node, ast.Starred) else [self(node)]
+            found.extend(self(node.value) if isinstance(node, ast.Starred) else [self(node)])
         return found
 
     def _list(self, node: ast.List) -> list[Any]:
@@ -243,10 +245,10 @@ class Evaluator:
         if name.endswith("path.join"):
             return "/".join(str(part) for part in self._items(node.args))
         method = node.func if isinstance(node.func, ast.Attribute) else None
-        if method is not None and method.attr in ("copy", "format", "items", "keys", "values"):
+        if method is not None and method.attr in ("copy", "format", "items", "keys", "tolist", "values"):
             owner = self(method.value)
-            if method.attr == "format":  # the only thing that files are formatted with is legged_gym's folder
-                return owner
+            if method.attr == "format" and isinstance(owner, str):
+                return self._formatted(owner, node)
             if isinstance(owner, dict | list):
                 found = getattr(owner, method.attr)()
                 return found if method.attr == "copy" else list(found)
@@ -257,6 +259,23 @@ class Evaluator:
             raise CannotEvaluateError(f"calls {name}, which is not run")
         keywords = {word.arg: self(word.value) for word in node.keywords if word.arg}
         return function(*self._items(node.args), **keywords)
+
+    def _formatted(self, text: str, node: ast.Call) -> str:
+        """Return what `text.format(...)` makes. A folder that is not known here stays a name in braces."""
+        named: dict[str, Any] = {}
+        for word in node.keywords:
+            if word.arg is None:
+                raise CannotEvaluateError("formats a text with names that are not followed")
+            try:
+                named[word.arg] = self(word.value)
+            except CannotEvaluateError:
+                if not word.arg.endswith(("ROOT", "DIR")):
+                    raise
+                named[word.arg] = f"{{{word.arg}}}"
+        given = self._items(node.args)
+        if not all(isinstance(value, str | int | float) for value in (*given, *named.values())):
+            raise CannotEvaluateError("formats something else than texts and numbers")
+        return text.format(*given, **named)
 
     def _field(self, node: ast.Call) -> Any:
         """Return the default of a dataclass's field."""
