@@ -151,8 +151,9 @@ def class_hints(source: Source, task: str, registered: Mapping[str, Registered])
 def _merged(
     layers: Iterable[_Layer], schema: type[TaskConfig], carry: Carry | None, robot: str | None, on_cpu: bool
 ) -> tuple[dict[str, Any], Origins]:
-    """Return layers laid over those after them. Each is checked by itself: what another one sets over it must not hide a
-    mistake. Numbers that a layer means for some robot are carried to `robot`, or if None, to that of the layers.
+    """Return layers laid over those after them, each under its own `cpu:` section (if asked), so that the nearest file has
+    the last word. Each is checked by itself: what another one sets over it must not hide a mistake. Numbers that a layer means
+    for some robot are carried to `robot`, or if None, to that of the layers.
 
     Raises:
         ConfigError: a layer does not fit the schema.
@@ -184,7 +185,10 @@ def _merged(
                 origins.written_for = tuple(dict.fromkeys([*origins.written_for, reference]))
             if carried is not data:
                 data, name = dict(carried), f"{name} (written for {Path(layer.written_for).name})"
+        cpu = data.pop("cpu", {})
         merge(merged, data, name, origins)
+        if on_cpu:
+            merge(merged, cpu, f"{name}: cpu", origins)
     return merged, origins
 
 
@@ -267,9 +271,9 @@ def load_config(
     schema: type[TaskConfig] = LeggedConfig,
     carry: Carry | None = None,
 ) -> TaskConfig:
-    """Load the task file or mapping `source`, over what it extends (a file, or one of the tasks in `registered`), under its
-    `cpu:` section (if asked) and overrides, as an instance of `schema`. What of it is written for another robot is carried
-    to that of the task by `carry`, if there is one; overrides never are.
+    """Load the task file or mapping `source`, over what it extends (a file, or one of the tasks in `registered`), each
+    under its `cpu:` section (if asked), and under overrides, as an instance of `schema`. What of it is written for another
+    robot is carried to that of the task by `carry`, if there is one; overrides never are.
 
     Raises:
         ConfigError: unknown key, wrong type or value, with file and dotted path.
@@ -279,14 +283,8 @@ def load_config(
     named = [robot_path(value, Path.cwd()) for key, value in overrides if key == "robot"]
     robot = named[-1] if named else None
     data, origins = _merged(_layers(source, task, registered or {}), schema, carry, robot, on_cpu)
-    cpu = data.pop("cpu", {})
     data["task"] = task
     where = Origins(origins)
-    if on_cpu:
-        set_here = Origins()
-        merge(data, copy.deepcopy(cpu), "", set_here)
-        for path in set_here:
-            where.note(path, origins.of(f"cpu.{path}") + ": cpu")
     _merge_overrides(data, overrides, where, schema)
     return from_dict(data, where, source=name, schema=schema)
 

@@ -292,7 +292,9 @@ def describe(cfg: TaskConfig, device: torch.device) -> str:
         engines = {"mujoco_warp": f"mujoco-warp on {cores} cores", "mujoco": f"C MuJoCo on {cores} cores"}
         name = engine_name(cfg.sim, device, num_envs=cfg.env.num_envs)
         engine = engines.get(name, f"Newton's {cfg.sim.solver} solver on the CPU")
-        where = f"no GPU in use: {engine}, settings of the task's cpu section"
+        where = f"no GPU in use: {engine}"
+        if any(source.endswith(": cpu") for source in cfg.origins.values()):
+            where += ", settings of the task's cpu section"
     else:
         where = torch.cuda.get_device_name(device)
     ranks = Ranks.now()

@@ -175,6 +175,15 @@ def test_the_cpu_section_is_laid_over_the_rest_on_a_cpu_only(write):
     assert (cpu.env.num_envs, cpu.env.seed, cpu.rewards.scales["torques"]) == (10, 5, -9.0)
 
 
+def test_what_a_file_sets_is_not_changed_by_the_cpu_section_of_its_parent(write):
+    """Two levels up as well; what it does not set is."""
+    write("parent", "env: {num_envs: 10, episode_length_s: 5.0}\ncpu: {env: {num_envs: 11, episode_length_s: 6.0}}\n")
+    write("child", "extends: parent\nenv: {num_envs: 12}\n")
+    cfg = load_config(write("mine", "extends: child\n"), "mine", on_cpu=True)
+    assert (cfg.env.num_envs, cfg.env.episode_length_s) == (12, 6.0)
+    assert cfg.origins.where("env.episode_length_s").endswith("parent.yaml: cpu: env.episode_length_s")
+
+
 def test_cpu_sections_of_parent_and_child_merge(write):
     write("parent", CPU)
     cfg = load_config(write("child", "extends: parent\ncpu: {env: {num_envs: 12}}\n"), "child", on_cpu=True)
