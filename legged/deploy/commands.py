@@ -40,7 +40,7 @@ class Operator(ABC):
 
 
 class Ramp:
-    """Commands as the policy gets them: within its ranges, without those that are too slow, changed bit by bit."""
+    """Commands as the policy gets them: none, or within its ranges and not too slow, changed bit by bit."""
 
     def __init__(self, contract: Contract) -> None:
         """Begin at no command."""
@@ -57,9 +57,11 @@ class Ramp:
         velocity = orders.velocity
         if orders.shares:
             velocity = np.where(velocity > 0.0, velocity * self._high, -velocity * self._low)
-        wanted = np.clip(np.nan_to_num(velocity), self._low, self._high)
+        velocity = np.nan_to_num(velocity)
+        # No command is 0 also where the ranges leave 0 out: a robot must always be able to halt.
+        wanted = np.clip(velocity, self._low, self._high) if velocity.any() else np.zeros(3)
         if np.hypot(*wanted[:2]) < self._dead_zone:
-            wanted[:2] = np.clip(0.0, self._low[:2], self._high[:2])
+            wanted[:2] = 0.0
         self.command = self.command + np.clip(wanted - self.command, -self._step, self._step)
         return self.command
 

@@ -130,6 +130,18 @@ def test_commands_are_ramped_and_stay_within_what_the_policy_knows(stage):
     np.testing.assert_allclose(commands[np.searchsorted(times, 7.9)], [0.0, 0.0, 0.0], atol=1e-9)
 
 
+def test_a_policy_that_was_never_asked_to_stand_still_can_be_halted(stage):
+    """It knows 0.3 to 1 m/s: who asks for less gets the slowest, and from there it takes 0.3 s to no command."""
+    stage.policy.contract.command_ranges[0] = [0.3, 1.0]
+    stage.run({**WALKS, 3.2: (0.1, 0.0, 0.0), 4.0: (0.0, 0.0, 0.0), 5.0: (0.1, 0.0, 0.0), 6.0: STAND, 8.0: QUIT})
+    cycles = stage.program.log._cycles
+    times, commands, states = (np.array(cycles[name]) for name in ("times", "command", "state"))
+    forward = commands[np.searchsorted(times, [3.1, 3.9, 4.15, 4.9, 5.9]), 0]
+    np.testing.assert_allclose(forward, [0.0, 0.3, 0.15, 0.0, 0.3], atol=0.03)
+    assert times[np.flatnonzero(states == 3)[-1]] == pytest.approx(7.3, abs=0.05)
+    assert stage.program.log.notes[3:5] == ["walk: it halts, and then stands", "walk -> stand"]
+
+
 def test_targets_are_clamped_by_hand(stage):
     """ANYmal's joints: 90 N m/rad, 4 N m s/rad, 80 N m; the first turns from -0.72 to 0.49 rad."""
     contract = stage.policy.contract
