@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from legged.commandline.command import run_main
+from legged.commandline.command import EXIT_WRONG_INPUT, run_main
 from legged.commandline.parser import CommandParser
 from legged.deploy.__main__ import add_program_arguments, limits_of
 from legged.deploy.contract import read_contract
@@ -22,7 +22,7 @@ from legged.errors import ConfigError, RunError
 from legged.policies.export import EXPORTED, export
 from legged.policies.restore import policy_of, restore, undisturbed
 from legged.process.paths import exists, ready_to_write, relative
-from legged.process.startup import in_main_thread
+from legged.process.startup import INTERRUPTED, in_main_thread
 from legged.robots.robot import load_robot
 from legged.tools.simulate_robot import LISTENING, add_simulation_arguments, check_simulation, motors_of, terrain_of
 from legged.tools.simulator.film import POSES, make_film
@@ -31,6 +31,8 @@ ROOM_MB = 16.0
 """What the disk must have room for: the exported policy and the log [MiB]."""
 END_S = 20.0
 """A process that was asked to end must do so within so long [s]."""
+DID_NOT_RUN = (EXIT_WRONG_INPUT, INTERRUPTED)
+"""Exit codes of a program that has moved no robot."""
 SIMULATED = ("terrain", "size", "cell", "sim_dt", "latency", "loss", "seed")
 PASSED_ON = ("input", "gamepad", "commands", "seconds", "stand_seconds", "max_tilt", "max_age", "max_missed")
 
@@ -73,6 +75,8 @@ def _main(argv: list[str] | None) -> int:
     ready_to_write(folder, ROOM_MB)
     folder.mkdir(parents=True, exist_ok=True)
     code, report = _run_both(args, exported, str(robot.folder), folder)
+    if report is None:
+        return code
     print(f"{relative(folder / 'report.json')}: {_told(report)}")
     if args.film:
         make_film(robot, terrain_of(args), folder)
@@ -97,13 +101,15 @@ def _exported(name: str) -> Path:
     return folder
 
 
-def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path) -> tuple[int, dict[str, Any]]:
-    """Run the simulated robot and the program to their ends; return the program's exit code and the robot's report.
+def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path) -> tuple[int, dict[str, Any] | None]:
+    """Run the simulated robot and the program to their ends; return the program's exit code and the robot's report, None if
+    the program did not run.
 
     Raises:
-        RunError: the simulated robot does not start, or does not end.
+        RunError: the simulated robot does not start, fails, or does not end.
     """
     report = folder / "report.json"
+    report.unlink(missing_ok=True)  # of another run
     simulator = subprocess.Popen(
         [
             *(sys.executable, "-m", "legged.tools.simulate_robot", robot, "--report", str(report)),
@@ -132,10 +138,14 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
             ]
         )
         code = _wait(program)
+        if code in DID_NOT_RUN:  # it has said why
+            return code, None
         try:
             simulator.communicate(timeout=END_S)
         except subprocess.TimeoutExpired as error:
             raise RunError("the simulated robot did not hear the program's goodbye") from error
+        if simulator.returncode:
+            raise RunError(f"the simulated robot failed (exit code {simulator.returncode}): there is no report of this run")
     finally:
         if program is not None and program.poll() is None:
             program.terminate()

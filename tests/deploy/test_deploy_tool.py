@@ -1,0 +1,57 @@
+"""The command that runs a simulated robot and its program: what it makes of their ends."""
+
+import subprocess
+import sys
+import time
+
+import pytest
+from helpers import call
+
+from legged.tools import deploy
+
+LISTENS = "import os, time; print('listening at 127.0.0.1:1', flush=True); "
+GOOD_REPORT = (
+    "import sys; open(sys.argv[sys.argv.index('--report') + 1], 'w').write('"
+    '{"fell": false, "time": 1.0, "distance": 0.5, "climbed": 0.0, "largest_lean": 0.1, "lost": 0, "sent": 9, "received": 9}'
+    "')"
+)
+
+
+@pytest.fixture
+def run(policy_folder, tmp_path, monkeypatch):
+    """A function that runs the command on two stand-ins, each a line of Python; it returns the exit code."""
+    starts = subprocess.Popen
+
+    def run(simulator, program):
+        def start(command, **settings):
+            source = program if "legged.deploy" in command else simulator
+            return starts([sys.executable, "-c", source, *command[3:]], **settings)
+
+        monkeypatch.setattr(deploy.subprocess, "Popen", start)
+        return call(deploy.main, ["--policy", str(policy_folder), "--robot", "sim", "--out", str(tmp_path)])
+
+    return run
+
+
+def test_the_report_of_a_run_is_told(run, capsys):
+    assert run(LISTENS + GOOD_REPORT, "raise SystemExit(3)") == 3
+    assert "did not fall, 1.0 s, 0.50 m away" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("end", "code"), [("os.kill(os.getpid(), 9)", -9), ("raise SystemExit(1)", 1)])
+def test_a_simulator_that_fails_is_told_and_an_older_report_is_not(end, code, run, tmp_path, capsys):
+    assert run(LISTENS + GOOD_REPORT, "") == 0
+    capsys.readouterr()
+    assert run(LISTENS + end, "raise SystemExit(3)") == 1
+    told = capsys.readouterr()
+    assert told.err == f"error: the simulated robot failed (exit code {code}): there is no report of this run\n"
+    assert told.out == ""
+    assert not (tmp_path / "report.json").exists()
+
+
+@pytest.mark.parametrize("code", [2, 130])
+def test_a_program_that_refuses_ends_the_simulator_at_once(code, run, capsys):
+    began = time.perf_counter()
+    assert run(LISTENS + "time.sleep(60.0)", f"raise SystemExit({code})") == code
+    assert time.perf_counter() - began < 10.0
+    assert capsys.readouterr() == ("", "")
