@@ -89,7 +89,8 @@ class Log:
         [rad], `stiffness`, `damping`, `positions` [rad], `velocities` [rad/s], `torques` [N m] (NaN where there are none),
         `quaternions` (T, 4), `gyro` (T, 3), `state` (T,), a number of `states`. By cycle, with `cycle_` before their names:
         what `add_cycle` was given. Beside them `joint_names`, `states`, `notes`, `note_times` [s] and `contract` (JSON).
-        What actuators can be fitted to goes into a file of its own, with `ACTUATORS` after its name.
+        What actuators can be fitted to goes into a file of its own, with `ACTUATORS` after its name; there is none of a run
+        without such samples.
 
         Raises:
             RunError: it can't be written.
@@ -104,9 +105,14 @@ class Log:
             "contract": np.array(self._said),
         }
         _write(path, arrays)
-        of_actuators = actuator_arrays(arrays, self._contract)
+        beside, of_actuators = path.with_stem(f"{path.stem}{ACTUATORS}"), actuator_arrays(arrays, self._contract)
         if of_actuators is not None:
-            _write(path.with_stem(f"{path.stem}{ACTUATORS}"), of_actuators)
+            _write(beside, of_actuators)
+            return
+        try:
+            beside.unlink(missing_ok=True)  # of another run
+        except OSError as error:
+            raise RunError(f"{beside}: {error.strerror or error}") from error
 
 
 def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
