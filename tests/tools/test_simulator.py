@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import threading
+from itertools import pairwise
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -151,6 +152,22 @@ def test_it_brakes_when_nobody_speaks_to_it_any_more(simulated):
     assert results[0]["lowest_base"] < 0.45
     assert len(robot.read()) > 50
     robot.close()
+
+
+def test_sources_come_every_fifth_state_at_any_time_step():
+    """At 0.35 ms a state comes after 11 steps (4 ms are 11.4), and sources after 5 states, 19.25 ms; 20 ms are 57 steps."""
+    server = Server(SimulatedRobot(load_robot("anymal_c"), None, SimConfig(dt=0.00035)))
+    thread = threading.Thread(target=lambda: server.run(1.2))
+    thread.start()
+    robot = UdpRobot(f"127.0.0.1:{server.port}")
+    robot.ask({"base_lin_vel": None})
+    robot.write(server.robot.robot.default_dof_pos, server.robot.robot.stiffness, server.robot.robot.damping)
+    thread.join()
+    readings = [reading for reading in robot.read() if reading.time > 0.0 and reading.sources]
+    robot.close()
+    came = [b.time for a, b in pairwise(readings) if b.sources["base_lin_vel"] is not a.sources["base_lin_vel"]]
+    assert len(came) > 5
+    np.testing.assert_allclose(np.diff(came), 55 * 0.00035, atol=1e-6)
 
 
 @pytest.mark.parametrize(

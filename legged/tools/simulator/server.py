@@ -30,7 +30,7 @@ POSE_S = 0.04
 """Poses are kept for a film after so long [s], at most `MOST_POSES` of them."""
 MOST_POSES = 750
 SOURCE_S = 0.02
-"""Sources beside the sensors are sent after so long [s]."""
+"""Sources beside the sensors are sent after so long [s], rounded to states, with which they go."""
 HOLD_S = 0.2
 """Motors that have been told nothing for so long brake with the D gains that they have [s]."""
 BEHIND_S = 0.1
@@ -71,7 +71,8 @@ class Server:
         still until the first command has come.
         """
         dt = self.robot.model.opt.timestep
-        state_steps, source_steps, pose_steps = (max(1, round(each / dt)) for each in (STATE_S, SOURCE_S, POSE_S))
+        state_steps, pose_steps = (max(1, round(each / dt)) for each in (STATE_S, POSE_S))
+        source_steps = state_steps * max(1, round(SOURCE_S / (state_steps * dt)))
         began = time.perf_counter()
         due, steps = began, 0
         while not self._gone and (now := time.perf_counter()) - began < seconds:
