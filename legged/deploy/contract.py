@@ -200,8 +200,8 @@ def read_contract(path: Path) -> Contract:
             f"{path}: contract_version: got {was}; this program reads {CONTRACT_VERSION}: export the policy again"
             f" (play.py --task {said.get('task')} --no-video)"
         )
-    if said["control_type"] != "P":
-        raise ConfigError(f"{path}: control_type: got {said['control_type']!r}; a robot takes joint angles ('P') only")
+    if (control := said.get("control_type")) != "P":
+        raise ConfigError(f"{path}: control_type: got {control!r}; a robot takes joint angles ('P') only")
     try:
         contract = _contract(path, said)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:

@@ -80,6 +80,7 @@ def test_a_joint_without_limits_has_none_in_the_contract_too(folder, tmp_path):
         ),
         ({"contract_version": 2}, r"contract_version: got 2; this program reads 1"),
         ({"control_type": "T"}, r"control_type: got 'T'; a robot takes joint angles"),
+        ({"control_type": None}, r"control_type: got None; a robot takes joint angles"),
         ({"command_ranges": None}, r"'anymal_c_flat' is no task of a legged robot"),
         ({"observation": None}, r"is no policy\.json of an export \(observation is missing\)"),
         ({"stiffness": [1.0]}, r"is no policy\.json of an export \(ValueError: stiffness: 12 numbers are wanted"),
