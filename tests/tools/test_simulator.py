@@ -207,6 +207,18 @@ def test_a_film_has_a_picture_for_each_pose(tmp_path):
     assert frames.std() > 10.0
 
 
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_run_too_short_for_a_film_has_none_and_says_so(count, tmp_path, capsys):
+    """One pose lasts for no time, so a film of it would have 0 pictures a second."""
+    robot = load_robot("anymal_c")
+    np.save(tmp_path / "poses.npy", np.array([[0.04, *robot.default_qpos]] * count))
+    np.savez(tmp_path / "log.npz", times=np.array([0.0]), state=np.array([0]), states=np.array(["idle"]))
+    (tmp_path / "film.mp4").write_bytes(b"of the run before")
+    make_film(robot, None, tmp_path)
+    assert "the run was too short for a film, so there is none" in capsys.readouterr().out
+    assert not (tmp_path / "film.mp4").exists()
+
+
 def test_an_unknown_robot_is_not_simulated(capsys):
     assert call(simulate_robot.main, ["anymal_x"]) == 2
     assert "there is no robot 'anymal_x'" in capsys.readouterr().err

@@ -22,15 +22,16 @@ GLIDE = 0.1
 
 
 def make_film(robot: Robot, terrain: Terrain | None, folder: Path) -> None:
-    """Draw the poses in `folder`, with the states that its log.npz has at their times.
+    """Draw the poses in `folder`, with the states that its log.npz has at their times; fewer than two make no film.
 
     Raises:
         RunError: nothing can be rendered here, or the film can't be written.
     """
     poses = np.load(folder / POSES)
     log = np.load(folder / "log.npz")
-    if not len(poses) or "times" not in log:
-        print(f"{folder}: nothing happened, so there is no film")
+    if len(poses) < 2 or "times" not in log:
+        (folder / FILM).unlink(missing_ok=True)  # of another run
+        print(f"{folder}: the run was too short for a film, so there is none")
         return
     camera = Camera(display_model(robot, 1, *SIZE, terrain), *SIZE)
     away = AWAY * size_of(robot).longest
