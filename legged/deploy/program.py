@@ -18,12 +18,16 @@ from legged.deploy.states import MOVING, Event, State, next_state
 
 STANDS_WITHIN = 0.6
 """A robot stands when no joint is further from the default pose [rad]; its weight makes some of that."""
+THERE = 0.05
+"""A robot is in the default pose when no joint is further from it [rad]: it has nothing to fold, and nothing to wait for."""
 FAR = 100.0
 """Angles that are further from 0 are no measurements [rad]."""
 HALT_S = 1.0
 """A robot that walks is asked to stand still for so long before it stands [s]: joints that stop at 1 m/s make it fall."""
 RETURN_S = 0.3
-"""A robot that has walked reaches the default pose in so long [s]: it stands on some of its legs, and would tip over."""
+"""A robot that has walked, or is there already, reaches the default pose in so long [s]: on some of its legs, or on two, it
+would tip over.
+"""
 SETTLE_S = 1.0
 """Joints are braked for so long before the program lets go of the robot [s]."""
 
@@ -206,8 +210,9 @@ class Program:
         if state is State.STAND and self._reading is not None:
             # Legs that lie anyhow are folded first. One that has walked stands already, and what carries it is how far its
             # targets are from its joints: they go on from where they were.
-            lies, bent = self.state is State.DAMPING, self._contract.crouch
-            first = self._reading.positions if lies else self._asked[0]
+            damped, bent = self.state is State.DAMPING, self._contract.crouch
+            first = self._reading.positions if damped else self._asked[0]
+            lies = damped and np.abs(first - self._contract.default).max() > THERE
             self._path_s = self._stand_s if lies else min(RETURN_S, self._stand_s)
             self._path = [first, *([bent] if lies and bent is not None else []), self._contract.default]
         self.state, self._since, self._halting_s = state, now, None

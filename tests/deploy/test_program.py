@@ -55,6 +55,19 @@ def test_a_robot_that_has_walked_stands_without_a_crouch(stage):
     assert stage.program.log.notes[-3:-1] == ["refused: walk: it stands up for 0.3 s first", "stand -> walk"]
 
 
+def test_a_robot_in_its_default_pose_need_not_stand_up(stage):
+    """All its joints are within 0.05 rad of it: no crouch, and walking is possible after 0.3 s, before two legs tip over."""
+    contract = stage.policy.contract
+    stage.robot.positions = contract.default + 0.04
+    stage.run({0.0: DAMPING, 0.1: STAND, 0.3: WALK, 0.44: WALK, 1.0: QUIT})
+    asked = {round(moment - 100.0, 2): asked for moment, *asked in stage.robot.written}
+    way = np.array([asked[round(moment, 2)][0] - contract.default for moment in np.arange(0.1, 0.43, 0.02)])
+    assert (np.abs(way) <= 0.04 + 1e-9).all()
+    np.testing.assert_allclose(asked[0.4][0], contract.default, atol=1e-9)
+    said = ["damping -> stand", "refused: walk: it stands up for 0.3 s first", "stand -> walk"]
+    assert stage.program.log.notes[1:4] == said
+
+
 def test_it_does_not_walk_when_it_does_not_stand(stage):
     stage.robot.change = with_one("positions", 1.1)  # a leg that is caught
     stage.run({**WALKS, 4.0: QUIT})
