@@ -94,13 +94,14 @@ def axes_of(cfg: LeggedConfig) -> dict[str, list[float]]:
 
 
 def _values(where: str, given: str, low: float, high: float, step: float) -> list[float]:
-    """Return the values of an axis; `where` and `given` are what an error says of it."""
+    """Return the values of an axis, none beyond `high`; `where` and `given` are what an error says of it."""
     count = (high - low) / step + 1.0
     if count > MOST_VALUES:
         raise ConfigError(
             f"{where}: '{given}' makes {count:,.0f} cells of this axis alone; at most {MOST_VALUES:,} are possible"
         )
-    return [round(float(value), 6) for value in np.arange(low, high + 0.5 * step, step)]
+    whole = int(count + 1e-9)  # 0:0.3:0.1 is three steps, whatever their quotient was rounded to
+    return [round(float(value), 6) for value in low + step * np.arange(whole)]
 
 
 def check_size(grid: Grid) -> None:

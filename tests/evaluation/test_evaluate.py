@@ -37,6 +37,8 @@ def on_grid(grid: Grid, act=stand, *settings):
         ("-1:1:0.5", [-1.0, -0.5, 0.0, 0.5, 1.0]),
         ("0:0.3:0.1", [0.0, 0.1, 0.2, 0.3]),  # the end belongs to it, in spite of rounding
         ("0:1:0.3", [0.0, 0.3, 0.6, 0.9]),
+        ("-1:1:0.3", [-1.0, -0.7, -0.4, -0.1, 0.2, 0.5, 0.8]),  # never beyond the end, however near the next step is
+        ("0:1:0.6", [0.0, 0.6]),
         ("0.25", [0.25]),
         ("-2", [-2.0]),
         ("1:1:0.5", [1.0]),
