@@ -10,6 +10,9 @@ Z95 = 1.959964
 DRAWS = 2000
 """Samples that a bootstrap draws."""
 
+FEWEST = 2
+"""Values that tell how far they scatter, at least: an interval of fewer would have no width."""
+
 Interval = tuple[float, float]
 
 
@@ -43,23 +46,34 @@ def mean_of_shares(shares: Sequence[tuple[int, int]]) -> tuple[float, Interval]:
     return mean, (max(0.0, mean - below), min(1.0, mean + above))
 
 
-def normal_mean(mean: float, std: float, count: int) -> Interval:
-    """Return the interval of a mean over `count` values, by their standard deviation and the normal distribution."""
+def normal_mean(mean: float, std: float, count: int) -> Interval | None:
+    """Return the interval of a mean over `count` values, by their standard deviation (that of a sample, with `count` - 1) and
+    the normal distribution; None of fewer than two values.
+    """
+    if count < FEWEST:
+        return None
     half = Z95 * std / sqrt(count)
     return mean - half, mean + half
 
 
-def welch(first: tuple[float, float, int], second: tuple[float, float, int]) -> Interval:
-    """Return the interval of the difference second - first of two means, each (mean, standard deviation, count), whose
-    standard deviations may differ (B. L. Welch 1947), by the normal distribution: counts are large.
+def welch(first: tuple[float, float, int], second: tuple[float, float, int]) -> Interval | None:
+    """Return the interval of the difference second - first of two means, each (mean, standard deviation of a sample, count),
+    whose standard deviations may differ (B. L. Welch 1947), by the normal distribution: counts are large. Return None where
+    one of them is of fewer than two values.
     """
+    if min(first[2], second[2]) < FEWEST:
+        return None
     half = Z95 * sqrt(sum(std**2 / count for _, std, count in (first, second)))
     difference = second[0] - first[0]
     return difference - half, difference + half
 
 
-def bootstrap_mean(values: Sequence[float], seed: int = 0) -> Interval:
-    """Return the percentile bootstrap interval of the mean of some values (B. Efron 1979), the same at every call."""
+def bootstrap_mean(values: Sequence[float], seed: int = 0) -> Interval | None:
+    """Return the percentile bootstrap interval of the mean of some values (B. Efron 1979), the same at every call; None of
+    fewer than two values.
+    """
+    if len(values) < FEWEST:
+        return None
     given = np.asarray(values, dtype=float)
     picks = np.random.default_rng(seed).integers(0, len(given), (DRAWS, len(given)))
     low, high = np.quantile(given[picks].mean(axis=1), (0.025, 0.975))

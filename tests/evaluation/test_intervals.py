@@ -33,3 +33,9 @@ def test_a_bootstrap_comes_near_the_normal_interval_and_is_the_same_every_time()
     wanted = normal_mean(float(values.mean()), float(values.std()), 500)
     assert (low, high) == pytest.approx(wanted, abs=0.03)
     assert bootstrap_mean([0.25] * 9) == (0.25, 0.25)
+
+
+def test_one_value_has_no_interval():
+    assert normal_mean(7.0, 0.0, 1) is None
+    assert welch((7.0, 1.0, 50), (9.0, 0.0, 1)) is None
+    assert bootstrap_mean([0.25]) is None

@@ -1,6 +1,7 @@
 """Several runs side by side: what they set otherwise, their curves over each other, their evaluations with intervals."""
 
 from collections.abc import Sequence
+from math import sqrt
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,8 @@ from legged.evaluation.reports.evaluation_part import BROKEN, between, falls_of,
 from legged.evaluation.reports.record import Record
 from legged.evaluation.result_file import tracking_of
 
-Measured = tuple[str, Interval] | None
-"""A figure in words, and its interval; None where a run lacks it."""
+Measured = tuple[str, Interval | None] | None
+"""A figure in words, and its interval, if there are enough values for one; None where a run lacks it."""
 
 
 def comparison_parts(records: Sequence[Record]) -> list[Part]:
@@ -76,7 +77,7 @@ def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
         "In brackets, intervals of 95 %: of shares Wilson's, of their difference Newcombe's; of errors a bootstrap over the"
         " commands of the grid, the same commands for both in a difference; of returns by their standard deviation (Welch)."
         " They say how sure a figure is of this one policy: another seed may differ by more. A * marks differences whose"
-        " interval leaves out 0."
+        " interval leaves out 0. Of a single command or episode there is no interval."
     )
     return [*parts, Paragraph(text)]
 
@@ -97,8 +98,14 @@ def _table(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> Ta
 def _words(found: Measured, marked: bool = False) -> str:
     if found is None:
         return "-"
-    text, (low, high) = found
-    return f"{text}{' *' if marked and not low <= 0.0 <= high else ''}"
+    text, interval = found
+    return f"{text}{' *' if marked and interval is not None and not interval[0] <= 0.0 <= interval[1] else ''}"
+
+
+def _with_interval(value: float, form: str, interval: Interval | None, factor: float = 1.0) -> Measured:
+    """Return a figure with its interval in brackets."""
+    around = "" if interval is None else f" ({between(interval, factor, form)})"
+    return f"{factor * value:{form}}{around}", interval
 
 
 def _measures(results: Sequence[dict[str, Any] | None]) -> list[tuple[str, Any, Any]]:
@@ -129,9 +136,8 @@ def _error(name: str) -> tuple[Any, Any]:
         values = list(cells(result).values())
         if not values:
             mean = tracking_of(result).get(name, {}).get("mean")
-            return None if mean is None else (f"{mean:.3f}", (mean, mean))
-        interval = bootstrap_mean(values)
-        return f"{np.mean(values):.3f} ({between(interval, form='.3f')})", interval
+            return None if mean is None else (f"{mean:.3f}", None)
+        return _with_interval(float(np.mean(values)), ".3f", bootstrap_mean(values))
 
     def more(first: dict[str, Any], second: dict[str, Any]) -> Measured:
         a, b = cells(first), cells(second)
@@ -139,8 +145,7 @@ def _error(name: str) -> tuple[Any, Any]:
         if not common:
             return None
         moved = [b[command] - a[command] for command in common]
-        interval = bootstrap_mean(moved)
-        return f"{np.mean(moved):+.3f} ({between(interval, form='+.3f')})", interval
+        return _with_interval(float(np.mean(moved)), "+.3f", bootstrap_mean(moved))
 
     return of, more
 
@@ -154,15 +159,13 @@ def _figure(read: Any, value: Any, interval: Any, of_difference: Any, form: str,
         found = read(result)
         if found is None:
             return None
-        around = interval(*found)
-        return f"{factor * value(*found):{form}} ({between(around, factor, form)})", around
+        return _with_interval(value(*found), form, interval(*found), factor)
 
     def more(first: dict[str, Any], second: dict[str, Any]) -> Measured:
         a, b = read(first), read(second)
         if a is None or b is None:
             return None
-        around = of_difference(a, b)
-        return f"{factor * (value(*b) - value(*a)):+{form}} ({between(around, factor, f'+{form}')})", around
+        return _with_interval(value(*b) - value(*a), f"+{form}", of_difference(a, b), factor)
 
     return of, more
 
@@ -178,11 +181,14 @@ def _failures(result: dict[str, Any]) -> tuple[int, int] | None:
 
 
 def _spread(result: dict[str, Any]) -> tuple[float, float, int] | None:
-    """Return mean and standard deviation of returns, and the number of episodes."""
+    """Return mean and standard deviation of returns, and the number of episodes. The file has the deviation of just these
+    returns; that of a sample, from which intervals follow, is a little larger.
+    """
     episodes = result.get("episodes")
     if episodes is None or int(episodes["count"]) < 1:
         return None
-    return episodes["return"]["mean"], episodes["return"]["std"], int(episodes["count"])
+    count = int(episodes["count"])
+    return episodes["return"]["mean"], episodes["return"]["std"] * sqrt(count / max(count - 1, 1)), count
 
 
 def _success(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> list[str]:
