@@ -12,6 +12,7 @@ import pytest
 import torch
 from helpers import TASK, TINY_TRAINING, call, run_folders, tiny_run, wait_for
 
+from legged.errors import ConfigError
 from legged.evaluation.judged_run import find_runs
 from legged.learning.timing import read_timing
 from legged.process.startup import STAGES_FILE
@@ -269,6 +270,35 @@ def test_of_several_seeds_the_lowest_gives_the_policy_and_the_others_what_they_c
         (folder, "model_0.pt"),
     ))  # fmt: skip
     assert shipped == trained  # the last of that seed
+
+
+def test_a_shipment_leaves_nothing_of_the_one_before_it():
+    place = Path("shipped") / TASK
+    for left in ("seed_2/timing.json", "seed_2/evaluation_mujoco.json", "seed_3/own.txt", "evaluation_newton_xpbd.json",
+                 "evaluation_mujoco.png", "timing.json", "play.gif", "model.pt"):  # fmt: skip
+        (place / left).parent.mkdir(parents=True, exist_ok=True)
+        (place / left).write_text(left)
+    run = tiny_run("--run_name", "s1", "--seed", "1", iterations=1)
+    whole = (run / "model_0.pt").read_bytes()
+    (run / "model_0.pt").write_bytes(b"damaged")
+    with pytest.raises(ConfigError):
+        ship(find_runs([run]), Path("shipped"))
+    assert (place / "model.pt").read_text() == "model.pt"
+    assert (place / "seed_2" / "evaluation_mujoco.json").exists()  # the old one is there as it was
+    (run / "model_0.pt").write_bytes(whole)
+    ship(find_runs([run]), Path("shipped"))
+    names = {str(path.relative_to(place)) for path in place.rglob("*") if path.is_file()}
+    assert names == {"model.pt", "config.yaml", "timing.json", "play.gif", "seed_3/own.txt"}
+    assert not (place / "seed_2").exists()
+    assert read_timing(place) == read_timing(run)
+
+
+def test_a_shipped_policy_is_not_shipped_over_itself():
+    ship(find_runs([tiny_run(iterations=1)]), Path("shipped"))
+    before = {path: path.read_bytes() for path in Path("shipped").rglob("*.*")}
+    with pytest.raises(ConfigError, match=f"--ship: shipped/{TASK} is shipped there already"):
+        ship(find_runs([Path("shipped")]), Path("shipped"))
+    assert {path: path.read_bytes() for path in Path("shipped").rglob("*.*")} == before
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 
 from legged.config.actuator import MOTORS
-from legged.errors import RunError
-from legged.evaluation.judged_run import JudgedRun
+from legged.errors import ConfigError, RunError
+from legged.evaluation.judged_run import SEED_FOLDER, JudgedRun
 from legged.evaluation.result_file import file_name
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL, checkpoints, find_checkpoint
@@ -24,14 +24,15 @@ BOTH = ("actor_state_dict", "critic_state_dict", "iter", "infos")
 
 def ship(runs: Sequence[JudgedRun], folder: Path) -> list[str]:
     """Write `folder`/<task>/ for each task: the policy of the lowest seed that has finished, with configuration, times and
-    evaluations, and in seed_<number>/ times and evaluations of the others. Of several runs of a seed the last counts. Return
-    a line on each.
+    evaluations, and in seed_<number>/ times and evaluations of the others. Of several runs of a seed the last counts. What an
+    earlier shipment has left of these goes. Return a line on each.
 
     Raises:
-        ConfigError: a checkpoint can't be read.
+        ConfigError: a checkpoint can't be read, or a run lies where it would be shipped to.
         RunError: a file can't be written.
     """
     finished = [run for run in runs if run.folder is not None and not run.failure]
+    _check_elsewhere(finished, folder)
     lines = []
     for task in dict.fromkeys(run.cfg.task for run in finished):
         by_seed = {run.seed: run for run in finished if run.cfg.task == task}
@@ -40,18 +41,36 @@ def ship(runs: Sequence[JudgedRun], folder: Path) -> list[str]:
         if first is None or first.folder is None:
             continue
         others = [run for run in seeds if run is not first]
-        size = _ship_model(find_checkpoint(first.folder, None), folder / task / SHIPPED_MODEL)
+        model = _small(find_checkpoint(first.folder, None))
+        make_folder(folder / task)
+        _remove_shipment(folder / task)
+        write_bytes(folder / task / SHIPPED_MODEL, model)
         _copy(first, folder / task, (CONFIG_FILE, MOTORS))
         for other in others:
             _copy(other, folder / task / f"seed_{other.seed}")
         more = "".join(f", evaluations of seed {other.seed}" for other in others)
-        lines.append(f"{relative(folder / task)}: policy of seed {first.seed}, {size / 1e6:.2f} MB{more}")
+        lines.append(f"{relative(folder / task)}: policy of seed {first.seed}, {len(model) / 1e6:.2f} MB{more}")
     return lines
 
 
-def _ship_model(checkpoint: Path, path: Path) -> int:
-    """Write a checkpoint without what only a resumed training needs, and without the critic if it is large; return its size
-    [bytes].
+def _check_elsewhere(runs: Sequence[JudgedRun], folder: Path) -> None:
+    """Look whether all runs lie elsewhere than the policies that are made of them.
+
+    Raises:
+        ConfigError: one of them is itself shipped there.
+    """
+    for run in runs:
+        assert run.folder is not None, "those without one were left out"
+        source, place = run.folder.resolve(), (folder / run.cfg.task).resolve()
+        if source == place or (source.parent == place and SEED_FOLDER.fullmatch(source.name)):
+            raise ConfigError(f"--ship: {relative(run.folder)} is shipped there already; name another folder, or other runs")
+
+
+def _small(checkpoint: Path) -> memoryview:
+    """Return a checkpoint's file without what only a resumed training needs, and without the critic if it is large.
+
+    Raises:
+        ConfigError: it can't be read.
     """
     saved = read_checkpoint(checkpoint)
     for parts in (BOTH, ACTOR):
@@ -59,9 +78,26 @@ def _ship_model(checkpoint: Path, path: Path) -> int:
         torch.save({part: saved[part] for part in parts if part in saved}, buffer)
         if buffer.tell() <= LARGEST:
             break
-    make_folder(path.parent)
-    write_bytes(path, buffer.getbuffer())
-    return buffer.tell()
+    return buffer.getbuffer()
+
+
+def _remove_shipment(folder: Path) -> None:
+    """Remove what an earlier policy was found to be worth: with the new one it would be read as if it were of that.
+
+    Raises:
+        RunError: a file can't be removed.
+    """
+    seeds = [path for path in folder.iterdir() if SEED_FOLDER.fullmatch(path.name) and path.is_dir()]
+    try:
+        (folder / MOTORS).unlink(missing_ok=True)
+        for place in (folder, *seeds):
+            for path in [place / TIMING_FILE, *place.glob("evaluation_*")]:
+                path.unlink(missing_ok=True)
+        for seed in seeds:
+            if not any(seed.iterdir()):  # what else lies there is not ours
+                seed.rmdir()
+    except OSError as error:
+        raise RunError(f"{relative(folder)}: {reason(error)}") from error
 
 
 def _copy(run: JudgedRun, folder: Path, more: tuple[str, ...] = ()) -> None:
