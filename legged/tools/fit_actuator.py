@@ -23,7 +23,7 @@ from legged.commandline.parser import CommandParser
 from legged.errors import ConfigError
 from legged.process.paths import make_folder, ready_to_write, relative, write_text
 from legged.tools.fitting.judgement import Fit, actuator_section, draw, errors
-from legged.tools.fitting.log import ActuatorLog, read_log
+from legged.tools.fitting.log import ActuatorLog, check_alike, read_log
 from legged.tools.fitting.parametric import Drive, fit_drive
 
 UPDATES = {"mlp": 2000, "lstm": 3000}
@@ -76,6 +76,7 @@ def _main(argv: list[str] | None) -> int:
     if spacing < 1 or abs(spacing * args.dt - args.spacing) > 1e-3 * args.dt:
         raise ConfigError(f"--spacing: must be a whole multiple of --dt, {args.dt:g} s, got {args.spacing:g}")
     log = read_log(args.log).only(args.joints)
+    check_alike(log, args.log)
     at_steps = log.resampled(args.dt)
     ready_to_write(args.out)
     _tell(log)

@@ -14,7 +14,7 @@ from legged.errors import ConfigError
 from legged.mdp.actuator import Friction, MotorCurve
 from legged.mdp.actuator_network import NetworkWeights
 from legged.tools import fit_actuator
-from legged.tools.fitting.log import read_log
+from legged.tools.fitting.log import check_alike, read_log
 from legged.tools.fitting.parametric import SMOOTHING, Drive, delayed, fit_drive
 
 pytestmark = pytest.mark.usefixtures("workplace")
@@ -207,6 +207,24 @@ def test_a_wrong_log_is_one_line(tmp_path, changes, said, capsys):
     told = capsys.readouterr().err
     assert told.startswith(f"error: {path}: {said}")
     assert told.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"stiffness": [14.0, 99.0]}, "stiffness: 14 at joint_0, 99 at joint_1; one drive is fitted to all joints"),
+        ({"damping": [2.0, 1.5]}, "damping: 1.5 at joint_1, 2 at joint_0"),
+        ({"torque_limit": [80.0, 40.0]}, "torque_limit: 40 at joint_1, 80 at joint_0"),
+    ],
+)
+def test_joints_with_drives_of_their_own_are_not_fitted_as_one(tmp_path, changes, said, capsys):
+    path = write(tmp_path, **{name: np.array(values) for name, values in changes.items()})
+    assert call(fit_actuator.main, [str(path), "--out", "fit"]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"error: {path}: {said}")
+    assert told.endswith("with --joints\n")
+    check_alike(read_log(path).only(["joint_1"]), path)
+    check_alike(read_log(write(tmp_path, stiffness=np.array([14.0, 99.0]), damping=None)), path)  # the gains are fitted
 
 
 @pytest.mark.parametrize(

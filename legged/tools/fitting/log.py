@@ -143,6 +143,25 @@ def read_log(path: Path) -> ActuatorLog:
     return ActuatorLog(names, _time_step(arrays, run, path), run, **found)
 
 
+def check_alike(log: ActuatorLog, path: Path) -> None:
+    """Look whether what a log states of its joints' drives is the same for all: one drive is fitted to them, with one
+    friction.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    known = log.stiffness is not None and log.damping is not None  # one alone is not used
+    for name in (*(OPTIONAL[3:5] if known else ()), OPTIONAL[5]):
+        values = getattr(log, name)
+        if values is None or np.allclose(values, values[0], rtol=1e-4, atol=0.0):
+            continue
+        low, high = int(values.argmin()), int(values.argmax())
+        raise ConfigError(
+            f"{path}: {name}: {values[low]:.4g} at {log.joint_names[low]}, {values[high]:.4g} at {log.joint_names[high]}; one"
+            " drive is fitted to all joints, so choose some that are alike with --joints"
+        )
+
+
 def _numbers(values: np.ndarray, where: str) -> np.ndarray:
     """Return an array as float64.
 

@@ -86,8 +86,8 @@ def delayed(log: ActuatorLog, samples: float) -> np.ndarray:
 
 
 def fit_drive(log: ActuatorLog, longest_delay: float = 0.05) -> Drive:
-    """Return the drive that explains a log's torques best, held-out samples left out. Gains that the log states are taken as
-    they are. Without them the damping has the viscous friction in it: they can't be told apart.
+    """Return the drive that explains a log's torques best, held-out samples left out. Gains that the log states, the same
+    for all joints, are taken as they are. Without them the damping has the viscous friction in it: they can't be told apart.
     """
     every = np.flatnonzero(~log.held_out)
     effort = np.inf if log.torque_limit is None else float(log.torque_limit.max())
