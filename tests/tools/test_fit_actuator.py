@@ -91,6 +91,30 @@ def test_held_out_samples_are_blocks_of_time_or_whole_runs(tmp_path):
     assert sorted(set(np.flatnonzero(held) // 160)) == [4, 9]
 
 
+@pytest.mark.parametrize(
+    ("lengths", "kept"),
+    [
+        ([25, 25, 25, 25, 500], [0, 1, 2, 3]),  # 100 of 600; the fifth run alone is 500
+        ([390, 390, 390, 390, 10], [3, 4]),  # 400 of 1570; the fifth run alone is 10
+        ([100, 50, 150, 300, 150, 200, 50], [1, 4]),  # exactly a fifth of 1000
+    ],
+)
+def test_a_fifth_of_the_samples_is_held_out_however_long_the_runs_are(tmp_path, lengths, kept):
+    log = read_log(write(tmp_path))
+    rows = {name: getattr(log, name)[: sum(lengths)] for name in ("target", "position", "velocity", "torque")}
+    log = type(log)(**{**vars(log), **rows, "run": np.repeat(np.arange(len(lengths)), lengths)})
+    assert sorted(set(log.run[log.held_out])) == kept
+    assert log.held_out.sum() == sum(lengths[i] for i in kept)
+    again = log.resampled(0.005)
+    assert sorted(set(again.run[again.held_out])) == kept  # what is fitted to one is judged on the same runs of the other
+
+
+def test_of_a_log_that_is_nearly_all_one_run_blocks_of_time_are_held_out(tmp_path):
+    log = read_log(write(tmp_path, run=np.repeat(np.arange(5), [10, 10, 1560, 10, 10])))
+    assert log.held_out.sum() == 4 * 2 + 312
+    assert set(log.run[~log.held_out]) == set(range(5))
+
+
 def test_a_log_is_resampled_without_looking_ahead(tmp_path):
     log = read_log(write(tmp_path))
     half = log.resampled(0.00375)
@@ -197,6 +221,8 @@ def test_an_lstm_in_a_task_is_torchs():
         ({"torques": np.zeros(3)}, "unknown key 'torques'; did you mean 'torque'"),
         ({"dt": None}, "'dt' is missing"),
         ({"dt": np.array(0.0)}, "dt: must be above 0"),
+        ({"dt": np.zeros(0)}, "dt: expected a number, got (0,)"),
+        ({"dt": None, "time": np.arange(1600.0), "run": np.arange(1600)}, "run: no two samples in a row are of one run"),
         ({"dt": None, "time": np.arange(1600.0) ** 1.1}, "time: samples are not evenly spaced"),
         ({"stiffness": np.zeros(5)}, "stiffness: expected a number or (2,)"),
     ],

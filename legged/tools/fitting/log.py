@@ -15,6 +15,8 @@ OPTIONAL = ("dt", "time", "run", "stiffness", "damping", "torque_limit")
 BLOCKS = 10
 """A run is cut into so many blocks of time, of which every `HELD_OUT`th is kept for the judgement."""
 HELD_OUT = 5
+FEWEST_HELD_OUT = 0.1
+"""Share of the samples that whole runs must come to, to be kept."""
 UNEVEN = 0.01
 """Share of the mean time step by which samples may be out of step."""
 SHORTEST = 200
@@ -45,12 +47,14 @@ class ActuatorLog:
 
     @property
     def held_out(self) -> np.ndarray:
-        """(T,) bool: samples that nothing is fitted to: of several runs every fifth run, of fewer every fifth block of
-        time.
+        """(T,) bool: samples that nothing is fitted to, about a fifth: whole runs, or every fifth block of time where there
+        are few runs, or nearly all samples are of one.
         """
-        runs = np.unique(self.run)
+        runs, lengths = np.unique(self.run, return_counts=True)
         if len(runs) >= HELD_OUT:
-            return np.isin(self.run, runs[HELD_OUT - 1 :: HELD_OUT])
+            chosen, share = _about_a_fifth(lengths)
+            if share >= FEWEST_HELD_OUT:
+                return np.isin(self.run, runs[chosen])
         held = np.zeros(len(self.run), dtype=bool)
         for number in runs:
             rows = np.flatnonzero(self.run == number)
@@ -97,6 +101,17 @@ class ActuatorLog:
                 parts[name].append((1.0 - share) * values[before] + share * values[after])
         joined: dict[str, Any] = {name: np.concatenate(values) for name, values in parts.items()}
         return replace(self, dt=dt, **joined)
+
+
+def _about_a_fifth(lengths: np.ndarray) -> tuple[list[int], float]:
+    """Return some runs, every fifth before the others, whose lengths come near a fifth of all, and their share of it."""
+    order = [i for first in reversed(range(HELD_OUT)) for i in range(first, len(lengths), HELD_OUT)]
+    wanted, held, chosen = lengths.sum() / HELD_OUT, 0, []
+    for i in order:
+        if abs(held + lengths[i] - wanted) < abs(held - wanted):
+            chosen.append(i)
+            held += int(lengths[i])
+    return chosen, held / lengths.sum()
 
 
 def read_log(path: Path) -> ActuatorLog:
@@ -180,7 +195,10 @@ def _time_step(arrays: dict[str, np.ndarray], run: np.ndarray, path: Path) -> fl
         ConfigError: nobody says it, or it changes within a run.
     """
     if "dt" in arrays:
-        dt = float(_numbers(arrays["dt"], f"{path}: dt").reshape(-1)[0])
+        given = _numbers(arrays["dt"], f"{path}: dt")
+        if given.size != 1:
+            raise ConfigError(f"{path}: dt: expected a number, got {given.shape}")
+        dt = given.item()
         if dt <= 0.0:
             raise ConfigError(f"{path}: dt: must be above 0, got {dt:g}")
         return dt
@@ -190,6 +208,10 @@ def _time_step(arrays: dict[str, np.ndarray], run: np.ndarray, path: Path) -> fl
     if time.shape != run.shape:
         raise ConfigError(f"{path}: time: expected {run.shape}, got {time.shape}")
     steps = np.diff(time)[np.diff(run) == 0]
+    if not len(steps):
+        raise ConfigError(
+            f"{path}: run: no two samples in a row are of one run, so 'time' does not say how far apart they are"
+        )
     dt = float(np.median(steps))
     if dt <= 0.0 or np.abs(steps - dt).max() > max(UNEVEN * dt, 1e-9):
         worst = float(np.abs(steps - dt).max())
