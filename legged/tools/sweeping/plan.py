@@ -150,6 +150,13 @@ class Plan:
         """Return the same with another number of trials."""
         return replace(self, given=replace(self.given, trials=trials))
 
+    @property
+    def negated(self) -> bool:
+        """Whether figures are negated where they are reported on the way: less is better there, as of the times that the
+        trials end with, and of the figure itself more is.
+        """
+        return self.until_target and not lower_is_better(self.figure)
+
     def arguments(self, values: Mapping[str, Any], number: int, seed: int) -> list[str]:
         """Return the flags and `key=value`s of train.py for a trial of that number."""
         target = self.given.objective.target

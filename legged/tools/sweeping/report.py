@@ -69,6 +69,7 @@ def table(plan: Plan, trials: Sequence["FrozenTrial"]) -> str:
     ranked = ranking(plan, trials)
     others = sorted((t for t in trials if t.state.name != "COMPLETE"), key=lambda t: (order[t.state.name], t.number))
     paths = [one.path for one in plan.parameters]
+    sign = -1.0 if plan.negated else 1.0
     lines = [f"# {plan.name}", "", f"`{plan.cfg.task}`, for the {plan.objective_text}.", ""]
     heads = ["rank", "trial", plan.objective_text, *(f"`{path}`" for path in paths), "run"]
     lines += [_row(heads), _row(["--:", "--:", "--:", *["--:"] * len(paths), ":--"])]
@@ -80,7 +81,7 @@ def table(plan: Plan, trials: Sequence["FrozenTrial"]) -> str:
         )
         if trial.state.name == "PRUNED" and trial.intermediate_values:
             step = max(trial.intermediate_values)
-            why += f"; {abs(trial.intermediate_values[step]):.4g} at {step}"
+            why += f"; {sign * trial.intermediate_values[step]:.4g} at {step}"
         lines.append(_row(["", trial.number, why, *_values(plan, trial, paths), _runs(trial)]))
     if ranked:
         command = shlex.join([f"{path}={_text(value)}" for path, value in settings(plan, ranked[0]).items()])

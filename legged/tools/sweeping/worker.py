@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from legged.commandline.stopping import stopping_on_signals
-from legged.envs.checks import lower_is_better
 from legged.errors import ConfigError
 from legged.learning.evaluations import Evaluated, reaches
 from legged.learning.run_folder import NOTE_FILE
@@ -139,7 +138,6 @@ class Worker:
         """Train with one seed; return its value. Raises as `_value`."""
         kept: list[Runner] = []
         until = self.plan.cfg.train.runner.max_iterations
-        lower = lower_is_better(self.plan.figure)
 
         def listen(found: Evaluated) -> str:
             """Report what was found, as the mean over the seeds so far; end the training if others were better by then."""
@@ -147,8 +145,8 @@ class Worker:
             if not math.isfinite(now):
                 return ""
             step = len(before) * until + found.iterations
-            if self.plan.until_target:  # less is better there: of times, and so of what is reported on the way
-                trial.report(now if lower else -now, step)
+            if self.plan.until_target:
+                trial.report(-now if self.plan.negated else now, step)
             else:
                 trial.report(mean([*before, now]), step)
             return PRUNED if found.iterations < until and trial.should_prune() else ""
