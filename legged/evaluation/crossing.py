@@ -99,7 +99,7 @@ def crossing_table(result: dict[str, Any]) -> Table:
             number(row["rmse_ang"], "{:.3f} rad/s"),
             f"{100 * row['falls']:.1f} %",
             number(row["cost_of_transport"], "{:.2f}"),
-            f"{row['base_height']:.3f} m",
+            number(row["base_height"], "{:.3f} m"),
             str(row["contact_overflows"]),
             f"{row['steps_per_s']:,.0f}",
         )

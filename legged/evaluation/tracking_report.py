@@ -13,6 +13,14 @@ from legged.evaluation.velocity_grid import AXES
 from legged.figures import figure
 from legged.terrain import BUMPS
 
+GAIT = (
+    ("duty factor", "duty_factor", 1.0, "{:.2f}"),
+    ("steps per second and foot", "steps_per_s", 1.0, "{:.2f}"),
+    ("base height", "base_height", 1.0, "{:.3f} m"),
+    ("thigh or shank contact", "thigh_contact", 100.0, "{:.2f} % of steps"),
+)
+"""Label, name in a cell, factor, how it is written; none where every robot fell before it was measured."""
+
 
 def print_tracking(result: dict[str, Any]) -> None:
     """Print the figures over the grid, and the gait at 0.5 m/s."""
@@ -37,10 +45,9 @@ def print_tracking(result: dict[str, Any]) -> None:
     if result["cost_of_transport"] is not None:
         table.add_row("cost of transport", f"{result['cost_of_transport']:.2f}", "sum |torque * speed| / (weight * speed)")
     at = _command(gait["command"])
-    table.add_row("duty factor", f"{gait['duty_factor']:.2f}", at)
-    table.add_row("steps per second and foot", f"{gait['steps_per_s']:.2f}", at)
-    table.add_row("base height", f"{gait['base_height']:.3f} m", at)
-    table.add_row("thigh or shank contact", f"{100 * gait['thigh_contact']:.2f} % of steps", at)
+    for label, name, factor, form in GAIT:
+        value = gait[name]
+        table.add_row(label, "none" if value is None else form.format(factor * value), at)
     Console(width=110).print(table)
 
 

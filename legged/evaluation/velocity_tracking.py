@@ -114,16 +114,16 @@ class _Sums:
 def summarize(
     task: LeggedRobot, grid: Grid, cells: np.ndarray, sums: _Sums, fell: Tensor, measured_s: float
 ) -> dict[str, Any]:
-    """Return the figures cell by cell, and over the grid."""
+    """Return the figures cell by cell, and over the grid; null where no robot was left to be measured."""
 
     def per_cell(name: str) -> np.ndarray:
         values = sums.values[name].double().cpu().numpy()
         return values.reshape(len(cells), grid.robots, *values.shape[1:]).sum(axis=1)
 
     counted = per_cell("steps")
-    steps = np.maximum(counted, 1.0)
-    # A cell in which every robot fell before it was measured has no error; 0 would look perfect.
-    lin, ang = (np.where(counted > 0, np.sqrt(per_cell(name) / steps), np.nan) for name in ("lin", "ang"))
+    # A cell in which every robot fell before it was measured has neither errors nor a gait; 0 would look perfect.
+    steps = np.where(counted > 0, counted, np.nan)
+    lin, ang = (np.sqrt(per_cell(name) / steps) for name in ("lin", "ang"))
     speed = per_cell("speed") / steps
     weight = task.robot.mass * GRAVITY
     moving = speed > SLOWEST

@@ -62,12 +62,13 @@ def test_the_command_measures_each_engine_and_writes_beside_the_checkpoint(run, 
 
 
 def test_an_engine_in_which_everybody_fell_is_shown_without_numbers(tmp_path, capsys):
-    rows = [result("mujoco"), result("newton_xpbd", rmse_lin=None, rmse_ang=None, cost_of_transport=None, falls=1.0)]
+    nothing = dict.fromkeys(("rmse_lin", "rmse_ang", "cost_of_transport", "base_height"))
+    rows = [result("mujoco"), result("newton_xpbd", **nothing, falls=1.0)]
     summary = {"task": TASK, "checkpoint": "m.pt", "grid": {"vx": [0], "vy": [0], "yaw": [0]}, "robots_per_cell": 2}
     summary["engines"] = rows
     Console(width=110).print(crossing.crossing_table(summary))
     line = next(line for line in capsys.readouterr().out.splitlines() if "newton_xpbd" in line)
-    assert line.count("none") == 3
+    assert line.count("none") == 4
     assert "100.0 %" in line
     crossing.draw_crossing(summary, tmp_path / "p.png")
     assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")

@@ -12,7 +12,7 @@ from legged import make_task
 from legged.config import override
 from legged.errors import RunError
 from legged.evaluation import crossing, following
-from legged.evaluation.tracking_report import draw_tracking
+from legged.evaluation.tracking_report import draw_tracking, print_tracking
 from legged.evaluation.velocity_grid import Grid, axes_of, axis_values
 from legged.evaluation.velocity_tracking import measure_tracking
 from legged.play import schedule
@@ -106,6 +106,18 @@ def test_a_cell_in_which_nobody_stands_long_enough_to_be_measured_does_not_count
         assert cell["rmse_lin"] is None or cell["rmse_lin"] > 0.3
     assert not result["rmse_lin"]["mean"] or result["rmse_lin"]["mean"] > 0.3
     json.dumps(result, allow_nan=False)
+
+
+def test_a_cell_in_which_nobody_was_measured_has_no_gait_either(capsys):
+    grid = Grid([0.5], [0.0], [0.0], robots=2, hold_s=0.6, settle_s=0.3)
+    fallen = on_grid(grid, stand, ("terminations.min_base_height", 5.0))
+    assert fallen["gait"] == {**dict.fromkeys(fallen["gait"]), "command": [0.5, 0.0, 0.0], "falls": 1.0}
+    said = {"task": TASK, "checkpoint": "model_0.pt", "physics": "mujoco", "ground": ""}
+    print_tracking({**said, **fallen})
+    lines = capsys.readouterr().out.splitlines()
+    for label in ("duty factor", "steps per second and foot", "base height", "thigh or shank contact"):
+        (line,) = (line for line in lines if label in line)
+        assert " none " in line
 
 
 def test_a_picture_of_nothing_measured_is_drawn_without_a_warning(tmp_path, recwarn):
