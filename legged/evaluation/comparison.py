@@ -57,7 +57,9 @@ def spread(values: Sequence[float]) -> float:
 
 
 def tracking_table(groups: Evaluations) -> Table:
-    """Return a column a group: mean over its seeds, and the spread where there are several."""
+    """Return a column a group: mean over its seeds, the spread where there are several, and how many of them have the number
+    where not all do.
+    """
     table = Table(title="following commands: mean of seeds (farthest from it)", title_justify="left")
     table.add_column("measure")
     for key, results in groups.items():
@@ -71,8 +73,10 @@ def tracking_table(groups: Evaluations) -> Table:
             if not values:  # every robot fell before it was measured
                 cells.append("none")
                 continue
-            text = f"{mean(values):.{decimals}f}"
-            cells.append(f"{text} ({100 * spread(values):.0f} %)" if len(values) > 1 else text)
+            told = [f"{100 * spread(values):.0f} %"] if len(values) > 1 else []
+            if len(values) < len(results):  # of the others every robot fell
+                told.append(f"of {len(values)} of {len(results)} seeds")
+            cells.append(f"{mean(values):.{decimals}f}" + (f" ({', '.join(told)})" if told else ""))
         table.add_row(escape(label), *cells)
     return table
 

@@ -147,6 +147,23 @@ def test_who_fell_before_anything_was_measured_has_no_error(tmp_path, capsys):
     assert lines["falls [%]"] == ["100.00 (0 %)"]
 
 
+def test_a_mean_without_the_seeds_that_fell_says_of_how_many_it_is(tmp_path, capsys):
+    for name, rmse in (("1", 0.3), ("2", 0.5), ("3", None), ("4", None)):
+        result = evaluation(tmp_path / f"{name}.json", rmse=rmse or 0.1)
+        changes = {} if rmse else {"rmse_lin": {"mean": None, "worst": None}, "falls": 1.0}
+        (tmp_path / f"{name}.json").write_text(json.dumps({**result, **changes}))
+
+    def told(*names):
+        assert main([str(tmp_path / f"{name}.json") for name in names]) == 0
+        lines = capsys.readouterr().out.split("\n")
+        return {line.split("│")[1].strip(): line.split("│")[2].strip() for line in lines if line.count("│") == 3}
+
+    assert told("1", "3")["velocity RMSE, mean [m/s]"] == "0.300 (of 1 of 2 seeds)"
+    found = told("1", "2", "3", "4")
+    assert found["velocity RMSE, worst cell [m/s]"] == "0.800 (25 %, of 2 of 4 seeds)"
+    assert found["falls [%]"] == "50.00 (100 %)"
+
+
 def test_an_engine_of_another_version_and_brackets_in_names_are_shown_as_they_are(tmp_path, capsys):
     evaluation(tmp_path / "1.json", task="[/x]", physics="[red]physx", stairs={0.1: 1.0, 0.2: 0.5})
     out = tmp_path / "new" / "x.png"
