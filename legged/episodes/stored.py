@@ -18,6 +18,8 @@ from legged.registry import task_schema
 
 ARRAYS, ABOUT, CONFIG = "episodes.npz", "episodes.json", "episodes.yaml"
 """The files: numbers; what they are; the configuration of the task that the robots were in."""
+MADE_OF_THEM = ("episodes.md", "episodes.parquet", "episode_[0-9]*.html", "joint_statistics.*")
+"""Patterns of the files that others make of a recording, beside it."""
 TIME_UP, NO_NUMBERS = "time", "non_finite"
 """How an episode ended that no term has ended."""
 
@@ -77,7 +79,8 @@ class Episodes:
 
 
 def save_episodes(episodes: Episodes, cfg: TaskConfig, folder: Path) -> None:
-    """Write the three files into `folder`; arrays as they are, with `time` [s] and `episode` beside them.
+    """Write the three files into `folder`; arrays as they are, with `time` [s] and `episode` beside them. They take the place
+    of an earlier recording, and what was made of that goes.
 
     Raises:
         ConfigError, RunError: a file can't be written.
@@ -85,6 +88,11 @@ def save_episodes(episodes: Episodes, cfg: TaskConfig, folder: Path) -> None:
     make_folder(folder)
     with replacing(folder / ARRAYS) as part:
         np.savez(part, **clock_of(episodes), **episodes.arrays)  # type: ignore[arg-type]
+        # Now that there is room for the numbers. Without the old description, nobody takes them for those of the old policy
+        # if the new one can't be written.
+        for name in (ABOUT, CONFIG, *MADE_OF_THEM):
+            for path in folder.glob(name):
+                path.unlink()
     write_text(folder / CONFIG, to_yaml(cfg))
     write_text(folder / ABOUT, json.dumps(episodes.about, indent=1, allow_nan=False))
 

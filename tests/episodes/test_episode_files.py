@@ -1,5 +1,6 @@
 """Stored episodes come back as they were; damaged ones are refused in one line."""
 
+import errno
 import json
 import re
 from pathlib import Path
@@ -9,8 +10,12 @@ import pytest
 from handmade import made_by_hand
 from helpers import small_config
 
+from legged.episodes.page import page_name
+from legged.episodes.parquet import TABLE
+from legged.episodes.statistics_report import NAME
 from legged.episodes.stored import ABOUT, ARRAYS, CONFIG, load_config, load_episodes, save_episodes
-from legged.errors import ConfigError
+from legged.errors import ConfigError, RunError
+from legged.tools.episodes import LIST
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -32,6 +37,36 @@ def test_episodes_come_back_as_they_were():
     with np.load(folder / ARRAYS) as plain:  # as somebody reads it who knows nothing of this package
         np.testing.assert_allclose(plain["time"], 0.02 * np.array([1, 2, 3, 1, 2, 3, 4, 5]), rtol=1e-6)
         assert plain["episode"].tolist() == [0] * 3 + [1] * 5
+
+
+@pytest.mark.parametrize("full", [ARRAYS, CONFIG, ABOUT])
+def test_numbers_are_never_described_by_an_earlier_recording(full, monkeypatch):
+    """The disk is full at one of the files: the earlier recording stays as it was, or there is none."""
+    folder, replace = saved(), Path.replace
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+
+    def fail(self, target):
+        if target.name == full:
+            raise OSError(errno.ENOSPC, "no space")
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", fail)
+    with pytest.raises(RunError, match=f"kept/{full}: no space left on the disk"):
+        save_episodes(made_by_hand(4, 4), small_config(), folder)
+    if {path: path.read_bytes() for path in folder.iterdir()} != before:
+        with pytest.raises(ConfigError, match=f"kept holds no {ABOUT}"):
+            load_episodes(folder, "--stored")
+
+
+def test_a_recording_takes_away_what_was_made_of_the_one_before_it():
+    folder = saved()
+    made = [page_name(3), page_name(1000), f"{NAME}.md", f"{NAME}.html", f"{NAME}.png", LIST, TABLE]
+    own = ["notes.md", "episode_best.html"]
+    for name in made + own:
+        (folder / name).write_text(name)
+    save_episodes(made_by_hand(4, 4), small_config(), folder)
+    assert {path.name for path in folder.iterdir()} == {ARRAYS, ABOUT, CONFIG, *own}
+    assert load_episodes(folder, "--stored").lengths.tolist() == [4, 4]
 
 
 def cut(path: Path):
