@@ -35,6 +35,8 @@ class JointStatistics:
     episodes: int
     """How many were longer than `SETTLE_S`."""
     steps: int
+    lost: int
+    """Steps that are left out because their numbers are not finite: physics blew up."""
     foot: str
     """By whose touch-downs cycles are told; empty if the task has no feet."""
     cycles: dict[str, np.ndarray]
@@ -54,6 +56,7 @@ def joint_statistics(episodes: Episodes, where: str = "--statistics") -> JointSt
 
     A cycle begins when the first foot touches down and ends when it does so the next time, if that is neither too soon nor
     too late (`SHORTEST_CYCLE_S`, `LONGEST_CYCLE_S`, `UNUSUAL`); values are interpolated linearly at `PHASES` equal parts.
+    Steps whose numbers are not finite are left out, and cycles that have one.
 
     Raises:
         ConfigError: the task's joints are not known, or no episode is long enough.
@@ -67,13 +70,19 @@ def joint_statistics(episodes: Episodes, where: str = "--statistics") -> JointSt
         raise ConfigError(f"{where}: no episode of '{episodes.about['task']}' is longer than {SETTLE_S:g} s")
     feet = list(episodes.about.get("feet", []))
     pooled: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    lost = 0
     spans: list[tuple[int, int, dict[str, np.ndarray]]] = []
     for i in chosen:
         one = {name: array[settled:] for name, array in episodes.of(i).items()}
+        known = np.all([np.isfinite(one[name]).all(axis=1) for name in names], axis=0)
+        lost += int((~known).sum())
         for name in names:
-            pooled[name].append(one[name])
+            pooled[name].append(one[name][known])
         if feet:
-            spans += [(*span, one) for span in cycles_of(one["feet_contact"][:, 0], episodes.dt)]
+            whole = (span for span in cycles_of(one["feet_contact"][:, 0], episodes.dt) if known[span[0] : span[1] + 1].all())
+            spans += [(*span, one) for span in whole]
+    if not any(len(part) for part in pooled[names[0]]):
+        raise ConfigError(f"{where}: physics blew up: no step of '{episodes.about['task']}' after {SETTLE_S:g} s has numbers")
     usual = float(np.median([end - begin for begin, end, _ in spans])) if spans else 0.0
     spans = [(begin, end, one) for begin, end, one in spans if abs(end - begin - usual) <= UNUSUAL * usual]
     lengths = [(end - begin) * episodes.dt for begin, end, _ in spans]
@@ -89,6 +98,7 @@ def joint_statistics(episodes: Episodes, where: str = "--statistics") -> JointSt
         std={name: value.std(axis=0) for name, value in values.items()},
         episodes=len(chosen),
         steps=len(values[names[0]]),
+        lost=lost,
         foot=feet[0] if feet else "",
         cycles={name: np.array(parts) for name, parts in cycles.items()} if lengths else {},
         cycle_s=np.array(lengths),

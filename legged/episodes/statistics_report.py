@@ -98,7 +98,10 @@ def _of(label: str, found: Mapping[str, JointStatistics]) -> str:
 
 def notes_of(found: Mapping[str, JointStatistics]) -> str:
     """Say of what the statistics are."""
-    parts = [f"{label}: {one.episodes} episodes, {one.steps} control steps." for label, one in found.items()]
+    parts = []
+    for label, one in found.items():
+        lost = f"; {one.lost} more are left out, in which physics blew up" if one.lost else ""
+        parts.append(f"{label}: {one.episodes} episodes, {one.steps} control steps{lost}.")
     parts.append(
         f"All steps after the first {SETTLE_S:g} s of an episode count alike; standard deviations are those of the steps."
     )

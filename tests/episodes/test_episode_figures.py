@@ -7,7 +7,7 @@ from handmade import DT, JOINTS, LIMIT, made_by_hand
 from legged.episodes.joint_statistics import PHASES, SETTLE_S, check_comparable, cycles_of, joint_statistics, resampled
 from legged.episodes.panels import Panels, groups_of, without_common_words
 from legged.episodes.ranking import counts_text, figures_of, heads_of, markdown_table, order_of, row_of
-from legged.episodes.statistics_report import tables_of
+from legged.episodes.statistics_report import notes_of, tables_of
 from legged.errors import ConfigError
 
 SETTLED = round(SETTLE_S / DT)
@@ -85,6 +85,28 @@ def test_joints_are_summed_up_after_they_have_settled():
     assert found.units["joint_vel"] == ["rad/s"] * len(JOINTS)
     with pytest.raises(ConfigError, match="longer than 1 s"):
         joint_statistics(made_by_hand(SETTLED))
+
+
+def test_steps_and_cycles_without_numbers_are_left_out_and_counted():
+    episodes = made_by_hand(SETTLED + 4, SETTLED + 60)
+    episodes["joint_pos"][SETTLED : SETTLED + 4, 0] = [1.0, 2.0, 9.0, np.nan]
+    episodes["torque"][SETTLED + 2, 3] = np.inf
+    second = slice(2 * SETTLED + 4, None)
+    episodes["joint_pos"][second, 0] = 1.5
+    for begin in (5, 25, 45):
+        episodes["feet_contact"][second, 0][begin : begin + 8] = 1.0
+    episodes["joint_vel"][second, 1][45] = np.nan  # the touch-down that ends the second cycle
+    found = joint_statistics(episodes)
+    assert (found.episodes, found.steps, found.lost) == (2, 2 + 59, 3)
+    assert found.mean["joint_pos"][0] == pytest.approx(1.5)
+    assert found.std["joint_pos"][0] == pytest.approx(np.sqrt(0.5 / 61))
+    for values in (*found.mean.values(), *found.std.values(), *found.over_cycle("joint_vel")):
+        assert np.isfinite(values).all()
+    assert len(found.cycle_s) == 1
+    assert "A: 2 episodes, 61 control steps; 3 more are left out" in notes_of({"A": found})
+    episodes["joint_pos"][:] = np.nan
+    with pytest.raises(ConfigError, match="--statistics: physics blew up: no step of 'by_hand'"):
+        joint_statistics(episodes)
 
 
 def test_a_cycle_goes_from_one_touch_down_to_the_next():
