@@ -1,6 +1,7 @@
 """A training and what its policy was found to be worth, read from its run folder or from the folder of a shipped policy."""
 
 import re
+import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -79,15 +80,23 @@ def why_unfinished(folder: Path, cfg: LeggedConfig, timing: Timing | None) -> st
 
 def find_runs(paths: Iterable[Path]) -> list[JudgedRun]:
     """Read the runs in some folders: a run folder itself, what lies in logs/ or logs/<task>/, or the folder of a shipped
-    policy with those of its other seeds.
+    policy with those of its other seeds. Runs of tasks that follow no commands are left out, and said to be, where others lie
+    beside them.
 
     Raises:
-        ConfigError: a folder holds no run, or something in one is damaged.
+        ConfigError: a folder holds no run, none of a task that follows commands, or something in one is damaged.
     """
     found: list[JudgedRun] = []
+    left_out: list[str] = []
     for path in paths:
-        for folder in folders_in(path):
+        folders = folders_in(path)
+        others = [folder for folder in folders if folder != path and not isinstance(run_config(folder), LeggedConfig)]
+        kept = [folder for folder in folders if folder not in others] or folders[:1]  # if none is left, the first says why
+        for folder in kept:
             found += [read_run(folder), *_other_seeds(folder)]
+        left_out += [relative(folder) for folder in others]
+    if left_out:
+        print(f"left out, for their tasks follow no commands: {', '.join(left_out)}", file=sys.stderr, flush=True)
     return found
 
 

@@ -135,3 +135,16 @@ def test_runs_are_found_in_folders_and_beside_shipped_policies(tmp_path):
 def test_a_task_without_commands_is_no_line(tmp_path):
     with pytest.raises(ConfigError, match="'half_cheetah' follows no commands"):
         find_runs([POLICY.parent / "half_cheetah"])
+
+
+def test_among_others_a_task_without_commands_is_left_out_and_named(tmp_path, capsys):
+    for task in ("half_cheetah", "anymal_c_flat"):
+        (tmp_path / task).mkdir()
+        for name in ("config.yaml", "model.pt"):
+            shutil.copy(POLICY.parent / task / name, tmp_path / task)
+    (found,) = find_runs([tmp_path])
+    assert found.folder == tmp_path / "anymal_c_flat"
+    assert capsys.readouterr().err == f"left out, for their tasks follow no commands: {tmp_path / 'half_cheetah'}\n"
+    shutil.rmtree(tmp_path / "anymal_c_flat")
+    with pytest.raises(ConfigError, match="'half_cheetah' follows no commands"):  # nothing is left
+        find_runs([tmp_path])
