@@ -2,6 +2,7 @@
 
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from rich.console import Console
 
 from legged.config import override
 from legged.evaluation.overflows import warn_of_overflows
-from legged.evaluation.result_file import file_name
+from legged.evaluation.result_file import changes_of, file_name
 from legged.physics import engine_name
 from legged.policies.episodes import episodes_table, for_episodes, measure_episodes
 from legged.policies.restore import TrainedPolicy, restore
@@ -38,15 +39,17 @@ def evaluate_episodes(
     task, act = restore(calm, [*changes, *asked], device, graph)
     measured = measure_episodes(task, act)
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
-    result = {**header(policy, engine, name), "wall_s": time.perf_counter() - start, "episodes": measured}
+    result = {**header(policy, engine, name, asked), "wall_s": time.perf_counter() - start, "episodes": measured}
     code = report(result, folder)
     warn_of_overflows("episodes", measured["contact_overflows"])
     return code
 
 
-def header(policy: TrainedPolicy, engine: str, device: str) -> dict[str, Any]:
-    """Return what every result says of what was measured."""
-    return {"task": policy.cfg.task, "checkpoint": policy.checkpoint.name, "physics": engine, "device": device}
+def header(policy: TrainedPolicy, engine: str, device: str, asked: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    """Return what every result says of what was measured; of what was `asked` for, the fields that were changed."""
+    what = {"task": policy.cfg.task, "checkpoint": policy.checkpoint.name, "physics": engine, "device": device}
+    changes = changes_of(asked)
+    return {**what, "changes": changes} if changes else what
 
 
 def report(result: dict[str, Any], folder: Path) -> int:

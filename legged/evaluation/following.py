@@ -50,7 +50,7 @@ def evaluate_following(
     figures = measure_tracking(task, act, grid)
     lost = figures.pop("contact_overflows")
     rough = cfg.terrain.mesh_type != "plane"
-    head = header(policy, engine, torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu")
+    head = header(policy, engine, torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu", asked)
     success = success_over_difficulty(policy, types, robots, full, asked, device, graph) if types else None
     result = {
         **head,

@@ -53,7 +53,7 @@ def evaluate_in_gymnasium(policy: TrainedPolicy, episodes: int, asked: list[tupl
     task, act = restore(calm, [*changes, ("sim.physics", "mujoco"), *asked], torch.device("cpu"), graph=False)
     export(task, act.network, folder / EXPORTED)
     measured = run_exported(folder / EXPORTED, name, episodes)
-    result = {**header(policy, ENGINE, "cpu"), "environment": name, "wall_s": time.perf_counter() - start}
+    result = {**header(policy, ENGINE, "cpu", asked), "environment": name, "wall_s": time.perf_counter() - start}
     return report({**result, "episodes": measured}, folder)
 
 

@@ -2,11 +2,21 @@
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from legged.errors import ConfigError
+
+CHANGED = "changed"
+"""Folder, beside a policy's own results, for those of evaluations for which fields were changed."""
+SAYS_NOTHING = ("sim.physics", "sim.solver", "sim.threads", "env.seed", "env.num_envs", "robot")
+"""Fields that say where a policy is measured, not under what."""
+
+
+def changes_of(asked: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    """Return field -> value of what was asked for that makes an evaluation another one than the policy's own."""
+    return {field: value for field, value in asked if field not in SAYS_NOTHING and not field.startswith("train.")}
 
 
 def file_name(engine: str) -> str:

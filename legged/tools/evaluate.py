@@ -35,13 +35,14 @@ from legged.evaluation.crossing import EVERYWHERE, cross
 from legged.evaluation.episodes import MOST_EPISODES, evaluate_episodes
 from legged.evaluation.following import evaluate_following
 from legged.evaluation.gymnasium_episodes import EPISODES, environment_of, evaluate_in_gymnasium
+from legged.evaluation.result_file import CHANGED, changes_of
 from legged.evaluation.stress.measuring import RISER, TREAD, Wish
 from legged.evaluation.stress.report import evaluate_stress
 from legged.evaluation.stress.table import NAMES
 from legged.evaluation.success import chosen_types
 from legged.evaluation.velocity_grid import AXES, MOST_ROBOTS, Grid, axes_of, axis_values, check_size
 from legged.physics import resolve_physics
-from legged.policies.restore import find_policy
+from legged.policies.restore import TrainedPolicy, find_policy
 from legged.process.paths import ready_to_write
 from legged.registry import task_class
 
@@ -116,7 +117,8 @@ def build_parser() -> CommandParser:
     parser.add_argument(
         "--out",
         type=Path,
-        help="folder for JSON and PNG; by default beside the checkpoint, or logs/evaluate for a shipped one",
+        help="folder for JSON and PNG; by default beside the checkpoint, or logs/evaluate for a shipped one, and changed/ in "
+        "it if fields are changed",
     )
     return parser
 
@@ -186,7 +188,7 @@ def _follow_commands(args: argparse.Namespace) -> int:
     axes = {**axes_of(judged), **given}
     grid = Grid(axes["vx"], axes["vy"], axes["yaw"], ROBOTS if args.robots is None else args.robots)
     check_size(grid)
-    folder, graph = args.out or policy.output("evaluate"), not args.no_graph
+    folder, graph = _folder(args, policy), not args.no_graph
     ready_to_write(folder)
     if everywhere:
         return cross(policy, grid, policy_overrides(args), device, graph, folder)
@@ -200,6 +202,12 @@ def _follow_commands(args: argparse.Namespace) -> int:
         return evaluate_all_checkpoints(policy, grid, asked, device, graph, folder, rmse, falls)
     types = chosen_types(policy.cfg, args.types)  # type: ignore[arg-type]
     return evaluate_following(policy, grid, types, a_point, args.full, asked, device, graph, folder, where)
+
+
+def _folder(args: argparse.Namespace, policy: TrainedPolicy) -> Path:
+    """Return where files go. Where fields are changed they are not the policy's own results, and do not take their place."""
+    own = policy.output("evaluate")
+    return args.out or (own / CHANGED if changes_of(policy_overrides(args)) else own)
 
 
 def _check_stress(args: argparse.Namespace) -> None:
@@ -251,7 +259,7 @@ def _run_episodes(args: argparse.Namespace) -> int:
         _refuse(args, ("physics", "solver", "sim_device"), "Gymnasium simulates by itself; leave it out")
     device = _device(args)
     policy = find_policy(args)
-    folder = args.out or policy.output("evaluate")
+    folder = _folder(args, policy)
     ready_to_write(folder)
     if args.gymnasium:
         return evaluate_in_gymnasium(policy, episodes, policy_overrides(args), folder)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -312,3 +313,17 @@ def test_a_disk_that_fills_up_meanwhile_costs_the_files_and_not_the_table(tmp_pa
     out, err = capsys.readouterr()
     assert "velocity RMSE, mean" in out
     assert err == "error: evaluation_mujoco.json: no space left on the disk\n"
+
+
+def test_an_evaluation_with_changed_fields_says_so_and_does_not_take_the_place_of_the_policy_s_own(tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(POLICY, run)
+    own = (run / "evaluation_mujoco.json").read_bytes()
+    grid = ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1", "--physics", "mujoco", "sim.threads=1"]
+    arguments = ["--task", TASK, "--load_run", str(run), *grid]
+    assert evaluate.main([*arguments, "domain_rand.ranges.added_base_mass=[40,40]"]) == 0
+    assert (run / "evaluation_mujoco.json").read_bytes() == own
+    changed = json.loads((run / "changed" / "evaluation_mujoco.json").read_text())
+    assert changed["changes"] == {"domain_rand.ranges.added_base_mass": [40, 40]}
+    assert evaluate.main(arguments) == 0
+    assert "changes" not in json.loads((run / "evaluation_mujoco.json").read_text())

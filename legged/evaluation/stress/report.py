@@ -62,7 +62,7 @@ def evaluate_stress(
         print(f"{setting.name}: {len(few)} lines", flush=True)
         others[setting.name] = bench.measure(few, setting.changes)
     result = {
-        **header(policy, engine, torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"),
+        **header(policy, engine, torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu", ()),
         "wall_s": time.perf_counter() - start,
         "changes": {key: value for key, value in asked if key != "sim.physics"},
         "definition": {
