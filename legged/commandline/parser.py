@@ -34,6 +34,19 @@ class CommandParser(argparse.ArgumentParser):
         return words[1 if words[0] != "python" else 3 if words[1] == "-m" else 2 : end]
 
 
+class Once(argparse.Action):
+    """A flag that may be given once: a second one would silently take the place of the first."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: Any = None
+    ) -> None:
+        """Keep the value, or end the program."""
+        before = getattr(namespace, self.dest)
+        if before is not None:
+            parser.error(f"{option}: is given twice, {before} and {values}; let one of them import the other")
+        setattr(namespace, self.dest, values)
+
+
 class Paragraphs(argparse.HelpFormatter):
     """A layout of help that fills each paragraph by itself, and leaves those with indented lines as they are."""
 

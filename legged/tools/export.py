@@ -39,7 +39,11 @@ def build_parser() -> CommandParser:
     )
     add_task_arguments(parser)
     add_run_arguments(parser)
-    parser.add_argument("--out", type=Path, help="folder for the folders; exported/ in the run folder by default")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        help="folder for the folders; exported/ in the run folder by default, or logs/export/ for a shipped policy",
+    )
     return parser
 
 
@@ -54,7 +58,7 @@ def _main(argv: list[str] | None) -> int:
     paths = checkpoints(policy.folder)
     if not paths:
         raise ConfigError(f"--load_run: {relative(policy.folder)} has no checkpoints of a training")
-    folder = args.out or policy.folder / EXPORTED
+    folder = args.out or policy.output("export") / EXPORTED
     ready_to_write(folder, MEGABYTES * len(paths))
     # The C engine needs no compiler, and one robot is enough: nothing is simulated.
     changes = [*undisturbed(1, 1.0), ("sim.physics", "mujoco"), *policy_overrides(args)]

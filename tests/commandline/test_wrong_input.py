@@ -214,7 +214,15 @@ LOADING = [(train.main, "--resume"), (play.main, "--no-video"), (evaluate.main, 
 @pytest.mark.parametrize(("main", "flag"), LOADING)
 def test_no_run_at_all(fails, monkeypatch, main, flag):
     monkeypatch.setattr(legged.policies.restore, "shipped_policy", lambda task: None)
-    fails(main, task(flag), "--load_run: there is no run with a checkpoint", f"logs/{TASK}")
+    fails(main, task(flag), f"'{TASK}': there is no run with a checkpoint", f"logs/{TASK}; train one first")
+
+
+def test_no_run_of_a_task_without_a_shipped_policy(fails):
+    fails(
+        play.main,
+        ["--task", "anymal_c_student_ppo", "--no-video"],
+        "logs/anymal_c_student_ppo, and the package has no policy",
+    )
 
 
 @pytest.mark.parametrize(("main", "flag"), LOADING)
@@ -373,3 +381,8 @@ def test_a_mistake_in_a_user_s_class_is_one_line_with_file_and_line(capsys, tmp_
     assert err.startswith(f"error: {words}")
     assert (f"({tmp_path / 'mine.py'}, line 3)" in err) == (kind not in FOUND_LATER)
     assert not Path("logs").exists()
+
+
+def test_a_second_import_does_not_take_the_place_of_the_first(fails):
+    words = ("--import: is given twice, slip.py and feel.py", "let one of them import the other")
+    fails(train.main, ["--task", TASK, "--import", "slip.py", "--import", "feel.py"], *words)

@@ -133,7 +133,7 @@ def test_a_fork_with_history_computed_values_and_rewards_of_its_own(migrated):
     }
     for setting, (place, line) in lost.items():
         assert place == f"fork_config.py:{line_of(GO2, setting.rpartition('.')[2] + ' = ')}", line
-    assert "write a method _reward_joint_power" in lost["rewards.scales.joint_power"][1]
+    assert "write a method _reward_joint_power and rewards.scales.joint_power: " in lost["rewards.scales.joint_power"][1]
     assert "'tail' is part of no body or shape" in lost["asset.penalize_contacts_on"][1]
     assert "'wheel' is part of no joint" in lost["control.stiffness"][1]
     assert "torso_joint" in lost["init_state.default_joint_angles"][1]

@@ -187,7 +187,8 @@ def _rewards(result: Translation) -> None:
         elif found.value:
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
             hint = f"; the nearest is {near[0]}" if near else ""
-            result.lose(path, f"no reward here is called so{hint}; write a method _reward_{name} (docs/migrating.md)")
+            own = f"a method _reward_{name} and rewards.scales.{name}: {found.value}"
+            result.lose(path, f"no reward here is called so{hint}; write {own} (docs/migrating.md)")
         result.done.add(path)
     for name in DEFAULTS["rewards"]["scales"]:
         if name not in {REWARDS.get(other, other) for other in scales}:
