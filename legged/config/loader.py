@@ -152,8 +152,8 @@ def _merged(
     layers: Iterable[_Layer], schema: type[TaskConfig], carry: Carry | None, robot: str | None, on_cpu: bool
 ) -> tuple[dict[str, Any], Origins]:
     """Return layers laid over those after them, each under its own `cpu:` section (if asked), so that the nearest file has
-    the last word. Each is checked by itself: what another one sets over it must not hide a mistake. Numbers that a layer means
-    for some robot are carried to `robot`, or if None, to that of the layers.
+    the last word. Each is checked by itself: what another one sets over it must not hide a mistake. Numbers that a layer
+    means for some robot are carried to `robot`, or if None, to that of the layers.
 
     Raises:
         ConfigError: a layer does not fit the schema.

@@ -42,7 +42,7 @@ STYLES = {
 ON_THE_LINE = len(STYLES)
 """Metrics on the line; a task that logs fewer of those gets others in their place."""
 WARNINGS = {
-    "non_finite_worlds": "{:.0f} robots reset after numbers overflowed",
+    "non_finite_worlds": "{:.0f} robots reset after numbers that are none (docs/training.md)",
     "contact_overflows": "contacts lost in {:.0f} robot steps: raise sim.nconmax, sim.njmax",
 }
 """Metrics of what should never happen: shown if it did."""

@@ -16,7 +16,7 @@ from legged.config.actuator import MOTORS
 from legged.config.legged import LeggedConfig
 from legged.config.loader import actuator_path, read_yaml
 from legged.errors import ConfigError, suggest
-from legged.process.paths import data_folder, make_folder, not_made, relative, write_bytes, write_text
+from legged.process.paths import data_folder, exists, make_folder, not_made, relative, write_bytes, write_text
 from legged.registry import task_schema
 
 LOGS = Path("logs")
@@ -134,7 +134,10 @@ def find_run(cfg: TaskConfig, load_run: str | None) -> Path:
     runs = sorted((p for p in parent.glob("*") if checkpoints(p)), key=_last_saved)
     if load_run in (None, "-1"):
         if not runs:
-            raise ConfigError(f"--load_run: there is no run with a checkpoint in {relative(parent)}; train one first")
+            shipped = ", and the package has no policy of this task"
+            which = shipped if load_run is None and not exists(data_folder("resources") / "policies" / cfg.task) else ""
+            where = "--load_run" if load_run else f"'{cfg.task}'"
+            raise ConfigError(f"{where}: there is no run with a checkpoint in {relative(parent)}{which}; train one first")
         return runs[-1]
     for folder in (parent / str(load_run), Path(str(load_run))):
         with suppress(OSError, ValueError):  # no name of a folder
