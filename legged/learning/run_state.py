@@ -30,6 +30,7 @@ OF_THE_STATE = (
     "rewards.soft_dof_pos_limit",
     "rewards.soft_dof_vel_limit",
     "env.seed",
+    "env.num_envs",
 )
 """Settings that are in the state as numbers: robots that went on where they were would go on with the old ones."""
 

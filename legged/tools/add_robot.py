@@ -4,6 +4,7 @@ Writes a robot folder (MJCF, meshes, robot.yaml, PROVENANCE.md) and a task on fl
 """
 
 import argparse
+import shlex
 import sys
 from pathlib import Path
 
@@ -79,7 +80,7 @@ def _main(argv: list[str] | None) -> int:
     _report(tree, guesses, folder, task, megabytes)
     task_config(register_file(str(task)), on_cpu=True)
     own = task.parent == data_folder("cfg")
-    print(f"train it: python train.py --task {task.stem if own else relative(task)}")
+    print(f"train it: python train.py --task {shlex.quote(str(task.stem if own else relative(task)))}")
     return 0
 
 

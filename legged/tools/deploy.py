@@ -16,6 +16,7 @@ import torch
 
 from legged.commandline.command import EXIT_WRONG_INPUT, run_main
 from legged.commandline.parser import CommandParser
+from legged.config import LeggedConfig
 from legged.deploy.__main__ import add_program_arguments, limits_of
 from legged.deploy.contract import read_contract
 from legged.errors import ConfigError, RunError
@@ -87,12 +88,14 @@ def _exported(name: str) -> Path:
     """Return the folder with the export that `name` means; one is made of a run or of a shipped policy.
 
     Raises:
-        ConfigError: there is none of that name.
+        ConfigError: there is none of that name, or it is of a task without commands.
     """
     for folder in (Path(name), Path(name).parent if name.endswith(".onnx") else Path(name) / EXPORTED):
         if exists(folder / "policy.onnx"):
             return folder
     policy = policy_of(name)
+    if not isinstance(policy.cfg, LeggedConfig):
+        raise ConfigError(f"--policy: '{policy.cfg.task}' follows no commands; the program is for legged robots that do")
     folder = policy.output("deploy") / EXPORTED
     changes = [*undisturbed(1, 1.0), ("sim.physics", "mujoco")]
     task, act = restore(policy, changes, torch.device("cpu"), graph=False)

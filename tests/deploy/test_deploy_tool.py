@@ -55,3 +55,8 @@ def test_a_program_that_refuses_ends_the_simulator_at_once(code, run, capsys):
     assert run(LISTENS + "time.sleep(60.0)", f"raise SystemExit({code})") == code
     assert time.perf_counter() - began < 10.0
     assert capsys.readouterr() == ("", "")
+
+
+def test_a_policy_without_commands_is_none_for_a_robot(capsys):
+    assert call(deploy.main, ["--policy", "half_cheetah", "--robot", "sim"]) == 2
+    assert "--policy: 'half_cheetah' follows no commands" in capsys.readouterr().err

@@ -97,6 +97,7 @@ def test_with_another_number_of_robots_they_begin_anew(capsys):
     folder = tiny_run(num_envs=8)
     out = start_anew(capsys, folder, "--num_envs", "6", "--max_iterations", "3")
     assert "env.num_envs 8 -> 6" in out
+    assert "env.num_envs was 8, and is 6 now" in out
 
 
 def test_robots_that_begin_anew_stand_on_their_tiles_and_nobody_is_promoted():
