@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from legged.config.schema import TerrainConfig
-from legged.physics.scene.terrain_geoms import DEPTH, add_height_field, add_terrain
+from legged.physics.scene.terrain_geoms import DEPTH, _rectangles, add_height_field, add_terrain
 from legged.terrain import TERRAIN_TYPES, HeightMap, Terrain, TileSpec
 
 DOWN = (0.0, 0.0, -1.0)
@@ -285,3 +285,35 @@ def test_one_height_field_of_the_whole_map():
     # The pit's edge is 2 m from its middle, at (0, 4): the surface falls over the cells on both sides of it.
     found = heights_by_ray(model, data, [1.85, 1.95, 2.0, 2.05, 2.15], [4.03] * 5)
     assert found == pytest.approx([-0.4, -0.3, -0.2, -0.1, 0.0], abs=1e-5)
+
+
+@pytest.mark.parametrize(("overlap", "seams"), [(False, 2), (True, 0)])
+def test_level_ground_has_no_seam_where_boxes_overlap(overlap, seams):
+    """An L of 0.1 m, 2 cells wide, with a block of 0.2 m beside it that its boxes run below: of the pairs of neighbouring cells
+    of the L, 2 are in no common box if it is cut in two.
+    """
+    heights = np.zeros((6, 6))
+    heights[1:5, 1:3] = 0.1
+    heights[3:5, 1:5] = 0.1
+    heights[2, 3] = 0.2
+    boxes = list(_rectangles(heights, np.full((6, 6), True), overlap))
+    found = np.full((6, 6), -1.0)
+    covers = []
+    for x, y, top in boxes:
+        found[x, y] = np.maximum(found[x, y], top)
+        cover = np.zeros((6, 6), dtype=bool)
+        cover[x, y] = abs(top - 0.1) < 1e-9
+        covers.append(cover)
+    assert np.array_equal(found, heights), "they are the ground, and nothing stands out of it"
+    level = heights == 0.1
+    missing = 0
+    for along in (0, 1):
+        first, second = ((slice(0, 5), slice(None)), (slice(1, 6), slice(None)))
+        pair = [level if along == 0 else level.T for _ in (0, 1)]
+        both = pair[0][first] & pair[1][second]
+        together = np.zeros_like(both)
+        for cover in covers:
+            turned = cover if along == 0 else cover.T
+            together |= turned[first] & turned[second]
+        missing += int((both & ~together).sum())
+    assert missing == seams

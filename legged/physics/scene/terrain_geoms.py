@@ -43,7 +43,7 @@ def add_terrain(
     """
     ground = terrain.height_map
     skin = SKIN if collide else 0.0
-    add = _Geoms(spec, ground, float(ground.corners.min()) - depth, _attributes(material, collide), skin)
+    add = _Geoms(spec, ground, float(ground.corners.min()) - depth, _attributes(material, collide), skin, collide)
     length, width, border = (round(x / ground.cell) for x in (*terrain.tile_size, terrain.border))
     count = terrain.origins.shape[:2]
     # A slope may be joined to the border, whose next cells then slope too: the outer tiles take these along.
@@ -96,6 +96,8 @@ class _Geoms:
     attributes: dict[str, Any]
     skin: float = 0.0
     """How far smooth ground is felt above its geom [m]."""
+    overlap: bool = False
+    """Whether boxes of one height overlap, so that level ground has few seams."""
     added: list[mujoco.MjsGeom] = field(default_factory=list)
 
     def box(self, x: slice, y: slice, top: float) -> None:
@@ -156,7 +158,7 @@ def _add_patch(add: _Geoms, x: slice, y: slice) -> None:
             points = _lattice(corners - add.skin * _steepness(corners, add.ground.cell)[:, :, None])[0]
         add.surface(x.start, y.start, points, add.skin)
         return
-    for i, j, top in _rectangles(low, flat):
+    for i, j, top in _rectangles(low, flat, add.overlap):
         add.box(slice(x.start + i.start, x.start + i.stop), slice(y.start + j.start, y.start + j.stop), top)
     if not flat.all():
         # Slopes among the steps, without a skin, which would stand out beside their faces. Points that no slope uses are
@@ -193,19 +195,20 @@ def _steepness(corners: np.ndarray, cell: float) -> np.ndarray:
     return np.sqrt(1.0 + (slopes**2).sum(axis=2))
 
 
-def _rectangles(low: np.ndarray, flat: np.ndarray) -> Iterator[tuple[slice, slice, float]]:
+def _rectangles(low: np.ndarray, flat: np.ndarray, overlap: bool) -> Iterator[tuple[slice, slice, float]]:
     """Rectangles, and their heights, that together make up all flat cells of heights `low` (X, Y) [m].
 
     Boxes are solid, so one may run below cells that are higher than itself: a pyramid is a pile of plates. Where they
-    are seen and touched they do not overlap. Greedy: the lowest cell that is still open takes the better of two
-    rectangles, grown along x or along y first.
+    are seen they do not overlap; where they are touched, those of one height do (`overlap`), for at a seam a foot that
+    sinks in would be pushed out sideways, into the next box. Greedy: the lowest cell that is still open takes the better
+    of two rectangles, grown along x or along y first.
     """
     open_cells = flat.copy()
     while open_cells.any():
         i, j = divmod(int(np.where(open_cells, low, np.inf).argmin()), flat.shape[1])
         top = float(low[i, j])
         wanted = open_cells & (low < top + SAME)
-        allowed = wanted | (low > top + SAME)
+        allowed = low > top - SAME if overlap else wanted | (low > top + SAME)
         across = _run(allowed[i, :], j)
         along = _run(allowed[:, j], i)
         one = _run(np.asarray(allowed[:, across].all(axis=1)), i), across
