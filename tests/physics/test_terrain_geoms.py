@@ -289,8 +289,8 @@ def test_one_height_field_of_the_whole_map():
 
 @pytest.mark.parametrize(("overlap", "seams"), [(False, 2), (True, 0)])
 def test_level_ground_has_no_seam_where_boxes_overlap(overlap, seams):
-    """An L of 0.1 m, 2 cells wide, with a block of 0.2 m beside it that its boxes run below: of the pairs of neighbouring cells
-    of the L, 2 are in no common box if it is cut in two.
+    """An L of 0.1 m, 2 cells wide, with a block of 0.2 m beside it that its boxes run below: of the pairs of neighbouring
+    cells of the L, 2 are in no common box if it is cut in two.
     """
     heights = np.zeros((6, 6))
     heights[1:5, 1:3] = 0.1
