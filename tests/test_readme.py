@@ -263,6 +263,19 @@ def test_numbers_of_the_bipeds_are_those_of_the_shipped_evaluations(task, row):
     assert low <= round(rmse, 2) <= high
 
 
+@pytest.mark.parametrize(("task", "row", "step"), [("cassie", "Cassie", 0.133161)])
+def test_numbers_of_the_bipeds_on_rough_ground_are_those_of_the_shipped_evaluations(task, row, step):
+    cells, shares, slopes = [], [], []
+    for engine in ("mujoco_warp", "mujoco"):
+        result = json.loads((ROUGH.parent / task / f"evaluation_{engine}.json").read_text())
+        cells.append(f"{result['rough']['rmse_lin']['mean']:.3f} ({result['rough']['rmse_lin']['worst']:.3f})")
+        shares.append([share(result, name, step) for name in ("stairs_up", "stairs_down", "obstacles")])
+        slopes.append([share(result, f"slope_{way}", 30.0) for way in ("up", "down")])
+        assert min(shares[-1][:2] + slopes[-1]) >= 90.0
+    words = [", ".join(f"{value:.0f}" for value in of_engine) + " %" for of_engine in (*shares, *slopes)]
+    assert f"| {row} | {' | '.join([*cells, *words])} |" in RESULTS
+
+
 @pytest.mark.parametrize(("row", "folder"), [("1", "seed_1"), ("2, shipped", ""), ("3", "seed_3")])
 def test_numbers_of_the_humanoid_are_those_of_the_shipped_evaluations(row, folder):
     files = [ROUGH.parent / "humanoid" / folder / f"evaluation_{engine}.json" for engine in ("mujoco_warp", "mujoco")]
