@@ -262,6 +262,6 @@ class LeggedGymNames:
         """Keep what was asked for of this step, before the task itself overwrites what it keeps."""
         for name in vars(self).get("_kept_names", ()):
             vars(self)[name].copy_(KEPT[name](self))
-            if name == "last_last_actions":  # a new episode has none before it
+            if name == "last_last_actions":  # a new episode has none before it; `last_actions` is still the old one's here
                 masked_set_(vars(self)[name], self.reset_buf, 0.0)
         super().remember()  # type: ignore[misc]

@@ -265,5 +265,5 @@ def test_the_program_walks_up_stairs_in_another_process(tmp_path):
     assert call(fit_actuator.main, [written, "--joints", "HAA", "--updates", "5", "--out", str(tmp_path / "fit")]) == 0
     fit = json.loads((tmp_path / "fit" / "fit.json").read_text())
     assert 0.006 < fit["drive"]["delay"] < 0.03
-    assert 0.75 < fit["drive"]["breakaway"] < 2.25  # of 1.5; on a busy machine the log has holes
+    assert 1.0 < fit["drive"]["breakaway"] < 2.0
     assert fit["held_out"]["parametric"]["rmse"] < 0.5 * fit["held_out"]["ideal PD"]["rmse"]

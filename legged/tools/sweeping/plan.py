@@ -14,7 +14,7 @@ from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
 from legged.envs.checks import evaluated_figures, lower_is_better
 from legged.errors import ConfigError, suggest
-from legged.learning.resume import value_at
+from legged.learning.run_state import value_at
 from legged.process.paths import data_folder, exists
 from legged.registry import task_class, task_config, task_names
 
