@@ -121,10 +121,11 @@ def _tell_drive(drive: Drive, log: ActuatorLog) -> None:
     else:
         print("motor: its torque-speed line is not reached in the log; the effort limit stays")
     viscous = f"viscous {drive.viscous:.3g} N m s/rad" if known else "viscous friction is part of the damping"
-    print(
-        f"friction: {drive.breakaway:.3g} N m to break away, {drive.coulomb:.3g} N m beyond"
-        f" {drive.stribeck_velocity:.2g} rad/s, {viscous}"
-    )
+    if drive.breakaway == drive.coulomb:
+        dry = f"{drive.coulomb:.3g} N m (the log shows no more to break away)"
+    else:
+        dry = f"{drive.breakaway:.3g} N m to break away, {drive.coulomb:.3g} N m beyond {drive.stribeck_velocity:.2g} rad/s"
+    print(f"friction: {dry}, {viscous}")
 
 
 def _write(folder: Path, log: ActuatorLog, drive: Drive, judged: dict[str, dict[str, float]]) -> None:

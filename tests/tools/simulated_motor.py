@@ -15,10 +15,12 @@ TRUTH = {
 }
 
 
-def simulated_log(seconds: float = 40.0, dt: float = 0.0025, joints: int = 2, noise: float = 0.0, seed: int = 0) -> dict:
+def simulated_log(
+    seconds: float = 40.0, dt: float = 0.0025, joints: int = 2, noise: float = 0.0, seed: int = 0, **truth: float
+) -> dict:
     """The arrays of a log: arms of 0.15 kg m^2 under gravity, which follow sweeps and jumps of the target."""
     rng = np.random.default_rng(seed)
-    t = TRUTH
+    t = TRUTH | truth
     steps, fine = round(seconds / dt), 10
     hold = round(0.01 / dt)  # targets come every 10 ms
     time = dt * np.arange(steps)

@@ -1,6 +1,7 @@
 """Actuators fitted to logs: of a simulated motor whose numbers are known, and of logs that are none."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -32,6 +33,17 @@ def test_the_motor_that_was_simulated_is_found_within_5_percent(tmp_path):
     drive = fit_drive(read_log(tmp_path / "log.npz"), longest_delay=0.02)
     found = {name: getattr(drive, name) for name in TRUTH}
     assert found == pytest.approx(TRUTH, rel=0.05)
+
+
+def test_a_peak_of_the_friction_that_the_log_does_not_show_is_not_invented(tmp_path, capsys):
+    """Dry friction alike at all speeds once came out as 4.4 N m below 0.005 rad/s, or as none beyond 5 rad/s."""
+    np.savez(tmp_path / "log.npz", **simulated_log(12.0, noise=1.0, breakaway=TRUTH["coulomb"]))
+    drive = fit_drive(read_log(tmp_path / "log.npz"), longest_delay=0.02)
+    assert drive.coulomb == drive.breakaway == pytest.approx(TRUTH["coulomb"], rel=0.05)
+    assert drive.viscous == pytest.approx(TRUTH["viscous"], rel=0.05)
+    flags = ["--updates", "5", "--out", "fit", "--longest_delay", "0.01"]
+    assert fit_actuator.main([str(tmp_path / "log.npz"), *flags]) == 0
+    assert re.search(r"friction: 1\.\d+ N m \(the log shows no more to break away\), viscous 0\.2", capsys.readouterr().out)
 
 
 def test_unknown_gains_are_found_too_with_the_viscous_friction_in_them(tmp_path):

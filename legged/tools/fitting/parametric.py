@@ -23,6 +23,11 @@ ROUGHLY = 4_000
 """Samples of the first search, over all delays."""
 SMOOTHING = 0.1
 """Speed below which Coulomb friction fades [rad/s]."""
+WORTH = 0.005
+"""Share of the squared error that a peak of the friction at low speed has to explain, to be told from the data."""
+NARROWEST, WIDEST = 0.5 * SMOOTHING, 0.1
+"""Stribeck velocities that a log can show: at least so many rad/s, for friction fades below, and at most this share of the
+fastest speed, for a wider "peak" fits whatever else falls with speed."""
 
 
 @dataclass(frozen=True)
@@ -88,15 +93,18 @@ def delayed(log: ActuatorLog, samples: float) -> np.ndarray:
 def fit_drive(log: ActuatorLog, longest_delay: float = 0.05) -> Drive:
     """Return the drive that explains a log's torques best, held-out samples left out. Gains that the log states, the same
     for all joints, are taken as they are. Without them the damping has the viscous friction in it: they can't be told apart.
+    Breakaway friction is the Coulomb friction unless the log shows a peak at low speed.
     """
     every = np.flatnonzero(~log.held_out)
     effort = np.inf if log.torque_limit is None else float(log.torque_limit.max())
 
-    def search(samples: float, start: Drive, limited: bool, most: int = MOST_SAMPLES) -> tuple[float, Drive]:
+    def search(
+        samples: float, start: Drive, limited: bool, most: int = MOST_SAMPLES, peaked: bool = True
+    ) -> tuple[float, Drive]:
         rows = every[:: max(1, round(len(every) * len(log.joint_names) / most))]
         position, velocity, torque = (getattr(log, name)[rows].ravel() for name in ("position", "velocity", "torque"))
         error = delayed(log, samples)[rows].ravel() - position
-        return _search(replace(start, delay=samples * log.dt), error, velocity, torque, _free(log, limited))
+        return _search(replace(start, delay=samples * log.dt), error, velocity, torque, _free(log, limited, peaked))
 
     # The delay first, roughly: in whole samples, with the motor's line and without.
     start = _start(log, effort)
@@ -112,7 +120,9 @@ def fit_drive(log: ActuatorLog, longest_delay: float = 0.05) -> Drive:
     for step in (1.0, 0.5, 0.25, 0.1):
         near = found[1].delay / log.dt + step * np.array([-1.0, 1.0])
         found = min([found, *(search(float(k), found[1], limited) for k in near if k >= 0.0)], key=lambda one: one[0])
-    return found[1]
+    even = search(found[1].delay / log.dt, _without_peak(found[1]), limited, peaked=False)
+    told = NARROWEST <= found[1].stribeck_velocity <= WIDEST * speeds.max() and found[0] <= (1.0 - WORTH) * even[0]
+    return (found if told else even)[1]
 
 
 def _start(log: ActuatorLog, effort: float) -> Drive:
@@ -126,12 +136,19 @@ def _start(log: ActuatorLog, effort: float) -> Drive:
     return Drive(float(stiffness), float(damping), dry, dry, 2.0 * SMOOTHING, 0.05 * damping + 1e-6, effort=effort)
 
 
-def _free(log: ActuatorLog, limited: bool) -> tuple[str, ...]:
-    """Return the names of the numbers that are searched for."""
+def _without_peak(drive: Drive) -> Drive:
+    """Return a drive whose dry friction is the same at all speeds, about as large as the given one's."""
+    dry = max(drive.coulomb, min(drive.breakaway, float(drive.friction(np.array(5.0 * SMOOTHING)))), 1e-6)
+    return replace(drive, coulomb=dry, breakaway=dry, stribeck_velocity=2.0 * SMOOTHING)
+
+
+def _free(log: ActuatorLog, limited: bool, peaked: bool) -> tuple[str, ...]:
+    """Return the names of the numbers that are searched for; without a peak, breakaway friction is Coulomb friction."""
     known = log.stiffness is not None and log.damping is not None
     gains = ("viscous",) if known else ("stiffness", "damping")
     limits = ("stall_torque", "no_load_speed") if limited else ()
-    return (*gains, "coulomb", "breakaway", "stribeck_velocity", *limits)
+    peak = ("breakaway", "stribeck_velocity") if peaked else ()
+    return (*gains, "coulomb", *peak, *limits)
 
 
 def _search(
@@ -143,7 +160,9 @@ def _search(
     start = start if "viscous" in free else replace(start, viscous=0.0)
 
     def drive(x: np.ndarray) -> Drive:
-        return replace(start, **dict(zip(free, np.exp(x).tolist(), strict=True)))
+        values = dict(zip(free, np.exp(x).tolist(), strict=True))
+        values.setdefault("breakaway", values["coulomb"])
+        return replace(start, **values)
 
     def residual(x: np.ndarray) -> np.ndarray:
         return drive(x).torques(error, velocity) - torque
