@@ -6,10 +6,10 @@ from pathlib import Path
 
 from legged.commandline.arguments import overrides
 from legged.config import LeggedConfig, TaskConfig, override, to_dict
+from legged.config.dotted import value_at
 from legged.errors import ConfigError
 from legged.learning.checkpoint import check_fits, check_optimizer, read_checkpoint
 from legged.learning.run_folder import find_checkpoint, find_run, run_config
-from legged.learning.run_state import value_at
 from legged.process.paths import relative
 from legged.registry import task_class, task_config
 

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from legged.config import TaskConfig, to_dict
+from legged.config.dotted import differences
 from legged.errors import ConfigError
 from legged.learning.checkpoint import load_plain, write_checkpoint
 from legged.process.paths import relative
@@ -81,26 +82,9 @@ def check_same_world(before: TaskConfig, after: TaskConfig) -> None:
     Raises:
         StateError: they can't: a setting that their state is made of is another one.
     """
-    old, new = to_dict(before), to_dict(after)
-    for path in OF_THE_STATE:
-        for name, was, now in _differing(path, value_at(old, path), value_at(new, path)):
+    for name, (was, now) in differences([to_dict(before), to_dict(after)]).items():
+        if any(name == path or name.startswith(f"{path}.") for path in OF_THE_STATE):
             raise StateError(f"{name} was {was}, and is {now} now")
-
-
-def _differing(path: str, was: Any, now: Any) -> Iterator[tuple[str, Any, Any]]:
-    """Yield path and both values of the leaves in which two nested mappings differ."""
-    if isinstance(was, dict) and isinstance(now, dict):
-        for key in dict.fromkeys([*was, *now]):
-            yield from _differing(f"{path}.{key}", was.get(key), now.get(key))
-    elif was != now:
-        yield path, was, now
-
-
-def value_at(values: Any, path: str) -> Any:
-    """Look up a dotted path in nested mappings; None where there is nothing."""
-    for key in path.split("."):
-        values = values.get(key) if isinstance(values, dict) else None
-    return values
 
 
 def generators() -> dict[str, Any]:

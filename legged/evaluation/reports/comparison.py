@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from legged.config.dotted import differences
 from legged.evaluation.engines import ENGINES, engine_of
 from legged.evaluation.intervals import Interval, bootstrap_mean, newcombe, normal_mean, welch, wilson
 from legged.evaluation.learning_curves import labels
 from legged.evaluation.reports.curves import curves_of_runs
-from legged.evaluation.reports.differences import differences, words
+from legged.evaluation.reports.differences import words
 from legged.evaluation.reports.document import Cell, Figures, Heading, Mono, Paragraph, Part, Table
 from legged.evaluation.reports.evaluation_part import BROKEN, between, falls_of, number, success_drawing, success_line
 from legged.evaluation.reports.record import Record

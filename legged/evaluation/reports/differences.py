@@ -1,45 +1,20 @@
 """In what configurations differ: a run's from its task file's, and those of several runs."""
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import yaml
 
 from legged.config import to_dict
+from legged.config.dotted import MISSING, differences, flat
 from legged.errors import ConfigError
 from legged.evaluation.reports.record import Record
 from legged.registry import task_config
 
-MISSING = object()
-"""Stands where a configuration lacks a setting."""
 NAMES = ("train.runner.run_name", "train.runner.experiment_name", "train.runner.report", "train.runner.film", "task")
 """Settings that say nothing of how a policy comes to be."""
 MOST_WORDS = 4
 """Settings that are named in a few words."""
 LONGEST_VALUE = 60
-
-
-def flat(config: Any, prefix: str = "") -> dict[str, Any]:
-    """Return dotted path -> value of all settings; a list is one value."""
-    if not isinstance(config, Mapping) or (not config and prefix):
-        return {prefix: config}
-    return {
-        path: value for key, entry in config.items() for path, value in flat(entry, f"{prefix}.{key}".lstrip(".")).items()
-    }
-
-
-def differences(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Return dotted path -> its value in each configuration, of settings that are not the same in all; MISSING stands where
-    one lacks it.
-    """
-    all_flat = [flat(config) for config in configs]
-    paths = dict.fromkeys(path for one in all_flat for path in one)
-    found = {path: [one.get(path, MISSING) for one in all_flat] for path in paths}
-    return {path: values for path, values in found.items() if any(not _same(values[0], value) for value in values[1:])}
-
-
-def _same(a: Any, b: Any) -> bool:
-    return (a is b) if MISSING in (a, b) else bool(a == b)
 
 
 def from_task_file(record: Record) -> dict[str, list[Any]] | None:

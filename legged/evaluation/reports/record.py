@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from legged.config import to_dict
+from legged.config.dotted import value_at
 from legged.errors import ConfigError
 from legged.evaluation.learning_curves import Scalars, read_config, read_scalars
 from legged.evaluation.result_file import file_name, read_results
 from legged.learning.run_folder import CODE_FILE, CONFIG_FILE, NOTE_FILE, checkpoints, run_config
-from legged.learning.run_state import value_at
 from legged.learning.timing import Timing, read_timing
 
 STAMP = re.compile(r"(\d{4}-\d{2}-\d{2}_\d{2}-\d{2}-\d{2})(?:_(.*))?")

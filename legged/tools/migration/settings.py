@@ -1,7 +1,5 @@
 """Settings of legged_gym -> settings here: where each goes, and what it is there."""
 
-from typing import Any
-
 SAME: dict[str, str] = {
     "env.num_envs": "env.num_envs",
     "env.episode_length_s": "env.episode_length_s",
@@ -185,10 +183,3 @@ OF_THE_ROBOT = (
     "asset.terminate_after_contacts_on",
 )
 """What goes into robot.yaml, or into the task's control tables."""
-
-
-def value_at(data: dict[str, Any], path: str) -> Any:
-    """Return what nested maps have at a dotted path; None where they have nothing."""
-    for key in path.split("."):
-        data = data.get(key) if isinstance(data, dict) else None  # type: ignore[assignment]
-    return data

@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from legged.config.checks import build, shown
+from legged.config.dotted import value_at
 from legged.config.loader import nest, to_dict
 from legged.config.origins import Origins
 from legged.config.schema import LeggedConfig
 from legged.errors import ConfigError
 from legged.tools.migration.found import Found, Place, members
 from legged.tools.migration.legged_gym_defaults import ENVIRONMENT, LEARNING
-from legged.tools.migration.settings import value_at
 
 DEFAULTS = to_dict(LeggedConfig())
 LARGEST_NUMBER = 1e12

@@ -10,11 +10,11 @@ from typing import Any, Literal
 from legged.config import TaskConfig, override, to_dict
 from legged.config.bounds import FLOAT32_MAX, NAME, between, items
 from legged.config.checks import PLAIN, build, is_plain_name, shown
+from legged.config.dotted import value_at
 from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
 from legged.envs.checks import evaluated_figures, lower_is_better
 from legged.errors import ConfigError, suggest
-from legged.learning.run_state import value_at
 from legged.process.paths import data_folder, exists
 from legged.registry import task_class, task_config, task_names
 

@@ -1,0 +1,44 @@
+"""Settings by their dotted paths, in nested mappings as YAML files have them: one of them, all, and those that differ."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+
+class _Missing:
+    def __repr__(self) -> str:
+        return "nothing"
+
+
+MISSING = _Missing()
+"""Stands where a configuration lacks a setting."""
+
+
+def value_at(values: Any, path: str) -> Any:
+    """Return what nested mappings have at a dotted path; None where there is nothing."""
+    for key in path.split("."):
+        values = values.get(key) if isinstance(values, dict) else None
+    return values
+
+
+def flat(config: Any, prefix: str = "") -> dict[str, Any]:
+    """Return dotted path -> value of all settings; a list is one value, and so is an empty mapping."""
+    if not isinstance(config, Mapping) or (not config and prefix):
+        return {prefix: config}
+    return {
+        path: value for key, entry in config.items() for path, value in flat(entry, f"{prefix}.{key}".lstrip(".")).items()
+    }
+
+
+def differences(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Return dotted path -> its value in each configuration, of settings that are not the same in all; MISSING stands where
+    one lacks it. An empty mapping is told only where no configuration has anything in it.
+    """
+    all_flat = [flat(config) for config in configs]
+    paths = dict.fromkeys(path for one in all_flat for path in one)
+    filled = {path[:i] for path in paths for i, letter in enumerate(path) if letter == "."}
+    found = {path: [one.get(path, MISSING) for one in all_flat] for path in paths if path not in filled}
+    return {path: values for path, values in found.items() if any(not _same(values[0], value) for value in values[1:])}
+
+
+def _same(a: Any, b: Any) -> bool:
+    return (a is b) if MISSING in (a, b) else bool(a == b)
