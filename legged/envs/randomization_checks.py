@@ -35,6 +35,14 @@ def check_randomization(cfg: TaskConfig) -> None:
                 raise ConfigError(
                     f"{where}: control.control_type T takes actions for torques, and has no {FIELDS[name].meaning}"
                 )
+    actuator = cfg.control.actuator if isinstance(cfg, LeggedConfig) else None
+    if actuator is not None and actuator.network and not actuator.joints:
+        for name in ("p_gain", "d_gain"):
+            if name in rand.ranges:
+                raise ConfigError(
+                    f"{cfg.origins.where(f'domain_rand.ranges.{name}')}: all joints have a learned actuator"
+                    " (control.actuator.network), which has no gains to draw"
+                )
     if isinstance(cfg, LeggedConfig) and cfg.control.control_type != "P" and "joint_offset" in rand.ranges:
         where = cfg.origins.where("domain_rand.ranges.joint_offset")
         raise ConfigError(f"{where}: control.control_type V does not look at angles, of which encoders show too much")

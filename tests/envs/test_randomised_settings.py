@@ -137,6 +137,10 @@ def test_mistakes_are_named(name, draw, error):
         ),
         ([("control.control_type", "T"), with_ranges(p_gain=[0.9, 1.1])], r"ranges\.p_gain: control\.control_type T takes"),
         ([("control.control_type", "V"), with_ranges(joint_offset=[0.0, 0.1])], r"ranges\.joint_offset: .*V does not look"),
+        (
+            [("control.actuator.network", "motors.npz"), with_ranges(d_gain=[0.9, 1.1])],
+            r"ranges\.d_gain: all joints have a learned actuator .*which has no gains to draw",
+        ),
         ([("domain_rand.kicks", {"k": {}})], r"domain_rand\.kicks\.k: it kicks nothing"),
         ([("domain_rand.forces", {"f": {}})], r"domain_rand\.forces\.f: it pushes nothing"),
         (
