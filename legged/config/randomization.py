@@ -29,8 +29,8 @@ class DrawConfig:
     """One number for each part that has the property (joint, body, shape), or one for all of a robot; null as the property
     says."""
     grow: Range = field(default=(0.0, 0.0), metadata=ITERATIONS)
-    """Iterations between which the range grows from the property's neutral value to its full width; [0, 0] has it full at
-    once."""
+    """Iterations between which the range grows to its full width, from the property's neutral value or, where it leaves that
+    out, from the end that is nearest; [0, 0] has it full at once."""
 
 
 @dataclass(frozen=True)

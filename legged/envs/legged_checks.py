@@ -37,7 +37,7 @@ def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
 
 
 def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
-    """Look whether robot, observations and height scan have a mirror image.
+    """Look whether robot, default pose, actions, observations and height scan have a mirror image.
 
     Raises:
         ConfigError: one of them has none.
@@ -46,8 +46,24 @@ def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     where, otherwise = origins.where("train.algorithm.symmetry"), "false learns without mirror images"
     if robot.mirror is None:
         raise ConfigError(f"{where}: '{robot.name}' is lopsided (joints and feet at zero angles); {otherwise}")
-    if mirror_of_actions(robot.mirror, acted_joints(robot, cfg.control, origins.where)) is None:
+    uneven = robot.mirror.uneven_joint(robot.default_dof_pos)
+    if uneven is not None:  # `dof_pos` and actions count from there
+        partner = robot.mirror.joints[uneven]
+        angles = ", ".join(f"{robot.joint_names[i]} {robot.default_dof_pos[i]:g} rad" for i in sorted({uneven, partner}))
+        raise ConfigError(
+            f"{where}: the default_joint_angles of '{robot.name}' are no mirror image of themselves ({angles}); {otherwise}"
+        )
+    acted = acted_joints(robot, cfg.control, origins.where)
+    image = mirror_of_actions(robot.mirror, acted)
+    if image is None:
         raise ConfigError(f"{origins.where('control.held')}: joints are held on one side only; {otherwise} ({where})")
+    scales = action_scales(robot, cfg.control, origins.where)
+    for i, partner in enumerate(image[0]):
+        if scales[i] != scales[partner]:
+            pair = ", ".join(f"{robot.joint_names[acted[k]]} {scales[k]:g}" for k in sorted((i, partner)))
+            raise ConfigError(
+                f"{origins.where('control.action_scale')}: is not the same left and right ({pair}); {otherwise} ({where})"
+            )
     used = [term for group in groups_in(cfg).values() for term in group.terms]
     check_mirror_kinds(cls.__name__, cls.MIRRORED, used, where)
     y = cfg.terrain.measured_points_y

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from legged.config.networks import groups_in, path_of_terms
 from legged.config.randomization import DrawConfig, ForceConfig, KickConfig, draw_of
 from legged.config.schema import LeggedConfig, TaskConfig
-from legged.envs.privileged_terms import PREFIX, observed, observed_forces
+from legged.envs.privileged_terms import MIRROR_KINDS, PREFIX, observed, observed_forces
 from legged.errors import ConfigError, suggest
 from legged.physics.fields import FIELDS
 from legged.physics.scene.robot_scene import body_names
@@ -34,6 +34,14 @@ def check_randomization(cfg: TaskConfig) -> None:
                 where = cfg.origins.where(f"domain_rand.ranges.{name}")
                 raise ConfigError(
                     f"{where}: control.control_type T takes actions for torques, and has no {FIELDS[name].meaning}"
+                )
+    actuator = cfg.control.actuator if isinstance(cfg, LeggedConfig) else None
+    if actuator is not None and actuator.network and not actuator.joints:
+        for name in ("p_gain", "d_gain"):
+            if name in rand.ranges:
+                raise ConfigError(
+                    f"{cfg.origins.where(f'domain_rand.ranges.{name}')}: all joints have a learned actuator"
+                    " (control.actuator.network), which has no gains to draw"
                 )
     if isinstance(cfg, LeggedConfig) and cfg.control.control_type != "P" and "joint_offset" in rand.ranges:
         where = cfg.origins.where("domain_rand.ranges.joint_offset")
@@ -125,10 +133,10 @@ def check_disturbances(cfg: LeggedConfig, robot: Robot) -> None:
 
 
 def check_observed(cfg: TaskConfig) -> None:
-    """Look whether what groups observe of the randomisation is randomised.
+    """Look whether what groups observe of the randomisation is randomised, and has a mirror image where one is learned from.
 
     Raises:
-        ConfigError: it is not.
+        ConfigError: it is not, or has none.
     """
     for group, section in groups_in(cfg).items():
         for term in section.terms:
@@ -139,6 +147,14 @@ def check_observed(cfg: TaskConfig) -> None:
                 raise ConfigError(
                     f"{where}: {term}: domain_rand.ranges does not draw '{name}', so there is nothing to observe"
                 )
+            draw = observed(cfg, name) if term.startswith(PREFIX) and name in FIELDS else None
+            if draw is not None and cfg.train.algorithm.symmetry and MIRROR_KINDS[term] in ("sideways", "joints"):
+                low, high = draw.range
+                if abs(low + high) > 1e-6 * max(abs(low), abs(high)):  # its image would lie beyond -1 or 1
+                    raise ConfigError(
+                        f"{cfg.origins.where(path)}: {term}: its range [{low:g}, {high:g}] is not the same on both sides of"
+                        " 0, so it has no mirror image; train.algorithm.symmetry=false learns without"
+                    )
             if term == "push_force" and isinstance(cfg, LeggedConfig) and not observed_forces(cfg):
                 raise ConfigError(f"{cfg.origins.where(path)}: push_force: domain_rand.forces names no force to observe")
             if term == "push_force" and isinstance(cfg, LeggedConfig) and cfg.train.algorithm.symmetry:

@@ -5,7 +5,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from legged.config.actuator import ActuatorConfig
+from legged.config.checks import build
+from legged.config.origins import Origins
 from legged.errors import ConfigError
+from legged.mdp.actuator import is_ideal
 
 COMMANDS = ("command_xy", "command_yaw")
 """What layouts call our term `commands`: its first two columns, and its third."""
@@ -26,6 +30,18 @@ def read_description(path: Path) -> dict[str, Any]:
         return _entries(said, path)
     except (KeyError, TypeError, IndexError, AttributeError) as error:
         raise ConfigError(f"{path}: is no policy.json of an export ({type(error).__name__}: {error})") from error
+
+
+def was_trained_with_other_motors(path: Path) -> bool:
+    """Return whether the policy of the policy.json at `path`, which `read_description` has read, had motors in its training
+    that no layout describes: control.actuator with a torque-speed line, friction, a delay, a learned law or rotors.
+
+    Raises:
+        ConfigError: what it says of motors is nothing that there is.
+    """
+    said = json.loads(path.read_text(encoding="utf-8")).get("actuator", {})
+    motors = build(ActuatorConfig, said, "", Origins(), f"{path}: actuator")
+    return not is_ideal(motors) or bool(motors.armature)
 
 
 def _entries(said: Mapping[str, Any], path: Path) -> dict[str, Any]:

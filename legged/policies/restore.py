@@ -15,7 +15,7 @@ from legged.learning.checkpoint import check_fits, read_checkpoint
 from legged.learning.run_folder import CONFIG_FILE, find_checkpoint, find_run, run_config, shipped_policy
 from legged.policies.actor import Actor
 from legged.process.paths import exists, relative
-from legged.registry import make_task, task_class, task_config
+from legged.registry import YAML_ENDINGS, make_task, register_file, task_class, task_config, task_names
 from legged.terrain import Terrain
 
 
@@ -53,23 +53,32 @@ def find_policy(args: argparse.Namespace) -> TrainedPolicy:
     return TrainedPolicy(cfg, find_checkpoint(folder, args.checkpoint))
 
 
-def policy_of(name: str) -> TrainedPolicy:
-    """Return the policy in the run folder `name`, or that of a shipped policy; else of the task of that name: of its newest
-    run, or the one that is shipped.
+def policy_of(name: str, where: str = "--task") -> TrainedPolicy:
+    """Return the policy in the run folder `name`, or that of a shipped policy; else of the task of that name, or in that YAML
+    file: of its newest run, or the one that is shipped. `where` is how an error about the name begins.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: there is none, or it is of a task that nobody has named the file or the module of.
     """
     folder = Path(name)
     if not exists(folder / CONFIG_FILE):
-        task = task_config(name)
+        try:
+            task = task_config(register_file(name) if name.endswith(YAML_ENDINGS) else name)
+        except ConfigError as error:
+            raise ConfigError(str(error).replace("--task:", f"{where}:", 1)) from error
         try:
             folder = _newest(task)
         except ConfigError as error:
             raise ConfigError(
                 f"'{name}': there is neither a run nor a shipped policy of this task; train one first"
             ) from error
-    return TrainedPolicy(run_config(folder), find_checkpoint(folder, None))
+    cfg = run_config(folder)
+    if cfg.task not in task_names():  # a run does not say where the file of its task lies, nor of what class it is
+        raise ConfigError(
+            f"{where}: {relative(folder)} was trained on a task of your own, '{cfg.task}': name the YAML file of the task,"
+            " whose newest run is taken, or import the module that registers it"
+        )
+    return TrainedPolicy(cfg, find_checkpoint(folder, None))
 
 
 def _newest(task: TaskConfig) -> Path:

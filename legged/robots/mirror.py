@@ -10,6 +10,8 @@ FLIP = np.array([1.0, -1.0, 1.0])
 """Reflection in the base's xz plane."""
 APART = 0.01
 """How far a joint or foot may be from where its partner is mirrored to [m]."""
+TURNED = 0.01
+"""How far the angle of a joint may be from that of its partner in the mirror [rad]."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,14 @@ class Mirror:
             return None
         others, their_signs = _joint_partners(model, data, passive)
         return cls(tuple(partners), signs, tuple(foot_partners), tuple(others or ()), their_signs)
+
+    def uneven_joint(self, angles: np.ndarray) -> int | None:
+        """Return the first joint whose angle is not that of its partner seen in the mirror, of `angles` (D,) [rad]; None if
+        the pose is its own mirror image.
+        """
+        image = np.asarray(self.signs) * angles[list(self.joints)]
+        apart = np.flatnonzero(np.abs(image - angles) > TURNED)
+        return int(apart[0]) if len(apart) else None
 
 
 def _joint_partners(

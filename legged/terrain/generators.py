@@ -251,12 +251,19 @@ class TerrainType:
         """Return the size at that difficulty on tiles of that scale, in `unit`: lengths grow, angles do not."""
         return self.size(difficulty) * (scale if self.unit == METRES else 1.0)
 
+    @property
+    def largest(self) -> float:
+        """Return the largest size that may be asked for, in `unit`."""
+        return STEEPEST if self.unit == DEGREES else LARGEST
+
     def text(self, *sizes: float) -> str:
         """Return sizes in words, to three digits and whole degrees: '0.194 m', '11 to 18 degrees'."""
         return f"{' to '.join(f'{size:.0f}' if self.unit == DEGREES else f'{size:.3g}' for size in sizes)} {self.unit}"
 
 
 METRES, DEGREES = "m", "degrees"
+LARGEST, STEEPEST = 100.0, 80.0
+"""Sizes are at most so large [m], and so steep [degrees]: at 90 a slope is a wall without end, and beyond it falls."""
 
 
 def _angle(difficulty: float) -> float:

@@ -155,8 +155,11 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
     if abs(total - 1.0) > 1e-6:
         listed = ", ".join(f"{name} {share:g}" for name, share in cfg.proportions.items())
         raise ConfigError(f"{where('proportions')}: must sum to 1, got {total:g} ({listed})")
-    for name in cfg.sizes:
-        terrain_type(name, where(f"sizes.{name}"))
+    for name, asked in cfg.sizes.items():
+        kind = terrain_type(name, where(f"sizes.{name}"))
+        size = max(asked) if isinstance(asked, tuple) else asked
+        if size > kind.largest:
+            raise ConfigError(f"{where(f'sizes.{name}')}: must be at most {kind.largest:g} {kind.unit}, got {size:g}")
     found = column_types(cfg.proportions, cfg.num_cols)
     for name, share in cfg.proportions.items():
         if share > 0.0 and name not in found:

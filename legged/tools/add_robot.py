@@ -76,7 +76,8 @@ def _main(argv: list[str] | None) -> int:
     where = name if folder.parent == data_folder("resources") / "robots" else f"./{name}"
     extends = args.extends or f"base/{guesses.kind}_flat"
     make_folder(task.parent)
-    write_text(task, task_yaml(name, where, extends, robot.mirror is not None))
+    symmetric = robot.mirror is not None and robot.mirror.uneven_joint(robot.default_dof_pos) is None
+    write_text(task, task_yaml(name, where, extends, symmetric))
     _report(tree, guesses, folder, task, megabytes)
     task_config(register_file(str(task)), on_cpu=True)
     own = task.parent == data_folder("cfg")

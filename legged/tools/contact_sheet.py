@@ -39,7 +39,12 @@ def build_parser() -> CommandParser:
         "python -m legged.tools.contact_sheet anymal_c_flat half_cheetah --out robots.gif",
         "python -m legged.tools.contact_sheet logs/go2_flat/2026-11-22_05-38-19 --out go2.png --side 400",
     )
-    parser.add_argument("robots", nargs="+", metavar="TASK | RUN", help="tasks, run folders, folders of shipped policies")
+    parser.add_argument(
+        "robots",
+        nargs="+",
+        metavar="TASK | RUN",
+        help="tasks, or YAML files of them; run folders, folders of shipped policies",
+    )
     parser.add_argument("--out", type=Path, required=True, help="the file, .gif or .png")
     parser.add_argument("--columns", type=int, help="tiles side by side; so many that the sheet is twice as wide as high")
     parser.add_argument("--side", type=int, default=SIDE, help=f"width and height of a tile [pixels]; {SIDE}")
@@ -58,7 +63,7 @@ def _main(argv: list[str] | None) -> int:
     ready_to_write_file("--out", args.out, 4.0)
     if args.module:
         import_tasks(args.module)
-    policies = [policy_of(name) for name in args.robots]
+    policies = [policy_of(name, "TASK | RUN") for name in args.robots]
     torch.set_num_threads(1)
     tiles = []
     for policy in policies:

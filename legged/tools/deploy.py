@@ -15,18 +15,20 @@ from typing import Any
 import torch
 
 from legged.commandline.command import EXIT_WRONG_INPUT, run_main
-from legged.commandline.parser import CommandParser
+from legged.commandline.parser import CommandParser, Once
 from legged.config import LeggedConfig
 from legged.deploy.__main__ import add_program_arguments, limits_of
-from legged.deploy.contract import read_contract
+from legged.deploy.contract import Contract, read_contract
 from legged.errors import ConfigError, RunError
+from legged.learning.run_folder import CONFIG_FILE, run_config
 from legged.policies.export import EXPORTED, export
 from legged.policies.restore import policy_of, restore, undisturbed
 from legged.process.paths import exists, ready_to_write, relative
 from legged.process.startup import INTERRUPTED, in_main_thread
-from legged.robots.robot import load_robot
+from legged.robots.robot import Robot, load_robot
 from legged.tools.simulate_robot import LISTENING, add_simulation_arguments, check_simulation, motors_of, terrain_of
 from legged.tools.simulator.film import POSES, make_film
+from legged.user_modules import import_tasks
 
 ROOM_MB = 16.0
 """What the disk must have room for: the exported policy and the log [MiB]."""
@@ -52,7 +54,12 @@ def build_parser() -> CommandParser:
         "python -m legged.tools.deploy --policy anymal_c_proprio --robot sim --terrain stairs_up --size 0.17 --film",
         "python -m legged.tools.deploy --policy anymal_c_proprio --robot sim 'control.actuator.delay=[4, 4]'",
     )
-    parser.add_argument("--policy", required=True, help="exported folder, run folder, or task whose newest or shipped policy")
+    parser.add_argument(
+        "--policy",
+        required=True,
+        help="exported folder, run folder, or task (or its YAML file) whose newest or shipped policy",
+    )
+    parser.add_argument("--import", dest="module", action=Once, help="module or .py file that registers tasks of your own")
     parser.add_argument("--robot", required=True, choices=("sim",), help="sim; a robot has its own command, legged.deploy")
     parser.add_argument("--simulated", metavar="ROBOT", help="name or folder of the robot; the policy's by default")
     add_simulation_arguments(parser)
@@ -68,9 +75,11 @@ def _main(argv: list[str] | None) -> int:
     check_simulation(args)
     if args.commands is not None and not exists(args.commands):
         raise ConfigError(f"--commands: there is no file {args.commands}")
+    if args.module:
+        import_tasks(args.module)
     exported = _exported(args.policy)
     contract = read_contract(exported / "policy.json")
-    robot = load_robot(args.simulated or contract.robot, "--simulated")
+    robot = _simulated(args.simulated, exported, contract)
     motors_of(args, robot, contract)
     folder = args.out or Path("logs") / "deploy" / contract.task
     ready_to_write(folder, ROOM_MB)
@@ -93,7 +102,7 @@ def _exported(name: str) -> Path:
     for folder in (Path(name), Path(name).parent if name.endswith(".onnx") else Path(name) / EXPORTED):
         if exists(folder / "policy.onnx"):
             return folder
-    policy = policy_of(name)
+    policy = policy_of(name, "--policy")
     if not isinstance(policy.cfg, LeggedConfig):
         raise ConfigError(f"--policy: '{policy.cfg.task}' follows no commands; the program is for legged robots that do")
     folder = policy.output("deploy") / EXPORTED
@@ -102,6 +111,27 @@ def _exported(name: str) -> Path:
     export(task, act.network, folder)
     print(f"exported {relative(folder / 'policy.onnx')}")
     return folder
+
+
+def _simulated(given: str | None, exported: Path, contract: Contract) -> Robot:
+    """Return the robot that is simulated: the one `given`, else the policy's. Of a robot of one's own a contract has the name
+    alone; its folder is known to the configuration of the run that the export lies in.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if given is not None:
+        return load_robot(given, "--simulated")
+    for folder in exported.absolute().parents[:2]:  # of an export of one checkpoint, and of those of all
+        if exists(folder / CONFIG_FILE):
+            cfg = run_config(folder)
+            if isinstance(cfg, LeggedConfig) and Path(cfg.robot).name == contract.robot:
+                return load_robot(cfg.robot, "--simulated")
+    try:
+        return load_robot(contract.robot)
+    except ConfigError as error:
+        said = f"{relative(contract.path)}: robot: '{contract.robot}' does not come with this package"
+        raise ConfigError(f"{said}; --simulated FOLDER says where it lies") from error
 
 
 def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path) -> tuple[int, dict[str, Any] | None]:

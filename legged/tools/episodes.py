@@ -252,7 +252,8 @@ def _compare(args: argparse.Namespace) -> int:
     folder = args.out or Path("logs") / "episodes" / "compare"
     ready_to_write(folder)
     sources: list[Episodes | TrainedPolicy] = [
-        load_episodes(Path(name), "--compare") if exists(Path(name) / ABOUT) else policy_of(name) for name in args.compare
+        load_episodes(Path(name), "--compare") if exists(Path(name) / ABOUT) else policy_of(name, "--compare")
+        for name in args.compare
     ]
     for source in sources:
         if isinstance(source, TrainedPolicy):

@@ -1,8 +1,9 @@
 """Export all checkpoints of a run: `python -m legged.tools.export --task go1_flat [--load_run RUN] [--out FOLDER]`.
 
-Each becomes FOLDER/<iterations>/policy.onnx, policy.pt and policy.json, whose metadata say after how many iterations and
-after how many seconds from the start of its process (`wall_s`) it was written. FOLDER is exported/ in the run folder
-by default. play.py exports one policy; this is for `legged.tools.playback`, which says when a training had one that walks.
+Each becomes FOLDER/<iterations>/policy.onnx, policy.pt, policy.weights and policy.json, whose metadata say after how many
+iterations and after how many seconds from the start of its process (`wall_s`) it was written. FOLDER is exported/ in the run
+folder by default. play.py exports one policy; this is for `legged.tools.playback`, which says when a training had one that
+walks.
 """
 
 import sys

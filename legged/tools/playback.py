@@ -21,6 +21,7 @@ from legged.errors import ConfigError
 from legged.evaluation.playback import SETTLING_S, Played, follow, play
 from legged.evaluation.velocity_grid import AXES, AXIS, Grid, axis_values, check_size
 from legged.policies.foreign import ForeignPolicy, Layout, read_layout
+from legged.policies.own_layout import was_trained_with_other_motors
 from legged.process.paths import exists, ready_to_write_file, relative, write_text
 from legged.robots.robot import Robot, load_robot
 
@@ -83,6 +84,9 @@ def _main(argv: list[str] | None) -> int:
         ready_to_write_file("--json", args.json)
     robot, layout = load_robot(args.robot), read_layout(args.layout, "--layout")
     policies = [ForeignPolicy(path, layout, robot) for path in args.policy]
+    if args.layout.endswith(".json") and was_trained_with_other_motors(Path(args.layout)):
+        told = "the policy was trained with motors that are not ideal (its actuator says which); here they are"
+        print(f"warning: {args.layout}: {told}", file=sys.stderr, flush=True)
     if grid:
         result = _follow_all(robot, layout, policies, args, grid)
     else:

@@ -104,12 +104,13 @@ def check_simulation(args: argparse.Namespace) -> None:
     Raises:
         ConfigError: there is one.
     """
+    largest = 0.0
     if args.terrain is not None:
-        terrain_type(args.terrain, "--terrain")
+        largest = terrain_type(args.terrain, "--terrain").largest
     elif args.size is not None:
         raise ConfigError("--size: a plane has no size; name a type of tiles with --terrain")
     for flag, value, low, high in (
-        ("--size", args.size, -100.0, 100.0),
+        ("--size", args.size, 0.0, largest),
         ("--cell", args.cell, 0.02, 1.0),
         ("--sim-dt", args.sim_dt, 1e-4, 0.02),
         ("--latency", args.latency, 0.0, 1.0),

@@ -3,11 +3,14 @@
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
-from helpers import call
+from helpers import call, tiny_run
+from importing_fixtures import urdf
 
-from legged.tools import deploy
+from legged import registry
+from legged.tools import add_robot, deploy
 
 LISTENS = "import os, time; print('listening at 127.0.0.1:1', flush=True); "
 GOOD_REPORT = (
@@ -60,3 +63,45 @@ def test_a_program_that_refuses_ends_the_simulator_at_once(code, run, capsys):
 def test_a_policy_without_commands_is_none_for_a_robot(capsys):
     assert call(deploy.main, ["--policy", "half_cheetah", "--robot", "sim"]) == 2
     assert "--policy: 'half_cheetah' follows no commands" in capsys.readouterr().err
+
+
+@pytest.fixture
+def own_run(workplace, monkeypatch, capsys):
+    """A run of a robot of one's own, in mine/, whose task no later command knows by its name."""
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    Path("toy.urdf").write_text(urdf())
+    assert call(add_robot.main, ["toy.urdf", "--out", "mine"]) == 0
+    folder = tiny_run("--task", "mine/toy_flat.yaml", iterations=1)
+    registry._REGISTERED.clear()
+    capsys.readouterr()
+    return folder
+
+
+def test_a_robot_of_ones_own_is_simulated_without_naming_it(own_run, monkeypatch, capsys):
+    """Its task is its YAML file; an export in its run folder has the robot that the run's configuration names; where it was
+    moved away from there, and where a run is named whose task nobody knows, an error says what to name.
+    """
+    simulated = []
+    monkeypatch.setattr(deploy, "_run_both", lambda args, exported, robot, folder: (simulated.append(robot), (0, None))[1])
+
+    def error(*flags):
+        assert call(deploy.main, ["--robot", "sim", *map(str, flags)]) == 2
+        return capsys.readouterr().err
+
+    assert "--policy: logs/toy_flat/" in (said := error("--policy", own_run))
+    assert "was trained on a task of your own, 'toy_flat': name the YAML file of the task" in said
+    robot = Path("mine/toy").resolve()
+    assert call(deploy.main, ["--policy", "mine/toy_flat.yaml", "--robot", "sim"]) == 0
+    assert call(deploy.main, ["--policy", str(own_run / "exported"), "--robot", "sim"]) == 0
+    assert simulated == [str(robot)] * 2
+    (own_run / "exported").rename("moved")
+    assert "moved/policy.json: robot: 'toy' does not come with this package; --simulated FOLDER" in error("--policy", "moved")
+    assert call(deploy.main, ["--policy", "moved", "--robot", "sim", "--simulated", "mine/toy"]) == 0
+    assert simulated[-1] == str(robot)
+
+
+def test_a_policy_that_is_not_there_is_named_by_its_flag(workplace, capsys):
+    assert call(deploy.main, ["--policy", "nonsense", "--robot", "sim"]) == 2
+    assert capsys.readouterr().err.startswith("error: --policy: there is no task 'nonsense'")
+    assert call(deploy.main, ["--policy", "nonsense.yaml", "--robot", "sim"]) == 2
+    assert capsys.readouterr().err == "error: --policy: there is no file 'nonsense.yaml'\n"

@@ -137,6 +137,10 @@ def test_mistakes_are_named(name, draw, error):
         ),
         ([("control.control_type", "T"), with_ranges(p_gain=[0.9, 1.1])], r"ranges\.p_gain: control\.control_type T takes"),
         ([("control.control_type", "V"), with_ranges(joint_offset=[0.0, 0.1])], r"ranges\.joint_offset: .*V does not look"),
+        (
+            [("control.actuator.network", "motors.npz"), with_ranges(d_gain=[0.9, 1.1])],
+            r"ranges\.d_gain: all joints have a learned actuator .*which has no gains to draw",
+        ),
         ([("domain_rand.kicks", {"k": {}})], r"domain_rand\.kicks\.k: it kicks nothing"),
         ([("domain_rand.forces", {"f": {}})], r"domain_rand\.forces\.f: it pushes nothing"),
         (
@@ -145,8 +149,23 @@ def test_mistakes_are_named(name, draw, error):
         ),
         ([observing("rand_p_gain")], r"groups\.critic\.terms: rand_p_gain: domain_rand\.ranges does not draw 'p_gain'"),
         ([observing("push_force")], r"groups\.critic\.terms: push_force: domain_rand\.forces names no force"),
+        (
+            [with_ranges(base_com_y=[0.0, 0.1]), observing("rand_base_com_y")],
+            r"groups\.critic\.terms: rand_base_com_y: its range \[0, 0\.1\] is not the same on both sides of 0, so",
+        ),
+        (
+            [with_ranges(joint_offset={"range": [-0.02, 0.04], "when": "reset"}), observing("rand_joint_offset")],
+            r"groups\.critic\.terms: rand_joint_offset: its range \[-0\.02, 0\.04\] is not the same on both sides",
+        ),
     ],
 )
 def test_settings_that_do_not_fit_each_other_are_named(settings, error):
     with pytest.raises(ConfigError, match=error):
         small_config(*settings)
+
+
+def test_what_leans_to_a_side_may_be_observed_without_mirror_images_and_drawn_with_them():
+    leaning = with_ranges(base_com_y=[0.0, 0.1])
+    small_config(leaning, observing("rand_base_com_y"), ("train.algorithm.symmetry", False))
+    small_config(leaning)
+    small_config(with_ranges(base_com_x=[0.0, 0.1]), observing("rand_base_com_x"))

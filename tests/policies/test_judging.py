@@ -145,6 +145,25 @@ def test_our_own_checkpoints_are_judged_as_the_task_sees_them(tmp_path, monkeypa
     assert (result["first"] or {}).get("file") == (first or {}).get("file")
 
 
+@pytest.mark.parametrize(
+    ("changes", "warns"),
+    [
+        ([], False),
+        ([("control.actuator.delay", [2, 4])], True),
+        ([("control.actuator.armature", {"KFE": 0.1})], True),
+    ],
+)
+def test_motors_that_are_not_simulated_are_told(changes, warns, tmp_path, capsys):
+    """A layout knows ideal motors alone, so a policy that was trained with others is not judged as it was trained."""
+    task = small_task(*changes, num_envs=1)
+    (tmp_path / "policy.json").write_text(json.dumps(describe(task)))
+    policy = write_policy(tmp_path / "policy.onnx", np.zeros((48, 12)), np.zeros(12))
+    command = ["--command", "0", "0", "0", "--seconds", "2.1"]
+    assert call(playback.main, ["anymal_c", str(policy), "--layout", str(tmp_path / "policy.json"), *command]) == 0
+    said = capsys.readouterr().err
+    assert ("policy.json: the policy was trained with motors that are not ideal" in said) == warns
+
+
 def test_the_first_that_follows(standing, tmp_path, capsys):
     later = write_policy(tmp_path / "later.onnx", np.zeros((12, 12)), np.zeros(12), wall_s=40.0)
     layout = tmp_path / "layout.yaml"

@@ -335,6 +335,15 @@ def test_sizes_between_two_go_from_the_easier_to_the_harder():
     assert np.unique(np.abs(steps[steps != 0.0]).round(3)) == pytest.approx([0.1, 0.15, 0.2, 0.25])
 
 
+@pytest.mark.parametrize("size", [90.0, (10.0, 120.0)])
+def test_a_slope_as_steep_as_a_wall_is_refused(size):
+    """At 90 degrees the ground would be 1e16 m high, and beyond it `slope_up` would go down."""
+    cfg = TerrainConfig(mesh_type="height_map", proportions={"slope_up": 1.0}, sizes={"slope_up": size})
+    with pytest.raises(ConfigError, match=r"terrain\.sizes\.slope_up: must be at most 80 degrees, got (90|120)$"):
+        check_terrain(cfg, Origins())
+    check_terrain(replace(cfg, sizes={"slope_up": 80.0}), Origins())
+
+
 def test_a_size_of_a_type_that_there_is_not_is_refused():
     cfg = TerrainConfig(mesh_type="height_map", proportions={"step": 1.0}, sizes={"stpe": 0.15})
     with pytest.raises(ConfigError, match=r"terrain\.sizes\.stpe: there is no terrain type 'stpe'; did you mean 'step'"):

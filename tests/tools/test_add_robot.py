@@ -13,6 +13,7 @@ from helpers import ENGINE, call
 from importing_fixtures import URDF_LEG, urdf
 
 from legged.config.yaml_files import read_yaml
+from legged.errors import ConfigError
 from legged.registry import make_task, register_file, task_config
 from legged.robots.importing.folder import Guesses, _compact, robot_yaml, task_yaml
 from legged.robots.importing.tree import Tree
@@ -146,6 +147,20 @@ def test_a_lopsided_robot_learns_without_mirror_images(added):
     task = yaml.safe_load(Path("mine/fifth_toy_flat.yaml").read_text())
     assert task["train"]["algorithm"]["symmetry"] is False
     task_config(register_file("mine/fifth_toy_flat.yaml"), on_cpu=True)
+
+
+def test_a_default_pose_that_leans_to_a_side_has_no_mirror_images(added):
+    """Left and right hips turn about x alike, so 0.1 rad on both sides spreads one leg and pulls the other one in."""
+    added(urdf(), "--name", "leaning_toy")
+    robot, task = Path("mine/leaning_toy/robot.yaml"), register_file("mine/leaning_toy_flat.yaml")
+    before = robot.read_text()
+    robot.write_text(before.replace("hip: 0", "hip: 0.1"))
+    assert robot.read_text() != before
+    with pytest.raises(ConfigError, match=r"symmetry: the default_joint_angles of 'leaning_toy' are no mirror image"):
+        task_config(task, on_cpu=True)
+    task_config(task, [("train.algorithm.symmetry", False)], on_cpu=True)
+    robot.write_text(before.replace("hip: 0", "fl_hip: 0.1\n  hl_hip: 0.1\n  fr_hip: -0.1\n  hr_hip: -0.1"))
+    task_config(task, on_cpu=True)
 
 
 def test_legs_that_nothing_touches_get_feet(added):

@@ -20,6 +20,7 @@ from legged.evaluation.stress.table import NOMINAL, WRITTEN_FOR, Disturbance, ta
 from legged.evaluation.success import point, run_out, to_run_out
 from legged.evaluation.tiles import dividing_cell, tiles_apart
 from legged.evaluation.velocity_grid import axes_of, number_or_null
+from legged.mdp.actuator_network import NetworkWeights
 from legged.mdp.tracking_error import velocity_error
 from legged.policies.restore import TrainedPolicy, restore, undisturbed
 from legged.robots.similarity import size_of
@@ -42,6 +43,8 @@ COMMANDS = (
     *((0.5, 0.0, 0.5), (0.5, 0.0, -0.5)),
 )
 """Commands on the flat (vx, vy, yaw rate), in parts of the ends of the axes of the task's grid; robots take turns."""
+HALF_STEP = "half the time step"
+"""The setting of the solver that not all motors have."""
 
 
 @dataclass(frozen=True)
@@ -68,17 +71,25 @@ class Setting:
 
 
 def settings(cfg: LeggedConfig, engine: str) -> list[Setting]:
-    """Return the settings of the solver that are tried beside the task's own: those that the engine knows."""
+    """Return the settings of the solver that are tried beside the task's own: those that the engine, and the motors, know."""
     halved: tuple[tuple[str, Any], ...] = (("sim.dt", 0.5 * cfg.sim.dt), ("control.decimation", 2 * cfg.control.decimation))
     if cfg.control.actuator.delay[1]:  # is counted in physics steps
         halved = (*halved, ("control.actuator.delay", [2 * steps for steps in cfg.control.actuator.delay]))
-    found = [Setting("half the time step", halved)]
+    found = [Setting(HALF_STEP, halved)] if can_halve_step(cfg) else []
     if engine in ("mujoco", "mujoco_warp", "newton_mujoco"):
         found += [
             Setting("elliptic cones", (("sim.cone", "elliptic"),)),
             Setting("impratio 100", (("sim.impratio", 100.0), ("sim.iterations", max(50, cfg.sim.iterations)))),
         ]
     return found
+
+
+def can_halve_step(cfg: LeggedConfig) -> bool:
+    """Return whether a task can be simulated with half its time step: an LSTM that has learned the motors sees every step,
+    and knows no other than that of its training.
+    """
+    network = cfg.control.actuator.network
+    return not network or NetworkWeights.load(network).kind != "lstm"
 
 
 def check_asked(changes: Sequence[tuple[str, Any]]) -> None:

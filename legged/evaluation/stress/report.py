@@ -13,7 +13,16 @@ from rich.table import Table
 from legged.config import LeggedConfig, override
 from legged.evaluation.episodes import header
 from legged.evaluation.overflows import warn_of_overflows
-from legged.evaluation.stress.measuring import HOLD_S, SETTLE_S, Bench, Wish, score, settings
+from legged.evaluation.stress.measuring import (
+    HALF_STEP,
+    HOLD_S,
+    SETTLE_S,
+    Bench,
+    Wish,
+    can_halve_step,
+    score,
+    settings,
+)
 from legged.evaluation.stress.table import NOMINAL
 from legged.evaluation.success import FORWARD, TIME_S
 from legged.figures import figure
@@ -58,7 +67,10 @@ def evaluate_stress(
     ground = {} if bench.on_plane or wish.lines else bench.on_new_ground()
     few = [row for row in bench.rows if full or row.name in SETTING_LINES]
     others = {}
-    for setting in settings(cfg, engine) if full or not wish.lines else ():
+    tried = settings(cfg, engine) if full or not wish.lines else []
+    if tried and not can_halve_step(cfg):
+        print(f"{HALF_STEP}: left out, because the motors' LSTM (control.actuator.network) knows its own alone", flush=True)
+    for setting in tried:
         print(f"{setting.name}: {len(few)} lines", flush=True)
         others[setting.name] = bench.measure(few, setting.changes)
     result = {

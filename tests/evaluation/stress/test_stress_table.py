@@ -13,7 +13,8 @@ from legged.evaluation.stress.measuring import STAIRS, followed, score, settings
 from legged.evaluation.stress.table import ALONE, NOMINAL, Disturbance, combined, scaled, table
 from legged.evaluation.success import to_run_out
 from legged.evaluation.tiles import dividing_cell, tiles_apart
-from legged.registry import task_config
+from legged.mdp.actuator_network import NetworkWeights
+from legged.registry import task_class, task_config
 from legged.robots.similarity import Size
 from legged.terrain import TileSpec
 
@@ -81,6 +82,20 @@ def test_solvers_that_are_tried():
     assert found["elliptic cones"] == {"sim.cone": "elliptic"}
     assert found["impratio 100"] == {"sim.impratio": 100.0, "sim.iterations": 50}
     assert [one.name for one in settings(cfg, "newton_xpbd")] == ["half the time step"]
+
+
+def test_the_time_step_is_not_halved_of_motors_that_know_their_own_alone(tmp_path):
+    """An LSTM sees every physics step as it was trained to; an MLP picks its samples out of more of them."""
+    output = {"weight": np.ones((1, 2), np.float32), "bias": np.zeros(1, np.float32)}
+    cell = {"input": np.ones((8, 2), np.float32), "hidden": np.ones((8, 2), np.float32), "bias": np.zeros(8, np.float32)}
+    for kind, layers, tried in (("lstm", (cell, output), 2), ("mlp", (output,), 3)):
+        file = tmp_path / f"{kind}.npz"
+        NetworkWeights(kind, 0.005, 1, np.ones(3, np.float32), layers).save(file)
+        learned = override(small_config(), [("control.actuator.network", str(file))])
+        found = settings(learned, "mujoco")
+        assert len(found) == tried
+        for one in found:  # every one of them can be built
+            task_class(learned.task).check(override(learned, one.changes))
 
 
 def test_who_has_followed_a_command():
