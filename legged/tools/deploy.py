@@ -20,7 +20,7 @@ from legged.config import LeggedConfig
 from legged.deploy.__main__ import add_program_arguments, limits_of
 from legged.deploy.contract import Contract, read_contract
 from legged.errors import ConfigError, RunError
-from legged.learning.run_folder import CONFIG_FILE, run_config
+from legged.learning.run_folder import CONFIG_FILE, checkpoints, run_config
 from legged.policies.export import EXPORTED, export
 from legged.policies.restore import policy_of, restore, undisturbed
 from legged.process.paths import exists, ready_to_write, relative
@@ -94,14 +94,17 @@ def _main(argv: list[str] | None) -> int:
 
 
 def _exported(name: str) -> Path:
-    """Return the folder with the export that `name` means; one is made of a run or of a shipped policy.
+    """Return the folder with the export that `name` means; one is made of a run, where its newest checkpoint has none yet, or
+    of a shipped policy.
 
     Raises:
         ConfigError: there is none of that name, or it is of a task without commands.
     """
-    for folder in (Path(name), Path(name).parent if name.endswith(".onnx") else Path(name) / EXPORTED):
-        if exists(folder / "policy.onnx"):
-            return folder
+    given = Path(name).parent if name.endswith(".onnx") else Path(name)
+    if exists(given / "policy.onnx"):
+        return given
+    if exists(given / EXPORTED / "policy.onnx") and not _outdated(given):
+        return given / EXPORTED
     policy = policy_of(name, "--policy")
     if not isinstance(policy.cfg, LeggedConfig):
         raise ConfigError(f"--policy: '{policy.cfg.task}' follows no commands; the program is for legged robots that do")
@@ -111,6 +114,12 @@ def _exported(name: str) -> Path:
     export(task, act.network, folder)
     print(f"exported {relative(folder / 'policy.onnx')}")
     return folder
+
+
+def _outdated(run: Path) -> bool:
+    """Return whether the export in a run folder is older than the run's newest checkpoint: the training has gone on."""
+    saved = checkpoints(run)
+    return bool(saved) and saved[max(saved)].stat().st_mtime > (run / EXPORTED / "policy.onnx").stat().st_mtime
 
 
 def _simulated(given: str | None, exported: Path, contract: Contract) -> Robot:

@@ -1,5 +1,6 @@
 """The command that runs a simulated robot and its program: what it makes of their ends."""
 
+import os
 import subprocess
 import sys
 import time
@@ -98,6 +99,25 @@ def test_a_robot_of_ones_own_is_simulated_without_naming_it(own_run, monkeypatch
     assert "moved/policy.json: robot: 'toy' does not come with this package; --simulated FOLDER" in error("--policy", "moved")
     assert call(deploy.main, ["--policy", "moved", "--robot", "sim", "--simulated", "mine/toy"]) == 0
     assert simulated[-1] == str(robot)
+
+
+def test_a_run_that_has_gone_on_is_exported_again(workplace, monkeypatch, capsys):
+    """Its export was once taken for its newest policy, whatever had been learned since. Who names the export gets it."""
+    folder = tiny_run(iterations=1)
+    monkeypatch.setattr(deploy, "_run_both", lambda args, exported, robot, folder: (0, None))
+    policy, (checkpoint,) = folder / "exported" / "policy.onnx", folder.glob("model_*.pt")
+
+    def says(name):
+        capsys.readouterr()
+        assert call(deploy.main, ["--policy", str(name), "--robot", "sim"]) == 0
+        return "exported" in capsys.readouterr().out
+
+    assert says(folder)
+    assert not says(folder)
+    os.utime(checkpoint, (policy.stat().st_mtime + 9.0,) * 2)
+    assert not says(folder / "exported")
+    assert not says(policy)
+    assert says(folder)
 
 
 def test_a_policy_that_is_not_there_is_named_by_its_flag(workplace, capsys):
