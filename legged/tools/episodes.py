@@ -49,7 +49,7 @@ from legged.episodes.stored import ABOUT, ARRAYS, Episodes, load_config, load_ep
 from legged.errors import ConfigError, suggest
 from legged.policies.restore import TrainedPolicy, find_policy, policy_of
 from legged.process.paths import exists, ready_to_write, relative, write_text
-from legged.user_modules import import_tasks
+from legged.registry import import_tasks
 
 EPISODES, MOST_ROBOTS = 50, 256
 """Episodes, and robots that run them, if nobody says how many."""

@@ -53,7 +53,7 @@ def build_parser() -> CommandParser:
     parser.add_argument("--sim_device", help="cpu, cuda, or several with commas, which the jobs take in turn")
     parser.add_argument("--storage", help="URL of a database that several machines share, or journal:<file>")
     parser.add_argument("--report", action="store_true", help="only write table and figures of what there is")
-    parser.add_argument("--import", dest="module", action=Once, help="module or .py file that registers tasks of your own")
+    parser.add_argument("--import", dest="module", action=Once, help="module, or .py or YAML file, with tasks of your own")
     parser.add_argument("--worker", type=int, metavar="NUMBER", help=argparse.SUPPRESS)
     return parser
 
