@@ -5,6 +5,7 @@ import io
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 from pathlib import Path
@@ -14,14 +15,16 @@ import numpy as np
 import pytest
 from helpers import POLICY, TASK, TINY_TRAINING, call, run_folders, tiny_run
 
+from legged import registry
 from legged.errors import RunError
 from legged.evaluation.learning_curves import read_scalars, smooth
 from legged.evaluation.reports import at_end
 from legged.evaluation.reports.record import read_record
 from legged.evaluation.reports.run_report import over_training, write_report
 from legged.learning.captured import CapturedRunner
+from legged.learning.given import GIVEN_FILE
 from legged.learning.timing import TIMING_FILE
-from legged.tools import report, train
+from legged.tools import evaluate, experiments, report, train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -247,6 +250,49 @@ def test_the_command_films(monkeypatch, capsys):
     monkeypatch.setattr(report, "film", fail)
     assert report.main([str(folder), "--film"]) == 0
     assert "no film: nothing can be rendered here\n" in capsys.readouterr().out
+
+
+# ---- tasks of one's own ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def forgotten(monkeypatch):
+    """forgotten(): lets go of tasks that were registered, as another process knows none of them."""
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    return registry._REGISTERED.clear
+
+
+def test_a_run_of_somebodys_own_task_says_how_it_is_found_again(forgotten, capsys):
+    Path("my own.d").mkdir()
+    Path("my own.d/mine.yaml").write_text(f"extends: {TASK}\n")
+    named = ["--task", "my own.d/mine.yaml", "train.runner.experiment_name=elsewhere"]
+    folder = tiny_run(*named, *REPORTED, "rewards.scales.torques=-3e-4", iterations=1)
+    assert "| `rewards.scales.torques` | `-0.0003` | `-1.0e-05` |" in read(folder, "report.md")
+    found = re.search(r"None yet: `python -m legged\.tools\.evaluate (.*)`", read(folder, "report.md"))
+    forgotten()
+    grid = ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1", "--sim_device", "cpu"]
+    assert call(evaluate.main, [*shlex.split(found[1]), *grid]) == 0  # as it stands there
+    forgotten()
+    assert report.main([str(folder)]) == 0
+    text = read(folder, "report.md")
+    command = f"python -m legged.tools.report --task 'my own.d/mine.yaml' {folder}"
+    assert f"There is no task 'mine' here to compare with, and `{command}`" in text
+    assert "| `rewards.scales.torques` | `-0.0003` |" in text
+    assert experiments.main(["--markdown", "all.md"]) == 0
+    assert "sim.physics mujoco, sim.threads 1, runner.num_steps_per_env 4" in read(Path(), "all.md").replace("\\", "")
+    assert report.main(["--task", "my own.d/mine.yaml", str(folder)]) == 0
+    assert "| `rewards.scales.torques` | `-0.0003` | `-1.0e-05` |" in read(folder, "report.md")
+    capsys.readouterr()
+
+
+def test_a_resumed_run_keeps_what_was_set_before():
+    first = tiny_run("rewards.scales.torques=-3e-4", "env.episode_length_s=0.1", iterations=1)
+    again = tiny_run("--resume", "env.episode_length_s=0.2", iterations=2)
+    changes = read_record(again).given.changes
+    assert (changes["rewards.scales.torques"], changes["env.episode_length_s"]) == (-3e-4, 0.2)
+    (first / GIVEN_FILE).write_text('{"task": 3}')
+    assert read_record(first).given is None
+    assert any(GIVEN_FILE in text for text in read_record(first).problems)
 
 
 # ---- command line ----------------------------------------------------------------------------------------------------
