@@ -194,6 +194,15 @@ def find_checkpoint(folder: Path, checkpoint: int | str | None) -> Path:
     return found[checkpoint]
 
 
+def of_another_policy(folder: Path, checkpoint: object) -> bool:
+    """Return whether an evaluation that is of the file `checkpoint` is of another policy than the last one in its folder:
+    of one from before the training went on, or of one that was asked for. The name that a shipped policy had is not known.
+    """
+    found = checkpoints(folder)
+    last = found[max(found)].name if found else SHIPPED_MODEL
+    return last != SHIPPED_MODEL and isinstance(checkpoint, str) and checkpoint != last
+
+
 def shipped_policy(task: str) -> Path | None:
     """Return the folder of the policy that comes with this package for a task, if there is one."""
     folder = data_folder("resources") / "policies" / task

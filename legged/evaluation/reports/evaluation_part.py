@@ -1,6 +1,6 @@
 """What an evaluation found, as tables and drawings: heat maps over commands, success over difficulty, returns of episodes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,14 +38,22 @@ def falls_of(tracking: dict[str, Any]) -> tuple[int, int] | None:
         return None
 
 
-def evaluation_parts(results: Sequence[dict[str, Any]]) -> list[Part]:
-    """Return the part of a report on evaluations, one an engine; nothing of none."""
+def evaluation_parts(
+    results: Sequence[dict[str, Any]], another_policy: Callable[[dict[str, Any]], str] = lambda _: ""
+) -> list[Part]:
+    """Return the part of a report on evaluations, one an engine; nothing of none. `another_policy` names the checkpoint of
+    one that is not of the run's last policy.
+    """
     if not results:
         return []
     results = sorted(results, key=lambda one: [*ENGINES, one["physics"]].index(one["physics"]))
     of_episodes = [result for result in results if "episodes" in result]
     following = [result for result in results if "episodes" not in result]
     parts: list[Part] = [Heading("Evaluation")]
+    for result in results:
+        if another_policy(result):
+            label = engine_of(result["physics"]).label
+            parts.append(Paragraph(f"In {label} it is of `{another_policy(result)}`, which is not the last policy."))
     if following:
         parts += _following(following)
     for result in of_episodes:

@@ -16,7 +16,7 @@ from legged.errors import ConfigError
 from legged.evaluation.learning_curves import Scalars, read_config, read_scalars
 from legged.evaluation.result_file import file_name, read_results
 from legged.learning.given import Given, read_given
-from legged.learning.run_folder import CODE_FILE, CONFIG_FILE, NOTE_FILE, checkpoints, run_config
+from legged.learning.run_folder import CODE_FILE, CONFIG_FILE, NOTE_FILE, checkpoints, of_another_policy, run_config
 from legged.learning.timing import Timing, read_timing
 
 STAMP = re.compile(r"(\d{4}-\d{2}-\d{2}_\d{2}-\d{2}-\d{2})(?:_(.*))?")
@@ -112,6 +112,11 @@ class Record:
         """Length of a control step [s]."""
         dt, decimation = self.at("sim.dt"), self.at("control.decimation")
         return dt * decimation if isinstance(dt, int | float) and isinstance(decimation, int) else None
+
+    def another_policy(self, result: dict[str, Any] | None) -> str:
+        """Return the checkpoint that an evaluation is of; nothing where it is the last one, whose the other figures are."""
+        checkpoint = (result or {}).get("checkpoint")
+        return str(checkpoint) if of_another_policy(self.folder, checkpoint) else ""
 
     @property
     def film(self) -> Path | None:

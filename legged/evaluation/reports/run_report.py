@@ -94,7 +94,7 @@ def report_parts(record: Record) -> list[Part]:
         parts += [Heading("Curves"), Figures("curves", curves_of_run(record), "learning curves")]
     else:
         parts += [Heading("Curves"), Paragraph("There is no TensorBoard file with values in this folder.")]
-    parts += evaluation_parts(record.results) or [
+    parts += evaluation_parts(record.results, record.another_policy) or [
         Heading("Evaluation"),
         Paragraph(f"None yet: `{command_on(record, 'evaluate', '--load_run')}`"),
     ]
