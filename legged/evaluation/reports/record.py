@@ -213,7 +213,8 @@ def is_running(folder: Path) -> bool:
                 if silent_s < 120.0:
                     return True
             elif silent_s < QUIET_S:
-                os.kill(int(match[2]), 0)  # asks whether it is there
+                with suppress(PermissionError):  # it is there, and somebody else's
+                    os.kill(int(match[2]), 0)  # asks whether it is there
                 return True
     return False
 
