@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import POLICY, TASK, TINY_TRAINING, call, run_folders, tiny_run
+from torch.utils.tensorboard import SummaryWriter
 
 from legged import registry
 from legged.errors import RunError
@@ -250,6 +251,29 @@ def test_the_command_films(monkeypatch, capsys):
     monkeypatch.setattr(report, "film", fail)
     assert report.main([str(folder), "--film"]) == 0
     assert "no film: nothing can be rendered here\n" in capsys.readouterr().out
+
+
+def test_what_is_no_number_is_left_out_and_does_not_spread():
+    """As a training that diverged leaves it, and one with a learning rate of 0."""
+    tags = ("Train/mean_reward", "Metrics/lin_vel_rmse", "Episode/rew_a", "Episode/rew_b", "Loss/learning_rate")
+    pages = []
+    for name, values in (("some", [1.0, np.nan, 3.0, np.inf, 2.0]), ("none", [np.nan] * 5), ("zero", [0.0] * 5)):
+        folder = Path("logs") / TASK / name
+        folder.mkdir(parents=True)
+        shutil.copy(POLICY / "config.yaml", folder)
+        with SummaryWriter(str(folder)) as writer:
+            for step, value in enumerate(values):
+                for tag in tags:
+                    writer.add_scalar(tag, value, step)
+        pages.append(write_report(folder).read_text())
+        text = read(folder, "report.md")
+        drawings = re.findall(r'(?:points|data-v|data-sort)="([^"]*)"', pages[-1])
+        assert drawings
+        assert not [one for one in drawings if "nan" in one or "inf" in one]
+        assert "| nan |" not in text
+        assert "| inf |" not in text
+    assert " | - | 2.50 | 2.500 |\n\n" in read(Path("logs") / TASK / "some", "report.md")  # of 3, inf and 2
+    assert " | - | - | - |\n\n" in read(Path("logs") / TASK / "none", "report.md")
 
 
 # ---- tasks of one's own ----------------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """What an evaluation found, as tables and drawings: heat maps over commands, success over difficulty, returns of episodes."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -20,8 +21,8 @@ BROKEN = (KeyError, TypeError, ValueError, IndexError, AttributeError)
 
 
 def number(value: float | None, form: str = ".3f", unit: str = "") -> Number:
-    """Return a number as a cell, a dash for none."""
-    return Number("-" if value is None else f"{value:{form}}{unit}", value)
+    """Return a number as a cell, a dash for none and for what is not finite, which can't be sorted."""
+    return Number("-", None) if value is None or not math.isfinite(value) else Number(f"{value:{form}}{unit}", value)
 
 
 def between(interval: tuple[float, float], factor: float = 1.0, form: str = ".1f") -> str:
