@@ -84,7 +84,7 @@ def _main(argv: list[str] | None) -> int:
         return _work(args, plan, names[0])
     trials = Trials(plan, args.storage or "")
     if args.report:
-        print(*write_report(trials), sep="\n")
+        print(*write_report(trials, args.module), sep="\n")
         return 0
     jobs = args.jobs or len(devices)
     print(f"{plan.name}: {plan.given.trials} trials of {plan.cfg.task} for the {plan.objective_text}; {jobs} at once")
@@ -99,7 +99,7 @@ def _main(argv: list[str] | None) -> int:
         stopped_by = worker.run()
     else:
         stopped_by = _crew(args, trials, path, names, jobs)
-    print(*write_report(trials), sep="\n")
+    print(*write_report(trials, args.module), sep="\n")
     if stopped_by:
         return 128 + stopped_by[0]
     return 0 if trials.done >= plan.given.trials else EXIT_FAILED

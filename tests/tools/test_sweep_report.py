@@ -1,10 +1,13 @@
 """The table of a sweep: what it says of trials that were ended early."""
 
+import json
+import shlex
 from pathlib import Path
 
 import pytest
 import yaml
 
+from legged.config import parse_override
 from legged.tools.sweeping.plan import plan_sweep, read_sweep
 from legged.tools.sweeping.report import table
 
@@ -29,3 +32,28 @@ def test_a_trial_that_was_ended_early_stands_with_the_figure_it_had(objective, r
     plan = plan_sweep(read_sweep(path), path, on_cpu=True)
     trial = optuna.trial.create_trial(state=optuna.trial.TrialState.PRUNED, intermediate_values={5: 1.0, 10: reported})
     assert f"; {said} |" in table(plan, [trial])
+
+
+def test_the_command_of_the_best_trial_sets_what_it_was_trained_with():
+    """All digits of a choice, texts that look like numbers, and where the task comes from."""
+    choices = {
+        "rewards.tracking_sigma": [0.25, 0.123456789],
+        "train.policy.actor_hidden_dims": [[32, 32], [16]],
+        "train.policy.activation": ["elu", "relu"],
+        "rewards.only_positive_rewards": [True, False],
+    }
+    given = {"task": "anymal_c_flat", "parameters": {path: {"choices": values} for path, values in choices.items()}}
+    path = Path("mine.yaml")
+    path.write_text(yaml.safe_dump(given))
+    plan = plan_sweep(read_sweep(path), path, on_cpu=True)
+    wanted = {path: values[-1] for path, values in choices.items()}
+    drawn = {path: json.dumps(value) for path, value in wanted.items()}
+    kinds = {one.path: optuna.distributions.CategoricalDistribution(one.choices) for one in plan.parameters}
+    text = table(plan, [optuna.trial.create_trial(params=drawn, distributions=kinds, value=0.5)], "own tasks.py")
+    (command,) = [line for line in text.splitlines() if line.startswith("python train.py")]
+    program, flags, settings = (shlex.split(command)[at] for at in (slice(2), slice(2, 6), slice(6, None)))
+    assert program == ["python", "train.py"]
+    assert flags == ["--import", "own tasks.py", "--task", "anymal_c_flat"]
+    assert dict(map(parse_override, settings)) == wanted
+    assert "| false | 0.123456789 | relu | [16] |" in text
+    assert "train.policy.activation=relu" in command
