@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import warnings
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,8 @@ import yaml
 
 from legged.config import parse_override
 from legged.tools.sweeping.plan import plan_sweep, read_sweep
-from legged.tools.sweeping.report import table
+from legged.tools.sweeping.report import importances, table
+from legged.tools.sweeping.study import Trials
 
 optuna = pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
 pytestmark = pytest.mark.usefixtures("workplace")
@@ -57,3 +59,21 @@ def test_the_command_of_the_best_trial_sets_what_it_was_trained_with():
     assert dict(map(parse_override, settings)) == wanted
     assert "| false | 0.123456789 | relu | [16] |" in text
     assert "train.policy.activation=relu" in command
+
+
+def test_nothing_is_said_to_matter_where_all_trials_are_alike():
+    """As when each reaches its target at the first evaluation: optuna warns, and calls all settings alike important."""
+    values = {
+        "train.algorithm.learning_rate": {"low": 1e-4, "high": 1e-2},
+        "train.policy.activation": {"choices": ["elu", "tanh"]},
+    }
+    path = Path("mine.yaml")
+    path.write_text(yaml.safe_dump({"task": "half_cheetah", "parameters": values}))
+    trials = Trials(plan_sweep(read_sweep(path), path, on_cpu=True))
+    for _ in range(6):
+        trial = trials.next()
+        trials.draw(trial)
+        trials.study.tell(trial.number, 1920.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        assert importances(trials) == {}

@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -132,17 +133,20 @@ def best_yaml(plan: Plan, best: "FrozenTrial") -> str:
 
 def importances(trials: Trials) -> dict[str, float]:
     """Return dotted path -> share of what the settings explain of which trials are among the best (PED-ANOVA, Watanabe et
-    al., arXiv 2304.10255), the largest first; nothing while there are too few trials to tell.
+    al., arXiv 2304.10255), the largest first; nothing while there are too few trials to tell, or while the best quarter
+    is no better than the rest: all settings would come out alike.
     """
     import optuna
 
     if len(ranking(trials.plan, trials.all)) < FEWEST or len(trials.plan.parameters) < 2:
         return {}
     evaluator = optuna.importance.PedAnovaImportanceEvaluator(target_quantile=0.25)
-    try:
-        return dict(optuna.importance.get_param_importances(trials.study, evaluator=evaluator))
-    except (ValueError, RuntimeError):  # all values are the same
-        return {}
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*select the same set of trials", category=UserWarning)
+        try:
+            return dict(optuna.importance.get_param_importances(trials.study, evaluator=evaluator))
+        except (ValueError, RuntimeError, UserWarning):
+            return {}
 
 
 # ---- figures ---------------------------------------------------------------------------------------------------------
