@@ -86,6 +86,7 @@ def _main(argv: list[str] | None) -> int:
     if args.report:
         print(*write_report(trials, args.module), sep="\n")
         return 0
+    trials.keep_to(devices[0].type)
     jobs = args.jobs or len(devices)
     print(f"{plan.name}: {plan.given.trials} trials of {plan.cfg.task} for the {plan.objective_text}; {jobs} at once")
     again = trials.take_back()

@@ -6,9 +6,12 @@ import warnings
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
+from helpers import call
 
 from legged.config import parse_override
+from legged.tools import sweep
 from legged.tools.sweeping.plan import plan_sweep, read_sweep
 from legged.tools.sweeping.report import importances, table
 from legged.tools.sweeping.study import Trials
@@ -77,3 +80,17 @@ def test_nothing_is_said_to_matter_where_all_trials_are_alike():
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         assert importances(trials) == {}
+
+
+def test_a_sweep_that_was_begun_on_a_cpu_does_not_go_on_with_a_gpu_but_is_reported_anywhere(capsys, monkeypatch):
+    parameters = {"train.algorithm.learning_rate": {"low": 1e-4, "high": 1e-2}}
+    path = Path("mine.yaml")
+    path.write_text(yaml.safe_dump({"task": "half_cheetah", "trials": 1, "parameters": parameters}))
+    trials = Trials(plan_sweep(read_sweep(path), path, on_cpu=True))
+    trials.keep_to("cpu")
+    trials.keep_to("cpu")
+    monkeypatch.setattr(sweep, "pick_device", lambda name: torch.device("cuda"))
+    assert call(sweep.main, ["mine.yaml"]) == 2
+    said = "error: --sim_device: the trials of 'sweep_mine' are trained on cpu, and those on cuda can't be compared with them"
+    assert capsys.readouterr().err.startswith(said)
+    assert call(sweep.main, ["mine.yaml", "--report"]) == 0
