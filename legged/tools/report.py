@@ -53,6 +53,8 @@ def build_parser() -> CommandParser:
 
 def _main(argv: list[str] | None) -> int:
     args = build_parser().parse_args(argv)
+    if args.checkpoint is not None and not args.film:
+        raise ConfigError(f"--checkpoint: {args.checkpoint}: says which policy is filmed; add --film")
     if args.task:
         register_given(args)
     elif args.module:

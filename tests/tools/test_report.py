@@ -340,6 +340,7 @@ def test_runs_are_named_as_in_other_tools(capsys):
         (["nowhere"], "error: nowhere: is no run folder (it has no config.yaml)"),
         (["--task", "anymal_x"], "error: --task: there is no task 'anymal_x'; did you mean"),
         (["--task", TASK, "--load_run", "x"], "error: --load_run: there is no run 'x'"),
+        (["x", "--checkpoint", "5"], "error: --checkpoint: 5: says which policy is filmed"),
         (["x", "--load_run", "y"], "error: --load_run: 'y' beside run folders"),
         (["RUN", "--note", " "], "error: --note: expected a sentence of at most 1000 letters, got 0"),
     ],
