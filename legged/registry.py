@@ -24,7 +24,7 @@ from legged.process.paths import data_folder, exists
 from legged.process.startup import importing, stage_ended
 from legged.robots.similarity import grown, size_of
 from legged.terrain import TERRAIN_TYPES, Terrain
-from legged.user_modules import import_tasks
+from legged.user_modules import run_module
 
 __all__ = [
     "import_tasks",
@@ -80,18 +80,32 @@ def register(name: str, config: Path | str | Mapping[str, Any], task_class: type
     add_ids([name])
 
 
-def register_file(path: str) -> str:
-    """Make the YAML file at `path` a task, which is called by the file's name without ending; returns that name.
+def import_tasks(name: str) -> None:
+    """Let tasks of a user's own be known: run the module of that name or path, or make the YAML file at that path one. Who
+    names a run, and not its task, has no other way to say where a file is.
+
+    Raises:
+        ConfigError: it can't be found, or it fails.
+    """
+    if name.endswith(YAML_ENDINGS):
+        register_file(name, "--import")
+    else:
+        run_module(name)
+
+
+def register_file(path: str, flag: str = "--task") -> str:
+    """Make the YAML file at `path` a task, which is called by the file's name without ending; returns that name. `flag` is
+    the one that names the file.
 
     Raises:
         ConfigError: there is no such file, or another task is called so.
     """
     file = Path(path).absolute()
     if not exists(file) or file.is_dir():
-        raise ConfigError(f"--task: there is no file {shown(path)}")
+        raise ConfigError(f"{flag}: there is no file {shown(path)}")
     name = file.stem
     if not is_plain_name(name):
-        raise ConfigError(f"--task: {shown(path)}: the name of the file, without ending, must be {PLAIN}")
+        raise ConfigError(f"{flag}: {shown(path)}: the name of the file, without ending, must be {PLAIN}")
     known = _REGISTERED.get(name)
     ours = data_folder("cfg") / f"{name}.yaml"
     other = known.config if known is not None else ours if ours.is_file() else None
@@ -100,7 +114,7 @@ def register_file(path: str) -> str:
         add_ids([name])
     elif not isinstance(other, Path) or other.resolve() != file.resolve():
         where = other if isinstance(other, Path) else "registered from code"
-        raise ConfigError(f"--task: '{path}': there is another task '{name}' ({where}); give the file another name")
+        raise ConfigError(f"{flag}: '{path}': there is another task '{name}' ({where}); give the file another name")
     return name
 
 

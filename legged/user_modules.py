@@ -16,7 +16,7 @@ _FOLDERS: set[str] = set()
 """Folders that modules of users were found in."""
 
 
-def import_tasks(name: str) -> None:
+def run_module(name: str) -> None:
     """Run a user's module, 'my_tasks' or 'path/my_tasks.py', so that it registers its tasks. What lies beside it can be
     imported from it.
 

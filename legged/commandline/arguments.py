@@ -20,7 +20,7 @@ def add_task_arguments(parser: argparse.ArgumentParser, required: bool = True) -
     overrides.
     """
     parser.add_argument("--task", required=required, help="name of the task, e.g. anymal_c_flat, or a YAML file")
-    parser.add_argument("--import", dest="module", action=Once, help="module or .py file that registers tasks of your own")
+    parser.add_argument("--import", dest="module", action=Once, help="module, or .py or YAML file, with tasks of your own")
     parser.add_argument("--num_envs", type=int, help="number of robots (env.num_envs)")
     parser.add_argument("--seed", type=int, help="random seed (env.seed)")
     parser.add_argument("--physics", metavar="ENGINE", help="mujoco_warp, mujoco or newton; that of the device by default")

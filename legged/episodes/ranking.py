@@ -9,7 +9,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from legged.episodes.stored import Episodes
+from legged.episodes.stored import NO_NUMBERS, TIME_UP, Episodes
 from legged.errors import ConfigError, suggest
 
 
@@ -51,6 +51,8 @@ class Figures:
     """(E,)"""
     ended: list[list[str]]
     """Which terms ended each episode."""
+    ends: list[str]
+    """All that can end an episode."""
 
     @property
     def columns(self) -> list[Column]:
@@ -63,6 +65,7 @@ def figures_of(episodes: Episodes) -> Figures:
     energy is the sum of |torque * velocity| over joints and time, power that by the length of the episode.
     """
     count, strained = len(episodes), []
+    ends = [*episodes.about["terminations"], TIME_UP, NO_NUMBERS]
     numbers = range(count)
 
     def each(measure: Callable[[dict[str, np.ndarray]], float]) -> np.ndarray:
@@ -82,7 +85,7 @@ def figures_of(episodes: Episodes) -> Figures:
             values["torque"] = 100.0 * shares.max(axis=1)
             names = [joint["name"] for joint in episodes.about["joints"]]
             strained = [names[worst] for worst in np.nan_to_num(shares, nan=np.inf).argmax(axis=1)]
-    return Figures(values, strained, episodes["failed"], [episodes.ended(i) for i in numbers])
+    return Figures(values, strained, episodes["failed"], [episodes.ended(i) for i in numbers], ends)
 
 
 def _work_rate(one: dict[str, np.ndarray]) -> float:
@@ -96,19 +99,18 @@ def _rms(errors: np.ndarray) -> float:
 
 
 def order_of(figures: Figures, by: str, ended_by: str | None = None, flag: str = "--sort") -> list[int]:
-    """Return the numbers of the episodes, the worst first; with `ended_by`, only of those that this term ended.
+    """Return the numbers of the episodes, the worst first; with `ended_by`, only of those that this term ended, which may be
+    none.
 
     Raises:
-        ConfigError: the task has no such figure, or no episode was ended by that term.
+        ConfigError: the task has no such figure, or no such term.
     """
     there = [FELL, *figures.values]
     if by not in there:
         raise ConfigError(f"{flag}: {by}: these episodes have no such figure{suggest(by, there)}")
     numbers = list(range(len(figures.ended)))
     if ended_by is not None:
-        known = {term for terms in figures.ended for term in terms}
-        if ended_by not in known:
-            raise ConfigError(f"--ended: {ended_by}: no episode ended by it{suggest(ended_by, known)}")
+        check_ended(ended_by, figures.ends)
         numbers = [i for i in numbers if ended_by in figures.ended[i]]
     if by == FELL:
         rest = figures.values.get("tracking", -figures.values["return"])
@@ -118,6 +120,16 @@ def order_of(figures: Figures, by: str, ended_by: str | None = None, flag: str =
     column = next(column for column in COLUMNS if column.name == by)
     sign = 1.0 if column.low_first else -1.0
     return sorted(numbers, key=lambda i: sign * _or_worst(figures.values[by][i], -sign))
+
+
+def check_ended(name: str, ends: Sequence[str]) -> None:
+    """Look whether an episode can end by the term of that name.
+
+    Raises:
+        ConfigError: it can't.
+    """
+    if name not in ends:
+        raise ConfigError(f"--ended: {name}: no episode ends by it{suggest(name, ends)}")
 
 
 def _or_worst(value: Any, sign: float = 1.0) -> float:

@@ -177,6 +177,8 @@ def draw_comparison(groups: Evaluations, path: Path) -> None:
         for axis, (name, entry) in zip(axes.flat, names.items(), strict=False):
             for (task, physics), results in groups.items():
                 found, engine, color = shares(results, name), engine_of(physics), colors[task]
+                if not found:  # no line: one without points that is not clipped takes all room from the panel
+                    continue
                 means = [mean(values) for values in found.values()]
                 axis.plot(list(found), means, engine.line, marker=engine.marker, ms=3, color=color, clip_on=False)
                 low, high = ([pick(values) for values in found.values()] for pick in (min, max))

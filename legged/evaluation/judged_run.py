@@ -11,7 +11,7 @@ from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.evaluation.engines import ENGINES
 from legged.evaluation.result_file import file_name, read_results
-from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL, checkpoints, run_config
+from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL, checkpoints, of_another_policy, run_config
 from legged.learning.timing import Timing, read_timing
 from legged.process.paths import relative
 
@@ -38,7 +38,8 @@ class JudgedRun:
 
 
 def read_run(folder: Path) -> JudgedRun:
-    """Read a run folder, or that of a shipped policy.
+    """Read a run folder, or that of a shipped policy. An evaluation of another checkpoint than the last says nothing of the
+    policy that is in the table and is shipped; it is left out, and a note says so.
 
     Raises:
         ConfigError: it is none, its task follows no commands, or a file in it is damaged.
@@ -47,8 +48,12 @@ def read_run(folder: Path) -> JudgedRun:
     if not isinstance(cfg, LeggedConfig):
         raise ConfigError(f"{relative(folder)}: '{cfg.task}' follows no commands; the table is of tasks that do")
     timing = read_timing(folder)
-    notes = ("it was resumed, and its times are those of the last part",) if timing and timing.resumed else ()
-    return JudgedRun(cfg, cfg.env.seed, folder, timing, results_in(folder), why_unfinished(folder, cfg, timing), notes)
+    notes = ["it was resumed, and its times are those of the last part"] if timing and timing.resumed else []
+    results = results_in(folder)
+    others = {name: one["checkpoint"] for name, one in results.items() if of_another_policy(folder, one.get("checkpoint"))}
+    notes += [f"its evaluation in {name} is of {file}, not of its last policy" for name, file in others.items()]
+    known = {name: one for name, one in results.items() if name not in others}
+    return JudgedRun(cfg, cfg.env.seed, folder, timing, known, why_unfinished(folder, cfg, timing), tuple(notes))
 
 
 def results_in(folder: Path) -> dict[str, dict[str, Any]]:

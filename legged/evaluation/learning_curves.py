@@ -96,12 +96,15 @@ def _at(config: Any, *keys: str) -> Any:
 
 
 def smooth(values: np.ndarray, width: int = 9) -> np.ndarray:
-    """Return the running mean over `width` values, shorter at the ends; of no values, none."""
+    """Return the running mean over `width` values, shorter at the ends; of no values, none. What is no finite number is left
+    out, so that it does not spread; where nothing else is near, there is none.
+    """
     if not len(values):
         return values
-    width = min(width, len(values))
-    kernel = np.ones(width)
-    return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
+    kernel, good = np.ones(min(width, len(values))), np.isfinite(values)
+    sums = np.convolve(np.where(good, values, 0.0), kernel, "same")
+    counts = np.convolve(good.astype(float), kernel, "same").round()
+    return np.where(counts > 0.0, sums / np.maximum(counts, 1.0), np.nan)
 
 
 def curves_of(runs: Collection[Scalars]) -> tuple[tuple[str, str, float], ...]:

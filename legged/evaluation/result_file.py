@@ -25,12 +25,12 @@ def file_name(engine: str) -> str:
 
 
 def read_results(paths: Iterable[Path]) -> list[dict[str, Any]]:
-    """Read the results in files and folders.
+    """Read the results in files and folders; one that is named twice, itself and by its folder, counts once.
 
     Raises:
         ConfigError: a path is not there, holds no evaluation, or is none.
     """
-    results = []
+    results: dict[Path, dict[str, Any]] = {}
     for path in paths:
         files = sorted(path.glob(file_name("*"))) if path.is_dir() else [path]
         if not files or not all(file.is_file() for file in files):
@@ -41,8 +41,8 @@ def read_results(paths: Iterable[Path]) -> list[dict[str, Any]]:
             except (OSError, ValueError, RecursionError) as error:
                 raise ConfigError(f"{file}: is not the result of an evaluation ({error})") from error
             check_result(result, str(file))
-            results.append(result)
-    return results
+            results[file.resolve()] = result
+    return list(results.values())
 
 
 def check_result(result: Any, where: str) -> None:

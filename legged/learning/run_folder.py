@@ -16,6 +16,7 @@ from legged.config.actuator import MOTORS
 from legged.config.legged import LeggedConfig
 from legged.config.loader import actuator_path, read_yaml
 from legged.errors import ConfigError, suggest
+from legged.learning.given import GIVEN_FILE
 from legged.process.paths import data_folder, exists, make_folder, not_made, relative, write_bytes, write_text
 from legged.registry import task_schema
 
@@ -75,7 +76,7 @@ def discard_run(folder: Path) -> None:
     """
     if checkpoints(folder) or (folder / BEST_MODEL).is_file():
         return
-    ours = [folder / name for name in (CONFIG_FILE, CODE_FILE, NOTE_FILE, MOTORS)]
+    ours = [folder / name for name in (CONFIG_FILE, CODE_FILE, GIVEN_FILE, NOTE_FILE, MOTORS)]
     ours += [*folder.glob("events.out.tfevents.*"), *folder.glob("state_*.pt")]
     with suppress(OSError):
         for path in ours:
@@ -191,6 +192,15 @@ def find_checkpoint(folder: Path, checkpoint: int | str | None) -> Path:
         have = ", ".join(str(i) for i in sorted(found))
         raise ConfigError(f"--checkpoint: {relative(folder)} has no checkpoint {checkpoint} (it has: {have})")
     return found[checkpoint]
+
+
+def of_another_policy(folder: Path, checkpoint: object) -> bool:
+    """Return whether an evaluation that is of the file `checkpoint` is of another policy than the last one in its folder:
+    of one from before the training went on, or of one that was asked for. The name that a shipped policy had is not known.
+    """
+    found = checkpoints(folder)
+    last = found[max(found)].name if found else SHIPPED_MODEL
+    return last != SHIPPED_MODEL and isinstance(checkpoint, str) and checkpoint != last
 
 
 def shipped_policy(task: str) -> Path | None:

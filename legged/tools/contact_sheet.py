@@ -48,7 +48,7 @@ def build_parser() -> CommandParser:
     parser.add_argument("--out", type=Path, required=True, help="the file, .gif or .png")
     parser.add_argument("--columns", type=int, help="tiles side by side; so many that the sheet is twice as wide as high")
     parser.add_argument("--side", type=int, default=SIDE, help=f"width and height of a tile [pixels]; {SIDE}")
-    parser.add_argument("--import", dest="module", action=Once, help="module or .py file that registers tasks of your own")
+    parser.add_argument("--import", dest="module", action=Once, help="module, or .py or YAML file, with tasks of your own")
     return parser
 
 

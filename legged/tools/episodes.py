@@ -35,6 +35,7 @@ from legged.episodes.ranking import (
     COLUMNS,
     FELL,
     Figures,
+    check_ended,
     counts_text,
     episodes_table,
     figures_of,
@@ -45,11 +46,20 @@ from legged.episodes.ranking import (
 )
 from legged.episodes.rollout import MOST_EPISODES, Wish, check_wish, roll_out
 from legged.episodes.statistics_report import screen_table, tables_of, write_statistics
-from legged.episodes.stored import ABOUT, ARRAYS, Episodes, load_config, load_episodes, save_episodes
+from legged.episodes.stored import (
+    ABOUT,
+    ARRAYS,
+    NO_NUMBERS,
+    TIME_UP,
+    Episodes,
+    load_config,
+    load_episodes,
+    save_episodes,
+)
 from legged.errors import ConfigError, suggest
 from legged.policies.restore import TrainedPolicy, find_policy, policy_of
 from legged.process.paths import exists, ready_to_write, relative, write_text
-from legged.user_modules import import_tasks
+from legged.registry import import_tasks
 
 EPISODES, MOST_ROBOTS = 50, 256
 """Episodes, and robots that run them, if nobody says how many."""
@@ -206,6 +216,9 @@ def _recorded(args: argparse.Namespace) -> tuple[Episodes, Path]:
     if wish.robots > wish.episodes:
         raise ConfigError(f"--num_envs: {wish.robots} robots have no more than {wish.episodes} episodes to run (--episodes)")
     _pages(args.page, wish.episodes)
+    if args.ended is not None:  # before a recording takes the place of the one that there is
+        terms = policy.cfg.terminations
+        check_ended(args.ended, [*terms.failures, *terms.time_outs, TIME_UP, NO_NUMBERS])
     check_wish(policy, wish)
     folder = args.out or _folder(policy)
     steps = round(policy.cfg.env.episode_length_s / policy.cfg.dt)

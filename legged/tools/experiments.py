@@ -50,7 +50,7 @@ def build_parser() -> CommandParser:
     parser.add_argument(
         "--seeds_share", action="store_true", help="a row of means for runs that differ in nothing but their seed"
     )
-    parser.add_argument("--import", dest="module", action=Once, help="module or .py file that registers tasks of your own")
+    parser.add_argument("--import", dest="module", action=Once, help="module, or .py or YAML file, with tasks of your own")
     return parser
 
 

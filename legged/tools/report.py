@@ -45,7 +45,7 @@ def build_parser() -> CommandParser:
     parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="run folders")
     parser.add_argument("--task", help="report on a run of this task; a name or a YAML file")
     add_run_arguments(parser)
-    parser.add_argument("--import", dest="module", action=Once, help="module or .py file that registers tasks of your own")
+    parser.add_argument("--import", dest="module", action=Once, help="module, or .py or YAML file, with tasks of your own")
     parser.add_argument("--film", action="store_true", help=f"film the policy anew, into {FILMS[0]}")
     parser.add_argument("--note", help=f"a sentence about the run, kept in its {NOTE_FILE}")
     return parser
@@ -53,6 +53,8 @@ def build_parser() -> CommandParser:
 
 def _main(argv: list[str] | None) -> int:
     args = build_parser().parse_args(argv)
+    if args.checkpoint is not None and not args.film:
+        raise ConfigError(f"--checkpoint: {args.checkpoint}: says which policy is filmed; add --film")
     if args.task:
         register_given(args)
     elif args.module:

@@ -53,7 +53,7 @@ def build_parser() -> CommandParser:
     parser.add_argument("--sim_device", help="cpu, cuda, or several with commas, which the jobs take in turn")
     parser.add_argument("--storage", help="URL of a database that several machines share, or journal:<file>")
     parser.add_argument("--report", action="store_true", help="only write table and figures of what there is")
-    parser.add_argument("--import", dest="module", action=Once, help="module or .py file that registers tasks of your own")
+    parser.add_argument("--import", dest="module", action=Once, help="module, or .py or YAML file, with tasks of your own")
     parser.add_argument("--worker", type=int, metavar="NUMBER", help=argparse.SUPPRESS)
     return parser
 
@@ -84,8 +84,9 @@ def _main(argv: list[str] | None) -> int:
         return _work(args, plan, names[0])
     trials = Trials(plan, args.storage or "")
     if args.report:
-        print(*write_report(trials), sep="\n")
+        print(*write_report(trials, args.module), sep="\n")
         return 0
+    trials.keep_to(devices[0].type)
     jobs = args.jobs or len(devices)
     print(f"{plan.name}: {plan.given.trials} trials of {plan.cfg.task} for the {plan.objective_text}; {jobs} at once")
     again = trials.take_back()
@@ -99,7 +100,7 @@ def _main(argv: list[str] | None) -> int:
         stopped_by = worker.run()
     else:
         stopped_by = _crew(args, trials, path, names, jobs)
-    print(*write_report(trials), sep="\n")
+    print(*write_report(trials, args.module), sep="\n")
     if stopped_by:
         return 128 + stopped_by[0]
     return 0 if trials.done >= plan.given.trials else EXIT_FAILED

@@ -36,6 +36,7 @@ from legged.learning.checkpoint import read_checkpoint
 from legged.learning.display import Display
 from legged.learning.distributed import RankLost, check_reachable
 from legged.learning.evaluations import Evaluations
+from legged.learning.given import Given, write_given
 from legged.learning.resume import resumed
 from legged.learning.run_folder import NOTE_FILE, create_run, discard_run, experiment_folder, find_run
 from legged.learning.runner import Runner
@@ -184,7 +185,7 @@ def _train(
 
         with stopping_on_signals(runner.stop) as stopped_by, quiet_writers():
             try:
-                folder, finished = _learn(runner, cfg, display, args, timing)
+                folder, finished = _learn(runner, cfg, display, args, timing, checkpoint if resumed else None)
             except RankLost as lost:
                 print(lost, file=sys.stderr, flush=True)
                 return EXIT_FAILED
@@ -231,10 +232,16 @@ def _evaluate_during(runner: Runner, resumed_from: Path | None) -> None:
 
 
 def _learn(
-    runner: Runner, cfg: TaskConfig, display: Display | None, args: argparse.Namespace, timing: Callable[[bool, str], Timing]
+    runner: Runner,
+    cfg: TaskConfig,
+    display: Display | None,
+    args: argparse.Namespace,
+    timing: Callable[[bool, str], Timing],
+    goes_on_from: Path | None,
 ) -> tuple[Path | None, bool]:
     """Train into a new run folder; gives the folder, none where another process has it, and whether training got to its end.
     A training that fails before its first checkpoint leaves no folder; one that fails later says so there, with its times.
+    `goes_on_from` is the checkpoint of a resumed one.
 
     Raises:
         RunError: the folder can't be written.
@@ -242,6 +249,8 @@ def _learn(
     folder = create_run(cfg) if display else None
     if folder is None or display is None:
         return None, runner.train(cfg.train.runner.max_iterations)
+    given = Given(args.given_task, args.module, dict(overrides(args)))
+    write_given(folder, given, goes_on_from.parent if goes_on_from is not None else None)
     if args.note is not None:
         write_text(folder / NOTE_FILE, f"{args.note}\n")
     print(f"run folder {relative(folder)}\nwatch it: {watch_command(args, folder)}", flush=True)

@@ -12,7 +12,7 @@ from legged.config import from_dict
 from legged.config.loader import read_yaml
 from legged.errors import ConfigError
 from legged.robots.robot import load_robot
-from legged.tools import evaluate, train
+from legged.tools import episodes, evaluate, train
 
 pytestmark = pytest.mark.usefixtures("workplace", "own_registry")
 
@@ -93,6 +93,19 @@ def test_a_policy_of_a_yaml_file_is_played_and_judged(capsys):
     arguments = ["--task", "mine.yaml", "--sim_device", "cpu", "sim.threads=1"]
     assert call(evaluate.main, [*arguments, "--vx=0", "--vy=0", "--yaw=0", "--robots", "1"]) == 0
     assert "logs/mine/" in capsys.readouterr().out
+
+
+def test_a_command_that_names_no_task_is_told_of_a_yaml_file_by_import(show, error, capsys):
+    """As is one that names only the run of such a task."""
+    written("mine.yaml", f"extends: {TASK}\nenv: {{num_envs: 7, episode_length_s: 0.4}}\n")
+    assert show("--import", "mine.yaml", "--task", "mine").env.num_envs == 7
+    assert "--import: there is no file 'none.yaml'" in error("--import", "none.yaml", "--task", TASK)
+    registry._REGISTERED.clear()
+    folder = tiny_run("--task", "mine.yaml")
+    registry._REGISTERED.clear()
+    flags = ["--import", "mine.yaml", "--compare", str(folder), str(folder), "--episodes", "1", "--physics", "mujoco"]
+    assert call(episodes.main, flags) == 2, "episodes of 0.4 s are too short for statistics"
+    assert "no episode of 'mine' is longer than 1 s" in capsys.readouterr().err
 
 
 def test_a_task_of_the_package_may_be_given_as_its_file(show):

@@ -47,7 +47,8 @@ def test_what_failed_comes_first_and_then_what_is_worst():
     assert order_of(figures, "tracking")[0] == 2
     assert order_of(figures, "length", "contact") == [3, 1]
     assert counts_text(figures) == "4 episodes, 2 failed; ended: 2 by contact, 1 by time, 1 by tilt"
-    with pytest.raises(ConfigError, match="--ended: contakt: no episode ended by it; did you mean 'contact'"):
+    assert order_of(figures, "fell", "non_finite") == []
+    with pytest.raises(ConfigError, match="--ended: contakt: no episode ends by it; did you mean 'contact'"):
         order_of(figures, "fell", "contakt")
     with pytest.raises(ConfigError, match="--sort: speed: these episodes have no such figure"):
         order_of(figures, "speed")

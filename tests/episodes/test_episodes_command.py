@@ -146,6 +146,7 @@ def test_two_policies_are_compared(capsys):
         ([*HERE, "--episodes", "0"], "--episodes: must be at least 1, got 0"),
         ([*HERE, "--episodes", "100000"], "--episodes: must be at most 4,096, got 100,000"),
         ([*HERE, "--num_envs", "9"], "--num_envs: 9 robots have no more than 3 episodes to run"),
+        ([*HERE, "--ended", "contakt"], "--ended: contakt: no episode ends by it; did you mean 'contact'?"),
         ([*HERE, "--page", "two"], "--page: expected numbers of episodes like 3 or 3,17, got 'two'"),
         ([*HERE, "--page", "7"], "--page: there is no episode 7; they are 0 to 2"),
         ([*HERE, "--top", "-1"], "--top: must be at least 0"),

@@ -132,6 +132,19 @@ def test_runs_are_found_in_folders_and_beside_shipped_policies(tmp_path):
         find_runs([tmp_path / "nowhere"])
 
 
+def test_an_evaluation_of_another_checkpoint_is_neither_in_the_table_nor_shipped(tmp_path):
+    """As after evaluate --checkpoint best: it is not what the policy that would be shipped is worth."""
+    for name in ("config.yaml", "evaluation_mujoco.json"):
+        shutil.copy(POLICY / name, tmp_path)
+    shutil.copy(POLICY / "model.pt", tmp_path / "model_299.pt")
+    assert [*read_run(tmp_path).results] == ["mujoco"]
+    path = tmp_path / "evaluation_mujoco.json"
+    path.write_text(path.read_text().replace('"model_299.pt"', '"model_best.pt"'))
+    found = read_run(tmp_path)
+    assert not found.results
+    assert found.notes == ("its evaluation in mujoco is of model_best.pt, not of its last policy",)
+
+
 def test_a_task_without_commands_is_no_line(tmp_path):
     with pytest.raises(ConfigError, match="'half_cheetah' follows no commands"):
         find_runs([POLICY.parent / "half_cheetah"])

@@ -8,11 +8,11 @@ import torch
 from helpers import ENGINE, POLICY, TASK
 
 from legged.learning.checkpoint import read_checkpoint, write_checkpoint
-from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL, run_config
+from legged.learning.run_folder import BEST, BEST_MODEL, CONFIG_FILE, SHIPPED_MODEL, run_config
 from legged.math import quat_rotate
 from legged.play.live.ground import OWN, PLANE, ChosenGround, changes_for, check_ground
 from legged.play.live.session import BEHIND_S, HARDEST_PUSH, Session, ago
-from legged.play.live.source import BEST, BEST_MODEL, NEWEST, Watched
+from legged.play.live.source import NEWEST, Watched
 
 SHIPPED = POLICY.parent
 

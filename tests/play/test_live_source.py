@@ -10,13 +10,15 @@ from helpers import POLICY, TASK
 
 from legged import registry
 from legged.errors import ConfigError
-from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL
-from legged.play.live.source import BEST, BEST_MODEL, CheckpointFollower, Watched, find_watched
+from legged.learning.run_folder import BEST, BEST_MODEL, CONFIG_FILE, SHIPPED_MODEL
+from legged.play.live.source import CheckpointFollower, Watched, find_watched
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
 
-def asked(task: str | None = None, load_run: str | None = None, checkpoint: int | None = None, experiment: str | None = None):
+def asked(
+    task: str | None = None, load_run: str | None = None, checkpoint: int | str | None = None, experiment: str | None = None
+):
     """What a command line asks for."""
     flags = {"task": task, "load_run": load_run, "checkpoint": checkpoint, "experiment_name": experiment}
     return find_watched(argparse.Namespace(**flags, overrides=[], solver=None))
@@ -104,3 +106,15 @@ def test_a_checkpoint_is_given_once_and_again_when_it_was_written_anew():
     assert follower.changed() == run / BEST_MODEL
     shutil.rmtree(run)
     assert follower.changed() is None
+
+
+def test_the_best_checkpoint_can_be_asked_for_and_is_followed():
+    run = begin(f"{TASK}/run", 50, when=100.0)
+    with pytest.raises(ConfigError, match=r"has no model_best\.pt"):
+        asked(checkpoint="best")
+    shutil.copy(POLICY / SHIPPED_MODEL, run / BEST_MODEL)
+    follower = CheckpointFollower(asked(checkpoint="best"))
+    assert follower.changed() == run / BEST_MODEL
+    os.utime(run / BEST_MODEL, (1.0, 1.0))  # the training has found a better one
+    assert follower.changed() == run / BEST_MODEL
+    assert follower.has_best  # and the page offers the newest, too

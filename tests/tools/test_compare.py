@@ -1,6 +1,7 @@
 """Evaluations side by side: seeds become means and spreads, by hand."""
 
 import json
+import warnings
 
 import pytest
 from helpers import call
@@ -44,6 +45,25 @@ def test_seeds_are_averaged_and_their_spread_is_told(tmp_path, capsys):
     assert "0.3 m" not in said  # not measured for both seeds
     assert "pit" not in said
     assert picture.stat().st_size > 10_000
+
+
+def test_an_evaluation_that_is_named_twice_is_one_seed(tmp_path, capsys):
+    evaluation(tmp_path / "a" / "evaluation_mujoco.json", physics="mujoco")
+    assert main([str(tmp_path / "a"), str(tmp_path / "a" / "evaluation_mujoco.json")]) == 0
+    assert "C MuJoCo, 1 seed " in capsys.readouterr().out
+
+
+def test_panels_of_types_that_one_engine_has_not_seen_are_as_wide_as_the_others(tmp_path, capsys):
+    """An empty line that is not clipped took the room of all panels; matplotlib said so, and drew them into corners."""
+    there = evaluation(tmp_path / "evaluation_mujoco_warp.json", stairs={0.1: 1.0, 0.2: 0.9})
+    evaluation(tmp_path / "evaluation_mujoco.json", physics="mujoco", stairs={0.1: 1.0, 0.2: 0.9})
+    types = there["success"]["types"]
+    types |= {"slope_up": types["pit"], "slope_down": types["pit"], "gap": types["pit"]}
+    (tmp_path / "evaluation_mujoco_warp.json").write_text(json.dumps(there))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert main([str(tmp_path), "--out", str(tmp_path / "success.png")]) == 0
+    assert "written:" in capsys.readouterr().out
 
 
 def test_seeds_are_those_of_one_task_in_one_engine(tmp_path):

@@ -86,6 +86,30 @@ def test_runs_are_in_one_table_newest_first(capsys):
     assert "return, evaluated" not in one  # of no run
 
 
+def test_an_evaluation_of_another_checkpoint_than_the_last_is_called_that(capsys):
+    """As after evaluate --checkpoint best, or of a training that went on afterwards."""
+    folders = [write_run(stamp) for stamp in STAMPS[:2]]
+    for folder in folders:
+        (folder / "model_4.pt").touch()
+        shutil.copyfile(POLICY / "evaluation_mujoco.json", folder / "evaluation_mujoco.json")
+    path = folders[1] / "evaluation_mujoco.json"
+    of_the_last = path.read_text().replace('"model_299.pt"', '"model_4.pt"')
+    path.write_text(of_the_last)
+    assert experiments.main([]) == 0
+    assert [row["evaluated"] for row in table()] == ["model_299.pt", ""]
+    assert report.main([*map(str, folders)]) == 0
+    said = "In C MuJoCo it is of `model_299.pt`, which is not the last policy."
+    assert [said in (folder / "report.md").read_text() for folder in folders] == [True, False]
+    assert experiments.main(["--compare", *map(str, folders)]) == 0
+    text = Path("logs/comparison.md").read_text().replace("\\", "")
+    assert text.count("which is not its last policy") == 1
+    assert f"({STAMPS[0]}): of `model_299.pt`" in text
+    (folders[0] / "evaluation_mujoco.json").write_text(of_the_last)
+    assert experiments.main([]) == 0
+    assert "evaluated" not in table()[0]
+    capsys.readouterr()
+
+
 def test_a_page_elsewhere_leads_to_no_report():
     folder = write_run(STAMPS[0])
     assert report.main([str(folder)]) == 0

@@ -5,6 +5,7 @@ import io
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 from pathlib import Path
@@ -13,15 +14,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import POLICY, TASK, TINY_TRAINING, call, run_folders, tiny_run
+from torch.utils.tensorboard import SummaryWriter
 
+from legged import registry
 from legged.errors import RunError
 from legged.evaluation.learning_curves import read_scalars, smooth
 from legged.evaluation.reports import at_end
 from legged.evaluation.reports.record import read_record
 from legged.evaluation.reports.run_report import over_training, write_report
 from legged.learning.captured import CapturedRunner
+from legged.learning.given import GIVEN_FILE
 from legged.learning.timing import TIMING_FILE
-from legged.tools import report, train
+from legged.tools import evaluate, experiments, report, train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -249,6 +253,72 @@ def test_the_command_films(monkeypatch, capsys):
     assert "no film: nothing can be rendered here\n" in capsys.readouterr().out
 
 
+def test_what_is_no_number_is_left_out_and_does_not_spread():
+    """As a training that diverged leaves it, and one with a learning rate of 0."""
+    tags = ("Train/mean_reward", "Metrics/lin_vel_rmse", "Episode/rew_a", "Episode/rew_b", "Loss/learning_rate")
+    pages = []
+    for name, values in (("some", [1.0, np.nan, 3.0, np.inf, 2.0]), ("none", [np.nan] * 5), ("zero", [0.0] * 5)):
+        folder = Path("logs") / TASK / name
+        folder.mkdir(parents=True)
+        shutil.copy(POLICY / "config.yaml", folder)
+        with SummaryWriter(str(folder)) as writer:
+            for step, value in enumerate(values):
+                for tag in tags:
+                    writer.add_scalar(tag, value, step)
+        pages.append(write_report(folder).read_text())
+        text = read(folder, "report.md")
+        drawings = re.findall(r'(?:points|data-v|data-sort)="([^"]*)"', pages[-1])
+        assert drawings
+        assert not [one for one in drawings if "nan" in one or "inf" in one]
+        assert "| nan |" not in text
+        assert "| inf |" not in text
+    assert " | - | 2.50 | 2.500 |\n\n" in read(Path("logs") / TASK / "some", "report.md")  # of 3, inf and 2
+    assert " | - | - | - |\n\n" in read(Path("logs") / TASK / "none", "report.md")
+
+
+# ---- tasks of one's own ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def forgotten(monkeypatch):
+    """forgotten(): lets go of tasks that were registered, as another process knows none of them."""
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    return registry._REGISTERED.clear
+
+
+def test_a_run_of_somebodys_own_task_says_how_it_is_found_again(forgotten, capsys):
+    Path("my own.d").mkdir()
+    Path("my own.d/mine.yaml").write_text(f"extends: {TASK}\n")
+    named = ["--task", "my own.d/mine.yaml", "train.runner.experiment_name=elsewhere"]
+    folder = tiny_run(*named, *REPORTED, "rewards.scales.torques=-3e-4", iterations=1)
+    assert "| `rewards.scales.torques` | `-0.0003` | `-1.0e-05` |" in read(folder, "report.md")
+    found = re.search(r"None yet: `python -m legged\.tools\.evaluate (.*)`", read(folder, "report.md"))
+    forgotten()
+    grid = ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1", "--sim_device", "cpu"]
+    assert call(evaluate.main, [*shlex.split(found[1]), *grid]) == 0  # as it stands there
+    forgotten()
+    assert report.main([str(folder)]) == 0
+    text = read(folder, "report.md")
+    command = f"python -m legged.tools.report --task 'my own.d/mine.yaml' {folder}"
+    assert f"There is no task 'mine' here to compare with, and `{command}`" in text
+    assert "| `rewards.scales.torques` | `-0.0003` |" in text
+    assert experiments.main(["--markdown", "all.md"]) == 0
+    assert "sim.physics mujoco, sim.threads 1, runner.num_steps_per_env 4" in read(Path(), "all.md").replace("\\", "")
+    assert report.main(["--task", "my own.d/mine.yaml", str(folder)]) == 0
+    assert "| `rewards.scales.torques` | `-0.0003` | `-1.0e-05` |" in read(folder, "report.md")
+    capsys.readouterr()
+
+
+def test_a_resumed_run_keeps_what_was_set_before():
+    first = tiny_run("rewards.scales.torques=-3e-4", "env.episode_length_s=0.1", iterations=1)
+    again = tiny_run("--resume", "env.episode_length_s=0.2", iterations=2)
+    changes = read_record(again).given.changes
+    assert (changes["rewards.scales.torques"], changes["env.episode_length_s"]) == (-3e-4, 0.2)
+    (first / GIVEN_FILE).write_text('{"task": 3}')
+    assert read_record(first).given is None
+    assert any(GIVEN_FILE in text for text in read_record(first).problems)
+
+
 # ---- command line ----------------------------------------------------------------------------------------------------
 
 
@@ -270,6 +340,7 @@ def test_runs_are_named_as_in_other_tools(capsys):
         (["nowhere"], "error: nowhere: is no run folder (it has no config.yaml)"),
         (["--task", "anymal_x"], "error: --task: there is no task 'anymal_x'; did you mean"),
         (["--task", TASK, "--load_run", "x"], "error: --load_run: there is no run 'x'"),
+        (["x", "--checkpoint", "5"], "error: --checkpoint: 5: says which policy is filmed"),
         (["x", "--load_run", "y"], "error: --load_run: 'y' beside run folders"),
         (["RUN", "--note", " "], "error: --note: expected a sentence of at most 1000 letters, got 0"),
     ],

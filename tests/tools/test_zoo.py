@@ -275,7 +275,8 @@ def test_of_several_seeds_the_lowest_gives_the_policy_and_the_others_what_they_c
 def test_a_shipment_leaves_nothing_of_the_one_before_it():
     place = Path("shipped") / TASK
     for left in ("seed_2/timing.json", "seed_2/evaluation_mujoco.json", "seed_3/own.txt", "evaluation_newton_xpbd.json",
-                 "evaluation_mujoco.png", "timing.json", "play.gif", "model.pt"):  # fmt: skip
+                 "evaluation_mujoco.png", "timing.json", "play.gif", "model.pt", "crossing.json", "crossing.png",
+                 "time_to_walk.json"):  # fmt: skip
         (place / left).parent.mkdir(parents=True, exist_ok=True)
         (place / left).write_text(left)
     run = tiny_run("--run_name", "s1", "--seed", "1", iterations=1)
@@ -286,7 +287,8 @@ def test_a_shipment_leaves_nothing_of_the_one_before_it():
     assert (place / "model.pt").read_text() == "model.pt"
     assert (place / "seed_2" / "evaluation_mujoco.json").exists()  # the old one is there as it was
     (run / "model_0.pt").write_bytes(whole)
-    ship(find_runs([run]), Path("shipped"))
+    lines = ship(find_runs([run]), Path("shipped"))
+    assert lines[1:] == [f"{place}: draw anew what shows the policy before: play.gif"]
     names = {str(path.relative_to(place)) for path in place.rglob("*") if path.is_file()}
     assert names == {"model.pt", "config.yaml", "timing.json", "play.gif", "seed_3/own.txt"}
     assert not (place / "seed_2").exists()

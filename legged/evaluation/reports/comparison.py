@@ -69,6 +69,8 @@ def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
         if sum(result is not None for result in results) < 2:
             continue
         parts += [Heading(f"Evaluation in {engine_of(engine).label}"), _table(names, results)]
+        others = [(name, record.another_policy(one)) for name, record, one in zip(names, records, results, strict=True)]
+        parts += [Paragraph(f"{name}: of `{file}`, which is not its last policy.") for name, file in others if file]
         drawings = _success(names, results)
         if drawings:
             parts.append(Figures(f"success_{engine}", drawings, f"success over difficulty in {engine_of(engine).label}"))

@@ -139,12 +139,18 @@ def _parts(scalars: Scalars) -> list[str]:
     for tag in tags:
         of = dict(zip(*scalars[tag], strict=True))
         parts[tag.removeprefix(EPISODE)] = smooth(np.array([of[step] for step in steps]))
+    known = np.isfinite(list(parts.values())).all(axis=0)
+    if not known.any():
+        return []
+    parts = {name: values[known] for name, values in parts.items()}
     order = sorted(parts, key=lambda name: -float(np.abs(parts[name]).mean()))
     shown = {name: parts[name] for name in order[:MOST_PARTS]}
     rest = order[MOST_PARTS:]
     if rest:
         shown[f"{len(rest)} more"] = np.sum([parts[name] for name in rest], axis=0)
-    return [stacked(Axes("parts of the reward, per second of a full episode", "iteration"), np.array(steps) + 1.0, shown)]
+    return [
+        stacked(Axes("parts of the reward, per second of a full episode", "iteration"), np.array(steps)[known] + 1.0, shown)
+    ]
 
 
 def _levels(record: Record) -> list[str]:

@@ -42,13 +42,18 @@ def words(value: Any) -> str:
 
 def what_changed(record: Record, named: bool = True) -> str:
     """Say in a few words what a run is about: somebody's note, else its own name, where it is to be `named`, and what it sets
-    otherwise than its task.
+    otherwise than its task; where that task is not known here, what its command line set.
     """
     if record.note:
         return record.note
-    changed = from_task_file(record) or {}
-    changed = {path: values for path, values in changed.items() if path not in (*NAMES, "env.seed")}
-    said = [f"{'.'.join(path.split('.')[-2:])} {words(given)}" for path, (given, _) in changed.items()]
+    found = from_task_file(record)
+    if found is not None:
+        changed = {path: own for path, (own, _) in found.items()}
+    else:
+        changed = dict(record.given.changes) if record.given is not None else {}
+    said = [
+        f"{'.'.join(path.split('.')[-2:])} {words(own)}" for path, own in changed.items() if path not in (*NAMES, "env.seed")
+    ]
     if len(said) > MOST_WORDS:
         said = [*said[:MOST_WORDS], f"{len(said) - MOST_WORDS} more settings"]
     return ": ".join(text for text in (record.run_name if named else "", ", ".join(said)) if text)

@@ -1,6 +1,7 @@
 """What an evaluation found, as tables and drawings: heat maps over commands, success over difficulty, returns of episodes."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,8 @@ BROKEN = (KeyError, TypeError, ValueError, IndexError, AttributeError)
 
 
 def number(value: float | None, form: str = ".3f", unit: str = "") -> Number:
-    """Return a number as a cell, a dash for none."""
-    return Number("-" if value is None else f"{value:{form}}{unit}", value)
+    """Return a number as a cell, a dash for none and for what is not finite, which can't be sorted."""
+    return Number("-", None) if value is None or not math.isfinite(value) else Number(f"{value:{form}}{unit}", value)
 
 
 def between(interval: tuple[float, float], factor: float = 1.0, form: str = ".1f") -> str:
@@ -38,14 +39,22 @@ def falls_of(tracking: dict[str, Any]) -> tuple[int, int] | None:
         return None
 
 
-def evaluation_parts(results: Sequence[dict[str, Any]]) -> list[Part]:
-    """Return the part of a report on evaluations, one an engine; nothing of none."""
+def evaluation_parts(
+    results: Sequence[dict[str, Any]], another_policy: Callable[[dict[str, Any]], str] = lambda _: ""
+) -> list[Part]:
+    """Return the part of a report on evaluations, one an engine; nothing of none. `another_policy` names the checkpoint of
+    one that is not of the run's last policy.
+    """
     if not results:
         return []
     results = sorted(results, key=lambda one: [*ENGINES, one["physics"]].index(one["physics"]))
     of_episodes = [result for result in results if "episodes" in result]
     following = [result for result in results if "episodes" not in result]
     parts: list[Part] = [Heading("Evaluation")]
+    for result in results:
+        if another_policy(result):
+            label = engine_of(result["physics"]).label
+            parts.append(Paragraph(f"In {label} it is of `{another_policy(result)}`, which is not the last policy."))
     if following:
         parts += _following(following)
     for result in of_episodes:

@@ -56,6 +56,8 @@ def experiments_parts(records: Sequence[Record], beside: Path, ending: str, seed
         " steps that nine robots of ten got up, and nine got down. Terrain level, return and velocity error are those of the"
         " end of training, with both. A commit with a + had changes that were not committed."
     )
+    if "evaluated" in shown:
+        text += " Where a checkpoint is named, the evaluation is of that one, not of the last."
     if len(rows) < len(newest):
         text += " Runs that differ in nothing but their seed share a row, with the means over them."
     return [Paragraph(text), Table(shown, [[row[name] for name in shown] for row in rows], wide=True)]
@@ -72,6 +74,7 @@ def _shared_row(group: Sequence[Record], beside: Path, ending: str) -> dict[str,
         shared[name] = number(mean(known) if known else None, form)
     seeds = [value for record in group if (value := _whole(record.at("env.seed"))) is not None]
     shared["seed"] = Number(", ".join(f"{seed:,d}" for seed in sorted(seeds)), min(seeds, default=None))
+    shared["evaluated"] = ", ".join(dict.fromkeys(text for row in rows if (text := _text(row["evaluated"]))))
     shared["what changed"] = what_changed(group[0], named=False)
     return shared
 
@@ -108,6 +111,7 @@ def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
         "status": record.status,
         "iterations": number(record.done, ",.0f"),
         "seed": number(_whole(record.at("env.seed")), ",.0f"),
+        "evaluated": record.another_policy(judged),
         **{name: number(value, FORMS[name]) for name, value in figures.items()},
         "robots": number(record.robots, ",.0f"),
         "device": ("" if timing is None else "CPU" if timing.device == "cpu" else timing.device),

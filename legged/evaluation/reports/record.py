@@ -15,7 +15,8 @@ from legged.config.dotted import value_at
 from legged.errors import ConfigError
 from legged.evaluation.learning_curves import Scalars, read_config, read_scalars
 from legged.evaluation.result_file import file_name, read_results
-from legged.learning.run_folder import CODE_FILE, CONFIG_FILE, NOTE_FILE, checkpoints, run_config
+from legged.learning.given import Given, read_given
+from legged.learning.run_folder import CODE_FILE, CONFIG_FILE, NOTE_FILE, checkpoints, of_another_policy, run_config
 from legged.learning.timing import Timing, read_timing
 
 STAMP = re.compile(r"(\d{4}-\d{2}-\d{2}_\d{2}-\d{2}-\d{2})(?:_(.*))?")
@@ -71,6 +72,8 @@ class Record:
     """Iterations behind its last policy or log, those before it was resumed too."""
     problems: tuple[str, ...]
     """What could not be read."""
+    given: Given | None = None
+    """What its command line said; None of runs that do not say so."""
 
     def at(self, path: str) -> Any:
         """Return a setting by its dotted path; None where there is none."""
@@ -110,6 +113,11 @@ class Record:
         dt, decimation = self.at("sim.dt"), self.at("control.decimation")
         return dt * decimation if isinstance(dt, int | float) and isinstance(decimation, int) else None
 
+    def another_policy(self, result: dict[str, Any] | None) -> str:
+        """Return the checkpoint that an evaluation is of; nothing where it is the last one, whose the other figures are."""
+        checkpoint = (result or {}).get("checkpoint")
+        return str(checkpoint) if of_another_policy(self.folder, checkpoint) else ""
+
     @property
     def film(self) -> Path | None:
         """A film of its policy, if there is one."""
@@ -126,11 +134,13 @@ def read_record(folder: Path) -> Record:
         raise ConfigError(f"{folder}: is no run folder (it has no {CONFIG_FILE})")
     problems: list[str] = []
     config = read_config(folder)
-    timing, scalars = None, {}
+    timing, scalars, given = None, {}, None
     with _noting(problems):
         config = to_dict(run_config(folder))
     with _noting(problems):
         timing = read_timing(folder)
+    with _noting(problems):
+        given = read_given(folder)
     if any(folder.glob("events.out.tfevents.*")):
         with _noting(problems):
             scalars = read_scalars(folder)
@@ -144,7 +154,7 @@ def read_record(folder: Path) -> Record:
     status, why = _status(folder, timing, value_at(config, "train.runner.max_iterations"), done, max(saved, default=0))
     return Record(
         folder, config, _began(folder), timing, scalars, tuple(results), read_code(folder), read_note(folder),
-        status, why, done, tuple(problems),
+        status, why, done, tuple(problems), given,
     )  # fmt: skip
 
 
@@ -203,7 +213,8 @@ def is_running(folder: Path) -> bool:
                 if silent_s < 120.0:
                     return True
             elif silent_s < QUIET_S:
-                os.kill(int(match[2]), 0)  # asks whether it is there
+                with suppress(PermissionError):  # it is there, and somebody else's
+                    os.kill(int(match[2]), 0)  # asks whether it is there
                 return True
     return False
 

@@ -1,5 +1,6 @@
 """The report on one run: report.html, which needs nothing else, and report.md with pictures beside it."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -25,8 +26,9 @@ from legged.evaluation.reports.document import (
 from legged.evaluation.reports.evaluation_part import evaluation_parts, number
 from legged.evaluation.reports.record import Record, read_record
 from legged.evaluation.reports.svg import sheet
+from legged.learning.given import Given
 from legged.learning.run_folder import BEST_MODEL, CODE_FILE, checkpoints
-from legged.process.paths import write_text
+from legged.process.paths import relative, write_text
 
 REPORT = "report"
 """What its files are called, before their ending."""
@@ -92,11 +94,9 @@ def report_parts(record: Record) -> list[Part]:
         parts += [Heading("Curves"), Figures("curves", curves_of_run(record), "learning curves")]
     else:
         parts += [Heading("Curves"), Paragraph("There is no TensorBoard file with values in this folder.")]
-    parts += evaluation_parts(record.results) or [
+    parts += evaluation_parts(record.results, record.another_policy) or [
         Heading("Evaluation"),
-        Paragraph(
-            f"None yet: `python -m legged.tools.evaluate --task {record.task} --load_run {record.folder.resolve().name}`"
-        ),
+        Paragraph(f"None yet: `{command_on(record, 'evaluate', '--load_run')}`"),
     ]
     if record.problems:
         parts += [Heading("What could not be read"), *(Paragraph(text) for text in record.problems)]
@@ -105,6 +105,15 @@ def report_parts(record: Record) -> list[Part]:
         rest = "" if len(shown) == len(record.code.text) else f"\n... and more: see {CODE_FILE}"
         parts += [Heading("Code"), Listing(f"version {record.code.version}, {record.code.summary}", shown + rest, CODE_FILE)]
     return parts
+
+
+def command_on(record: Record, tool: str, *before: str) -> str:
+    """Return the command that does something with a run, whose folder follows on the words `before`, as it can be pasted
+    into a shell: with what says where a task of somebody's own is, and with the folder's path, for its experiment need not be
+    called as the task is.
+    """
+    given = Given(record.task) if record.given is None else record.given
+    return shlex.join(["python", "-m", f"legged.tools.{tool}", *given.flags, *before, relative(record.folder)])
 
 
 def _facts(record: Record) -> list[list[Cell]]:
@@ -161,8 +170,11 @@ def _differences(record: Record) -> list[Part]:
     heading = Heading("Settings other than the task's")
     found = from_task_file(record)
     if found is None:
-        text = f"There is no task '{record.task}' here to compare with; config.yaml has all settings."
-        return [heading, Paragraph(text)]
+        told = f", and `{command_on(record, 'report')}` says where it is" if record.given is not None else ""
+        text = f"There is no task '{record.task}' here to compare with{told}; config.yaml has all settings."
+        changes = {} if record.given is None else record.given.changes
+        set_there: list[list[Cell]] = [[Mono(path), Mono(words(value))] for path, value in changes.items()]
+        return [heading, Paragraph(text), *([Table(["setting", "the command line"], set_there)] if set_there else [])]
     if not found:
         return [heading, Paragraph("None: the run is its task as the task is now.")]
     rows: list[list[Cell]] = [[Mono(path), Mono(words(own)), Mono(words(of_task))] for path, (own, of_task) in found.items()]

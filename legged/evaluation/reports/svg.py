@@ -337,7 +337,7 @@ def _y_range(values: np.ndarray, axes: Axes) -> tuple[float, float]:
     values = values[np.isfinite(values)]
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
     if axes.log:
-        return (low / 1.2, high * 1.2) if high > 0.0 else (0.1, 1.0)
+        return (low / 1.2, high * 1.2) if low > 0.0 else (0.1, 1.0)
     low = low if axes.low is None else min(low, axes.low)
     if axes.high is not None:
         return low, axes.high

@@ -9,11 +9,12 @@ from functools import partial
 from typing import Any
 
 from legged.errors import ConfigError
+from legged.learning.run_folder import BEST
 from legged.play.live.drawing import Drawing
 from legged.play.live.history import AXES, UNITS
 from legged.play.live.plots import gait_figure, reward_figure, velocity_figures
 from legged.play.live.session import FASTEST, HARDEST_PUSH, SLOWEST, Session
-from legged.play.live.source import BEST, NEWEST
+from legged.play.live.source import NEWEST
 
 INSTALL = "pip install 'legged[watch]'"
 PICTURES_S, PLOTS_S, LOOK_S = 1.0 / 30.0, 0.25, 1.0
@@ -90,7 +91,7 @@ class Page:
     def _add_controls(self) -> None:
         gui, session = self.server.gui, self.session
         self.status = gui.add_markdown("")
-        self.choice = gui.add_dropdown("checkpoint", (NEWEST, BEST), initial_value=NEWEST, visible=False)
+        self.choice = gui.add_dropdown("checkpoint", (NEWEST, BEST), initial_value=session.follower.choice, visible=False)
         self.choice.on_update(lambda _: self._later(lambda: session.follow(str(self.choice.value))))
         if session.has_commands:
             with gui.add_folder("Command"):

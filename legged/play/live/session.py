@@ -10,9 +10,10 @@ from legged.config import TaskConfig
 from legged.envs import BaseTask, LeggedRobot
 from legged.errors import ConfigError
 from legged.learning.checkpoint import check_fits, read_checkpoint
+from legged.learning.run_folder import BEST
 from legged.play.live.ground import PLANE, ChosenGround, build, grounds_of
 from legged.play.live.history import History
-from legged.play.live.source import BEST, NEWEST, CheckpointFollower, Watched, age
+from legged.play.live.source import NEWEST, CheckpointFollower, Watched, age
 from legged.policies.actor import Actor
 from legged.process.paths import relative
 

@@ -11,6 +11,8 @@ from legged.commandline.arguments import overrides
 from legged.config import TaskConfig
 from legged.errors import ConfigError, suggest
 from legged.learning.run_folder import (
+    BEST,
+    BEST_MODEL,
     CONFIG_FILE,
     LOGS,
     checkpoints,
@@ -22,10 +24,8 @@ from legged.learning.run_folder import (
 from legged.process.paths import data_folder, exists, relative
 from legged.registry import task_config
 
-BEST_MODEL = "model_best.pt"
-"""The checkpoint that a training keeps because its evaluation was best, where it keeps one."""
-NEWEST, BEST = "newest", "best"
-"""The checkpoints that can be followed."""
+NEWEST = "newest"
+"""The checkpoint that is followed, unless it is the BEST, which a training keeps where it evaluates its policy."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,8 @@ class Watched:
     folder: Path
     checkpoint: int | None = None
     """The iteration that is shown whatever comes after it; none to follow the training."""
+    choice: str = NEWEST
+    """Which checkpoint of the training is followed at first: NEWEST or BEST."""
 
 
 def find_watched(args: argparse.Namespace) -> Watched:
@@ -54,10 +56,10 @@ def find_watched(args: argparse.Namespace) -> Watched:
     cfg = run_config(folder)
     if args.task is not None and cfg.task != args.task:
         raise ConfigError(f"--load_run: {relative(folder)} was trained on '{cfg.task}', not on '{args.task}'")
-    fixed = None if args.checkpoint in (None, -1) else args.checkpoint
-    if fixed is not None:
-        find_checkpoint(folder, fixed)
-    return Watched(cfg, folder, fixed)
+    if args.checkpoint in (None, -1):
+        return Watched(cfg, folder)
+    find_checkpoint(folder, args.checkpoint)
+    return Watched(cfg, folder, choice=BEST) if args.checkpoint == BEST else Watched(cfg, folder, args.checkpoint)
 
 
 def _newest(task: TaskConfig | None, experiment: Path | None) -> Path:
@@ -109,9 +111,9 @@ class CheckpointFollower:
     """Looks into a run folder for the checkpoint to be shown, and says when it is another one."""
 
     def __init__(self, watched: Watched) -> None:
-        """Follow the newest checkpoint; nothing has been shown yet."""
+        """Follow the checkpoint that is asked for; nothing has been shown yet."""
         self.watched = watched
-        self.choice = NEWEST
+        self.choice = watched.choice
         """NEWEST or BEST; of no account where one checkpoint was asked for."""
         self._shown: tuple[Path, int, int] | None = None
 

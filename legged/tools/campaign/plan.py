@@ -28,7 +28,7 @@ class Order:
     overrides: tuple[str, ...] = ()
     """`key=value`, of the trainings."""
     module: str | None = None
-    """Module that registers tasks, or a file of one."""
+    """Module that registers tasks, or a file of one, or a YAML file that is one."""
     sim_device: str | None = None
     on_cpu: bool = False
     """Whether tasks take the settings of their `cpu:` section."""

@@ -20,6 +20,9 @@ LARGEST = 700_000
 """A file with the critic, at most [bytes]: a larger one holds the actor alone, which is enough to act."""
 ACTOR = ("actor_state_dict", "iter", "infos")
 BOTH = ("actor_state_dict", "critic_state_dict", "iter", "infos")
+JUDGED = ("evaluation_*", "crossing.*", "time_to_walk.json")
+"""Files that say what a policy was found to be worth."""
+PICTURES = ("*.png", "*.gif", "*.mp4")
 
 
 def ship(runs: Sequence[JudgedRun], folder: Path) -> list[str]:
@@ -50,6 +53,9 @@ def ship(runs: Sequence[JudgedRun], folder: Path) -> list[str]:
             _copy(other, folder / task / f"seed_{other.seed}")
         more = "".join(f", evaluations of seed {other.seed}" for other in others)
         lines.append(f"{relative(folder / task)}: policy of seed {first.seed}, {len(model) / 1e6:.2f} MB{more}")
+        pictures = sorted(path.name for pattern in PICTURES for path in (folder / task).glob(pattern))
+        if pictures:  # which may be linked to from pages, and are drawn by other commands
+            lines.append(f"{relative(folder / task)}: draw anew what shows the policy before: {', '.join(pictures)}")
     return lines
 
 
@@ -91,7 +97,7 @@ def _remove_shipment(folder: Path) -> None:
     try:
         (folder / MOTORS).unlink(missing_ok=True)
         for place in (folder, *seeds):
-            for path in [place / TIMING_FILE, *place.glob("evaluation_*")]:
+            for path in [place / TIMING_FILE, *(path for pattern in JUDGED for path in place.glob(pattern))]:
                 path.unlink(missing_ok=True)
         for seed in seeds:
             if not any(seed.iterdir()):  # what else lies there is not ours

@@ -1,12 +1,15 @@
 """What a sweep has found: a table of its trials, the settings of the best, and figures."""
 
+import json
 import shlex
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from legged.config import parse_override
 from legged.config.loader import merge, nest
 from legged.config.origins import Origins
 from legged.figures import COLORS, figure
@@ -25,8 +28,9 @@ WIDEST_NAME = 28
 """Letters of a setting's name in a figure."""
 
 
-def write_report(trials: Trials) -> list[str]:
-    """Write table.md, best.yaml and figures into the sweep's folder; return lines on what was found and where it is.
+def write_report(trials: Trials, module: str | None = None) -> list[str]:
+    """Write table.md, best.yaml and figures into the sweep's folder; return lines on what was found and where it is. `module`
+    is what --import named.
 
     Raises:
         RunError: a file can't be written.
@@ -34,7 +38,7 @@ def write_report(trials: Trials) -> list[str]:
     plan, all_trials = trials.plan, trials.all
     ranked = ranking(plan, all_trials)
     folder = plan.folder
-    write_text(folder / "table.md", table(plan, all_trials))
+    write_text(folder / "table.md", table(plan, all_trials, module))
     written = [folder / "table.md"]
     lines = [f"{trials.done} of {plan.given.trials} trials are done"]
     if ranked:
@@ -63,7 +67,7 @@ def settings(plan: Plan, trial: "FrozenTrial") -> dict[str, Any]:
     return {one.path: one.value(trial.params[one.path]) for one in plan.parameters if one.path in trial.params}
 
 
-def table(plan: Plan, trials: Sequence["FrozenTrial"]) -> str:
+def table(plan: Plan, trials: Sequence["FrozenTrial"], module: str | None = None) -> str:
     """Return all trials as Markdown: those with a value by rank, then those that were ended early, then the others."""
     order = {"PRUNED": 0, "RUNNING": 1, "WAITING": 2, "FAIL": 3}
     ranked = ranking(plan, trials)
@@ -84,9 +88,10 @@ def table(plan: Plan, trials: Sequence["FrozenTrial"]) -> str:
             why += f"; {sign * trial.intermediate_values[step]:.4g} at {step}"
         lines.append(_row(["", trial.number, why, *_values(plan, trial, paths), _runs(trial)]))
     if ranked:
-        command = shlex.join([f"{path}={_text(value)}" for path, value in settings(plan, ranked[0]).items()])
+        words = ["python", "train.py", *(["--import", module] if module else []), "--task", plan.given.task]
+        words += [_override(path, value) for path, value in settings(plan, ranked[0]).items()]
         lines += ["", "The settings of the best, as YAML:", "", "```yaml", best_yaml(plan, ranked[0]).rstrip(), "```"]
-        lines += ["", "and on the command line:", "", "```", f"python train.py --task {plan.given.task} {command}", "```"]
+        lines += ["", "and on the command line:", "", "```", shlex.join(words), "```"]
         if plan.given.overrides:
             common = ", ".join(f"`{path}={_text(value)}`" for path, value in plan.given.overrides.items())
             lines += ["", f"Neither holds what all trials had in common: {common}."]
@@ -103,7 +108,14 @@ def _values(plan: Plan, trial: "FrozenTrial", paths: Sequence[str]) -> list[str]
 
 
 def _text(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value).lower() if isinstance(value, bool) else str(value)
+    """Return a value as it would stand in a YAML file, all of its digits: it is copied from there."""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _override(path: str, value: Any) -> str:
+    """Return `key=value` for the command line; a text that would be read as something else has quotation marks."""
+    plain = f"{path}={_text(value)}"
+    return plain if parse_override(plain) == (path, value) else f"{path}={json.dumps(value)}"
 
 
 def _runs(trial: "FrozenTrial") -> str:
@@ -121,17 +133,20 @@ def best_yaml(plan: Plan, best: "FrozenTrial") -> str:
 
 def importances(trials: Trials) -> dict[str, float]:
     """Return dotted path -> share of what the settings explain of which trials are among the best (PED-ANOVA, Watanabe et
-    al., arXiv 2304.10255), the largest first; nothing while there are too few trials to tell.
+    al., arXiv 2304.10255), the largest first; nothing while there are too few trials to tell, or while the best quarter
+    is no better than the rest: all settings would come out alike.
     """
     import optuna
 
     if len(ranking(trials.plan, trials.all)) < FEWEST or len(trials.plan.parameters) < 2:
         return {}
     evaluator = optuna.importance.PedAnovaImportanceEvaluator(target_quantile=0.25)
-    try:
-        return dict(optuna.importance.get_param_importances(trials.study, evaluator=evaluator))
-    except (ValueError, RuntimeError):  # all values are the same
-        return {}
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*select the same set of trials", category=UserWarning)
+        try:
+            return dict(optuna.importance.get_param_importances(trials.study, evaluator=evaluator))
+        except (ValueError, RuntimeError, UserWarning):
+            return {}
 
 
 # ---- figures ---------------------------------------------------------------------------------------------------------

@@ -32,6 +32,8 @@ OWNER, ALIVE, TRIES, WHY, RUNS = "owner", "alive", "tries", "why", "runs"
 """What we note of a trial."""
 SWEEP = "sweep"
 """What we note of the study: what must stay the same."""
+DEVICE = "device"
+"""And on what its trials are trained: cpu or cuda."""
 
 
 def check_installed() -> None:
@@ -80,6 +82,21 @@ class Trials:
             raise ConfigError(
                 f"sweep: '{plan.name}' was begun with another task, other seeds, overrides, parameters or another objective;"
                 " give this one another name (name: in its file)"
+            )
+
+    def keep_to(self, device: str) -> None:
+        """Note what kind of device, cpu or cuda, trials are trained on from the first one on.
+
+        Raises:
+            ConfigError: those before were trained on the other kind.
+        """
+        known = self.study.user_attrs.get(DEVICE)
+        if known is None:
+            self.study.set_user_attr(DEVICE, device)
+        elif known != device:
+            raise ConfigError(
+                f"--sim_device: the trials of '{self.plan.name}' are trained on {known}, and those on {device} can't be"
+                f" compared with them; go on with --sim_device {known}, or give this sweep another name (name: in its file)"
             )
 
     @property

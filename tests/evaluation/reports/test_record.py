@@ -101,6 +101,13 @@ def test_whose_log_is_written(monkeypatch):
     here = folder / f"events.out.tfevents.123.{socket.gethostname()}.{os.getpid()}.0"
     here.touch()
     assert is_running(folder)
+
+    def refuse(process, signal):
+        raise PermissionError
+
+    with monkeypatch.context() as of_another_user:
+        of_another_user.setattr(os, "kill", refuse)
+        assert is_running(folder)
     os.utime(here, (0, 0))  # its number is somebody else's by now
     assert not is_running(folder)
     elsewhere = folder / "events.out.tfevents.123.another-host.99.0"

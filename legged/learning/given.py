@@ -1,0 +1,68 @@
+"""What a training was told on its command line: given.json in its run folder.
+
+A task of a user's own is known by its name to nobody who has not been told where it is. A report therefore names it as it was
+named, and where it can't be looked up says what the command line set.
+"""
+
+import json
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from legged.config.checks import shown
+from legged.errors import ConfigError
+from legged.process.paths import relative, write_text
+
+GIVEN_FILE = "given.json"
+
+
+@dataclass(frozen=True)
+class Given:
+    """A task as it was named, and what was set."""
+
+    task: str
+    """Its name, or its YAML file."""
+    module: str | None = None
+    """What --import named."""
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    """Dotted path -> value; of a resumed training also those of the command lines before."""
+
+    @property
+    def flags(self) -> list[str]:
+        """The flags by which another command finds the task."""
+        return ["--task", self.task, *(["--import", self.module] if self.module else [])]
+
+
+def write_given(folder: Path, given: Given, before: Path | None = None) -> None:
+    """Write what a training was told into its run folder; `before` is the folder that it goes on from, if it does.
+
+    Raises:
+        RunError: it can't be written.
+    """
+    earlier: Mapping[str, Any] = {}
+    if before is not None:
+        with suppress(ConfigError):  # a report on that run names what is damaged
+            earlier = (read_given(before) or given).changes
+    said = {"task": given.task, "import": given.module, "changes": {**earlier, **given.changes}}
+    write_text(folder / GIVEN_FILE, json.dumps(said, indent=1, default=str) + "\n")
+
+
+def read_given(folder: Path) -> Given | None:
+    """Read what the training of a run folder was told; None where it does not say that, as older ones do not.
+
+    Raises:
+        ConfigError: the file is none that was written here.
+    """
+    path = folder / GIVEN_FILE
+    if not path.is_file():
+        return None
+    try:
+        said: Any = json.loads(path.read_text(encoding="utf-8"))
+        for name, kind in (("task", str), ("import", str | None), ("changes", dict)):
+            if not isinstance(said[name], kind):
+                raise TypeError(f"{name}: got {shown(said[name])}")
+        return Given(said["task"], said["import"], said["changes"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ConfigError(f"{relative(path)}: does not say what a training was told ({error})") from error
