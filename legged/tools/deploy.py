@@ -25,10 +25,10 @@ from legged.policies.export import EXPORTED, export
 from legged.policies.restore import policy_of, restore, undisturbed
 from legged.process.paths import exists, ready_to_write, relative
 from legged.process.startup import INTERRUPTED, in_main_thread
+from legged.registry import import_tasks
 from legged.robots.robot import Robot, load_robot
 from legged.tools.simulate_robot import LISTENING, add_simulation_arguments, check_simulation, motors_of, terrain_of
 from legged.tools.simulator.film import POSES, make_film
-from legged.user_modules import import_tasks
 
 ROOM_MB = 16.0
 """What the disk must have room for: the exported policy and the log [MiB]."""
@@ -59,7 +59,7 @@ def build_parser() -> CommandParser:
         required=True,
         help="exported folder, run folder, or task (or its YAML file) whose newest or shipped policy",
     )
-    parser.add_argument("--import", dest="module", action=Once, help="module or .py file that registers tasks of your own")
+    parser.add_argument("--import", dest="module", action=Once, help="module, or .py or YAML file, with tasks of your own")
     parser.add_argument("--robot", required=True, choices=("sim",), help="sim; a robot has its own command, legged.deploy")
     parser.add_argument("--simulated", metavar="ROBOT", help="name or folder of the robot; the policy's by default")
     add_simulation_arguments(parser)
