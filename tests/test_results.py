@@ -181,7 +181,7 @@ def test_numbers_of_the_quadrupeds_on_rough_ground_are_those_of_the_shipped_eval
     assert f"| {' | '.join(row)} |" in RESULTS
     beyond = [", ".join(f"{crossings(results[1], name)[i][1]:.0f}" for i in (3, 4, 5)) for name in (*ways, "obstacles")]
     assert f"| {ROUGH_QUADRUPEDS[task]} | {' | '.join(beyond)} |" in RESULTS
-    least = int(re.findall(r"\| stairs of 0\.36 of their height: (\d+) to 100 % \|", README)[0])
+    least = int(re.findall(r"\| up stairs of 0\.36 of their height: (\d+) to 100 % \|", README)[0])
     for each in results:
         assert crossings(each, "stairs_up")[3][1] >= 95.0
         assert crossings(each, "stairs_up")[3][1] >= least

@@ -50,16 +50,17 @@ def evaluate_following(
     figures = measure_tracking(task, act, grid)
     lost = figures.pop("contact_overflows")
     rough = cfg.terrain.mesh_type != "plane"
+    bumps = {"bumps": BUMPS * task.cfg.terrain.scale} if rough else {}  # [m]
     head = header(policy, engine, torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu", asked)
     success = success_over_difficulty(policy, types, robots, full, asked, device, graph) if types else None
     result = {
         **head,
         "wall_s": time.perf_counter() - start,
-        **({"rough": {"bumps": BUMPS, **figures, "contact_overflows": lost}} if rough else figures),
+        **({"rough": {**bumps, **figures, "contact_overflows": lost}} if rough else figures),
         **({} if success is None else {"success": success}),
     }
     # First what is on the screen: no disk can take it away any more.
-    tracking = {**head, **figures, "ground": "on rough ground, " if rough else ""}
+    tracking = {**head, **bumps, **figures, "ground": "on rough ground, " if rough else ""}
     print_tracking(tracking)
     warn_of_overflows("tracking", lost)
     if success is not None:

@@ -11,7 +11,6 @@ from rich.table import Table
 
 from legged.evaluation.velocity_grid import AXES
 from legged.figures import figure
-from legged.terrain import BUMPS
 
 GAIT = (
     ("duty factor", "duty_factor", 1.0, "{:.2f}"),
@@ -27,7 +26,7 @@ def print_tracking(result: dict[str, Any]) -> None:
     lin, ang, gait = result["rmse_lin"], result["rmse_ang"], result["gait"]
     title = f"{result['task']} ({result['checkpoint']}) in {result['physics']}"
     if result["ground"]:
-        title += f", on level ground with bumps of up to {100 * BUMPS:g} cm"
+        title += f", on level ground with bumps of up to {100 * result['bumps']:.2g} cm"
     table = Table(title=escape(title), title_justify="left")
     for name, justify in (("measure", "left"), ("value", "right"), ("where", "left")):
         table.add_column(name, justify=justify)  # type: ignore[arg-type]

@@ -71,7 +71,7 @@ def _main(argv: list[str] | None) -> int:
         if isinstance(seconds, int | float):
             training["wall_s"] = seconds
         export(task, act.network, folder / f"{iterations:05d}", training)
-    print(f"exported {len(paths)} checkpoints to {relative(folder)}")
+    print(f"exported {len(paths)} checkpoint{'s' if len(paths) != 1 else ''} to {relative(folder)}")
     return 0
 
 

@@ -6,6 +6,7 @@ killed. `--film` films the policy first, where pictures can be drawn; `--note` k
 """
 
 import argparse
+import shlex
 import sys
 from pathlib import Path
 
@@ -65,7 +66,7 @@ def _main(argv: list[str] | None) -> int:
     for folder in folders:
         ready_to_write(folder, 4.0)
         if args.film:
-            why = _film(folder, args.checkpoint)
+            why = _film(folder, args)
             print(f"no film: {why}" if why else f"written: {relative(folder / FILMS[0])}", flush=True)
         print(f"written: {relative(write_report(folder))}", flush=True)
     return 0
@@ -103,14 +104,17 @@ def write_note(folders: list[Path], text: str) -> None:
         write_text(folder / NOTE_FILE, " ".join(text.split()) + "\n")
 
 
-def _film(folder: Path, checkpoint: int | None) -> str:
+def _film(folder: Path, args: argparse.Namespace) -> str:
     """Film the policy of a run; return why that can't be done, nothing if it was."""
     try:
         cfg = run_config(folder)
         if not isinstance(cfg, LeggedConfig):
-            return f"'{cfg.task}' follows no commands; python -m legged.tools.play --task {cfg.task} --gif makes one"
+            words = ["python", "-m", "legged.tools.play", "--task", args.given_task if args.task else cfg.task]
+            words += ["--import", args.module] if args.module else []
+            command = shlex.join([*words, "--load_run", relative(folder), "--gif"])
+            return f"'{cfg.task}' follows no commands; {command} makes one"
         torch.set_num_threads(1)
-        policy = TrainedPolicy(cfg, find_checkpoint(folder, checkpoint))
+        policy = TrainedPolicy(cfg, find_checkpoint(folder, args.checkpoint))
         write_sheet(sheet([film(policy, SIDE)], [cfg.task]), folder / FILMS[0])
     except (ConfigError, RunError) as error:
         return " ".join(str(error).split())

@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from helpers import POLICY, TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
 
 from legged import make_task
 from legged.config import override
 from legged.errors import ConfigError
 from legged.evaluation import success
+from legged.evaluation.following import evaluate_following
 from legged.evaluation.overflows import warn_of_overflows
 from legged.evaluation.success import (
     chosen_types,
@@ -23,7 +25,8 @@ from legged.evaluation.success_report import is_beyond, panels_of, with_other_en
 from legged.evaluation.tiles import cell_for, dividing_cell, on_terrain, rough_ground, rough_side, tiles_of_sizes
 from legged.evaluation.velocity_grid import Grid
 from legged.evaluation.velocity_tracking import measure_tracking, place_to_track
-from legged.policies.restore import undisturbed
+from legged.learning.run_folder import find_checkpoint, run_config
+from legged.policies.restore import TrainedPolicy, undisturbed
 from legged.registry import task_config
 from legged.terrain import Terrain, TileSpec, check_terrain
 from legged.tools import evaluate
@@ -106,6 +109,18 @@ def test_small_robots_are_tracked_on_rough_ground_too():
     changes, ground = place_to_track(cfg, grid, [])
     check_terrain(override(cfg, changes).terrain, cfg.origins)
     assert min(ground.tile_size) == pytest.approx(rough_side(grid), abs=cfg.terrain.horizontal_scale)
+
+
+def test_bumps_are_as_high_as_is_said_for_a_small_robot(tmp_path, capsys):
+    """A Go2's ground is 0.589 times an ANYmal's."""
+    cfg = override(run_config(POLICY.with_name("go2")), [("sim.physics", "mujoco"), ("sim.threads", 1)])
+    heights = place_to_track(cfg, Grid([0.5], [0.0], [0.0]), [])[1].height_map.heights
+    assert (heights.min(), heights.max()) == pytest.approx((-0.0295, 0.0295), abs=1e-4)
+    policy = TrainedPolicy(cfg, find_checkpoint(POLICY.with_name("go2"), None))
+    grid = Grid([0.5], [0.0], [0.0], robots=1, hold_s=1.2)
+    assert evaluate_following(policy, grid, (), 1, False, [], torch.device("cpu"), False, tmp_path) == 0
+    assert "on level ground with bumps of up to 2.9 cm" in capsys.readouterr().out
+    assert json.loads((tmp_path / "evaluation_mujoco.json").read_text())["rough"]["bumps"] == pytest.approx(0.0295, abs=1e-4)
 
 
 def test_types_are_measured_in_cells_that_make_what_they_are_called():

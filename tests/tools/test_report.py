@@ -319,6 +319,21 @@ def test_a_resumed_run_keeps_what_was_set_before():
     assert any(GIVEN_FILE in text for text in read_record(first).problems)
 
 
+def test_a_task_without_commands_is_told_the_command_that_films_it(capsys):
+    """The task of a YAML file and of a module is found by it, and the run that it films is this one."""
+    Path("mine.yaml").write_text("extends: half_cheetah\n", encoding="utf-8")
+    Path("my tasks.py").write_text("", encoding="utf-8")
+    told = ["--import", "my tasks.py", "--task", "mine.yaml"]
+    folder = tiny_run(*told, iterations=1)
+    film = ["python", "-m", "legged.tools.play", "--task", "mine.yaml", "--import", "my tasks.py", "--load_run", str(folder)]
+    assert report.main([*told, "--film"]) == 0
+    assert f"no film: 'mine' follows no commands; {shlex.join([*film, '--gif'])} makes one\n" in capsys.readouterr().out
+
+    plain = tiny_run("--task", "half_cheetah", iterations=1)
+    assert report.main([str(plain), "--film"]) == 0
+    assert f"python -m legged.tools.play --task half_cheetah --load_run {plain} --gif makes one\n" in capsys.readouterr().out
+
+
 # ---- command line ----------------------------------------------------------------------------------------------------
 
 
