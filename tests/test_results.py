@@ -1,4 +1,4 @@
-"""The numbers of the page of results, and those of the README, are those of the evaluations that come with the policies."""
+"""The numbers of the README and of the pages of results and evaluation are those of the files that come with the policies."""
 
 import json
 import re
@@ -8,7 +8,9 @@ import pytest
 from helpers import POLICY
 
 ROOT = Path(__file__).resolve().parents[1]
-README, RESULTS = ((ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/results.md"))
+README, RESULTS, EVALUATION = (
+    (ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/results.md", "docs/evaluation.md")
+)
 ROUGH = ROOT / "resources" / "policies" / "anymal_c"
 
 
@@ -205,6 +207,28 @@ def test_numbers_of_the_bipeds_on_rough_ground_are_those_of_the_shipped_evaluati
         for name in ("stairs_up", "stairs_down", "obstacles")
     ]
     assert f"| {row} | {' | '.join(beyond)} |" in RESULTS
+
+
+@pytest.mark.parametrize(
+    ("row", "folder"),
+    [
+        ("`anymal_c`, seed 1 (in the package)", "anymal_c"),
+        ("`anymal_c`, seed 2", "anymal_c/seed_2"),
+        ("`anymal_c`, seed 3", "anymal_c/seed_3"),
+        ("`anymal_c_blind`", "anymal_c_blind"),
+        ("`anymal_c_proprio`, with a history", "anymal_c_proprio"),
+    ],
+)
+def test_numbers_of_the_stress_table_are_those_of_the_shipped_stress_tests(row, folder):
+    result = json.loads((ROUGH.parent / folder / "stress_mujoco.json").read_text())
+    score, lines = result["score"], {line["name"]: line["stairs"] for line in result["lines"]}
+    cells = [f"{100.0 * score['value']:.1f} % ({100.0 * score['low']:.0f} to {100.0 * score['high']:.0f})"]
+    cells += [f"{100.0 * score[part]:.0f} %" for part in ("stairs", "flat", "ground")]
+    measured = [lines[name] for name in ("no map", "together", "everything")]
+    measured += [result["ground"][name] for name in ("dense_blocks", "kerbs", "rubble")]
+    assert all(point["robots"] == 128 for point in measured)
+    cells += [str(point["robots"] - point["successes"]) for point in measured]
+    assert f"| {row} | {' | '.join(cells)} |\n" in EVALUATION
 
 
 @pytest.mark.parametrize(("row", "folder"), [("1", "seed_1"), ("2, shipped", ""), ("3", "seed_3")])

@@ -24,6 +24,11 @@ def file_name(engine: str) -> str:
     return f"evaluation_{engine}.json"
 
 
+def stress_name(engine: str) -> str:
+    """Return what the result of a stress test in an engine is called."""
+    return f"stress_{engine}.json"
+
+
 def read_results(paths: Iterable[Path]) -> list[dict[str, Any]]:
     """Read the results in files and folders; one that is named twice, itself and by its folder, counts once.
 

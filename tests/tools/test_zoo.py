@@ -276,7 +276,7 @@ def test_a_shipment_leaves_nothing_of_the_one_before_it():
     place = Path("shipped") / TASK
     for left in ("seed_2/timing.json", "seed_2/evaluation_mujoco.json", "seed_3/own.txt", "evaluation_newton_xpbd.json",
                  "evaluation_mujoco.png", "timing.json", "play.gif", "model.pt", "crossing.json", "crossing.png",
-                 "time_to_walk.json"):  # fmt: skip
+                 "time_to_walk.json", "stress_mujoco.json", "seed_2/stress_mujoco.json"):  # fmt: skip
         (place / left).parent.mkdir(parents=True, exist_ok=True)
         (place / left).write_text(left)
     run = tiny_run("--run_name", "s1", "--seed", "1", iterations=1)
@@ -293,6 +293,18 @@ def test_a_shipment_leaves_nothing_of_the_one_before_it():
     assert names == {"model.pt", "config.yaml", "timing.json", "play.gif", "seed_3/own.txt"}
     assert not (place / "seed_2").exists()
     assert read_timing(place) == read_timing(run)
+
+
+def test_stress_tests_of_the_policy_are_shipped_with_it():
+    run = tiny_run("--run_name", "s1", "--seed", "1", iterations=1)
+    (run / "stress_mujoco.json").write_text('{"checkpoint": "model_0.pt"}')
+    (run / "stress_mujoco_warp.json").write_text('{"checkpoint": "model_best.pt"}')  # of another one
+    ship(find_runs([run]), Path("shipped"))
+    assert [path.name for path in (Path("shipped") / TASK).glob("stress_*")] == ["stress_mujoco.json"]
+    (run / "stress_mujoco.json").write_text("[]")
+    with pytest.raises(ConfigError, match=r"stress_mujoco\.json: is not the result of a stress test"):
+        ship(find_runs([run]), Path("shipped"))
+    assert (Path("shipped") / TASK / "stress_mujoco.json").exists()  # the old one is there as it was
 
 
 def test_a_shipped_policy_is_not_shipped_over_itself():

@@ -13,6 +13,7 @@ from rich.table import Table
 from legged.config import LeggedConfig, override
 from legged.evaluation.episodes import header
 from legged.evaluation.overflows import warn_of_overflows
+from legged.evaluation.result_file import stress_name
 from legged.evaluation.stress.measuring import (
     HALF_STEP,
     HOLD_S,
@@ -97,7 +98,7 @@ def evaluate_stress(
     print_stress(result)
     warn_of_overflows("stress", bench.lost)
     make_folder(folder)
-    path = folder / f"stress_{engine}.json"
+    path = folder / stress_name(engine)
     write_text(path, json.dumps(result, indent=1, allow_nan=False))
     draw_stress(result, path.with_suffix(".png"))
     print(f"written: {relative(path)}, {relative(path.with_suffix('.png'))}")

@@ -1,6 +1,7 @@
-"""A policy as it comes with the package: small, with its configuration, its times and its evaluations."""
+"""A policy as it comes with the package: small, with its configuration, its times, its evaluations and its stress tests."""
 
 import io
+import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,9 +11,9 @@ import torch
 from legged.config.actuator import MOTORS
 from legged.errors import ConfigError, RunError
 from legged.evaluation.judged_run import SEED_FOLDER, JudgedRun
-from legged.evaluation.result_file import file_name
+from legged.evaluation.result_file import file_name, stress_name
 from legged.learning.checkpoint import read_checkpoint
-from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL, checkpoints, find_checkpoint
+from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL, checkpoints, find_checkpoint, of_another_policy
 from legged.learning.timing import TIMING_FILE
 from legged.process.paths import make_folder, reason, relative, write_bytes
 
@@ -20,18 +21,18 @@ LARGEST = 700_000
 """A file with the critic, at most [bytes]: a larger one holds the actor alone, which is enough to act."""
 ACTOR = ("actor_state_dict", "iter", "infos")
 BOTH = ("actor_state_dict", "critic_state_dict", "iter", "infos")
-JUDGED = ("evaluation_*", "crossing.*", "time_to_walk.json")
+JUDGED = ("evaluation_*", "stress_*", "crossing.*", "time_to_walk.json")
 """Files that say what a policy was found to be worth."""
 PICTURES = ("*.png", "*.gif", "*.mp4")
 
 
 def ship(runs: Sequence[JudgedRun], folder: Path) -> list[str]:
-    """Write `folder`/<task>/ for each task: the policy of the lowest seed that has finished, with configuration, times and
-    evaluations, and in seed_<number>/ times and evaluations of the others. Of several runs of a seed the last counts. What an
-    earlier shipment has left of these goes. Return a line on each.
+    """Write `folder`/<task>/ for each task: the policy of the lowest seed that has finished, with configuration, times,
+    evaluations and stress tests, and in seed_<number>/ times, evaluations and stress tests of the others. Of several runs of
+    a seed the last counts. What an earlier shipment has left of these goes. Return a line on each.
 
     Raises:
-        ConfigError: a checkpoint can't be read, or a run lies where it would be shipped to.
+        ConfigError: a checkpoint or a stress test can't be read, or a run lies where it would be shipped to.
         RunError: a file can't be written.
     """
     finished = [run for run in runs if run.folder is not None and not run.failure]
@@ -45,12 +46,13 @@ def ship(runs: Sequence[JudgedRun], folder: Path) -> list[str]:
             continue
         others = [run for run in seeds if run is not first]
         model = _small(find_checkpoint(first.folder, None))
+        files = {run.seed: _judged(run) for run in seeds}  # before what is there goes
         make_folder(folder / task)
         _remove_shipment(folder / task)
         write_bytes(folder / task / SHIPPED_MODEL, model)
-        _copy(first, folder / task, (CONFIG_FILE, MOTORS))
+        _copy(first, folder / task, (CONFIG_FILE, MOTORS, *files[first.seed]))
         for other in others:
-            _copy(other, folder / task / f"seed_{other.seed}")
+            _copy(other, folder / task / f"seed_{other.seed}", files[other.seed])
         more = "".join(f", evaluations of seed {other.seed}" for other in others)
         lines.append(f"{relative(folder / task)}: policy of seed {first.seed}, {len(model) / 1e6:.2f} MB{more}")
         pictures = sorted(path.name for pattern in PICTURES for path in (folder / task).glob(pattern))
@@ -106,11 +108,29 @@ def _remove_shipment(folder: Path) -> None:
         raise RunError(f"{relative(folder)}: {reason(error)}") from error
 
 
-def _copy(run: JudgedRun, folder: Path, more: tuple[str, ...] = ()) -> None:
-    """Copy evaluations and times of a run, and some `more` of its files."""
+def _judged(run: JudgedRun) -> tuple[str, ...]:
+    """Return the names of the files that say what a run came to: times, evaluations, and stress tests of its last policy.
+
+    Raises:
+        ConfigError: a stress test is damaged.
+    """
+    assert run.folder is not None, "those without one were left out"
+    found = [TIMING_FILE, *map(file_name, run.results)]
+    for path in sorted(run.folder.glob(stress_name("*"))):
+        try:
+            checkpoint = json.loads(path.read_text(encoding="utf-8"))["checkpoint"]
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+            raise ConfigError(f"{relative(path)}: is not the result of a stress test ({error})") from error
+        if not of_another_policy(run.folder, checkpoint):
+            found.append(path.name)
+    return tuple(found)
+
+
+def _copy(run: JudgedRun, folder: Path, names: Sequence[str]) -> None:
+    """Copy the files of those names that a run has."""
     assert run.folder is not None, "those without one were left out"
     make_folder(folder)
-    for name in (TIMING_FILE, *more, *map(file_name, run.results)):
+    for name in names:
         if (run.folder / name).is_file():
             try:
                 shutil.copyfile(run.folder / name, folder / name)
