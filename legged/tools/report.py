@@ -6,7 +6,6 @@ killed. `--film` films the policy first, where pictures can be drawn; `--note` k
 """
 
 import argparse
-import shlex
 import sys
 from pathlib import Path
 
@@ -17,8 +16,8 @@ from legged.commandline.command import run_main
 from legged.commandline.parser import CommandParser, Once
 from legged.config import LeggedConfig
 from legged.errors import ConfigError, RunError
-from legged.evaluation.reports.record import FILMS
-from legged.evaluation.reports.run_report import write_report
+from legged.evaluation.reports.record import FILMS, read_record
+from legged.evaluation.reports.run_report import command_on, write_report
 from legged.learning.run_folder import CONFIG_FILE, NOTE_FILE, find_checkpoint, find_run, run_config
 from legged.play.contact_sheet import film, sheet, write_sheet
 from legged.policies.restore import TrainedPolicy
@@ -66,7 +65,7 @@ def _main(argv: list[str] | None) -> int:
     for folder in folders:
         ready_to_write(folder, 4.0)
         if args.film:
-            why = _film(folder, args)
+            why = _film(folder, args.checkpoint)
             print(f"no film: {why}" if why else f"written: {relative(folder / FILMS[0])}", flush=True)
         print(f"written: {relative(write_report(folder))}", flush=True)
     return 0
@@ -104,17 +103,15 @@ def write_note(folders: list[Path], text: str) -> None:
         write_text(folder / NOTE_FILE, " ".join(text.split()) + "\n")
 
 
-def _film(folder: Path, args: argparse.Namespace) -> str:
+def _film(folder: Path, checkpoint: int | str | None) -> str:
     """Film the policy of a run; return why that can't be done, nothing if it was."""
     try:
         cfg = run_config(folder)
         if not isinstance(cfg, LeggedConfig):
-            words = ["python", "-m", "legged.tools.play", "--task", args.given_task if args.task else cfg.task]
-            words += ["--import", args.module] if args.module else []
-            command = shlex.join([*words, "--load_run", relative(folder), "--gif"])
-            return f"'{cfg.task}' follows no commands; {command} makes one"
+            command = command_on(read_record(folder), "play", "--load_run")
+            return f"'{cfg.task}' follows no commands; {command} --gif makes one"
         torch.set_num_threads(1)
-        policy = TrainedPolicy(cfg, find_checkpoint(folder, args.checkpoint))
+        policy = TrainedPolicy(cfg, find_checkpoint(folder, checkpoint))
         write_sheet(sheet([film(policy, SIDE)], [cfg.task]), folder / FILMS[0])
     except (ConfigError, RunError) as error:
         return " ".join(str(error).split())
