@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from legged.commandline.parser import Once
+from legged.commandline.parser import add_import_argument
 from legged.config import parse_override
 from legged.errors import ConfigError
 from legged.process.paths import relative
@@ -20,7 +20,7 @@ def add_task_arguments(parser: argparse.ArgumentParser, required: bool = True) -
     overrides.
     """
     parser.add_argument("--task", required=required, help="name of the task, e.g. anymal_c_flat, or a YAML file")
-    parser.add_argument("--import", dest="module", action=Once, help="module, or .py or YAML file, with tasks of your own")
+    add_import_argument(parser)
     parser.add_argument("--num_envs", type=int, help="number of robots (env.num_envs)")
     parser.add_argument("--seed", type=int, help="random seed (env.seed)")
     parser.add_argument("--physics", metavar="ENGINE", help="mujoco_warp, mujoco or newton; that of the device by default")

@@ -47,6 +47,11 @@ class Once(argparse.Action):
         setattr(namespace, self.dest, values)
 
 
+def add_import_argument(parser: argparse.ArgumentParser) -> None:
+    """Add the flag that names tasks of a user's own, which all commands spell alike; `args.module` has it."""
+    parser.add_argument("--import", dest="module", action=Once, help="module, or .py or YAML file, with tasks of your own")
+
+
 class Paragraphs(argparse.HelpFormatter):
     """A layout of help that fills each paragraph by itself, and leaves those with indented lines as they are."""
 

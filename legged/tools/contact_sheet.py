@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from legged.commandline.command import run_main
-from legged.commandline.parser import CommandParser, Once
+from legged.commandline.parser import CommandParser, add_import_argument
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.play.contact_sheet import film, sheet, write_sheet
@@ -48,7 +48,7 @@ def build_parser() -> CommandParser:
     parser.add_argument("--out", type=Path, required=True, help="the file, .gif or .png")
     parser.add_argument("--columns", type=int, help="tiles side by side; so many that the sheet is twice as wide as high")
     parser.add_argument("--side", type=int, default=SIDE, help=f"width and height of a tile [pixels]; {SIDE}")
-    parser.add_argument("--import", dest="module", action=Once, help="module, or .py or YAML file, with tasks of your own")
+    add_import_argument(parser)
     return parser
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from legged.commandline.command import EXIT_WRONG_INPUT, run_main
-from legged.commandline.parser import CommandParser, Once
+from legged.commandline.parser import CommandParser, add_import_argument
 from legged.config import LeggedConfig
 from legged.deploy.__main__ import add_program_arguments, limits_of
 from legged.deploy.contract import Contract, read_contract
@@ -59,7 +59,7 @@ def build_parser() -> CommandParser:
         required=True,
         help="exported folder, run folder, or task (or its YAML file) whose newest or shipped policy",
     )
-    parser.add_argument("--import", dest="module", action=Once, help="module, or .py or YAML file, with tasks of your own")
+    add_import_argument(parser)
     parser.add_argument("--robot", required=True, choices=("sim",), help="sim; a robot has its own command, legged.deploy")
     parser.add_argument("--simulated", metavar="ROBOT", help="name or folder of the robot; the policy's by default")
     add_simulation_arguments(parser)

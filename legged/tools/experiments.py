@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from legged.commandline.command import run_main
-from legged.commandline.parser import CommandParser, Once
+from legged.commandline.parser import CommandParser, add_import_argument
 from legged.errors import ConfigError, suggest
 from legged.evaluation.judged_run import folders_in
 from legged.evaluation.reports.comparison import comparison_parts
@@ -50,7 +50,7 @@ def build_parser() -> CommandParser:
     parser.add_argument(
         "--seeds_share", action="store_true", help="a row of means for runs that differ in nothing but their seed"
     )
-    parser.add_argument("--import", dest="module", action=Once, help="module, or .py or YAML file, with tasks of your own")
+    add_import_argument(parser)
     return parser
 
 

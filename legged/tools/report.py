@@ -13,7 +13,7 @@ import torch
 
 from legged.commandline.arguments import add_run_arguments, register_given
 from legged.commandline.command import run_main
-from legged.commandline.parser import CommandParser, Once
+from legged.commandline.parser import CommandParser, add_import_argument
 from legged.config import LeggedConfig
 from legged.errors import ConfigError, RunError
 from legged.evaluation.reports.record import FILMS, read_record
@@ -45,7 +45,7 @@ def build_parser() -> CommandParser:
     parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="run folders")
     parser.add_argument("--task", help="report on a run of this task; a name or a YAML file")
     add_run_arguments(parser)
-    parser.add_argument("--import", dest="module", action=Once, help="module, or .py or YAML file, with tasks of your own")
+    add_import_argument(parser)
     parser.add_argument("--film", action="store_true", help=f"film the policy anew, into {FILMS[0]}")
     parser.add_argument("--note", help=f"a sentence about the run, kept in its {NOTE_FILE}")
     return parser

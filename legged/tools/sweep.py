@@ -13,7 +13,7 @@ from pathlib import Path
 
 from legged.commandline.arguments import pick_device
 from legged.commandline.command import EXIT_FAILED, run_main
-from legged.commandline.parser import CommandParser, Once
+from legged.commandline.parser import CommandParser, add_import_argument
 from legged.commandline.stopping import stopping_on_signals
 from legged.config.checks import shown
 from legged.errors import ConfigError
@@ -53,7 +53,7 @@ def build_parser() -> CommandParser:
     parser.add_argument("--sim_device", help="cpu, cuda, or several with commas, which the jobs take in turn")
     parser.add_argument("--storage", help="URL of a database that several machines share, or journal:<file>")
     parser.add_argument("--report", action="store_true", help="only write table and figures of what there is")
-    parser.add_argument("--import", dest="module", action=Once, help="module, or .py or YAML file, with tasks of your own")
+    add_import_argument(parser)
     parser.add_argument("--worker", type=int, metavar="NUMBER", help=argparse.SUPPRESS)
     return parser
 

@@ -21,7 +21,7 @@ import torch
 
 from legged.commandline.arguments import pick_device
 from legged.commandline.command import EXIT_FAILED, run_main
-from legged.commandline.parser import CommandParser, Once
+from legged.commandline.parser import CommandParser, add_import_argument
 from legged.commandline.stopping import stopping_on_signals
 from legged.errors import ConfigError
 from legged.evaluation.judged_run import JudgedRun, find_runs
@@ -75,7 +75,7 @@ def build_parser() -> CommandParser:
     parser.add_argument("--full", action="store_true", help="all sizes of a terrain type, 256 robots each")
     parser.add_argument("--robots-per-point", type=int, help="robots for each size of a type; 32, or 256 with --full")
     parser.add_argument("--again", action="store_true", help="train also what has been trained")
-    parser.add_argument("--import", dest="module", action=Once, help="module, or .py or YAML file, with tasks of your own")
+    add_import_argument(parser)
     parser.add_argument("--sim_device", help="cpu or cuda[:i]; the GPU if there is one")
     parser.add_argument("--out", type=Path, help=f"folder for the table and what the processes print; {OUT} by default")
     parser.add_argument("--ship", type=Path, help="folder to copy the policies to, e.g. resources/policies")
