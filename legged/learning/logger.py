@@ -19,6 +19,7 @@ from legged.learning.estimator import SECTION as ESTIMATES
 from legged.learning.evaluations import SECTION, Ended
 from legged.learning.trackers import Tracker, open_writer
 from legged.learning.watch import FAULT, MINI_BATCHES, Diverged, FaultWatch
+from legged.process.neighbours import Neighbours
 
 
 class Interrupted(Exception):
@@ -38,6 +39,8 @@ class QuietLogger(Logger):
         """Evaluates the policy after so many iterations of a total, where that is due, and gives what it finds."""
         self.why_end: Callable[[], str] | None = None
         """Says why the last evaluation ends the training, or nothing; None where no process evaluates."""
+        self.neighbours: Neighbours | None = None
+        """Other trainings on this device, for the times to be understood; the first process counts them."""
         self.loop_s = 0.0
         """Time spent in iterations so far, this process [s]."""
         self.return_std: float | None = None
@@ -109,6 +112,8 @@ class QuietLogger(Logger):
         self.watch.judge(values, left_out)
         self.latest = names | {name: value for name, value in self.latest.items() if not name.startswith(FAULT)} | values
         self.loop_s += collect_time + learn_time
+        if self.neighbours is not None:
+            self.neighbours.glance()
         if self.display is not None:
             self.display.show(
                 Progress(

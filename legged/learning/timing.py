@@ -36,7 +36,7 @@ class Timing:
     kernels_compiled: int
     """Modules of Warp's kernels that its cache lacked."""
     beside: int = 0
-    """Other trainings that ran on the same machine at the same time, as far as who started it knows."""
+    """The most other trainings that were seen on the same device at one time; of several GPUs, on the first one's."""
     error: str = ""
     """What ended it, in one line, where that was neither its last iteration nor a signal."""
     evaluation_s: float = 0.0

@@ -47,6 +47,7 @@ from legged.learning.trackers import check_tracker
 from legged.learning.transfer import transferred
 from legged.physics import engine_name, resolve_physics
 from legged.process.cores import available_cores
+from legged.process.neighbours import Neighbours
 from legged.process.paths import full_disk_in, ready_to_write, reason, relative, write_text
 from legged.process.ranks import Ranks
 from legged.process.startup import STARTED_S, command_of_ours, stage_ended
@@ -130,9 +131,10 @@ def _main(argv: list[str] | None, prepared: Prepared | None = None) -> int:
         print(f"going on with the settings of {relative(checkpoint.parent)}" + "".join(f"; {text}" for text in changed))
     settle_on(device)
     if Ranks.now().first:
-        return _train(args, cfg, device, rl_device, checkpoint, teacher, start, prepared)
+        with Neighbours(_name_of(device)) as neighbours:
+            return _train(args, cfg, device, rl_device, checkpoint, teacher, start, prepared, neighbours)
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-        return _train(args, cfg, device, rl_device, checkpoint, teacher, start, prepared)
+        return _train(args, cfg, device, rl_device, checkpoint, teacher, start, prepared, None)
 
 
 def _train(
@@ -144,6 +146,7 @@ def _train(
     teacher: Teacher | None,
     start: float,
     prepared: Prepared | None,
+    neighbours: Neighbours | None,
 ) -> int:
     """Build and train; returns the exit code. Of several processes the first one has a run folder and a display."""
     first = Ranks.now().first
@@ -175,13 +178,13 @@ def _train(
             _evaluate_during(runner, checkpoint if not args.transfer else None)
         if prepared is not None:
             prepared(runner)
+        runner.logger.neighbours = neighbours
         ready = time.perf_counter()
         resumed = checkpoint is not None and not args.transfer
 
         def timing(finished: bool, error: str = "") -> Timing:
-            return replace(
-                _timing(runner, device, ready - start, time.perf_counter() - start, finished, resumed), error=error
-            )
+            times = _timing(runner, device, ready - start, time.perf_counter() - start, finished, resumed)
+            return replace(times, error=error)
 
         with stopping_on_signals(runner.stop) as stopped_by, quiet_writers():
             try:
@@ -335,9 +338,16 @@ def play_program() -> list[str]:
     return ["python", str(Path(sys.argv[0]).with_name("play.py")) if how == "script" else "play.py"]
 
 
+def _name_of(device: torch.device) -> str:
+    """Return the name of a device among all of the machine's."""
+    return f"gpu-{torch.cuda.get_device_properties(device).uuid}" if device.type == "cuda" else "cpu"
+
+
 def _timing(runner: Runner, device: torch.device, start_up_s: float, wall_s: float, finished: bool, resumed: bool) -> Timing:
     """Return how long the training took, and what."""
-    steps = runner.logger.tot_timesteps
+    steps, neighbours = runner.logger.tot_timesteps, runner.logger.neighbours
+    if neighbours is not None:
+        neighbours.look()
     return Timing(
         task=runner.env.cfg.task,
         finished=finished,
@@ -350,6 +360,7 @@ def _timing(runner: Runner, device: torch.device, start_up_s: float, wall_s: flo
         wall_s=wall_s,
         device=torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         kernels_compiled=runner.env.physics.compiled,
+        beside=neighbours.most if neighbours is not None else 0,
         evaluation_s=runner.evaluations.spent_s if runner.evaluations is not None else 0.0,
     )
 

@@ -26,7 +26,7 @@ from legged.commandline.stopping import stopping_on_signals
 from legged.errors import ConfigError
 from legged.evaluation.judged_run import JudgedRun, find_runs
 from legged.evaluation.run_table import markdown, summary
-from legged.learning.timing import read_timing, write_timing
+from legged.learning.timing import read_timing
 from legged.process.cores import available_cores
 from legged.process.paths import make_folder, ready_to_write, relative, write_text
 from legged.process.ranks import Ranks
@@ -179,8 +179,6 @@ class _Campaign:
                 return self._written([])
             timing = read_timing(training.folder)
             assert timing is not None, "it has just been written"
-            if job.beside:
-                write_timing(training.folder, replace(timing, beside=job.beside))
             speed = f"{timing.loop_s:.1f} s, {timing.steps_per_s:,.0f} steps/s, start-up {timing.start_up_s:.1f} s"
             self._say(f"{training.label}: trained in {speed}; {relative(training.folder)}")
             return self._written(self._evaluations(training))

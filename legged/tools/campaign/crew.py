@@ -39,8 +39,6 @@ class Job:
     """File for what it prints."""
     done: Callable[["Job", int], Iterable["Job"]]
     """Called with its exit code when it has ended; gives the jobs that follow from it."""
-    beside: int = 0
-    """The most other trainings that ran at the same time, if it is one."""
     told: bool = False
     """Whether it was asked to end."""
     process: subprocess.Popen[bytes] | None = field(default=None, repr=False)
@@ -96,7 +94,6 @@ class Crew:
                         self.waiting.remove(job)
                         job.start()
                         self.running.append(job)
-                        self._count_trainings()
                 time.sleep(POLL_S)
                 for job in self.running if self.stopped else []:
                     if not job.told:
@@ -123,11 +120,6 @@ class Crew:
             return not any(other.starting for other in same)
         trainings = any(other.kind is Kind.TRAINING for other in (*self.running, *self.waiting))
         return not (job.kind in self.shared and trainings)
-
-    def _count_trainings(self) -> None:
-        trainings = [job for job in self.running if job.kind is Kind.TRAINING]
-        for job in trainings:
-            job.beside = max(job.beside, len(trainings) - 1)
 
     def _end_at_once(self) -> None:
         """End what still runs, because this process has to go."""

@@ -1,0 +1,96 @@
+"""Trainings that share a device know of each other, whoever started them and however they end."""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+from helpers import tiny_run
+
+from legged.learning.timing import read_timing
+from legged.process.neighbours import ENDING, FOLDER, Neighbours
+
+ANOTHER = """
+import sys, time
+from legged.process.neighbours import Neighbours
+with Neighbours("gpu-a"):
+    print("in", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture(autouse=True)
+def temporary_files(tmp_path, monkeypatch):
+    """Trainings that really run on this machine are no neighbours of these."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    return tmp_path
+
+
+def another() -> subprocess.Popen:
+    """A process that is among those on the device, until it is told to end."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(str(Path(entry or ".").resolve()) for entry in sys.path)}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    process = subprocess.Popen([sys.executable, "-c", ANOTHER], env=environment, **pipes)
+    assert process.stdout.readline() == "in\n"
+    return process
+
+
+def test_each_sees_the_others_of_its_own_device_alone():
+    with Neighbours("gpu-a") as first, Neighbours("gpu-b") as elsewhere:
+        assert first.most == 0
+        with Neighbours("gpu-a") as second, Neighbours("gpu-a") as third:
+            assert (second.most, third.most) == (1, 2)
+            first.look()
+            assert first.most == 2
+        first.look()
+        assert first.most == 2  # at one time; now there are none
+        elsewhere.look()
+        assert elsewhere.most == 0
+    with Neighbours("gpu-a") as later:
+        assert later.most == 0
+
+
+def test_a_training_that_is_killed_is_a_neighbour_no_longer(temporary_files):
+    with Neighbours("gpu-a") as first:
+        process = another()
+        first.look()
+        assert first.most == 1
+        os.kill(process.pid, signal.SIGKILL)
+        process.communicate()
+        folder = temporary_files / FOLDER / "gpu-a"
+        assert len(list(folder.glob(f"*{ENDING}"))) == 2  # nobody has removed what it left
+        with Neighbours("gpu-a") as second:
+            assert second.most == 1
+        assert len(list(folder.iterdir())) == 1
+    assert not list(folder.iterdir())
+
+
+def test_one_that_begins_and_ends_during_a_training_is_seen_by_a_glance(monkeypatch):
+    now = 1000.0
+    monkeypatch.setattr("time.monotonic", lambda: now)
+    with Neighbours("gpu-a") as first:
+        with Neighbours("gpu-a"):
+            now += 0.5
+            first.glance()
+            assert first.most == 0  # it has looked half a second ago
+            now += 0.6
+            first.glance()
+        assert first.most == 1
+
+
+def test_where_nobody_may_write_a_training_goes_on(temporary_files):
+    (temporary_files / FOLDER).write_text("a file where the folder would be")
+    with Neighbours("gpu-a") as alone:
+        alone.look()
+    assert alone.most == 0
+
+
+def test_times_of_a_training_say_how_many_others_its_device_had():
+    with Neighbours("cpu"), Neighbours("cpu"), Neighbours("gpu-a"):
+        beside_two = tiny_run(iterations=1)
+    alone = tiny_run(iterations=1)
+    assert (read_timing(beside_two).beside, read_timing(alone).beside) == (2, 0)
