@@ -85,24 +85,35 @@ def why_unfinished(folder: Path, cfg: LeggedConfig, timing: Timing | None) -> st
 
 def find_runs(paths: Iterable[Path]) -> list[JudgedRun]:
     """Read the runs in some folders: a run folder itself, what lies in logs/ or logs/<task>/, or the folder of a shipped
-    policy with those of its other seeds. Runs of tasks that follow no commands are left out, and said to be, where others lie
-    beside them.
+    policy with those of its other seeds. Where others lie beside them, runs of tasks that follow no commands and runs of a
+    configuration that this version can't read are left out, and said to be.
 
     Raises:
-        ConfigError: a folder holds no run, none of a task that follows commands, or something in one is damaged.
+        ConfigError: a folder holds no run, none that the table is of, or something in one is damaged.
     """
     found: list[JudgedRun] = []
-    left_out: list[str] = []
+    left_out: dict[str, list[str]] = {}
     for path in paths:
         folders = folders_in(path)
-        others = [folder for folder in folders if folder != path and not isinstance(run_config(folder), LeggedConfig)]
-        kept = [folder for folder in folders if folder not in others] or folders[:1]  # if none is left, the first says why
+        reasons = {folder: why_not(folder) for folder in folders if folder != path}
+        kept = [folder for folder in folders if not reasons.get(folder)] or folders[:1]  # if none is left, the first says why
         for folder in kept:
             found += [read_run(folder), *_other_seeds(folder)]
-        left_out += [relative(folder) for folder in others]
-    if left_out:
-        print(f"left out, for their tasks follow no commands: {', '.join(left_out)}", file=sys.stderr, flush=True)
+        for folder, reason in reasons.items():
+            if reason:
+                left_out.setdefault(reason, []).append(relative(folder))
+    for reason, names in left_out.items():
+        print(f"left out, {reason}: {', '.join(names)}", file=sys.stderr, flush=True)
     return found
+
+
+def why_not(folder: Path) -> str:
+    """Say why the table is not of a run; nothing if it may be."""
+    try:
+        cfg = run_config(folder)
+    except ConfigError as error:
+        return f"for its configuration can't be read ({' '.join(str(error).split())})"
+    return "" if isinstance(cfg, LeggedConfig) else "for their tasks follow no commands"
 
 
 def folders_in(path: Path) -> list[Path]:

@@ -6,6 +6,7 @@ picture.
 """
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -15,7 +16,7 @@ from legged.commandline.parser import CommandParser, add_import_argument
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.play.contact_sheet import film, sheet, write_sheet
-from legged.policies.restore import policy_of
+from legged.policies.restore import TrainedPolicy, policy_of
 from legged.process.paths import ready_to_write_file
 from legged.registry import import_tasks
 
@@ -69,14 +70,21 @@ def _main(argv: list[str] | None) -> int:
     for policy in policies:
         tiles.append(film(policy, args.side))
         print(f"{policy.cfg.task}: {len(tiles[-1])} pictures", flush=True)
-    print(write_sheet(sheet(tiles, names_of([policy.cfg for policy in policies]), args.columns), args.out))
+    print(write_sheet(sheet(tiles, names_of(policies), args.columns), args.out))
     return 0
 
 
-def names_of(configs: list) -> list[str]:
-    """Return what is written below the tiles: the robot, or the task where the robot comes twice."""
-    robots = [Path(cfg.robot).name if isinstance(cfg, LeggedConfig) else "" for cfg in configs]
-    return [robot if robots.count(robot) == 1 else cfg.task for robot, cfg in zip(robots, configs, strict=True)]
+def names_of(policies: Sequence[TrainedPolicy]) -> list[str]:
+    """Return what is written below the tiles: the robot; the task where the robot comes twice; the folder of the policy too
+    where the task does.
+    """
+    tasks = [policy.cfg.task for policy in policies]
+    robots = [Path(policy.cfg.robot).name if isinstance(policy.cfg, LeggedConfig) else policy.cfg.task for policy in policies]
+    names = []
+    for robot, task, policy in zip(robots, tasks, policies, strict=True):
+        known = robot if robots.count(robot) == 1 else task
+        names.append(known if tasks.count(task) == 1 else f"{task} {policy.folder.name}")
+    return names
 
 
 if __name__ == "__main__":

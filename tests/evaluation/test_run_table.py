@@ -161,3 +161,20 @@ def test_among_others_a_task_without_commands_is_left_out_and_named(tmp_path, ca
     shutil.rmtree(tmp_path / "anymal_c_flat")
     with pytest.raises(ConfigError, match="'half_cheetah' follows no commands"):  # nothing is left
         find_runs([tmp_path])
+
+
+def test_among_others_a_run_that_this_version_cannot_read_is_left_out_and_why(tmp_path, capsys):
+    for name in ("new", "old"):
+        (tmp_path / name).mkdir()
+        for file in ("config.yaml", "model.pt"):
+            shutil.copy(POLICY / file, tmp_path / name)
+    path = tmp_path / "old" / "config.yaml"
+    path.write_text(path.read_text().replace("env:", "evn:", 1))
+    (found,) = find_runs([tmp_path])
+    assert found.folder == tmp_path / "new"
+    said = capsys.readouterr().err
+    assert said.startswith(f"left out, for its configuration can't be read ({path}: ")
+    assert "did you mean 'env'" in said
+    assert said.endswith(f"): {tmp_path / 'old'}\n")
+    with pytest.raises(ConfigError, match="did you mean 'env'"):  # it was asked for by itself
+        find_runs([tmp_path / "old"])

@@ -12,7 +12,7 @@ from legged import registry
 from legged.errors import RunError
 from legged.play import contact_sheet as sheets
 from legged.play.contact_sheet import film, sheet, write_sheet
-from legged.policies.restore import policy_of
+from legged.policies.restore import TrainedPolicy, policy_of
 from legged.registry import task_config
 from legged.rendering import RobotsCamera
 from legged.tools import contact_sheet
@@ -121,9 +121,12 @@ def test_the_command_shows_tasks_and_run_folders(capsys):
     assert "written: robots.gif" in capsys.readouterr().out
 
 
-def test_a_robot_that_comes_twice_is_called_by_its_task():
-    configs = [small_config(), task_config("go2_flat"), task_config("go2")]
-    assert contact_sheet.names_of(configs) == ["anymal_c", "go2_flat", "go2"]
+def test_tiles_are_called_by_robot_task_or_run_whatever_tells_them_apart():
+    configs = [small_config(), task_config("go2_flat"), task_config("go2"), task_config("half_cheetah")]
+    policies = [TrainedPolicy(cfg, Path("logs", cfg.task, "10-30", "model_9.pt")) for cfg in configs]
+    assert contact_sheet.names_of(policies) == ["anymal_c", "go2_flat", "go2", "half_cheetah"]
+    policies.append(TrainedPolicy(configs[2], Path("logs", "go2", "11-15", "model_9.pt")))
+    assert contact_sheet.names_of(policies) == ["anymal_c", "go2_flat", "go2 10-30", "half_cheetah", "go2 11-15"]
 
 
 @pytest.mark.parametrize(
