@@ -283,12 +283,19 @@ def friction_numbers(
     `where` is as for `modelled_joints`.
 
     Raises:
-        ConfigError: a pattern that matches no joint.
+        ConfigError: a pattern that matches no joint, or less friction at the start of a motion than in it.
     """
     nothing = np.zeros(robot.num_dof)
     coulomb = by_joint(cfg.coulomb_friction, robot, where("control.actuator.coulomb_friction"), nothing)
     breakaway = by_joint(cfg.breakaway_friction, robot, where("control.actuator.breakaway_friction"), coulomb)
     viscous = by_joint(cfg.viscous_friction, robot, where("control.actuator.viscous_friction"), nothing)
+    if (breakaway < coulomb).any():
+        joint = int(np.argmax(breakaway < coulomb))
+        least = f"its coulomb_friction of {coulomb[joint]:g} N m"
+        raise ConfigError(
+            f"{where('control.actuator.breakaway_friction')}: {breakaway[joint]:g} N m for '{robot.joint_names[joint]}' is"
+            f" less than {least}; what a joint must overcome to begin to move is at least that"
+        )
     return coulomb, breakaway, viscous
 
 
