@@ -102,6 +102,10 @@ def test_the_table_has_the_numbers_of_the_log():
     wanted = smooth(scalars["Metrics/lin_vel_rmse"][1])
     assert [row[error].value for row in table.rows] == pytest.approx([wanted[int(i) - 1] for i in iterations])
     assert np.isfinite([row[4].value for row in table.rows[1:]]).all()
+    resumed = tiny_run("--resume", "--load_run", folder.name, iterations=30)
+    table = over_training(read_record(resumed))
+    assert table.head[2] == "time since it was resumed [s]"
+    assert table.rows[0][0].value == 26.0
 
 
 def test_a_training_that_raises_leaves_a_report_that_says_so(monkeypatch):

@@ -127,7 +127,8 @@ def _facts(record: Record) -> list[list[Cell]]:
     if timing is not None:
         rest_s = timing.wall_s - timing.start_up_s - timing.loop_s - timing.evaluation_s
         compiled = f", {timing.kernels_compiled} modules of kernels compiled" if timing.kernels_compiled else ""
-        beside = f", beside {timing.beside} other trainings" if timing.beside else ""
+        others = "other training" if timing.beside == 1 else "other trainings"
+        beside = f", beside {timing.beside} {others}" if timing.beside else ""
         found |= {
             "device": ("CPU" if timing.device == "cpu" else timing.device) + beside,
             "iterations, steps": f"{timing.iterations:,}, {timing.steps:,}" + (" after it was resumed" * timing.resumed),
@@ -198,7 +199,8 @@ def over_training(record: Record) -> Table:
         row.append(number(float(seconds[until][-1]) if until.any() else None, ".1f"))
         row += [number(_at(smoothed[tag], step), form) for tag, _, _, form in columns]
         rows.append(row)
-    return Table(["iteration", "steps", "time [s]", *(head for _, head, _, _ in columns)], rows)
+    clock = "time since it was resumed [s]" if record.timing is not None and record.timing.resumed else "time [s]"
+    return Table(["iteration", "steps", clock, *(head for _, head, _, _ in columns)], rows)
 
 
 def _at(curve: tuple[np.ndarray, np.ndarray], step: int) -> float | None:
