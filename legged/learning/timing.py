@@ -47,6 +47,11 @@ class Timing:
         """Steps of all robots in a second of training loop."""
         return self.steps / max(self.loop_s, 1e-9)
 
+    @property
+    def company(self) -> str:
+        """With how many others the device was shared, to be written behind a comma; nothing where with none."""
+        return f", beside {self.beside} other training{'s' * (self.beside > 1)}" if self.beside else ""
+
 
 def write_timing(folder: Path, timing: Timing) -> None:
     """Write the times of a training into its run folder.

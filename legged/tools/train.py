@@ -370,8 +370,8 @@ def _summary(runner: Runner, folder: Path, timing: Timing, play: str) -> None:
         print(*runner.evaluations.summary(timing.loop_s), sep="\n")
     print(
         f"{'finished' if timing.finished else 'stopped'} after {runner.current_learning_iteration + 1} iterations: "
-        f"{timing.steps:,} steps in {timing.loop_s:.1f} s of training loop ({timing.steps_per_s:,.0f} steps/s), "
-        f"{timing.start_up_s:.1f} s of start-up, imports and kernel compilation included\n"
+        f"{timing.steps:,} steps in {timing.loop_s:.1f} s of training loop ({timing.steps_per_s:,.0f} steps/s"
+        f"{timing.company}), {timing.start_up_s:.1f} s of start-up, imports and kernel compilation included\n"
         f"checkpoint in {relative(folder)}; see it walk: {play}",
         flush=True,
     )

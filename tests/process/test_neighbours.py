@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -93,4 +94,7 @@ def test_times_of_a_training_say_how_many_others_its_device_had():
     with Neighbours("cpu"), Neighbours("cpu"), Neighbours("gpu-a"):
         beside_two = tiny_run(iterations=1)
     alone = tiny_run(iterations=1)
-    assert (read_timing(beside_two).beside, read_timing(alone).beside) == (2, 0)
+    times = read_timing(beside_two), read_timing(alone)
+    assert [each.beside for each in times] == [2, 0]
+    assert [each.company for each in times] == [", beside 2 other trainings", ""]
+    assert replace(times[0], beside=1).company == ", beside 1 other training"

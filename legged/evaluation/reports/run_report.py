@@ -127,10 +127,8 @@ def _facts(record: Record) -> list[list[Cell]]:
     if timing is not None:
         rest_s = timing.wall_s - timing.start_up_s - timing.loop_s - timing.evaluation_s
         compiled = f", {timing.kernels_compiled} modules of kernels compiled" if timing.kernels_compiled else ""
-        others = "other training" if timing.beside == 1 else "other trainings"
-        beside = f", beside {timing.beside} {others}" if timing.beside else ""
         found |= {
-            "device": ("CPU" if timing.device == "cpu" else timing.device) + beside,
+            "device": ("CPU" if timing.device == "cpu" else timing.device) + timing.company,
             "iterations, steps": f"{timing.iterations:,}, {timing.steps:,}" + (" after it was resumed" * timing.resumed),
             "time to start": f"{timing.start_up_s:.1f} s (imports, task{compiled or ', no kernels compiled'})",
             "time to train": f"{timing.loop_s:.1f} s ({timing.steps_per_s:,.0f} steps/s)",
