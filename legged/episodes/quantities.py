@@ -134,7 +134,7 @@ def _of_legs(task: LeggedRobot) -> list[Quantity]:
             "contact forces on the feet at the last physics step, world frame, by x, y, z",
             feet,
         ),
-        Quantity("feet_contact", lambda: task.contacts.in_contact, "1", "1 where a foot is in contact", feet),
+        Quantity("feet_contact", lambda: task.contacts.in_contact, "1", "1 where a foot touches, or did a step before", feet),
         Quantity(
             "contact_force",
             lambda: task.contact_forces.norm(dim=2),
