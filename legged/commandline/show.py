@@ -191,8 +191,7 @@ def _effect(task: BaseTask, i: int) -> str:
         offset = f"{middle:g} + " if middle else ""
         return f"{joint}: {offset}{float(task.control_reach[i]) * force:g} a [{'N' if slides else 'N m'}]"
     control, law = task.control, task.cfg.control
-    laws = (control.stiffness, control.damping, control.torque_limits)  # of the one robot there is, if robots differ
-    p, d, limit = (float(values.view(-1)[i]) for values in laws)
+    p, d, limit = (float(control.nominal[name][i]) for name in ("p_gain", "d_gain", "torque_limit"))
     scales = dict(zip(control.acted, action_scales(task.robot, law).tolist(), strict=True))
     if i not in scales:
         target = f"position {float(task.default_dof_pos[i]):g} [rad], held"

@@ -82,7 +82,12 @@ def _friction(task: Any) -> Tensor:
 def _joint_pos_target(task: Any) -> Tensor:
     if task.cfg.control.control_type != "P":
         raise AttributeError("only control.control_type P has joint angles as targets")
-    return task.default_dof_pos + task.control.action_scale * task.actions
+    asked = task.control.action_scale * task.actions
+    if len(task.control.acted) < task.robot.num_dof:  # joints that are held stay at their default angles
+        every = torch.zeros(task.num_envs, task.robot.num_dof, device=task.device)
+        every[:, list(task.control.acted)] = asked
+        asked = every
+    return task.default_dof_pos + asked
 
 
 def _obs_scales(task: Any) -> SimpleNamespace:
@@ -93,7 +98,9 @@ def _obs_scales(task: Any) -> SimpleNamespace:
 
 
 def _noise_scale_vec(task: Any) -> Tensor:
-    return torch.cat([term.scale * term.noise for term in task.observation_groups["actor"].terms])
+    sensors, noisy = task.observation_terms.sensors, task.cfg.observations.groups["actor"].noise
+    measured = sensors.noise if sensors is not None and noisy else {}  # sensors add the noise of what they measure
+    return torch.cat([term.scale * measured.get(term.name, term.noise) for term in task.observation_groups["actor"].terms])
 
 
 def _command_ranges(task: Any) -> dict[str, Any]:

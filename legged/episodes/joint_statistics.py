@@ -44,7 +44,9 @@ class JointStatistics:
     cycle_s: np.ndarray
     """(C,) length of each cycle [s]."""
     duty: dict[str, float]
-    """Foot -> share of the cycles' steps in which it is in contact."""
+    """Foot -> share of the cycles' steps at whose end it feels the ground, like the duty factor of an evaluation:
+    `feet_contact` holds each contact a step longer.
+    """
 
     def over_cycle(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and standard deviation over cycles, (PHASES, D) each."""
@@ -86,7 +88,7 @@ def joint_statistics(episodes: Episodes, where: str = "--statistics") -> JointSt
     usual = float(np.median([end - begin for begin, end, _ in spans])) if spans else 0.0
     spans = [(begin, end, one) for begin, end, one in spans if abs(end - begin - usual) <= UNUSUAL * usual]
     lengths = [(end - begin) * episodes.dt for begin, end, _ in spans]
-    contacts = [one["feet_contact"][begin:end] for begin, end, one in spans]
+    contacts = [one["feet_force"][begin:end, :, 2] > episodes.about["contact_threshold"] for begin, end, one in spans]
     cycles = {name: [resampled(one[name], begin, end) for begin, end, one in spans] for name in names}
     values = {name: np.concatenate(parts).astype(np.float64) for name, parts in pooled.items()}
     joints = episodes.about["joints"]

@@ -44,7 +44,7 @@ class Joint:
     """Lowest and highest position; None if it has no stops."""
     max_velocity: float | None
     max_torque: float | None
-    """Largest torque [N m], or force [N] where it slides, either way; None if nobody limits it."""
+    """Largest torque [N m], or force [N] where it slides, either way, whatever is drawn for it; None if nobody limits it."""
 
     def described(self) -> dict[str, Any]:
         """Return plain values, for a JSON file."""
@@ -76,7 +76,7 @@ def joints_of(task: BaseTask) -> list[Joint]:
     """Return the joints with a motor, in the order of the motors; none if a motor drives something else than one joint."""
     if isinstance(task, LeggedRobot):
         robot = task.robot
-        limits = task.control.torque_limits.broadcast_to(len(robot.joint_names)).tolist()
+        limits = task.control.nominal["torque_limit"].tolist()
         return [
             Joint(
                 name=name,
@@ -134,7 +134,7 @@ def _of_legs(task: LeggedRobot) -> list[Quantity]:
             "contact forces on the feet at the last physics step, world frame, by x, y, z",
             feet,
         ),
-        Quantity("feet_contact", lambda: task.contacts.in_contact, "1", "1 where a foot is in contact", feet),
+        Quantity("feet_contact", lambda: task.contacts.in_contact, "1", "1 where a foot touches, or did a step before", feet),
         Quantity(
             "contact_force",
             lambda: task.contact_forces.norm(dim=2),

@@ -62,7 +62,8 @@ class Figures:
 
 def figures_of(episodes: Episodes) -> Figures:
     """Compute the figures of all episodes. Errors of tracking are root mean squares over all steps, the first included;
-    energy is the sum of |torque * velocity| over joints and time, power that by the length of the episode.
+    energy is the sum of |torque * velocity| over joints and time, of those at the ends of control steps; power is that by the
+    length of the episode.
     """
     count, strained = len(episodes), []
     ends = [*episodes.about["terminations"], TIME_UP, NO_NUMBERS]

@@ -56,7 +56,8 @@ def place_to_track(
 def measure_tracking(task: LeggedRobot, act: Callable[[TensorDict], Tensor], grid: Grid) -> dict[str, Any]:
     """Run the grid on a task of grid.num_envs robots; return plain numbers and lists, one entry a cell in "cells".
 
-    A robot that falls counts as a fall and is measured up to its fall. Errors are instantaneous, per control step.
+    A robot that falls counts as a fall and is measured up to its fall. Errors are instantaneous, per control step, and so is
+    the power of the cost of transport: that of the last physics step of each, which is less than the mean over all of them.
     `contact_overflows` counts the robots and steps in which contacts were lost for want of memory; `estimates` are the errors
     of a policy that estimates something.
     """

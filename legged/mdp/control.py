@@ -69,7 +69,8 @@ class Control:
         self._zero = torch.zeros((), device=torques.device)
         self.zero_dof_pos = self.default_dof_pos
         """(D,) or (N, D) true joint angles at which encoders show the default ones [rad]."""
-        self._nominal = {"p_gain": self.stiffness, "d_gain": self.damping, "torque_limit": self.torque_limits}
+        self.nominal = {"p_gain": self.stiffness, "d_gain": self.damping, "torque_limit": self.torque_limits}
+        """Gains and limits (D,) that the factors given to `vary` act on, by its names: whatever is drawn, they stay."""
         self._varied = False
         self._target = torch.zeros_like(self.torques)  # joint angles, velocities or torques
         self._columns = None if len(self.acted) == robot.num_dof else torch.tensor(self.acted, device=torques.device)
@@ -88,17 +89,17 @@ class Control:
         write in place.
         """
         each = {
-            name: values.view(len(values), -1) for name, values in drawn.items() if name in (*self._nominal, "joint_offset")
+            name: values.view(len(values), -1) for name, values in drawn.items() if name in (*self.nominal, "joint_offset")
         }
         if not each:
             return
         if not self._varied:
             self._varied = True
-            self._nominal_law = torch.stack([*self._nominal.values(), self.default_dof_pos])
+            self._nominal_law = torch.stack([*self.nominal.values(), self.default_dof_pos])
             one = torch.ones_like(self.torques[:1])
-            self._factors = {**dict.fromkeys(self._nominal, one), "joint_offset": torch.zeros_like(one)}
+            self._factors = {**dict.fromkeys(self.nominal, one), "joint_offset": torch.zeros_like(one)}
             self.stiffness, self.damping, self.torque_limits, self._lowest_torques = (
-                torch.zeros_like(self.torques) + nominal for nominal in (*self._nominal.values(), self._lowest_torques)
+                torch.zeros_like(self.torques) + nominal for nominal in (*self.nominal.values(), self._lowest_torques)
             )
             self.zero_dof_pos = torch.zeros_like(self.torques) + self.default_dof_pos
             if self.actuator is not None and self.control_type == "P":
@@ -112,7 +113,7 @@ class Control:
         written = {"p_gain": self.stiffness, "d_gain": self.damping, "torque_limit": self.torque_limits}
         for name, values in each.items():
             if name in written:
-                torch.mul(self._nominal[name], values, out=written[name])
+                torch.mul(self.nominal[name], values, out=written[name])
         if "torque_limit" in each:
             torch.neg(self.torque_limits, out=self._lowest_torques)
         if "joint_offset" in each:

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 class TerrainCurriculum:
     """Which tile each robot lives on: its column (a terrain type) for good, its row (a level) by success.
 
-    As in legged_gym: a robot that got further than half a tile from where it started moves up, one that got less than
-    half as far as its command asked moves down, and from the top it goes to a random level. A policy that is always
+    As in legged_gym: a robot that got further than half a tile from the middle of its own moves up, one that got less
+    than half as far as its command asked moves down, and from the top it goes to a random level. A policy that is always
     promoted thus has a mean level of 6.0 over ten rows, not 9.
     """
 

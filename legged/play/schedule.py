@@ -23,7 +23,7 @@ SCHEDULE = (  # seconds; vx, vy [m/s], yaw rate [rad/s]
 )
 """What the robots are asked to do in the video, clipped to the ranges the task was trained on."""
 SETTLE_S = 1.0
-"""At the start of a command, for getting there: not measured [s]."""
+"""At the start of a command, for getting there, and of an episode that begins anew after a fall: not measured [s]."""
 
 
 def schedule_s() -> float:
@@ -39,7 +39,6 @@ def follow_schedule(task: LeggedRobot, act: Callable[[TensorDict], Tensor], vide
     for name in TrackingErrors.COLUMNS:
         table.add_column(name, justify="right")
     device = torch.device(task.device)
-    everybody = torch.ones(task.num_envs, dtype=torch.bool, device=device)
     low, high = task.command_sampler.full_ranges.cpu().numpy().T
     task.reset()
     for seconds, wanted in SCHEDULE:
@@ -48,7 +47,8 @@ def follow_schedule(task: LeggedRobot, act: Callable[[TensorDict], Tensor], vide
         errors = TrackingErrors(task.num_envs, device)
         for step in range(max(1, round(seconds / task.dt))):
             observations, _, _, _ = task.step(act(observations))
-            errors.add(task, everybody & (step * task.dt >= SETTLE_S))
+            settled = task.episode_length_buf * task.dt >= SETTLE_S
+            errors.add(task, settled & (step * task.dt >= SETTLE_S))
             if video.due(step):
                 video.take(*velocities(task, slice(None)))
         table.add_row(", ".join(f"{value:g}" for value in command), *errors.row())

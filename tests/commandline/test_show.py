@@ -111,6 +111,13 @@ def test_other_control_laws_say_what_an_action_is(law, effect):
     assert effect in "\n".join(summary(small_config(("control.control_type", law))))
 
 
+def test_gains_are_those_that_nothing_was_drawn_for():
+    """A robot whose gains are drawn has the factors beside them, under randomisation; not one draw of them here."""
+    drawn = {"p_gain": [0.8, 0.9], "d_gain": [1.1, 1.2], "torque_limit": [0.7, 0.8]}
+    actions = rows(summary(small_config(("domain_rand.ranges", drawn))), "actions: 12 numbers, clipped at +-100")
+    assert actions[1][2] == "LF_HFE: position 0.4 + 0.5 a [rad], stiffness 90, damping 4, torque at most 80 N m"
+
+
 def test_a_task_without_a_robot_folder():
     lines = summary(task_config("humanoid", on_cpu=True))
     assert rows(lines, "actions: 17 numbers, clipped at +-1")[5] == ["5", "right_hip_y", "right_hip_y: 120 a [N m]"]

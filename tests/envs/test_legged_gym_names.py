@@ -75,6 +75,22 @@ def test_names_mean_what_they_mean_there(task):
     assert task.command_ranges["lin_vel_x"].tolist() == task.command_sampler.ranges[0].tolist()
 
 
+def test_targets_of_joints_that_are_held_are_their_default_angles():
+    task = small_task(("control.held", ["HAA"]), ("train.algorithm.symmetry", False))
+    task.step(torch.ones(ROBOTS, 8))
+    moved = torch.tensor([0.0, 0.5, 0.5]).repeat(4)  # action_scale times 1, but for the first joint of each leg
+    torch.testing.assert_close(task.joint_pos_target - task.default_dof_pos, moved.expand(ROBOTS, JOINTS))
+
+
+def test_noise_is_that_of_the_actor_whoever_adds_it():
+    """Sensors that are late add the noise of what they measure by themselves."""
+    noisy = ("observations.add_noise", True)
+    usual = small_task(noisy).noise_scale_vec
+    assert usual[24:36].tolist() == pytest.approx([0.05 * 1.5] * JOINTS)  # of dof_vel: scale times half width
+    late = small_task(noisy, ("observations.delay", {"dof_vel": [0, 2]}), ("observations.bias", {"dof_pos": 0.02}))
+    assert late.noise_scale_vec.equal(usual)
+
+
 def test_a_terrain_has_its_names():
     ground = [("terrain.mesh_type", "height_map"), ("terrain.proportions", {"flat": 1.0}), ("terrain.num_rows", 3)]
     rough = small_task(*ground, ("terrain.num_cols", 2), ("terrain.max_init_terrain_level", 1))

@@ -129,8 +129,9 @@ def test_joints_over_the_cycle_are_those_of_a_wave():
     episodes = made_by_hand(rows)
     steps = np.arange(rows) - SETTLED - 5
     episodes["joint_pos"][:, 2] = np.sin(2.0 * np.pi * steps / period)
-    episodes["feet_contact"][:, 0] = (steps % period) < 12
-    episodes["feet_contact"][:, 1] = (steps % period) < 5
+    for foot, stance in enumerate((12, 5)):  # a contact is held for a step more than the foot feels the ground
+        episodes["feet_force"][:, foot, 2] = np.where((steps % period) < stance, 50.0, 0.5)
+        episodes["feet_contact"][:, foot] = (steps % period) < stance + 1
     found = joint_statistics(episodes)
     mean, std = found.over_cycle("joint_pos")
     assert found.cycle_s == pytest.approx(np.full(len(found.cycle_s), period * DT))

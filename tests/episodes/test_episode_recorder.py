@@ -138,6 +138,12 @@ def test_joints_of_every_kind_of_robot_are_found():
     assert found == {"bthigh": 120.0, "bshin": 90.0, "bfoot": 60.0, "fthigh": 120.0, "fshin": 60.0, "ffoot": 30.0}
 
 
+def test_limits_are_the_robots_own_where_gains_and_limits_are_drawn():
+    drawn = {"p_gain": [0.9, 1.1], "torque_limit": [0.8, 1.1], "joint_offset": [-0.02, 0.02]}
+    joints = joints_of(small_task(("domain_rand.ranges", drawn)))
+    assert [joint.max_torque for joint in joints] == [80.0] * JOINTS
+
+
 def test_torques_of_motors_are_their_controls_times_the_gear():
     task = make_task(task_config("half_cheetah", [("env.num_envs", 1), ("env.episode_length_s", 0.3), *ENGINE], on_cpu=True))
     actions = torch.tensor([[0.5, -0.25, 1.0, -1.0, 0.0, 0.1]])

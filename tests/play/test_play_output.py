@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import POLICY, TASK, call, small_task, stand
+from helpers import POLICY, TASK, call, small_config, small_task, stand
 
 import legged.policies.restore
+from legged.envs import LeggedRobot
 from legged.errors import RunError
 from legged.play import schedule, video
 from legged.policies.actor import Actor
@@ -48,6 +49,30 @@ def test_a_command_that_is_over_before_it_is_measured_has_no_error(short):
     assert film.fps == pytest.approx(1 / task.dt)
     film.write()
     assert Path("film/play.mp4").stat().st_size > 0
+
+
+def test_a_robot_that_fell_is_not_measured_until_it_has_settled_again(short, monkeypatch):
+    """It falls every 60 steps of 20 ms: of 150 steps, measured are 9 before the first fall, which begin at 1 s or later, 10
+    before the second one, which end at 1 s of their episode or later, and none of the rest.
+    """
+
+    class Falling(LeggedRobot):
+        def _terminate_contact(self):
+            return self.episode_length_buf >= 60
+
+    kept = []
+
+    class Kept(schedule.TrackingErrors):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            kept.append(self)
+
+    monkeypatch.setattr(schedule, "SCHEDULE", ((3.0, (0.5, 0.0, 0.0)),))
+    monkeypatch.setattr(schedule, "TrackingErrors", Kept)
+    task = Falling(small_config(num_envs=2))
+    schedule.follow_schedule(task, stand, video.Video(task, 1, Path("film")))
+    assert kept[0].falls.tolist() == [2.0, 2.0]
+    assert kept[0].steps.tolist() == [19.0, 19.0]
 
 
 def test_a_film_that_does_not_fit_costs_no_table(short, monkeypatch, capsys):

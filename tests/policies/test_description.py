@@ -198,6 +198,14 @@ def test_the_law_and_the_time_are_those_of_the_task():
     assert told["recurrent"] is None
 
 
+def test_gains_are_a_number_for_each_joint_whatever_is_drawn_for_them():
+    drawn = {"p_gain": [0.9, 0.9], "d_gain": [1.1, 1.1], "torque_limit": [0.8, 0.8], "joint_offset": [0.01, 0.01]}
+    told, usual = describe(small_task(("domain_rand.ranges", drawn), num_envs=2)), describe(small_task())
+    for name, value in (("stiffness", 90.0), ("damping", 4.0), ("torque_limits", 80.0)):
+        assert told[name] == usual[name] == [value] * 12
+    assert told["default_joint_angles"] == usual["default_joint_angles"]
+
+
 def test_a_term_of_the_users_is_described_by_its_docstring():
     class Mine(LeggedRobot):
         MIRRORED = {**LeggedRobot.MIRRORED, "feet": "feet", "bare": "same"}
