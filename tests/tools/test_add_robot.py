@@ -92,6 +92,26 @@ def test_the_stance_is_that_of_a_two_link_leg(added):
         np.testing.assert_allclose(data.geom(f"{leg}_foot").xpos[:2], [x, y], atol=0.005)
 
 
+@pytest.mark.parametrize(
+    ("hind", "called"), [(("hl", "hr"), "robot with 3 legs"), (("hl", "hr", "ml", "mr"), "robot with 5 legs")]
+)
+def test_any_number_of_legs_stands_as_four_do(added, hind, called):
+    """One leg in front, in the middle; the stance is that of the test above, 0.8 of a stretched leg of 0.3815 m."""
+    places = {"f": (0.3, 0.0), "hl": (-0.2, 0.1), "hr": (-0.2, -0.1), "ml": (0.05, 0.1), "mr": (0.05, -0.1)}
+    legs = "".join(URDF_LEG.format(n=n, x=x, y=y, side=0.5 * y) for n, (x, y) in places.items() if n in ("f", *hind))
+    name = f"toy_of_{1 + len(hind)}_legs"
+    out = added(urdf(legs=legs), "--name", name)
+    assert f"{name}: a {called} of " in out
+    assert f"guess: a {called} with feet: f_foot, " in out
+    robot = load_robot(f"mine/{name}")
+    angles = dict(zip(robot.joint_names, robot.default_dof_pos, strict=True))
+    assert robot.height == pytest.approx(0.305 + 0.02, abs=0.004)
+    for leg in ("f", *hind):
+        assert angles[f"{leg}_calf"] == pytest.approx(-1.405, abs=0.03)
+        assert angles[f"{leg}_thigh"] == pytest.approx(0.703, abs=0.03)
+    assert yaml.safe_load(Path(f"mine/{name}_flat.yaml").read_text())["extends"] == "base/quadruped_flat"
+
+
 def test_a_frame_on_the_ground_is_not_the_base(added):
     """0.3 m below it, the base would stand at a tenth of its height, and torque limits by its height be a tenth too."""
     weak = urdf().replace('effort="30"', 'effort="0"')
@@ -303,7 +323,7 @@ def test_a_name_that_yaml_reads_as_something_else_is_in_quotes(name, tmp_path):
     path.write_text(task_yaml(name, name, name, symmetric=True))
     assert read_yaml(path) == {"extends": name, "robot": name}
     tree = Tree(name, path, [], 0.0)
-    guesses = Guesses(name, 0.3, {name: 0.5}, "", [name], [name], [name], [name], {}, {}, {}, "quadruped")
+    guesses = Guesses(name, 0.3, {name: 0.5}, "", [name], [name], [name], [name], {}, {}, {}, 4)
     path.write_text(robot_yaml(tree, guesses))
     read = read_yaml(path)
     assert (read["model"], read["base"], read["feet"]) == (f"{name}.xml", name, [name])

@@ -7,7 +7,7 @@ import numpy as np
 
 from legged.errors import ConfigError
 from legged.robots.importing.actuation import guess_efforts, speed_limits, take_gains
-from legged.robots.importing.folder import Guesses
+from legged.robots.importing.folder import Guesses, called
 from legged.robots.importing.inverse_kinematics import GOOD, standing_angles
 from legged.robots.importing.legs import Leg, Poser, face_forward, find_legs
 from legged.robots.importing.mend import mend
@@ -66,8 +66,7 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
         stiffness, damping = ({hinge.name: gain for hinge in tree.hinges if hinge.driven} for gain in gains)
     _check_mass(tree)
     feet = [shape.name for leg in legs for shape in leg.feet]
-    kind = "quadruped" if len(legs) > 2 else "biped"
-    tree.say(f"guess: a {kind} with feet", ", ".join(feet))
+    tree.say(f"guess: a {called(len(legs))} with feet", ", ".join(feet))
     ending, penalized = (_named_apart(tree, role) for role in _roles(tree, legs, feet))
     if not ending:
         tree.say("guess: neither base nor trunk has a shape, so no contact ends an episode")
@@ -83,7 +82,7 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
         stiffness=stiffness,
         damping=damping,
         velocity=speed_limits(tree),
-        kind=kind,
+        legs=len(legs),
     )
 
 

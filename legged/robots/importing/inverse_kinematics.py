@@ -11,8 +11,8 @@ import numpy as np
 from legged.robots.importing.legs import ANKLE, SAMPLES, Leg, Poser
 from legged.robots.importing.tree import Tree, Vector
 
-STRETCH = {4: 0.8, 2: 0.96}
-"""Distance from hip to foot by the number of legs, in that of a stretched leg."""
+STRETCH, UPRIGHT = 0.8, 0.96
+"""Distance from hip to foot of three legs or more, and of two, in that of a stretched leg."""
 MARGIN = 0.05
 """Part of a joint's range that is kept free at each end."""
 TRIES, ROUNDS = 24, 60
@@ -57,7 +57,8 @@ def standing_angles(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], floa
     free = [(limb, k) for limb in limbs for k in range(len(limb.leg.hinges))]
     lows, highs = np.array([_kept(poser, limb.leg.hinges[k]) for limb, k in free]).T
     rest = {hinge.name: float(np.clip(0.0, *_kept(poser, hinge.name))) for hinge in tree.hinges}
-    stretch = STRETCH[2 if len(legs) < 4 else 4]
+    biped = len(legs) == 2  # three legs stand like four, each to its own side
+    stretch = UPRIGHT if biped else STRETCH
 
     def angles(x: Vector) -> dict[str, float]:
         found = dict(rest)
@@ -78,20 +79,20 @@ def standing_angles(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], floa
             foot = poser.point(limb.leg.end, limb.leg.tip)
             feet.append(foot)
             goal = np.array([limb.hip[0], limb.side, limb.hip[2] - stretch * limb.length])
-            weights = np.array([1.0, 1.0, 3.0]) if len(legs) >= 4 else np.array([0.1, 1.0, 3.0])
+            weights = np.array([0.1, 1.0, 3.0]) if biped else np.array([1.0, 1.0, 3.0])
             found += list(weights * (foot - goal) / limb.length)
-            if len(limb.leg.hinges) >= ANKLE and len(legs) < 4:
+            if len(limb.leg.hinges) >= ANKLE and biped:
                 up = poser.data.xmat[poser.ids[limb.leg.end]].reshape(3, 3) @ limb.level
                 found += list(up[:2])
         over = np.mean([foot[0] for foot in feet]) - centre[0]
-        found.append((1.0 if len(legs) < 4 else 0.2) * over / limbs[0].length)
+        found.append((1.0 if biped else 0.2) * over / limbs[0].length)
         return np.array([*found, *(0.02 * (x - middle))])
 
     best, least = middle, np.inf
     random = np.random.default_rng(0)
     for k in range(TRIES):
         x = _solved(errors, middle if k == 0 else random.uniform(lows, highs), lows, highs)
-        cost = float(np.sum(errors(x) ** 2)) + _wrong_knees(poser, limbs, forward=len(legs) < 4)
+        cost = float(np.sum(errors(x) ** 2)) + _wrong_knees(poser, limbs, forward=biped)
         if cost < least - 1e-9:
             best, least = x, cost
     found = {name: round(angle, 3) + 0.0 for name, angle in angles(best).items()}
