@@ -112,6 +112,20 @@ def test_any_number_of_legs_stands_as_four_do(added, hind, called):
     assert yaml.safe_load(Path(f"mine/{name}_flat.yaml").read_text())["extends"] == "base/quadruped_flat"
 
 
+@pytest.mark.parametrize(("low", "high", "left", "right"), [(-1.3, -0.5, -1.26, -1.26), (0.5, 2.7, -1.405, 1.405)])
+def test_legs_of_a_pair_keep_the_limits_of_both(added, low, high, left, right):
+    """The right knee bends less than the left one, which wants -1.405 rad, or the other way; 0.05 of a range is kept free."""
+    knee = URDF_LEG.format(n="fr", x=0.2, y=-0.1, side=-0.05)
+    changed = knee.replace('lower="-2.7" upper="-0.5"', f'lower="{low}" upper="{high}"')
+    name = f"toy_whose_knee_bends_to_{high:g}".replace(".", "_").replace("-", "minus_")
+    added(urdf().replace(knee, changed), "--name", name)
+    robot = load_robot(f"mine/{name}")
+    angles = dict(zip(robot.joint_names, robot.default_dof_pos, strict=True))
+    assert (angles["fl_calf"], angles["fr_calf"]) == (pytest.approx(left, abs=0.03), pytest.approx(right, abs=0.03))
+    limits = robot.dof_pos_limits
+    assert ((limits[:, 0] < robot.default_dof_pos) & (robot.default_dof_pos < limits[:, 1])).all()
+
+
 def test_a_frame_on_the_ground_is_not_the_base(added):
     """0.3 m below it, the base would stand at a tenth of its height, and torque limits by its height be a tenth too."""
     weak = urdf().replace('effort="30"', 'effort="0"')

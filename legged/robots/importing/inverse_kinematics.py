@@ -34,6 +34,8 @@ class _Limb:
     partner: Leg | None
     signs: Vector
     """Of the partner's angles."""
+    ranges: Vector
+    """(hinges, 2) where its angles may be, and with their signs the partner's [rad]."""
     hip_name: str
     """The first hinge that bends it forward."""
     hip: Vector
@@ -55,7 +57,7 @@ def standing_angles(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], floa
     poser = Poser(tree)
     limbs = _limbs(tree, legs, poser)
     free = [(limb, k) for limb in limbs for k in range(len(limb.leg.hinges))]
-    lows, highs = np.array([_kept(poser, limb.leg.hinges[k]) for limb, k in free]).T
+    lows, highs = np.array([limb.ranges[k] for limb, k in free]).T
     rest = {hinge.name: float(np.clip(0.0, *_kept(poser, hinge.name))) for hinge in tree.hinges}
     biped = len(legs) == 2  # three legs stand like four, each to its own side
     stretch = UPRIGHT if biped else STRETCH
@@ -159,12 +161,16 @@ def _limbs(tree: Tree, legs: list[Leg], poser: Poser) -> list[_Limb]:
             partner = None
         axes = np.array([data.xaxis[joints[name]] for name in leg.hinges])
         signs = np.ones(len(axes))
+        ranges = np.array([_kept(poser, name) for name in leg.hinges])
         other = None
         if partner is not None:
-            other = legs[partner]
-            theirs = np.array([data.xaxis[joints[name]] for name in other.hinges])
-            signs = np.sign((axes * [-1.0, 1.0, -1.0] * theirs).sum(axis=1))
-            taken.add(int(partner))
+            theirs = np.array([data.xaxis[joints[name]] for name in legs[partner].hinges])
+            mirrored = np.sign((axes * [-1.0, 1.0, -1.0] * theirs).sum(axis=1))
+            mapped = np.sort(mirrored[:, None] * [_kept(poser, name) for name in legs[partner].hinges], axis=1)
+            both = np.stack([np.maximum(ranges, mapped)[:, 0], np.minimum(ranges, mapped)[:, 1]], axis=1)
+            if (both[:, 0] <= both[:, 1]).all():  # else no pose suits both, and each leg stands for itself
+                other, signs, ranges = legs[partner], mirrored, both
+                taken.add(int(partner))
         bends = [k for k, axis in enumerate(axes) if abs(axis[1]) > LATERAL] or list(range(len(axes)))
         hip_name = leg.hinges[bends[0]]
         hip = data.xanchor[joints[hip_name]].copy()
@@ -172,7 +178,7 @@ def _limbs(tree: Tree, legs: list[Leg], poser: Poser) -> list[_Limb]:
         knee = next(j for j in leg.links if any(hinge.name == knee_hinge for hinge in tree.links[j].hinges))
         side = float(poser.point(leg.end, leg.tip)[1])
         level = data.xmat[poser.ids[leg.end]].reshape(3, 3).T[:, 2].copy()
-        limbs.append(_Limb(leg, other, signs, hip_name, hip, side, knee, 1.0, level))
+        limbs.append(_Limb(leg, other, signs, ranges, hip_name, hip, side, knee, 1.0, level))
     for limb in limbs:
         limb.length = _stretched(poser, limb)
     return limbs
@@ -181,7 +187,7 @@ def _limbs(tree: Tree, legs: list[Leg], poser: Poser) -> list[_Limb]:
 def _stretched(poser: Poser, limb: _Limb) -> float:
     """Return how far the foot gets from the hip [m], by random angles within the limits."""
     random = np.random.default_rng(1)
-    lows, highs = np.array([_kept(poser, name) for name in limb.leg.hinges]).T
+    lows, highs = limb.ranges.T
     hip = int(poser.model.joint(limb.hip_name).id)
     farthest = 0.0
     for k in range(SAMPLES):
