@@ -126,6 +126,42 @@ def test_legs_of_a_pair_keep_the_limits_of_both(added, low, high, left, right):
     assert ((limits[:, 0] < robot.default_dof_pos) & (robot.default_dof_pos < limits[:, 1])).all()
 
 
+SPIDER = """<mujoco><worldbody><body name="core"><freejoint/><geom type="cylinder" size="0.2 0.04" mass="4"/>
+<replicate count="{count}" euler="0 0 {turn}"><body name="coxa" pos="0.2 0 0"><joint name="coxa" axis="0 0 1" range="-40 40"/>
+<geom size="0.02" mass="0.1"/><body name="femur" pos="0.05 0 0"><joint name="femur" axis="0 1 0" range="-80 80"/>
+<geom type="capsule" fromto="0 0 0 0.1 0 0" size="0.01" mass="0.1"/><body name="tibia" pos="0.1 0 0">
+<joint name="tibia" axis="0 1 0" range="-20 140"/><geom type="capsule" fromto="0 0 0 0.13 0 0" size="0.008" mass="0.05"/>
+<geom name="foot" size="0.01" pos="0.15 0 0" mass="0.01"/></body></body></body></replicate></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("legs", ["spider of 3", "spider of 6", "short behind"])
+def test_all_feet_stand_on_the_same_ground(added, legs):
+    """Legs drawn stretched to all sides, and hind shanks of 0.15 m: the base is level, as high as the shortest leg allows.
+    The foremost leg of a spider, of 0.1 and 0.15 m, has its hip at the femur and stands 0.8 of 0.25 m below it.
+    """
+    name = legs.replace(" ", "_")
+    if legs == "short behind":
+        rear = [URDF_LEG.format(n=n, x=-0.2, y=y, side=y / 2) for n, y in (("hl", 0.1), ("hr", -0.1))]
+        text = urdf()
+        for leg in rear:
+            assert leg in text
+            text = text.replace(leg, leg.replace('<origin xyz="0 0 -0.2"/></joint>', '<origin xyz="0 0 -0.15"/></joint>'))
+        out = added(text, "--name", name)
+    else:
+        count = int(legs[-1])
+        out = added(SPIDER.format(count=count, turn=360 / count), "--name", name, file="toy.xml")
+    assert "look at it" not in out
+    robot = load_robot(f"mine/{name}")
+    model = mujoco.MjModel.from_xml_path(str(robot.model_path))
+    data = mujoco.MjData(model)
+    data.qpos[3:] = [1.0, 0.0, 0.0, 0.0, *robot.default_dof_pos]
+    mujoco.mj_kinematics(model, data)
+    depths = [data.geom(foot).xpos[2] - data.xpos[1, 2] for foot in robot.feet_names]
+    np.testing.assert_allclose(depths, np.mean(depths), atol=0.004)
+    if legs != "short behind":
+        assert np.mean(depths) == pytest.approx(-0.2, abs=0.004)
+
+
 def test_a_frame_on_the_ground_is_not_the_base(added):
     """0.3 m below it, the base would stand at a tenth of its height, and torque limits by its height be a tenth too."""
     weak = urdf().replace('effort="30"', 'effort="0"')

@@ -13,6 +13,8 @@ from legged.robots.importing.tree import Tree, Vector
 
 STRETCH, UPRIGHT = 0.8, 0.96
 """Distance from hip to foot of three legs or more, and of two, in that of a stretched leg."""
+OUTWARD = 0.5
+"""A foot stands at most so far to the side of its hip, in the length of a stretched leg."""
 MARGIN = 0.05
 """Part of a joint's range that is kept free at each end."""
 TRIES, ROUNDS = 24, 60
@@ -41,7 +43,7 @@ class _Limb:
     hip: Vector
     """(3,) where that is at zero angles [m]."""
     side: float
-    """Where its foot is at zero angles, along y [m]."""
+    """Where its foot should stand, along y: as at zero angles, if it can [m]."""
     knee: int
     """Index among the links of the next one."""
     length: float
@@ -61,6 +63,7 @@ def standing_angles(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], floa
     rest = {hinge.name: float(np.clip(0.0, *_kept(poser, hinge.name))) for hinge in tree.hinges}
     biped = len(legs) == 2  # three legs stand like four, each to its own side
     stretch = UPRIGHT if biped else STRETCH
+    ground = max(float(limb.hip[2]) - stretch * limb.length for limb in limbs)  # where the shortest leg stands
 
     def angles(x: Vector) -> dict[str, float]:
         found = dict(rest)
@@ -80,7 +83,7 @@ def standing_angles(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], floa
         for limb in limbs:
             foot = poser.point(limb.leg.end, limb.leg.tip)
             feet.append(foot)
-            goal = np.array([limb.hip[0], limb.side, limb.hip[2] - stretch * limb.length])
+            goal = np.array([limb.hip[0], limb.side, ground])
             weights = np.array([0.1, 1.0, 3.0]) if biped else np.array([1.0, 1.0, 3.0])
             found += list(weights * (foot - goal) / limb.length)
             if len(limb.leg.hinges) >= ANKLE and biped:
@@ -99,13 +102,13 @@ def standing_angles(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], floa
             best, least = x, cost
     found = {name: round(angle, 3) + 0.0 for name, angle in angles(best).items()}
     poser.pose(found)
-    miss = [_miss(poser, limb, stretch) for limb in limbs]
+    miss = [_miss(poser, limb, ground) for limb in limbs]
     return found, max(miss)
 
 
-def _miss(poser: Poser, limb: _Limb, stretch: float) -> float:
+def _miss(poser: Poser, limb: _Limb, ground: float) -> float:
     foot = poser.point(limb.leg.end, limb.leg.tip)
-    goal = np.array([limb.side, limb.hip[2] - stretch * limb.length])
+    goal = np.array([limb.side, ground])
     return float(np.linalg.norm(foot[1:] - goal) / limb.length)
 
 
@@ -181,6 +184,8 @@ def _limbs(tree: Tree, legs: list[Leg], poser: Poser) -> list[_Limb]:
         limbs.append(_Limb(leg, other, signs, ranges, hip_name, hip, side, knee, 1.0, level))
     for limb in limbs:
         limb.length = _stretched(poser, limb)
+        out = OUTWARD * limb.length  # legs that are drawn stretched to the side reach no further, as low as they stand
+        limb.side = float(np.clip(limb.side, limb.hip[1] - out, limb.hip[1] + out))
     return limbs
 
 
