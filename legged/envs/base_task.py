@@ -206,6 +206,8 @@ class BaseTask(ObservingTask, PrivilegedTerms, SavedTask, VecEnv):
         self.sense()
         self.advance()
         self.check_termination()
+        if type(self).check_termination is not BaseTask.check_termination:
+            self._settle_endings()
         with self._beside.fork():
             self.measure()
         self.compute_reward()
@@ -263,6 +265,13 @@ class BaseTask(ObservingTask, PrivilegedTerms, SavedTask, VecEnv):
         torch.lt(largest, LARGEST_STATE, out=self._in_bounds)  # so is NaN not
         torch.logical_and(self._in_bounds, self.faults.sound, out=self.valid)
         self.terminations.evaluate(self.valid, self.episode_length_buf >= self.max_episode_length)
+
+    def _settle_endings(self) -> None:
+        """Let what an override of `check_termination` wrote into `reset_buf`, as legged_gym's do, count: what ends and is not
+        out of time has failed.
+        """
+        self.time_out_buf.logical_and_(self.reset_buf)
+        torch.gt(self.reset_buf, self.time_out_buf, out=self.terminated_buf)
 
     def measure(self) -> None:
         """Record metrics and faults of the step. Runs beside the rewards."""

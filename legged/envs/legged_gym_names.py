@@ -189,6 +189,16 @@ _INDICES = (
 _BODIES = (
     "self.feet_pos and self.feet_vel (N, F, 3) have the feet; QUANTITIES = ('xpos', 'xquat', 'cvel') asks for all bodies"
 )
+_ANGLES = "self.rpy (N, 3) has roll, pitch and yaw, each in [-pi, pi]"
+_HISTORY = "observations.groups.<group>.history in the YAML says how many steps a group holds"
+_PICTURES = "nothing is drawn while training; play.py makes pictures (legged/rendering)"
+
+
+def _drawn(name: str) -> str:
+    """Say where what is drawn for each robot is."""
+    return f"self.randomization.fields['{name}'] is what domain_rand.ranges.{name} draws (docs/randomisation.md)"
+
+
 ABSENT = {
     "common_step_counter": _COUNT,
     "gym": _GYM,
@@ -202,8 +212,35 @@ ABSENT = {
     "rigid_body_state": _BODIES,
     "rigid_body_pos": _BODIES,
     "height_samples": "self.measured_heights (N, P) are the heights around each robot, self.terrain.height_map all of them",
+    "rigid_state": _BODIES,
+    "rb_states": _BODIES,
     "hip_indices": _INDICES,
+    "knee_indices": _INDICES,
+    "thigh_indices": _INDICES,
+    "calf_indices": _INDICES,
     "command_counter": _COUNT,
+    "global_counter": _COUNT,
+    "roll": _ANGLES,
+    "pitch": _ANGLES,
+    "yaw": _ANGLES,
+    "base_euler_xyz": _ANGLES,
+    "first_contact": "self.contacts.first_contact (N, F) says which feet touch down at this step",
+    "obs_history": _HISTORY,
+    "obs_history_buf": _HISTORY,
+    "env_frictions": _drawn("friction"),
+    "friction_coeffs_tensor": _drawn("friction"),
+    "restitutions": _drawn("restitution"),
+    "payload": _drawn("added_base_mass"),
+    "payloads": _drawn("added_base_mass"),
+    "com_displacement": _drawn("base_com_x"),
+    "com_displacements": _drawn("base_com_x"),
+    "motor_strength": _drawn("motor_strength"),
+    "motor_strengths": _drawn("motor_strength"),
+    "motor_offsets": _drawn("joint_offset"),
+    "Kp_factors": _drawn("p_gain"),
+    "Kd_factors": _drawn("d_gain"),
+    "headless": _PICTURES,
+    "debug_viz": _PICTURES,
     "init_done": "_init_buffers() and what it calls run before the first step, everything else after them",
 }
 """Name that is not there -> what takes its place."""

@@ -2,6 +2,7 @@
 
 import inspect
 from pathlib import Path
+from types import CodeType
 from typing import Any
 
 from legged.config.networks import groups_in, path_of_terms
@@ -81,14 +82,26 @@ OUTSIDE = {
 }
 """Method of a task that only play and evaluation call -> what is overridden in its place."""
 
+EXTENDED = {
+    "advance": "time would stand still: episode_length_buf and self.contacts",
+    "check_termination": "falls would not be counted, nor robots put back whose physics blew up; what ends an episode is a"
+    " method _terminate_<name>, listed in terminations.failures or terminations.time_outs",
+    "compute_reward": "rewards of episodes and falls would not be counted; a reward is a method _reward_<name>, with its"
+    " scale in rewards.scales",
+    "draw": "all episodes would begin alike, under the same commands",
+    "remember": "last_actions and last_dof_vel would be those of the start",
+    "reset_idx": "no episode would begin anew",
+}
+"""Hook that a class extends and does not replace -> what would be missing."""
+
 
 def check_overrides(cls: type) -> None:
-    """Look for hooks that `cls`, or a class between it and the class of this package that it extends, defines in vain, and
-    whether it can be made as tasks are made here.
+    """Look for hooks that `cls`, or a class between it and the class of this package that it extends, defines in vain or
+    without what they do here, and whether it can be made as tasks are made here.
 
     Raises:
         ConfigError: there is a hook which that class does not have, or which training does not call, and no OWN_HELPERS
-            names; or a constructor that wants other arguments.
+            names; one that does not call super()'s; or a constructor that wants other arguments.
     """
     base = next(part for part in cls.__mro__ if part.__module__.startswith("legged."))
     between = [part for part in cls.__mro__ if part not in base.__mro__]
@@ -105,8 +118,20 @@ def check_overrides(cls: type) -> None:
                 f"{place(part, vars(part)[name])}: {part.__name__}.{name} {vain}"
                 f" (if your own code calls it: OWN_HELPERS = ('{name}',) in the class)"
             )
+        for name in EXTENDED:
+            code = getattr(inspect.unwrap(vars(part).get(name, check_overrides)), "__code__", None)
+            if name in vars(part) and code is not None and name not in _names_in(code):
+                raise ConfigError(
+                    f"{place(part, vars(part)[name])}: {part.__name__}.{name} must call super().{name}(): {EXTENDED[name]}"
+                )
         if "__init__" in vars(part):
             _check_constructor(part)
+
+
+def _names_in(code: CodeType) -> set[str]:
+    """Return the attributes and globals that a function, or one within it, names."""
+    within = [constant for constant in code.co_consts if isinstance(constant, CodeType)]
+    return set(code.co_names).union(*(_names_in(constant) for constant in within))
 
 
 def _check_constructor(part: type) -> None:

@@ -3,8 +3,9 @@
 Two inertias matter. With the robot in the air a joint moves what hangs on it, against the rest; with its feet on the ground
 the same joint moves the base as well. P gains come from the first, at a natural frequency that is the same for all robots in
 units of their own time sqrt(h / g), but so that no joint gives way under the robot's weight; D gains come from the geometric
-mean of both, at one damping ratio. For ANYmal C and Go2 this gives their makers' P gains within a factor of two, and D gains
-that are 0.7 to 2.4 and 1.9 to 3.7 times theirs.
+mean of both, at one damping ratio. Both are kept so small that an explicit control law is stable at steps of 5 ms. For ANYmal
+C and Go2 this gives their makers' P gains within a factor of two, and D gains that are 0.7 to 2.4 and 1.9 to 3.7 times
+theirs.
 """
 
 from collections.abc import Sequence
@@ -25,7 +26,7 @@ LARGEST_TARGET = 0.3
 TIME_STEP = 0.005
 """Physics step in which an explicit control law has to be stable [s]."""
 MARGIN = 1.0
-"""Largest eigenvalue of TIME_STEP M^-1 D; from 2 on the explicit law diverges."""
+"""Largest eigenvalue of TIME_STEP M^-1 D and of TIME_STEP^2 M^-1 K; from 2 on the explicit law diverges."""
 
 VELOCITY_LIMIT = 30.0
 """Largest speed of the joints of a robot that states none, as geared motors of legged robots have it [rad/s]."""
@@ -51,6 +52,8 @@ def gains(
     leg = np.abs(jacobian[:, dofs]).max(axis=0) > 0.0
     least = np.maximum(weight / SAG, SHIFT * model.body_mass.sum() * gravity * height * leg)
     stiffness = np.minimum(np.maximum(in_air * FREQUENCY**2 * gravity / height, least), effort / LARGEST_TARGET)
+    # By Gershgorin's circles no eigenvalue of TIME_STEP^2 M^-1 K is larger: what is light, as toes are, is held more softly.
+    stiffness = np.minimum(stiffness, MARGIN / (TIME_STEP**2 * np.abs(inverse[np.ix_(dofs, dofs)]).sum(axis=0)))
     damping = 2.0 * RATIO * np.sqrt(stiffness * np.sqrt(in_air * on_feet))
     damping = np.minimum(damping, MARGIN * in_air / TIME_STEP)
     fastest = TIME_STEP * np.abs(np.linalg.eigvals(inverse[np.ix_(dofs, dofs)] * damping)).max()

@@ -14,7 +14,7 @@ from legged.config.checks import PLAIN, is_plain_name, shown
 from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, exists, make_folder, ready_to_write, relative, write_text
 from legged.registry import register_file, task_config
-from legged.robots.importing.folder import Guesses, task_yaml, write_folder
+from legged.robots.importing.folder import Guesses, called, task_yaml, write_folder
 from legged.robots.importing.guess import make_ready, read_robot
 from legged.robots.importing.menagerie import PREFIX, menagerie_model
 from legged.robots.importing.mend import plain
@@ -74,7 +74,7 @@ def _main(argv: list[str] | None) -> int:
     megabytes = write_folder(folder, tree, guesses, source, licence)
     robot = load_robot(str(folder))
     where = name if folder.parent == data_folder("resources") / "robots" else f"./{name}"
-    extends = args.extends or f"base/{guesses.kind}_flat"
+    extends = args.extends or f"base/{'biped' if guesses.legs == 2 else 'quadruped'}_flat"
     make_folder(task.parent)
     symmetric = robot.mirror is not None and robot.mirror.uneven_joint(robot.default_dof_pos) is None
     write_text(task, task_yaml(name, where, extends, symmetric))
@@ -138,7 +138,7 @@ def _report(tree: Tree, guesses: Guesses, folder: Path, task: Path, megabytes: f
     driven = sum(hinge.driven for hinge in tree.hinges)
     mass = sum(link.mass for link in tree.links)
     counts = f"{len(tree.hinges)} hinges, {driven} motors, {len(tree.shapes)} shapes"
-    print(f"{tree.name}: a {guesses.kind} of {mass:.4g} kg, {counts}")
+    print(f"{tree.name}: a {called(guesses.legs)} of {mass:.4g} kg, {counts}")
     for line in tree.said:
         print(f"  {line}")
     for title, names in (("is penalised", guesses.penalized), ("ends an episode", guesses.terminating)):

@@ -65,6 +65,31 @@ def test_a_fall_at_the_last_step_is_a_fall_and_no_time_out():
 # ---- failures --------------------------------------------------------------------------------------------------------
 
 
+def test_an_episode_that_an_override_ends_as_legged_gyms_do_is_a_fall():
+    """Of four robots that begin at steps 0 to 3 of 30, those at step 8 are ended; a time-out stays one, and what the override
+    spares is neither.
+    """
+
+    class Ending(LeggedRobot):
+        def check_termination(self):
+            super().check_termination()
+            self.reset_buf |= self.episode_length_buf == 8
+            self.reset_buf &= self.commands[:, 0] < 5.0
+
+    settings = [("env.episode_length_s", 0.6), ("rewards.scales.termination", -100.0)]
+    task = Ending(small_config(*settings))
+    task.command_sampler.hold(torch.zeros(3))
+    task.episode_length_buf = torch.tensor([7, 29, 0, 29])
+    task.commands[3, 0] = 9.0
+    _, rewards, dones, extras = task.step(zero_actions(task))
+    assert dones.tolist() == [True, True, False, False]
+    assert extras["time_outs"].tolist() == [False, True, False, False]
+    assert task.terminated_buf.tolist() == [True, False, False, False]
+    assert rewards[0] == pytest.approx(-100.0 * task.dt, abs=0.2)
+    assert rewards[1:].abs().max() < 0.2
+    assert task.log_rollout()["Metrics/falls"] == 0.5
+
+
 def test_a_base_that_touches_the_ground_ends_the_episode_of_that_robot_only():
     task = standing()
     lay_on_its_back(task, 2)

@@ -1,6 +1,7 @@
 """What environment classes of legged_gym and its forks call by other names, and what such a class must not do."""
 
 import math
+import re
 
 import pytest
 import torch
@@ -114,6 +115,18 @@ def test_a_name_that_is_not_there_says_what_is(task, name):
     with pytest.raises(AttributeError, match=f"^self.{name}: is not there; ") as error:
         getattr(task, name)
     assert ABSENT[name] in str(error.value)
+
+
+def test_what_takes_the_place_of_a_name_is_there():
+    """What is drawn lies under the names that the errors say, and two names of forks are not taken for others like them."""
+    said = re.findall(r"self\.randomization\.fields\['(\w+)'\]", " ".join(ABSENT.values()))
+    assert {"friction", "added_base_mass", "motor_strength", "p_gain"} <= set(said)
+    ranges = {name: [0.9, 1.0] for name in said}
+    varied = small_task(("domain_rand.randomize_friction", False), ("domain_rand.ranges", ranges))
+    assert all(varied.randomization.fields[name].shape[0] == varied.num_envs for name in said)
+    assert varied.contacts.first_contact.shape == (varied.num_envs, varied.feet_num)
+    assert "root_states" not in ABSENT["rb_states"]
+    assert varied.rpy.shape == (varied.num_envs, 3)
 
 
 def test_a_slip_of_the_pen_has_its_nearest_name(task):

@@ -8,7 +8,7 @@ import pytest
 from helpers import call, small_config
 
 from legged.envs import LeggedRobot
-from legged.envs.overrides import HOOKS
+from legged.envs.overrides import EXTENDED, HOOKS
 from legged.errors import ConfigError
 from legged.tools import train
 
@@ -163,6 +163,19 @@ def test_a_helper_of_that_name_which_the_class_calls_itself_is_allowed(own):
         subclass("Last", (Mine,), _push_robots=hook).check(small_config())
 
 
+@pytest.mark.parametrize("name", EXTENDED)
+def test_a_hook_that_replaces_what_is_done_here_is_refused(name):
+    """legged_gym's own check_termination writes reset_buf and calls nothing: here falls would go uncounted."""
+
+    def replaced(self, *args):
+        self.reset_buf = self.episode_length_buf > 7
+
+    with pytest.raises(ConfigError) as error:
+        subclass(**{name: replaced}).check(small_config())
+    line = replaced.__code__.co_firstlineno
+    assert f"test_overrides.py:{line}: Mine.{name} must call super().{name}(): {EXTENDED[name]}" in str(error.value)
+
+
 def test_methods_that_are_called_here_and_those_of_another_name_are_allowed():
     class Mine(LeggedRobot):
         def check_termination(self):
@@ -172,7 +185,7 @@ def test_methods_that_are_called_here_and_those_of_another_name_are_allowed():
             super().compute_reward()
 
         def reset_idx(self, mask):
-            super().reset_idx(mask)
+            (lambda: LeggedRobot.reset_idx(self, mask))()
 
         def _step(self):
             super()._step()

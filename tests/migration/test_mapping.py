@@ -116,6 +116,28 @@ def test_what_has_no_counterpart_is_listed_by_file_and_line(migrated, section, l
     built(result)
 
 
+RANGES = "motor_strength_range = [0.8, 1.2]"
+
+
+@pytest.mark.parametrize(
+    ("lines", "lost", "ranges"),
+    [
+        (f"randomize_motor_strength = True\n{RANGES}", [], {"motor_strength": [0.8, 1.2]}),
+        (f"randomize_motor_strength = False\n{RANGES}", [], None),
+        (f"randomize_motor = True\n{RANGES}", ["randomize_motor = True", RANGES], None),
+        (RANGES, [RANGES], None),
+        ("randomize_kp = True", ["randomize_kp = True"], None),
+        ("randomize_kp = True\nkp_range = [0.9]", ["randomize_kp = True", "kp_range = [0.9]"], None),
+        ("randomize_gains = True\nstiffness_multiplier_range = [0.9, 1.1]", [], {"p_gain": [0.9, 1.1]}),
+    ],
+)
+def test_what_a_fork_draws_of_the_model_is_mapped_or_listed_or_off(migrated, lines, lost, ranges):
+    """A range whose switch has another name than the known one was neither in the task nor in the list."""
+    result = migrated(sections(domain_rand=lines))
+    assert [line.split(": ")[1] for line in result.lost] == [f"domain_rand.{line}" for line in lost]
+    assert result.data.get("domain_rand", {}).get("ranges") == ranges
+
+
 def test_legged_gyms_own_settings_that_mean_nothing_here_are_not_listed(migrated):
     """physx, viewer and the like are in every configuration."""
     assert migrated(BASE + FLAT).lost == []

@@ -178,6 +178,14 @@ def test_a_file_without_actuators_drives_every_hinge_by_its_force_range(read):
     assert any("no actuators" in line for line in tree.said)
 
 
+def test_a_heavy_door_beside_the_robot_is_not_the_robot(read):
+    """It hangs on a hinge, but nothing hangs on it."""
+    door = '<body name="door" pos="3 0 1"><joint name="swing"/><geom type="box" size="0.1 0.5 1" mass="300"/></body>'
+    tree = read(scene().replace("<worldbody>", f"<worldbody>{door}"))
+    assert (tree.links[0].name, tree.mass) == ("trunk", pytest.approx(12.0))
+    assert any("bodies door, crate" in line for line in tree.said)
+
+
 @pytest.mark.parametrize("root", ["", '<joint name="x" type="slide" axis="1 0 0"/><joint name="turn" axis="0 1 0"/>'])
 def test_a_base_that_does_not_float_does(dog, root):
     """It is fixed to the world, or hangs on joints of a plane, as the half cheetah."""
@@ -319,7 +327,10 @@ def test_loops_and_springs_are_kept(read, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>", "nothing in it turns: no body has a hinge"),
+        (
+            "<mujoco><worldbody><geom size='1'/></worldbody></mujoco>",
+            "nothing in it turns: no body that hangs on another one has a hinge",
+        ),
         ("<mujoco><worldbody><body/></worldbody>", "MuJoCo refuses it"),
         ("<mujoco><compiler coordinate='global'/></mujoco>", "MuJoCo refuses it"),
     ],
@@ -373,3 +384,7 @@ def test_gains_of_position_actuators_are_taken_where_they_hold(tmp_path):
     assert guesses.stiffness == {}
     assert any("gains of the file's position actuators are left out" in line for line in tree.said)
     assert all(hinge.passive["damping"] == 0.5 for hinge in tree.hinges)
+    path.write_text(scene().replace('damping="0.5"', ""))  # deviations would go on for ever
+    tree = read_robot(path)
+    assert make_ready(tree).stiffness == {}
+    assert any("left out: neither actuators nor joints have any damping" in line for line in tree.said)

@@ -100,6 +100,16 @@ def test_gains_of_a_leg_on_a_heavy_base(pendulum):
     assert stiffness == pytest.approx(1.5 / LARGEST_TARGET)
 
 
+def test_what_is_too_light_for_the_weight_is_held_as_softly_as_the_explicit_law_needs(pendulum):
+    """A robot that would stand 1 km high wants m g h / 10 of a leg of 0.2 kg m^2. Semi-implicit steps with K dt^2 / I above 4
+    diverge; it is kept to 1, at 8000 N m/rad. Toes of a biped were driven until its physics blew up.
+    """
+    joint, foot = pendulum.joint("hip").id, pendulum.geom("foot").id
+    stiffness, _ = gains(pendulum, pendulum.qpos0, [joint], [foot], np.array([1e9]), 1000.0)
+    assert stiffness == pytest.approx(MARGIN * 0.2 / TIME_STEP**2, rel=1e-2)
+    assert stiffness == pytest.approx(8000.0, rel=1e-2)
+
+
 def test_p_gains_of_known_robots_are_those_of_their_makers_within_a_factor_of_two_and_d_gains_nearly():
     """ANYmal C 90 N m/rad and 4 N m s/rad; Go2 20 and 0.5, whose D gain is known as small."""
     for name, most in (("anymal_c", 2.5), ("go2", 3.8)):
@@ -128,6 +138,7 @@ def test_the_explicit_law_is_stable_and_holds_the_weight():
     mujoco.mj_forward(model, data)
     inverse = np.linalg.inv(mass_matrix(model, data))[6:, 6:]
     assert TIME_STEP * np.abs(np.linalg.eigvals(inverse * d)).max() <= MARGIN + 1e-9
+    assert TIME_STEP**2 * np.abs(np.linalg.eigvals(inverse * p)).max() <= MARGIN + 1e-9
     knees = [i for i, name in enumerate(robot.joint_names) if "KFE" in name]
     assert (25.0 / p[knees] < SAG * 1.01).all()  # 25 N m each carries the robot, worked out from a quarter of its weight
     assert RATIO == 0.5

@@ -6,6 +6,7 @@ import pytest
 from importing_fixtures import LEG_MASS, LEGS, TRUNK, urdf
 
 from legged.errors import ConfigError
+from legged.robots.importing.guess import make_ready, read_robot
 from legged.robots.importing.mend import mend
 from legged.robots.importing.mjcf import read_mjcf
 from legged.robots.importing.shapes import fit_meshes, name_shapes
@@ -321,3 +322,13 @@ def test_what_is_written_is_what_was_read(read, tmp_path):
     ):
         np.testing.assert_allclose(getattr(one, name), getattr(two, name), atol=1e-8, err_msg=name)
     assert {n for n in LEGS} == {name[:2] for name in (hinge.name for hinge in again.hinges)}
+
+
+def test_a_heel_behind_a_toe_may_stand_on_the_ground(tmp_path):
+    """Toes turn: they are the feet, and heels, which stand beside them, are no shanks whose contact is penalised."""
+    fixed, toe = '_foot_fixed" type="fixed" dont_collapse="true">', '_toe" type="revolute"><axis xyz="0 1 0"/>'
+    text = urdf().replace(fixed, f'{toe}<limit lower="-0.3" upper="0.3" effort="9"/>').replace("_calf", "_heel")
+    (tmp_path / "toy.urdf").write_text(text)
+    guesses = make_ready(read_robot(tmp_path / "toy.urdf"))
+    assert guesses.feet == ["foot"]
+    assert guesses.penalized == [f"{leg}_thigh" for leg in LEGS]

@@ -77,7 +77,8 @@ def states(trials: Trials) -> list[str]:
     ("changes", "words"),
     [
         ({"tasks": "x"}, "mine.yaml: tasks: unknown key 'tasks'; did you mean 'task'?"),
-        ({"task": "half_cheeta"}, "there is no task 'half_cheeta'; did you mean 'half_cheetah'?"),
+        ({"task": "half_cheeta"}, "mine.yaml: task: there is no task 'half_cheeta'; did you mean 'half_cheetah'?"),
+        ({"task": "half_cheeta.yaml"}, "mine.yaml: task: there is no file 'half_cheeta.yaml'"),
         ({"trials": 0}, "mine.yaml: trials: must be at least 1, got 0"),
         ({"parameters": {}}, "mine.yaml: parameters: a sweep tries the values of at least one setting"),
         (

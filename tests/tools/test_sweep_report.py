@@ -94,3 +94,19 @@ def test_a_sweep_that_was_begun_on_a_cpu_does_not_go_on_with_a_gpu_but_is_report
     said = "error: --sim_device: the trials of 'sweep_mine' are trained on cpu, and those on cuda can't be compared with them"
     assert capsys.readouterr().err.startswith(said)
     assert call(sweep.main, ["mine.yaml", "--report"]) == 0
+
+
+def test_a_task_may_be_a_file_beside_that_of_the_sweep():
+    """As it may of train.py, whose command in the table names it, as one would from where the sweep was run."""
+    runner = {"max_iterations": 2, "num_steps_per_env": 4, "evaluate_interval": 1, "evaluate_envs": 2}
+    small = {"env": {"num_envs": 4, "episode_length_s": 0.5}, "sim": {"physics": "mujoco", "threads": 1}}
+    task = {"extends": "half_cheetah", **small, "train": {"runner": runner}}
+    parameters = {"train.algorithm.gamma": {"low": 0.9, "high": 0.99}}
+    Path("mine").mkdir()
+    Path("mine/short_cheetah.yaml").write_text(yaml.safe_dump(task))
+    given = {"task": "short_cheetah.yaml", "trials": 1, "objective": {"figure": "return"}, "parameters": parameters}
+    Path("mine/search.yaml").write_text(yaml.safe_dump(given))
+    assert call(sweep.main, ["mine/search.yaml", "--sim_device", "cpu"]) == 0
+    text = Path("logs/sweep_search/table.md").read_text()
+    assert "`short_cheetah`, for the last return" in text
+    assert "python train.py --task mine/short_cheetah.yaml train.algorithm.gamma=0.9" in text

@@ -40,7 +40,8 @@ def speed_limits(tree: Tree) -> dict[str, float]:
 
 def take_gains(tree: Tree, angles: dict[str, float]) -> tuple[dict[str, float], dict[str, float]]:
     """Return P and D gains [N m/rad], [N m s/rad] of the file's position actuators by hinge; the damping of a hinge whose
-    actuator has none is its D gain, and leaves the hinge. Empty, where the file has none or they would not hold.
+    actuator has none is its D gain, and leaves the hinge. Empty, where the file has none, nothing is damped, or
+    they would not hold.
     """
     driven = [hinge for hinge in tree.hinges if hinge.driven]
     stated = [hinge for hinge in driven if hinge.stiffness]
@@ -53,6 +54,9 @@ def take_gains(tree: Tree, angles: dict[str, float]) -> tuple[dict[str, float], 
         return {}, {}
     stiffness = {hinge.name: float(hinge.stiffness or 0.0) for hinge in driven}
     damping = {hinge.name: float(hinge.damping or hinge.passive.get("damping", 0.0)) for hinge in driven}
+    if not any(damping.values()):  # on the verge of growth, to either side of which rounding puts it
+        tree.say("gains of the file's position actuators are left out: neither actuators nor joints have any damping")
+        return {}, {}
     growth = _growth(tree, angles, stiffness, damping)
     if growth > 1.0:
         tree.say(

@@ -35,8 +35,12 @@ class Guesses:
     stiffness: dict[str, float]
     damping: dict[str, float]
     velocity: dict[str, float]
-    kind: str
-    """quadruped or biped."""
+    legs: int
+
+
+def called(legs: int) -> str:
+    """Return what a robot with so many legs is called."""
+    return {2: "biped", 4: "quadruped"}.get(legs, f"robot with {legs} legs")
 
 
 def write_folder(folder: Path, tree: Tree, guesses: Guesses, source: str, licence: str) -> float:

@@ -1,5 +1,6 @@
 """A Tree that was read -> one that is ready, with everything that robot.yaml says, each guess named."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from legged.errors import ConfigError
 from legged.robots.importing.actuation import guess_efforts, speed_limits, take_gains
-from legged.robots.importing.folder import Guesses
+from legged.robots.importing.folder import Guesses, called
 from legged.robots.importing.inverse_kinematics import GOOD, standing_angles
 from legged.robots.importing.legs import Leg, Poser, face_forward, find_legs
 from legged.robots.importing.mend import mend
@@ -22,6 +23,8 @@ LIGHT = 0.005
 """Fingers that move a smaller part of the mass are held."""
 MIDDLE = 0.01
 """How far from the middle plane a link may begin that belongs to the trunk [m]."""
+SOLE = re.compile(r"foot|feet|toe|sole|heel", re.IGNORECASE)
+"""In the names of what stands on the ground behind a toe."""
 ABOVE = 1.03
 """Spawn height, in that of the standing base."""
 LOST = 1e-6
@@ -66,8 +69,7 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
         stiffness, damping = ({hinge.name: gain for hinge in tree.hinges if hinge.driven} for gain in gains)
     _check_mass(tree)
     feet = [shape.name for leg in legs for shape in leg.feet]
-    kind = "quadruped" if len(legs) > 2 else "biped"
-    tree.say(f"guess: a {kind} with feet", ", ".join(feet))
+    tree.say(f"guess: a {called(len(legs))} with feet", ", ".join(feet))
     ending, penalized = (_named_apart(tree, role) for role in _roles(tree, legs, feet))
     if not ending:
         tree.say("guess: neither base nor trunk has a shape, so no contact ends an episode")
@@ -83,7 +85,7 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
         stiffness=stiffness,
         damping=damping,
         velocity=speed_limits(tree),
-        kind=kind,
+        legs=len(legs),
     )
 
 
@@ -142,18 +144,20 @@ def _exact(tree: Tree, names: Sequence[str]) -> list[str]:
 
 def _roles(tree: Tree, legs: list[Leg], feet: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the shapes whose contact ends an episode, those of the base and of what carries arms and a head, and those whose
-    contact is penalised: thighs, shanks, and what arms end in. Hips are next to the base, and hardly touch.
+    contact is penalised: thighs, shanks, and what arms end in. Hips are next to the base, and hardly touch; heels stand.
     """
     poser = Poser(tree)
     poser.pose({})
     of_legs = {i for leg in legs for i in leg.links}
+    before = {i for leg in legs for i in leg.links[-2:-1]}  # of a leg that ends in a toe, it has the heel
+    soles = {shape.name for i in before for shape in tree.links[i].shapes if SOLE.search(f"{shape.link} {shape.name}")}
     in_the_middle = [i for i in range(len(tree.links)) if i not in of_legs and abs(poser.point(i, np.zeros(3))[1]) < MIDDLE]
     ends = [i for i in range(1, len(tree.links)) if not tree.children(i) and i not in of_legs and i not in in_the_middle]
     limbs = [i for leg in legs for i in (leg.links[1:] if len(leg.links) > 2 else leg.links)[-3:]]
     found = []
     for links in (in_the_middle, limbs + ends):
         shapes = [shape for i in dict.fromkeys(links) for shape in tree.links[i].shapes if shape.collides]
-        found.append([shape.name for shape in shapes if shape.name not in feet])
+        found.append([shape.name for shape in shapes if shape.name not in soles.union(feet)])
     ending, penalized = found
     return ending, penalized
 

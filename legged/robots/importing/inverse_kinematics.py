@@ -11,8 +11,10 @@ import numpy as np
 from legged.robots.importing.legs import ANKLE, SAMPLES, Leg, Poser
 from legged.robots.importing.tree import Tree, Vector
 
-STRETCH = {4: 0.8, 2: 0.96}
-"""Distance from hip to foot by the number of legs, in that of a stretched leg."""
+STRETCH, UPRIGHT = 0.8, 0.96
+"""Distance from hip to foot of three legs or more, and of two, in that of a stretched leg."""
+OUTWARD = 0.5
+"""A foot stands at most so far to the side of its hip, in the length of a stretched leg."""
 MARGIN = 0.05
 """Part of a joint's range that is kept free at each end."""
 TRIES, ROUNDS = 24, 60
@@ -34,12 +36,14 @@ class _Limb:
     partner: Leg | None
     signs: Vector
     """Of the partner's angles."""
+    ranges: Vector
+    """(hinges, 2) where its angles may be, and with their signs the partner's [rad]."""
     hip_name: str
     """The first hinge that bends it forward."""
     hip: Vector
     """(3,) where that is at zero angles [m]."""
     side: float
-    """Where its foot is at zero angles, along y [m]."""
+    """Where its foot should stand, along y: as at zero angles, if it can [m]."""
     knee: int
     """Index among the links of the next one."""
     length: float
@@ -55,9 +59,11 @@ def standing_angles(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], floa
     poser = Poser(tree)
     limbs = _limbs(tree, legs, poser)
     free = [(limb, k) for limb in limbs for k in range(len(limb.leg.hinges))]
-    lows, highs = np.array([_kept(poser, limb.leg.hinges[k]) for limb, k in free]).T
+    lows, highs = np.array([limb.ranges[k] for limb, k in free]).T
     rest = {hinge.name: float(np.clip(0.0, *_kept(poser, hinge.name))) for hinge in tree.hinges}
-    stretch = STRETCH[2 if len(legs) < 4 else 4]
+    biped = len(legs) == 2  # three legs stand like four, each to its own side
+    stretch = UPRIGHT if biped else STRETCH
+    ground = max(float(limb.hip[2]) - stretch * limb.length for limb in limbs)  # where the shortest leg stands
 
     def angles(x: Vector) -> dict[str, float]:
         found = dict(rest)
@@ -77,32 +83,32 @@ def standing_angles(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], floa
         for limb in limbs:
             foot = poser.point(limb.leg.end, limb.leg.tip)
             feet.append(foot)
-            goal = np.array([limb.hip[0], limb.side, limb.hip[2] - stretch * limb.length])
-            weights = np.array([1.0, 1.0, 3.0]) if len(legs) >= 4 else np.array([0.1, 1.0, 3.0])
+            goal = np.array([limb.hip[0], limb.side, ground])
+            weights = np.array([0.1, 1.0, 3.0]) if biped else np.array([1.0, 1.0, 3.0])
             found += list(weights * (foot - goal) / limb.length)
-            if len(limb.leg.hinges) >= ANKLE and len(legs) < 4:
+            if len(limb.leg.hinges) >= ANKLE and biped:
                 up = poser.data.xmat[poser.ids[limb.leg.end]].reshape(3, 3) @ limb.level
                 found += list(up[:2])
         over = np.mean([foot[0] for foot in feet]) - centre[0]
-        found.append((1.0 if len(legs) < 4 else 0.2) * over / limbs[0].length)
+        found.append((1.0 if biped else 0.2) * over / limbs[0].length)
         return np.array([*found, *(0.02 * (x - middle))])
 
     best, least = middle, np.inf
     random = np.random.default_rng(0)
     for k in range(TRIES):
         x = _solved(errors, middle if k == 0 else random.uniform(lows, highs), lows, highs)
-        cost = float(np.sum(errors(x) ** 2)) + _wrong_knees(poser, limbs, forward=len(legs) < 4)
+        cost = float(np.sum(errors(x) ** 2)) + _wrong_knees(poser, limbs, forward=biped)
         if cost < least - 1e-9:
             best, least = x, cost
     found = {name: round(angle, 3) + 0.0 for name, angle in angles(best).items()}
     poser.pose(found)
-    miss = [_miss(poser, limb, stretch) for limb in limbs]
+    miss = [_miss(poser, limb, ground) for limb in limbs]
     return found, max(miss)
 
 
-def _miss(poser: Poser, limb: _Limb, stretch: float) -> float:
+def _miss(poser: Poser, limb: _Limb, ground: float) -> float:
     foot = poser.point(limb.leg.end, limb.leg.tip)
-    goal = np.array([limb.side, limb.hip[2] - stretch * limb.length])
+    goal = np.array([limb.side, ground])
     return float(np.linalg.norm(foot[1:] - goal) / limb.length)
 
 
@@ -158,12 +164,16 @@ def _limbs(tree: Tree, legs: list[Leg], poser: Poser) -> list[_Limb]:
             partner = None
         axes = np.array([data.xaxis[joints[name]] for name in leg.hinges])
         signs = np.ones(len(axes))
+        ranges = np.array([_kept(poser, name) for name in leg.hinges])
         other = None
         if partner is not None:
-            other = legs[partner]
-            theirs = np.array([data.xaxis[joints[name]] for name in other.hinges])
-            signs = np.sign((axes * [-1.0, 1.0, -1.0] * theirs).sum(axis=1))
-            taken.add(int(partner))
+            theirs = np.array([data.xaxis[joints[name]] for name in legs[partner].hinges])
+            mirrored = np.sign((axes * [-1.0, 1.0, -1.0] * theirs).sum(axis=1))
+            mapped = np.sort(mirrored[:, None] * [_kept(poser, name) for name in legs[partner].hinges], axis=1)
+            both = np.stack([np.maximum(ranges, mapped)[:, 0], np.minimum(ranges, mapped)[:, 1]], axis=1)
+            if (both[:, 0] <= both[:, 1]).all():  # else no pose suits both, and each leg stands for itself
+                other, signs, ranges = legs[partner], mirrored, both
+                taken.add(int(partner))
         bends = [k for k, axis in enumerate(axes) if abs(axis[1]) > LATERAL] or list(range(len(axes)))
         hip_name = leg.hinges[bends[0]]
         hip = data.xanchor[joints[hip_name]].copy()
@@ -171,16 +181,18 @@ def _limbs(tree: Tree, legs: list[Leg], poser: Poser) -> list[_Limb]:
         knee = next(j for j in leg.links if any(hinge.name == knee_hinge for hinge in tree.links[j].hinges))
         side = float(poser.point(leg.end, leg.tip)[1])
         level = data.xmat[poser.ids[leg.end]].reshape(3, 3).T[:, 2].copy()
-        limbs.append(_Limb(leg, other, signs, hip_name, hip, side, knee, 1.0, level))
+        limbs.append(_Limb(leg, other, signs, ranges, hip_name, hip, side, knee, 1.0, level))
     for limb in limbs:
         limb.length = _stretched(poser, limb)
+        out = OUTWARD * limb.length  # legs that are drawn stretched to the side reach no further, as low as they stand
+        limb.side = float(np.clip(limb.side, limb.hip[1] - out, limb.hip[1] + out))
     return limbs
 
 
 def _stretched(poser: Poser, limb: _Limb) -> float:
     """Return how far the foot gets from the hip [m], by random angles within the limits."""
     random = np.random.default_rng(1)
-    lows, highs = np.array([_kept(poser, name) for name in limb.leg.hinges]).T
+    lows, highs = limb.ranges.T
     hip = int(poser.model.joint(limb.hip_name).id)
     farthest = 0.0
     for k in range(SAMPLES):

@@ -142,11 +142,12 @@ def mesh_name(mesh: mujoco.MjsMesh) -> str:
 
 def _root(model: mujoco.MjModel, path: Path, tree: Tree) -> int:
     """Return the body that carries the robot: the heaviest on the world with something below that turns."""
-    moved = {int(model.body_rootid[body]) for body in model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]}
+    turned = [int(body) for body in model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]]
+    moved = {root for body in turned if (root := int(model.body_rootid[body])) != body}
     tops = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
     able = [body for body in tops if body in moved]
     if not able:
-        raise ConfigError(f"{path}: nothing in it turns: no body has a hinge")
+        raise ConfigError(f"{path}: nothing in it turns: no body that hangs on another one has a hinge")
     root = max(able, key=lambda body: float(model.body_subtreemass[body]))
     if model.body_subtreemass[root] <= 0.0:
         raise ConfigError(f"{path}: body '{_name(model, root)}' and what hangs on it have no mass")

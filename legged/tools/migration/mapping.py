@@ -270,12 +270,18 @@ RANDOM_MODEL = (
 def _random_model(result: Translation) -> None:
     """Map what forks draw of the model, as far as it means the same; leave out what they have switched off."""
     prefix = "domain_rand."
-    for switch, name, fields in RANDOM_MODEL:
-        path = f"{prefix}{name}_range"
-        values = result.numbers(path, [])
-        if result.get(f"{prefix}randomize_{switch}", False) and len(values) == 2:
+    mapped, waiting = set(), set()
+    for name_of_switch, name, fields in RANDOM_MODEL:
+        switch, path = f"{prefix}randomize_{name_of_switch}", f"{prefix}{name}_range"
+        on, values = result.get(switch), result.numbers(path, [])
+        if on and len(values) == 2:
+            mapped.add(switch)
             for field_of_model in fields:
                 result.put(f"domain_rand.ranges.{field_of_model}", list(values), path)
+        elif on is not False:
+            waiting |= {switch, path} if on else {path}
+    # What is not known to be off, and means nothing that is known, is listed with the rest.
+    result.done -= waiting - mapped - {entry.setting for entry in result.lost}
     angles = result.get(f"{prefix}initial_joint_pos_range")
     if result.get(f"{prefix}randomize_initial_joint_pos", False) and angles is not None:
         result.put("init_state.dof_pos_factor", angles, f"{prefix}initial_joint_pos_range")

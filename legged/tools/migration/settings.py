@@ -139,7 +139,8 @@ ELSEWHERE: dict[str, str] = {
     "commands.num_commands": "commands here are vx, vy, yaw rate and heading; others are tensors of your own class",
     "init_state.lin_vel": "init_state.base_velocity is the range from which it is drawn",
     "init_state.ang_vel": "init_state.base_velocity is the range from which it is drawn",
-    "control.use_actuator_network": "there are no actuator networks here; the robot's gains stand for it",
+    "control.use_actuator_network": "legged_gym's file is not read, and the robot's gains stand for it;"
+    " control.actuator.network names one that legged.tools.fit_actuator has fitted",
     "asset.fix_base_link": "the base of a legged robot floats here",
     "asset.disable_gravity": "gravity is never off",
     "asset.collapse_fixed_joints": _MODEL,

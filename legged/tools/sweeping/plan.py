@@ -15,8 +15,8 @@ from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
 from legged.envs.checks import evaluated_figures, lower_is_better
 from legged.errors import ConfigError, suggest
-from legged.process.paths import data_folder, exists
-from legged.registry import task_class, task_config, task_names
+from legged.process.paths import data_folder, exists, relative
+from legged.registry import YAML_ENDINGS, register_file, task_class, task_config, task_names
 
 OWN = ("task", "env.seed", "train.runner.run_name", "train.runner.experiment_name", "train.runner.stop_at")
 """Settings that a sweep makes itself."""
@@ -58,7 +58,7 @@ class SweepConfig:
     """The file of a sweep."""
 
     task: str = ""
-    """Task that is trained."""
+    """Task that is trained: a name, or a YAML file, relative to this one."""
     name: str = field(default="", metadata=NAME)
     """Folder under logs/; sweep_ and the name of the file when empty."""
     trials: int = field(default=20, metadata=between(1, 1_000_000))
@@ -112,6 +112,8 @@ class Plan:
     """What all trials have in common."""
     figure: str
     parameters: tuple[Parameter, ...]
+    task: str
+    """What a command is given as its --task: a name, or a YAML file."""
 
     @property
     def folder(self) -> Path:
@@ -162,7 +164,7 @@ class Plan:
         target = self.given.objective.target
         goal = {} if target is None else {f"train.runner.stop_at.{self.figure}": target}
         settings = {**self._own_defaults(), **self.given.overrides, **values, **goal}
-        flags = ["--task", self.given.task, "--seed", str(seed), "--experiment_name", self.name]
+        flags = ["--task", self.task, "--seed", str(seed), "--experiment_name", self.name]
         flags += ["--run_name", f"trial{number:03d}_s{seed}", "--note", self.note(values, number)]
         return [*flags, *(f"{path}={json.dumps(value)}" for path, value in settings.items())]
 
@@ -223,8 +225,12 @@ def plan_sweep(given: SweepConfig, path: Path, on_cpu: bool) -> Plan:
         for key in getattr(given, section):
             if key in OWN or key.startswith(f"{OWN[-1]}."):
                 raise ConfigError(f"{path}: {section}: {key}: is set by the sweep itself (seeds, name, objective)")
+    task, file = given.task, None
+    if task.endswith(YAML_ENDINGS):
+        file = relative(path.parent / task)
+        task = register_file(file, f"{path}: task")
     with _said_in(path, "overrides"):
-        cfg = task_config(given.task, given.overrides.items(), on_cpu)
+        cfg = task_config(task, given.overrides.items(), on_cpu)
     runner = cfg.train.runner
     changes: list[tuple[str, Any]] = []
     if not runner.evaluate_interval:
@@ -233,7 +239,7 @@ def plan_sweep(given: SweepConfig, path: Path, on_cpu: bool) -> Plan:
         changes.append(("train.runner.evaluate_share", 1.0))  # trials are compared at the same iterations
     cfg = override(cfg, changes)
     parameters = tuple(_parameter(key, one, cfg, path) for key, one in given.parameters.items())
-    return Plan(name, given, cfg, _figure(given, cfg, path), parameters)
+    return Plan(name, given, cfg, _figure(given, cfg, path), parameters, file or task)
 
 
 def _figure(given: SweepConfig, cfg: TaskConfig, path: Path) -> str:
@@ -294,11 +300,11 @@ def _tried(key: str, values: Iterable[Any], cfg: TaskConfig, path: Path) -> None
 
 @contextmanager
 def _said_in(path: Path, section: str) -> Iterator[None]:
-    """Let errors about settings name the file of the sweep, where they would say 'command line'."""
+    """Let errors about settings name the file of the sweep, where they would say 'command line' or '--task'."""
     try:
         yield
     except ConfigError as error:
-        said = "command line: "
-        if not str(error).startswith(said):
-            raise
-        raise ConfigError(f"{path}: {section}: {str(error).removeprefix(said)}") from error
+        for said, key in (("command line: ", section), ("--task: ", "task")):
+            if str(error).startswith(said):
+                raise ConfigError(f"{path}: {key}: {str(error).removeprefix(said)}") from error
+        raise

@@ -88,7 +88,7 @@ def table(plan: Plan, trials: Sequence["FrozenTrial"], module: str | None = None
             why += f"; {sign * trial.intermediate_values[step]:.4g} at {step}"
         lines.append(_row(["", trial.number, why, *_values(plan, trial, paths), _runs(trial)]))
     if ranked:
-        words = ["python", "train.py", *(["--import", module] if module else []), "--task", plan.given.task]
+        words = ["python", "train.py", *(["--import", module] if module else []), "--task", plan.task]
         words += [_override(path, value) for path, value in settings(plan, ranked[0]).items()]
         lines += ["", "The settings of the best, as YAML:", "", "```yaml", best_yaml(plan, ranked[0]).rstrip(), "```"]
         lines += ["", "and on the command line:", "", "```", shlex.join(words), "```"]
