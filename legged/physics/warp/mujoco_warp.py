@@ -13,6 +13,7 @@ from torch import Tensor
 from legged.config.schema import SimConfig
 from legged.errors import ConfigError
 from legged.physics.collider.terrain_contact import TerrainContact
+from legged.physics.collider.touches import DEFAULT_SOLREF, is_mixed
 from legged.physics.fields import DERIVED, FIELDS, GRAVITY, changed_arrays
 from legged.physics.fused.block_step import BlockStep
 from legged.physics.fused.constraint_solver import ConstraintSolver, ask_for_dense_rows
@@ -82,6 +83,8 @@ class MujocoWarpPhysics(WarpPhysics):
         self.model = scene.model(sim, "none" if cells else "height_field")
         if sim.step != "library":
             ask_for_dense_rows(self.model)
+        for solrefs in (self.model.eq_solref, self.model.jnt_solref, self.model.dof_solref):
+            solrefs[is_mixed(solrefs)] = DEFAULT_SOLREF  # as C MuJoCo does in each step, and mujoco-warp does not
         keep_centres_apart(self.model, randomized)
         self._randomized = RandomizedModel(scene, self.model, randomized, torch.float32, device)
         self._redraws: Redraws | None = None
