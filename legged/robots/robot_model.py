@@ -55,6 +55,9 @@ def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
     for flag in ("CONTACT", "CONSTRAINT", "ACTUATION"):
         if model.opt.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"):
             raise ConfigError(f"{at}: option flag: {flag.lower()} is disabled; without it the robot could not walk")
+    for flag in ("SLEEP", "IPC"):
+        if model.opt.enableflags & getattr(mujoco.mjtEnableBit, f"mjENBL_{flag}"):
+            raise ConfigError(f"{at}: option flag: {flag.lower()} is enabled; its state is not kept per robot, leave it out")
     return model
 
 

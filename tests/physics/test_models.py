@@ -303,6 +303,7 @@ def test_newton_simulates_robots_only(robot):
         (None, "No such file|cannot read"),
         ("<mujoco", "cannot read"),
         ("<mujoco><worldbody><body mocap='true'><geom size='1'/></body></worldbody></mujoco>", "it has mocap bodies"),
+        ("<mujoco><option><flag sleep='enable'/></option></mujoco>", "it has bodies that sleep"),
     ],
 )
 def test_a_file_that_is_no_model_is_one_line(tmp_path, text, error):
