@@ -24,6 +24,8 @@ RENDER_MODES = ["rgb_array"]
 REWARD = "reward_"
 """How the parts of the reward are called in infos."""
 LARGEST_SEED = 2**63
+LARGEST_PICTURE = 16384
+"""Most pixels along a side of a picture: what graphics cards draw into at most."""
 
 
 class Driver:
@@ -177,3 +179,15 @@ def checked_render_mode(mode: str | None) -> str | None:
     if mode is not None and mode not in RENDER_MODES:
         raise ConfigError(f"render_mode: got {shown(mode)}{suggest(str(mode)[:100], RENDER_MODES)}")
     return mode
+
+
+def checked_size(width: int, height: int) -> tuple[int, int]:
+    """Return the size of a picture [pixels].
+
+    Raises:
+        ConfigError: one of them is no whole number that can be drawn.
+    """
+    for name, side in (("width", width), ("height", height)):
+        if isinstance(side, bool) or not isinstance(side, (int, np.integer)) or not 1 <= side <= LARGEST_PICTURE:
+            raise ConfigError(f"{name}: must be a whole number of pixels from 1 to {LARGEST_PICTURE}, got {shown(side)}")
+    return int(width), int(height)

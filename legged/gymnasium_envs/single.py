@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from legged.gymnasium_envs.arrays import as_numpy, row
-from legged.gymnasium_envs.driver import RENDER_MODES, Driver, Seen, checked_render_mode
+from legged.gymnasium_envs.driver import RENDER_MODES, Driver, Seen, checked_render_mode, checked_size
 
 
 class TaskEnv(gymnasium.Env):
@@ -36,7 +36,7 @@ class TaskEnv(gymnasium.Env):
             ConfigError: there is no such task, device or setting, or one has a value that it can't have.
         """
         self.render_mode = checked_render_mode(render_mode)
-        self._size = width, height
+        self._size = checked_size(width, height)
         self._driver = Driver(task, 1, device, physics, config, observations)
         self.metadata = {**type(self).metadata, "render_fps": self._driver.fps}  # type: ignore[misc]
         self.action_space = self._driver.action_space()

@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from legged.gymnasium_envs.arrays import as_numpy, rows_of
-from legged.gymnasium_envs.driver import RENDER_MODES, Driver, Seen, checked_render_mode
+from legged.gymnasium_envs.driver import RENDER_MODES, Driver, Seen, checked_render_mode, checked_size
 
 
 class TaskVectorEnv(VectorEnv):
@@ -42,7 +42,7 @@ class TaskVectorEnv(VectorEnv):
             ConfigError: there is no such task, device or setting, or one has a value that it can't have.
         """
         self.num_envs, self.render_mode = num_envs, checked_render_mode(render_mode)
-        self._size, self._to_numpy = (width, height), to_numpy
+        self._size, self._to_numpy = checked_size(width, height), to_numpy
         self._driver = Driver(task, num_envs, device, physics, config, observations)
         self.metadata = {**type(self).metadata, "render_fps": self._driver.fps}  # type: ignore[misc]
         self.single_action_space = self._driver.action_space()

@@ -25,7 +25,7 @@ def add_painted_terrain(scene: mujoco.MjSpec, terrain: Terrain, checkered: bool 
     """Add a terrain that is seen and not touched, coloured by height. With `checkered` level ground and slopes are, so
     that one sees a camera move over them; steps are not, which would make a frame a third dearer.
     """
-    span = LEVEL_RANGE
+    span, lowest = LEVEL_RANGE, float(terrain.height_map.corners.min())
     if checkered:
         dark, light = ([grey] * 3 for grey in CHECKER)
         builtin = mujoco.mjtBuiltin.mjBUILTIN_CHECKER
@@ -35,7 +35,7 @@ def add_painted_terrain(scene: mujoco.MjSpec, terrain: Terrain, checkered: bool 
         material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = GROUND
         span = max(span, float(np.abs(terrain.height_map.corners).max()))
     for geom in add_terrain(scene, terrain, collide=False, depth=SHOWN_DEPTH):
-        _paint(scene, geom, span, terrain.height_map.cell if checkered else None)
+        _paint(scene, geom, span, lowest, terrain.height_map.cell if checkered else None)
 
 
 def add_horizon(scene: mujoco.MjSpec, terrain: Terrain) -> None:
@@ -59,9 +59,9 @@ def add_horizon(scene: mujoco.MjSpec, terrain: Terrain) -> None:
             )
 
 
-def _paint(scene: mujoco.MjSpec, geom: mujoco.MjsGeom, span: float, cell: float | None) -> None:
-    """Colour by height, up and down to `span` [m]: one colour a box, a texture on a height field. With the distance
-    `cell` between the points of height fields [m], checkered.
+def _paint(scene: mujoco.MjSpec, geom: mujoco.MjsGeom, span: float, lowest: float, cell: float | None) -> None:
+    """Colour by height, up and down to `span` [m]: one colour a box, a texture on a height field, whose points below the
+    `lowest` ground are sunk and not seen. With the distance `cell` between the points of height fields [m], checkered.
     """
     if geom.type == mujoco.mjtGeom.mjGEOM_BOX:
         top = geom.pos[2] + geom.size[2]
@@ -71,7 +71,7 @@ def _paint(scene: mujoco.MjSpec, geom: mujoco.MjsGeom, span: float, cell: float 
         return
     shape = scene.hfield(geom.hfieldname)
     heights = geom.pos[2] + shape.size[2] * np.array(shape.userdata).reshape(shape.nrow, shape.ncol)
-    colors = color(heights, span)
+    colors = color(_spread(heights, heights < lowest - SAME), span)
     if cell is not None:
         rows, columns = (np.arange(n) * cell // SQUARE for n in heights.shape)
         colors = colors * np.where((rows[:, None] + columns) % 2 > 0, *CHECKER)[:, :, None]
@@ -87,6 +87,22 @@ def _paint(scene: mujoco.MjSpec, geom: mujoco.MjsGeom, span: float, cell: float 
     material = scene.add_material(name=geom.name, specular=0.0)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = geom.name
     geom.material = geom.name
+
+
+def _spread(heights: np.ndarray, sunk: np.ndarray) -> np.ndarray:
+    """Return heights (X, Y) in which points that are `sunk` have the mean of those around them that are not, or of all: a
+    texture is blurred, and their colour, that of the deepest ground, would run into what is seen.
+    """
+    if not sunk.any():
+        return heights
+    seen = np.pad(~sunk, 1)
+    padded = np.where(seen, np.pad(heights, 1), 0.0)
+    x, y = heights.shape
+    around = [(slice(i, i + x), slice(j, j + y)) for i in range(3) for j in range(3)]
+    count = sum(seen[at].astype(int) for at in around)
+    total = sum(padded[at] for at in around)
+    beside = np.where(count > 0, total / np.maximum(count, 1), heights[~sunk].mean())
+    return np.where(sunk, beside, heights)
 
 
 def color(heights: np.ndarray, span: float = LEVEL_RANGE) -> np.ndarray:

@@ -16,6 +16,8 @@ FLOOR = "floor"
 """Name of the ground's geom, where it is a plane or stands for a height map; no geom of a robot may have it."""
 TAKEN = {"geom": r"floor|terrain_\d+", "sensor": "contact_.*"}
 """Kind of element -> names that the scene gives to its own."""
+GROUPS = 31
+"""Groups of actuators that a model may disable, from 0."""
 LARGEST_NUMBER = 1e12
 """Largest number of a model: beyond it float32, in which GPUs compute, overflows."""
 NUMBERS = ("qpos0", "qpos_spring", "body_", "jnt_", "dof_", "geom_", "site_", "actuator_", "mesh_", "eq_", "tendon_")
@@ -55,6 +57,12 @@ def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
     for flag in ("CONTACT", "CONSTRAINT", "ACTUATION"):
         if model.opt.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"):
             raise ConfigError(f"{at}: option flag: {flag.lower()} is disabled; without it the robot could not walk")
+    for group in model.actuator_group:
+        if 0 <= group < GROUPS and model.opt.disableactuator >> int(group) & 1:
+            raise ConfigError(f"{at}: option actuatorgroupdisable: motors are in group {group}, which it disables")
+    for flag in ("SLEEP", "IPC"):
+        if model.opt.enableflags & getattr(mujoco.mjtEnableBit, f"mjENBL_{flag}"):
+            raise ConfigError(f"{at}: option flag: {flag.lower()} is enabled; its state is not kept per robot, leave it out")
     return model
 
 

@@ -194,6 +194,9 @@ def test_nothing_is_shown_without_a_render_mode():
         ({"config": ["env.num_envs"]}, "config: expected settings by dotted path"),
         ({"config": {"rewards.scales.foward": 1.0}}, "did you mean 'forward'"),
         ({"physics": "bullet"}, "sim.physics"),
+        ({"width": 0}, "width: must be a whole number of pixels from 1 to 16384, got 0"),
+        ({"height": 270.5}, "height: must be a whole number of pixels from 1 to 16384, got 270.5"),
+        ({"height": "270"}, "height: must be a whole number of pixels from 1 to 16384, got '270'"),
     ],
 )
 def test_wrong_arguments_are_errors_of_one_line(arguments, text):

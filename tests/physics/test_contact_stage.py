@@ -12,7 +12,7 @@ from devices import ON_A_GPU, build, on_gpu
 from reference import heaps, random_states, roll
 
 from legged.config.schema import TerrainConfig
-from legged.physics import RobotScene
+from legged.physics import ModelScene, RobotScene
 from legged.physics.collider.touches import spring_of, touch_of
 from legged.physics.fused.contact_stage import ContactStage
 from legged.terrain import Terrain, TileSpec
@@ -327,6 +327,26 @@ def test_springs_of_two_shapes_are_mixed_as_in_c_mujoco(priority, solrefs):
     touch = touch_of(model, 0, 1)
     np.testing.assert_allclose(touch.solref, data.contact[0].solref, rtol=1e-12)
     np.testing.assert_allclose(touch.solimp, data.contact[0].solimp, rtol=1e-12)
+
+
+@pytest.mark.parametrize("solref", ["0.1 0", "0.02 -50", "-1000 1"])
+def test_a_solref_of_two_kinds_at_once_is_that_of_c_mujoco(solref, tmp_path):
+    """C MuJoCo takes the default for it, of contacts, limits and equalities; a stiffness of 1e15 threw the ball away."""
+    file = tmp_path / "ball.xml"
+    file.write_text(
+        f'<mujoco><worldbody><geom type="plane" size="0 0 1" solref="{solref}"/>'
+        f'<body pos="0 0 .095"><freejoint/><geom size=".1" mass="1" solref="{solref}"/><body pos="0 0 .1">'
+        f'<joint name="a" axis="0 1 0" limited="true" range="-1 -.1" solreflimit="{solref}"/><geom size=".05" pos=".3 0 .1"/>'
+        f'</body><body pos="0 0 .2"><joint name="b" axis="1 0 0"/><geom size=".05" pos="0 0 .1"/></body></body></worldbody>'
+        f'<equality><joint joint1="b" polycoef=".05 0 0 0 0" solref="{solref}"/></equality></mujoco>'
+    )
+    found = []
+    for engine in ("mujoco", "mujoco_warp"):
+        physics = build(ModelScene(file), engine, 1)
+        for _ in range(20):
+            physics.step()
+        found.append(physics.qpos.clone())
+    torch.testing.assert_close(found[1], found[0], atol=1e-4, rtol=0.0)
 
 
 def test_impedance_and_spring_are_worked_by_hand():

@@ -1,5 +1,6 @@
 """Models that are no robots with feet: two of Gymnasium's, stepped as C MuJoCo steps them, and what may be asked of them."""
 
+import re
 from pathlib import Path
 
 import gymnasium
@@ -303,6 +304,7 @@ def test_newton_simulates_robots_only(robot):
         (None, "No such file|cannot read"),
         ("<mujoco", "cannot read"),
         ("<mujoco><worldbody><body mocap='true'><geom size='1'/></body></worldbody></mujoco>", "it has mocap bodies"),
+        ("<mujoco><option><flag sleep='enable'/></option></mujoco>", "it has bodies that sleep"),
     ],
 )
 def test_a_file_that_is_no_model_is_one_line(tmp_path, text, error):
@@ -327,3 +329,37 @@ def test_solver_options_are_laid_over_those_of_the_file():
     assert option.solver == mujoco.mjtSolver.mjSOL_NEWTON
     for name in ("geom_contype", "geom_conaffinity", "geom_friction", "geom_condim", "body_mass", "dof_damping"):
         np.testing.assert_array_equal(getattr(model, name), getattr(own, name))
+
+
+HINGE = """<mujoco><compiler angle="radian"/><option actuatorgroupdisable="{off}"/>
+<worldbody><geom type="plane" size="0 0 1"/><body pos="0 0 1">
+  <joint name="a" axis="0 1 0" range="-.02 .03" margin="{margin}"/><geom size=".1" pos=".2 0 0"/></body></worldbody>
+<actuator><motor joint="a" group="1"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("off", "margin", "error"),
+    [
+        ("1", ".02", "it would drive the actuators of group 1 too, which the model disables"),
+        ("2", ".04", r"joint 'a' may be within the margin \(0.04\) of both of its limits, 0.05 apart"),
+        ("2", ".02", ""),
+    ],
+)
+def test_what_mujoco_warp_would_pass_over_is_said(tmp_path, off, margin, error):
+    """C MuJoCo has two rows for a hinge within the margin of both limits, and no force of a group that is disabled."""
+    path = tmp_path / "hinge.xml"
+    path.write_text(HINGE.format(off=off, margin=margin))
+    if error:
+        with pytest.raises(ConfigError, match=error):
+            build(ModelScene(path), "mujoco_warp", 1)
+        auto = make_physics(ModelScene(path), SimConfig(), 300, CPU)
+        assert re.search(error, auto.why_c_engine)  # on a CPU, for many worlds: it takes the C engine and says so
+        return
+    found = []
+    for engine in ("mujoco", "mujoco_warp"):
+        physics = build(ModelScene(path), engine, 1)
+        for _ in range(20):
+            physics.ctrl.fill_(1.0)
+            physics.step()
+        found.append(physics.qpos.clone())
+    torch.testing.assert_close(found[1], found[0], atol=1e-5, rtol=0.0)

@@ -90,21 +90,28 @@ def test_rays_find_the_height_map_on_every_type():
     assert (bound > 1e-3).any()
 
 
-def test_rays_find_slopes_among_steps():
-    """With slope_threshold 0.75 cells up to 7.5 cm apart are joined: slopes lie beside faces, and beside other slopes."""
-    terrain = terrain_of(["obstacles", "rough_slope_up", "obstacles", "stairs_up"], (0.2, 0.5, 0.9), slope_threshold=0.75)
+@pytest.mark.parametrize(
+    ("names", "difficulties", "threshold"),
+    [
+        pytest.param(["obstacles", "rough_slope_up", "obstacles", "stairs_up"], (0.2, 0.5, 0.9), 0.75, id="few slopes"),
+        pytest.param(["rubble", "dense_blocks", "random_grid"], (0.2, 0.9), 0.75, id="many slopes"),
+        pytest.param(["rubble", "dense_blocks", "random_grid"], (0.0, 0.1), 0.2, id="the easiest rows"),
+    ],
+)
+def test_rays_find_slopes_among_steps(names, difficulties, threshold):
+    """With slope_threshold 0.75 cells up to 7.5 cm apart are joined, with 0.2 those up to 2 cm: slopes lie beside faces,
+    around lower cells, and beside other slopes. One height field of them all was up to 0.23 m too high.
+    """
+    terrain = terrain_of(names, difficulties, slope_threshold=threshold)
     ground = terrain.height_map
     model, data = seen(terrain)
     i, j, x, y = points_in_cells(ground)
     error = np.abs(heights_by_ray(model, data, x, y) - ground.height_at(x, y))
-    far = error > twist(ground, i, j) + 1e-4
-    # Two slopes that share a point but not its height: a few cells, wrong by less than a difference that is joined.
-    assert far.mean() < 0.003
-    assert error.max() < 0.075
+    assert (error < twist(ground, i, j) + 1e-4).all()
     sloped = np.ptp(ground.corners[i, j], axis=1) > 0.01
-    stepped = np.isin((y - ground.origin[1] - 3.0) // 8.0, [0, 2])
-    assert (sloped & stepped).sum() > 50
-    assert not (far & ~sloped).any()
+    stepped = np.array([TERRAIN_TYPES[name].stepped for name in names])
+    column = ((y - ground.origin[1] - 3.0) // 8.0).astype(int)
+    assert (sloped & stepped[np.clip(column, 0, len(names) - 1)]).sum() > 50
 
 
 def test_border_beside_rough_ground_slopes_with_it():

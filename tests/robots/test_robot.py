@@ -291,6 +291,8 @@ def test_mistake_in_robot_yaml_is_an_error_that_names_file_and_field(folder, old
         ('name="LF_FOOT"', 'name="floor"', "geom 'floor': the scene has one of that name"),
         ('name="LF_FOOT"', 'name="terrain_3"', "geom 'terrain_3': the scene has one of that name"),
         ("<worldbody>", '<option><flag contact="disable"/></option><worldbody>', "contact is disabled"),
+        ("<worldbody>", '<option actuatorgroupdisable="0 2"/><worldbody>', "motors are in group 0, which it disables"),
+        ("<worldbody>", '<option><flag sleep="enable"/></option><worldbody>', "sleep is enabled"),
         # Numbers.
         ('mass="26.37317"', 'mass="inf"', "numbers must be finite"),
         ('mass="26.37317"', 'mass="0"', "MuJoCo refuses it"),

@@ -6,7 +6,9 @@ import pytest
 from helpers import TASK, call
 from PIL import Image
 
-from legged.rendering.paint import HIGH, LOW, MIDDLE, color
+from legged.config.schema import TerrainConfig
+from legged.rendering.paint import HIGH, LOW, MIDDLE, add_painted_terrain, color
+from legged.terrain import Terrain, TileSpec
 from legged.tools import show_terrain
 
 
@@ -75,3 +77,19 @@ def test_wrong_input_is_named_and_writes_nothing(tmp_path, capsys, arguments, wo
     for word in words:
         assert word in message
     assert not (tmp_path / "out").exists()
+
+
+def test_slopes_among_steps_have_the_colours_of_their_heights():
+    """Nothing of rubble is below the level ground, so nothing has the colours of deep ground; points of height fields that
+    are sunk where they hold no slope had, and textures blur them into the slopes beside.
+    """
+    cfg = TerrainConfig(border_size=2.0, slope_threshold=0.75)
+    terrain = Terrain.of_tiles([[TileSpec("rubble", 0.19)]], cfg, np.random.default_rng(1))
+    scene = mujoco.MjSpec()
+    add_painted_terrain(scene, terrain)
+    model = scene.compile()
+    assert model.ntex > 1
+    level, highest = color(np.array(0.0)), color(np.array(0.19))
+    found = model.tex_data.reshape(-1, 3) / 255.0
+    assert (found >= np.minimum(level, highest) - 0.01).all()
+    assert (found <= np.maximum(level, highest) + 0.01).all()

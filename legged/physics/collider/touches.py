@@ -19,6 +19,8 @@ lowest point of an ellipsoid."""
 SPRING = 7
 """Numbers that say how a constraint holds: stiffness [1/s^2], damping [1/s], least and greatest impedance, the depth at which
 it is greatest [m or rad], and middle and power of the way there."""
+DEFAULT_SOLREF = np.array([0.02, 1.0])
+"""MuJoCo's: time constant [s] and damping ratio."""
 LEAST_FRICTION, LEAST, GREATEST, TINY = mujoco.mjMINMU, mujoco.mjMINIMP, mujoco.mjMAXIMP, mujoco.mjMINVAL
 
 
@@ -72,8 +74,11 @@ def touch_of(model: mujoco.MjModel, first: int, second: int, pair: int = -1) -> 
 def spring_of(solref: np.ndarray, solimp: np.ndarray, timestep: float, safe: bool) -> np.ndarray:
     """Return the SPRING numbers of a constraint with MuJoCo's parameters; `safe` keeps its time constant above two steps.
 
-    Source: MuJoCo documentation, "Modeling", solver parameters.
+    Source: MuJoCo documentation, "Modeling", solver parameters. (mujoco-warp makes a stiffness without end of a solref
+    that `is_mixed`.)
     """
+    if is_mixed(solref):
+        solref = DEFAULT_SOLREF
     least, greatest, middle = np.clip(solimp[[0, 1, 3]], LEAST, GREATEST)
     width, power = max(TINY, float(solimp[2])), max(1.0, float(solimp[4]))
     if least == greatest or solimp[2] <= TINY:
@@ -84,6 +89,11 @@ def spring_of(solref: np.ndarray, solimp: np.ndarray, timestep: float, safe: boo
     stiffness = -solref[0] / steepest**2 if solref[0] <= 0.0 else 1.0 / max(TINY, (steepest * time * ratio) ** 2)
     damping = -solref[1] / steepest if solref[1] <= 0.0 else 2.0 / max(TINY, steepest * time)
     return np.array([stiffness, damping, least, greatest, width, middle, power])
+
+
+def is_mixed(solref: np.ndarray) -> np.ndarray:
+    """Return of solrefs (..., 2) which are half a time constant and half a stiffness: C MuJoCo takes its default instead."""
+    return np.asarray((solref[..., 0] > 0.0) != (solref[..., 1] > 0.0))
 
 
 def alike_springs(model: mujoco.MjModel, pairs: Sequence[tuple[int, int, int]]) -> bool:

@@ -144,7 +144,8 @@ class ContactStage:
             made = [spring(*pair) for pair in zip(solrefs, solimps, strict=True)]
             return wp.array(np.reshape(made, (-1, touches.SPRING)), dtype=float)
 
-        sliding = [spring(t.solreffriction if t.solreffriction.any() else t.solref, t.solimp)[1] for t in every]
+        own = [t.solreffriction.any() and not touches.is_mixed(t.solreffriction) for t in every]
+        sliding = [spring(t.solreffriction if has else t.solref, t.solimp)[1] for t, has in zip(every, own, strict=True)]
         arrays.touch_geom = wp.array([t.geoms for t in every], dtype=wp.vec2i)
         arrays.touch_margin = wp.array([t.margin for t in every], dtype=float)
         arrays.touch_dim = wp.array([t.dim for t in every], dtype=int)

@@ -29,7 +29,14 @@ class ModelScene(Scene):
                 model = spec.compile()
         except ValueError as error:
             raise ConfigError(f"{self.name}: MuJoCo cannot read it: {error}") from error
-        for kind, count in (("delays", model.nhistory), ("plugins", model.nplugin), ("mocap bodies", model.nmocap)):
+        sleeps = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
+        kinds = {
+            "delays": model.nhistory,
+            "plugins": model.nplugin,
+            "mocap bodies": model.nmocap,
+            "bodies that sleep": sleeps,
+        }
+        for kind, count in kinds.items():
             if count:
                 raise ConfigError(f"{self.name}: it has {kind}, whose state the engines here do not keep per world")
         return model

@@ -160,12 +160,38 @@ def _add_patch(add: _Geoms, x: slice, y: slice) -> None:
         return
     for i, j, top in _rectangles(low, flat, add.overlap):
         add.box(slice(x.start + i.start, x.start + i.stop), slice(y.start + j.start, y.start + j.stop), top)
-    if not flat.all():
+    for sloped in _layers(corners, ~flat):
         # Slopes among the steps, without a skin, which would stand out beside their faces. Points that no slope uses are
         # sunk: what hangs down to them is inside the boxes.
-        i, j = (slice(int(at.min()), int(at.max()) + 1) for at in np.nonzero(~flat))
-        points = _lattice(corners[i, j], ~flat[i, j])[0]
+        i, j = (slice(int(at.min()), int(at.max()) + 1) for at in np.nonzero(sloped))
+        points = _lattice(corners[i, j], sloped[i, j])[0]
         add.surface(x.start + i.start, y.start + j.start, np.where(np.isnan(points), add.floor, points))
+
+
+def _layers(corners: np.ndarray, sloped: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield sets of cells (X, Y), together those that are `sloped`, each of which one height field can hold: its cells agree
+    where they share a point, and between them it stands out over no other cell.
+
+    The first set leaves out all cells around some points: those at which slopes disagree, and those above a lower cell of
+    which the field would hold three corners or more, as of one that slopes go around. Those cells are dealt out to further
+    sets in which two cells lie between any two.
+    """
+    points, bad = _lattice(corners, sloped)
+    used = [~np.isnan(own) for own in _at_corners(points)]
+    covers = ~sloped & ((used[0] & used[3]) | (used[1] & used[2]))  # three corners, or two on a diagonal
+    for k, (top, is_bad) in enumerate(zip(_at_corners(points), _at_corners(bad), strict=True)):
+        is_bad |= covers & (top > corners[:, :, k] + SAME)
+    alone = sloped & np.any(_at_corners(bad), axis=0)
+    i, j = np.indices(alone.shape) % 3
+    for layer in (sloped & ~alone, *(alone & (i == a) & (j == b) for a in range(3) for b in range(3))):
+        if layer.any():
+            yield layer
+
+
+def _at_corners(points: np.ndarray) -> list[np.ndarray]:
+    """Lattice points (X + 1, Y + 1) -> views of those at each corner of the cells, (X, Y) each, in the order of CORNERS."""
+    x, y = (n - 1 for n in points.shape)
+    return [points[right : right + x, up : up + y] for right, up in CORNERS]
 
 
 def _lattice(corners: np.ndarray, used: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,7 @@ from torch import Tensor
 from legged.config.schema import SimConfig
 from legged.errors import ConfigError
 from legged.physics.collider.terrain_contact import TerrainContact
+from legged.physics.collider.touches import DEFAULT_SOLREF, is_mixed
 from legged.physics.fields import DERIVED, FIELDS, GRAVITY, changed_arrays
 from legged.physics.fused.block_step import BlockStep
 from legged.physics.fused.constraint_solver import ConstraintSolver, ask_for_dense_rows
@@ -29,7 +30,7 @@ from legged.physics.warp.physics import WarpPhysics
 from legged.physics.warp.redraws import Redraws, Variants
 from legged.process.cores import available_cores
 from legged.process.ranks import Ranks
-from legged.robots.robot_model import FLOOR
+from legged.robots.robot_model import FLOOR, GROUPS
 
 PER_WORLD = ("geom_friction", "body_mass", *DERIVED)
 """Arrays of the model that always differ per world, beside those of the fields that are randomised."""
@@ -49,6 +50,24 @@ def absent_stages(model: mujoco.MjModel, randomized: Collection[str] = ()) -> in
     if without("dof_frictionloss", "tendon_frictionloss"):
         flags |= bits.mjDSBL_FRICTIONLOSS
     return flags
+
+
+def ignored(model: mujoco.MjModel) -> str:
+    """Return what of a model mujoco-warp passes over without a word; empty if nothing."""
+    for group in model.actuator_group:
+        if 0 <= group < GROUPS and model.opt.disableactuator >> int(group) & 1:
+            return f"it would drive the actuators of group {group} too, which the model disables"
+    scalar = np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE))
+    for kind, limited, span, margin in (
+        ("joint", (model.jnt_limited != 0) & scalar, np.diff(model.jnt_range)[:, 0], model.jnt_margin),
+        ("tendon", model.tendon_limited != 0, np.diff(model.tendon_range)[:, 0], model.tendon_margin),
+    ):
+        for i in np.flatnonzero(limited & (span < 2.0 * margin)):
+            return (
+                f"{kind} '{getattr(model, kind)(i).name}' may be within the margin ({margin[i]:g}) of both of its limits,"
+                f" {span[i]:g} apart, and would feel the nearer one only"
+            )
+    return ""
 
 
 class NoBlocks(Exception):
@@ -82,6 +101,8 @@ class MujocoWarpPhysics(WarpPhysics):
         self.model = scene.model(sim, "none" if cells else "height_field")
         if sim.step != "library":
             ask_for_dense_rows(self.model)
+        for solrefs in (self.model.eq_solref, self.model.jnt_solref, self.model.dof_solref):
+            solrefs[is_mixed(solrefs)] = DEFAULT_SOLREF  # as C MuJoCo does in each step, and mujoco-warp does not
         keep_centres_apart(self.model, randomized)
         self._randomized = RandomizedModel(scene, self.model, randomized, torch.float32, device)
         self._redraws: Redraws | None = None
@@ -128,6 +149,8 @@ class MujocoWarpPhysics(WarpPhysics):
 
     def _put_model(self, scene: str) -> Any:
         """Return mujoco-warp's model, with room for what differs per world."""
+        if reason := ignored(self.model):
+            raise ConfigError(f"sim.physics: mujoco_warp cannot simulate {scene}, mujoco might: {reason}")
         names = [name for name in (*PER_WORLD, *self._per_world) if name != GRAVITY and getattr(self.model, name).size]
         try:
             m = mjw.put_model(self.model, batch_sizes=dict.fromkeys(names, self.num_envs))
