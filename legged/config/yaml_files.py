@@ -1,4 +1,4 @@
-"""YAML texts -> plain values; whatever is wrong with a file is one line that names it, and the line in it."""
+"""YAML texts -> plain values, and back; whatever is wrong with a file is one line that names it, and the line in it."""
 
 import contextlib
 import re
@@ -85,11 +85,16 @@ class _Loader(yaml.SafeLoader):
             raise yaml.MarkedYAMLError(problem=f"{what} cannot be read ({error})", problem_mark=node.start_mark) from error
 
 
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+$"),
-    list("-+.0123456789"),
-)
+class _Dumper(yaml.SafeDumper):
+    """SafeDumper that puts text into quotes which the loader above would read as a number."""
+
+
+for _kind in (_Loader, _Dumper):
+    _kind.add_implicit_resolver(
+        "tag:yaml.org,2002:float",
+        re.compile(r"^[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+$"),
+        list("-+.0123456789"),
+    )
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -131,6 +136,12 @@ def parse(text: str, source: str) -> Any:
             return loader.get_single_data()
         finally:
             loader.dispose()
+
+
+def dump(value: Any, **style: Any) -> str:
+    """Return a YAML text of a plain value, which `parse` reads back as it was; `style` is that of yaml.dump."""
+    text: str = yaml.dump(value, Dumper=_Dumper, **style)
+    return text
 
 
 @contextlib.contextmanager

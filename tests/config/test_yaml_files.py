@@ -2,7 +2,7 @@
 
 import pytest
 
-from legged.config.yaml_files import MOST_BYTES, parse, read_yaml
+from legged.config.yaml_files import MOST_BYTES, dump, parse, read_yaml
 from legged.errors import ConfigError
 
 
@@ -29,6 +29,17 @@ def test_merge_keys_are_laid_below_a_block_s_own():
     assert data["d"] == {"x": 1, "y": 2, "z": 4, "w": 0}  # of two the first wins
     assert data["e"] == {"v": 1}
     assert data["a"] == {"x": 1, "y": 2}
+
+
+@pytest.mark.parametrize("text", ["1e-3", "1e3", "7e12345", "-1E5", ".5e3", "1_0e2", "1e-3.", "010", "yes", "2026-11-22"])
+def test_text_that_looks_like_a_number_is_read_back_as_text(text):
+    """A run that is named after its learning rate could be trained, and then neither played nor resumed."""
+    assert parse(dump({text: [text]}), "here") == {text: [text]}
+
+
+@pytest.mark.parametrize("number", [1e-3, 1e3, -1e5, 500.0, 1e20, 1e-300, 10])
+def test_numbers_are_read_back_as_numbers(number):
+    assert parse(dump([number]), "here") == [number]
 
 
 @pytest.mark.parametrize(
