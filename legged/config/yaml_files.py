@@ -20,8 +20,8 @@ MOST_VALUES = 100_000
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that reads `1e-4` as a number (YAML 1.1 wants a dot), knows merge keys `<<`, and refuses a key given twice
-    and what would take forever to read.
+    """SafeLoader that reads `1e-4` and `-.5` as numbers (YAML 1.1 wants more of them), knows merge keys `<<`, and refuses a
+    key given twice, numbers that are others in YAML 1.2, and what would take forever to read.
     """
 
     def get_single_node(self) -> yaml.Node | None:
@@ -74,6 +74,14 @@ class _Loader(yaml.SafeLoader):
     def _refuse(self, problem: str, node: yaml.Node) -> None:
         raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
 
+    def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
+        """Construct a whole number; YAML 1.1 counts in eights after a leading 0, and in sixties at a colon."""
+        number: int = super().construct_yaml_int(node)
+        digits = node.value.replace("_", "")
+        if ":" in digits or (re.fullmatch(r"[-+]?0\d+", digits) and int(digits) != number):
+            raise ValueError("it is one number in YAML 1.1 and another, or text, in 1.2")
+        return number
+
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         """Construct an object as the constructor does; numbers and dates that are none are an error with a line."""
         try:
@@ -85,6 +93,9 @@ class _Loader(yaml.SafeLoader):
             raise yaml.MarkedYAMLError(problem=f"{what} cannot be read ({error})", problem_mark=node.start_mark) from error
 
 
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
+
+
 class _Dumper(yaml.SafeDumper):
     """SafeDumper that puts text into quotes which the loader above would read as a number."""
 
@@ -92,7 +103,7 @@ class _Dumper(yaml.SafeDumper):
 for _kind in (_Loader, _Dumper):
     _kind.add_implicit_resolver(
         "tag:yaml.org,2002:float",
-        re.compile(r"^[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+$"),
+        re.compile(r"^[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+$|^[-+]\.\d[\d_]*$"),
         list("-+.0123456789"),
     )
 
