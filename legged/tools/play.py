@@ -90,7 +90,7 @@ def _main(argv: list[str] | None) -> int:
         task, act = restore(policy, [*changes, *asked], device, graph)
     print(f"{policy.cfg.task}: {relative(policy.checkpoint)}\nwatch it: {watch_command(args, policy.folder)}")
 
-    differences = export(task, act.network, folder / EXPORTED)
+    differences = export(task, act.network, folder / EXPORTED, trained=policy.cfg)
     for name, difference in differences.items():
         print(f"exported {relative(folder / EXPORTED / name)}, largest difference to the policy {difference:.1e}")
 
