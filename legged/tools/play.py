@@ -71,6 +71,8 @@ def build_parser() -> CommandParser:
 
 def _main(argv: list[str] | None) -> int:
     args = build_parser().parse_intermixed_args(argv)
+    if args.gif and args.no_video:
+        raise ConfigError("--gif: asks for a film, and --no-video for none; leave out one of them")
     register_given(args)
     device = pick_device(args.sim_device)
     settle_on(device)
