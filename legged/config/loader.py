@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from legged.config.checks import DEEPEST, SHOWN, build, plain_path, shown
 from legged.config.legged import LeggedConfig
 from legged.config.origins import Origins
 from legged.config.renamed import renamed
 from legged.config.task import TaskConfig
-from legged.config.yaml_files import parse, read_yaml
+from legged.config.yaml_files import dump, parse, read_yaml
 from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, exists
 
@@ -343,4 +341,4 @@ def to_dict(config: Any) -> Any:
 
 def to_yaml(config: TaskConfig) -> str:
     """Return the full configuration as YAML that `load_config` reads back."""
-    return yaml.safe_dump(to_dict(config), sort_keys=False, default_flow_style=None, width=120)
+    return dump(to_dict(config), sort_keys=False, default_flow_style=None, width=120)

@@ -1,4 +1,4 @@
-"""YAML texts -> plain values; whatever is wrong with a file is one line that names it, and the line in it."""
+"""YAML texts -> plain values, and back; whatever is wrong with a file is one line that names it, and the line in it."""
 
 import contextlib
 import re
@@ -20,8 +20,8 @@ MOST_VALUES = 100_000
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that reads `1e-4` as a number (YAML 1.1 wants a dot), knows merge keys `<<`, and refuses a key given twice
-    and what would take forever to read.
+    """SafeLoader that reads `1e-4` and `-.5` as numbers (YAML 1.1 wants more of them), knows merge keys `<<`, and refuses a
+    key given twice, numbers that are others in YAML 1.2, and what would take forever to read.
     """
 
     def get_single_node(self) -> yaml.Node | None:
@@ -74,6 +74,14 @@ class _Loader(yaml.SafeLoader):
     def _refuse(self, problem: str, node: yaml.Node) -> None:
         raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
 
+    def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
+        """Construct a whole number; YAML 1.1 counts in eights after a leading 0, and in sixties at a colon."""
+        number: int = super().construct_yaml_int(node)
+        digits = node.value.replace("_", "")
+        if ":" in digits or (re.fullmatch(r"[-+]?0\d+", digits) and int(digits) != number):
+            raise ValueError("it is one number in YAML 1.1 and another, or text, in 1.2")
+        return number
+
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         """Construct an object as the constructor does; numbers and dates that are none are an error with a line."""
         try:
@@ -85,11 +93,19 @@ class _Loader(yaml.SafeLoader):
             raise yaml.MarkedYAMLError(problem=f"{what} cannot be read ({error})", problem_mark=node.start_mark) from error
 
 
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+$"),
-    list("-+.0123456789"),
-)
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
+
+
+class _Dumper(yaml.SafeDumper):
+    """SafeDumper that puts text into quotes which the loader above would read as a number."""
+
+
+for _kind in (_Loader, _Dumper):
+    _kind.add_implicit_resolver(
+        "tag:yaml.org,2002:float",
+        re.compile(r"^[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+$|^[-+]\.\d[\d_]*$"),
+        list("-+.0123456789"),
+    )
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -131,6 +147,12 @@ def parse(text: str, source: str) -> Any:
             return loader.get_single_data()
         finally:
             loader.dispose()
+
+
+def dump(value: Any, **style: Any) -> str:
+    """Return a YAML text of a plain value, which `parse` reads back as it was; `style` is that of yaml.dump."""
+    text: str = yaml.dump(value, Dumper=_Dumper, **style)
+    return text
 
 
 @contextlib.contextmanager

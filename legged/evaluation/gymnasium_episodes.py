@@ -51,7 +51,7 @@ def evaluate_in_gymnasium(policy: TrainedPolicy, episodes: int, asked: list[tupl
     name = environment_of(policy.cfg.task)
     calm, changes = for_episodes(policy, 1)
     task, act = restore(calm, [*changes, ("sim.physics", "mujoco"), *asked], torch.device("cpu"), graph=False)
-    export(task, act.network, folder / EXPORTED)
+    export(task, act.network, folder / EXPORTED, trained=policy.cfg)
     measured = run_exported(folder / EXPORTED, name, episodes)
     result = {**header(policy, ENGINE, "cpu", asked), "environment": name, "wall_s": time.perf_counter() - start}
     return report({**result, "episodes": measured}, folder)

@@ -28,6 +28,20 @@ def hidden_states(networks: Mapping[str, Any], num_envs: int) -> dict[str, Tenso
     return found
 
 
+def keep_shape_of_one_robot(policy: Any) -> None:
+    """Let a recurrent policy of rsl-rl give the log-probabilities of T steps of a single robot as (T,). Its update has those
+    that were stored in this shape where a mini-batch is a single robot; of (T, 1) and (T,) it would make the ratio of every
+    step to every other one, (T, T). Those of more robots, (T, n), and of one step, (N,), are left as they are.
+    """
+    ask = policy.get_output_log_prob
+
+    def shaped(outputs: Tensor) -> Tensor:
+        found: Tensor = ask(outputs)
+        return found.squeeze(1) if found.ndim == 2 else found
+
+    policy.get_output_log_prob = shaped
+
+
 def parts_of(layers: torch.nn.Module) -> int:
     """Return how many tensors the hidden state of recurrent layers is made of."""
     return 2 if isinstance(layers, torch.nn.LSTM) else 1

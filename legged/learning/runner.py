@@ -30,7 +30,7 @@ from legged.learning.divergence_meter import DivergenceMeter
 from legged.learning.evaluations import Ended, Evaluations
 from legged.learning.logger import Interrupted, QuietLogger
 from legged.learning.networks import begin_std, keep_std_in_bounds, network_settings, use_matmul
-from legged.learning.recurrent import hidden_states
+from legged.learning.recurrent import hidden_states, keep_shape_of_one_robot
 from legged.learning.run_folder import BEST_MODEL, CONFIG_FILE, run_config
 from legged.learning.run_state import (
     check_same_world,
@@ -109,6 +109,8 @@ class Runner(OnPolicyRunner):
         self.evaluations: Evaluations | None = None
         """What evaluates the policy during training; of several processes, in the first."""
         keep_std_in_bounds(self.alg.get_policy(), self.alg.optimizer)
+        if self.alg.get_policy().is_recurrent:
+            keep_shape_of_one_robot(self.alg.get_policy())
         self._guard = None if hasattr(self.alg.optimizer, "found_inf") else StepGuard(self.alg.optimizer)
         self.logger = QuietLogger(
             log_dir=str(log_dir) if log_dir else None,

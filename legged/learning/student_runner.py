@@ -6,7 +6,7 @@ from typing import Any
 from legged.envs import BaseTask
 from legged.errors import ConfigError
 from legged.learning.captured import CapturedRunner
-from legged.learning.checkpoint import Saved, describe_mismatch
+from legged.learning.checkpoint import describe_mismatch
 from legged.learning.display import Display
 from legged.learning.networks import actor_settings, network_settings
 from legged.learning.rollout import Steps
@@ -80,6 +80,6 @@ class StudentRunner(CapturedRunner):
         saved["infos"]["networks"] = {**saved["infos"]["networks"], "teacher": dict(self.teacher.network)}
         return saved
 
-    def _load_learner(self, path: Path, saved: Saved, parts: dict | None = None, strict: bool = True) -> None:
-        super()._load_learner(path, saved, parts, strict)
-        self.alg.learning_rate = self.env.cfg.train.distillation.learning_rate
+    def _set_rate(self, saved: float) -> None:
+        """Go on with the learning rate of the configuration: a student's does not adapt, and is none of PPO's."""
+        self.alg.learning_rate = self.alg.optimizer.param_groups[0]["lr"] = self.env.cfg.train.distillation.learning_rate

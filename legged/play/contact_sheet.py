@@ -50,9 +50,7 @@ def film(policy: TrainedPolicy, side: int) -> Tile:
         ConfigError: the policy follows no commands, or does not fit its task.
         RunError: nothing can be rendered.
     """
-    cfg = policy.cfg
-    if not isinstance(cfg, LeggedConfig):
-        raise ConfigError(f"'{cfg.task}' follows no commands: there is no way to ask it to walk")
+    cfg = walker(policy)
     task, act, playground = _on_ground(policy, cfg)
     camera = RobotsCamera(task, 1, SHARP * side, SHARP * side, instead="")
     camera.come_near(FILL, GLIDE)
@@ -60,6 +58,17 @@ def film(policy: TrainedPolicy, side: int) -> Tile:
         return [_shown(picture, side) for picture in _walk(task, act, playground, camera)]
     finally:
         camera.close()
+
+
+def walker(policy: TrainedPolicy, where: str = "") -> LeggedConfig:
+    """Return the configuration of a policy that can be asked to walk; `where` is how an error begins.
+
+    Raises:
+        ConfigError: it follows no commands.
+    """
+    if not isinstance(policy.cfg, LeggedConfig):
+        raise ConfigError(f"{where}'{policy.cfg.task}' follows no commands: there is no way to ask it to walk")
+    return policy.cfg
 
 
 def _on_ground(policy: TrainedPolicy, cfg: LeggedConfig) -> tuple[LeggedRobot, Actor, Playground | None]:

@@ -7,6 +7,7 @@ from typing import Any
 from legged.config.actuator import MOTORS
 from legged.config.loader import to_dict
 from legged.config.networks import ESTIMATED, groups_of
+from legged.config.task import TaskConfig
 from legged.config.units import unit_in
 from legged.deploy.contract import CONTRACT_VERSION, need_of
 from legged.envs import BaseTask, LeggedRobot
@@ -23,14 +24,19 @@ LAWS = {
 FRAMES = ("base frame", "yaw frame", "world frame")
 
 
-def describe(task: BaseTask) -> dict[str, Any]:
-    """Return observation layout with units, frames and formulas, joints, control law, time; keys are never renamed."""
+def describe(task: BaseTask, trained: TaskConfig | None = None) -> dict[str, Any]:
+    """Return observation layout with units, frames and formulas, joints, control law, time; keys are never renamed. The
+    configuration that the policy was `trained` with says which noise it knows; without one the task's does.
+    """
     cfg = task.cfg
     groups = describe_groups(task)
+    noise = {group["name"]: noise_in(trained or cfg, group["name"]) for group in groups}
     return {
         "task": cfg.task,
         "observation": [
-            describe_term(task, term, group) for group in groups for term in task.observation_groups[group["name"]].terms
+            describe_term(task, term, group, noise[group["name"]].get(term.name, 0.0))
+            for group in groups
+            for term in task.observation_groups[group["name"]].terms
         ],
         "observation_history": groups[0]["history"],
         "observation_groups": groups,
@@ -115,11 +121,19 @@ def describe_groups(task: BaseTask) -> list[dict[str, Any]]:
     return groups
 
 
-def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any]) -> dict[str, Any]:
-    """Return one observation term; unit, frame and formula are those that its method's docstring says."""
+def noise_in(cfg: TaskConfig, group: str) -> dict[str, float]:
+    """Return the half width of the noise on each term of an observation group, in the term's unit; nothing without noise."""
+    observations = cfg.observations
+    noisy = observations.add_noise and observations.groups[group].noise
+    return {term: half * observations.noise_level for term, half in observations.noise.items()} if noisy else {}
+
+
+def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any], noise: float) -> dict[str, Any]:
+    """Return one observation term, with the half width of its noise; unit, frame and formula are those that its method's
+    docstring says.
+    """
     docstring = inspect.getdoc(getattr(type(task), f"_obs_{term.name}"))
     text = " ".join((docstring or "").partition("\n\n")[0].split())
-    cfg = task.cfg.observations
     entry: dict[str, Any] = {
         "name": term.name,
         "group": group["name"],
@@ -127,7 +141,7 @@ def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any]) 
         "size": term.columns.stop - term.columns.start,
         "scale": [float(value) for value in term.scale],
         "needs": need_of(term.name),
-        "noise": cfg.noise.get(term.name, 0.0) * cfg.noise_level if cfg.groups[group["name"]].noise else 0.0,
+        "noise": noise,
         "unit": unit_in(docstring),
         "frame": next((frame for frame in FRAMES if frame in text), None),
         "formula": text or None,

@@ -14,6 +14,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged.config import TaskConfig
 from legged.config.actuator import MOTORS
 from legged.deploy.weights import NumpyNetwork
 from legged.envs import BaseTask, LeggedRobot
@@ -37,21 +38,27 @@ class ExportError(RunError):
     """An exported policy does not compute what the policy does."""
 
 
-def export(task: BaseTask, policy: Any, folder: Path, training: Mapping[str, Any] | None = None) -> dict[str, float]:
+def export(
+    task: BaseTask,
+    policy: Any,
+    folder: Path,
+    training: Mapping[str, Any] | None = None,
+    trained: TaskConfig | None = None,
+) -> dict[str, float]:
     """Write `policy`, rsl-rl's network of the actor, as policy.pt (TorchScript), policy.onnx and policy.weights (plain
     numbers, legged.deploy.weights) to `folder`; return the largest difference of each to it.
 
     All take one flat observation (batch, width) and give actions (batch, joints), without noise: the groups that the policy
     reads side by side, and of each with a history of H steps H times its layout, oldest step first. Of a recurrent policy
     the TorchScript keeps the hidden state of a batch of 1 inside, until its reset(); the ONNX takes it and gives it back. The
-    metadata is in the ONNX file and beside it in policy.json, with what is said of its `training`. A network of the motors is
-    copied beside it.
+    metadata is in the ONNX file and beside it in policy.json, with what is said of its `training`; `trained` is the
+    configuration that it was trained with, if that is not the task's. A network of the motors is copied beside it.
 
     Raises:
         ExportError: a file computes something else.
         RunError: a file can't be written.
     """
-    metadata = {**describe(task), **(training or {})}
+    metadata = {**describe(task, trained), **(training or {})}
     device = next(policy.parameters()).device
     widths = {name: task.observation_groups[name].buffer.shape[1] for name in policy.obs_groups}
     # A sequence of batches; only a policy with a memory cares which comes first.

@@ -15,7 +15,7 @@ from legged.commandline.command import run_main
 from legged.commandline.parser import CommandParser, add_import_argument
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
-from legged.play.contact_sheet import film, sheet, write_sheet
+from legged.play.contact_sheet import film, sheet, walker, write_sheet
 from legged.policies.restore import TrainedPolicy, policy_of
 from legged.process.paths import ready_to_write_file
 from legged.registry import import_tasks
@@ -37,7 +37,7 @@ def build_parser() -> CommandParser:
     parser = CommandParser(
         "contact_sheet",
         __doc__,
-        "python -m legged.tools.contact_sheet anymal_c_flat half_cheetah --out robots.gif",
+        "python -m legged.tools.contact_sheet anymal_c_flat go2_flat --out robots.gif",
         "python -m legged.tools.contact_sheet logs/go2_flat/2026-11-22_05-38-19 --out go2.png --side 400",
     )
     parser.add_argument(
@@ -65,6 +65,8 @@ def _main(argv: list[str] | None) -> int:
     if args.module:
         import_tasks(args.module)
     policies = [policy_of(name, "TASK | RUN") for name in args.robots]
+    for policy in policies:
+        walker(policy, "TASK | RUN: ")
     torch.set_num_threads(1)
     tiles = []
     for policy in policies:

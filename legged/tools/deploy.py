@@ -111,7 +111,7 @@ def _exported(name: str) -> Path:
     folder = policy.output("deploy") / EXPORTED
     changes = [*undisturbed(1, 1.0), ("sim.physics", "mujoco")]
     task, act = restore(policy, changes, torch.device("cpu"), graph=False)
-    export(task, act.network, folder)
+    export(task, act.network, folder, trained=policy.cfg)
     print(f"exported {relative(folder / 'policy.onnx')}")
     return folder
 

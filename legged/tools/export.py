@@ -70,7 +70,7 @@ def _main(argv: list[str] | None) -> int:
         seconds = (read_checkpoint(path).get("infos") or {}).get("wall_s")
         if isinstance(seconds, int | float):
             training["wall_s"] = seconds
-        export(task, act.network, folder / f"{iterations:05d}", training)
+        export(task, act.network, folder / f"{iterations:05d}", training, policy.cfg)
     print(f"exported {len(paths)} checkpoint{'s' if len(paths) != 1 else ''} to {relative(folder)}")
     return 0
 

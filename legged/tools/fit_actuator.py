@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from legged.commandline.command import run_main
 from legged.commandline.parser import CommandParser
+from legged.config.yaml_files import dump
 from legged.errors import ConfigError
 from legged.process.paths import make_folder, ready_to_write, relative, write_text
 from legged.tools.fitting.judgement import Fit, actuator_section, draw, errors
@@ -142,7 +142,7 @@ def _write(folder: Path, log: ActuatorLog, drive: Drive, judged: dict[str, dict[
     told = "# Fitted by legged.tools.fit_actuator: to be laid into the YAML of a task\n"
     write_text(
         folder / "actuator.yaml",
-        told + yaml.safe_dump({"control": control}, sort_keys=False, default_flow_style=None, width=120),
+        told + dump({"control": control}, sort_keys=False, default_flow_style=None, width=120),
     )
     numbers = {name: value if np.isfinite(value) else None for name, value in vars(drive).items()}
     facts = {"joints": list(log.joint_names), "sim_dt": log.dt, "drive": numbers, "held_out": judged}

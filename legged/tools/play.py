@@ -71,6 +71,8 @@ def build_parser() -> CommandParser:
 
 def _main(argv: list[str] | None) -> int:
     args = build_parser().parse_intermixed_args(argv)
+    if args.gif and args.no_video:
+        raise ConfigError("--gif: asks for a film, and --no-video for none; leave out one of them")
     register_given(args)
     device = pick_device(args.sim_device)
     settle_on(device)
@@ -90,7 +92,7 @@ def _main(argv: list[str] | None) -> int:
         task, act = restore(policy, [*changes, *asked], device, graph)
     print(f"{policy.cfg.task}: {relative(policy.checkpoint)}\nwatch it: {watch_command(args, policy.folder)}")
 
-    differences = export(task, act.network, folder / EXPORTED)
+    differences = export(task, act.network, folder / EXPORTED, trained=policy.cfg)
     for name, difference in differences.items():
         print(f"exported {relative(folder / EXPORTED / name)}, largest difference to the policy {difference:.1e}")
 

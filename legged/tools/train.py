@@ -115,7 +115,7 @@ def _main(argv: list[str] | None, prepared: Prepared | None = None) -> int:
     changed: list[str] = []
     if args.transfer:
         cfg, checkpoint = transferred(args, on_cpu=device.type == "cpu")
-    elif args.resume or args.load_run or args.checkpoint is not None:
+    elif args.resume or args.load_run is not None or args.checkpoint is not None:
         cfg, checkpoint, changed = resumed(args)
     else:
         cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")

@@ -243,7 +243,7 @@ def test_a_file_s_mistake_is_named_under_its_parent_s_cpu_section(tmp_path, wron
     """`anymal_c_flat` sets the first three on a CPU."""
     mine = {"extends": TASK, **nest(*wrong)}
     path = tmp_path / "mine.yaml"
-    path.write_text(config.loader.yaml.safe_dump(mine))
+    path.write_text(config.yaml_files.dump(mine))
     with pytest.raises(ConfigError) as error:
         load_config(path, "mine", on_cpu=on_cpu)
     assert str(error.value).startswith(f"{path}: {wrong[0]}: ")

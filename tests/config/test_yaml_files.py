@@ -2,7 +2,7 @@
 
 import pytest
 
-from legged.config.yaml_files import MOST_BYTES, parse, read_yaml
+from legged.config.yaml_files import MOST_BYTES, dump, parse, read_yaml
 from legged.errors import ConfigError
 
 
@@ -29,6 +29,44 @@ def test_merge_keys_are_laid_below_a_block_s_own():
     assert data["d"] == {"x": 1, "y": 2, "z": 4, "w": 0}  # of two the first wins
     assert data["e"] == {"v": 1}
     assert data["a"] == {"x": 1, "y": 2}
+
+
+@pytest.mark.parametrize(
+    "text", ["1e-3", "1e3", "7e12345", "-1E5", ".5e3", "1_0e2", "010", "-.5", "1:30", "yes", "2026-11-22"]
+)
+def test_text_that_looks_like_a_number_is_read_back_as_text(text):
+    """A run that is named after its learning rate could be trained, and then neither played nor resumed."""
+    assert parse(dump({text: [text]}), "here") == {text: [text]}
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("-.5", -0.5),
+        ("+.5", 0.5),
+        (".5", 0.5),
+        ("-.5e1", -5.0),
+        ("-5.", -5.0),
+        ("-0", 0),
+        ("0", 0),
+        ("0x10", 16),
+        ("1_0", 10),
+    ],
+)
+def test_numbers_with_signs_and_without_zeros(text, value):
+    assert parse(f"[{text}]", "here") == [value]
+
+
+@pytest.mark.parametrize("text", ["010", "-010", "0_10", "1:30"])
+def test_a_number_that_others_read_as_another_one_is_refused(text):
+    """`env.seed=010` was seed 8, where `--seed 010` is 10."""
+    with pytest.raises(ConfigError, match=rf"^here: not valid YAML: '{text}' cannot be read \(it is one number in YAML 1.1"):
+        parse(text, "here")
+
+
+@pytest.mark.parametrize("number", [1e-3, 1e3, -1e5, 500.0, 1e20, 1e-300, 10])
+def test_numbers_are_read_back_as_numbers(number):
+    assert parse(dump([number]), "here") == [number]
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from helpers import small_task
+from helpers import small_config, small_task
 
 from legged.deploy.commands import Operator, Orders
 from legged.deploy.interface import Interface, Reading, RobotFacts
@@ -27,8 +27,9 @@ BLIND = [("observations.actor", PROPRIOCEPTION), ("observations.actor_history", 
 
 def exported(folder, *changes):
     """The folder with a fresh policy of anymal_c_flat that needs nothing but sensors, unless `changes` say otherwise."""
-    task = small_task(*SMALL, *(changes or BLIND), num_envs=1)
-    export(task, Runner(task).alg.get_policy(), folder)
+    changes = (*SMALL, *(changes or BLIND))
+    task, trained = small_task(*changes, num_envs=1), small_config(*changes, ("observations.add_noise", True))
+    export(task, Runner(task).alg.get_policy(), folder, trained=trained)
     return folder
 
 

@@ -77,6 +77,25 @@ def test_training_says_that_rsl_rls_loop_runs_and_why(capsys):
     assert "rsl-rl's own training loop: the actor is a RNNModel" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(("robots", "mini_batches"), [(4, 2), (4, 4), (1, 1)])
+def test_each_step_of_a_mini_batch_is_weighed_by_its_own_advantage_and_no_other_one(robots, mini_batches):
+    """While the policy stands still the ratio of probabilities is 1, and the loss minus the mean advantage."""
+    learning = [("train.algorithm.num_mini_batches", mini_batches), ("train.algorithm.num_learning_epochs", 1)]
+    still = [("train.algorithm.learning_rate", 1e-12), ("train.algorithm.schedule", "fixed")]
+    steps = [("train.runner.num_steps_per_env", 6)]
+    task = small_task(*recurrent("gru"), *learning, *still, *steps, num_envs=robots)
+    algorithm = Runner(task).alg
+    algorithm.train_mode()
+    observations = task.get_observations()
+    with torch.inference_mode():
+        for _ in range(6):
+            observations, rewards, dones, extras = task.step(algorithm.act(observations))
+            algorithm.process_env_step(observations, rewards, dones, extras)
+        algorithm.compute_returns(observations)
+        algorithm.storage.advantages[:] = torch.arange(6.0).view(6, 1, 1)
+    assert algorithm.update()["surrogate"] == pytest.approx(-2.5, rel=1e-4)
+
+
 # ---- configuration -------------------------------------------------------------------------------------------------------
 
 

@@ -159,6 +159,16 @@ def test_two_and_two_iterations_are_four(settings):
 
 
 @pytest.mark.parametrize("loop", ["stock", "captured"])
+@pytest.mark.parametrize("of_ppo", [[], ["train.algorithm.schedule=fixed", "train.algorithm.learning_rate=0.07"]])
+def test_a_resumed_student_learns_at_the_rate_of_the_configuration(loop, of_ppo):
+    folder = student("--runner", loop)
+    resume = ["--resume", "--load_run", str(folder), "train.distillation.learning_rate=0.00001"]
+    saved = content(tiny_run(*STUDENT[:2], *resume, *of_ppo, num_envs=12, iterations=3), 2)
+    assert saved["optimizer_state_dict"]["param_groups"][0]["lr"] == pytest.approx(1e-5)
+    assert saved["infos"]["learning_rate"] == pytest.approx(1e-5)
+
+
+@pytest.mark.parametrize("loop", ["stock", "captured"])
 def test_a_teacher_with_a_memory_teaches(loop):
     teacher = tiny_run("train.policy.rnn_type=gru", "train.policy.rnn_hidden_dim=6", "train.algorithm.symmetry=false")
     folder = student("--runner", loop, *EVENTFUL, teacher=str(teacher))

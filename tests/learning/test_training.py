@@ -193,6 +193,14 @@ def test_resuming_what_is_finished_is_an_error_and_leaves_no_folder(capsys):
     assert run_folders() == before
 
 
+def test_a_run_without_a_name_is_no_new_training(capsys):
+    """As a script has it whose variable is empty."""
+    arguments = ["--task", TASK, "--sim_device", "cpu", "--load_run", "", "--max_iterations", "1", *SIZES]
+    assert call(train.main, arguments) == 2
+    assert capsys.readouterr().err.startswith("error: --load_run: there is no run ''")
+    assert run_folders() == []
+
+
 def test_the_newest_run_is_the_one_trained_last_not_the_one_looked_at_last():
     old = tiny_run("--run_name", "1_old", iterations=1)
     new = tiny_run("--run_name", "2_new", iterations=1)

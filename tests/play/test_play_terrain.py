@@ -303,6 +303,7 @@ def test_a_policy_for_a_plane_is_shown_on_terrain(short, tmp_path, capsys):
         ("anymal_c", ["--difficulty", "nan"], ["--difficulty", "between 0 and 1"]),
         ("anymal_c", ["terrain.proportions={gapp: 0.5}"], ["terrain.proportions.gapp", "did you mean 'gap'?"]),
         ("anymal_c", ["--terrain", "pit", "terrain.terrain_length=3"], ["3 x 8 m", "platform of 'pit'"]),
+        ("anymal_c_flat", ["--gif"], ["--gif", "--no-video"]),
         ("anymal_c_flat", ["--difficulty", "0.5"], ["--difficulty", "anymal_c_flat", "plane", "--terrain"]),
     ],
 )

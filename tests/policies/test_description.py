@@ -6,7 +6,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-from helpers import CALM, ENGINE, small_config, small_task
+from helpers import CALM, ENGINE, TASK, call, small_config, small_task, tiny_run
 
 from legged.config.schema import ObservationGroupConfig
 from legged.envs import LeggedRobot
@@ -15,6 +15,7 @@ from legged.physics import FIELDS
 from legged.policies.description import describe
 from legged.policies.export import export
 from legged.registry import make_task, task_config
+from legged.tools import export as export_tool
 
 SMALL_TERRAIN = [
     ("terrain.num_rows", 3),
@@ -150,6 +151,17 @@ def test_a_controller_that_reads_only_the_exported_files_does_the_same(name, tmp
     computed = task.control.compute(task.dof_pos, task.dof_vel)
     for robot, controller in enumerate(controllers):
         np.testing.assert_allclose(controller.torques(raw_state(task, robot)), computed[robot], rtol=0.0, atol=1e-3)
+
+
+@pytest.mark.usefixtures("workplace")
+@pytest.mark.parametrize(("add", "half"), [("true", 0.25), ("false", 0.0)])
+def test_noise_is_that_of_the_training_and_not_of_the_task_that_is_exported_from(add, half):
+    """Tools turn noise off, whatever the training had, and somebody may ask them for another level of it."""
+    folder = tiny_run("observations.noise.dof_vel=0.5", "observations.noise_level=0.5", f"observations.add_noise={add}")
+    arguments = ["--task", TASK, "--load_run", str(folder), "observations.noise_level=8"]
+    assert call(export_tool.main, arguments) == 0
+    terms = json.loads((folder / "exported" / "00002" / "policy.json").read_text())["observation"]
+    assert {term["name"]: term["noise"] for term in terms}["dof_vel"] == half
 
 
 def test_every_shipped_term_has_a_formula_and_a_unit():

@@ -11,7 +11,7 @@ from PIL import Image
 from legged import registry
 from legged.errors import RunError
 from legged.play import contact_sheet as sheets
-from legged.play.contact_sheet import film, sheet, write_sheet
+from legged.play.contact_sheet import film, sheet, walker, write_sheet
 from legged.policies.restore import TrainedPolicy, policy_of
 from legged.registry import task_config
 from legged.rendering import RobotsCamera
@@ -127,6 +127,19 @@ def test_tiles_are_called_by_robot_task_or_run_whatever_tells_them_apart():
     assert contact_sheet.names_of(policies) == ["anymal_c", "go2_flat", "go2", "half_cheetah"]
     policies.append(TrainedPolicy(configs[2], Path("logs", "go2", "11-15", "model_9.pt")))
     assert contact_sheet.names_of(policies) == ["anymal_c", "go2_flat", "go2 10-30", "half_cheetah", "go2 11-15"]
+
+
+def test_a_robot_that_cannot_be_asked_to_walk_is_refused_before_others_are_filmed(capsys):
+    assert call(contact_sheet.main, [TASK, "half_cheetah", "--out", "a.gif"]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("error: TASK | RUN: 'half_cheetah' follows no commands")
+
+
+def test_the_tasks_of_its_help_can_be_shown():
+    first = contact_sheet.build_parser().examples[0].split()
+    for task in first[first.index("legged.tools.contact_sheet") + 1 : first.index("--out")]:
+        assert walker(policy_of(task)).task == task
 
 
 @pytest.mark.parametrize(

@@ -2,10 +2,9 @@
 
 from typing import Any
 
-import yaml
-
 from legged.config import to_dict
 from legged.config.dotted import MISSING, differences, flat
+from legged.config.yaml_files import dump
 from legged.errors import ConfigError
 from legged.evaluation.reports.record import Record
 from legged.registry import task_config
@@ -36,7 +35,7 @@ def words(value: Any) -> str:
     """Return a value as it would stand in a YAML file, on one line; a dash for none."""
     if value is MISSING:
         return "-"
-    text = yaml.safe_dump(value, default_flow_style=True, width=1_000_000).strip().removesuffix("...").strip()
+    text = dump(value, default_flow_style=True, width=1_000_000).strip().removesuffix("...").strip()
     return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 3] + "..."
 
 

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import yaml
-
+from legged.config.yaml_files import dump
 from legged.process.paths import make_folder, write_text
 from legged.robots.importing import meshes
 from legged.robots.importing.mend import plain
@@ -135,7 +134,7 @@ def _name(text: str) -> str:
     """Return a text as YAML, in quotes where it would be something else without."""
     if re.fullmatch(r"[-+\d._]+[eE][-+]?\d+", text):  # 1e3 is a number for our reader, and none for YAML 1.1
         return f"'{text}'"
-    return yaml.safe_dump(text, default_flow_style=True, width=10_000, allow_unicode=True).split("\n", 1)[0]
+    return dump(text, default_flow_style=True, width=10_000, allow_unicode=True).split("\n", 1)[0]
 
 
 def _list(names: Sequence[str]) -> str:

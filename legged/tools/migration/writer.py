@@ -5,9 +5,8 @@ import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import yaml
-
 from legged.config.schema import LeggedConfig
+from legged.config.yaml_files import dump
 from legged.tools.migration.translation import DEFAULTS, Lost
 
 WIDTH = 120
@@ -81,7 +80,7 @@ def _with_comment(line: str, comment: str, indent: int) -> Iterator[str]:
 
 def _text(value: Any) -> str:
     """Return a value as YAML on one line."""
-    return yaml.safe_dump(value, default_flow_style=True, width=10**9, sort_keys=False).removesuffix("\n...\n").strip()
+    return dump(value, default_flow_style=True, width=10**9, sort_keys=False).removesuffix("\n...\n").strip()
 
 
 def robot_yaml(head: Sequence[str], entries: Mapping[str, Any]) -> str:

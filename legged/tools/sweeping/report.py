@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import yaml
-
 from legged.config import parse_override
 from legged.config.loader import merge, nest
 from legged.config.origins import Origins
+from legged.config.yaml_files import dump
 from legged.figures import COLORS, figure
 from legged.process.paths import relative, write_text
 from legged.tools.sweeping.plan import Parameter, Plan
@@ -128,7 +127,7 @@ def best_yaml(plan: Plan, best: "FrozenTrial") -> str:
     for path, value in settings(plan, best).items():
         merge(nested, nest(path, value), "sweep", Origins())
     heading = f"# {plan.name}, trial {best.number}; {plan.objective_text}: {best.value:.4g}\n"
-    return heading + yaml.safe_dump(nested, sort_keys=False, default_flow_style=None, width=120)
+    return heading + dump(nested, sort_keys=False, default_flow_style=None, width=120)
 
 
 def importances(trials: Trials) -> dict[str, float]:
