@@ -13,7 +13,6 @@ import torch
 
 from legged.commandline.command import run_main
 from legged.commandline.parser import CommandParser, add_import_argument
-from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.play.contact_sheet import film, sheet, walker, write_sheet
 from legged.policies.restore import TrainedPolicy, policy_of
@@ -65,23 +64,25 @@ def _main(argv: list[str] | None) -> int:
     if args.module:
         import_tasks(args.module)
     policies = [policy_of(name, "TASK | RUN") for name in args.robots]
-    for policy in policies:
-        walker(policy, "TASK | RUN: ")
+    names = names_of(policies)
     torch.set_num_threads(1)
     tiles = []
     for policy in policies:
         tiles.append(film(policy, args.side))
         print(f"{policy.cfg.task}: {len(tiles[-1])} pictures", flush=True)
-    print(write_sheet(sheet(tiles, names_of(policies), args.columns), args.out))
+    print(write_sheet(sheet(tiles, names, args.columns), args.out))
     return 0
 
 
 def names_of(policies: Sequence[TrainedPolicy]) -> list[str]:
     """Return what is written below the tiles: the robot; the task where the robot comes twice; the folder of the policy too
     where the task does.
+
+    Raises:
+        ConfigError: one of them follows no commands, so that it can't be asked to walk.
     """
+    robots = [Path(walker(policy, "TASK | RUN: ").robot).name for policy in policies]
     tasks = [policy.cfg.task for policy in policies]
-    robots = [Path(policy.cfg.robot).name if isinstance(policy.cfg, LeggedConfig) else policy.cfg.task for policy in policies]
     names = []
     for robot, task, policy in zip(robots, tasks, policies, strict=True):
         known = robot if robots.count(robot) == 1 else task

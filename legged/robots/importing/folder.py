@@ -1,6 +1,5 @@
 """A robot folder out of a Tree: MJCF, meshes, robot.yaml, PROVENANCE.md, and a task that trains it."""
 
-import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -132,8 +131,6 @@ def _compact(values: dict[str, float]) -> dict[str, float]:
 
 def _name(text: str) -> str:
     """Return a text as YAML, in quotes where it would be something else without."""
-    if re.fullmatch(r"[-+\d._]+[eE][-+]?\d+", text):  # 1e3 is a number for our reader, and none for YAML 1.1
-        return f"'{text}'"
     return dump(text, default_flow_style=True, width=10_000, allow_unicode=True).split("\n", 1)[0]
 
 
