@@ -16,6 +16,7 @@ from helpers import kept_global_state
 
 from legged.physics import Physics, RobotScene
 from legged.physics.fused.torque_step import TorqueStep
+from legged.process import neighbours
 from legged.robots.robot import Robot, load_robot
 
 torch.set_num_threads(1)  # tensors are small here; a second thread only costs
@@ -35,9 +36,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Commands run in the test's own folder, and what they change for the whole process is put back. A file asks for it with
-    `pytestmark = pytest.mark.usefixtures("workplace")`.
+    `pytestmark = pytest.mark.usefixtures("workplace")`. Trainings of other tests are no neighbours of theirs.
     """
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(neighbours, "FOLDER", str(tmp_path.with_name(f"{tmp_path.name}_neighbours")))
     with kept_global_state():
         yield
 

@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,30 +11,26 @@ import pytest
 from helpers import tiny_run
 
 from legged.learning.timing import read_timing
-from legged.process.neighbours import ENDING, FOLDER, Neighbours
+from legged.process import neighbours
+from legged.process.neighbours import ENDING, Neighbours
+
+pytestmark = pytest.mark.usefixtures("workplace")
 
 ANOTHER = """
-import sys, time
-from legged.process.neighbours import Neighbours
-with Neighbours("gpu-a"):
+import sys
+from legged.process import neighbours
+neighbours.FOLDER = sys.argv[1]
+with neighbours.Neighbours("gpu-a"):
     print("in", flush=True)
     sys.stdin.read()
 """
-
-
-@pytest.fixture(autouse=True)
-def temporary_files(tmp_path, monkeypatch):
-    """Trainings that really run on this machine are no neighbours of these."""
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    monkeypatch.setattr(tempfile, "tempdir", None)
-    return tmp_path
 
 
 def another() -> subprocess.Popen:
     """A process that is among those on the device, until it is told to end."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(str(Path(entry or ".").resolve()) for entry in sys.path)}
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    process = subprocess.Popen([sys.executable, "-c", ANOTHER], env=environment, **pipes)
+    process = subprocess.Popen([sys.executable, "-c", ANOTHER, neighbours.FOLDER], env=environment, **pipes)
     assert process.stdout.readline() == "in\n"
     return process
 
@@ -55,14 +50,14 @@ def test_each_sees_the_others_of_its_own_device_alone():
         assert later.most == 0
 
 
-def test_a_training_that_is_killed_is_a_neighbour_no_longer(temporary_files):
+def test_a_training_that_is_killed_is_a_neighbour_no_longer():
     with Neighbours("gpu-a") as first:
         process = another()
         first.look()
         assert first.most == 1
         os.kill(process.pid, signal.SIGKILL)
         process.communicate()
-        folder = temporary_files / FOLDER / "gpu-a"
+        folder = Path(neighbours.FOLDER, "gpu-a")
         assert len(list(folder.glob(f"*{ENDING}"))) == 2  # nobody has removed what it left
         with Neighbours("gpu-a") as second:
             assert second.most == 1
@@ -83,8 +78,8 @@ def test_one_that_begins_and_ends_during_a_training_is_seen_by_a_glance(monkeypa
         assert first.most == 1
 
 
-def test_where_nobody_may_write_a_training_goes_on(temporary_files):
-    (temporary_files / FOLDER).write_text("a file where the folder would be")
+def test_where_nobody_may_write_a_training_goes_on():
+    Path(neighbours.FOLDER).write_text("a file where the folder would be")
     with Neighbours("gpu-a") as alone:
         alone.look()
     assert alone.most == 0
