@@ -82,12 +82,7 @@ def _friction(task: Any) -> Tensor:
 def _joint_pos_target(task: Any) -> Tensor:
     if task.cfg.control.control_type != "P":
         raise AttributeError("only control.control_type P has joint angles as targets")
-    asked = task.control.action_scale * task.actions
-    if len(task.control.acted) < task.robot.num_dof:  # joints that are held stay at their default angles
-        every = torch.zeros(task.num_envs, task.robot.num_dof, device=task.device)
-        every[:, list(task.control.acted)] = asked
-        asked = every
-    return task.default_dof_pos + asked
+    return task.default_dof_pos + task.control.spread(task.actions)
 
 
 def _obs_scales(task: Any) -> SimpleNamespace:

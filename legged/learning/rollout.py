@@ -1,5 +1,7 @@
 """A rollout without a host read: policy, sampling, task and returns, written straight into rsl-rl's storage."""
 
+from abc import ABC, abstractmethod
+
 import torch
 from rsl_rl.storage import RolloutStorage
 from torch import Tensor
@@ -8,7 +10,7 @@ from legged.envs import BaseTask
 from legged.learning.ppo import DevicePPO, gaussian_log_prob
 
 
-class Steps:
+class Steps(ABC):
     """The T control steps of an iteration, as rsl-rl's training loop makes them, in one function that a graph can hold. A
     subclass says who acts (`_act`), and what follows from all steps together (`_judge`).
     """
@@ -50,13 +52,13 @@ class Steps:
         self._spread()
         self._judge()
 
+    @abstractmethod
     def _act(self, t: int) -> Tensor:
         """Return the actions (N, D) of step `t`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _judge(self) -> None:
         """Compute what acting did not need, for all steps at once."""
-        raise NotImplementedError
 
     def _step(self, t: int) -> None:
         env, st = self.env, self.storage

@@ -128,11 +128,12 @@ class Control:
         if self._columns is None and isinstance(self.action_scale, float):
             torch.add(middle, actions, alpha=self.action_scale, out=self._target)
             return
-        if self._columns is None:
-            torch.mul(actions, self.action_scale, out=self._target)
-        else:
-            self._target.zero_().index_copy_(1, self._columns, actions * self.action_scale)
-        self._target.add_(middle)
+        torch.add(middle, self.spread(actions), out=self._target)
+
+    def spread(self, actions: Tensor) -> Tensor:
+        """Return actions (N, A) times their scales, (N, D); 0 for joints that are held."""
+        scaled = actions * self.action_scale
+        return scaled if self._columns is None else torch.zeros_like(self.torques).index_copy_(1, self._columns, scaled)
 
     def compute(self, dof_pos: Tensor, dof_vel: Tensor) -> Tensor:
         """Compute torques (N, D) [N m] at joint angles [rad] and velocities [rad/s], each (N, D), for one physics step."""

@@ -57,13 +57,18 @@ def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
     for flag in ("CONTACT", "CONSTRAINT", "ACTUATION"):
         if model.opt.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"):
             raise ConfigError(f"{at}: option flag: {flag.lower()} is disabled; without it the robot could not walk")
-    for group in model.actuator_group:
-        if 0 <= group < GROUPS and model.opt.disableactuator >> int(group) & 1:
-            raise ConfigError(f"{at}: option actuatorgroupdisable: motors are in group {group}, which it disables")
+    for group in disabled_groups(model):
+        raise ConfigError(f"{at}: option actuatorgroupdisable: motors are in group {group}, which it disables")
     for flag in ("SLEEP", "IPC"):
         if model.opt.enableflags & getattr(mujoco.mjtEnableBit, f"mjENBL_{flag}"):
             raise ConfigError(f"{at}: option flag: {flag.lower()} is enabled; its state is not kept per robot, leave it out")
     return model
+
+
+def disabled_groups(model: mujoco.MjModel) -> list[int]:
+    """Return the groups of actuators that a model has and disables."""
+    groups = sorted({int(group) for group in model.actuator_group if 0 <= group < GROUPS})
+    return [group for group in groups if model.opt.disableactuator >> group & 1]
 
 
 @contextlib.contextmanager

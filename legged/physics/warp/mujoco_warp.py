@@ -30,7 +30,7 @@ from legged.physics.warp.physics import WarpPhysics
 from legged.physics.warp.redraws import Redraws, Variants
 from legged.process.cores import available_cores
 from legged.process.ranks import Ranks
-from legged.robots.robot_model import FLOOR, GROUPS
+from legged.robots.robot_model import FLOOR, disabled_groups
 
 PER_WORLD = ("geom_friction", "body_mass", *DERIVED)
 """Arrays of the model that always differ per world, beside those of the fields that are randomised."""
@@ -54,9 +54,8 @@ def absent_stages(model: mujoco.MjModel, randomized: Collection[str] = ()) -> in
 
 def ignored(model: mujoco.MjModel) -> str:
     """Return what of a model mujoco-warp passes over without a word; empty if nothing."""
-    for group in model.actuator_group:
-        if 0 <= group < GROUPS and model.opt.disableactuator >> int(group) & 1:
-            return f"it would drive the actuators of group {group} too, which the model disables"
+    for group in disabled_groups(model):
+        return f"it would drive the actuators of group {group} too, which the model disables"
     scalar = np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE))
     for kind, limited, span, margin in (
         ("joint", (model.jnt_limited != 0) & scalar, np.diff(model.jnt_range)[:, 0], model.jnt_margin),
