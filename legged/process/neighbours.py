@@ -51,7 +51,7 @@ class Neighbours:
         descriptor, name = tempfile.mkstemp(prefix=f"{os.getpid()}.", dir=self._folder)
         self._lock = os.fdopen(descriptor, "wb")
         os.fchmod(descriptor, 0o644)
-        _locked(self._lock)
+        _locked(self._lock, fcntl.LOCK_EX)
         self._path = Path(name).rename(f"{name}{ENDING}")  # locked before anybody takes it for one of a dead process
 
     def glance(self) -> None:
@@ -67,17 +67,17 @@ class Neighbours:
             if path == self._path:
                 continue
             with contextlib.suppress(OSError), path.open("rb") as file:
-                if _locked(file):
+                if _locked(file, fcntl.LOCK_SH):  # shared: who looks at the same time is not taken for its owner
                     path.unlink()
                 else:
                     others += 1
         self.most = max(self.most, others)
 
 
-def _locked(file: IO[bytes]) -> bool:
-    """Whether the lock of `file` is ours now: nobody else has it open and locked. Does not wait."""
+def _locked(file: IO[bytes], kind: int) -> bool:
+    """Whether a lock of that kind on `file` is ours now. Does not wait."""
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(file, kind | fcntl.LOCK_NB)
     except OSError:
         return False
     return True

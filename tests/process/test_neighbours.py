@@ -1,5 +1,6 @@
 """Trainings that share a device know of each other, whoever started them and however they end."""
 
+import fcntl
 import os
 import signal
 import subprocess
@@ -63,6 +64,17 @@ def test_a_training_that_is_killed_is_a_neighbour_no_longer():
             assert second.most == 1
         assert len(list(folder.iterdir())) == 1
     assert not list(folder.iterdir())
+
+
+def test_who_looks_at_what_a_killed_training_has_left_is_no_training():
+    with Neighbours("gpu-a") as first:
+        left = Path(neighbours.FOLDER, "gpu-a", f"1.left{ENDING}")
+        left.touch()
+        with left.open("rb") as other:
+            fcntl.flock(other, fcntl.LOCK_SH)  # as another training does while it looks
+            first.look()
+        assert first.most == 0
+        assert not left.exists()
 
 
 def test_one_that_begins_and_ends_during_a_training_is_seen_by_a_glance(monkeypatch):
