@@ -229,6 +229,25 @@ def test_a_program_that_is_asked_to_end_brakes_the_robot_for_a_second_and_says_g
     assert (tmp_path / "log.npz").is_file()
 
 
+def test_whoever_interrupts_a_program_that_waits_for_a_robot_does_not_wait(policy_folder, tmp_path):
+    (tmp_path / "lie.txt").write_text("0 damping\n")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.settimeout(60.0)
+        address = f"127.0.0.1:{silent.getsockname()[1]}"
+        command = [sys.executable, "-m", "legged.deploy", "--policy", str(policy_folder), "--robot", f"udp:{address}"]
+        program = subprocess.Popen([*command, "--commands", "lie.txt"], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+        try:
+            silent.recv(100)
+            asked = time.perf_counter()
+            program.send_signal(signal.SIGINT)
+            said = program.communicate(timeout=20.0)[1]
+            assert time.perf_counter() - asked < 0.5 * udp.ANSWER_S
+        finally:
+            program.kill()
+    assert (program.returncode, said) == (130, "interrupted\n")
+
+
 @pytest.mark.parametrize("address", ["", "here", "127.0.0.1:", "127.0.0.1:0", "127.0.0.1:99999", ":80"])
 def test_what_is_no_address_is_refused(address):
     with pytest.raises(ConfigError, match="expected udp:HOST:PORT"):
