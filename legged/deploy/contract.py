@@ -331,6 +331,7 @@ def _check_numbers(contract: Contract) -> None:
     """
     low, high = contract.command_ranges.T
     for key, values, allowed, right in (
+        ("sim_dt", contract.sim_dt, "above 0, and at most control_dt", 0.0 < contract.sim_dt <= contract.control_dt + 1e-9),
         ("stiffness", contract.stiffness, "0 or more", contract.stiffness >= 0.0),
         ("damping", contract.damping, "above 0: it is what stops a robot", contract.damping > 0.0),
         ("torque_limits", contract.torque_limits, "above 0", contract.torque_limits > 0.0),

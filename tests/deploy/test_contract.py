@@ -88,6 +88,7 @@ def test_a_joint_without_limits_has_none_in_the_contract_too(folder, tmp_path):
         ({"imu_frame": None}, r"is no policy\.json of an export \(KeyError: 'imu_frame'\)"),
         ({"damping": [4.0] * 11 + [0.0]}, r"damping: must be above 0: it is what stops a robot, got 0"),
         ({"stiffness": [-1.0] + [90.0] * 11}, r"stiffness: must be 0 or more, got -1"),
+        ({"sim_dt": -0.005}, r"sim_dt: must be above 0, and at most control_dt, got -0\.005"),
         ({"action_scale": float("nan")}, r"action_scale: must be finite, got nan"),
         ({"action_clip": float("inf")}, r"action_clip: must be above 0 and finite, got inf"),
         ({"torque_limits": [0.0] * 12}, r"torque_limits: must be above 0, got 0"),
