@@ -92,6 +92,7 @@ def _main(argv: list[str] | None) -> int:
     hurries = take_priority()  # before any thread of a robot's SDK begins: threads inherit it
     try:
         robot = _connect(args)
+        operator.take()
     except BaseException:
         operator.close()
         raise
@@ -161,17 +162,25 @@ def make_operator(args: argparse.Namespace) -> Operator:
 
 
 class Interruptible(Operator):
-    """An operator who can also end the program by Ctrl-C and the like (`ENDING`): the robot is braked first."""
+    """An operator who can also end the program by Ctrl-C and the like (`ENDING`): the robot is braked first. While there is
+    none yet, the program ends at once: nobody should have to wait until a robot has been made to leave its controller.
+    """
 
     def __init__(self, operator: Operator) -> None:
         """Listen to signals on top of `operator`."""
-        self._operator, self._ends = operator, False
+        self._operator, self._ends, self._has_robot = operator, False, False
         for name in ENDING:
             if hasattr(signal, name):
                 signal.signal(getattr(signal, name), self._end)
 
     def _end(self, _number: int, _frame: FrameType | None) -> None:
+        if not self._has_robot:
+            raise KeyboardInterrupt
         self._ends = True
+
+    def take(self) -> None:
+        """Take a robot: from now on there is one to be braked first."""
+        self._has_robot = True
 
     def poll(self, seconds: float) -> Orders:
         orders = self._operator.poll(seconds)

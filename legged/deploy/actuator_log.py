@@ -8,12 +8,16 @@ from legged.deploy.contract import Contract
 
 SHORTEST = 20
 """Samples of a run, at least."""
+UNEVEN = 0.75
+"""Share of a time step by which the time between two samples may differ from it: a clock may count milliseconds, and 400 Hz
+are 2 and 3 of them in turn; a sample that is missing makes it a whole step more."""
 
 
 def actuator_arrays(log: Mapping[str, np.ndarray], contract: Contract) -> dict[str, np.ndarray] | None:
     """Return of the readings of a log (arrays as `Log.save` has them) those with the policy's gains and with torques, in runs
-    that end where a reading is missing: `joint_names` (D,), `run` (T,), `dt` [s], `target`, `position` [rad], `velocity`
-    [rad/s], `torque` [N m] (T, D), and the gains `stiffness`, `damping` (D,). None if there are none.
+    that end where a reading is missing; one that was sent again is left out: `joint_names` (D,), `run` (T,), `dt` [s],
+    `target`, `position` [rad], `velocity` [rad/s], `torque` [N m] (T, D), and the gains `stiffness`, `damping` (D,). None if
+    there are none.
     """
     if "times" not in log:
         return None
@@ -21,14 +25,19 @@ def actuator_arrays(log: Mapping[str, np.ndarray], contract: Contract) -> dict[s
     usable = (log["stiffness"] == contract.stiffness).all(axis=1) & (log["damping"] == contract.damping).all(axis=1)
     for name in measured:
         usable &= np.isfinite(log[name]).all(axis=1)
-    rows = np.flatnonzero(usable)
-    if len(rows) < SHORTEST:
+    new = np.concatenate([[True], np.diff(log["times"]) != 0.0])
+    rows, left_out = np.flatnonzero(usable & new), np.cumsum(new & ~usable)
+    if len(rows) < SHORTEST:  # or the robot has no clock
         return None
     steps = np.diff(log["times"][rows])
-    dt = float(np.median(steps))
-    if not dt > 0.0:  # the robot has no clock
+    usual = float(np.median(steps))
+    if not usual > 0.0:
         return None
-    run = np.concatenate([[0], np.cumsum((np.diff(rows) > 1) | (np.abs(steps - dt) > 0.5 * dt))])
+    apart = (np.diff(left_out[rows]) > 0) | (np.abs(steps - usual) > UNEVEN * usual)
+    if apart.all():
+        return None
+    dt = float(np.mean(steps[~apart]))
+    run = np.concatenate([[0], np.cumsum(apart)])
     long = np.bincount(run)[run] >= SHORTEST
     if not long.any():
         return None

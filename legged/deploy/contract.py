@@ -159,7 +159,7 @@ class Contract:
             ("velocity_limits", "rad/s", self.velocity_limits, robot.velocity_limits),
         ):
             for joint, mine, its in zip(self.joint_names, own, there, strict=True):
-                if mine > its * (1.0 + TOLERANCE):
+                if not mine <= its * (1.0 + TOLERANCE):  # nor fits a robot whose limit is no number
                     raise ConfigError(
                         f"{self.path}: {name}: the policy was trained with {mine:g} {unit} at '{joint}',"
                         f" '{robot.name}' has {its:g}"
@@ -285,12 +285,19 @@ def _check_sizes(contract: Contract) -> None:
         ConfigError: there is something.
     """
     path, groups = contract.path, {group.name: group for group in contract.groups}
+    joints = len(contract.joint_names)
+    sizes = {"base_ang_vel": 3, "projected_gravity": 3, "commands": 3, "dof_pos": joints, "dof_vel": joints}
+    sizes["actions"] = len(contract.acted)
     if not 1e-3 <= contract.control_dt <= 1.0:
         raise ConfigError(f"{path}: control_dt: must be between 0.001 and 1, got {contract.control_dt:g}")
     for term in contract.terms:
         group = groups.get(term.group)
         if group is None or not group.start <= term.start <= group.start + group.size - term.size:
             raise ConfigError(f"{path}: observation: '{term.name}' lies outside its group '{term.group}'")
+        if term.source is None and term.needs != SENSORS.get(term.name):
+            raise ConfigError(f"{path}: observation: '{term.name}' needs '{term.needs}', which it is not made of")
+        if term.source is None and term.size != sizes[term.name]:
+            raise ConfigError(f"{path}: observation: '{term.name}' has {term.size} numbers, a robot gives {sizes[term.name]}")
         if len(term.scale) != term.size:
             raise ConfigError(f"{path}: observation: '{term.name}' has {term.size} numbers and {len(term.scale)} scales")
         if term.source == "heights" and (term.points is None or len(term.points) != term.size):
@@ -304,6 +311,11 @@ def _check_sizes(contract: Contract) -> None:
     for name, group in groups.items():
         if filled[name] != group.size:
             raise ConfigError(f"{path}: observation_groups: '{name}' has {group.size} numbers, its terms {filled[name]}")
+        place = group.start
+        for term in sorted((term for term in contract.terms if term.group == name), key=lambda term: term.start):
+            if term.start != place:
+                raise ConfigError(f"{path}: observation: '{term.name}' must start at column {place}, got {term.start}")
+            place += term.size
     low, high = contract.position_limits.T
     outside = (contract.default < low - TOLERANCE) | (contract.default > high + TOLERANCE)
     if outside.any():
@@ -319,6 +331,7 @@ def _check_numbers(contract: Contract) -> None:
     """
     low, high = contract.command_ranges.T
     for key, values, allowed, right in (
+        ("sim_dt", contract.sim_dt, "above 0, and at most control_dt", 0.0 < contract.sim_dt <= contract.control_dt + 1e-9),
         ("stiffness", contract.stiffness, "0 or more", contract.stiffness >= 0.0),
         ("damping", contract.damping, "above 0: it is what stops a robot", contract.damping > 0.0),
         ("torque_limits", contract.torque_limits, "above 0", contract.torque_limits > 0.0),

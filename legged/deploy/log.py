@@ -45,6 +45,7 @@ class Log:
             "positions": reading.positions,
             "velocities": reading.velocities,
             "torques": nothing if reading.torques is None else reading.torques,
+            "temperatures": nothing if reading.temperatures is None else reading.temperatures,
             "quaternions": reading.quaternion,
             "gyro": reading.gyro,
             "state": STATES.index(state.value),
@@ -86,9 +87,10 @@ class Log:
 
     def save(self, path: Path) -> None:
         """Write the file. By reading: `times` by the robot's clock [s], `received` by this machine's [s], `targets` (T, D)
-        [rad], `stiffness`, `damping`, `positions` [rad], `velocities` [rad/s], `torques` [N m] (NaN where there are none),
-        `quaternions` (T, 4), `gyro` (T, 3), `state` (T,), a number of `states`. By cycle, with `cycle_` before their names:
-        what `add_cycle` was given. Beside them `joint_names`, `states`, `notes`, `note_times` [s] and `contract` (JSON).
+        [rad], `stiffness`, `damping`, `positions` [rad], `velocities` [rad/s], `torques` [N m], `temperatures` [degrees
+        Celsius] (both NaN where there are none), `quaternions` (T, 4), `gyro` (T, 3), `state` (T,), a number of `states`. By
+        cycle, with `cycle_` before their names: what `add_cycle` was given. Beside them `joint_names`, `states`, `notes`,
+        `note_times` [s] and `contract` (JSON).
         What actuators can be fitted to goes into a file of its own, with `ACTUATORS` after its name; there is none of a run
         without such samples.
 

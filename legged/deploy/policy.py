@@ -113,8 +113,9 @@ class Policy:
         """
         contract = self.contract
         self.observation = self._observer.observe(reading, command, self.actions)
-        actions = self._network.run(self.observation).astype(float)
-        self.actions = np.clip(actions, -contract.action_clip, contract.action_clip)
+        given = self._network.run(self.observation).astype(float)
+        actions = np.clip(given, -contract.action_clip, contract.action_clip)
+        self.actions = np.where(np.isfinite(given), actions, np.nan)  # clipping would make a number of an infinite one
         targets = contract.default.copy()
         targets[contract.acted] += contract.action_scale * self.actions
         return targets

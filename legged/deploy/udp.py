@@ -34,8 +34,10 @@ SO_TIMESTAMP = getattr(socket, "SO_TIMESTAMP", 29)
 """Linux's socket option that tells when a packet came, by `time.time`, and the name of what it tells."""
 MOMENT = struct.Struct("@ll")
 """Seconds and microseconds."""
+SET_S = 0.01
+"""This machine's time of day has been set, if it is so much further from its other clock than at the last look [s]."""
 SOURCE_AGE_S = 0.2
-"""A source that has been silent for so long gives nothing any more [s]."""
+"""A source that has been silent for so long gives nothing any more [s], by this machine's clock: a robot may have none."""
 
 
 class UdpRobot(Interface):
@@ -61,6 +63,7 @@ class UdpRobot(Interface):
         if sys.platform == "linux":
             self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMP, 1)
         self._sent = self._newest = 0
+        self._behind = time.perf_counter() - time.time()
         self._seen: dict[str, tuple[float, np.ndarray]] = {}
         self._asked: set[str] = set()
         self._greeting = packet(HELLO, 0, pack_json({"sources": {}}))
@@ -88,9 +91,12 @@ class UdpRobot(Interface):
             return
 
     def _received(self) -> list[tuple[bytes, float]]:
-        """Return the packets that have come, and when each did, by `time.perf_counter` [s]."""
+        """Return the packets that have come, and when each did, by `time.perf_counter` [s]; now, where the time of day by
+        which they came has been set in between.
+        """
         found: list[tuple[bytes, float]] = []
-        behind = time.perf_counter() - time.time()
+        now, behind = time.perf_counter(), time.perf_counter() - time.time()
+        was_set, self._behind = abs(behind - self._behind) > SET_S, behind
         while True:
             try:
                 data, notes, _, _ = self._socket.recvmsg(LARGEST, socket.CMSG_SPACE(MOMENT.size))
@@ -101,7 +107,7 @@ class UdpRobot(Interface):
                 if (level, kind, len(value)) == (socket.SOL_SOCKET, SO_TIMESTAMP, MOMENT.size):
                     seconds, microseconds = MOMENT.unpack(value)
                     came = seconds + 1e-6 * microseconds
-            found.append((data, came + behind))
+            found.append((data, now if was_set else came + behind))
 
     def ask(self, sources: Mapping[str, np.ndarray | None]) -> None:
         wanted = {name: None if points is None else points.tolist() for name, points in sources.items()}
@@ -122,8 +128,8 @@ class UdpRobot(Interface):
             if len(state.positions) != len(self.facts.joint_names):
                 continue
             self._newest = opened[1]
-            self._seen |= {name: (state.time, values) for name, values in state.sources.items()}
-            fresh = {name: values for name, (at, values) in self._seen.items() if state.time - at <= SOURCE_AGE_S}
+            self._seen |= {name: (came, values) for name, values in state.sources.items()}
+            fresh = {name: values for name, (at, values) in self._seen.items() if came - at <= SOURCE_AGE_S}
             found.append(
                 Reading(
                     time=state.time,

@@ -25,6 +25,8 @@ from legged.deploy.unitree_messages import (
 from legged.errors import ConfigError, RunError
 
 COMMAND_TOPIC, STATE_TOPIC = "rt/lowcmd", "rt/lowstate"
+SIMULATOR_DOMAIN = 1
+"""DDS domain of Unitree's own simulator."""
 REPEAT_S = 0.005
 """A command is sent again after so long: motors, and simulators more so, expect more than one in a control step [s]."""
 HOLD_S = 0.1
@@ -56,14 +58,14 @@ class Wire(Protocol):
 class SdkWire:
     """The messages by Unitree's own SDK (the extra `unitree-sdk2`)."""
 
-    def __init__(self, kind: UnitreeKind, network: str | None, domain: int, release: bool = True) -> None:
-        """Join the network: `network` names its interface, eth0 for instance; a DDS domain of 0 is a robot, and 1 is what
-        Unitree's simulator takes. With `release`, a robot that walks by itself is told to leave that first: two programs must
-        never command one robot.
+    def __init__(self, kind: UnitreeKind, network: str | None, domain: int) -> None:
+        """Join the network: `network` names its interface, eth0 for instance; a DDS domain of 0 is a robot, and
+        `SIMULATOR_DOMAIN` what Unitree's simulator takes. A robot that walks by itself is told to leave that first: two
+        programs must never command one robot. The simulator has no controller of its own, and nobody to answer for one.
 
         Raises:
-            ConfigError: the SDK is not installed.
-            RunError: the robot does not let go.
+            ConfigError: the SDK is not installed, or cannot join the network.
+            RunError: the robot does not answer, or does not let go.
         """
         try:
             channel = import_module("unitree_sdk2py.core.channel")
@@ -74,8 +76,11 @@ class SdkWire:
                 f"--robot: Unitree's SDK cannot be imported ({' '.join(str(error).split())}): pip install"
                 " 'legged[unitree-sdk2]'; where that is done, install it from Unitree's own sources (unitree_sdk2_python)"
             ) from error
-        channel.ChannelFactoryInitialize(domain, network)
-        if release:
+        try:
+            channel.ChannelFactoryInitialize(domain, network)
+        except Exception as error:  # the SDK's own has no class of its own
+            raise ConfigError(f"--network: {network or 'none given'}: domain {domain} cannot be joined ({error})") from error
+        if domain != SIMULATOR_DOMAIN:
             self._release()
         self._new: Callable[[], Any] = getattr(default, f"{kind.package}_msg_dds__LowCmd_")
         self._publisher = channel.ChannelPublisher(COMMAND_TOPIC, messages.LowCmd_)
@@ -87,18 +92,21 @@ class SdkWire:
         """Make the robot leave its own controller.
 
         Raises:
-            RunError: it does not.
+            RunError: it does not, or does not answer.
         """
         client = import_module("unitree_sdk2py.comm.motion_switcher.motion_switcher_client").MotionSwitcherClient()
         client.SetTimeout(RELEASE_S)
         client.Init()
-        end = time.perf_counter() + RELEASE_S
+        end, answered = time.perf_counter() + RELEASE_S, False
         while time.perf_counter() < end:
             code, mode = client.CheckMode()
             if code == 0 and not (mode or {}).get("name"):
                 return
+            answered |= code == 0
             client.ReleaseMode()
             time.sleep(1.0)
+        if not answered:
+            raise RunError("--robot: nobody says whether the robot's own controller is on; is --network the right one?")
         raise RunError(f"--robot: the robot's own controller is still on after {RELEASE_S:g} s; leave it by hand")
 
     def new_command(self) -> Any:
@@ -108,7 +116,8 @@ class SdkWire:
         self._subscriber.Init(heard, 10)
 
     def send(self, command: Any) -> None:
-        self._publisher.Write(command)
+        if self._publisher.Write(command) is False:  # it raises nothing
+            raise RunError("--robot: Unitree's SDK could not send a command")
 
     def close(self) -> None:
         self._subscriber.Close()

@@ -189,11 +189,13 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         if simulator.returncode:
             raise RunError(f"the simulated robot failed (exit code {simulator.returncode}): there is no report of this run")
     finally:
-        if program is not None and program.poll() is None:
-            program.terminate()
-            program.wait(END_S)
-        simulator.kill()
-        simulator.wait()
+        try:
+            if program is not None and program.poll() is None:
+                program.terminate()
+                program.wait(END_S)
+        finally:
+            simulator.kill()
+            simulator.wait()
     return code, json.loads(report.read_text(encoding="utf-8"))
 
 

@@ -88,6 +88,7 @@ def test_a_joint_without_limits_has_none_in_the_contract_too(folder, tmp_path):
         ({"imu_frame": None}, r"is no policy\.json of an export \(KeyError: 'imu_frame'\)"),
         ({"damping": [4.0] * 11 + [0.0]}, r"damping: must be above 0: it is what stops a robot, got 0"),
         ({"stiffness": [-1.0] + [90.0] * 11}, r"stiffness: must be 0 or more, got -1"),
+        ({"sim_dt": -0.005}, r"sim_dt: must be above 0, and at most control_dt, got -0\.005"),
         ({"action_scale": float("nan")}, r"action_scale: must be finite, got nan"),
         ({"action_clip": float("inf")}, r"action_clip: must be above 0 and finite, got inf"),
         ({"torque_limits": [0.0] * 12}, r"torque_limits: must be above 0, got 0"),
@@ -117,6 +118,22 @@ def test_what_is_no_contract_is_refused_in_one_line(changes, says, folder, tmp_p
         read_contract(changed(folder, tmp_path, **changes))
 
 
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"name": "my_gyro"}, "'my_gyro' needs 'gyro', which it is not made of"),
+        ({"needs": "quaternion"}, "'base_ang_vel' needs 'quaternion', which"),
+        ({"size": 2, "scale": [1.0, 1.0]}, "'base_ang_vel' has 2 numbers, a robot gives 3"),
+        ({"start": 3}, "'base_ang_vel' must start at column 0, got 3"),
+    ],
+)
+def test_a_term_that_cannot_be_made_is_refused_before_the_robot_walks(changes, says, folder, tmp_path):
+    said = json.loads((folder / "policy.json").read_text())
+    path = changed(folder, tmp_path, observation=[{**said["observation"][0], **changes}, *said["observation"][1:]])
+    with pytest.raises(ConfigError, match=says):
+        read_contract(path)
+
+
 @pytest.mark.parametrize("text", ["", "[]", "{}", "{", "[" * 100_000])
 def test_a_file_that_is_none_is_refused(text, tmp_path):
     path = tmp_path / "policy.json"
@@ -137,6 +154,7 @@ def other_order(names):
         ({"joint_names": other_order}, "joint 0 is 'LF_HAA' for the policy and 'LF_HFE' for 'still': another order"),
         ({"torque_limits": lambda limits: limits * 0.9}, "trained with 80 N m at 'LF_HAA', 'still' has 72"),
         ({"velocity_limits": lambda limits: limits - 1.0}, "trained with 20 rad/s at 'LF_HAA', 'still' has 19"),
+        ({"torque_limits": lambda limits: limits * np.nan}, "trained with 80 N m at 'LF_HAA', 'still' has nan"),
         ({"position_limits": lambda limits: limits * 0.5}, "trained with -0.72 to 0.49 rad at 'LF_HAA', 'still' has -0.36"),
         ({"imu_body": lambda _: "torso"}, "in the frame of 'base', the IMU of 'still' measures in that of 'torso'"),
     ],

@@ -11,6 +11,7 @@ from helpers import call, tiny_run
 from importing_fixtures import urdf
 
 from legged import registry
+from legged.errors import RunError
 from legged.tools import add_robot, deploy
 
 LISTENS = "import os, time; print('listening at 127.0.0.1:1', flush=True); "
@@ -51,6 +52,35 @@ def test_a_simulator_that_fails_is_told_and_an_older_report_is_not(end, code, ru
     assert told.err == f"error: the simulated robot failed (exit code {code}): there is no report of this run\n"
     assert told.out == ""
     assert not (tmp_path / "report.json").exists()
+
+
+def test_a_program_that_does_not_end_leaves_no_simulator_behind(policy_folder, tmp_path, monkeypatch):
+    """As one that writes a long log."""
+    starts, started = subprocess.Popen, []
+
+    def start(command, **settings):
+        busy = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(60.0)"
+        source = busy if "legged.deploy" in command else LISTENS + "time.sleep(60.0)"
+        own = {"stdout": subprocess.PIPE} if source is busy else {}
+        started.append(starts([sys.executable, "-c", source], **{**settings, **own}))
+        return started[-1]
+
+    def fails(program):
+        program.stdout.readline()
+        raise RunError("what goes wrong here")
+
+    monkeypatch.setattr(deploy.subprocess, "Popen", start)
+    monkeypatch.setattr(deploy, "_wait", fails)
+    monkeypatch.setattr(deploy, "END_S", 0.2)
+    try:
+        with pytest.raises(subprocess.TimeoutExpired):
+            deploy.main(["--policy", str(policy_folder), "--robot", "sim", "--out", str(tmp_path)])
+        assert started[0].poll() is not None
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+            process.stdout.close()
 
 
 @pytest.mark.parametrize("code", [2, 130])

@@ -165,6 +165,9 @@ def test_a_signal_asks_the_program_to_end_and_keeps_what_else_was_asked(tmp_path
     kept = {number: signal.getsignal(number) for number in map(signal.Signals.__getitem__, ENDING)}
     with kept_global_state():
         operator = Interruptible(Script(path))
+        with pytest.raises(KeyboardInterrupt):  # there is no robot that would have to be braked
+            signal.raise_signal(getattr(signal, name))
+        operator.take()
         assert operator.poll(0.0).events == (Event.DAMPING,)
         signal.raise_signal(getattr(signal, name))
         assert operator.poll(1.0).events == (Event.STAND, Event.QUIT)

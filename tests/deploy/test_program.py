@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from still_robot import WALKS, spoil, tilted, with_one
 
+from legged.deploy.actuator_log import actuator_arrays
 from legged.deploy.safety import Limits, braking, clamp_targets
 from legged.deploy.states import Event
 
@@ -195,6 +196,25 @@ def test_the_log_for_fitting_is_even_and_cut_where_a_reading_is_lost(stage, tmp_
     assert (log["stiffness"] == 60.0).all()
 
 
+@pytest.mark.parametrize(
+    ("milliseconds", "dt", "runs"),
+    [
+        (np.floor(2.5 * np.arange(400)), 0.0025, [400]),  # 400 Hz by a clock that counts milliseconds: 2 and 3 in turn
+        (np.repeat(4.0 * np.arange(200), 2), 0.004, [200]),  # each measurement sent twice
+        (4.0 * np.delete(np.arange(400), 100), 0.004, [100, 299]),
+    ],
+    ids=["coarse clock", "sent twice", "one lost"],
+)
+def test_the_step_of_the_log_for_fitting_is_that_of_the_measurements(stage, milliseconds, dt, runs):
+    contract = stage.policy.contract
+    rows = np.zeros((len(milliseconds), 12))
+    log = {name: rows for name in ("positions", "velocities", "torques", "targets")}
+    log |= {"stiffness": rows + contract.stiffness, "damping": rows + contract.damping, "times": 1e-3 * milliseconds}
+    found = actuator_arrays(log, contract)
+    assert found["dt"] == pytest.approx(dt, rel=1e-3)
+    np.testing.assert_array_equal(np.bincount(found["run"]), runs)
+
+
 def test_a_robot_that_never_stood_up_leaves_nothing_to_fit_to(stage, tmp_path):
     (tmp_path / "log_actuators.npz").write_bytes(b"of the run before")
     stage.run({0.0: DAMPING, 1.0: QUIT})
@@ -203,12 +223,17 @@ def test_a_robot_that_never_stood_up_leaves_nothing_to_fit_to(stage, tmp_path):
 
 
 def test_the_log_has_what_an_actuator_can_be_fitted_to(stage, tmp_path):
-    stage.run({**WALKS, 4.0: QUIT})
+    def warm():
+        stage.robot.change = spoil(temperatures=lambda _: np.full(12, 40.0))
+
+    stage.run({**WALKS, 4.0: QUIT}, {3.5: warm})
     stage.program.log.save(tmp_path / "new" / "log.npz")
     log = np.load(tmp_path / "new" / "log.npz", allow_pickle=False)
     length = len(log["times"])
     for name in ("targets", "positions", "velocities", "torques", "stiffness", "damping"):
         assert log[name].shape == (length, 12)
+    assert np.isnan(log["temperatures"][0]).all()
+    assert (log["temperatures"][-1] == 40.0).all()
     assert log["state"].shape == (length,)
     assert [str(log["states"][i]) for i in np.unique(log["state"])] == ["idle", "damping", "stand", "walk"]
     walking = log["state"] == list(log["states"]).index("walk")

@@ -151,6 +151,15 @@ def test_an_output_that_is_no_number_stops_it(stage, monkeypatch):
     assert all(np.isfinite(asked).all() for _, *row in stage.robot.written for asked in row)
 
 
+@pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan])
+def test_an_infinite_action_is_not_taken_for_the_largest_one(stage, monkeypatch, value):
+    def begin():
+        monkeypatch.setattr(stage.policy._network, "run", lambda _: np.array([value] + [0.0] * 11, dtype=np.float32))
+
+    assert stage.run({**WALKS, 5.0: QUIT}, {4.0: begin}).stops == ("non-finite output of the policy",)
+    assert not any(stiffness.any() for moment, _, stiffness, _ in stage.robot.written if moment > 103.99)
+
+
 def test_the_operator_stops_it_and_it_goes_on_only_by_damping(stage):
     plan = {**WALKS, 4.0: STOP, 4.5: WALK, 5.0: STAND, 5.5: DAMPING, 6.0: STAND, 8.5: WALK, 9.0: QUIT}
     outcome = stage.run(plan)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -172,15 +173,30 @@ def test_a_robot_with_other_joints_gives_no_reading(link):
     assert robot.read() == []
 
 
-def test_a_source_is_kept_until_it_is_too_old(link):
+@pytest.mark.parametrize("seconds", [[10.0, 0.0], [-0.5, 0.2]])
+def test_the_time_of_day_may_be_set_while_packets_come(link, monkeypatch, seconds):
+    """As when a robot's computer hears of the time: ages are neither below 0, nor is what has just come old."""
+    robot, there = link
+    set_back = [0.0]
+    monkeypatch.setattr(udp, "time", SimpleNamespace(perf_counter=time.perf_counter, time=lambda: time.time() - set_back[0]))
+    for number, set_back[0] in enumerate(seconds, 1):
+        there.send(packet(STATE, number, pack_state(state())))
+        (reading,) = robot.read()
+        assert 0.0 <= time.perf_counter() - reading.received < 0.1
+
+
+@pytest.mark.parametrize("times", [(1.0, 1.1, 1.3), (0.0, 0.0, 0.0), (1000.0, 0.1, 0.3)], ids=["ticks", "none", "set back"])
+def test_a_source_is_kept_until_it_is_too_old_whatever_the_robots_clock_says(link, times):
     robot, there = link
     robot.ask({"heights": np.array([[0.5, 0.0]])})
-    there.send(packet(STATE, 1, pack_state(state(1.0, heights=np.array([-0.4])))))
+    there.send(packet(STATE, 1, pack_state(state(times[0], heights=np.array([-0.4])))))
     assert robot.read()[0].sources["heights"] == pytest.approx(-0.4)
-    there.send(packet(STATE, 2, pack_state(state(1.0 + udp.SOURCE_AGE_S - 0.01))))
+    time.sleep(0.5 * udp.SOURCE_AGE_S)
+    there.send(packet(STATE, 2, pack_state(state(times[1]))))
     assert "heights" in robot.read()[0].sources
     before = len(there.heard)
-    there.send(packet(STATE, 3, pack_state(state(1.0 + udp.SOURCE_AGE_S + 0.01))))
+    time.sleep(0.6 * udp.SOURCE_AGE_S)
+    there.send(packet(STATE, 3, pack_state(state(times[2]))))
     assert "heights" not in robot.read()[0].sources
     time.sleep(0.1)
     asked = [opened for opened in there.heard[before:] if opened[0] == HELLO]
@@ -227,6 +243,25 @@ def test_a_program_that_is_asked_to_end_brakes_the_robot_for_a_second_and_says_g
         assert not asked_for[1].any()
         np.testing.assert_allclose(asked_for[2], braking(contract), rtol=1e-6)
     assert (tmp_path / "log.npz").is_file()
+
+
+def test_whoever_interrupts_a_program_that_waits_for_a_robot_does_not_wait(policy_folder, tmp_path):
+    (tmp_path / "lie.txt").write_text("0 damping\n")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.settimeout(60.0)
+        address = f"127.0.0.1:{silent.getsockname()[1]}"
+        command = [sys.executable, "-m", "legged.deploy", "--policy", str(policy_folder), "--robot", f"udp:{address}"]
+        program = subprocess.Popen([*command, "--commands", "lie.txt"], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+        try:
+            silent.recv(100)
+            asked = time.perf_counter()
+            program.send_signal(signal.SIGINT)
+            said = program.communicate(timeout=20.0)[1]
+            assert time.perf_counter() - asked < 0.5 * udp.ANSWER_S
+        finally:
+            program.kill()
+    assert (program.returncode, said) == (130, "interrupted\n")
 
 
 @pytest.mark.parametrize("address", ["", "here", "127.0.0.1:", "127.0.0.1:0", "127.0.0.1:99999", ":80"])

@@ -2,7 +2,6 @@
 
 import ctypes
 import struct
-import sys
 import threading
 import time
 from types import SimpleNamespace
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 
 from legged.deploy import unitree
-from legged.deploy.unitree import SdkWire, UnitreeRobot
+from legged.deploy.unitree import UnitreeRobot
 from legged.deploy.unitree_messages import GO_COMMAND, HG_COMMAND, KINDS, crc, fill_command, new_command
 from legged.errors import ConfigError, RunError
 from legged.robots.robot import load_robot
@@ -312,81 +311,6 @@ def test_a_robot_that_says_nothing_is_named(monkeypatch):
     with pytest.raises(RunError, match=r"--robot: g1: no state came within 0\.05 s"):
         UnitreeRobot("g1", wire)
     assert wire.closed
-
-
-def test_without_the_sdk_one_line_says_what_to_install(monkeypatch):
-    for name in [name for name in sys.modules if name.startswith("unitree_sdk2py")]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "unitree_sdk2py", None)
-    with pytest.raises(ConfigError, match=r"SDK cannot be imported \(.*\): pip install 'legged\[unitree-sdk2\]'"):
-        SdkWire(KINDS["go2"], "lo", 1)
-
-
-def test_the_wire_calls_the_sdk_as_it_wants_to_be_called(monkeypatch):
-    """Topics, messages, network and domain; and a robot that walks by itself is told to leave that first."""
-    told = []
-    modes = [(0, {"name": "mcf"}), (0, {"name": ""})]
-
-    class Client:
-        def SetTimeout(self, seconds):  # noqa: N802  (names of the SDK)
-            told.append(("timeout", seconds))
-
-        def Init(self):  # noqa: N802
-            told.append("client")
-
-        def CheckMode(self):  # noqa: N802
-            return modes.pop(0)
-
-        def ReleaseMode(self):  # noqa: N802
-            told.append("release")
-
-    class Channel:
-        def __init__(self, topic, kind):
-            told.append((topic, kind))
-
-        def Init(self, *handler):  # noqa: N802
-            told.append(("init", *handler))
-
-        def Write(self, command):  # noqa: N802
-            told.append(("write", command))
-
-        def Close(self):  # noqa: N802
-            told.append("close")
-
-    def initialise(domain, network):
-        told.append((domain, network))
-
-    modules = {
-        "unitree_sdk2py.core.channel": {
-            "ChannelFactoryInitialize": initialise,
-            "ChannelPublisher": Channel,
-            "ChannelSubscriber": Channel,
-        },
-        "unitree_sdk2py.idl.default": {"unitree_hg_msg_dds__LowCmd_": lambda: "zeros"},
-        "unitree_sdk2py.idl.unitree_hg.msg.dds_": {"LowCmd_": "LowCmd", "LowState_": "LowState"},
-        "unitree_sdk2py.comm.motion_switcher.motion_switcher_client": {"MotionSwitcherClient": Client},
-    }
-    found = {name: SimpleNamespace(**members) for name, members in modules.items()}
-    monkeypatch.setattr(unitree, "import_module", found.__getitem__)
-    monkeypatch.setattr(unitree.time, "sleep", lambda _: None)
-    wire = SdkWire(KINDS["g1"], "eth0", 0)
-    assert wire.new_command() == "zeros"
-    wire.listen(print)
-    wire.send("command")
-    wire.close()
-    assert told == [
-        (0, "eth0"),
-        ("timeout", unitree.RELEASE_S),
-        "client",
-        "release",
-        ("rt/lowcmd", "LowCmd"),
-        ("init",),
-        ("rt/lowstate", "LowState"),
-        ("init", print, 10),
-        ("write", "command"),
-        "close",
-        "close",
-    ]
 
 
 def test_a_filled_command_can_be_filled_again():

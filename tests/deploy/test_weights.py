@@ -166,6 +166,18 @@ def test_layers_that_make_no_network_are_refused_by_both(data, says, program, tm
         unpack(data)
 
 
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_what_is_no_number_stays_none(name, program, tmp_path):
+    """Or a sensor that has died would make actions that look like others."""
+    data = pack([Layer(2, list(ACTIVATIONS).index(name), 1, 1, ())])
+    (tmp_path / "policy.weights").write_bytes(data)
+    (tmp_path / "in").write_bytes(np.array([np.nan], np.float32).tobytes())
+    subprocess.run([str(program), *(str(tmp_path / name) for name in ("policy.weights", "in", "out"))], check=True)
+    assert np.isnan(np.frombuffer((tmp_path / "out").read_bytes(), np.float32)).all()
+    with np.errstate(invalid="ignore"):
+        assert np.isnan(NumpyNetwork(data).run(np.array([[np.nan]]))).all()
+
+
 def test_a_layer_by_hand():
     """(2 - 1) / 4 = 0.25; 3 * 0.25 - 1 = -0.25; elu of that is exp(-0.25) - 1."""
     layers = [

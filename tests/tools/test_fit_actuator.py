@@ -127,6 +127,15 @@ def test_of_a_log_that_is_nearly_all_one_run_blocks_of_time_are_held_out(tmp_pat
     assert set(log.run[~log.held_out]) == set(range(5))
 
 
+def test_a_run_whose_number_comes_back_is_another_one(tmp_path):
+    """As where two logs were put together, each of which begins with run 0: nothing lies between their ends."""
+    run = np.repeat([0, 1, 0], [802, 398, 400])
+    position = np.where(run == 1, 5.0, np.repeat([0.0, 0.0, 1.0], [802, 398, 400]))[:, None] * np.ones(2)
+    log = read_log(write(tmp_path, run=run, position=position))
+    assert [rows.tolist() for rows in np.unique(log.run, return_counts=True)] == [[0, 1, 2], [802, 398, 400]]
+    assert set(log.resampled(0.004).position.ravel()) == {0.0, 5.0, 1.0}, "not half-way between two runs"
+
+
 def test_a_log_is_resampled_without_looking_ahead(tmp_path):
     log = read_log(write(tmp_path))
     half = log.resampled(0.00375)
@@ -237,6 +246,14 @@ def test_an_lstm_in_a_task_is_torchs():
         ({"dt": None, "time": np.arange(1600.0), "run": np.arange(1600)}, "run: no two samples in a row are of one run"),
         ({"dt": None, "time": np.arange(1600.0) ** 1.1}, "time: samples are not evenly spaced"),
         ({"stiffness": np.zeros(5)}, "stiffness: expected a number or (2,)"),
+        ({"stiffness": np.array(-80.0)}, "stiffness: must be 0 or more, got -80"),
+        ({"torque_limit": np.array(0.0)}, "torque_limit: must be above 0, got 0"),
+        ({"torque": np.zeros((1600, 2))}, "torque: is 0 N m throughout; nothing can be fitted to that"),
+        ({"run": np.full(1600, np.nan)}, "run: expected finite numbers"),
+        ({"run": np.array(["walk"] * 1600)}, "run: expected finite numbers"),
+        ({"time": 0.005 * np.arange(1600)}, "dt: got 0.0025 s, but 'time' says 0.005 s"),
+        ({"time": 0.0025 * np.arange(1600)[::-1]}, "time: samples are not evenly spaced (median step -0.0025 s"),
+        ({"joint_names": np.array(["knee", "knee"])}, "joint_names: must differ from each other, got knee, knee"),
     ],
 )
 def test_a_wrong_log_is_one_line(tmp_path, changes, said, capsys):

@@ -16,6 +16,7 @@ from helpers import CALM, ENGINE, call
 
 from legged.config.schema import SimConfig, TerrainConfig
 from legged.deploy.udp import UdpRobot
+from legged.errors import RunError
 from legged.physics import RobotScene
 from legged.process.headless import off_screen_library
 from legged.registry import make_task, task_config
@@ -134,6 +135,19 @@ def test_its_ground_and_its_time_step_are_its_own():
     # Its contacts are those of C MuJoCo's own model of that ground.
     assert simulated.model.ngeom == RobotScene(simulated.robot, stairs(0.1)).model(SimConfig()).ngeom
     assert mujoco.mj_id2name(simulated.model, mujoco.mjtObj.mjOBJ_GEOM, 0) is not None
+
+
+def test_a_simulation_that_blows_up_says_so_and_does_not_begin_anew():
+    """D gains of 40 N m s/rad on legs of 0.014 kg m^2 are far beyond what steps of 20 ms can hold."""
+    simulated = SimulatedRobot(load_robot("anymal_c"), None, SimConfig(dt=0.02))
+    simulated.asked[:] = simulated.robot.default_dof_pos, simulated.robot.stiffness, np.full(12, 40.0)
+
+    def ten_seconds():
+        for _ in range(500):
+            simulated.step()
+
+    with pytest.raises(RunError, match=r"became unstable after \d\.\d\d s at steps of 0\.02 s \(--sim-dt\)"):
+        ten_seconds()
 
 
 def test_it_brakes_when_nobody_speaks_to_it_any_more(simulated):

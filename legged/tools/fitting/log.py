@@ -120,7 +120,7 @@ def read_log(path: Path) -> ActuatorLog:
     (D,).
 
     Raises:
-        ConfigError: something is missing, of another shape, no number, or sampled unevenly.
+        ConfigError: something is missing, of another shape, no number, one that cannot be, or sampled unevenly.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -136,6 +136,8 @@ def read_log(path: Path) -> ActuatorLog:
         if name not in arrays:
             raise ConfigError(f"{path}: '{name}' is missing (keys: {', '.join(NEEDED)}, and dt or time)")
     names = tuple(str(name) for name in np.atleast_1d(arrays["joint_names"]))
+    if len(set(names)) < len(names):
+        raise ConfigError(f"{path}: joint_names: must differ from each other, got {', '.join(names)}")
     shape = arrays["target"].shape
     if len(shape) != 2 or shape[1] != len(names):
         raise ConfigError(f"{path}: target: expected (samples, {len(names)} joints), got {shape}")
@@ -149,22 +151,32 @@ def read_log(path: Path) -> ActuatorLog:
     run = np.atleast_1d(arrays.get("run", np.zeros(shape[0], dtype=int)))
     if run.shape != shape[:1]:
         raise ConfigError(f"{path}: run: expected ({shape[0]},), got {run.shape}")
+    if run.dtype.kind not in "bfiu" or not np.isfinite(run).all():
+        raise ConfigError(f"{path}: run: expected finite numbers")
+    # A number that comes back, as where two logs were put together, is another run: there is a gap in between.
+    run = np.concatenate([[0], np.cumsum(run[1:] != run[:-1])])
     for name in OPTIONAL[3:]:
         if name in arrays:
             values = _numbers(arrays[name], f"{path}: {name}")
             if values.shape not in ((), (1,), (len(names),)):
                 raise ConfigError(f"{path}: {name}: expected a number or ({len(names)},), got {values.shape}")
+            if values.min() < 0.0 or (name == "torque_limit" and values.min() == 0.0):
+                allowed = "above 0" if name == "torque_limit" else "0 or more"
+                raise ConfigError(f"{path}: {name}: must be {allowed}, got {values.min():g}")
             found[name] = np.broadcast_to(values, (len(names),)).copy()
     return ActuatorLog(names, _time_step(arrays, run, path), run, **found)
 
 
 def check_alike(log: ActuatorLog, path: Path) -> None:
     """Look whether what a log states of its joints' drives is the same for all: one drive is fitted to them, with one
-    friction.
+    friction. And whether there is anything to fit it to.
 
     Raises:
-        ConfigError: it is not.
+        ConfigError: it is not, or there is nothing.
     """
+    fitted_to = log.torque[~log.held_out]
+    if fitted_to.min() == fitted_to.max():
+        raise ConfigError(f"{path}: torque: is {fitted_to[0, 0]:g} N m throughout; nothing can be fitted to that")
     known = log.stiffness is not None and log.damping is not None  # one alone is not used
     for name in (*(OPTIONAL[3:5] if known else ()), OPTIONAL[5]):
         values = getattr(log, name)
@@ -192,7 +204,7 @@ def _time_step(arrays: dict[str, np.ndarray], run: np.ndarray, path: Path) -> fl
     """Return the time between two samples [s].
 
     Raises:
-        ConfigError: nobody says it, or it changes within a run.
+        ConfigError: nobody says it, it changes within a run, or `dt` and `time` say two.
     """
     if "dt" in arrays:
         given = _numbers(arrays["dt"], f"{path}: dt")
@@ -201,10 +213,21 @@ def _time_step(arrays: dict[str, np.ndarray], run: np.ndarray, path: Path) -> fl
         dt = given.item()
         if dt <= 0.0:
             raise ConfigError(f"{path}: dt: must be above 0, got {dt:g}")
+        if "time" in arrays and not np.isclose(step := _even_step(arrays["time"], run, path), dt, rtol=UNEVEN):
+            raise ConfigError(f"{path}: dt: got {dt:g} s, but 'time' says {step:g} s; leave one of them out")
         return dt
     if "time" not in arrays:
         raise ConfigError(f"{path}: 'dt' is missing: the time between two samples [s], or 'time' of each of them")
-    time = _numbers(arrays["time"], f"{path}: time")
+    return _even_step(arrays["time"], run, path)
+
+
+def _even_step(times: np.ndarray, run: np.ndarray, path: Path) -> float:
+    """Return the time between two samples by the time of each [s].
+
+    Raises:
+        ConfigError: it changes within a run.
+    """
+    time = _numbers(times, f"{path}: time")
     if time.shape != run.shape:
         raise ConfigError(f"{path}: time: expected {run.shape}, got {time.shape}")
     steps = np.diff(time)[np.diff(run) == 0]

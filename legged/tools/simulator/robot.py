@@ -9,6 +9,7 @@ from legged.config.schema import ActuatorConfig, SimConfig
 from legged.deploy.contract import SCANS
 from legged.deploy.interface import RobotFacts
 from legged.deploy.udp_packets import RobotState
+from legged.errors import RunError
 from legged.physics import RobotScene
 from legged.robots.robot import Robot
 from legged.terrain import Terrain
@@ -16,6 +17,8 @@ from legged.tools.simulator.motors import Motors
 
 OFFERS = frozenset({"base_lin_vel", "heights"})
 """Sources beside the sensors: what a simulator knows and a robot would have to estimate."""
+UNSTABLE = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
+"""MuJoCo's warnings after which it has begun anew at time 0, with another pose."""
 FALLEN = 1.2
 """A base that leans further than this has fallen [rad]."""
 
@@ -66,10 +69,17 @@ class SimulatedRobot:
         )
 
     def step(self) -> None:
-        """Make one physics step, with the torques that the motors give now."""
-        data = self.data
+        """Make one physics step, with the torques that the motors give now.
+
+        Raises:
+            RunError: the simulation blew up.
+        """
+        data, before = self.data, self.data.time
         data.ctrl[:] = self._motors.torques(self.asked, data.qpos[self._qpos], data.qvel[self._qvel])
         mujoco.mj_step(self.model, data)
+        if any(data.warning[i].number for i in UNSTABLE):
+            dt = self.model.opt.timestep
+            raise RunError(f"the simulation became unstable after {before:.2f} s at steps of {dt:g} s (--sim-dt)")
         self.lowest, self.highest = min(self.lowest, data.qpos[2]), max(self.highest, data.qpos[2])
         _, x, y, _ = data.qpos[3:7]
         self.steepest = max(self.steepest, float(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0))))
