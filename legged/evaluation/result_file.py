@@ -59,12 +59,19 @@ def check_result(result: Any, where: str) -> None:
     fields = _mapping(result, where, "the whole file")
     for name in ("task", "physics"):
         _text(fields, name, where, "")
+    _mapping(fields.get("changes", {}), where, "changes")
     if "episodes" in fields:
         check_episodes(fields, where)
         return
     tracking, path = (fields["rough"], "rough.") if "rough" in fields else (fields, "")
     _mapping(tracking, where, "rough")
     _number(tracking, "falls", where, path)
+    for axis, values in _mapping(tracking.get("grid", {}), where, f"{path}grid").items():
+        numbers = dict(enumerate(values)) if isinstance(values, list) else {}
+        for i in numbers:
+            _number({str(i): numbers[i]}, str(i), where, f"{path}grid.{axis}.")
+        if not numbers:
+            raise _wrong(where, f"{path}grid.{axis}", "a list of numbers", values)
     for name in ("rmse_lin", "rmse_ang"):
         for part in ("mean", "worst"):
             _number(_mapping(tracking.get(name), where, f"{path}{name}"), part, where, f"{path}{name}.", or_null=True)
