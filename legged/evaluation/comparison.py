@@ -1,7 +1,6 @@
 """Several evaluations side by side, as tables and as curves; those of one task in one engine, made alike, are its seeds."""
 
 from collections.abc import Sequence
-from math import prod
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -11,7 +10,7 @@ from rich.table import Table
 
 from legged.errors import ConfigError, suggest
 from legged.evaluation.engines import engine_of
-from legged.evaluation.result_file import tracking_of
+from legged.evaluation.result_file import grid_text, tracking_of
 from legged.evaluation.success_report import TRAINED, TRAINED_LABEL, as_success
 from legged.figures import COLORS, figure
 
@@ -49,7 +48,7 @@ def grouped(results: Sequence[dict[str, Any]]) -> Evaluations:
     """Return the seeds of the same task in the same engine together, in the order of their first: those that were measured
     with the same fields changed, and on the same grid of commands.
     """
-    grids = [_grid_text(result) for result in results]
+    grids = [grid_text(result) for result in results]
     told = len(set(grids) - {""}) > 1
     groups: Evaluations = {}
     for result, grid in zip(results, grids, strict=True):
@@ -57,15 +56,6 @@ def grouped(results: Sequence[dict[str, Any]]) -> Evaluations:
         conditions = ", ".join(text for text in (changed, grid if told else "") if text)
         groups.setdefault((result["task"], result["physics"], conditions), []).append(result)
     return groups
-
-
-def _grid_text(result: dict[str, Any]) -> str:
-    """Return the commands of an evaluation in words, 'vx -1 to 1, vy 0, yaw 0 (5 commands)'; nothing of one without."""
-    grid = tracking_of(result).get("grid", {})
-    ends = {axis: sorted({min(values), max(values)}) for axis, values in grid.items()}
-    parts = [f"{axis} {' to '.join(f'{value:g}' for value in values)}" for axis, values in ends.items()]
-    count = prod(map(len, grid.values()))
-    return f"{', '.join(parts)} ({count} command{'s' if count > 1 else ''})" if grid else ""
 
 
 def spread(values: Sequence[float]) -> float:

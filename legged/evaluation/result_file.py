@@ -12,11 +12,14 @@ CHANGED = "changed"
 """Folder, beside a policy's own results, for those of evaluations for which fields were changed."""
 SAYS_NOTHING = ("sim.physics", "sim.solver", "sim.threads", "env.seed", "env.num_envs", "robot")
 """Fields that say where a policy is measured, not under what."""
+SECTIONS_THAT_SAY_NOTHING = ("train.", "evaluation.")
+"""Sections of such fields: of the grid of commands a result says what it is, by whatever way it was asked for."""
 
 
 def changes_of(asked: Sequence[tuple[str, Any]]) -> dict[str, Any]:
     """Return field -> value of what was asked for that makes an evaluation another one than the policy's own."""
-    return {field: value for field, value in asked if field not in SAYS_NOTHING and not field.startswith("train.")}
+    said = ((field, value) for field, value in asked if field not in SAYS_NOTHING)
+    return {field: value for field, value in said if not f"{field}.".startswith(SECTIONS_THAT_SAY_NOTHING)}
 
 
 def file_name(engine: str) -> str:
@@ -114,6 +117,15 @@ def check_success(result: Any, where: str) -> None:
 def tracking_of(result: dict[str, Any]) -> dict[str, Any]:
     """Return the part of a result that says how commands were followed."""
     return result.get("rough", result)
+
+
+def grid_text(result: dict[str, Any]) -> str:
+    """Return the commands of an evaluation in words, 'vx -1 to 1, vy 0, yaw 0 (5 commands)'; nothing of one without."""
+    grid = tracking_of(result).get("grid", {})
+    ends = {axis: sorted({min(values), max(values)}) for axis, values in grid.items()}
+    parts = [f"{axis} {' to '.join(f'{value:g}' for value in values)}" for axis, values in ends.items()]
+    count = math.prod(map(len, grid.values()))
+    return f"{', '.join(parts)} ({count} command{'s' if count > 1 else ''})" if grid else ""
 
 
 def _mapping(value: Any, where: str, path: str) -> dict[str, Any]:

@@ -176,6 +176,16 @@ def test_the_grid_is_that_of_the_task_where_no_flag_says_otherwise(run, tmp_path
     assert result["grid"] == {"vx": [-0.5, 1.0], "vy": [0.3], "yaw": [-0.2]}
 
 
+def test_a_grid_is_no_changed_field_however_it_is_asked_for(run):
+    """The zoo judges again what was trained with another grid, and looks for the result beside the checkpoint."""
+    judged = ["evaluation.vx=[0.5,0.5,1]", "evaluation.vy=[0,0,1]", "evaluation.yaw=[0,0,1]", "evaluation.stairs=0.3"]
+    assert call(evaluate.main, ["--task", TASK, "--physics", "mujoco", "--robots", "1", *judged, "sim.threads=1"]) == 0
+    result = json.loads((run / "evaluation_mujoco.json").read_text())
+    assert result["grid"] == {"vx": [0.5], "vy": [0.0], "yaw": [0.0]}
+    assert "changes" not in result
+    assert not (run / "changed").exists()
+
+
 @pytest.mark.parametrize(
     ("task", "axes"),
     [
