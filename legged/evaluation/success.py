@@ -220,16 +220,14 @@ def success_over_difficulty(
     configuration come after our own. Return plain numbers and lists.
     """
     assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
-    trained, scale = trained_to(policy.cfg), policy.cfg.terrain.scale
+    cfg: Any = override(policy.cfg, changes)  # another scale asks for other lengths
+    trained, scale = trained_to(policy.cfg), cfg.terrain.scale
     found: dict[str, Any] = {}
     lost = 0
     for name in names:
         sizes = sizes_of(name, full, scale)
-        own = [
-            *to_run_out(policy.cfg, robots * len(sizes)),
-            ("terrain.horizontal_scale", cell_for(name, policy.cfg.terrain)),
-            *changes,
-        ]
+        cell = ("terrain.horizontal_scale", cell_for(name, cfg.terrain))
+        own = [*to_run_out(cfg, robots * len(sizes)), *changes, cell]
         points, overflows = _on_type(policy, name, sizes, robots, own, device, graph)
         lost += overflows
         kind = TERRAIN_TYPES[name]

@@ -286,6 +286,29 @@ def test_configuration_of_the_tasks(monkeypatch, capsys):
     assert (run.control, run.terminations, run.sim.dt) == (cfg.control, cfg.terminations, cfg.sim.dt)
 
 
+def test_ground_of_a_scale_that_is_asked_for_is_measured_and_told_at_that_scale(monkeypatch):
+    """At a quarter of the lengths and half the speeds; what training ended at stays. Its cells still divide treads."""
+    cfg = task_config("anymal_c", [("terrain.num_rows", 10), *ENGINE], on_cpu=True)
+    found = []
+
+    def fake(policy, name, sizes, robots, changes, device, graph):
+        found.append((name, sizes, override(cfg, changes).terrain))
+        return [point(size, torch.tensor([REACHED] * robots), torch.ones(robots)) for size in sizes], 0
+
+    monkeypatch.setattr(success, "_on_type", fake)
+    asked = [("terrain.scale", 0.25), ("terrain.horizontal_scale", 0.025)]
+    names = ["stairs_up", "narrow_stairs_up"]
+    policy = TrainedPolicy(cfg, Path("model_0.pt"))
+    result = success.success_over_difficulty(policy, names, 2, False, asked, torch.device("cpu"))
+    rule = result["definition"]
+    assert (rule["distance_m"], rule["vx"], rule["vy"][1]) == pytest.approx((1.0, 0.375, 0.05))
+    assert result["types"]["stairs_up"]["trained_to"] == pytest.approx(0.212)
+    (_, sizes, built), (_, _, narrow) = found
+    assert sizes == pytest.approx([0.25 * size for size in success.FEWER["stairs_up"]])
+    assert (built.scale, built.terrain_length, built.horizontal_scale) == pytest.approx((0.25, 2.0, 0.025))
+    assert narrow.horizontal_scale == pytest.approx(0.07 / 3)  # a third of the tread of 0.28 m at that scale
+
+
 def test_the_shipped_policy_climbs_a_gentle_slope_and_not_a_wall():
     """The whole measurement, with a policy that walks: 10 degrees are easy for it, a pit of 1 m has walls."""
     policy = TrainedPolicy(run_config(POLICY), find_checkpoint(POLICY, None))
