@@ -218,9 +218,7 @@ class Bench:
         specs: Sequence[TileSpec],
         last: Sequence[tuple[str, Any]] = (),
     ) -> tuple[Tensor, Tensor]:
-        """Return the outcomes (N,) of robots that are shared out among tiles, and when [s]. `last` changes come after what the
-        user asks for.
-        """
+        """Return the outcomes (N,) of robots that are shared out among tiles, and when [s]; `last` is as for `_build`."""
         own = to_run_out(self.cfg, len(rows))
         cfg: Any = override(self.cfg, [*own, *self._asked, *last])
         task, act = self._build(rows, own, last, tiles_apart(specs, cfg.terrain, cfg.env.seed))
