@@ -10,7 +10,7 @@ from rich.table import Table
 
 from legged.errors import ConfigError, suggest
 from legged.evaluation.engines import engine_of
-from legged.evaluation.result_file import grid_text, tracking_of
+from legged.evaluation.result_file import changes_text, grid_text, tracking_of
 from legged.evaluation.success_report import TRAINED, TRAINED_LABEL, as_success
 from legged.figures import COLORS, figure
 
@@ -52,8 +52,7 @@ def grouped(results: Sequence[dict[str, Any]]) -> Evaluations:
     told = len(set(grids) - {""}) > 1
     groups: Evaluations = {}
     for result, grid in zip(results, grids, strict=True):
-        changed = ", ".join(f"{field}={value}" for field, value in sorted(result.get("changes", {}).items()))
-        conditions = ", ".join(text for text in (changed, grid if told else "") if text)
+        conditions = ", ".join(text for text in (changes_text(result), grid if told else "") if text)
         groups.setdefault((result["task"], result["physics"], conditions), []).append(result)
     return groups
 

@@ -10,7 +10,7 @@ from typing import Any
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.evaluation.engines import ENGINES
-from legged.evaluation.result_file import file_name, grid_text, read_results, tracking_of
+from legged.evaluation.result_file import changes_text, file_name, grid_text, read_results, tracking_of
 from legged.evaluation.velocity_grid import axes_of
 from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL, checkpoints, of_another_policy, run_config
 from legged.learning.timing import Timing, read_timing
@@ -57,8 +57,7 @@ def read_run(folder: Path) -> JudgedRun:
     known = {name: one for name, one in results.items() if name not in others}
     for name, one in [*known.items()]:
         if one.get("changes"):
-            fields = ", ".join(f"{field}={value}" for field, value in known.pop(name)["changes"].items())
-            notes.append(f"its evaluation in {name} was made with {fields}, and is left out")
+            notes.append(f"its evaluation in {name} was made with {changes_text(known.pop(name))}, and is left out")
         elif tracking_of(one).get("grid") not in (None, axes_of(cfg)):
             notes.append(f"its evaluation in {name} is not on its task's grid of commands, but on {grid_text(one)}")
     return JudgedRun(cfg, cfg.env.seed, folder, timing, known, why_unfinished(folder, cfg, timing), tuple(notes))

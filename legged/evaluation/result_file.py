@@ -119,6 +119,11 @@ def tracking_of(result: dict[str, Any]) -> dict[str, Any]:
     return result.get("rough", result)
 
 
+def changes_text(result: dict[str, Any]) -> str:
+    """Return the changed fields of an evaluation in words, 'sim.dt=0.002, terrain.scan=own'; nothing of one without."""
+    return ", ".join(f"{field}={value}" for field, value in sorted(result.get("changes", {}).items()))
+
+
 def grid_text(result: dict[str, Any]) -> str:
     """Return the commands of an evaluation in words, 'vx -1 to 1, vy 0, yaw 0 (5 commands)'; nothing of one without."""
     grid = tracking_of(result).get("grid", {})
