@@ -91,6 +91,16 @@ def test_the_first_event_counts():
     assert scores.done
 
 
+def test_a_time_out_of_the_task_ends_the_time_of_a_robot():
+    """At 3 m it is put back to its start, from where it walks 4.1 m: that would be another try."""
+    scores = Scores(torch.zeros(2, 3))
+    no = torch.zeros(2, dtype=torch.bool)
+    scores.update(1.0, torch.tensor([[4.5, 0.0, 0.0], [3.0, 0.0, 0.0]]), no, ~no)  # of neither is the place its own any more
+    scores.update(2.0, torch.tensor([[4.1, 0.0, 0.0], [4.1, 0.0, 0.0]]), no, no)
+    assert scores.outcome.tolist() == [STUCK, STUCK]
+    assert scores.time_s.tolist() == [1.0, 1.0]
+
+
 def test_height_is_no_distance():
     scores = Scores(torch.zeros(1, 3))
     scores.update(1.0, torch.tensor([[2.0, 2.0, -5.0]]), torch.zeros(1, dtype=torch.bool))

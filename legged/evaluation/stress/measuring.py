@@ -228,23 +228,25 @@ class Bench:
 
     @torch.inference_mode()
     def _follow(self, task: StressedTask, act: Callable[[TensorDict], Tensor], commands: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the mean square error of each robot's velocity up to its fall (N,) [m^2/s^2], NaN for those that fell before
-        anything was measured, and who fell (N,).
+        """Return the mean square error of each robot's velocity in its first episode (N,) [m^2/s^2], NaN for those that fell
+        before anything was measured, and who fell (N,).
         """
         task.reset()
         observations = task.hold_commands(commands.to(task.device))
         alive = torch.ones(task.num_envs, dtype=torch.bool, device=task.device)
+        fell = torch.zeros_like(alive)
         total, steps = (torch.zeros(task.num_envs, device=task.device) for _ in range(2))
         overflows = Overflows()
         for step in range(round(HOLD_S / task.dt)):
             observations, _, _, extras = task.step(act(observations))
             overflows.add(extras)
-            alive &= ~task.terminated_buf
+            fell |= alive & task.terminated_buf
+            alive &= ~task.reset_buf
             if step >= round(SETTLE_S / task.dt):
                 total += torch.where(alive, velocity_error(task.commands, task.base_lin_vel), 0.0)
                 steps += alive
         self.lost += overflows.total(task)
-        return (total / steps).cpu(), ~alive.cpu()
+        return (total / steps).cpu(), fell.cpu()
 
 
 def _make(
