@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 from helpers import POLICY
 
+from legged.robots.robot import load_robot
+
 ROOT = Path(__file__).resolve().parents[1]
 README, RESULTS, EVALUATION = (
     (ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/results.md", "docs/evaluation.md")
@@ -183,6 +185,11 @@ def test_numbers_of_the_quadrupeds_on_rough_ground_are_those_of_the_shipped_eval
     assert f"| {' | '.join(row)} |" in RESULTS
     beyond = [", ".join(f"{crossings(results[1], name)[i][1]:.0f}" for i in (3, 4, 5)) for name in (*ways, "obstacles")]
     assert f"| {ROUGH_QUADRUPEDS[task]} | {' | '.join(beyond)} |" in RESULTS
+    height, ends = load_robot(task).height, results[0][0]["success"]["types"]
+    shares = [f"{crossings(results[1], 'stairs_up')[i][0] / height:.2f}" for i in (3, 4, 5)]
+    assert "at {}, {} and {} times the standing height; training ends at".format(*shares) in RESULTS
+    stairs, obstacles = (ends[name]["trained_to"] / height for name in ("stairs_up", "obstacles"))
+    assert f"training ends at {stairs:.2f} (obstacles {obstacles:.2f}):" in RESULTS
     least = int(re.findall(r"\| up stairs of 0\.36 of their height: (\d+) to 100 % \|", README)[0])
     for each in results:
         assert crossings(each, "stairs_up")[3][1] >= 95.0

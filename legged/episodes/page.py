@@ -11,6 +11,7 @@ import numpy as np
 from legged.episodes.panels import Panels
 from legged.episodes.ranking import Figures
 from legged.episodes.stored import Episodes
+from legged.evaluation.result_file import changes_text
 from legged.process.paths import relative, write_text
 
 WEB = Path(__file__).resolve().parent / "web"
@@ -71,9 +72,11 @@ def _ending(episodes: Episodes, figures: Figures, number: int) -> str:
 
 def _conditions(about: dict[str, Any]) -> str:
     """Say under which conditions episodes were recorded."""
-    return (
+    text = (
         "noise, pushes and randomisation as trained" if about.get("as_trained") else "without noise, pushes and randomisation"
     )
+    changes = changes_text(about)
+    return f"{text}, but with {changes}" if changes else text
 
 
 def _facts(episodes: Episodes, figures: Figures, number: int) -> list[tuple[str, str]]:

@@ -16,6 +16,7 @@ from legged.episodes.stored import Episodes
 from legged.episodes.stored_check import FORMAT
 from legged.errors import ConfigError
 from legged.evaluation.overflows import warn_of_overflows
+from legged.evaluation.result_file import changes_of
 from legged.physics import engine_name, resolve_physics
 from legged.play.playground import SETTING, Playground
 from legged.policies.episodes import unit_of
@@ -114,6 +115,7 @@ def roll_out(
         "physics": engine,
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "as_trained": wish.as_trained,
+        "changes": changes_of(wish.changes),
         "held_command": list(wish.command) if wish.command else None,
         "ground": {"terrain": wish.terrain, "difficulty": wish.difficulty} if playground is not None else None,
         "episodes": wish.episodes,

@@ -67,6 +67,7 @@ def check_stored(about: Any, arrays: dict[str, np.ndarray], where: str) -> None:
             raise _wrong(where, "ground.terrain", "a text or null", entry["terrain"])
         if entry.get("difficulty") is not None:
             _number(entry["difficulty"], where, "ground.difficulty")
+    _mapping(about.get("changes", {}), where, "changes")
     held = about.get("held_command")
     if held is not None:
         for value in _list(held, where, "held_command"):

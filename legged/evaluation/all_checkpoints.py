@@ -7,6 +7,8 @@ from typing import Any
 import torch
 
 from legged.errors import ConfigError
+from legged.evaluation.overflows import warn_of_overflows
+from legged.evaluation.result_file import changes_of
 from legged.evaluation.velocity_grid import Grid
 from legged.evaluation.velocity_tracking import measure_tracking, ready_to_track
 from legged.learning.checkpoint import read_checkpoint
@@ -59,6 +61,7 @@ def evaluate_all_checkpoints(
     there = {path: _written_at(path) for path in checkpoints(policy.folder).values()}
     task, act = ready_to_track(policy, grid, asked, device, graph)
     rows: list[dict[str, Any]] = []
+    lost = 0
     print(
         f"{'iteration':>9} {'seconds':>8} {'velocity RMSE [m/s]':>20} {'yaw rate RMSE [rad/s]':>22} {'falls [%]':>10}",
         flush=True,
@@ -66,6 +69,7 @@ def evaluate_all_checkpoints(
     for path, seconds in there.items():
         iterations = act.load(path)
         figures = measure_tracking(task, act, grid)
+        lost += figures["contact_overflows"]
         row = {
             "iteration": iterations,
             "wall_s": seconds,
@@ -82,11 +86,23 @@ def evaluate_all_checkpoints(
     print(
         f"{limits}: " + (f"after {first['wall_s']:.1f} s, {first['iteration']} iterations" if first else "never"), flush=True
     )
+    warn_of_overflows("tracking", lost)
     make_folder(folder)
     path = folder / "time_to_walk.json"
-    engine = engine_name(task.cfg.sim, device)
-    result = {"task": task.cfg.task, "physics": engine, "rmse": rmse, "share_of_falls": falls, "first": first}
-    write_text(path, json.dumps({**result, "checkpoints": rows}, indent=1))
+    engine, changes = engine_name(task.cfg.sim, device), changes_of(asked)
+    result = {
+        "task": task.cfg.task,
+        "physics": engine,
+        **({"changes": changes} if changes else {}),
+        "grid": grid.axes,
+        "robots_per_cell": grid.robots,
+        "rmse": rmse,
+        "share_of_falls": falls,
+        "first": first,
+        "checkpoints": rows,
+        "contact_overflows": lost,
+    }
+    write_text(path, json.dumps(result, indent=1, allow_nan=False))
     print(f"written: {relative(path)}")
     return 0
 

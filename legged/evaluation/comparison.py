@@ -1,4 +1,4 @@
-"""Several evaluations side by side, as tables and as curves; those of one task in one engine are its seeds."""
+"""Several evaluations side by side, as tables and as curves; those of one task in one engine, made alike, are its seeds."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,12 +10,14 @@ from rich.table import Table
 
 from legged.errors import ConfigError, suggest
 from legged.evaluation.engines import engine_of
-from legged.evaluation.result_file import tracking_of
+from legged.evaluation.result_file import changes_text, grid_text, tracking_of
 from legged.evaluation.success_report import TRAINED, TRAINED_LABEL, as_success
 from legged.figures import COLORS, figure
 
-Evaluations = dict[tuple[str, str], list[dict[str, Any]]]
-"""(task, physics) -> results, one a seed."""
+Key = tuple[str, str, str]
+"""Task, physics, and under what conditions it was measured where those are not the policy's own or not the same for all."""
+Evaluations = dict[Key, list[dict[str, Any]]]
+"""What evaluations have in common -> results, one a seed."""
 FIGURES = (
     ("velocity RMSE, mean [m/s]", "rmse_lin", "mean", 1.0, 3),
     ("velocity RMSE, worst cell [m/s]", "rmse_lin", "worst", 1.0, 3),
@@ -43,10 +45,15 @@ def keep_types(results: Sequence[dict[str, Any]], types: Sequence[str]) -> None:
 
 
 def grouped(results: Sequence[dict[str, Any]]) -> Evaluations:
-    """Return the seeds of the same task in the same engine together, in the order of their first."""
+    """Return the seeds of the same task in the same engine together, in the order of their first: those that were measured
+    with the same fields changed, and on the same grid of commands.
+    """
+    grids = [grid_text(result) for result in results]
+    told = len(set(grids) - {""}) > 1
     groups: Evaluations = {}
-    for result in results:
-        groups.setdefault((result["task"], result["physics"]), []).append(result)
+    for result, grid in zip(results, grids, strict=True):
+        conditions = ", ".join(text for text in (changes_text(result), grid if told else "") if text)
+        groups.setdefault((result["task"], result["physics"], conditions), []).append(result)
     return groups
 
 
@@ -116,31 +123,37 @@ def _mean_and_range(values: Sequence[float]) -> str:
     return f"{text} ({min(values):.{decimals}f} to {max(values):.{decimals}f})" if len(values) > 1 else text
 
 
-def heading(key: tuple[str, str], seeds: int) -> str:
+def heading(key: Key, seeds: int) -> str:
     """Return a group in words."""
-    task, physics = key
-    return f"{task}\n{engine_of(physics).label}, {seeds} seed{'s' if seeds > 1 else ''}"
+    task, physics, conditions = key
+    text = f"{task}\n{engine_of(physics).label}, {seeds} seed{'s' if seeds > 1 else ''}"
+    return f"{text}\n{conditions}" if conditions else text
 
 
 def shares(results: Sequence[dict[str, Any]], terrain: str) -> dict[float, list[float]]:
-    """Return size -> success of every seed, for the sizes that all of them were measured at."""
-    found = [
-        {point["size"]: point["share"] for point in result["success"]["types"][terrain]["points"]}
-        for result in results
-        if terrain in result["success"]["types"]
-    ]
+    """Return size -> success of every seed that was measured on that type, for the sizes that all of those have."""
+    entries = [_types(result)[terrain] for result in results if terrain in _types(result)]
+    found = [{point["size"]: point["share"] for point in entry["points"]} for entry in entries]
     common = set.intersection(*(set(one) for one in found)) if found else set()
     return {size: [one[size] for one in found] for size in sorted(common)}
 
 
 def types_of(groups: Evaluations) -> dict[str, dict[str, Any]]:
     """Return terrain type -> one of its entries, of all types that were measured."""
-    entries = [result["success"]["types"] for results in groups.values() for result in results]
+    entries = [_types(result) for results in groups.values() for result in results]
     return {name: entry for one in entries for name, entry in one.items()}
 
 
+def _types(result: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return terrain type -> what was measured on it; nothing of an evaluation without success."""
+    found: dict[str, dict[str, Any]] = result.get("success", {}).get("types", {})
+    return found
+
+
 def success_table(groups: Evaluations) -> Table:
-    """Return a line a type and size: mean success over seeds, and the range where there are several."""
+    """Return a line a type and size: mean success over seeds, the range where there are several, and of how many they are
+    where not all were measured on that type.
+    """
     table = Table(title="success [%]: mean of seeds (lowest to highest)", title_justify="left")
     table.add_column("terrain")
     table.add_column("size", justify="right")
@@ -149,23 +162,27 @@ def success_table(groups: Evaluations) -> Table:
     for name, entry in types_of(groups).items():
         columns = [shares(results, name) for results in groups.values()]
         for i, size in enumerate(sorted(set().union(*columns))):
-            cells = [_share(column.get(size, [])) for column in columns]
+            cells = [_share(column.get(size, []), len(seeds)) for column, seeds in zip(columns, groups.values(), strict=True)]
             table.add_row(escape(name if i == 0 else ""), escape(f"{size:g} {entry['unit']}"), *cells)
         table.add_section()
     return table
 
 
-def _share(values: Sequence[float]) -> str:
+def _share(values: Sequence[float], seeds: int) -> str:
     if not values:
         return ""
-    text = f"{100 * mean(values):.1f}"
-    return f"{text} ({100 * min(values):.0f} to {100 * max(values):.0f})" if len(values) > 1 else text
+    told = [f"{100 * min(values):.0f} to {100 * max(values):.0f}"] if len(values) > 1 else []
+    if len(values) < seeds:
+        told.append(f"of {len(values)} of {seeds} seeds")
+    return f"{100 * mean(values):.1f}" + (f" ({', '.join(told)})" if told else "")
 
 
 def draw_comparison(groups: Evaluations, path: Path) -> None:
-    """Draw a panel a terrain type: a colour a task, a line style an engine, a band from the worst to the best seed."""
+    """Draw a panel a terrain type: a colour a task and its conditions, a line style an engine, a band from the worst to the
+    best seed.
+    """
     names = types_of(groups)
-    tasks = list(dict.fromkeys(task for task, _ in groups))
+    tasks = list(dict.fromkeys((task, conditions) for task, _, conditions in groups))
     colors = {task: COLORS[i % len(COLORS)] for i, task in enumerate(tasks)}
     columns = min(2, len(names))
     rows = -(-len(names) // columns)
@@ -175,23 +192,27 @@ def draw_comparison(groups: Evaluations, path: Path) -> None:
         for axis in axes.flat[len(names) :]:
             axis.set_visible(False)
         for axis, (name, entry) in zip(axes.flat, names.items(), strict=False):
-            for (task, physics), results in groups.items():
-                found, engine, color = shares(results, name), engine_of(physics), colors[task]
+            for (task, physics, conditions), results in groups.items():
+                found, engine, color = shares(results, name), engine_of(physics), colors[task, conditions]
                 if not found:  # no line: one without points that is not clipped takes all room from the panel
                     continue
                 means = [mean(values) for values in found.values()]
                 axis.plot(list(found), means, engine.line, marker=engine.marker, ms=3, color=color, clip_on=False)
                 low, high = ([pick(values) for values in found.values()] for pick in (min, max))
                 axis.fill_between(list(found), low, high, color=color, alpha=0.15, lw=0)
-            entries = [result["success"]["types"].get(name) for results in groups.values() for result in results]
+            entries = [_types(result).get(name) for results in groups.values() for result in results]
             for end in {one["trained_to"] for one in entries if one is not None} - {None}:
                 axis.axvline(end, **TRAINED)
             axis.set_title(name.replace("_", " "), fontsize="medium")
             as_success(axis, entry)
+        for axis in axes[:, 0]:
+            axis.set_ylabel("success")
         keys = []
-        for (task, physics), results in groups.items():
-            engine = engine_of(physics)
-            text = f"{task}, {engine.label}" + (f", {len(results)} seeds" if len(results) > 1 else "")
-            keys.append(Line2D([], [], color=colors[task], ls=engine.line, marker=engine.marker, ms=4, label=text))
+        for (task, physics, conditions), results in groups.items():
+            engine, seeds = engine_of(physics), sum("success" in result for result in results)
+            text = f"{task}, {engine.label}" + (f", {seeds} seeds" if seeds > 1 else "")
+            text += f"\n{conditions}" if conditions else ""
+            color = colors[task, conditions]
+            keys.append(Line2D([], [], color=color, ls=engine.line, marker=engine.marker, ms=4, label=text))
         keys.append(Line2D([], [], **TRAINED, label=TRAINED_LABEL))
         drawn.legend(handles=keys, loc="outside lower center", ncols=2, frameon=False)

@@ -13,6 +13,7 @@ from rich.table import Table
 from legged.config import override
 from legged.errors import RunError
 from legged.evaluation.engines import ENGINES
+from legged.evaluation.result_file import changes_of
 from legged.evaluation.velocity_grid import Grid
 from legged.evaluation.velocity_tracking import measure_tracking, ready_to_track
 from legged.figures import COLORS, figure
@@ -37,6 +38,7 @@ def cross(
     result: dict[str, Any] = {
         "task": policy.cfg.task,
         "checkpoint": policy.checkpoint.name,
+        **({"changes": changes} if (changes := changes_of(asked)) else {}),
         "grid": grid.axes,
         "robots_per_cell": grid.robots,
         "engines": [],

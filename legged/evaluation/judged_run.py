@@ -10,7 +10,8 @@ from typing import Any
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.evaluation.engines import ENGINES
-from legged.evaluation.result_file import file_name, read_results
+from legged.evaluation.result_file import changes_text, file_name, grid_text, read_results, tracking_of
+from legged.evaluation.velocity_grid import axes_of
 from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL, checkpoints, of_another_policy, run_config
 from legged.learning.timing import Timing, read_timing
 from legged.process.paths import relative
@@ -39,7 +40,8 @@ class JudgedRun:
 
 def read_run(folder: Path) -> JudgedRun:
     """Read a run folder, or that of a shipped policy. An evaluation of another checkpoint than the last says nothing of the
-    policy that is in the table and is shipped; it is left out, and a note says so.
+    policy that is in the table and is shipped, and one with changed fields is not comparable; they are left out, and a note
+    says so. So it does of one on another grid of commands than the task's.
 
     Raises:
         ConfigError: it is none, its task follows no commands, or a file in it is damaged.
@@ -53,6 +55,11 @@ def read_run(folder: Path) -> JudgedRun:
     others = {name: one["checkpoint"] for name, one in results.items() if of_another_policy(folder, one.get("checkpoint"))}
     notes += [f"its evaluation in {name} is of {file}, not of its last policy" for name, file in others.items()]
     known = {name: one for name, one in results.items() if name not in others}
+    for name, one in [*known.items()]:
+        if one.get("changes"):
+            notes.append(f"its evaluation in {name} was made with {changes_text(known.pop(name))}, and is left out")
+        elif tracking_of(one).get("grid") not in (None, axes_of(cfg)):
+            notes.append(f"its evaluation in {name} is not on its task's grid of commands, but on {grid_text(one)}")
     return JudgedRun(cfg, cfg.env.seed, folder, timing, known, why_unfinished(folder, cfg, timing), tuple(notes))
 
 
@@ -85,20 +92,23 @@ def why_unfinished(folder: Path, cfg: LeggedConfig, timing: Timing | None) -> st
 
 def find_runs(paths: Iterable[Path]) -> list[JudgedRun]:
     """Read the runs in some folders: a run folder itself, what lies in logs/ or logs/<task>/, or the folder of a shipped
-    policy with those of its other seeds. Where others lie beside them, runs of tasks that follow no commands and runs of a
-    configuration that this version can't read are left out, and said to be.
+    policy with those of its other seeds; each once, however often it is named. Where others lie beside them, runs of tasks
+    that follow no commands and runs of a configuration that this version can't read are left out, and said to be.
 
     Raises:
         ConfigError: a folder holds no run, none that the table is of, or something in one is damaged.
     """
     found: list[JudgedRun] = []
+    seen: set[Path] = set()
     left_out: dict[str, list[str]] = {}
     for path in paths:
         folders = folders_in(path)
         reasons = {folder: why_not(folder) for folder in folders if folder != path}
         kept = [folder for folder in folders if not reasons.get(folder)] or folders[:1]  # if none is left, the first says why
         for folder in kept:
-            found += [read_run(folder), *_other_seeds(folder)]
+            if folder.resolve() not in seen:
+                found += [read_run(folder), *_other_seeds(folder)]
+            seen.add(folder.resolve())
         for folder, reason in reasons.items():
             if reason:
                 left_out.setdefault(reason, []).append(relative(folder))

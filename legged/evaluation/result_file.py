@@ -12,11 +12,14 @@ CHANGED = "changed"
 """Folder, beside a policy's own results, for those of evaluations for which fields were changed."""
 SAYS_NOTHING = ("sim.physics", "sim.solver", "sim.threads", "env.seed", "env.num_envs", "robot")
 """Fields that say where a policy is measured, not under what."""
+SECTIONS_THAT_SAY_NOTHING = ("train.", "evaluation.")
+"""Sections of such fields: of the grid of commands a result says what it is, by whatever way it was asked for."""
 
 
 def changes_of(asked: Sequence[tuple[str, Any]]) -> dict[str, Any]:
     """Return field -> value of what was asked for that makes an evaluation another one than the policy's own."""
-    return {field: value for field, value in asked if field not in SAYS_NOTHING and not field.startswith("train.")}
+    said = ((field, value) for field, value in asked if field not in SAYS_NOTHING)
+    return {field: value for field, value in said if not f"{field}.".startswith(SECTIONS_THAT_SAY_NOTHING)}
 
 
 def file_name(engine: str) -> str:
@@ -59,12 +62,19 @@ def check_result(result: Any, where: str) -> None:
     fields = _mapping(result, where, "the whole file")
     for name in ("task", "physics"):
         _text(fields, name, where, "")
+    _mapping(fields.get("changes", {}), where, "changes")
     if "episodes" in fields:
         check_episodes(fields, where)
         return
     tracking, path = (fields["rough"], "rough.") if "rough" in fields else (fields, "")
     _mapping(tracking, where, "rough")
     _number(tracking, "falls", where, path)
+    for axis, values in _mapping(tracking.get("grid", {}), where, f"{path}grid").items():
+        numbers = dict(enumerate(values)) if isinstance(values, list) else {}
+        for i in numbers:
+            _number({str(i): numbers[i]}, str(i), where, f"{path}grid.{axis}.")
+        if not numbers:
+            raise _wrong(where, f"{path}grid.{axis}", "a list of numbers", values)
     for name in ("rmse_lin", "rmse_ang"):
         for part in ("mean", "worst"):
             _number(_mapping(tracking.get(name), where, f"{path}{name}"), part, where, f"{path}{name}.", or_null=True)
@@ -107,6 +117,20 @@ def check_success(result: Any, where: str) -> None:
 def tracking_of(result: dict[str, Any]) -> dict[str, Any]:
     """Return the part of a result that says how commands were followed."""
     return result.get("rough", result)
+
+
+def changes_text(result: dict[str, Any]) -> str:
+    """Return the changed fields of an evaluation in words, 'sim.dt=0.002, terrain.scan=own'; nothing of one without."""
+    return ", ".join(f"{field}={value}" for field, value in sorted(result.get("changes", {}).items()))
+
+
+def grid_text(result: dict[str, Any]) -> str:
+    """Return the commands of an evaluation in words, 'vx -1 to 1, vy 0, yaw 0 (5 commands)'; nothing of one without."""
+    grid = tracking_of(result).get("grid", {})
+    ends = {axis: sorted({min(values), max(values)}) for axis, values in grid.items()}
+    parts = [f"{axis} {' to '.join(f'{value:g}' for value in values)}" for axis, values in ends.items()]
+    count = math.prod(map(len, grid.values()))
+    return f"{', '.join(parts)} ({count} command{'s' if count > 1 else ''})" if grid else ""
 
 
 def _mapping(value: Any, where: str, path: str) -> dict[str, Any]:

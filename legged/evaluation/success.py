@@ -65,7 +65,8 @@ OPEN, REACHED, FELL, STUCK = range(4)
 
 class Scores:
     """The first thing that happens to each of N robots: it gets far enough away from its start, it falls (the task terminates
-    it), or its time is up. What it does after that, or after the reset that follows a fall, does not count.
+    it), or its time is up, by our clock or by a time-out of the task. What it does after that, or after a reset, does not
+    count.
     """
 
     def __init__(self, start: Tensor, distance: float = DISTANCE) -> None:
@@ -76,15 +77,16 @@ class Scores:
         self.time_s = torch.zeros(len(start), device=start.device)
         """(N,) when it happened [s]."""
 
-    def update(self, time_s: float, base_pos: Tensor, terminated: Tensor) -> None:
-        """Judge a control step that ends at `time_s`: bases at (N, 3), failures (N,)."""
+    def update(self, time_s: float, base_pos: Tensor, terminated: Tensor, timed_out: Tensor | None = None) -> None:
+        """Judge a control step that ends at `time_s`: bases at (N, 3), failures (N,), time-outs (N,) if there can be any."""
         waiting = self.outcome == OPEN
-        fell = waiting & terminated
-        # A robot that fell in this step has been put back to its start already: its position says nothing.
-        reached = waiting & ~terminated & ((base_pos[:, :2] - self._start).norm(dim=1) >= self._distance)
-        self.outcome.masked_fill_(fell, FELL)
+        late = torch.zeros_like(terminated) if timed_out is None else timed_out
+        # A robot whose episode ended in this step has been put back to its start already: its position says nothing.
+        reached = waiting & ~(terminated | late) & ((base_pos[:, :2] - self._start).norm(dim=1) >= self._distance)
+        self.time_s.masked_fill_(reached | (waiting & (terminated | late)), time_s)
+        self.outcome.masked_fill_(waiting & late, STUCK)
+        self.outcome.masked_fill_(waiting & terminated, FELL)
         self.outcome.masked_fill_(reached, REACHED)
-        self.time_s.masked_fill_(fell | reached, time_s)
 
     def finish(self) -> None:
         """End the time of those that are left."""
@@ -182,7 +184,7 @@ def run_out(task: LeggedRobot, act: Callable[[TensorDict], Tensor], robots: int)
     for step in range(1, round(TIME_S / task.dt) + 1):
         observations, _, _, extras = task.step(act(observations))
         overflows.add(extras)
-        scores.update(step * task.dt, task.base_pos, task.terminated_buf)
+        scores.update(step * task.dt, task.base_pos, task.terminated_buf, task.time_out_buf)
         if scores.done:
             break
     scores.finish()
@@ -220,16 +222,14 @@ def success_over_difficulty(
     configuration come after our own. Return plain numbers and lists.
     """
     assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
-    trained, scale = trained_to(policy.cfg), policy.cfg.terrain.scale
+    cfg: Any = override(policy.cfg, changes)  # another scale asks for other lengths
+    trained, scale = trained_to(policy.cfg), cfg.terrain.scale
     found: dict[str, Any] = {}
     lost = 0
     for name in names:
         sizes = sizes_of(name, full, scale)
-        own = [
-            *to_run_out(policy.cfg, robots * len(sizes)),
-            ("terrain.horizontal_scale", cell_for(name, policy.cfg.terrain)),
-            *changes,
-        ]
+        cell = ("terrain.horizontal_scale", cell_for(name, cfg.terrain))
+        own = [*to_run_out(cfg, robots * len(sizes)), *changes, cell]
         points, overflows = _on_type(policy, name, sizes, robots, own, device, graph)
         lost += overflows
         kind = TERRAIN_TYPES[name]

@@ -64,8 +64,8 @@ def is_beyond(name: str, size: float, trained_to: float | None) -> bool:
 
 
 def with_other_engines(result: dict[str, Any], path: Path) -> list[dict[str, Any]]:
-    """Return `result`, and those of other engines that lie beside `path` (evaluation_<physics>.json) and are of the same
-    checkpoint.
+    """Return `result`, and those of other engines that lie beside `path` (evaluation_<physics>.json), are of the same
+    checkpoint and were measured with the same fields changed.
     """
     found = [result]
     for engine in ENGINES:
@@ -77,7 +77,8 @@ def with_other_engines(result: dict[str, Any], path: Path) -> list[dict[str, Any
             check_success(saved, str(other))
             points = [point for entry in saved["success"]["types"].values() for point in entry["points"]]
             drawable = "robots_per_point" in saved["success"] and all({"low", "high"} <= point.keys() for point in points)
-            if drawable and saved["physics"] == engine and all(saved[key] == result[key] for key in ("task", "checkpoint")):
+            same = all(saved.get(key) == result.get(key) for key in ("task", "checkpoint", "changes"))
+            if drawable and saved["physics"] == engine and same:
                 found.append(saved)
         except (OSError, ValueError, KeyError):  # not a file of ours: nothing to show
             continue

@@ -56,7 +56,8 @@ def place_to_track(
 def measure_tracking(task: LeggedRobot, act: Callable[[TensorDict], Tensor], grid: Grid) -> dict[str, Any]:
     """Run the grid on a task of grid.num_envs robots; return plain numbers and lists, one entry a cell in "cells".
 
-    A robot that falls counts as a fall and is measured up to its fall. Errors are instantaneous, per control step, and so is
+    A robot that falls counts as a fall and is measured up to its fall; one whose episode a time-out of the task ends, up to
+    that. Errors are instantaneous, per control step, and so is
     the power of the cost of transport: that of the last physics step of each, which is less than the mean over all of them.
     `contact_overflows` counts the robots and steps in which contacts were lost for want of memory; `estimates` are the errors
     of a policy that estimates something.
@@ -68,21 +69,22 @@ def measure_tracking(task: LeggedRobot, act: Callable[[TensorDict], Tensor], gri
     observations = task.hold_commands(commands)
     sums, overflows, estimates = _Sums(task), Overflows(), EstimateMeter(task, act)
     alive = torch.ones(task.num_envs, dtype=torch.bool, device=device)
+    fell = torch.zeros_like(alive)
     settle, steps = round(grid.settle_s / task.dt), round(grid.hold_s / task.dt)
     for step in range(steps):
         observations, _, _, extras = task.step(act(observations))
         overflows.add(extras)
-        alive &= ~task.terminated_buf
+        fell |= alive & task.terminated_buf
+        alive &= ~task.reset_buf
         if step >= settle:
             sums.add(task, alive)
             estimates.add(observations, alive)
-    fell = (~alive).float()
-    result = summarize(task, grid, cells, sums, fell, (steps - settle) * task.dt)
+    result = summarize(task, grid, cells, sums, fell.float(), (steps - settle) * task.dt)
     return {**result, **estimates.found(), "contact_overflows": overflows.total(task)}
 
 
 class _Sums:
-    """Sums per robot over the measured steps before it fell."""
+    """Sums per robot over the measured steps of its first episode."""
 
     NAMES = ("steps", "lin", "ang", "power", "positive_power", "speed", "height", "collision")
 

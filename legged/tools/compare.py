@@ -1,7 +1,8 @@
 """Several evaluations side by side: `python -m legged.tools.compare logs/anymal_c/<run> [<run> ...] [--out success.png]`.
 
 Takes evaluation files, or folders that hold them. Evaluations of one task in one engine are its seeds: the tables give their
-mean and how far the farthest is from it, the picture their mean and range.
+mean and how far the farthest is from it, the picture their mean and range. Those with other fields changed, or on another
+grid of commands, are apart, and the tables say so.
 """
 
 import sys
@@ -54,14 +55,14 @@ def _main(argv: list[str] | None) -> int:
     groups = grouped(results)
     episodes = {key: results for key, results in groups.items() if all("episodes" in result for result in results)}
     following = {key: results for key, results in groups.items() if not any("episodes" in result for result in results)}
-    for task, physics in groups.keys() - episodes.keys() - following.keys():
+    for task, physics, _ in groups.keys() - episodes.keys() - following.keys():
         raise ConfigError(f"{task} in {physics}: some evaluations are of commands, others of episodes; compare them apart")
     console = Console(width=130)
     if following:
         console.print(tracking_table(following))
     if episodes:
         console.print(episodes_comparison(episodes))
-    with_success = {key: results for key, results in following.items() if all("success" in result for result in results)}
+    with_success = {key: results for key, results in following.items() if any("success" in result for result in results)}
     if not types_of(with_success):
         with_success = {}
     if with_success:

@@ -59,6 +59,16 @@ def test_a_run_has_its_episodes_beside_it_and_they_are_listed_again(capsys, monk
     assert "--page: there is no episode 3; they are 0 to 2" in capsys.readouterr().err
 
 
+def test_a_page_says_what_was_changed_for_its_episodes(capsys):
+    tiny_run("env.episode_length_s=0.1")
+    asked = ["observations.add_noise=true", "domain_rand.push_robots=true"]
+    assert call(episodes.main, ["--task", TASK, *FEW, "--page", "0", "--out", "out", *asked]) == 0
+    about = json.loads(Path("out/episodes.json").read_text())
+    assert about["changes"] == {"observations.add_noise": True, "domain_rand.push_robots": True}
+    said = "randomisation, but with domain_rand.push_robots=True, observations.add_noise=True"
+    assert said in Path("out/episode_000.html").read_text(encoding="utf-8")
+
+
 def test_where_nothing_can_be_drawn_a_page_has_a_stick_figure(monkeypatch, capsys):
     def fail(*_):
         raise RunError("cannot render here")

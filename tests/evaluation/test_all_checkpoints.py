@@ -6,6 +6,7 @@ import pytest
 import torch
 from helpers import TASK, call, run_folders, tiny_run
 
+from legged.evaluation import all_checkpoints
 from legged.evaluation.all_checkpoints import walks
 from legged.learning.checkpoint import read_checkpoint, write_checkpoint
 from legged.tools import evaluate
@@ -45,6 +46,19 @@ def test_checkpoints_are_judged_in_order_and_the_first_good_one_is_named(capsys)
     wanted = 4.0 if result["checkpoints"][0]["rmse_lin"] < limit else 5.0
     assert first["wall_s"] == wanted
     assert f"after {wanted:.1f} s" in capsys.readouterr().out
+
+
+def test_the_file_says_under_what_conditions_checkpoints_were_judged_and_lost_contacts_are_warned_of(capsys, monkeypatch):
+    tiny_run(iterations=1)
+    (folder,) = run_folders()
+    figures = {"rmse_lin": {"mean": 0.1}, "rmse_ang": {"mean": 0.1}, "falls": 0.0, "contact_overflows": 3}
+    monkeypatch.setattr(all_checkpoints, "measure_tracking", lambda *_: figures)
+    assert evaluate.main([*HERE, "--vx=0.5", "--vy=0", "--yaw=0", "sim.iterations=30"]) == 0
+    result = json.loads((folder / "changed" / "time_to_walk.json").read_text())
+    assert result["changes"] == {"sim.iterations": 30}
+    assert (result["grid"], result["robots_per_cell"]) == ({"vx": [0.5], "vy": [0.0], "yaw": [0.0]}, 1)
+    assert result["contact_overflows"] == 3
+    assert "warning: tracking: contacts were lost for want of memory, 3 times" in capsys.readouterr().err
 
 
 def test_a_robot_that_always_falls_does_not_walk():

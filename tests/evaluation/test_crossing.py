@@ -49,6 +49,7 @@ def test_the_command_measures_each_engine_and_writes_beside_the_checkpoint(run, 
     assert call(evaluate.main, ["--task", TASK, "--physics", "all", "--sim_device", "cpu", *GRID, "sim.threads=1"]) == 0
     out = capsys.readouterr().out
     found = json.loads((run / "crossing.json").read_text())
+    assert "changes" not in found
     assert [row["physics"] for row in found["engines"]] == ["mujoco", "newton_mujoco"]
     assert (run / "crossing.png").read_bytes().startswith(b"\x89PNG")
     assert not list(run.glob(".crossing*"))
@@ -59,6 +60,16 @@ def test_the_command_measures_each_engine_and_writes_beside_the_checkpoint(run, 
     assert one["steps_per_s"] > 0
     for words in ("newton_mujoco", f"{one['rmse_lin']:.3f} m/s", "crossing.json", "2 commands x 1 robots"):
         assert words in out
+
+
+def test_the_file_says_what_was_changed(run, monkeypatch):
+    figures = {"rmse_lin": {"mean": 0.1}, "rmse_ang": {"mean": 0.1}, "gait": {"base_height": 0.5}}
+    figures |= {"falls": 0.0, "cost_of_transport": 0.5, "contact_overflows": 0}
+    monkeypatch.setattr(crossing, "ENGINES", {"mujoco": crossing.ENGINES["mujoco"]})
+    monkeypatch.setattr(crossing, "measure_tracking", lambda *_: figures)
+    arguments = ["--task", TASK, "--physics", "all", "--sim_device", "cpu", *GRID, "sim.threads=1", "sim.iterations=30"]
+    assert call(evaluate.main, arguments) == 0
+    assert json.loads((run / "changed" / "crossing.json").read_text())["changes"] == {"sim.iterations": 30}
 
 
 def test_an_engine_in_which_everybody_fell_is_shown_without_numbers(tmp_path, capsys):

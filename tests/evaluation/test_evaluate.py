@@ -12,7 +12,7 @@ from helpers import POLICY, TASK, call, kept_global_state, run_folders, small_co
 from legged import make_task
 from legged.config import override
 from legged.errors import RunError
-from legged.evaluation import crossing, following
+from legged.evaluation import crossing, following, velocity_tracking
 from legged.evaluation.tracking_report import draw_tracking, print_tracking
 from legged.evaluation.velocity_grid import Grid, axes_of, axis_values
 from legged.evaluation.velocity_tracking import measure_tracking
@@ -109,6 +109,20 @@ def test_a_cell_in_which_nobody_stands_long_enough_to_be_measured_does_not_count
     json.dumps(result, allow_nan=False)
 
 
+def test_a_robot_is_measured_up_to_a_time_out_and_has_not_fallen(monkeypatch):
+    """Its time is up at the end of step 15, so that of 30 steps those from 10 to 13 are of its first episode."""
+    counted = []
+    add = velocity_tracking._Sums.add
+    monkeypatch.setattr(
+        velocity_tracking._Sums, "add", lambda sums, task, alive: (counted.append(alive.tolist()), add(sums, task, alive))
+    )
+    grid = Grid([0.5], [0.0], [0.0], robots=2, hold_s=0.6, settle_s=0.2)
+    result = on_grid(grid, stand, ("env.episode_length_s", 0.3))
+    assert counted == [[True] * 2] * 4 + [[False] * 2] * 16
+    assert result["falls"] == 0.0
+    assert result["cells"][0]["rmse_lin"] == pytest.approx(0.5, abs=0.2)
+
+
 def test_a_cell_in_which_nobody_was_measured_has_no_gait_either(capsys):
     grid = Grid([0.5], [0.0], [0.0], robots=2, hold_s=0.6, settle_s=0.3)
     fallen = on_grid(grid, stand, ("terminations.min_base_height", 5.0))
@@ -174,6 +188,16 @@ def test_the_grid_is_that_of_the_task_where_no_flag_says_otherwise(run, tmp_path
     assert call(evaluate.main, [*arguments, *judged, "sim.threads=1"]) == 0
     result = json.loads((tmp_path / "evaluation_mujoco.json").read_text())
     assert result["grid"] == {"vx": [-0.5, 1.0], "vy": [0.3], "yaw": [-0.2]}
+
+
+def test_a_grid_is_no_changed_field_however_it_is_asked_for(run):
+    """The zoo judges again what was trained with another grid, and looks for the result beside the checkpoint."""
+    judged = ["evaluation.vx=[0.5,0.5,1]", "evaluation.vy=[0,0,1]", "evaluation.yaw=[0,0,1]", "evaluation.stairs=0.3"]
+    assert call(evaluate.main, ["--task", TASK, "--physics", "mujoco", "--robots", "1", *judged, "sim.threads=1"]) == 0
+    result = json.loads((run / "evaluation_mujoco.json").read_text())
+    assert result["grid"] == {"vx": [0.5], "vy": [0.0], "yaw": [0.0]}
+    assert "changes" not in result
+    assert not (run / "changed").exists()
 
 
 @pytest.mark.parametrize(

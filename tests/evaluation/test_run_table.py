@@ -145,6 +145,33 @@ def test_an_evaluation_of_another_checkpoint_is_neither_in_the_table_nor_shipped
     assert found.notes == ("its evaluation in mujoco is of model_best.pt, not of its last policy",)
 
 
+def test_an_evaluation_with_changed_fields_is_left_out_and_one_on_another_grid_is_named(tmp_path):
+    """As after evaluate --out <run folder>, and after evaluate --vx=0.5."""
+    for name in ("config.yaml", "model.pt", "evaluation_mujoco.json", "evaluation_mujoco_warp.json"):
+        shutil.copy(POLICY / name, tmp_path)
+    assert read_run(tmp_path).notes == ()
+    changed, other_grid = (tmp_path / f"evaluation_{engine}.json" for engine in ("mujoco", "mujoco_warp"))
+    changed.write_text(json.dumps(json.loads(changed.read_text()) | {"changes": {"sim.dt": 0.002}}))
+    one = {"vx": [0.5], "vy": [0.0], "yaw": [0.0]}
+    other_grid.write_text(json.dumps(json.loads(other_grid.read_text()) | {"grid": one}))
+    found = read_run(tmp_path)
+    assert [*found.results] == ["mujoco_warp"]
+    assert found.notes == (
+        "its evaluation in mujoco_warp is not on its task's grid of commands, but on vx 0.5, vy 0, yaw 0 (1 command)",
+        "its evaluation in mujoco was made with sim.dt=0.002, and is left out",
+    )
+
+
+def test_a_run_that_is_named_twice_is_one_seed(tmp_path):
+    """Itself and by the folder above it; of the shipped one, its other seeds come once as well."""
+    folder = tmp_path / "logs" / "run"
+    folder.mkdir(parents=True)
+    for name in ("config.yaml", "model.pt"):
+        shutil.copy(POLICY / name, folder)
+    assert [found.folder for found in find_runs([folder.parent, folder, tmp_path])] == [folder]
+    assert [found.seed for found in find_runs([POLICY, POLICY / ".." / POLICY.name])] == [1, 2, 3]
+
+
 def test_a_task_without_commands_is_no_line(tmp_path):
     with pytest.raises(ConfigError, match="'half_cheetah' follows no commands"):
         find_runs([POLICY.parent / "half_cheetah"])

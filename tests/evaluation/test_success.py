@@ -91,6 +91,16 @@ def test_the_first_event_counts():
     assert scores.done
 
 
+def test_a_time_out_of_the_task_ends_the_time_of_a_robot():
+    """At 3 m it is put back to its start, from where it walks 4.1 m: that would be another try."""
+    scores = Scores(torch.zeros(2, 3))
+    no = torch.zeros(2, dtype=torch.bool)
+    scores.update(1.0, torch.tensor([[4.5, 0.0, 0.0], [3.0, 0.0, 0.0]]), no, ~no)  # of neither is the place its own any more
+    scores.update(2.0, torch.tensor([[4.1, 0.0, 0.0], [4.1, 0.0, 0.0]]), no, no)
+    assert scores.outcome.tolist() == [STUCK, STUCK]
+    assert scores.time_s.tolist() == [1.0, 1.0]
+
+
 def test_height_is_no_distance():
     scores = Scores(torch.zeros(1, 3))
     scores.update(1.0, torch.tensor([[2.0, 2.0, -5.0]]), torch.zeros(1, dtype=torch.bool))
@@ -284,6 +294,29 @@ def test_configuration_of_the_tasks(monkeypatch, capsys):
     assert (rand.push_robots, rand.randomize_friction, rand.randomize_base_mass) == (False, False, False)
     assert (run.terrain.terrain_length, run.terrain.terrain_width, run.terrain.spawn_range) == (8.0, 8.0, 0.1)
     assert (run.control, run.terminations, run.sim.dt) == (cfg.control, cfg.terminations, cfg.sim.dt)
+
+
+def test_ground_of_a_scale_that_is_asked_for_is_measured_and_told_at_that_scale(monkeypatch):
+    """At a quarter of the lengths and half the speeds; what training ended at stays. Its cells still divide treads."""
+    cfg = task_config("anymal_c", [("terrain.num_rows", 10), *ENGINE], on_cpu=True)
+    found = []
+
+    def fake(policy, name, sizes, robots, changes, device, graph):
+        found.append((name, sizes, override(cfg, changes).terrain))
+        return [point(size, torch.tensor([REACHED] * robots), torch.ones(robots)) for size in sizes], 0
+
+    monkeypatch.setattr(success, "_on_type", fake)
+    asked = [("terrain.scale", 0.25), ("terrain.horizontal_scale", 0.025)]
+    names = ["stairs_up", "narrow_stairs_up"]
+    policy = TrainedPolicy(cfg, Path("model_0.pt"))
+    result = success.success_over_difficulty(policy, names, 2, False, asked, torch.device("cpu"))
+    rule = result["definition"]
+    assert (rule["distance_m"], rule["vx"], rule["vy"][1]) == pytest.approx((1.0, 0.375, 0.05))
+    assert result["types"]["stairs_up"]["trained_to"] == pytest.approx(0.212)
+    (_, sizes, built), (_, _, narrow) = found
+    assert sizes == pytest.approx([0.25 * size for size in success.FEWER["stairs_up"]])
+    assert (built.scale, built.terrain_length, built.horizontal_scale) == pytest.approx((0.25, 2.0, 0.025))
+    assert narrow.horizontal_scale == pytest.approx(0.07 / 3)  # a third of the tread of 0.28 m at that scale
 
 
 def test_the_shipped_policy_climbs_a_gentle_slope_and_not_a_wall():

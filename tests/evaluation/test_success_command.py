@@ -224,6 +224,8 @@ def test_the_other_engine_is_drawn_too_if_it_is_of_the_same_checkpoint(tmp_path)
         assert with_other_engines(mine, path) == [mine]
     other.write_text(json.dumps({**mine, "physics": "mujoco_warp"}))
     assert [one["physics"] for one in with_other_engines(mine, path)] == ["mujoco_warp", "mujoco"]
+    other.write_text(json.dumps({**mine, "physics": "mujoco_warp", "changes": {"terrain.scan": "lowest"}}))
+    assert with_other_engines(mine, path) == [mine]  # its curve is of other settings, and the picture would not say so
 
 
 def test_a_plane_task_is_evaluated_as_ever_and_crosses_terrain_only_if_asked(tmp_path, monkeypatch, capsys):

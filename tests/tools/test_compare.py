@@ -35,7 +35,7 @@ def test_seeds_are_averaged_and_their_spread_is_told(tmp_path, capsys):
     picture = tmp_path / "success.png"
     assert main([str(tmp_path / "a"), str(tmp_path / "b"), "--types", "stairs_up", "--out", str(picture)]) == 0
     said = capsys.readouterr().out
-    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in said.split("\n") if "│" in line]
+    rows = rows_of(said)
     lines = {row[0]: row[1:] for row in rows}
     assert lines["velocity RMSE, mean [m/s]"] == ["0.110 (9 %)", "0.200"]
     assert lines["yaw rate RMSE, worst cell [rad/s]"] == ["0.330 (9 %)", "0.600"]
@@ -75,7 +75,47 @@ def test_seeds_are_those_of_one_task_in_one_engine(tmp_path):
     ]
     groups = grouped(results)
     assert [len(group) for group in groups.values()] == [2, 1, 1]
-    assert list(groups) == [("anymal_c", "mujoco_warp"), ("anymal_c_flat", "mujoco_warp"), ("anymal_c", "mujoco")]
+    assert list(groups) == [("anymal_c", "mujoco_warp", ""), ("anymal_c_flat", "mujoco_warp", ""), ("anymal_c", "mujoco", "")]
+
+
+def rows_of(said):
+    """The cells of tables, line by line."""
+    return [[cell.strip() for cell in line.split("│")[1:-1]] for line in said.split("\n") if "│" in line]
+
+
+def test_evaluations_under_other_conditions_are_no_seeds_of_each_other(tmp_path, capsys):
+    """One policy with its own map, with another one, and on another grid: none of them is averaged with another."""
+    own = evaluation(tmp_path / "1.json", rmse=0.1, stairs={0.2: 0.9})
+    other = evaluation(tmp_path / "2.json", rmse=0.3, stairs={0.2: 0.1}) | {"changes": {"terrain.scan": "highest"}}
+    (tmp_path / "2.json").write_text(json.dumps(other))
+    picture = tmp_path / "success.png"
+    assert main([str(tmp_path / "1.json"), str(tmp_path / "2.json"), "--out", str(picture)]) == 0
+    said = capsys.readouterr().out
+    assert "terrain.scan=highest" in said
+    assert " seeds " not in said.replace("mean of seeds (", "")
+    assert ["velocity RMSE, mean [m/s]", "0.100", "0.300"] in rows_of(said)
+    assert ["stairs_up", "0.2 m", "90.0", "10.0"] in rows_of(said)
+    grids = {"vx": [-1.0, 0.0, 1.0], "vy": [0.0], "yaw": [0.0, 0.5]}, {"vx": [0.5], "vy": [0.0], "yaw": [0.0]}
+    for name, grid in zip("34", grids, strict=True):
+        (tmp_path / f"{name}.json").write_text(json.dumps(own | {"rough": own["rough"] | {"grid": grid}}))
+    groups = grouped([json.loads((tmp_path / f"{name}.json").read_text()) for name in "34"])
+    assert [key[2] for key in groups] == ["vx -1 to 1, vy 0, yaw 0 to 0.5 (6 commands)", "vx 0.5, vy 0, yaw 0 (1 command)"]
+    (alone,) = grouped([json.loads((tmp_path / "3.json").read_text())] * 2)
+    assert alone == ("anymal_c", "mujoco_warp", "")  # where all have one grid there is nothing to tell
+
+
+def test_success_of_some_of_the_seeds_says_of_how_many_it_is(tmp_path, capsys):
+    """Of three seeds one was measured on the plane only, and one on stairs but not on a pit."""
+    evaluation(tmp_path / "1.json", stairs={0.1: 1.0})
+    second = evaluation(tmp_path / "2.json", stairs={0.1: 0.5})
+    del second["success"]["types"]["pit"]
+    (tmp_path / "2.json").write_text(json.dumps(second))
+    evaluation(tmp_path / "3.json")
+    names = [str(tmp_path / f"{i}.json") for i in (1, 2, 3)]
+    assert main([*names, "--out", str(tmp_path / "success.png")]) == 0
+    rows = rows_of(capsys.readouterr().out)
+    assert ["stairs_up", "0.1 m", "75.0 (50 to 100, of 2 of 3 seeds)"] in rows
+    assert ["pit", "0.1 m", "100.0 (of 1 of 3 seeds)"] in rows
 
 
 def test_spread_is_that_of_the_farthest():
@@ -135,6 +175,9 @@ POINT = ("success", "types", "pit", "points")
         (("success", "types", "pit"), [], "success.types.pit: expected a mapping"),
         ((*POINT[:-1], "unit"), 1, "success.types.pit.unit: expected a text"),
         (POINT, {}, "success.types.pit.points: expected a list"),
+        (("changes",), 3, "changes: expected a mapping, got int '3'"),
+        (("rough", "grid"), {"vx": []}, "rough.grid.vx: expected a list of numbers, got list '[]'"),
+        (("rough", "grid"), {"vx": ["a"]}, "rough.grid.vx.0: expected a number, got str 'a'"),
         ((*POINT, 0, "share"), True, "success.types.pit.points[0].share: expected a number, got bool"),
     ],
 )

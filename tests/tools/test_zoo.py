@@ -158,7 +158,8 @@ def test_an_evaluation_is_done_again_if_it_asked_for_something_else(monkeypatch)
     path.write_text(json.dumps(result))
     assert missing_engines(one, ORDER) == []
     assert list(one.judged(ORDER).results) == ["mujoco"]
-    for changed in ({"checkpoint": "model_9.pt"}, {"robots_per_cell": 2}, {"grid": {"vx": [0.0], "vy": [0.0], "yaw": [0.0]}}):
+    other_grid = {"grid": {"vx": [0.0], "vy": [0.0], "yaw": [0.0]}}
+    for changed in ({"checkpoint": "model_9.pt"}, {"robots_per_cell": 2}, other_grid, {"changes": {"sim.dt": 0.002}}):
         path.write_text(json.dumps(result | changed))
         assert missing_engines(one, ORDER) == ["mujoco"]
         assert not one.judged(ORDER).results

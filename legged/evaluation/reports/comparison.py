@@ -15,7 +15,7 @@ from legged.evaluation.reports.differences import words
 from legged.evaluation.reports.document import Cell, Figures, Heading, Mono, Paragraph, Part, Table
 from legged.evaluation.reports.evaluation_part import BROKEN, between, falls_of, number, success_drawing, success_line
 from legged.evaluation.reports.record import Record
-from legged.evaluation.result_file import tracking_of
+from legged.evaluation.result_file import changes_text, grid_text, tracking_of
 
 Measured = tuple[str, Interval | None] | None
 """A figure in words, and its interval, if there are enough values for one; None where a run lacks it."""
@@ -71,6 +71,7 @@ def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
         parts += [Heading(f"Evaluation in {engine_of(engine).label}"), _table(names, results)]
         others = [(name, record.another_policy(one)) for name, record, one in zip(names, records, results, strict=True)]
         parts += [Paragraph(f"{name}: of `{file}`, which is not its last policy.") for name, file in others if file]
+        parts += [Paragraph(f"{name}: {text}.") for name, text in zip(names, conditions_of(results), strict=True) if text]
         drawings = _success(names, results)
         if drawings:
             parts.append(Figures(f"success_{engine}", drawings, f"success over difficulty in {engine_of(engine).label}"))
@@ -83,6 +84,18 @@ def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
         " interval leaves out 0. Of a single command or episode there is no interval."
     )
     return [*parts, Paragraph(text)]
+
+
+def conditions_of(results: Sequence[dict[str, Any] | None]) -> list[str]:
+    """Say of each evaluation what fields were changed for it, and its grid of commands where not all have the same."""
+    found = [result or {} for result in results]
+    grids = [grid_text(one) for one in found]
+    told = len(set(grids) - {""}) > 1
+    changes = [changes_text(one) for one in found]
+    return [
+        "; ".join([*([f"made with {changed}"] if changed else []), *([f"on {grid}"] if told and grid else [])])
+        for changed, grid in zip(changes, grids, strict=True)
+    ]
 
 
 def _table(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> Table:
@@ -202,5 +215,5 @@ def _success(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> 
         there = [(name, one[kind]) for name, one in zip(names, entries, strict=True) if kind in one]
         if len(there) > 1:
             lines = [success_line(name, entry) for name, entry in there]
-            found.append(success_drawing(kind.replace("_", " "), there[0][1], lines))
+            found.append(success_drawing(kind.replace("_", " "), [entry for _, entry in there], lines))
     return found

@@ -10,7 +10,7 @@ from legged.evaluation.engines import ENGINES, engine_of
 from legged.evaluation.intervals import wilson
 from legged.evaluation.reports.document import Cell, Figures, Heading, Number, Paragraph, Part, Table
 from legged.evaluation.reports.svg import Axes, Line, curves, heat_map
-from legged.evaluation.result_file import tracking_of
+from legged.evaluation.result_file import changes_text, tracking_of
 from legged.evaluation.success_report import PANELS as SUCCESS_PANELS
 from legged.evaluation.success_report import TRAINED_LABEL, panels_of
 from legged.evaluation.tracking_report import PANELS, grid_means
@@ -55,6 +55,8 @@ def evaluation_parts(
         if another_policy(result):
             label = engine_of(result["physics"]).label
             parts.append(Paragraph(f"In {label} it is of `{another_policy(result)}`, which is not the last policy."))
+        if result.get("changes"):
+            parts.append(Paragraph(f"In {engine_of(result['physics']).label} it was made with {changes_text(result)}."))
     if following:
         parts += _following(following)
     for result in of_episodes:
@@ -135,7 +137,8 @@ def _success(results: Sequence[dict[str, Any]]) -> list[str]:
             if (entry := result.get("success", {}).get("types", {}).get(name)) is not None
         ]
         lines = [success_line(_label(name, physics, types, results), entry) for name, physics, entry in entries]
-        found.append(success_drawing(title if title in SUCCESS_PANELS else title.replace("_", " "), entries[0][2], lines))
+        panel = title if title in SUCCESS_PANELS else title.replace("_", " ")
+        found.append(success_drawing(panel, [entry for *_, entry in entries], lines))
     return found
 
 
@@ -156,12 +159,19 @@ def success_line(label: str, entry: dict[str, Any]) -> Line:
     return Line(label, size, share, band, markers=True)
 
 
-def success_drawing(title: str, entry: dict[str, Any], lines: Sequence[Line]) -> str:
-    """Draw success over the size of a terrain type."""
-    trained = entry["trained_to"]
-    wall = None if trained is None else (TRAINED_LABEL, float(trained))
-    x_label = f"{entry['what']} [{entry['unit']}]"
-    return curves(Axes(f"success: {title}", x_label, unit=entry["what"], high=1.0, percent=True, wall=wall), lines)
+def success_drawing(title: str, entries: Sequence[dict[str, Any]], lines: Sequence[Line]) -> str:
+    """Draw success over the size of a terrain type, a line an entry. Where training did not end at one size for all that were
+    trained on it, the dotted lines say whose they are.
+    """
+    ends: dict[float, list[str]] = {}
+    for entry, line in zip(entries, lines, strict=True):
+        if entry["trained_to"] is not None:
+            ends.setdefault(float(entry["trained_to"]), []).append(line.name)
+    several = len(ends) > 1
+    walls = tuple((f"{TRAINED_LABEL}: {', '.join(names)}" if several else TRAINED_LABEL, end) for end, names in ends.items())
+    what = entries[0]["what"]
+    axes = Axes(f"success: {title}", f"{what} [{entries[0]['unit']}]", unit=what, high=1.0, percent=True, walls=walls)
+    return curves(axes, lines)
 
 
 def _episodes(result: dict[str, Any]) -> list[Part]:

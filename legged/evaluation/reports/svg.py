@@ -57,8 +57,8 @@ class Axes:
     percent: bool = False
     level: tuple[str, float] | None = None
     """A dotted line at one y, and its name."""
-    wall: tuple[str, float] | None = None
-    """A dotted line at one x, and its name."""
+    walls: tuple[tuple[str, float], ...] = ()
+    """Dotted lines at some x, and their names."""
 
 
 def curves(axes: Axes, lines: Sequence[Line]) -> str:
@@ -69,8 +69,7 @@ def curves(axes: Axes, lines: Sequence[Line]) -> str:
     ys = [part for line in drawn for part in (line.y, *(line.band or ()))]
     if axes.level is not None:
         ys.append(np.array([axes.level[1]]))
-    if axes.wall is not None:
-        xs = np.append(xs, axes.wall[1])
+    xs = np.append(xs, [x for _, x in axes.walls])
     y_range = _y_range(np.concatenate(ys) if ys else np.array([0.0, 1.0]), axes)
     frame = _Frame(axes, _wide(float(xs.min()), float(xs.max())), y_range, [line.name for line in lines if line.name])
     for i, line in enumerate(drawn):
@@ -237,8 +236,7 @@ class _Frame:
         parts += self.body
         if axes.level is not None:
             parts.append(self._dotted(axes.level[0], None, axes.level[1]))
-        if axes.wall is not None:
-            parts.append(self._dotted(axes.wall[0], axes.wall[1], None))
+        parts += [self._dotted(name, x, None, row) for row, (name, x) in enumerate(axes.walls)]
         middle = (LEFT + WIDTH - RIGHT) / 2
         parts.append(
             f'<text x="{middle:g}" y="{self.height - 8:g}" font-size="12" text-anchor="middle" fill="{QUIET}">'
@@ -286,8 +284,8 @@ class _Frame:
             found.append(f'<text x="{LEFT - 6:g}" y="{y + 4:.1f}" font-size="11.5" text-anchor="end">{value:g}</text>')
         return found
 
-    def _dotted(self, name: str, x: float | None, y: float | None) -> str:
-        """Return a dotted line across the axes, and its name."""
+    def _dotted(self, name: str, x: float | None, y: float | None, row: int = 0) -> str:
+        """Return a dotted line across the axes, and its name; that of a line at one x in a row of its own, from below."""
         line = f'stroke="{QUIET}" stroke-width="1.3" stroke-dasharray="2 3"'
         if y is not None:
             at = float(self.py(np.array([y]))[0])
@@ -296,7 +294,7 @@ class _Frame:
         else:
             at = float(self.px(np.array([x]))[0])
             ends = f'x1="{at:.1f}" x2="{at:.1f}" y1="{self.top:g}" y2="{self.floor:g}"'
-            where = f'x="{at - 4:.1f}" y="{self.floor - 6:g}"'
+            where = f'x="{at - 4:.1f}" y="{self.floor - 6 - 13 * row:g}"'
         return f'<line {ends} {line}/><text {where} font-size="11" text-anchor="end" fill="{QUIET}">{escape(name)}</text>'
 
 

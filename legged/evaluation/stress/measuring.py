@@ -125,11 +125,11 @@ class Bench:
         """
         check_asked(asked)
         assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
-        self.cfg: LeggedConfig = policy.cfg
+        self.cfg: LeggedConfig = override(policy.cfg, asked)  # type: ignore[assignment]
         rows = table(size_of(policy.cfg.robot), size_of(WRITTEN_FOR), wish.payload)
         self.rows = tuple(row for row in rows if not wish.lines or row.name in wish.lines)
         """The lines of the table that are measured."""
-        self.scale = policy.cfg.terrain.scale
+        self.scale = self.cfg.terrain.scale
         self.riser = round(RISER * self.scale, 3) if wish.riser is None else wish.riser
         self.tread, self.robots = wish.tread, robots
         self.limit = LIMIT * sqrt(self.scale)
@@ -157,9 +157,9 @@ class Bench:
         """Return the success of each line, half of its robots going up."""
         half = max(1, self.robots // 2)
         per_robot = [row for _ in STAIRS for row in rows for _ in range(half)]
-        cell = dividing_cell(self.tread, self.cfg.terrain.horizontal_scale)
+        cell = ("terrain.horizontal_scale", dividing_cell(self.tread, self.cfg.terrain.horizontal_scale))
         specs = [TileSpec(name, self.riser, self.tread) for name in STAIRS]
-        outcomes, times = self._run_out(per_robot, specs, [("terrain.horizontal_scale", cell)], changes)
+        outcomes, times = self._run_out(per_robot, specs, [cell, *changes])
         # (up or down, line, robot) -> line by line
         outcomes, times = (values.view(2, len(rows), half).transpose(0, 1).flatten(1) for values in (outcomes, times))
         return [point(self.riser, *of_row) for of_row in zip(outcomes, times, strict=True)]
@@ -167,7 +167,7 @@ class Bench:
     def on_new_ground(self) -> dict[str, Any]:
         """Return type -> the success of robots with which nothing is wrong on ground that nobody trains on."""
         specs = [TileSpec(name, round(size * self.scale, 6)) for name, size in GROUND.items()]
-        found = self._run_out([NOMINAL] * (len(specs) * self.robots), specs, [], [])
+        found = self._run_out([NOMINAL] * (len(specs) * self.robots), specs)
         outcomes, times = (values.view(len(specs), self.robots) for values in found)
         return {
             spec.type: {
@@ -201,51 +201,52 @@ class Bench:
         self,
         rows: Sequence[Disturbance],
         own: Sequence[tuple[str, Any]],
-        solver: Sequence[tuple[str, Any]],
+        last: Sequence[tuple[str, Any]],
         terrain: Terrain | None,
     ) -> tuple[StressedTask, Callable[[TensorDict], Tensor]]:
-        """Build a task and the policy that acts in it. What the user asks for comes after what is our `own`, but another
-        `solver` is another one than the user's.
+        """Build a task and the policy that acts in it. What the user asks for comes after what is our `own`, but before the
+        `last` changes: another solver is another one than the user's.
         """
         gc.collect()  # the task before this one lives in a cycle of references; two need not fit on a GPU
         make = partial(_make, rows)
-        changes = [*own, *declared(rows), *self._asked, *solver]
+        changes = [*own, *declared(rows), *self._asked, *last]
         return restore(self._policy, changes, self._device, self._graph, terrain, make)
 
     def _run_out(
         self,
         rows: Sequence[Disturbance],
         specs: Sequence[TileSpec],
-        own: Sequence[tuple[str, Any]],
-        solver: Sequence[tuple[str, Any]],
+        last: Sequence[tuple[str, Any]] = (),
     ) -> tuple[Tensor, Tensor]:
-        """Return the outcomes (N,) of robots that are shared out among tiles, and when [s]."""
-        own = [*to_run_out(self.cfg, len(rows)), *own]
-        cfg: Any = override(self.cfg, [*own, *self._asked])
-        task, act = self._build(rows, own, solver, tiles_apart(specs, cfg.terrain, cfg.env.seed))
+        """Return the outcomes (N,) of robots that are shared out among tiles, and when [s]; `last` is as for `_build`."""
+        own = to_run_out(self.cfg, len(rows))
+        cfg: Any = override(self.cfg, [*own, *self._asked, *last])
+        task, act = self._build(rows, own, last, tiles_apart(specs, cfg.terrain, cfg.env.seed))
         scores, lost = run_out(task, act, len(rows) // len(specs))
         self.lost += lost
         return scores.outcome.cpu(), scores.time_s.cpu()
 
     @torch.inference_mode()
     def _follow(self, task: StressedTask, act: Callable[[TensorDict], Tensor], commands: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the mean square error of each robot's velocity up to its fall (N,) [m^2/s^2], NaN for those that fell before
-        anything was measured, and who fell (N,).
+        """Return the mean square error of each robot's velocity in its first episode (N,) [m^2/s^2], NaN for those that fell
+        before anything was measured, and who fell (N,).
         """
         task.reset()
         observations = task.hold_commands(commands.to(task.device))
         alive = torch.ones(task.num_envs, dtype=torch.bool, device=task.device)
+        fell = torch.zeros_like(alive)
         total, steps = (torch.zeros(task.num_envs, device=task.device) for _ in range(2))
         overflows = Overflows()
         for step in range(round(HOLD_S / task.dt)):
             observations, _, _, extras = task.step(act(observations))
             overflows.add(extras)
-            alive &= ~task.terminated_buf
+            fell |= alive & task.terminated_buf
+            alive &= ~task.reset_buf
             if step >= round(SETTLE_S / task.dt):
                 total += torch.where(alive, velocity_error(task.commands, task.base_lin_vel), 0.0)
                 steps += alive
         self.lost += overflows.total(task)
-        return (total / steps).cpu(), ~alive.cpu()
+        return (total / steps).cpu(), fell.cpu()
 
 
 def _make(

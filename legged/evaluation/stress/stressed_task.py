@@ -45,10 +45,9 @@ def declared(rows: Sequence[Disturbance]) -> list[tuple[str, Any]]:
 
 
 def late(rows: Sequence[Disturbance], cfg: LeggedConfig) -> list[tuple[str, Any]]:
-    """Return overrides by which targets of a task can be as late as those of these robots."""
-    most = max(round(row.delay / cfg.sim.dt) for row in rows)
-    own = cfg.control.actuator.delay[1]
-    return [("control.actuator.delay", [max(most, own)] * 2), ("control.actuator.delay_varies", False)] if most else []
+    """Return overrides by which targets of a task can be as late as those of these robots, each of which keeps its delay."""
+    most = max(cfg.control.actuator.delay[1], *(round(row.delay / cfg.sim.dt) for row in rows))
+    return [("control.actuator.delay", [most] * 2), ("control.actuator.delay_varies", False)] if most else []
 
 
 def make_stressed(

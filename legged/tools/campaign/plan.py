@@ -183,9 +183,11 @@ def missing_engines(training: Training, order: Order) -> list[str]:
 
 
 def is_measured(result: dict[str, Any] | None, training: Training, order: Order) -> bool:
-    """Say whether an evaluation is of the last checkpoint, on the grid and the terrain that are asked for."""
+    """Say whether an evaluation is of the last checkpoint, on the grid and the terrain that are asked for, and with no field
+    changed.
+    """
     assert training.folder is not None, "the training comes first"
-    if result is None or result.get("checkpoint") != find_checkpoint(training.folder, None).name:
+    if result is None or result.get("changes") or result.get("checkpoint") != find_checkpoint(training.folder, None).name:
         return False
     tracking = tracking_of(result)
     if tracking.get("grid") != axes_of(training.cfg) or tracking.get("robots_per_cell") != order.robots:

@@ -131,6 +131,35 @@ def test_half_of_a_lines_robots_go_up_and_the_others_down(trained, monkeypatch):
     assert bench.lost == 3
 
 
+def test_what_is_asked_of_ground_and_grid_counts_for_what_is_measured(trained, monkeypatch):
+    """Stairs, distances and limits of the scale that is asked for, in cells that divide the tread; commands of its grid."""
+    asked = [*ENGINE, ("terrain.scale", 0.5), ("terrain.horizontal_scale", 0.1), ("evaluation.vx", [-0.3, 0.6, 0.3])]
+    bench = Bench(policy_of(str(trained)), 2, Wish(), asked, torch.device("cpu"), False)
+    assert (bench.riser, bench.limit) == (0.085, pytest.approx(0.25 * 0.5**0.5))
+    seen = {}
+
+    def look(task, act, robots):
+        ground = task.terrain.height_map
+        line = ground.heights[:, ground.heights.shape[1] // 2]
+        seen["treads"] = np.diff(np.flatnonzero(np.diff(line) < -0.05)) * ground.cell
+        seen["side"], seen["cell"] = task.terrain.tile_size[0], task.cfg.terrain.horizontal_scale
+        return Scores(task.base_pos), 0
+
+    monkeypatch.setattr(measuring, "run_out", look)
+    bench.on_stairs([Disturbance("a", payload=1.0)])
+    assert seen["cell"] == pytest.approx(0.28 / 3)
+    assert np.sort(seen["treads"])[:3] == pytest.approx(0.28)
+    assert seen["side"] == pytest.approx(4.0, abs=0.1)
+
+    def follow(task, act, commands):
+        seen["vx"] = commands[:, 0].tolist()
+        return torch.zeros(len(commands)), torch.zeros(len(commands), dtype=torch.bool)
+
+    monkeypatch.setattr(bench, "_follow", follow)
+    bench.on_flat([Disturbance("a")])
+    assert seen["vx"] == pytest.approx([0.6, -0.3])
+
+
 def test_robots_take_turns_at_commands_within_the_tasks_grid(trained, monkeypatch):
     bench = Bench(policy_of(str(trained)), 9, Wish(), ENGINE, torch.device("cpu"), False)
     seen = {}

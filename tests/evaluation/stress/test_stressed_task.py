@@ -221,6 +221,18 @@ def test_delays_of_the_task_stay_where_a_row_says_nothing():
     assert int(halved.control.actuator.delay[30]) == 8
 
 
+def test_delays_of_the_task_are_kept_where_no_row_says_anything_of_them():
+    """As for the lines beside them: neither another episode nor `delay_varies` draws another."""
+    own = [("control.actuator.delay", [0, 6]), ("control.actuator.delay_varies", True)]
+    task = stressed(*[NOMINAL] * 30, changes=own)
+    before = task.control.actuator.delay.clone()
+    assert set(before.tolist()) <= set(range(7))
+    assert len(before.unique()) > 3
+    task.reset()
+    task.step(zero_actions(task))
+    assert torch.equal(task.control.actuator.delay, before)
+
+
 def test_what_else_is_drawn_differs_from_robot_to_robot_beside_the_rows():
     """The user asks for it after what the rows need."""
     rows = [NOMINAL, Disturbance("one", payload=4.0)]
