@@ -3,11 +3,12 @@
 from typing import Any
 
 from legged.config.networks import groups_in, path_of_terms
+from legged.config.randomization import draw_of
 from legged.config.schema import LeggedConfig
 from legged.envs.checks import check_mirror_kinds
 from legged.envs.randomization_checks import check_disturbances
 from legged.errors import ConfigError
-from legged.mdp.actuator import check_actuator
+from legged.mdp.actuator import check_actuator, check_slowest
 from legged.mdp.control import acted_joints, action_scales, control_gains
 from legged.mdp.mirror_images import mirror_of_actions
 from legged.robots.robot import Robot
@@ -29,6 +30,9 @@ def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     check_passive(cfg, robot)
     action_scales(robot, cfg.control, cfg.origins.where)
     check_actuator(robot, cfg.control, cfg.sim.dt, cfg.origins.where)
+    if "velocity_limit" in cfg.domain_rand.ranges:
+        lowest = draw_of(cfg.domain_rand.ranges["velocity_limit"]).range[0]
+        check_slowest(robot, cfg.control, cfg.sim.dt, lowest, cfg.origins.where)
     check_terrain(cfg.terrain, cfg.origins)
     check_base_mass(cfg, robot)
     check_disturbances(cfg, robot)
