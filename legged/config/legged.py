@@ -93,7 +93,7 @@ class CommandRanges:
     lin_vel_y: Range = field(default=(-1.0, 1.0), metadata=MOTION)
     """Leftward velocity, base frame [m/s]."""
     ang_vel_yaw: Range = field(default=(-1.0, 1.0), metadata=MOTION)
-    """Yaw rate [rad/s]; the clip of the heading controller in heading mode."""
+    """Yaw rate [rad/s]; in heading mode the clip of the heading controller, which a curriculum widens too."""
     heading: Range = field(default=(-3.141592653589793, 3.141592653589793), metadata=MOTION)
     """Heading in the world, heading mode only [rad]."""
 

@@ -72,7 +72,7 @@ def check_evaluation(cls: type, cfg: TaskConfig) -> None:
     """Look whether the evaluations during training find what the configuration asks of them.
 
     Raises:
-        ConfigError: a figure is none of theirs, or there are none.
+        ConfigError: a figure is none of theirs, there are none, or they are over before the first step.
     """
     runner, figures = cfg.train.runner, evaluated_figures(cls, cfg)
     asked = {f"train.runner.stop_at.{name}": name for name in runner.stop_at}
@@ -85,6 +85,11 @@ def check_evaluation(cls: type, cfg: TaskConfig) -> None:
     if runner.stop_at and not runner.evaluate_interval:
         where = cfg.origins.where("train.runner.stop_at")
         raise ConfigError(f"{where}: nothing is evaluated during training; train.runner.evaluate_interval=50 does it")
+    if runner.evaluate_interval and runner.evaluate_s and round(runner.evaluate_s / cfg.dt) < 1:
+        where, given = cfg.origins.where("train.runner.evaluate_s"), runner.evaluate_s
+        raise ConfigError(
+            f"{where}: must be at least a control step of {cfg.dt:g} s (sim.dt * control.decimation), or 0, got {given:g}"
+        )
 
 
 def check_lengths(cfg: TaskConfig) -> None:

@@ -3,13 +3,16 @@
 from typing import Any
 
 from legged.config.networks import groups_in, path_of_terms
+from legged.config.randomization import draw_of
 from legged.config.schema import LeggedConfig
 from legged.envs.checks import check_mirror_kinds
+from legged.envs.privileged_terms import MIRROR_KINDS, PREFIX, observed
 from legged.envs.randomization_checks import check_disturbances
 from legged.errors import ConfigError
-from legged.mdp.actuator import check_actuator
+from legged.mdp.actuator import check_actuator, check_slowest
 from legged.mdp.control import acted_joints, action_scales, control_gains
 from legged.mdp.mirror_images import mirror_of_actions
+from legged.physics.fields import FIELDS
 from legged.robots.robot import Robot
 from legged.terrain import check_terrain
 
@@ -29,6 +32,9 @@ def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     check_passive(cfg, robot)
     action_scales(robot, cfg.control, cfg.origins.where)
     check_actuator(robot, cfg.control, cfg.sim.dt, cfg.origins.where)
+    if "velocity_limit" in cfg.domain_rand.ranges:
+        lowest = draw_of(cfg.domain_rand.ranges["velocity_limit"]).range[0]
+        check_slowest(robot, cfg.control, cfg.sim.dt, lowest, cfg.origins.where)
     check_terrain(cfg.terrain, cfg.origins)
     check_base_mass(cfg, robot)
     check_disturbances(cfg, robot)
@@ -66,10 +72,36 @@ def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
             )
     used = [term for group in groups_in(cfg).values() for term in group.terms]
     check_mirror_kinds(cls.__name__, cls.MIRRORED, used, where)
+    for name in FIELDS:
+        if f"{PREFIX}{name}" in used:
+            check_mirrored_draw(cfg, robot, name)
     y = cfg.terrain.measured_points_y
     if sorted(y) != sorted(-value for value in y):
         points = f"terrain.measured_points_y ({origins.of('terrain.measured_points_y')})"
         raise ConfigError(f"{where}: {points} are not the same left and right: {list(y)}")
+
+
+def check_mirrored_draw(cfg: LeggedConfig, robot: Robot, name: str) -> None:
+    """Look whether a randomised property that is observed has as many numbers as its mirror image: those of bodies and shapes
+    are in no pairs, those of passive joints neither, and an offset that is one for all joints is none for a mirrored robot.
+
+    Raises:
+        ConfigError: it has not.
+    """
+    draw, kind = observed(cfg, name), MIRROR_KINDS[f"{PREFIX}{name}"]
+    if draw is None:
+        return
+    each = FIELDS[name].each if draw.each is None else draw.each
+    passive = name.startswith("joint_") and robot.passive is not None and bool(robot.passive.names)
+    unpaired = each and (kind == "scalar" or (kind == "of_joints" and passive))
+    if unpaired or (kind == "joints" and not each):
+        table = "ranges" if name in cfg.domain_rand.ranges else "observed_ranges"
+        where = cfg.origins.where(f"domain_rand.{table}.{name}.each")
+        what = f"numbers for each of the {FIELDS[name].what} have" if each else "one number for all joints has"
+        raise ConfigError(
+            f"{where}: {PREFIX}{name} is observed, and {what} no mirror image; each: {str(not each).lower()} has one, and"
+            " train.algorithm.symmetry=false learns without"
+        )
 
 
 def check_passive(cfg: LeggedConfig, robot: Robot) -> None:

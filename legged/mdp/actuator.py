@@ -328,11 +328,38 @@ def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where:
         NetworkWeights.load(actuator.network, path).steps_between(sim_dt, path)
 
 
+def check_slowest(
+    robot: Robot, cfg: LeggedControlConfig, sim_dt: float, lowest: float, where: Callable[[str], str] = str
+) -> None:
+    """Look whether torque-speed lines still fit the physics step where no-load speeds are drawn, at the `lowest` factor on
+    them. `where` is as for `modelled_joints`.
+
+    Raises:
+        ConfigError: a motor is too strong for the physics step then, as for `check_actuator`.
+    """
+    gain = _line_gains(with_rotors(robot, cfg.actuator, where), *motor_numbers(robot, cfg.actuator, where), sim_dt)
+    i = int(np.argmax(gain))
+    if gain[i] > LARGEST_GAIN * lowest:
+        least = math.ceil(100.0 * gain[i] / LARGEST_GAIN) / 100.0
+        raise ConfigError(
+            f"{where('domain_rand.ranges.velocity_limit')}: its lowest value, {lowest:g}, makes the torque-speed line of "
+            f"'{robot.joint_names[i]}' so steep that in physics steps of {sim_dt:g} s it would push and brake in turn "
+            f"(control.actuator.model dc_motor); must be at least {least:g}"
+        )
+
+
+def _line_gains(robot: Robot, stall: np.ndarray, speed: np.ndarray, sim_dt: float) -> np.ndarray:
+    """Return by how much a joint in the air gets faster or slower within a physics step, over how far its speed is off the
+    line of its motor, (D,); 0 of ideal motors, whose speed is infinite.
+    """
+    return sim_dt * stall / (robot.inertia * speed)
+
+
 def _check_line(robot: Robot, stall: np.ndarray, speed: np.ndarray, sim_dt: float, where: Callable[[str], str]) -> None:
     """Raise ConfigError where a torque-speed line is so steep that a joint in the air gains or loses more than twice the
     speed that it is off within a physics step: on its line such a motor pushes and brakes in turn, and gets nowhere.
     """
-    gain = sim_dt * stall / (robot.inertia * speed)  # 0 of ideal motors, whose speed is infinite
+    gain = _line_gains(robot, stall, speed, sim_dt)
     i = int(np.argmax(gain))
     if gain[i] <= LARGEST_GAIN:
         return

@@ -86,7 +86,7 @@ class Commands:
         masked_set_(self.standing, due, self._sample_standing)
         masked_set_(self.time_left, due, self.cfg.resampling_time_s)
         if self.cfg.heading_command:
-            low, high = self.cfg.ranges.ang_vel_yaw
+            low, high = self.ranges[2]
             error = wrap_to_pi(self.commands[:, 3] - yaw_of(base_quat))
             steered = self.steered & ~self.standing
             self.commands[:, 2].copy_(torch.where(steered, (HEADING_GAIN * error).clamp(low, high), self.commands[:, 2]))
@@ -97,7 +97,7 @@ class Commands:
         masks = (reset, self.held, self.steered)
         drawn = (self._sample, self._sample_standing)
         times = (self.dt, 0.5 * self.dt, self.cfg.resampling_time_s)
-        steering = (HEADING_GAIN if self.cfg.heading_command else 0.0, *self.cfg.ranges.ang_vel_yaw)
+        steering = (HEADING_GAIN if self.cfg.heading_command else 0.0, self.ranges)
         written = (self.commands, self.standing, self.time_left, self.is_moving)
         self._kernels.renew_commands(*masks, *drawn, base_quat, *times, *steering, MOVING, *written)
 

@@ -14,6 +14,7 @@ import torch
 from legged.commandline.arguments import add_run_arguments, add_task_arguments, policy_overrides, register_given, settle_on
 from legged.commandline.command import run_main
 from legged.commandline.parser import CommandParser
+from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.run_folder import checkpoints
@@ -62,7 +63,8 @@ def _main(argv: list[str] | None) -> int:
     folder = args.out or policy.output("export") / EXPORTED
     ready_to_write(folder, MEGABYTES * len(paths))
     # The C engine needs no compiler, and one robot is enough: nothing is simulated.
-    changes = [*undisturbed(1, 1.0), ("sim.physics", "mujoco"), *policy_overrides(args)]
+    calm = undisturbed(1, 1.0) if isinstance(policy.cfg, LeggedConfig) else [("env.num_envs", 1)]
+    changes = [*calm, ("sim.physics", "mujoco"), *policy_overrides(args)]
     task, act = restore(policy, changes, device, graph=False)
     for path in paths.values():
         iterations = act.load(path)

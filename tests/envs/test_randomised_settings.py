@@ -8,7 +8,7 @@ from helpers import small_config, small_task
 
 from legged.errors import ConfigError
 from legged.policies.restore import nominal, undisturbed
-from legged.registry import make_task
+from legged.registry import make_task, task_config
 
 FORCES = {
     "pull": {"body": "LF_THIGH", "interval_s": [0.02, 0.06], "duration_s": [0.04, 0.1], "y": [-50.0, 50.0]},
@@ -89,7 +89,8 @@ def test_privileged_observations_have_mirror_images():
     assert columns.tolist() == [0, 1, 5, 6, 7, 2, 3, 4, 11, 12, 13, 8, 9, 10, 14, 15, 16, 17, 18, 19]
     assert signs.tolist() == [1.0, -1.0, *[1.0] * 12, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0]
     each = {"link_mass": {"range": [0.9, 1.1], "each": True}}
-    task = small_task(("domain_rand.ranges", each), ("observations.groups.critic.terms", ["rand_link_mass"]), num_envs=1)
+    without = ("train.algorithm.symmetry", False)  # with it the configuration is refused
+    task = small_task(("domain_rand.ranges", each), observing("rand_link_mass"), without, num_envs=1)
     with pytest.raises(ConfigError, match=r"'rand_link_mass' has 13 numbers, but its kind 'scalar' is for 1"):
         task.mirror_images()
 
@@ -169,3 +170,36 @@ def test_what_leans_to_a_side_may_be_observed_without_mirror_images_and_drawn_wi
     small_config(leaning, observing("rand_base_com_y"), ("train.algorithm.symmetry", False))
     small_config(leaning)
     small_config(with_ranges(base_com_x=[0.0, 0.1]), observing("rand_base_com_x"))
+
+
+@pytest.mark.parametrize(
+    ("task", "name", "each", "words"),
+    [
+        (
+            "anymal_c_flat",
+            "link_mass",
+            True,
+            "numbers for each of the moving bodies have no mirror image; each: false",
+        ),
+        ("anymal_c_flat", "friction", True, "numbers for each of the shapes have no mirror image; each: false has one"),
+        ("anymal_c_flat", "joint_offset", False, "one number for all joints has no mirror image; each: true has one"),
+        ("anymal_c_flat", "joint_damping", True, ""),
+        (
+            "cassie_flat",
+            "joint_damping",
+            True,
+            "numbers for each of the hinges and slides have no mirror image",
+        ),  # passive ones
+    ],
+)
+def test_numbers_that_are_not_in_pairs_are_observed_without_mirror_images(task, name, each, words):
+    """The error names who asked for them; it was about a table of the task's class, and came from the learner."""
+    low = -0.1 if name == "joint_offset" else 0.9
+    drawn = ("domain_rand.ranges", {name: {"range": [low, 0.1 if low < 0.0 else 1.1], "each": each}})
+    settings = [("env.num_envs", 1), drawn, observing(f"rand_{name}")]
+    if words:
+        with pytest.raises(ConfigError, match=rf"domain_rand.ranges.{name}.each: rand_{name} is observed, and {words}"):
+            task_config(task, [*settings, ("train.algorithm.symmetry", True)])
+    else:
+        task_config(task, [*settings, ("train.algorithm.symmetry", True)])
+    task_config(task, [*settings, ("train.algorithm.symmetry", False)])

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from helpers import small_config, small_task
+from helpers import ENGINE, small_config, small_task
 from torch import nn
 
 from legged.config import override
@@ -162,3 +162,11 @@ def test_a_recurrent_policy_begins_each_evaluation_without_memory():
 def test_what_evaluations_do_not_find_is_refused(changes, words):
     with pytest.raises(ConfigError, match=words):
         small_config(*changes)
+
+
+@pytest.mark.parametrize("name", ["anymal_c_flat", "half_cheetah"])
+def test_evaluations_that_are_over_before_the_first_step_are_refused(name):
+    """The message is about the setting that was given; for tasks without commands it was about env.episode_length_s."""
+    changes = [("train.runner.evaluate_interval", 1), ("train.runner.evaluate_s", 0.005)]
+    with pytest.raises(ConfigError, match=r"train.runner.evaluate_s: must be at least a control step of .*, got 0.005"):
+        TrainingEvaluation(make_task(task_config(name, [("env.num_envs", 8), *ENGINE, *changes], on_cpu=True)))

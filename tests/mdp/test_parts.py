@@ -127,6 +127,16 @@ def test_heading_mode_steers_by_half_the_wrapped_error_inside_the_yaw_range():
     assert torch.allclose(sampler.commands[:, 2], expected, atol=1e-4)
 
 
+def test_a_curriculum_holds_the_rates_of_heading_mode_too():
+    """They were those of the full range from the start, while the log said that 0.27 is the largest."""
+    sampler = commands(heading_command=True)
+    sampler.commands[:, 3] = torch.linspace(-3.0, 3.0, MANY)
+    sampler.held.fill_(True)
+    CommandCurriculum(CommandCurriculumConfig(enabled=True, start=0.3), sampler.full_ranges, DT).write_ranges(sampler.ranges)
+    sampler.update(torch.zeros(MANY, dtype=torch.bool), torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(MANY, 4))
+    assert sampler.commands[:, 2].aminmax() == pytest.approx((0.3 * -0.7, 0.3 * 0.9))
+
+
 @pytest.mark.parametrize("heading", [False, True])
 def test_held_commands_are_neither_sampled_nor_steered(heading):
     sampler = commands(num_envs=2, heading_command=heading, resampling_time_s=0.1)

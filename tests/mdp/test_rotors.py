@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from helpers import small_task
+from helpers import small_config, small_task
 
 from legged.config.actuator import ActuatorConfig
 from legged.config.legged import LeggedControlConfig
@@ -77,6 +77,22 @@ def test_a_line_that_is_too_steep_for_the_physics_step_is_refused_and_the_number
     check_actuator(with_rotors(robot, heavy.actuator), heavy, dt)  # what a robot has is not added once more
     ideal = ActuatorConfig(**{**ANYDRIVE, "joints": ("HAA", "HFE")})  # their legs are heavy enough
     check_actuator(robot, LeggedControlConfig(actuator=ideal), dt)
+
+
+@pytest.mark.parametrize(
+    ("drawn", "fits"), [([0.5, 1.0], True), ([0.3, 1.0], False), ([0.0, 0.0], False), ({"range": [0.3, 1.0]}, False)]
+)
+def test_a_line_that_is_too_steep_at_the_slowest_speed_that_is_drawn_is_refused(drawn, fits):
+    """A motor whose speed is drawn as 0 gave no number at all: 0 / 0 where the joint is at rest."""
+    motor = {**ANYDRIVE, "armature": {"K": 0.1, "H": 0.1}}
+    changes = [(f"control.actuator.{name}", value) for name, value in motor.items()]
+    changes += [("domain_rand.ranges.velocity_limit", drawn)]
+    if fits:
+        small_config(*changes)
+        return
+    with pytest.raises(ConfigError, match=r"velocity_limit: its lowest value, 0.*'.._KFE'.*at least 0\.36$"):
+        small_config(*changes)  # 120 N m * 0.005 s / (0.114 kg m^2 * 7.5 rad/s) = 0.70 = 2 * 0.35
+    small_config(*changes, ("control.actuator.model", "ideal"))  # of which only rewards know
 
 
 def test_rotors_of_the_configuration_are_those_of_the_model_in_every_form():

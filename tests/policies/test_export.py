@@ -7,11 +7,13 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from helpers import small_task
+from helpers import TINY_TRAINING, call, run_folders, small_task
 
 import legged.policies.export as export_module
 from legged.learning.runner import Runner
 from legged.policies.export import ExportError, export
+from legged.tools import export as export_tool
+from legged.tools import train
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["plain", "normalised"])
@@ -149,3 +151,15 @@ def test_a_policy_of_large_actions_may_differ_by_their_share(tmp_path):
             parameter.mul_(100.0)
         assert runner.alg.get_policy()(runner.env.get_observations()).abs().max() > 1e5
     assert max(export(runner.env, runner.alg.get_policy(), tmp_path / "exported").values()) < 1e-4
+
+
+@pytest.mark.usefixtures("workplace")
+def test_all_checkpoints_of_a_task_without_commands_are_exported():
+    """It has neither pushes nor a base to draw a mass for, so there is nothing to switch off."""
+    flags = ["--task", "half_cheetah", "--num_envs", "4", "--max_iterations", "2", "train.runner.save_interval=1"]
+    assert call(train.main, [*flags, *TINY_TRAINING, "--sim_device", "cpu", "train.algorithm.num_mini_batches=1"]) == 0
+    assert call(export_tool.main, ["--task", "half_cheetah"]) == 0
+    (folder,) = run_folders()
+    for name in ("00001", "00002"):
+        policy = torch.jit.load(str(folder / "exported" / name / "policy.pt"))
+        assert policy(torch.zeros(1, 17)).shape == (1, 6)

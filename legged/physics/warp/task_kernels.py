@@ -84,8 +84,7 @@ def renew_commands(
     last_moment: float,
     resampling_time: float,
     heading_gain: float,
-    lowest_rate: float,
-    highest_rate: float,
+    ranges: wp.array2d[float],
     moving: float,
     commands: wp.array2d[float],
     standing: wp.array[wp.bool],
@@ -106,7 +105,7 @@ def renew_commands(
         yaw = wp.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
         turned = commands[robot, 3] - yaw + PI
         error = turned - 2.0 * PI * wp.floor(turned / (2.0 * PI)) - PI
-        commands[robot, 2] = wp.clamp(heading_gain * error, lowest_rate, highest_rate)
+        commands[robot, 2] = wp.clamp(heading_gain * error, ranges[2, 0], ranges[2, 1])
     velocity = wp.vec3(commands[robot, 0], commands[robot, 1], commands[robot, 2])
     is_moving[robot] = wp.length(velocity) > moving
 
