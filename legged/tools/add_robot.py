@@ -57,7 +57,7 @@ def _main(argv: list[str] | None) -> int:
     name = args.name or plain(Path(args.source.removeprefix(PREFIX)).stem).lower()
     if not is_plain_name(name):
         raise ConfigError(f"--name: the name of a robot must be {PLAIN}; got {shown(name)}")
-    folder, task = _places(name, args.out)
+    folder, task = _places(name, args.out, args.extends)
     _check_apart(path, folder)
     if not args.force and (exists(folder) or exists(task)):
         taken = folder if exists(folder) else task
@@ -123,14 +123,18 @@ def _check_task(name: str, beside: Path) -> None:
         raise ConfigError(f"--extends: there is no task {shown(name)}{suggest(name[:100], names, 'tasks')}")
 
 
-def _places(name: str, out: Path | None) -> tuple[Path, Path]:
-    """Return the robot's folder and its task's file."""
+def _places(name: str, out: Path | None, extends: str | None) -> tuple[Path, Path]:
+    """Return the robot's folder and its task's file. As the tasks in cfg/, one that extends a `..._flat` or a `..._real` ends
+    like it, and one on rough ground is called like its robot; without `extends` it is a flat one.
+    """
+    like = "_flat" if extends is None else extends.removesuffix(".yaml")
+    file = name + next((ending for ending in ("_flat", "_real") if like.endswith(ending)), "") + ".yaml"
     if out is not None:
-        return out / name, out / f"{name}_flat.yaml"
+        return out / name, out / file
     robots, tasks = data_folder("resources") / "robots", data_folder("cfg")
     if robots.resolve().is_relative_to(Path(sys.modules["legged"].__file__ or ".").resolve().parent):
-        return Path(name), Path(f"{name}_flat.yaml")  # an installed package is no place for robots
-    return robots / name, tasks / f"{name}_flat.yaml"
+        return Path(name), Path(file)  # an installed package is no place for robots
+    return robots / name, tasks / file
 
 
 def _report(tree: Tree, guesses: Guesses, folder: Path, task: Path, megabytes: float) -> None:

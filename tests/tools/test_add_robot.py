@@ -340,6 +340,11 @@ def test_a_wrong_call_ends_with_one_line(tmp_path, capsys, arguments, message):
     assert not Path("mine").exists()
 
 
+def test_a_task_on_rough_ground_is_called_like_its_robot(added):
+    added(urdf(), "--name", "rough_toy", "--extends", "base/quadruped_rough")
+    assert yaml.safe_load(Path("mine/rough_toy.yaml").read_text())["extends"] == "base/quadruped_rough"
+
+
 def test_nothing_is_written_over_unless_asked(added, capsys):
     added(urdf(), "--name", "ninth_toy")
     assert call(add_robot.main, ["toy.urdf", "--name", "ninth_toy", "--out", "mine"]) == 2
