@@ -8,7 +8,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -158,15 +158,18 @@ def ready_to_write(folder: Path, megabytes: float = 1.0) -> None:
         raise RunError(f"{relative(folder)}: cannot write there: {reason(error)}") from error
 
 
-def ready_to_write_file(flag: str, path: Path, megabytes: float = 1.0) -> None:
-    """Check as `ready_to_write` that the file `path`, which was asked for by `flag`, can be written.
+def ready_to_write_file(flag: str, path: Path, megabytes: float = 1.0, endings: Sequence[str] = ()) -> None:
+    """Check as `ready_to_write` that the file `path`, which was asked for by `flag`, can be written, and that its name has
+    one of the `endings`, if any are given: what is written must be what the name says.
 
     Raises:
-        ConfigError: it is a folder, or can't lie where it should.
+        ConfigError: it is a folder, is called something else, or can't lie where it should.
         RunError: it can't be written there.
     """
     if "\0" in path.name or len(os.fsencode(path.name)) > LONGEST_NAME:
         raise ConfigError(f"{flag}: no file can be called {path.name}")
     if path.is_dir() or not path.name:
         raise ConfigError(f"{flag}: {path} is a folder; the name of a file is wanted")
+    if endings and path.suffix not in endings:
+        raise ConfigError(f"{flag}: must end in {' or '.join(endings)}, got '{path.name}'")
     ready_to_write(path.parent, megabytes)

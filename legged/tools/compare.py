@@ -48,7 +48,7 @@ def build_parser() -> CommandParser:
 def _main(argv: list[str] | None) -> int:
     args = build_parser().parse_args(argv)
     if args.out:
-        ready_to_write_file("--out", args.out)
+        ready_to_write_file("--out", args.out, endings=(".png",))
     results = read_results(args.paths)
     if args.types:
         keep_types(results, [name.strip() for name in args.types.split(",")])

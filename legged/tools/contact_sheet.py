@@ -54,13 +54,11 @@ def build_parser() -> CommandParser:
 
 def _main(argv: list[str] | None) -> int:
     args = build_parser().parse_args(argv)
-    if args.out.suffix not in ENDINGS:
-        raise ConfigError(f"--out: '{args.out.name}' ends neither with .gif nor with .png")
+    ready_to_write_file("--out", args.out, 4.0, ENDINGS)
     if args.columns is not None and args.columns < 1:
         raise ConfigError(f"--columns: must be at least 1, got {args.columns}")
     if not SMALLEST <= args.side <= LARGEST:
         raise ConfigError(f"--side: must be between {SMALLEST} and {LARGEST}, got {args.side}")
-    ready_to_write_file("--out", args.out, 4.0)
     if args.module:
         import_tasks(args.module)
     policies = [policy_of(name, "TASK | RUN") for name in args.robots]

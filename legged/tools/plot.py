@@ -34,7 +34,7 @@ def build_parser() -> CommandParser:
 
 def _main(argv: list[str] | None) -> int:
     args = build_parser().parse_args(argv)
-    ready_to_write_file("--out", args.out)
+    ready_to_write_file("--out", args.out, endings=(".png",))
     runs = [read_scalars(run) for run in args.runs]
     configs = [read_config(run) for run in args.runs]
     named = dict(zip(labels(args.runs, configs), runs, strict=True))

@@ -145,3 +145,9 @@ def test_a_folder_that_cannot_be_is_the_users_mistake(check, name, tmp_path):
 def test_a_name_that_no_file_can_have_is_refused_before_the_work(tmp_path, name):
     with pytest.raises(ConfigError, match="--out: no file can be called"):
         ready_to_write_file("--out", tmp_path / name)
+
+
+def test_a_file_is_called_what_it_is(tmp_path):
+    ready_to_write_file("--out", tmp_path / "a.png", endings=(".gif", ".png"))
+    with pytest.raises(ConfigError, match=r"--out: must end in \.gif or \.png, got 'a\.txt'"):
+        ready_to_write_file("--out", tmp_path / "a.txt", endings=(".gif", ".png"))

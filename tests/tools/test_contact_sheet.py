@@ -148,7 +148,7 @@ def test_the_tasks_of_its_help_can_be_shown():
         (["anymal_flat", "--out", "a.gif"], "there is no task 'anymal_flat'"),
         (["untrained", "--out", "a.gif"], "'untrained': there is neither a run nor a shipped policy of this task"),
         (["half_cheetah", "--out", "a.gif"], "'half_cheetah' follows no commands"),
-        ([TASK, "--out", "a.jpg"], "--out: 'a.jpg' ends neither with .gif nor with .png"),
+        ([TASK, "--out", "a.jpg"], "--out: must end in .gif or .png, got 'a.jpg'"),
         ([TASK, "--out", "a.gif", "--columns", "0"], "--columns: must be at least 1, got 0"),
         ([TASK, "--out", "a.gif", "--side", "5"], "--side: must be between 32 and 1000, got 5"),
     ],

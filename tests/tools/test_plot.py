@@ -123,6 +123,7 @@ def test_wrong_input_is_one_line(tmp_path, capsys):
     (tmp_path / "bad" / "events.out.tfevents.1").write_text("garbage")
     for arguments, words in (
         ([tmp_path / "run", "--out", tmp_path], "is a folder; the name of a file is wanted"),
+        ([tmp_path / "run", "--out", tmp_path / "a.txt"], "--out: must end in .png, got 'a.txt'"),
         ([tmp_path / "none"], "none: holds no TensorBoard file"),
         ([tmp_path / "bad"], "bad: its TensorBoard file holds no values"),
     ):
