@@ -77,14 +77,13 @@ class Scores:
         self.time_s = torch.zeros(len(start), device=start.device)
         """(N,) when it happened [s]."""
 
-    def update(self, time_s: float, base_pos: Tensor, terminated: Tensor, timed_out: Tensor | None = None) -> None:
-        """Judge a control step that ends at `time_s`: bases at (N, 3), failures (N,), time-outs (N,) if there can be any."""
+    def update(self, time_s: float, base_pos: Tensor, terminated: Tensor, timed_out: Tensor) -> None:
+        """Judge a control step that ends at `time_s`: bases at (N, 3), failures (N,), time-outs of the task (N,)."""
         waiting = self.outcome == OPEN
-        late = torch.zeros_like(terminated) if timed_out is None else timed_out
         # A robot whose episode ended in this step has been put back to its start already: its position says nothing.
-        reached = waiting & ~(terminated | late) & ((base_pos[:, :2] - self._start).norm(dim=1) >= self._distance)
-        self.time_s.masked_fill_(reached | (waiting & (terminated | late)), time_s)
-        self.outcome.masked_fill_(waiting & late, STUCK)
+        reached = waiting & ~(terminated | timed_out) & ((base_pos[:, :2] - self._start).norm(dim=1) >= self._distance)
+        self.time_s.masked_fill_(reached | (waiting & (terminated | timed_out)), time_s)
+        self.outcome.masked_fill_(waiting & timed_out, STUCK)
         self.outcome.masked_fill_(waiting & terminated, FELL)
         self.outcome.masked_fill_(reached, REACHED)
 

@@ -75,7 +75,7 @@ def test_the_first_event_counts():
         position[:, 1] += torch.tensor(distances)
         terminated = torch.zeros(6, dtype=torch.bool)
         terminated[list(fell)] = True
-        scores.update(time_s, position, terminated)
+        scores.update(time_s, position, terminated, torch.zeros_like(terminated))
 
     assert scores.outcome.tolist() == [OPEN] * 6
     at(1.0, [3.9, 3.0, 3.9, 0.0, 0.0, 3.99])
@@ -103,9 +103,10 @@ def test_a_time_out_of_the_task_ends_the_time_of_a_robot():
 
 def test_height_is_no_distance():
     scores = Scores(torch.zeros(1, 3))
-    scores.update(1.0, torch.tensor([[2.0, 2.0, -5.0]]), torch.zeros(1, dtype=torch.bool))
+    no = torch.zeros(1, dtype=torch.bool)
+    scores.update(1.0, torch.tensor([[2.0, 2.0, -5.0]]), no, no)
     assert scores.outcome.tolist() == [OPEN]
-    scores.update(2.0, torch.tensor([[2.9, 2.9, 0.0]]), torch.zeros(1, dtype=torch.bool))  # 4.1 m along the diagonal
+    scores.update(2.0, torch.tensor([[2.9, 2.9, 0.0]]), no, no)  # 4.1 m along the diagonal
     assert scores.outcome.tolist() == [REACHED]
 
 
