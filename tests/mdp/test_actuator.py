@@ -300,6 +300,8 @@ def test_a_task_with_every_model_is_checked_walks_and_resumes():
         ("control.actuator.delay", [0.5, 1], "expected a whole number"),
         ("control.actuator.delays", [0, 1], "unknown key 'delays'"),
         ("control.actuator.network", "missing.npz", "missing.npz: No such file"),
+        ("control.actuator.stall_torque", {"KFE": 60.0}, "set control.actuator.model to dc_motor"),
+        ("control.actuator.no_load_speed", {"KFE": 9.0}, "set control.actuator.model to dc_motor"),
     ],
 )
 def test_wrong_settings_are_one_line_that_names_them(path, value, said):
@@ -308,6 +310,12 @@ def test_wrong_settings_are_one_line_that_names_them(path, value, said):
     assert str(error.value).startswith(f"command line: {path}")
     assert said in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_who_says_ideal_may_leave_the_numbers_of_a_line():
+    """So motors of a task with a torque-speed line are tried without it."""
+    task = small_task(("control.actuator.stall_torque", {"KFE": 60.0}), ("control.actuator.model", "ideal"))
+    assert task.control.actuator is None
 
 
 def test_a_joint_needs_no_less_to_begin_to_move_than_to_go_on():
