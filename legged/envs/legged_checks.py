@@ -9,7 +9,7 @@ from legged.envs.checks import check_mirror_kinds
 from legged.envs.privileged_terms import MIRROR_KINDS, PREFIX, observed
 from legged.envs.randomization_checks import check_disturbances
 from legged.errors import ConfigError
-from legged.mdp.actuator import check_actuator, check_slowest
+from legged.mdp.actuator import check_actuator, check_motor_model, check_slowest
 from legged.mdp.control import acted_joints, action_scales, control_gains
 from legged.mdp.mirror_images import mirror_of_actions
 from legged.physics.fields import FIELDS
@@ -32,7 +32,7 @@ def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     check_passive(cfg, robot)
     action_scales(robot, cfg.control, cfg.origins.where)
     check_actuator(robot, cfg.control, cfg.sim.dt, cfg.origins.where)
-    check_motor_model(cfg)
+    check_motor_model(cfg.control.actuator, cfg.origins)
     if "velocity_limit" in cfg.domain_rand.ranges:
         lowest = draw_of(cfg.domain_rand.ranges["velocity_limit"]).range[0]
         check_slowest(robot, cfg.control, cfg.sim.dt, lowest, cfg.origins.where)
@@ -41,23 +41,6 @@ def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     check_disturbances(cfg, robot)
     check_points(cfg)
     check_grid(cfg)
-
-
-def check_motor_model(cfg: LeggedConfig) -> None:
-    """Look whether numbers of a torque-speed line are given to motors of which nobody said that they have one.
-
-    Raises:
-        ConfigError: they are. Who says `ideal` may leave them: so the same motors are tried without it.
-    """
-    origins, model = cfg.origins, "control.actuator.model"
-    if cfg.control.actuator.model == "dc_motor" or origins.of(model) != "the default":
-        return
-    for name in ("stall_torque", "no_load_speed"):
-        if getattr(cfg.control.actuator, name):
-            raise ConfigError(
-                f"{origins.where(f'control.actuator.{name}')}: is of motors with a torque-speed line, and these are ideal: "
-                f"set {model} to dc_motor, or to ideal if that is meant"
-            )
 
 
 def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:

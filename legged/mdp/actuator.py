@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from legged.config.origins import Origins
 from legged.config.schema import ActuatorConfig, LeggedControlConfig
 from legged.errors import ConfigError
 from legged.math import masked_set_
@@ -326,6 +327,25 @@ def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where:
         if cfg.control_type != "P":
             raise ConfigError(f"{path}: a learned actuator takes joint angles (control_type P), not {cfg.control_type}")
         NetworkWeights.load(actuator.network, path).steps_between(sim_dt, path)
+
+
+def check_motor_model(actuator: ActuatorConfig, origins: Origins) -> None:
+    """Look whether numbers of a torque-speed line are given to motors that have none. Who says `ideal` may leave those of a
+    file: so the same motors are tried without their line.
+
+    Raises:
+        ConfigError: nobody has said what the motors are, or the command line gives numbers and leaves them ideal.
+    """
+    path, told = "control.actuator.model", origins.of("control.actuator.model")
+    for name in ("stall_torque", "no_load_speed"):
+        if actuator.model == "dc_motor" or not getattr(actuator, name):
+            continue
+        where = f"control.actuator.{name}"
+        if told == "the default" or (origins.of(where) == "command line" and told != "command line"):
+            raise ConfigError(
+                f"{origins.where(where)}: is of motors with a torque-speed line, and these are ideal: "
+                f"set {path} to dc_motor, or to ideal if that is meant"
+            )
 
 
 def check_slowest(

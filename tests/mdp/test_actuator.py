@@ -8,10 +8,12 @@ import pytest
 import torch
 from helpers import assert_goes_on_alike, small_task
 
+from legged.config import override
 from legged.config.actuator import ActuatorConfig
 from legged.config.legged import LeggedControlConfig
+from legged.config.loader import from_dict
 from legged.errors import ConfigError
-from legged.mdp.actuator import Friction, MotorCurve, is_ideal
+from legged.mdp.actuator import Friction, MotorCurve, check_motor_model, is_ideal
 from legged.mdp.actuator_network import NetworkWeights
 from legged.mdp.control import Control
 from legged.mdp.uniform_numbers import UniformNumbers
@@ -316,6 +318,23 @@ def test_who_says_ideal_may_leave_the_numbers_of_a_line():
     """So motors of a task with a torque-speed line are tried without it."""
     task = small_task(("control.actuator.stall_torque", {"KFE": 60.0}), ("control.actuator.model", "ideal"))
     assert task.control.actuator is None
+
+
+def given_and_changed(given, *changes):
+    """A configuration of a file, as that of a run is, and what the command line changes of it."""
+    data = {"task": "anymal_c_flat", "robot": "anymal_c", "control": {"actuator": given}}
+    return override(from_dict(data, source="config.yaml"), changes)
+
+
+def test_motors_that_a_run_says_are_ideal_are_given_no_line_in_silence():
+    """The configuration of a run says everything, also what nobody had set."""
+    cfg = given_and_changed({"model": "ideal"}, ("control.actuator.no_load_speed", {"KFE": 9.0}))
+    with pytest.raises(ConfigError, match=r"command line: control\.actuator\.no_load_speed: .*set control\.actuator\.model"):
+        check_motor_model(cfg.control.actuator, cfg.origins)
+    line = {"model": "dc_motor", "no_load_speed": {"KFE": 9.0}}
+    for changes in ([], [("control.actuator.model", "ideal")], [("control.actuator.stall_torque", {"KFE": 60.0})]):
+        cfg = given_and_changed(line, *changes)
+        check_motor_model(cfg.control.actuator, cfg.origins)
 
 
 def test_a_joint_needs_no_less_to_begin_to_move_than_to_go_on():

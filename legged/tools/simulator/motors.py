@@ -16,7 +16,7 @@ from legged.config.loader import from_dict
 from legged.config.schema import ActuatorConfig
 from legged.deploy.contract import Contract
 from legged.errors import ConfigError
-from legged.mdp.actuator import check_actuator, friction_numbers, modelled_joints, motor_numbers
+from legged.mdp.actuator import check_actuator, check_motor_model, friction_numbers, modelled_joints, motor_numbers
 from legged.mdp.actuator_network import ActuatorNetwork, NetworkWeights
 from legged.robots.robot import Robot
 
@@ -53,6 +53,7 @@ def motors_config(
         check_actuator(robot, cfg.control, dt, cfg.origins.where)
     except ConfigError as error:
         raise ConfigError(str(error).replace("sim.dt", "--sim-dt")) from error
+    check_motor_model(cfg.control.actuator, cfg.origins)
     return cfg.control.actuator, counted
 
 
