@@ -48,6 +48,13 @@ class Wire(Protocol):
     def listen(self, heard: Callable[[Any], None]) -> None:
         """Call `heard` with every LowState_, in a thread of its own."""
 
+    def take_over(self) -> None:
+        """Make the robot leave its own controller, before the first command: two programs must never command one robot.
+
+        Raises:
+            RunError: it does not, or does not answer.
+        """
+
     def send(self, command: Any) -> None:
         """Send a LowCmd_."""
 
@@ -60,12 +67,10 @@ class SdkWire:
 
     def __init__(self, kind: UnitreeKind, network: str | None, domain: int) -> None:
         """Join the network: `network` names its interface, eth0 for instance; a DDS domain of 0 is a robot, and
-        `SIMULATOR_DOMAIN` what Unitree's simulator takes. A robot that walks by itself is told to leave that first: two
-        programs must never command one robot. The simulator has no controller of its own, and nobody to answer for one.
+        `SIMULATOR_DOMAIN` what Unitree's simulator takes.
 
         Raises:
             ConfigError: the SDK is not installed, or cannot join the network.
-            RunError: the robot does not answer, or does not let go.
         """
         try:
             channel = import_module("unitree_sdk2py.core.channel")
@@ -80,20 +85,21 @@ class SdkWire:
             channel.ChannelFactoryInitialize(domain, network)
         except Exception as error:  # the SDK's own has no class of its own
             raise ConfigError(f"--network: {network or 'none given'}: domain {domain} cannot be joined ({error})") from error
-        if domain != SIMULATOR_DOMAIN:
-            self._release()
+        self._simulated = domain == SIMULATOR_DOMAIN
         self._new: Callable[[], Any] = getattr(default, f"{kind.package}_msg_dds__LowCmd_")
         self._publisher = channel.ChannelPublisher(COMMAND_TOPIC, messages.LowCmd_)
         self._publisher.Init()
         self._subscriber = channel.ChannelSubscriber(STATE_TOPIC, messages.LowState_)
 
-    @staticmethod
-    def _release() -> None:
-        """Make the robot leave its own controller.
+    def new_command(self) -> Any:
+        return self._new()
 
-        Raises:
-            RunError: it does not, or does not answer.
-        """
+    def listen(self, heard: Callable[[Any], None]) -> None:
+        self._subscriber.Init(heard, 10)
+
+    def take_over(self) -> None:
+        if self._simulated:  # it has no controller of its own, and nobody to answer for one
+            return
         client = import_module("unitree_sdk2py.comm.motion_switcher.motion_switcher_client").MotionSwitcherClient()
         client.SetTimeout(RELEASE_S)
         client.Init()
@@ -109,12 +115,6 @@ class SdkWire:
             raise RunError("--robot: nobody says whether the robot's own controller is on; is --network the right one?")
         raise RunError(f"--robot: the robot's own controller is still on after {RELEASE_S:g} s; leave it by hand")
 
-    def new_command(self) -> Any:
-        return self._new()
-
-    def listen(self, heard: Callable[[Any], None]) -> None:
-        self._subscriber.Init(heard, 10)
-
     def send(self, command: Any) -> None:
         if self._publisher.Write(command) is False:  # it raises nothing
             raise RunError("--robot: Unitree's SDK could not send a command")
@@ -128,11 +128,11 @@ class UnitreeRobot(Interface):
     """A robot of Unitree's. A thread sends the newest command again and again, and brakes the joints if the program dies."""
 
     def __init__(self, name: str, wire: Wire, repeat_s: float = REPEAT_S) -> None:
-        """Listen to the robot `name`, a key of `KINDS`, until its first state has come.
+        """Listen to the robot `name`, a key of `KINDS`, until its first state has come, and make it leave its own controller.
 
         Raises:
-            ConfigError: it is one with fewer joints.
-            RunError: nothing is heard of it.
+            ConfigError: it is one with fewer joints; it has kept its controller.
+            RunError: nothing is heard of it, or it does not let go.
         """
         self.kind = KINDS[name]
         self.facts = self.kind.facts
@@ -152,6 +152,13 @@ class UnitreeRobot(Interface):
         if lacks is not None:
             wire.close()
             raise ConfigError(f"--robot: g1: mode_machine is {self._mode_machine}: this robot has {lacks}, not 29 joints")
+        try:
+            wire.take_over()
+        except RunError:
+            wire.close()
+            raise
+        with self._lock:
+            del self._heard[:-1]  # what it told while it let go
         self._record = new_command(self.kind, self._mode_machine or 0)
         self._command = wire.new_command()
         self._written: float | None = None

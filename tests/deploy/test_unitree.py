@@ -127,7 +127,7 @@ class StandIn:
 
     def __init__(self, name, states=()):
         self.kind, self.structure = KINDS[name], COMMANDS[name]
-        self.states, self.sent, self.closed = list(states), [], False
+        self.states, self.sent, self.closed, self.taken, self.lets_go = list(states), [], False, False, True
 
     def new_command(self):
         return plain(self.structure())
@@ -136,6 +136,11 @@ class StandIn:
         self.heard = heard
         for state in self.states:
             threading.Thread(target=heard, args=(state,)).start()
+
+    def take_over(self):
+        if not self.lets_go:
+            raise RunError("still on")
+        self.taken = True
 
     def send(self, command):
         data = packed(command, self.structure)
@@ -303,6 +308,24 @@ def test_a_g1_with_fewer_joints_is_refused_before_anything_is_sent():
         with pytest.raises(ConfigError, match=f"g1: mode_machine is {code}: this robot has {says}, not 29 joints"):
             UnitreeRobot("g1", wire)
         assert (wire.closed, wire.sent) == (True, [])
+        assert not wire.taken  # it stands by its own controller, and goes on to
+
+
+def test_a_robot_that_keeps_its_controller_is_sent_nothing():
+    wire = StandIn("go2", [state_of(KINDS["go2"], np.zeros(12), np.zeros(12))])
+    wire.lets_go = False
+    with pytest.raises(RunError, match="still on"):
+        UnitreeRobot("go2", wire)
+    assert (wire.closed, wire.sent) == (True, [])
+
+
+def test_what_a_robot_told_while_it_let_go_of_its_controller_is_not_read_late():
+    kind = KINDS["go2"]
+    wire = StandIn("go2", [state_of(kind, np.zeros(12), np.zeros(12), tick=1)])
+    wire.take_over = lambda: [wire.heard(state_of(kind, np.zeros(12), np.zeros(12), tick=tick)) for tick in (2, 3)]
+    robot = UnitreeRobot("go2", wire)
+    assert [reading.time for reading in robot.read()] == [0.003]
+    robot.close()
 
 
 def test_a_robot_that_says_nothing_is_named(monkeypatch):

@@ -76,22 +76,23 @@ def test_without_the_sdk_one_line_says_what_to_install(monkeypatch):
 
 
 def test_the_wire_calls_the_sdk_as_it_wants_to_be_called(monkeypatch):
-    """Topics, messages, network and domain; and a robot that walks by itself is told to leave that first."""
+    """Topics, messages, network and domain; and a robot that walks by itself is told to leave that once it is known."""
     sdk = Sdk(monkeypatch, [(0, {"name": "mcf"}), (0, {"name": ""})])
     wire = SdkWire(KINDS["g1"], "eth0", 0)
     assert wire.new_command() == "zeros"
     wire.listen(print)
+    wire.take_over()
     wire.send("command")
     wire.close()
     assert sdk.told == [
         (0, "eth0"),
-        ("timeout", unitree.RELEASE_S),
-        "client",
-        "release",
         ("rt/lowcmd", "LowCmd"),
         ("init",),
         ("rt/lowstate", "LowState"),
         ("init", print, 10),
+        ("timeout", unitree.RELEASE_S),
+        "client",
+        "release",
         ("write", "command"),
         "close",
         "close",
@@ -101,7 +102,7 @@ def test_the_wire_calls_the_sdk_as_it_wants_to_be_called(monkeypatch):
 def test_unitrees_simulator_has_no_controller_that_must_be_left(monkeypatch):
     """It serves low-level messages alone: whoever waits for an answer about a controller never gets one."""
     sdk = Sdk(monkeypatch, [(3104, None)])
-    SdkWire(KINDS["g1"], "lo", 1)
+    SdkWire(KINDS["g1"], "lo", 1).take_over()
     assert sdk.told == [(1, "lo"), ("rt/lowcmd", "LowCmd"), ("init",), ("rt/lowstate", "LowState")]
 
 
@@ -114,8 +115,9 @@ def test_unitrees_simulator_has_no_controller_that_must_be_left(monkeypatch):
 )
 def test_a_robot_that_does_not_answer_is_not_said_to_keep_its_controller(monkeypatch, mode, says):
     Sdk(monkeypatch, [mode])
+    wire = SdkWire(KINDS["g1"], "eth0", 0)
     with pytest.raises(RunError, match=says):
-        SdkWire(KINDS["g1"], "eth0", 0)
+        wire.take_over()
 
 
 def test_a_network_that_is_not_there_is_named(monkeypatch):
@@ -126,7 +128,7 @@ def test_a_network_that_is_not_there_is_named(monkeypatch):
 
 def test_a_command_that_the_sdk_could_not_send_is_no_command(monkeypatch):
     """The SDK says so by what it returns; of a program that did not notice, the robot would keep the last command."""
-    sdk = Sdk(monkeypatch, [(0, {"name": ""})])
+    sdk = Sdk(monkeypatch)
     wire = SdkWire(KINDS["g1"], "eth0", 0)
     sdk.sends = False
     with pytest.raises(RunError, match="could not send a command"):
