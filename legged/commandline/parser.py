@@ -1,11 +1,14 @@
 """The parser that every command has: its help keeps the paragraphs of the description and ends with examples."""
 
 import argparse
+import re
 import shlex
 import textwrap
 from typing import Any
 
 LEAST_EXAMPLES = 2
+NEGATIVE_NUMBER = re.compile(r"-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?$", re.IGNORECASE)
+"""What is a value though it begins like a flag. Before Python 3.14 argparse knew no -1e-1."""
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -23,6 +26,7 @@ class CommandParser(argparse.ArgumentParser):
         """Command lines, each of which this parser can read."""
         shown = "\n".join(["examples:", *(f"  {example}" for example in examples)])
         super().__init__(prog=prog, description=description, epilog=shown, formatter_class=Paragraphs, **options)
+        self._negative_number_matcher = NEGATIVE_NUMBER
 
     @staticmethod
     def arguments_of(example: str) -> list[str]:

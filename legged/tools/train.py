@@ -300,8 +300,8 @@ def _report(folder: Path, cfg: TaskConfig, args: argparse.Namespace | None) -> N
 def describe(cfg: TaskConfig, device: torch.device) -> str:
     """One line on what is about to run where."""
     if device.type == "cpu":
-        cores = cfg.sim.threads or available_cores()
-        engines = {"mujoco_warp": f"mujoco-warp on {cores} cores", "mujoco": f"C MuJoCo on {cores} cores"}
+        cores = _counted(cfg.sim.threads or available_cores(), "core")
+        engines = {"mujoco_warp": f"mujoco-warp on {cores}", "mujoco": f"C MuJoCo on {cores}"}
         name = engine_name(cfg.sim, device, num_envs=cfg.env.num_envs)
         engine = engines.get(name, f"Newton's {cfg.sim.solver} solver on the CPU")
         where = f"no GPU in use: {engine}"
@@ -311,8 +311,12 @@ def describe(cfg: TaskConfig, device: torch.device) -> str:
         where = torch.cuda.get_device_name(device)
     ranks = Ranks.now()
     share = f" on each of {ranks.count} processes" if ranks.several else ""
-    robots = f"{cfg.env.num_envs} robots{share}"
-    return f"{cfg.task}: {robots}, {cfg.train.runner.max_iterations} iterations, {where}"
+    robots = f"{_counted(cfg.env.num_envs, 'robot')}{share}"
+    return f"{cfg.task}: {robots}, {_counted(cfg.train.runner.max_iterations, 'iteration')}, {where}"
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'s' if count > 1 else ''}"
 
 
 def play_command(args: argparse.Namespace, cfg: TaskConfig, folder: Path) -> str:

@@ -50,3 +50,19 @@ def test_paragraphs_of_a_description_are_filled_one_by_one_and_indented_lines_ke
     said = CommandParser("x", text, "python x.py a", "python x.py b").format_help()
     assert "One two three four five six seven\neight nine.\n\n  as it\n  is\n\nLast.\n" in said
     assert said.endswith("examples:\n  python x.py a\n  python x.py b\n")
+
+
+@pytest.mark.parametrize("given", ["-1e-1", "-.5E+0", "-2", "-0.25"])
+def test_a_negative_number_is_a_value_however_it_is_written(given):
+    parser = CommandParser("x", "Do.", "python x.py a", "python x.py b")
+    parser.add_argument("--command", nargs=3, type=float)
+    parser.add_argument("-v", action="store_true")
+    assert parser.parse_args(["--command", given, "0", given, "-v"]).command == [float(given), 0.0, float(given)]
+
+
+@pytest.mark.parametrize("given", ["-1e", "-e1", "-1x"])
+def test_what_only_begins_like_a_number_is_no_value(given):
+    parser = CommandParser("x", "Do.", "python x.py a", "python x.py b")
+    parser.add_argument("--command", nargs="*")
+    with pytest.raises(SystemExit):
+        parser.parse_args(["--command", given])
