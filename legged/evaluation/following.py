@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,16 +26,15 @@ from legged.terrain import BUMPS
 def evaluate_following(
     policy: TrainedPolicy,
     grid: Grid,
-    types: Sequence[str],
+    sizes: Mapping[str, Sequence[float]],
     robots: int,
-    full: bool,
     asked: list[tuple[str, Any]],
     device: torch.device,
     graph: bool,
     folder: Path,
     where: str = "sim.physics",
 ) -> int:
-    """Measure tracking on the grid and success on the terrain `types`, `robots` a size; print tables, then write
+    """Measure tracking on the grid and success at all `sizes` of each terrain type, `robots` a size; print tables, then write
     evaluation_<physics>.json and .png and success_<physics>.png into `folder`. Return the exit code. `where` says who asks
     for the engine.
 
@@ -52,7 +51,7 @@ def evaluate_following(
     rough = cfg.terrain.mesh_type != "plane"
     bumps = {"bumps": BUMPS * task.cfg.terrain.scale} if rough else {}  # [m]
     head = header(policy, engine, torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu", asked)
-    success = success_over_difficulty(policy, types, robots, full, asked, device, graph) if types else None
+    success = success_over_difficulty(policy, sizes, robots, asked, device, graph) if sizes else None
     result = {
         **head,
         "wall_s": time.perf_counter() - start,

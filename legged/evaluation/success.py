@@ -7,7 +7,7 @@ of the task, velocities times its root (the same Froude number).
 """
 
 import gc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import sqrt
 from typing import Any
 
@@ -22,6 +22,7 @@ from legged.errors import ConfigError
 from legged.evaluation.intervals import wilson
 from legged.evaluation.overflows import Overflows
 from legged.evaluation.tiles import cell_for, on_terrain, tiles_of_sizes
+from legged.evaluation.velocity_grid import read_range, spaced
 from legged.math import uniform, yaw_of
 from legged.policies.restore import TrainedPolicy, restore, undisturbed
 from legged.terrain import METRES, TERRAIN_TYPES, hardest_difficulty, terrain_types, tile_size
@@ -58,6 +59,10 @@ FEWER: dict[str, tuple[float, ...]] = {
     **dict.fromkeys(OF_STEPS, (0.05, 0.1, 0.15, 0.2, 0.25, 0.3)),
 }
 """Type -> the sizes that are measured without `--full`, where they are fewer."""
+TYPES_HELP = (
+    "terrain types to cross, with sizes of your own if you like: stairs_up,kerbs=0.17,stairs_down=0.2:0.3:0.05; those of the"
+    " training by default"
+)
 
 OPEN, REACHED, FELL, STUCK = range(4)
 """What has become of a robot."""
@@ -111,18 +116,32 @@ def sizes_of(name: str, full: bool, scale: float = 1.0) -> tuple[float, ...]:
     return found if kind.unit != METRES or scale == 1.0 else tuple(round(size * scale, 6) for size in found)
 
 
-def chosen_types(cfg: LeggedConfig, asked: str | None) -> list[str]:
-    """Return the types in the comma-separated list `asked`, else those the task was trained on (none on a plane).
+def chosen_sizes(cfg: LeggedConfig, asked: str | None, full: bool, scale: float) -> dict[str, tuple[float, ...]]:
+    """Return type -> the sizes that are measured, growing, in its unit: of the types in the comma-separated list `asked`,
+    else of those the task was trained on (none on a plane).
+
+    A type of the list may name its sizes, which are taken as they are: 'stairs_up=0.25', 'kerbs=0.1:0.2:0.05'. Those of all
+    others are those of `sizes_of`, on ground of that `scale`.
 
     Raises:
-        ConfigError: one is no type or comes twice, or the policy cannot see terrain.
+        ConfigError: one is no type or comes twice, a size is none, or the policy cannot see terrain.
     """
     if asked is None:
-        return [name for name in trained_to(cfg) if name != "flat"]
-    names = terrain_types("--types", asked)
+        return {name: sizes_of(name, full, scale) for name in trained_to(cfg) if name != "flat"}
+    entries = [[part.strip() for part in entry.partition("=")] for entry in asked.split(",")]
+    terrain_types("--types", ",".join(name for name, _, _ in entries))
     if cfg.terrain.mesh_type == "plane" and "heights" in cfg.observations.groups["actor"].terms:
         raise ConfigError(f"--types: '{cfg.task}' was trained on a plane: to its policy 'heights' means nothing")
-    return names
+    return {name: _named_sizes(name, text) if given else sizes_of(name, full, scale) for name, given, text in entries}
+
+
+def _named_sizes(name: str, text: str) -> tuple[float, ...]:
+    """Return the sizes of a type that somebody has named, '0.25' or '0.1:0.2:0.05', in its unit."""
+    flag, kind = f"--types: {name}", TERRAIN_TYPES[name]
+    low, high, step = read_range(flag, text, f"{name}=0.1:0.2:0.05")
+    if not 0.0 < low <= high <= kind.largest:
+        raise ConfigError(f"{flag}: sizes are above 0 and at most {kind.largest:g} {kind.unit}, got '{text}'")
+    return tuple(spaced(flag, text, low, high, step, "sizes"))
 
 
 def trained_to(cfg: LeggedConfig) -> dict[str, float]:
@@ -210,14 +229,13 @@ def point(size: float, outcomes: Tensor, times: Tensor) -> dict[str, Any]:
 
 def success_over_difficulty(
     policy: TrainedPolicy,
-    names: Sequence[str],
+    sizes: Mapping[str, Sequence[float]],
     robots: int,
-    full: bool,
     changes: Sequence[tuple[str, Any]],
     device: torch.device,
     graph: bool = True,
 ) -> dict[str, Any]:
-    """Measure the points of all `names`, `robots` robots each, and print a line about each type; `changes` to the
+    """Measure all `sizes` of each type, `robots` robots each, and print a line about each type; `changes` to the
     configuration come after our own. Return plain numbers and lists.
     """
     assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
@@ -225,16 +243,16 @@ def success_over_difficulty(
     trained, scale = trained_to(policy.cfg), cfg.terrain.scale
     found: dict[str, Any] = {}
     lost = 0
-    for name in names:
-        sizes = sizes_of(name, full, scale)
+    for name, of_type in sizes.items():
         cell = ("terrain.horizontal_scale", cell_for(name, cfg.terrain))
-        own = [*to_run_out(cfg, robots * len(sizes)), *changes, cell]
-        points, overflows = _on_type(policy, name, sizes, robots, own, device, graph)
+        own = [*to_run_out(cfg, robots * len(of_type)), *changes, cell]
+        points, overflows = _on_type(policy, name, of_type, robots, own, device, graph)
         lost += overflows
         kind = TERRAIN_TYPES[name]
         found[name] = {"unit": kind.unit, "what": kind.what, "trained_to": trained.get(name), "points": points}
-        reached, count = sum(entry["successes"] for entry in points), robots * len(sizes)
-        print(f"{name}: {len(sizes)} sizes x {robots} robots, {100 * reached / count:.0f} % got out", flush=True)
+        reached, count = sum(entry["successes"] for entry in points), robots * len(of_type)
+        count_of_sizes = f"{len(of_type)} size{'s' if len(of_type) > 1 else ''}"
+        print(f"{name}: {count_of_sizes} x {robots} robots, {100 * reached / count:.0f} % got out", flush=True)
     return {
         "definition": {
             "distance_m": DISTANCE * scale,

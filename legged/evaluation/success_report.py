@@ -142,7 +142,10 @@ def _draw_panel(axis: Any, results: list[dict[str, Any]], names: tuple[str, ...]
             engine = ENGINES[result["physics"]]
             size, share, low, high = ([point[key] for point in entry["points"]] for key in ("size", "share", "low", "high"))
             axis.plot(size, share, engine.line, marker=engine.marker, ms=4, color=color, clip_on=False, zorder=3)
-            axis.fill_between(size, low, high, color=color, alpha=0.12, lw=0)
+            if len(size) > 1:
+                axis.fill_between(size, low, high, color=color, alpha=0.12, lw=0)
+            else:  # a band has no width there
+                axis.vlines(size, low, high, color=color, lw=1.0)
             as_success(axis, entry)
             if entry["unit"] == "degrees":
                 axis.xaxis.set_major_locator(MultipleLocator(5))

@@ -68,18 +68,28 @@ def axis_values(flag: str, text: str) -> list[float]:
     Raises:
         ConfigError: not of that form.
     """
+    low, high, step = read_range(flag, text, f"{flag}=-1:1:0.5")
+    if max(abs(low), abs(high)) > FASTEST:
+        raise ConfigError(f"{flag}: '{text}' asks for more than {FASTEST:g}; commands are in m/s and rad/s")
+    return spaced(flag, text, low, high, step)
+
+
+def read_range(flag: str, text: str, example: str) -> tuple[float, float, float]:
+    """Read 'low:high:step', or a single number, which is both ends.
+
+    Raises:
+        ConfigError: not of that form.
+    """
     try:
         parts = [float(part) for part in text.split(":")]
     except ValueError:
         parts = []
-    finite = all(np.isfinite(part) for part in parts)
-    if finite and any(abs(part) > FASTEST for part in parts[:2]):
-        raise ConfigError(f"{flag}: '{text}' asks for more than {FASTEST:g}; commands are in m/s and rad/s")
-    if len(parts) == 1 and finite:
-        return parts
-    if len(parts) != 3 or not finite or parts[2] <= 0 or parts[1] < parts[0]:
-        raise ConfigError(f"{flag}: '{text}' is not of the form low:high:step, e.g. {flag}=-1:1:0.5")
-    return _values(flag, text, *parts)
+    if len(parts) == 1:
+        parts = [*parts, *parts, 1.0]
+    if len(parts) != 3 or not np.isfinite(parts).all() or parts[2] <= 0 or parts[1] < parts[0]:
+        raise ConfigError(f"{flag}: '{text}' is not of the form low:high:step, e.g. {example}")
+    low, high, step = parts
+    return low, high, step
 
 
 def axes_of(cfg: LeggedConfig) -> dict[str, list[float]]:
@@ -90,16 +100,20 @@ def axes_of(cfg: LeggedConfig) -> dict[str, list[float]]:
     """
     check_grid(cfg)
     given = {axis: getattr(cfg.evaluation, axis) for axis in AXES}
-    return {axis: _values(f"evaluation.{axis}", str(list(values)), *values) for axis, values in given.items()}
+    return {axis: spaced(f"evaluation.{axis}", str(list(values)), *values) for axis, values in given.items()}
 
 
-def _values(where: str, given: str, low: float, high: float, step: float) -> list[float]:
-    """Return the values of an axis, none beyond `high`; `where` and `given` are what an error says of it."""
+def spaced(
+    where: str, given: str, low: float, high: float, step: float, what: str = "cells of this axis alone"
+) -> list[float]:
+    """Return the values of a range, none beyond `high`; `where`, `given` and `what` are what an error says of them.
+
+    Raises:
+        ConfigError: they are too many.
+    """
     count = (high - low) / step + 1.0
     if count > MOST_VALUES:
-        raise ConfigError(
-            f"{where}: '{given}' makes {count:,.0f} cells of this axis alone; at most {MOST_VALUES:,} are possible"
-        )
+        raise ConfigError(f"{where}: '{given}' makes {count:,.0f} {what}; at most {MOST_VALUES:,} are possible")
     whole = int(count + 1e-9)  # 0:0.3:0.1 is three steps, whatever their quotient was rounded to
     return [round(float(value), 6) for value in low + step * np.arange(whole)]
 

@@ -39,7 +39,7 @@ from legged.evaluation.result_file import CHANGED, changes_of
 from legged.evaluation.stress.measuring import RISER, TREAD, Wish
 from legged.evaluation.stress.report import evaluate_stress
 from legged.evaluation.stress.table import NAMES
-from legged.evaluation.success import chosen_types
+from legged.evaluation.success import TYPES_HELP, chosen_sizes
 from legged.evaluation.velocity_grid import AXES, MOST_ROBOTS, Grid, axes_of, axis_values, check_size
 from legged.physics import resolve_physics
 from legged.policies.restore import TrainedPolicy, find_policy
@@ -92,7 +92,7 @@ def build_parser() -> CommandParser:
     for axis, unit in AXES.items():
         parser.add_argument(f"--{axis}", help=f"low:high:step of the command grid [{unit}]; evaluation.{axis} by default")
     parser.add_argument("--robots", type=int, help=f"robots a cell; {ROBOTS}")
-    parser.add_argument("--types", help="terrain types to cross, e.g. stairs_up,pit; those of the training by default")
+    parser.add_argument("--types", help=TYPES_HELP)
     parser.add_argument(
         "--full", action="store_true", help="all sizes of a type, or all lines with every solver; 256 robots each"
     )
@@ -200,8 +200,8 @@ def _follow_commands(args: argparse.Namespace) -> int:
         return evaluate_stress(policy, a_point, args.full, wish, asked, device, graph, folder, where)
     if args.all_checkpoints:
         return evaluate_all_checkpoints(policy, grid, asked, device, graph, folder, rmse, falls)
-    types = chosen_types(policy.cfg, args.types)  # type: ignore[arg-type]
-    return evaluate_following(policy, grid, types, a_point, args.full, asked, device, graph, folder, where)
+    sizes = chosen_sizes(policy.cfg, args.types, args.full, judged.terrain.scale)  # type: ignore[arg-type]
+    return evaluate_following(policy, grid, sizes, a_point, asked, device, graph, folder, where)
 
 
 def _folder(args: argparse.Namespace, policy: TrainedPolicy) -> Path:

@@ -26,6 +26,7 @@ from legged.commandline.stopping import stopping_on_signals
 from legged.errors import ConfigError
 from legged.evaluation.judged_run import JudgedRun, find_runs
 from legged.evaluation.run_table import markdown, summary
+from legged.evaluation.success import TYPES_HELP
 from legged.learning.timing import read_timing
 from legged.process.cores import available_cores
 from legged.process.paths import make_folder, ready_to_write, relative, write_text
@@ -71,7 +72,7 @@ def build_parser() -> CommandParser:
     parser.add_argument("--evaluations", type=int, help=f"evaluations side by side, of a kind; at most {MOST_EVALUATIONS}")
     parser.add_argument("--engines", default="mujoco_warp,mujoco", help="engines to judge in; mujoco_warp,mujoco by default")
     parser.add_argument("--robots", type=int, default=ROBOTS, help=f"robots a cell of the command grid; {ROBOTS}")
-    parser.add_argument("--types", help="terrain types to cross, for tasks with terrain; those of the training by default")
+    parser.add_argument("--types", help=f"{TYPES_HELP}; for tasks with terrain")
     parser.add_argument("--full", action="store_true", help="all sizes of a terrain type, 256 robots each")
     parser.add_argument("--robots-per-point", type=int, help="robots for each size of a type; 32, or 256 with --full")
     parser.add_argument("--again", action="store_true", help="train also what has been trained")

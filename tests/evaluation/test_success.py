@@ -275,8 +275,8 @@ def test_configuration_of_the_tasks(monkeypatch, capsys):
 
     monkeypatch.setattr(success, "_on_type", fake)
     policy = TrainedPolicy(cfg, Path("model_0.pt"))
-    names, asked = ["stairs_up", "pit"], [("sim.threads", 2)]
-    result = success.success_over_difficulty(policy, names, 5, False, asked, torch.device("cpu"))
+    sizes, asked = success.chosen_sizes(cfg, "stairs_up,pit", False, 1.0), [("sim.threads", 2)]
+    result = success.success_over_difficulty(policy, sizes, 5, asked, torch.device("cpu"))
     lines = capsys.readouterr().out.splitlines()
     assert lines == ["stairs_up: 6 sizes x 5 robots, 100 % got out", "pit: 6 sizes x 5 robots, 100 % got out"]
     assert result["contact_overflows"] == 6
@@ -308,9 +308,9 @@ def test_ground_of_a_scale_that_is_asked_for_is_measured_and_told_at_that_scale(
 
     monkeypatch.setattr(success, "_on_type", fake)
     asked = [("terrain.scale", 0.25), ("terrain.horizontal_scale", 0.025)]
-    names = ["stairs_up", "narrow_stairs_up"]
+    chosen = success.chosen_sizes(cfg, "stairs_up,narrow_stairs_up", False, 0.25)
     policy = TrainedPolicy(cfg, Path("model_0.pt"))
-    result = success.success_over_difficulty(policy, names, 2, False, asked, torch.device("cpu"))
+    result = success.success_over_difficulty(policy, chosen, 2, asked, torch.device("cpu"))
     rule = result["definition"]
     assert (rule["distance_m"], rule["vx"], rule["vy"][1]) == pytest.approx((1.0, 0.375, 0.05))
     assert result["types"]["stairs_up"]["trained_to"] == pytest.approx(0.212)

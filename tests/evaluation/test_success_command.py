@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,11 +18,11 @@ from legged.evaluation import success
 from legged.evaluation.following import evaluate_following
 from legged.evaluation.overflows import warn_of_overflows
 from legged.evaluation.success import (
-    chosen_types,
+    chosen_sizes,
     sizes_of,
     trained_to,
 )
-from legged.evaluation.success_report import is_beyond, panels_of, with_other_engines
+from legged.evaluation.success_report import _draw_panel, is_beyond, panels_of, with_other_engines
 from legged.evaluation.tiles import cell_for, dividing_cell, on_terrain, rough_ground, rough_side, tiles_of_sizes
 from legged.evaluation.velocity_grid import Grid
 from legged.evaluation.velocity_tracking import measure_tracking, place_to_track
@@ -73,15 +74,47 @@ def test_panels():
 
 def test_types_that_are_asked_for():
     rough, flat = task_config("anymal_c", on_cpu=True), small_config()
-    assert chosen_types(rough, None) == [name for name, share in rough.terrain.proportions.items() if share > 0.0]
-    assert chosen_types(rough, "pit, gap") == ["pit", "gap"]
-    assert chosen_types(flat, None) == []
-    assert chosen_types(flat, "pit") == ["pit"]
+    trained = [name for name, share in rough.terrain.proportions.items() if share > 0.0]
+    assert list(chosen_sizes(rough, None, False, 1.0)) == trained
+    assert chosen_sizes(rough, "pit, gap", True, 0.5) == {name: sizes_of(name, True, 0.5) for name in ("pit", "gap")}
+    assert chosen_sizes(flat, None, False, 1.0) == {}
+    assert list(chosen_sizes(flat, "pit", False, 1.0)) == ["pit"]
     with pytest.raises(ConfigError, match=r"--types: there is no terrain type 'stair_up'; did you mean 'stairs_up'"):
-        chosen_types(rough, "stair_up")
+        chosen_sizes(rough, "stair_up", False, 1.0)
     blind_ground = task_config("anymal_c", [("terrain.mesh_type", "plane")], on_cpu=True)
     with pytest.raises(ConfigError, match=r"--types: .*'heights'"):
-        chosen_types(blind_ground, "pit")
+        chosen_sizes(blind_ground, "pit", False, 1.0)
+
+
+def test_sizes_that_are_asked_for():
+    """As they are, whatever the scale and --full; the others as ever."""
+    cfg = task_config("anymal_c", on_cpu=True)
+    chosen = chosen_sizes(cfg, "kerbs=0.17, pit,slope_up = 10:25:5,stairs_down=0.2:0.31:0.05", True, 0.5)
+    assert chosen == {
+        "kerbs": (0.17,),
+        "pit": sizes_of("pit", True, 0.5),
+        "slope_up": (10.0, 15.0, 20.0, 25.0),
+        "stairs_down": (0.2, 0.25, 0.3),
+    }
+
+
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [
+        ("kerbs=", "kerbs: '' is not of the form low:high:step, e.g. kerbs=0.1:0.2:0.05"),
+        ("kerbs=high", "kerbs: 'high' is not of the form"),
+        ("kerbs=0.3:0.1:0.1", "kerbs: '0.3:0.1:0.1' is not of the form"),
+        ("kerbs=0", "kerbs: sizes are above 0 and at most 100 m, got '0'"),
+        ("slope_up=10:90:10", "slope_up: sizes are above 0 and at most 80 degrees, got '10:90:10'"),
+        ("kerbs=0.1:100:0.00001", "kerbs: '0.1:100:0.00001' makes 9,990,001 sizes; at most"),
+        ("kerbs=nan", "kerbs: 'nan' is not of the form"),
+        ("kerbs=0.1,kerbs=0.2", "'kerbs' is given twice"),
+        ("kerb=0.1", "there is no terrain type 'kerb'; did you mean 'kerbs'"),
+    ],
+)
+def test_sizes_that_are_none_are_refused(asked, says):
+    with pytest.raises(ConfigError, match=f"^--types: {re.escape(says)}"):
+        chosen_sizes(task_config("anymal_c", on_cpu=True), asked, False, 1.0)
 
 
 # ---- rough ground ----------------------------------------------------------------------------------------------------
@@ -118,7 +151,7 @@ def test_bumps_are_as_high_as_is_said_for_a_small_robot(tmp_path, capsys):
     assert (heights.min(), heights.max()) == pytest.approx((-0.0295, 0.0295), abs=1e-4)
     policy = TrainedPolicy(cfg, find_checkpoint(POLICY.with_name("go2"), None))
     grid = Grid([0.5], [0.0], [0.0], robots=1, hold_s=1.2)
-    assert evaluate_following(policy, grid, (), 1, False, [], torch.device("cpu"), False, tmp_path) == 0
+    assert evaluate_following(policy, grid, {}, 1, [], torch.device("cpu"), False, tmp_path) == 0
     assert "on level ground with bumps of up to 2.9 cm" in capsys.readouterr().out
     assert json.loads((tmp_path / "evaluation_mujoco.json").read_text())["rough"]["bumps"] == pytest.approx(0.0295, abs=1e-4)
 
@@ -266,3 +299,20 @@ def test_wrong_input(arguments, words, capsys):
     error = capsys.readouterr().err
     for word in words:
         assert word in error
+
+
+def test_a_single_size_is_drawn_with_its_interval():
+    """A band has no width there."""
+    from matplotlib import pyplot as plt
+
+    axis = plt.figure().subplots()
+    entry = {
+        "unit": "m",
+        "what": "height",
+        "trained_to": None,
+        "points": [{"size": 0.2, "share": 0.5, "low": 0.4, "high": 0.7}],
+    }
+    _draw_panel(axis, [{"physics": "mujoco", "success": {"types": {"kerbs": entry}}}], ("kerbs",))
+    (bars,) = axis.collections
+    assert bars.get_segments()[0].tolist() == [[0.2, 0.4], [0.2, 0.7]]
+    plt.close()

@@ -11,7 +11,7 @@ from legged.errors import ConfigError, suggest
 from legged.evaluation.engines import ENGINES
 from legged.evaluation.judged_run import JudgedRun, results_in, why_unfinished
 from legged.evaluation.result_file import tracking_of
-from legged.evaluation.success import chosen_types, sizes_of
+from legged.evaluation.success import chosen_sizes
 from legged.evaluation.velocity_grid import axes_of
 from legged.learning.run_folder import CONFIG_FILE, checkpoints, experiment_folder, find_checkpoint, run_config
 from legged.learning.timing import read_timing
@@ -97,7 +97,7 @@ def _config(task: str, order: Order) -> LeggedConfig:
         raise ConfigError(f"'{task}' follows no commands; a table of RMSE and falls is of tasks that do")
     axes_of(cfg)
     if cfg.terrain.mesh_type != "plane":
-        chosen_types(cfg, order.types)
+        chosen_sizes(cfg, order.types, order.full, cfg.terrain.scale)
     return cfg
 
 
@@ -195,10 +195,10 @@ def is_measured(result: dict[str, Any] | None, training: Training, order: Order)
     if not training.rough:
         return True
     cfg = training.cfg
-    types = chosen_types(cfg, order.types)
+    wanted = chosen_sizes(cfg, order.types, order.full, cfg.terrain.scale)
     success = result.get("success", {"types": {}})
     found = {name: {point["size"] for point in entry["points"]} for name, entry in success["types"].items()}
-    there = all({*sizes_of(name, order.full, cfg.terrain.scale)} <= found.get(name, set()) for name in types)
+    there = all({*sizes} <= found.get(name, set()) for name, sizes in wanted.items())
     return there and success.get("robots_per_point") == order.robots_per_point
 
 
