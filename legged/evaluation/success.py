@@ -59,6 +59,10 @@ FEWER: dict[str, tuple[float, ...]] = {
     **dict.fromkeys(OF_STEPS, (0.05, 0.1, 0.15, 0.2, 0.25, 0.3)),
 }
 """Type -> the sizes that are measured without `--full`, where they are fewer."""
+SMALLEST = 0.001
+"""The least that a size may be [m] or [degrees]."""
+MOST_SIZES = 100
+"""Sizes of one type that can be measured: each has tiles of its own, all in one map."""
 TYPES_HELP = (
     "terrain types to cross, with sizes of your own if you like: stairs_up,kerbs=0.17,stairs_down=0.2:0.3:0.05; those of the"
     " training by default"
@@ -139,9 +143,9 @@ def _named_sizes(name: str, text: str) -> tuple[float, ...]:
     """Return the sizes of a type that somebody has named, '0.25' or '0.1:0.2:0.05', in its unit."""
     flag, kind = f"--types: {name}", TERRAIN_TYPES[name]
     low, high, step = read_range(flag, text, f"{name}=0.1:0.2:0.05")
-    if not 0.0 < low <= high <= kind.largest:
-        raise ConfigError(f"{flag}: sizes are above 0 and at most {kind.largest:g} {kind.unit}, got '{text}'")
-    return tuple(spaced(flag, text, low, high, step, "sizes"))
+    if not SMALLEST <= low <= high <= kind.largest:
+        raise ConfigError(f"{flag}: sizes are at least {SMALLEST:g} and at most {kind.largest:g} {kind.unit}, got '{text}'")
+    return tuple(spaced(flag, text, low, high, step, "sizes", MOST_SIZES))
 
 
 def trained_to(cfg: LeggedConfig) -> dict[str, float]:

@@ -104,16 +104,22 @@ def axes_of(cfg: LeggedConfig) -> dict[str, list[float]]:
 
 
 def spaced(
-    where: str, given: str, low: float, high: float, step: float, what: str = "cells of this axis alone"
+    where: str,
+    given: str,
+    low: float,
+    high: float,
+    step: float,
+    what: str = "cells of this axis alone",
+    most: int = MOST_VALUES,
 ) -> list[float]:
     """Return the values of a range, none beyond `high`; `where`, `given` and `what` are what an error says of them.
 
     Raises:
-        ConfigError: they are too many.
+        ConfigError: they are more than `most`.
     """
     count = (high - low) / step + 1.0
-    if count > MOST_VALUES:
-        raise ConfigError(f"{where}: '{given}' makes {count:,.0f} {what}; at most {MOST_VALUES:,} are possible")
+    if count > most:
+        raise ConfigError(f"{where}: '{given}' makes {count:,.0f} {what}; at most {most:,} are possible")
     whole = int(count + 1e-9)  # 0:0.3:0.1 is three steps, whatever their quotient was rounded to
     return [round(float(value), 6) for value in low + step * np.arange(whole)]
 
