@@ -25,6 +25,7 @@ from legged.deploy.unitree_messages import (
 from legged.errors import ConfigError, RunError
 
 COMMAND_TOPIC, STATE_TOPIC = "rt/lowcmd", "rt/lowstate"
+SWITCHER = "unitree_sdk2py.comm.motion_switcher.motion_switcher_client"
 SIMULATOR_DOMAIN = 1
 """DDS domain of Unitree's own simulator."""
 REPEAT_S = 0.005
@@ -76,6 +77,8 @@ class SdkWire:
             channel = import_module("unitree_sdk2py.core.channel")
             default = import_module("unitree_sdk2py.idl.default")
             messages = import_module(f"unitree_sdk2py.idl.{kind.package}.msg.dds_")
+            # A simulator has no controller of its own, and nobody to answer for one.
+            self._switcher = None if domain == SIMULATOR_DOMAIN else import_module(SWITCHER)
         except ImportError as error:
             raise ConfigError(
                 f"--robot: Unitree's SDK cannot be imported ({' '.join(str(error).split())}): pip install"
@@ -85,7 +88,6 @@ class SdkWire:
             channel.ChannelFactoryInitialize(domain, network)
         except Exception as error:  # the SDK's own has no class of its own
             raise ConfigError(f"--network: {network or 'none given'}: domain {domain} cannot be joined ({error})") from error
-        self._simulated = domain == SIMULATOR_DOMAIN
         self._new: Callable[[], Any] = getattr(default, f"{kind.package}_msg_dds__LowCmd_")
         self._publisher = channel.ChannelPublisher(COMMAND_TOPIC, messages.LowCmd_)
         self._publisher.Init()
@@ -98,9 +100,9 @@ class SdkWire:
         self._subscriber.Init(heard, 10)
 
     def take_over(self) -> None:
-        if self._simulated:  # it has no controller of its own, and nobody to answer for one
+        if self._switcher is None:
             return
-        client = import_module("unitree_sdk2py.comm.motion_switcher.motion_switcher_client").MotionSwitcherClient()
+        client = self._switcher.MotionSwitcherClient()
         client.SetTimeout(RELEASE_S)
         client.Init()
         end, answered = time.perf_counter() + RELEASE_S, False
@@ -143,22 +145,11 @@ class UnitreeRobot(Interface):
         self._mode_machine: int | None = None
         self._first = threading.Event()
         wire.listen(self._hear)
-        if not self._first.wait(FIRST_STATE_S):
-            wire.close()
-            raise RunError(
-                f"--robot: {name}: no state came within {FIRST_STATE_S:g} s; is it on, and --network the right one?"
-            )
-        lacks = OTHER_G1.get(self._mode_machine or 0) if name == "g1" else None
-        if lacks is not None:
-            wire.close()
-            raise ConfigError(f"--robot: g1: mode_machine is {self._mode_machine}: this robot has {lacks}, not 29 joints")
         try:
-            wire.take_over()
-        except RunError:
+            self._meet(name)
+        except BaseException:  # Ctrl-C too
             wire.close()
             raise
-        with self._lock:
-            del self._heard[:-1]  # what it told while it let go
         self._record = new_command(self.kind, self._mode_machine or 0)
         self._command = wire.new_command()
         self._written: float | None = None
@@ -166,6 +157,19 @@ class UnitreeRobot(Interface):
         self._closing = threading.Event()
         self._repeater = threading.Thread(target=self._repeat, name="unitree-commands", daemon=True)
         self._repeater.start()
+
+    def _meet(self, name: str) -> None:
+        """Wait for the first state, look whether it is that of the robot `name`, and take over."""
+        if not self._first.wait(FIRST_STATE_S):
+            raise RunError(
+                f"--robot: {name}: no state came within {FIRST_STATE_S:g} s; is it on, and --network the right one?"
+            )
+        lacks = OTHER_G1.get(self._mode_machine or 0) if name == "g1" else None
+        if lacks is not None:
+            raise ConfigError(f"--robot: g1: mode_machine is {self._mode_machine}: this robot has {lacks}, not 29 joints")
+        self._wire.take_over()
+        with self._lock:
+            del self._heard[:-1]  # what it told while it let go
 
     def _hear(self, state: Any) -> None:
         """Take a LowState_."""

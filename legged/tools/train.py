@@ -316,7 +316,7 @@ def describe(cfg: TaskConfig, device: torch.device) -> str:
 
 
 def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}{'s' if count > 1 else ''}"
+    return f"{count} {noun}{'s' if count != 1 else ''}"
 
 
 def play_command(args: argparse.Namespace, cfg: TaskConfig, folder: Path) -> str:

@@ -127,7 +127,7 @@ class StandIn:
 
     def __init__(self, name, states=()):
         self.kind, self.structure = KINDS[name], COMMANDS[name]
-        self.states, self.sent, self.closed, self.taken, self.lets_go = list(states), [], False, False, True
+        self.states, self.sent, self.closed, self.taken, self.refusal = list(states), [], False, False, None
 
     def new_command(self):
         return plain(self.structure())
@@ -138,8 +138,8 @@ class StandIn:
             threading.Thread(target=heard, args=(state,)).start()
 
     def take_over(self):
-        if not self.lets_go:
-            raise RunError("still on")
+        if self.refusal is not None:
+            raise self.refusal
         self.taken = True
 
     def send(self, command):
@@ -311,10 +311,11 @@ def test_a_g1_with_fewer_joints_is_refused_before_anything_is_sent():
         assert not wire.taken  # it stands by its own controller, and goes on to
 
 
-def test_a_robot_that_keeps_its_controller_is_sent_nothing():
+@pytest.mark.parametrize("refusal", [RunError("still on"), KeyboardInterrupt()])
+def test_a_robot_that_keeps_its_controller_is_sent_nothing(refusal):
     wire = StandIn("go2", [state_of(KINDS["go2"], np.zeros(12), np.zeros(12))])
-    wire.lets_go = False
-    with pytest.raises(RunError, match="still on"):
+    wire.refusal = refusal
+    with pytest.raises(type(refusal)):
         UnitreeRobot("go2", wire)
     assert (wire.closed, wire.sent) == (True, [])
 

@@ -120,6 +120,22 @@ def test_a_robot_that_does_not_answer_is_not_said_to_keep_its_controller(monkeyp
         wire.take_over()
 
 
+def test_an_sdk_that_cannot_switch_controllers_is_refused_at_once(monkeypatch):
+    """Release 1.0.1 lacks `comm`; a simulator does without."""
+    Sdk(monkeypatch)
+    found = unitree.import_module
+
+    def without(name):
+        if name == unitree.SWITCHER:
+            raise ImportError(f"No module named '{name}'")
+        return found(name)
+
+    monkeypatch.setattr(unitree, "import_module", without)
+    with pytest.raises(ConfigError, match=r"SDK cannot be imported \(No module named .*motion_switcher.*\): pip install"):
+        SdkWire(KINDS["g1"], "eth0", 0)
+    SdkWire(KINDS["g1"], "lo", 1).take_over()
+
+
 def test_a_network_that_is_not_there_is_named(monkeypatch):
     Sdk(monkeypatch, joins=False)
     with pytest.raises(ConfigError, match=r"^--network: eth7: domain 0 cannot be joined \(channel factory init error"):
