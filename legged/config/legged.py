@@ -29,7 +29,7 @@ from legged.config.mdp import (
     TerminationsConfig,
 )
 from legged.config.randomization import DrawConfig, ForceConfig, KickConfig
-from legged.config.sensors import HeightMapConfig
+from legged.config.sensors import HeightLimitsConfig, HeightMapConfig
 from legged.config.task import TaskConfig
 
 MOTION = between(-100, 100)
@@ -293,9 +293,22 @@ class LeggedObservationsConfig(ObservationsConfig):
     heights_offset: float = field(default=0.5, metadata=carried("m", between(-100, 100)))
     """Observed heights are relative to this far below the base [m]."""
     heights_limit: float = field(default=1.0, metadata=carried("m", positive(100)))
-    """Observed heights are at most this large [m]."""
+    """Observed heights are at most this large, up or down [m]."""
+    depth_limit: float = field(default=0.0, metadata=carried("m", between(0, 100)))
+    """Low ground is observed at most this deep, if heights_limit is more; 0: heights_limit alone [m]."""
+    once_trained: HeightLimitsConfig = field(default_factory=HeightLimitsConfig)
+    """What a policy is told of heights in play, evaluation and export, if that is less than in training."""
     height_map: HeightMapConfig = field(default_factory=HeightMapConfig)
     """What is wrong with the map of heights, beside the noise of its points."""
+
+    @property
+    def deepest(self) -> float:
+        """How deep ground is observed at most [m]."""
+        return min(self.heights_limit, self.depth_limit or self.heights_limit)
+
+    def trained(self) -> Self:
+        limits, depths = self.once_trained, self.once_trained.depth_limit or self.depth_limit
+        return replace(self, heights_limit=limits.heights_limit or self.heights_limit, depth_limit=depths)
 
 
 @dataclass(frozen=True)

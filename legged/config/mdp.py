@@ -95,3 +95,7 @@ class ObservationsConfig:
     """Term -> share of the control steps in which it does not arrive: the numbers of the step before are seen again."""
     clip: float = field(default=100.0, metadata=positive(LARGEST))
     """Scaled observations are clipped at plus and minus this."""
+
+    def trained(self) -> Self:
+        """Return what a policy observes once it is trained: in play, evaluation and export."""
+        return self

@@ -25,3 +25,13 @@ class HeightMapConfig:
     lost: float = field(default=0.0, metadata=between(0, 1))
     """Share of the robots, drawn for each episode, whose map knows nothing at all, so that they have to walk as blind ones
     do. Success on terrain is measured with robots that have a map."""
+
+
+@dataclass(frozen=True)
+class HeightLimitsConfig:
+    """Limits of the term `heights` for a policy that is trained; 0: as in training. Training does not use them."""
+
+    heights_limit: float = field(default=0.0, metadata=carried("m", between(0, 100)))
+    """In place of observations.heights_limit [m]."""
+    depth_limit: float = field(default=0.0, metadata=carried("m", between(0, 100)))
+    """In place of observations.depth_limit [m]."""

@@ -1,7 +1,7 @@
 """The configuration of a task of any kind. A task class with sections of its own has a subclass of it as `Config`."""
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
 
 from legged.config.bounds import NAME
 from legged.config.learning import TrainConfig
@@ -36,6 +36,12 @@ class TaskConfig:
     """Free space for a user's own terms: `self.cfg.custom["name"]`."""
     origins: Origins = field(default_factory=Origins, repr=False, compare=False)
     """Who set what; no setting itself (`compare` says so), so neither read from files nor written to them."""
+
+    def trained(self) -> Self:
+        """Return the configuration in which a trained policy is shown and measured: with nothing drawn, and with what it is
+        to observe otherwise than in training.
+        """
+        return replace(self, domain_rand=self.domain_rand.nominal(), observations=self.observations.trained())
 
     @property
     def dt(self) -> float:

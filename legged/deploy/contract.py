@@ -54,6 +54,8 @@ class Term:
     """Observed heights are relative to this far below the base [m]."""
     limit: float
     """Observed heights are at most this large [m]."""
+    deepest: float
+    """Low ground is observed at most this deep [m]."""
     scan: str
     """What a point reads of a map of cells, one of `SCANS`."""
 
@@ -267,6 +269,7 @@ def _term(said: Mapping[str, Any]) -> Term:
         points=None if points is None else np.array(points, dtype=float).reshape(-1, 2),
         offset=float(said.get("offset", 0.0)),
         limit=float(said.get("limit", np.inf)),
+        deepest=float(said.get("deepest", said.get("limit", np.inf))),
         scan=str(said.get("scan", SCANS[0])),
     )
 

@@ -65,5 +65,5 @@ class Observer:
             return values[term.name]
         given = reading.sources[term.source]
         if term.source == "heights":
-            return np.clip(-given - term.offset, -term.limit, term.limit)
+            return np.clip(-given - term.offset, -term.limit, term.deepest)
         return given

@@ -142,15 +142,15 @@ class Terms:
         return self.actions
 
     def _obs_heights(self) -> Tensor:
-        """Base above ground, less an offset: clip(base_z - offset - ground_z, -limit, limit) at each of the points, which lie
-        in the yaw frame; base_z and ground_z in the world frame [m].
+        """Base above ground, less an offset: clip(base_z - offset - ground_z, -limit, deepest) at each of the points, which
+        lie in the yaw frame; base_z and ground_z in the world frame [m].
         """
         return self.heights_seen(self.measured_heights)
 
     def heights_seen(self, ground: Tensor) -> Tensor:
         """Return what the term `heights` is for a ground at (N, P) in the world [m]."""
-        offset, limit = self.cfg.observations.heights_offset, self.cfg.observations.heights_limit
-        return (self.base_pos[:, 2:3] - offset - ground).clamp(-limit, limit)
+        seen = self.cfg.observations
+        return (self.base_pos[:, 2:3] - seen.heights_offset - ground).clamp(-seen.heights_limit, seen.deepest)
 
     def _force(self, units: float) -> float:
         """Return a force in units of what counts as a contact of this robot's feet [N]."""

@@ -4,7 +4,6 @@ nothing can be drawn, the bodies' places as a stick figure.
 
 import base64
 import io
-from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -42,7 +41,7 @@ class Projector:
             ConfigError: that task is not there any more.
         """
         self.episodes = episodes
-        nominal = replace(cfg, domain_rand=cfg.domain_rand.nominal())
+        nominal = cfg.trained()
         alone = [("env.num_envs", 1), ("sim.physics", "mujoco"), ("sim.solver", "mujoco"), ("sim.threads", 1)]
         terrain = ground_of(cfg, episodes.about.get("ground"))
         self.task: BaseTask = make_task(override(nominal, alone), "cpu", False, terrain)

@@ -113,7 +113,7 @@ def differences(here: TaskConfig, there: TaskConfig, terms: Iterable[str]) -> li
     if "heights" in terms and isinstance(here, LeggedConfig) and isinstance(there, LeggedConfig):
         for name in ("measured_points_x", "measured_points_y", "scan"):
             pairs[f"terrain.{name}"] = (getattr(here.terrain, name), getattr(there.terrain, name))
-        for name in ("heights_offset", "heights_limit"):
+        for name in ("heights_offset", "heights_limit", "depth_limit"):
             pairs[f"observations.{name}"] = (getattr(here.observations, name), getattr(there.observations, name))
     return [f"{name} {_shown(theirs)} there, {_shown(ours)} here" for name, (ours, theirs) in pairs.items() if ours != theirs]
 

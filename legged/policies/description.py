@@ -150,6 +150,7 @@ def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any], 
         points = [[round(value, 6) for value in point] for point in task.height_scan.points.tolist()]
         legged = task.cfg.observations
         entry |= {"points": points, "offset": legged.heights_offset, "limit": legged.heights_limit}
+        entry["deepest"] = legged.deepest
         entry["scan"] = task.cfg.terrain.scan
     if isinstance(task, LeggedRobot) and term.name in ("passive_pos", "passive_vel") and task.robot.passive is not None:
         entry |= {"joints": list(task.robot.passive.names), "default": task.passive_default_pos.tolist()}

@@ -22,7 +22,7 @@ def for_episodes(policy: TrainedPolicy, episodes: int) -> tuple[TrainedPolicy, l
     noise. What is logged of a rollout comes once, at the end.
     """
     cfg = policy.cfg
-    calm = replace(policy, cfg=replace(cfg, domain_rand=cfg.domain_rand.nominal()))
+    calm = replace(policy, cfg=cfg.trained())
     steps = round(cfg.env.episode_length_s / cfg.dt)
     return calm, [
         ("env.num_envs", episodes),

@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +116,7 @@ def nominal(cfg: TaskConfig, changes: Iterable[tuple[str, Any]]) -> TaskConfig:
         ConfigError: the changes do not fit it.
     """
     few_robots_do = ("train.algorithm.num_mini_batches", 1)  # nothing is trained
-    cfg = override(replace(cfg, domain_rand=cfg.domain_rand.nominal()), [*changes, few_robots_do])
+    cfg = override(cfg.trained(), [*changes, few_robots_do])
     task_class(cfg.task).check(cfg)
     return cfg
 

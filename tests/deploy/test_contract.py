@@ -210,11 +210,12 @@ def reading_of(task, robot, sources):
     ("name", "changes"),
     [
         ("anymal_c", SMALL_TERRAIN),
+        ("anymal_c", [*SMALL_TERRAIN, ("observations.depth_limit", 0.02), ("observations.heights_limit", 0.04)]),
         ("anymal_c_proprio", SMALL_TERRAIN),
         ("anymal_c_flat", [("train.policy.rnn_type", "lstm"), ("train.policy.rnn_num_layers", 2)]),
         ("anymal_c_flat", [("train.policy.rnn_type", "gru"), ("control.held", ["HAA"])]),
     ],
-    ids=["height map", "history", "LSTM", "GRU, held joints"],
+    ids=["height map", "shallow height map", "history", "LSTM", "GRU, held joints"],
 )
 def test_the_program_sees_and_does_what_the_tasks_policy_does(name, changes, tmp_path):
     """Observations to 2e-5 in their scaled units, and actions to 1e-5, over an episode's first steps."""

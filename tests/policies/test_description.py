@@ -85,7 +85,7 @@ class Controller:
                 turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
                 points = state["position"][:2] + np.array(term["points"]) @ turn.T
                 below = state["position"][2] - term["offset"] - np.array([ground(*point) for point in points])
-                return np.clip(below, -term["limit"], term["limit"])
+                return np.clip(below, -term["limit"], term["deepest"])
         raise AssertionError(term["name"])
 
     def torques(self, state):
@@ -196,6 +196,7 @@ def test_every_shipped_term_has_a_formula_and_a_unit():
     heights = terms["heights"]
     larger = 1.008025 / 0.548820  # than ANYmal C, for which the task is written
     assert (heights["offset"], heights["limit"]) == pytest.approx((0.5 * larger, 1.0 * larger), rel=1e-4)
+    assert heights["deepest"] == heights["limit"]
     assert len(heights["points"]) == 187
     assert heights["points"][1] == pytest.approx([-0.8 * larger, -0.4 * larger], rel=1e-4)
     assert "(0, 0, -1) when the base is level" in terms["projected_gravity"]["formula"]

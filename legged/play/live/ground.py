@@ -1,7 +1,7 @@
 """The task that a live view simulates: a few undisturbed robots, on the ground that somebody chose."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -83,7 +83,7 @@ def build(
     Raises:
         ConfigError: the configuration can't be built, or tiles are too small.
     """
-    nominal = replace(cfg, domain_rand=cfg.domain_rand.nominal())
+    nominal = cfg.trained()
     few_robots_do = ("train.algorithm.num_mini_batches", 1)  # nothing is trained
     changed = override(nominal, [*changes, few_robots_do])
     if not isinstance(changed, LeggedConfig) or ground.kind == PLANE or len(grounds_of(cfg)) == 1:
