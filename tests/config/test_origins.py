@@ -63,7 +63,7 @@ def test_a_configuration_knows_its_origins_but_they_are_no_setting(mine):
     assert cfg.origins.of("env.num_envs") == str(path)
     assert cfg.origins.of("terrain.proportions.gap") == cfg.origins.of("env.seed") == "the default"
     assert cfg.origins.of("terrain.mesh_type") == str(ROUGH)
-    assert cfg.origins.of("rewards.scales") == f"{BASES / 'quadruped_flat.yaml'}, {ROUGH}"
+    assert cfg.origins.of("rewards.scales") == f"{ROUGH}, {BASES / 'quadruped_flat.yaml'}"
     assert override(cfg, [("env.seed", 3)]).origins.of("env") == f"{path}, command line"
     assert cfg.origins.of("env") == str(path)  # the original is left alone
     assert "origins" not in to_dict(cfg)

@@ -42,7 +42,7 @@ def test_a_trained_policy_is_told_less_of_depth_than_in_training():
         return cfg.observations.heights_limit, cfg.observations.deepest
 
     training = config(("observations.once_trained", {"heights_limit": 0.17, "depth_limit": 0.07}))
-    assert limits(training) == (1.0, 1.0)
+    assert limits(training) == (0.35, 0.35)
     assert limits(nominal(training, [])) == (0.17, 0.07)
     assert limits(nominal(nominal(training, []), [])) == (0.17, 0.07)  # the pages of episodes do it twice
     assert limits(nominal(training, [("observations.depth_limit", 0.1)])) == (0.17, 0.1)
@@ -50,4 +50,4 @@ def test_a_trained_policy_is_told_less_of_depth_than_in_training():
         ("observations.once_trained", {"heights_limit": 0.0, "depth_limit": 0.0}),
         ("observations.depth_limit", 0.2),
     )
-    assert limits(nominal(same, [])) == limits(same) == (1.0, 0.2)
+    assert limits(nominal(same, [])) == limits(same) == (0.35, 0.2)

@@ -250,7 +250,9 @@ def test_tiles_are_apart_from_each_other_and_random_ones_differ(monkeypatch):
 
 def test_the_policy_sees_what_it_saw_in_training():
     """The same points, scales and noise; what is changed is the ground, not the observation."""
-    exact = [(f"observations.height_map.{error}", 0.0) for error in ("offset", "shift", "drift", "shift_drift", "holes")]
+    exact = [
+        (f"observations.height_map.{error}", 0.0) for error in ("offset", "shift", "drift", "shift_drift", "holes", "lost")
+    ]
     cfg = task_config("anymal_c", [("env.num_envs", 2), *exact, *ENGINE], on_cpu=True)
     changed = override(cfg, [*undisturbed(2, 20.0), *on_terrain(cfg, 8.0, 0.1), ("observations.add_noise", True)])
     task = make_task(changed, terrain=tiles_of_sizes("pit", [0.4], changed.terrain, 1))
@@ -258,10 +260,10 @@ def test_the_policy_sees_what_it_saw_in_training():
     seen = task.reset()
     heights = seen["critic"][:, 48:]
     assert heights.shape == (2, 187)
-    # The pit is 4 m wide: all that is measured lies on its floor, and the base 0.6 m above; scaled by 5.
-    assert heights.flatten().tolist() == pytest.approx([5.0 * (0.6 - 0.5)] * 374, abs=1e-3)
+    # The pit is 4 m wide: all that is measured lies on its floor, and the base 0.6 m above; scaled by 2.5.
+    assert heights.flatten().tolist() == pytest.approx([2.5 * (0.6 - 0.5)] * 374, abs=1e-3)
     noise = seen["actor"][:, 48:] - heights
-    assert 0.4 < noise.abs().max() <= 0.501  # 5 times U(-0.1, 0.1)
+    assert 0.2 < noise.abs().max() <= 0.2501  # 2.5 times U(-0.1, 0.1)
 
 
 def test_configuration_of_the_tasks(monkeypatch, capsys):

@@ -114,16 +114,16 @@ def test_a_rollout_is_that_of_rsl_rl(kind):
 
 
 def test_a_student_is_trained_logged_played_and_exported(capsys):
-    folder = student(iterations=4)
-    saved = content(folder, 3)
+    folder = student(iterations=8)
+    saved = content(folder, 7)
     assert "critic_state_dict" not in saved
     assert saved["infos"]["teacher"]["task"] == TASK
     cfg = run_config(folder)
     assert cfg.train.distillation.teacher == TASK
     assert [*cfg.observations.groups] == ["actor", "critic"], "a policy is played without what its teacher saw"
     losses = read_scalars(folder)["Loss/behavior"][1]
-    assert len(losses) == 4
-    assert losses[-1] < losses[0]
+    assert len(losses) == 8
+    assert losses[-4:].mean() < losses[:4].mean()
     capsys.readouterr()
     flags = ["--task", "anymal_c_student", "--load_run", str(folder), "--sim_device", "cpu", "--headless", "--no-video"]
     assert call(play.main, flags) == 0

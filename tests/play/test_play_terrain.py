@@ -21,7 +21,16 @@ from legged.registry import make_task, task_config
 from legged.terrain import TERRAIN_TYPES
 from legged.tools import play
 
-TYPES = ["slope_up", "slope_down", "rough_slope_up", "rough_slope_down", "stairs_up", "stairs_down", "obstacles"]
+TYPES = [
+    "slope_up",
+    "slope_down",
+    "rough_slope_up",
+    "rough_slope_down",
+    "stairs_up",
+    "stairs_down",
+    "obstacles",
+    "random_grid",
+]
 
 
 def config(name: str = "anymal_c") -> TaskConfig:
@@ -66,11 +75,11 @@ def test_a_task_on_terrain_is_shown_on_each_of_its_types_once():
     assert back["obstacles"] == pytest.approx(0.05 + 0.2 * 0.8)
     terrain = ground.build(override(cfg, [*SETTING, *ground.changes(cfg)]))
     assert list(terrain.types) == TYPES
-    assert terrain.origins.shape == (2, 7, 3)
+    assert terrain.origins.shape == (2, 8, 3)
     assert terrain.border == 3.0
     # The types that training has most of come first.
-    assert [TYPES[column] for column in ground.columns(3)] == ["stairs_up", "stairs_down", "obstacles"]
-    assert sorted(ground.columns(7)) == list(range(7))
+    assert [TYPES[column] for column in ground.columns(3)] == ["stairs_up", "stairs_down", "slope_up"]
+    assert sorted(ground.columns(8)) == list(range(8))
 
 
 def test_difficulty_alone_is_that_of_all_types():
@@ -131,16 +140,16 @@ def test_a_task_on_steps_has_the_constraint_rows_that_play_gives_to_others():
 
 def test_robots_start_on_their_tiles_and_face_along_x():
     ground = playground(config())
-    task = on(ground, config(), num_envs=9)
+    task = on(ground, config(), num_envs=10)
     assert task.terrain is not None
-    middles = torch.tensor(task.terrain.origins[0], dtype=torch.float32)[ground.columns(9)]
+    middles = torch.tensor(task.terrain.origins[0], dtype=torch.float32)[ground.columns(10)]
     assert ((task.base_pos - middles)[:, :2].abs() <= 0.3).all()
     assert (task.base_pos[:, 2] > middles[:, 2] + 0.3).all()
     assert yaw_of(task.base_quat).abs().max() < 1e-5
     names = [ground.label(task.terrain, pos).split(",")[0] for pos in task.base_pos.tolist()]
-    assert names[:3] == ["stairs_up", "stairs_down", "obstacles"]
-    assert set(names[:7]) == set(TYPES)
-    assert names[7:] == names[:2]
+    assert names[:3] == ["stairs_up", "stairs_down", "slope_up"]
+    assert set(names[:8]) == set(TYPES)
+    assert names[8:] == names[:2]
     ground.place(task, shift=1)
     task.reset()
     assert ground.label(task.terrain, task.base_pos[0].tolist()).startswith("stairs_down, step height 0.14")
@@ -174,17 +183,17 @@ def test_robots_are_asked_to_walk_along_x_and_are_counted_by_type(monkeypatch, h
     monkeypatch.setattr(outing, "EPISODE_S", 0.1)
     cfg = override(config(), [("commands.heading_command", heading), ("commands.ranges.lin_vel_x", [-1.0, 0.5])])
     ground = playground(cfg)
-    task = on(ground, cfg, num_envs=8)
+    task = on(ground, cfg, num_envs=9)
     seen = []
 
     def act(observations) -> torch.Tensor:
         seen.append(task.commands.clone())
-        return torch.zeros(8, 12)
+        return torch.zeros(9, 12)
 
     table = outing.walk_out(task, act, ground, video.Video(task, 1, None))
     assert len(seen) == 2 * 5
     commands = torch.stack(seen)
-    torch.testing.assert_close(commands[..., 0], torch.full((10, 8), 0.5))  # what the task was trained on
+    torch.testing.assert_close(commands[..., 0], torch.full((10, 9), 0.5))  # what the task was trained on
     assert (commands[..., 1] == 0.0).all()
     turning = commands[1:5, :, 2].abs().max() > 0  # robots start with a random yaw rate; steered back to heading 0
     assert bool(turning) == heading

@@ -48,7 +48,7 @@ def test_n_goes_on_to_the_next_tile(capsys):
     torch.set_num_threads(1)
     task = make_task(cfg, terrain=playground.build(cfg))
     keyboard = Keyboard([-1.0] * 3, [1.0] * 3)
-    for tile in ("stairs_up", "stairs_down", "obstacles"):
+    for tile in ("stairs_up", "stairs_down", "slope_up"):
         begin_anew(task, playground, keyboard)
         assert not keyboard.restart
         assert capsys.readouterr().out.startswith(f"{tile}, ")

@@ -195,7 +195,7 @@ def test_every_shipped_term_has_a_formula_and_a_unit():
     assert terms["passive_pos"]["default"][:2] == pytest.approx([0.0, 1.4214], abs=1e-3)
     heights = terms["heights"]
     larger = 1.008025 / 0.548820  # than ANYmal C, for which the task is written
-    assert (heights["offset"], heights["limit"]) == pytest.approx((0.5 * larger, 1.0 * larger), rel=1e-4)
+    assert (heights["offset"], heights["limit"]) == pytest.approx((0.5 * larger, 0.35 * larger), rel=1e-4)
     assert heights["deepest"] == heights["limit"]
     assert len(heights["points"]) == 187
     assert heights["points"][1] == pytest.approx([-0.8 * larger, -0.4 * larger], rel=1e-4)

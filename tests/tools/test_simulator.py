@@ -106,6 +106,8 @@ def test_its_sensors_and_sources_measure_what_the_tasks_do(name):
     task.reset()
     simulated = SimulatedRobot(task.robot, task.terrain, SimConfig(dt=0.005), scan=task.cfg.terrain.scan)
     points = task.height_scan.points.double().numpy()
+    if rough:
+        assert np.ptp(task.measured_heights.numpy(), axis=1).any(), "somebody stands before a step"
     for robot in range(3):
         simulated.data.qpos[:], simulated.data.qvel[:] = task.physics._qpos[robot], task.physics._qvel[robot]
         state = simulated.state({"base_lin_vel": None, "heights": points})
@@ -119,7 +121,6 @@ def test_its_sensors_and_sources_measure_what_the_tasks_do(name):
             measured = task.measured_heights[robot].numpy()
             same = np.abs(state.sources["heights"] + height - measured) < 1e-4
             assert same.mean() > 0.98, "a point on the edge between two cells may belong to either"
-            assert np.ptp(measured) > 0.0 or robot > 0
         else:
             np.testing.assert_allclose(state.sources["heights"], -height, atol=1e-5)
 

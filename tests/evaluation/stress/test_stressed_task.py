@@ -148,7 +148,7 @@ def test_only_those_are_pushed_who_should_be(monkeypatch):
 
 def on_steps(*rows):
     """Robots at the bottom of stairs, which their maps show once they are near."""
-    exact = [("observations.add_noise", True), ("observations.noise_level", 0.0)]
+    exact = [("observations.add_noise", True), ("observations.noise_level", 0.0), ("observations.heights_limit", 1.0)]
     cfg = task_config("anymal_c", [("env.num_envs", len(rows)), *ENGINE, *CALM, *AT_REST, *exact], on_cpu=True)
     cfg = override(cfg, [*on_terrain(cfg, 8.0, 0.0), *declared(rows)])
     terrain = Terrain.of_tiles([[TileSpec("stairs_up", 0.2, tread=0.3)]], cfg.terrain, None)
