@@ -218,11 +218,8 @@ def test_no_run_at_all(fails, monkeypatch, main, flag):
 
 
 def test_no_run_of_a_task_without_a_shipped_policy(fails):
-    fails(
-        play.main,
-        ["--task", "anymal_c_student_ppo", "--no-video"],
-        "logs/anymal_c_student_ppo, and the package has no policy",
-    )
+    Path("never_trained.yaml").write_text("extends: anymal_c_flat\n")
+    fails(play.main, ["--task", "never_trained.yaml", "--no-video"], "logs/never_trained, and the package has no policy")
 
 
 @pytest.mark.parametrize(("main", "flag"), LOADING)
