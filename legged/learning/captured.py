@@ -3,6 +3,8 @@
 import math
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +16,27 @@ from legged.envs import BaseTask
 from legged.graph.step_graph import StepGraph
 from legged.learning.display import Display
 from legged.learning.estimator import EstimatingModel, EstimationErrors
+from legged.learning.evaluations import Ended
+from legged.learning.logger import Interrupted
 from legged.learning.ppo import DevicePPO
+from legged.learning.reading import Reading
 from legged.learning.rollout import Rollout, Steps
 from legged.learning.runner import Runner
 from legged.learning.update_threads import UpdateThreads
+from legged.learning.watch import Diverged
 from legged.process.cores import available_cores
 from legged.process.ranks import Ranks
 from legged.process.startup import stage_ended
 
 ROLLOUTS_TO_WARM_UP = 1
 """Steps have been warmed up when the task was built."""
+LOGGED = "log/"
+"""How the names of what a task logs begin in a reading."""
 
 
 class CapturedRunner(Runner):
-    """As Runner, with the host out of the loop: it launches, and reads what is logged once an iteration.
+    """As Runner, with the host out of the loop: it launches, and reads what is logged once an iteration. On a GPU it launches
+    an iteration before it logs the last one, so that the device never waits for the log.
 
     Checkpoints, configuration and logs are those of Runner, and so is `learn` where a feature needs it (`why_stock`).
     """
@@ -69,22 +78,42 @@ class CapturedRunner(Runner):
         threads = UpdateThreads(self.env.cfg.sim.threads or available_cores() // Ranks.now().local_count)
         first = self.current_learning_iteration
         total = first + num_learning_iterations
+        clock: Clock | None = None
+        unlogged: Made | None = None
         for iteration in range(first, total):
-            clock = Clock(torch.device(self.device))
+            clock = Clock(torch.device(self.device), clock)
             collect()
             clock.lap()
             with threads.use():
                 (update_critic if iteration < warmup else update)()
             clock.lap()
             self.current_learning_iteration = iteration
-            self._log(iteration, first, total, rollout, clock)
+            made = Made(iteration, first, total, self._read(rollout), clock)
+            if unlogged is not None:
+                self._log_before(unlogged, made)
+            unlogged = made
+            saves = self.logger.writer is not None and iteration % self.cfg["save_interval"] == 0
+            evaluates = self.evaluations is not None and self.evaluations.may_be_due(iteration + 1, total)
+            # The one before the last is not left for later: who asks to stop then does so before the training is complete.
+            if not self._runs_ahead or saves or evaluates or iteration == first or iteration + 2 >= total:
+                self._log(made)
+                unlogged = None
             if iteration == first:
                 stage_ended("first iteration")
-            if self.logger.writer is not None and iteration % self.cfg["save_interval"] == 0:
+            if saves:
                 self.save(str(Path(self.logger.log_dir) / f"model_{iteration}.pt"))
+            if saves or evaluates:
+                clock = None  # what they take is no time of an iteration
         if self.logger.writer is not None:
             self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
             self.logger.stop_logging_writer()
+
+    @property
+    def _runs_ahead(self) -> bool:
+        """Whether the next iteration is launched before one is logged. Several processes log in step, because the log asks
+        all of them whether to stop.
+        """
+        return torch.device(self.device).type == "cuda" and not self.is_distributed
 
     def _steps(self) -> Steps:
         """Return what makes the steps of an iteration."""
@@ -123,28 +152,54 @@ class CapturedRunner(Runner):
     def _episodes(self) -> dict[str, Tensor]:
         return super()._episodes() if self._rollout is None else self._rollout.episodes
 
-    def _log(self, iteration: int, first: int, total: int, rollout: Steps, clock: "Clock") -> None:
-        """Read what is logged, which waits for the iteration to end."""
-        logger = self.logger
-        ended, returns, lengths, squares = rollout.ended.tolist()
+    def _read(self, rollout: Steps) -> Reading:
+        """Ask for what is logged of the iteration that was just launched."""
+        logged = self.env.log_rollout() if self.logger.writer is not None else {}
+        named = {LOGGED + name: value for name, value in logged.items()}
+        return Reading({"ended": rollout.ended, **self.alg.outcome(), **named})
+
+    def _log_before(self, made: "Made", following: "Made") -> None:
+        """Log an iteration while the device computes the `following` one; if training ends here, log that one too, because
+        the networks have learned from it.
+
+        Raises:
+            Interrupted: the training was asked to stop.
+            Diverged: numbers have been NaN or infinite for too long.
+        """
+        try:
+            self._log(made)
+        except Interrupted:
+            with suppress(Interrupted, Ended):
+                self._log(following)
+            raise
+        except Diverged:
+            self.current_learning_iteration = made.iteration
+            raise
+
+    def _log(self, made: "Made") -> None:
+        """Log an iteration; waits for it to end."""
+        logger, numbers = self.logger, made.reading.numbers()
+        ended, returns, lengths, squares = numbers.pop("ended")
         if ended:
             logger.return_std = math.sqrt(squares / ended)
             logger.rewbuffer.clear()
             logger.rewbuffer.append(returns / ended)
             logger.lenbuffer.clear()
             logger.lenbuffer.append(lengths / ended)
-        if logger.writer is not None:
-            logger.ep_extras.append(self.env.log_rollout())
-        collect_s, learn_s = clock.seconds()
+        losses, std = self.alg.losses(numbers.pop("losses")), torch.tensor(numbers.pop("std"))
+        rate = numbers.pop("rate")[0] if "rate" in numbers else self.alg.learning_rate
+        if numbers:
+            logger.ep_extras.append({name.removeprefix(LOGGED): torch.tensor(value) for name, (value,) in numbers.items()})
+        collect_s, learn_s = made.clock.seconds()
         logger.log(
-            it=iteration,
-            start_it=first,
-            total_it=total,
+            it=made.iteration,
+            start_it=made.first,
+            total_it=made.total,
             collect_time=collect_s,
             learn_time=learn_s,
-            loss_dict=self.alg.losses(),
-            learning_rate=self.alg.learning_rate,
-            action_std=self.alg.action_std().detach(),
+            loss_dict=losses,
+            learning_rate=rate,
+            action_std=std,
             rnd_weight=None,
         )
 
@@ -160,11 +215,12 @@ def copies(tensors: Iterable[Tensor]) -> list[Tensor]:
 class Clock:
     """Times of laps on a device; on a GPU measured there, without making anything wait."""
 
-    def __init__(self, device: torch.device) -> None:
-        """Start at once."""
+    def __init__(self, device: torch.device, before: "Clock | None" = None) -> None:
+        """Start at once, or where the clock `before` ended, so that what was done meanwhile counts as well."""
         self._cuda = device.type == "cuda"
-        self._marks: list[Any] = []
-        self.lap()
+        self._marks: list[Any] = [] if before is None else before._marks[-1:]
+        if before is None:
+            self.lap()
 
     def lap(self) -> None:
         """End a lap."""
@@ -182,3 +238,17 @@ class Clock:
             return [end - start for start, end in pairs]
         self._marks[-1].synchronize()
         return [1e-3 * start.elapsed_time(end) for start, end in pairs]
+
+
+@dataclass(frozen=True)
+class Made:
+    """An iteration that was launched, and what is to be logged of it."""
+
+    iteration: int
+    first: int
+    """The training's first iteration."""
+    total: int
+    """Iterations there will be in the end, with those of the run that this one goes on from."""
+    reading: Reading
+    clock: Clock
+    """Of its rollout and its update."""

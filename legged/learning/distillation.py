@@ -1,6 +1,7 @@
 """rsl-rl's distillation, updated without a host read: the student acts, the teacher says what it would have done."""
 
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -90,9 +91,15 @@ class DeviceDistillation(Distillation):
         if self.student.obs_normalization:
             update_normalizer(self.student.obs_normalizer, inputs.flatten(0, 1))
 
-    def losses(self) -> dict[str, float]:
-        """Return the mean loss of a step in the last update, read from the device like `left_out`; NaN if none was taken."""
-        loss, taken = self._losses.tolist()
+    def outcome(self) -> dict[str, Tensor]:
+        """Return what an update leaves on the device to be read: `losses` (2,), and `std` (D,) of the actions."""
+        return {"losses": self._losses, "std": self.action_std()}
+
+    def losses(self, numbers: Sequence[float] | None = None) -> dict[str, float]:
+        """Return the mean loss of a step from the `numbers` of an update's outcome, and take `left_out` from them; read from
+        the device, of the last update, where none are given. NaN if none was taken.
+        """
+        loss, taken = self._losses.tolist() if numbers is None else numbers
         self.left_out = 1.0 - taken
         return {"behavior": loss}
 

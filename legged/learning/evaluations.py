@@ -71,13 +71,17 @@ class Evaluations:
         self.listener: Callable[[Evaluated], str] | None = None
         """Is told of every evaluation, and may say why training should end."""
 
+    def may_be_due(self, iterations: int, total: int) -> bool:
+        """Return whether to ask `due` after so many `iterations` of `total`: at every interval, and at the end."""
+        return iterations == total or iterations % self._runner.evaluate_interval == 0
+
     def due(self, iterations: int, total: int, loop_s: float) -> bool:
         """Return whether to evaluate after so many `iterations` of `total`, which have taken `loop_s` [s]: at every interval,
         if there is time for it and for the last one, and at the end.
         """
         if iterations == total:
             return True
-        if iterations % self._runner.evaluate_interval:
+        if not self.may_be_due(iterations, total):
             return False
         share = self._runner.evaluate_share
         return share >= 1.0 or not self.history or self.spent_s + 2.0 * self._last_s <= share * loop_s

@@ -29,6 +29,8 @@ class Interrupted(Exception):
 class QuietLogger(Logger):
     """Logs iterations; at the end of one, training stops here if that was asked for, or if it can't go on."""
 
+    device: str
+
     def __init__(self, *args: Any, display: Display | None = None, left_out: Callable[[], float], **kwargs: Any) -> None:
         """`left_out` gives the share of the last update's mini-batches that changed nothing."""
         super().__init__(*args, **kwargs)
@@ -106,8 +108,12 @@ class QuietLogger(Logger):
         losses = {name: loss for name, loss in given.items() if name not in estimated} | ({} if kl is None else {"kl": kl})
         losses = {name: loss for name, loss in losses.items() if math.isfinite(loss)}
         self._log_return_std(it)
-        with contextlib.redirect_stdout(io.StringIO()):
-            super().log(it, start_it, total_it, collect_time, learn_time, loss_dict=losses, **kwargs)
+        device, self.device = self.device, "cpu"  # of numbers that are on the host already: no launch for each of them
+        try:
+            with contextlib.redirect_stdout(io.StringIO()):
+                super().log(it, start_it, total_it, collect_time, learn_time, loss_dict=losses, **kwargs)
+        finally:
+            self.device = device
         self.ep_extras.clear()  # rsl-rl leaves them where nothing is written, as in all processes but the first
         self.watch.judge(values, left_out)
         self.latest = names | {name: value for name, value in self.latest.items() if not name.startswith(FAULT)} | values

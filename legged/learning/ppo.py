@@ -1,6 +1,7 @@
 """rsl-rl's PPO, updated without a host read: the same losses and steps, in closed form, on data shuffled once."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -182,11 +183,19 @@ class DevicePPO(CriticWarmup):
         self._losses[-1:] /= self.num_learning_epochs * self.num_mini_batches
         self._update_normalizers()
 
-    def losses(self) -> dict[str, float]:
-        """Mean losses of the last update, read from the device, as is `left_out`; NaN if no mini-batch had any. Beside them
-        the root mean square errors of the estimates by term, `Estimator/<term>_rmse`, each in the term's unit.
+    def outcome(self) -> dict[str, Tensor]:
+        """What an update leaves on the device to be read: `losses` (K,), of which `losses` makes sense, `std` (D,) of the
+        actions, and the learning `rate` ().
         """
-        *losses, taken = self._losses.tolist()
+        rate = {} if self._rate is None else {"rate": self._rate}
+        return {"losses": self._losses, "std": self.action_std(), **rate}
+
+    def losses(self, numbers: Sequence[float] | None = None) -> dict[str, float]:
+        """Mean losses of an update from the `numbers` of its outcome, as is `left_out`; read from the device, of the last
+        update, where none are given. NaN if no mini-batch had any. Beside them the root mean square errors of the estimates
+        by term, `Estimator/<term>_rmse`, each in the term's unit.
+        """
+        *losses, taken = self._losses.tolist() if numbers is None else numbers
         self.left_out = 1.0 - taken
         terms = self._errors.names if self._errors else ()
         squares = [losses.pop() for _ in terms][::-1]

@@ -29,9 +29,9 @@ class Timing:
     start_up_s: float
     """Until everything was built: imports, and kernels where they were compiled [s]."""
     loop_s: float
-    """In iterations [s]."""
+    """In iterations, one after the other, with what is logged of them; of rsl-rl's own loop without [s]."""
     wall_s: float
-    """From the start of the process to here: beside the two above, capturing the training, checkpoints and logs [s]."""
+    """From the start of the process to here: beside the two above, capturing the training, checkpoints and evaluations [s]."""
     device: str
     kernels_compiled: int
     """Modules of Warp's kernels that its cache lacked."""

@@ -255,6 +255,17 @@ def test_laps_are_timed(monkeypatch):
     assert clock.seconds() == [3.0, 0.5]
 
 
+def test_a_clock_that_follows_another_counts_what_was_done_between_them(monkeypatch):
+    now = iter([10.0, 13.0, 17.0, 18.0])
+    monkeypatch.setattr(captured_module.time, "perf_counter", lambda: next(now))
+    before = Clock(torch.device("cpu"))
+    before.lap()
+    after = Clock(torch.device("cpu"), before)
+    after.lap()
+    after.lap()
+    assert (before.seconds(), after.seconds()) == ([3.0], [4.0, 1.0])
+
+
 def test_a_snapshot_leaves_no_gradient_node_alive():
     # It is taken on one CUDA stream and the update captured on another; see captured.copies.
     parameter = torch.nn.Parameter(torch.ones(3))

@@ -111,10 +111,10 @@ def test_the_table_has_the_numbers_of_the_log():
 def test_a_training_that_raises_leaves_a_report_that_says_so(monkeypatch):
     log = CapturedRunner._log
 
-    def fail(self, iteration, *rest):
-        if iteration == 1:
+    def fail(self, made):
+        if made.iteration == 1:
             raise RuntimeError("no <good>")
-        log(self, iteration, *rest)
+        log(self, made)
 
     monkeypatch.setattr(CapturedRunner, "_log", fail)
     with pytest.raises(RuntimeError, match="good"):

@@ -133,7 +133,7 @@ def _facts(record: Record) -> list[list[Cell]]:
             "time to start": f"{timing.start_up_s:.1f} s (imports, task{compiled or ', no kernels compiled'})",
             "time to train": f"{timing.loop_s:.1f} s ({timing.steps_per_s:,.0f} steps/s)",
             "time to evaluate": f"{timing.evaluation_s:.1f} s" if timing.evaluation_s else None,
-            "time for the rest": f"{rest_s:.1f} s (graphs captured, checkpoints, logs); {timing.wall_s:.1f} s in all",
+            "time for the rest": f"{rest_s:.1f} s (graphs captured, checkpoints); {timing.wall_s:.1f} s in all",
         }
     elif record.scalars:
         seconds, _ = _loop_time(record.scalars)

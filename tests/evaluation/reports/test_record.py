@@ -53,9 +53,9 @@ def test_a_run_that_came_to_its_end():
 def test_a_training_that_raises_says_why_it_ended(monkeypatch):
     log = CapturedRunner._log
 
-    def fail(self, iteration, *rest):
-        log(self, iteration, *rest)
-        if iteration == 2:
+    def fail(self, made):
+        log(self, made)
+        if made.iteration == 2:
             raise RuntimeError("the floor\nis lava")
 
     monkeypatch.setattr(CapturedRunner, "_log", fail)
