@@ -31,7 +31,7 @@ class Timing:
     loop_s: float
     """In iterations, one after the other, with what is logged of them; of rsl-rl's own loop without [s]."""
     wall_s: float
-    """From the start of the process to here: beside the two above, capturing the training, checkpoints and evaluations [s]."""
+    """From the start of the process to here: beside the two above, graphs captured, checkpoints and evaluations [s]."""
     device: str
     kernels_compiled: int
     """Modules of Warp's kernels that its cache lacked."""
