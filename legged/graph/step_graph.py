@@ -1,5 +1,6 @@
 """The control step as one CUDA graph, and the guard that keeps it capturable on machines without a GPU."""
 
+import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -36,6 +37,20 @@ class Branch:
         """Let what follows wait for the block."""
         if self._stream is not None:
             torch.cuda.current_stream(self._stream.device).wait_stream(self._stream)
+
+
+@contextmanager
+def garbage_kept() -> Iterator[None]:
+    """Let nothing in reference cycles be freed within the block. A task of before may have left its CUDA graph in one, and to
+    free a graph is a call that CUDA forbids during a capture: the capture in progress would be lost.
+    """
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
 
 
 class StepGraph:
@@ -106,7 +121,7 @@ class StepGraph:
         failure: Exception | None = None
         try:
             # Torch owns the capture; Warp is told of it, so that the solver's loop becomes a conditional node.
-            with torch.cuda.graph(graph, stream=stream, capture_error_mode=error_mode):
+            with garbage_kept(), torch.cuda.graph(graph, stream=stream, capture_error_mode=error_mode):
                 warp_stream = wp.stream_from_torch(torch.cuda.current_stream(device))
                 with wp.ScopedStream(warp_stream, sync_enter=False), wp.ScopedCapture(stream=warp_stream, external=True):
                     try:

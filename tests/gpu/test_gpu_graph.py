@@ -1,5 +1,6 @@
 """The step as a CUDA graph: what is replayed is what would have been run, and what cannot be captured is named."""
 
+import gc
 import subprocess
 import sys
 from pathlib import Path
@@ -41,6 +42,28 @@ class Walk:
         self.place.copy_(torch.tanh(self.place @ self.matrix) + self.noise)
         self.place[:, [3, 5]] += weights * torch.rand(256, 2, device=DEVICE)
         self.count.add_(1)
+
+
+def test_an_old_graph_in_a_cycle_does_not_break_the_next_capture():
+    """A task that was dropped is freed when Python's collector runs next, perhaps while another's step is recorded."""
+    old = StepGraph(Walk().step, DEVICE, enabled=True)
+    old.cycle = old  # type: ignore[attr-defined]
+    walk, thresholds = Walk(), gc.get_threshold()
+
+    def littering() -> None:
+        walk.step()
+        if torch.cuda.is_current_stream_capturing():
+            gc.set_threshold(1, 1, 1)  # the collector would run with every list
+        for _ in range(200):
+            cycle: list[object] = []
+            cycle.append(cycle)
+
+    gc.set_threshold(10**9)  # the rehearsals free nothing
+    try:
+        del old
+        assert StepGraph(littering, DEVICE, enabled=True).captured
+    finally:
+        gc.set_threshold(*thresholds)
 
 
 def test_replays_are_eager_calls_with_the_same_random_numbers():

@@ -1,5 +1,7 @@
 """The step as one function that a CUDA graph can hold, and the real step under the guard."""
 
+import gc
+
 import pytest
 import torch
 from torch.overrides import _get_current_function_mode
@@ -8,7 +10,7 @@ from torch.utils._python_dispatch import _get_current_dispatch_mode
 from legged.config import TaskConfig
 from legged.envs import LeggedRobot
 from legged.errors import TermError
-from legged.graph.step_graph import Branch, ForbidHostReads, HostReadError, StepGraph, calling
+from legged.graph.step_graph import Branch, ForbidHostReads, HostReadError, StepGraph, calling, garbage_kept
 from legged.registry import make_task, task_config
 
 CPU = torch.device("cpu")
@@ -27,6 +29,42 @@ def test_calling_lets_success_through():
     with calling("_reward_mine"):
         value = 3
     assert value == 3
+
+
+class Freed:
+    """Something in a reference cycle that tells when it is freed."""
+
+    def __init__(self, told: list[str]) -> None:
+        self.told, self.me = told, self
+
+    def __del__(self) -> None:
+        self.told.append("freed")
+
+
+def litter(told: list[str]) -> None:
+    """Drop a cycle, and so many more that Python's collector, where it is on, runs; then fail, as a capture may."""
+    Freed(told)
+    for _ in range(200_000):
+        cycle: list[object] = []
+        cycle.append(cycle)
+    assert not told
+    raise InterruptedError
+
+
+@pytest.mark.parametrize("collects", [True, False])
+def test_cycles_are_freed_after_a_block_that_keeps_garbage(collects: bool):
+    """The destructor of an old CUDA graph breaks a capture in progress."""
+    told: list[str] = []
+    before = gc.isenabled()
+    try:
+        gc.enable() if collects else gc.disable()
+        with pytest.raises(InterruptedError), garbage_kept():
+            litter(told)
+        assert gc.isenabled() == collects
+        gc.collect()
+        assert told == ["freed"]
+    finally:
+        gc.enable() if before else gc.disable()
 
 
 def test_step_graph_checks_first_and_then_runs_plainly_on_the_cpu():
