@@ -165,8 +165,11 @@ class FusedWorlds:
         contacts: int = 64,
         rows: int = 128,
         device: str = "cpu",
+        known: bool = True,
     ) -> None:
-        """Build `count` worlds, which differ in the arrays `drawn` of the model, of one row a world."""
+        """Build `count` worlds, which differ in the arrays `drawn` of the model, of one row a world; if rows are `known`
+        again, the solver begins with where they were in the step before.
+        """
         drawn = drawn or {}
         self.model, self.device = model, device
         ask_for_dense_rows(model)
@@ -180,9 +183,10 @@ class FusedWorlds:
             assert ConstraintSolver.why_not(self.m, self.d) == ""
             assert TorqueStep.why_not(model, drawn) == ""
             self.m.opt.disableflags |= absent_stages(model, drawn)
-            self._step = TorqueStep(model, self.m, self.d, drawn)
             own = not ContactStage.why_not(model, self.m, self.d, drawn)
             self._contacts = ContactStage(model, self.m, self.d, drawn) if own else None
+            self.sides = None if self._contacts is None or not known else self._contacts.sides
+            self._step = TorqueStep(model, self.m, self.d, drawn, self.sides)
 
     def write(self, qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray) -> None:
         """Put the worlds into states, one row a world, with their controls."""

@@ -388,7 +388,8 @@ def test_robots_on_stairs_move_as_by_mujoco_warps_own_launches(robot, where):
     states.base_pos[:, 1] += torch.linspace(-0.5, 0.5, 6)
     states.base_pos[:, 2] += float(ground.origins[0, 0, 2])
     for step in ("library", "fused"):
-        physics = build(RobotScene(robot, ground), "mujoco_warp" + where, 6, step=step, njmax=128, nconmax=32)
+        room = {"njmax": 128, "nconmax": 32, "iterations": 50}  # mujoco-warp's own needs more than the usual 10
+        physics = build(RobotScene(robot, ground), "mujoco_warp" + where, 6, step=step, **room)
         states.write(physics)
         force = torch.zeros(6)
         for _ in range(5):

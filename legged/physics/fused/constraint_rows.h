@@ -1,7 +1,8 @@
 // The constraint rows of one world, and who holds what. Constants: NV (degrees of freedom, at most 64), ROWS (most constraint
 // rows), KEPT_ROWS (of the Jacobian in shared memory), STRIDE (from one row of a matrix to the next), ENTRIES (of the mass
 // matrix that are not zero), FRICTION (whether there may be rows of dry friction), DRY (whether they are all of degrees of
-// freedom), SPLIT (whether there are branches), ROOT (degrees of freedom before the first branch).
+// freedom), SPLIT (whether there are branches), ROOT (degrees of freedom before the first branch), KNOWN (whether rows are known
+// again from step to step; sides are those of row_sides.py).
 //
 // On a GPU each lane holds what belongs to one degree of freedom or two (a row of a matrix too), in registers; what all lanes
 // read often, and what belongs to constraint rows, is in shared memory. On the CPU one thread holds everything, and the same
@@ -41,6 +42,7 @@ LEGGED_SHARED signed char dry_sides[DRY_DOFS];
 LEGGED_SHARED short dry_row[DRY_DOFS];
 float a[DOFS], Ma[DOFS], Ms[DOFS], smooth[DOFS], grad[DOFS], s[DOFS];
 const float TINY = 1e-15f;
+const int UNKNOWN = -3;
 
 const int ne = arrays.equalities.data[world], frictions = FRICTION ? arrays.frictions.data[world] : 0;
 const int of_all = arrays.nefc.data[world] < ROWS ? arrays.nefc.data[world] : ROWS;
@@ -82,6 +84,13 @@ auto along_row = [&](int r) {
     if (d * at < -loss) { side = -2.0f; return -loss; }
     return d * at;
 };
+// The same where it is on this side, or would be.
+[[maybe_unused]] auto rub_on = [](float d, float loss, float at, float& side) {
+    if (side == 0.0f) return 0.0f;
+    if (side < 0.0f) return side == -1.0f ? loss : -loss;
+    side = d;
+    return d * at;
+};
 // The same of a row.
 auto pull = [&](int r, float at, float& side) {
     const float d = D[r];
@@ -95,7 +104,7 @@ meet();  // of the world before
 if (DRY) EACH(i, NV) {
     dry_row[i] = -1;
     dry_D[i] = dry_loss[i] = dry_reference[i] = dry_curvature[i] = 0.0f;
-    dry_sides[i] = -3;
+    dry_sides[i] = UNKNOWN;
 }
 ROLLED EACH(k, NV * STRIDE) M[k] = 0.0f;
 #if defined(__CUDA_ARCH__)
@@ -111,7 +120,7 @@ ROLLED EACH(k, NV * STRIDE) M[k] = 0.0f;
 EACH_ROW(r) {
     D[r] = number_of(arrays.stiffness, r);
     x[r] = -number_of(arrays.reference, r);
-    sides[r] = -3;
+    sides[r] = UNKNOWN;
 }
 EACH_DOF(i) {
     OF(a, i) = arrays.warmstart.data[world * arrays.warmstart.shape[1] + i];
@@ -142,6 +151,35 @@ EACH_DOF(i) {
     OF(Ma, i) = total;
 }
 EACH_ROW(r) x[r] += along_row(r);
+// The sides of the last step, but after a reset, which leaves no acceleration to begin with.
+[[maybe_unused]] int* last_rows = KNOWN ? arrays.last_rows.data + (long long)world * arrays.last_rows.shape[1] : nullptr;
+[[maybe_unused]] const int* row_keys = KNOWN ? arrays.row_key.data + (long long)world * arrays.row_key.shape[1] + ne : nullptr;
+int had = 0;  // rows in the last step
+if (KNOWN) {
+    bool moving = false;
+    EACH_DOF(i) moving |= OF(a, i) != 0.0f;
+    if (any(moving)) had = last_rows[0];
+    int* before = reinterpret_cast<int*>(force);
+    EACH(k, had) before[k] = last_rows[1 + k];
+    meet();
+    // Of the k-th row after equalities; it often has the place that it had.
+    auto side_of = [&](int k) {
+        const int key = row_keys[k];
+        int place = k;
+        if (k >= had || before[k] >> 2 != key) {
+            place = 0;
+            ROLLED for (int beyond = had; place < beyond;) {
+                const int middle = (place + beyond) / 2;
+                if (before[middle] >> 2 < key) place = middle + 1; else beyond = middle;
+            }
+            if (place >= had || before[place] >> 2 != key) return UNKNOWN;
+        }
+        return (before[place] & 3) - 2;
+    };
+    EACH_ROW(r) if (r >= ne) sides[r] = side_of(efc_row(r) - ne);
+    if (DRY) EACH(i, NV) if (dry_row[i] >= 0) dry_sides[i] = side_of(dry_row[i] - ne);
+    meet();
+}
 if (SPLIT) EACH_ROW(r) {
     with_row(r, [&](int r, const float* row) {
         unsigned long long moved = 0;

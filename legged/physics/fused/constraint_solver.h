@@ -1,9 +1,13 @@
 // MuJoCo's Newton solver for the constraint forces of one world, after constraint_rows.h, elliptic_cones.h and elimination.h.
-// Constants: DAMPED (whether dampers are integrated implicitly), SPLIT, FRICTION, ELLIPTIC (as there).
+// Constants: DAMPED (whether dampers are integrated implicitly), SPLIT, FRICTION, ELLIPTIC, KNOWN (as there).
 
 int round = 0;
+const float INFINITE = 3.0e38f, ENOUGH = 0.1f;
+float alpha = 0.0f;  // of the last step; a whole one on which no row changes sides leads to the lowest point
 [[maybe_unused]] float dragged[DOFS];  // the force of dry friction, against the motion
 while (true) {
+    // The first step goes all the way to the lowest point of the quadratic function that the sides of the last step make.
+    const bool guessing = KNOWN && round == 0 && had > 0;
     if (!advancing) {
         // Forces, whether rows changed sides, and the gradient.
         bool changed = false;
@@ -14,8 +18,10 @@ while (true) {
                 side = press(r);
                 changed |= side == 2;  // there the cost is not quadratic
             } else {
-                float piece;
-                force[r] = -pull(r, x[r], piece);
+                float piece = sides[r];
+                const bool given = guessing && sides[r] != UNKNOWN;
+                force[r] = given ? -rub_on(D[r], FRICTION && !DRY && r < nf ? number_of(arrays.frictionloss, r) : 0.0f, x[r], piece)
+                                 : -pull(r, x[r], piece);
                 curvature[r] = most(piece, 0.0f);
                 side = piece > 0.0f ? 1 : (int)piece;
             }
@@ -23,8 +29,10 @@ while (true) {
             sides[r] = side;
         }
         if (DRY) EACH_DOF(i) {
-            float piece;
-            OF(dragged, i) = rub(dry_D[i], dry_loss[i], OF(a, i) - dry_reference[i], piece);
+            float piece = dry_sides[i];
+            const bool given = guessing && dry_sides[i] != UNKNOWN;
+            const float at = OF(a, i) - dry_reference[i];
+            OF(dragged, i) = given ? rub_on(dry_D[i], dry_loss[i], at, piece) : rub(dry_D[i], dry_loss[i], at, piece);
             dry_curvature[i] = most(piece, 0.0f);
             const int side = piece > 0.0f ? 1 : (int)piece;
             changed |= side != dry_sides[i];
@@ -54,7 +62,7 @@ while (true) {
             squares += OF(grad, i) * OF(grad, i);
         }
         squares = sum(squares);
-        if (round == most_rounds || scale * sqrtf(squares) < tolerance || (round > 0 && !changed)) {
+        if (round == most_rounds || (!guessing && scale * sqrtf(squares) < tolerance) || (alpha == 1.0f && !changed)) {
             if (!DAMPED) break;
             advancing = true;
         }
@@ -81,16 +89,18 @@ while (true) {
     }
     sum_four(sums);
     const float slope = sums[0], bend = sums[1], length = sums[2], decrement = sums[3];
-    if (!(scale * 0.5f * decrement >= tolerance)) {  // nothing to gain; also where something is not a number
+    if (!(scale * 0.5f * decrement >= (guessing ? -INFINITE : tolerance))) {  // nothing to gain; also where something is not a number
         if (!DAMPED) break;
         advancing = true;
         continue;
     }
     EACH_ROW(r) jv[r] = along_row(r);
     if (ELLIPTIC) meet();
-    const float flat = tolerance * ls_tolerance * sqrtf(length) / scale;
-    float alpha = 1.0f, low = 0.0f, high = -1.0f;
-    ROLLED for (int k = 0; k < most_searches; ++k) {
+    // It need not be followed to its lowest point: what is left of its slope goes in the next round.
+    const float flat = most(tolerance * ls_tolerance * sqrtf(length) / scale, ENOUGH * decrement);
+    alpha = 1.0f;
+    float low = 0.0f, high = -1.0f;
+    ROLLED for (int k = guessing ? most_searches : 0; k < most_searches; ++k) {
         float first = 0.0f, second = 0.0f;
         EACH_ROW(r) {
             if (ELLIPTIC && directions[r] != 0) {
@@ -134,3 +144,8 @@ if (DRY) EACH_DOF(i) {
     if (dry_row[i] >= 0) arrays.efc_force.data[(long long)world * arrays.efc_force.shape[1] + dry_row[i]] = -OF(dragged, i);
 }
 if (lane == 0) arrays.rounds.data[world] = round;
+if (KNOWN) {
+    EACH_ROW(r) if (r >= ne) last_rows[1 + efc_row(r) - ne] = row_keys[efc_row(r) - ne] << 2 | (sides[r] + 2);
+    if (DRY) EACH_DOF(i) if (dry_row[i] >= 0) last_rows[1 + dry_row[i] - ne] = i << 2 | (dry_sides[i] + 2);
+    if (lane == 0) last_rows[0] = of_all - ne;
+}

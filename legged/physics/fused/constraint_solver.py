@@ -4,7 +4,8 @@ mujoco-warp takes about ten launches for a round of the solver and goes on until
 here a world that is done is done. What is minimised is the same (Todorov, ICRA 2014; MuJoCo documentation, "Computation"):
 0.5 (a - a0)^T M (a - a0) + sum_r s_r(J_r a - aref_r) over accelerations a, with s_r quadratic on the side where a limit
 or an edge of a friction pyramid pushes, and Huber's function for dry friction. Newton's method on that piecewise quadratic
-function with an exact line search ends where no row changes sides any more.
+function with a line search ends where no row changes sides any more. It begins with the sides of the last step
+(row_sides.py): the lowest point of the quadratic function that they make is most often the solution, or near it.
 """
 
 from typing import Any
@@ -14,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from legged.physics.fused.native import LANES, Constant, native_source
+from legged.physics.fused.row_sides import RowSides
 from legged.physics.fused.solver_arrays import SolverArrays
 from legged.physics.fused.tree import MOST_DOFS, Tree
 from legged.physics.fused.wide_solver import WIDE, fits_wide, wide_constants, wide_kernel
@@ -35,11 +37,18 @@ def row_length(nv: int) -> int:
 
 
 def solver_constants(
-    tree: Tree, rows: int, entries: int, damped: bool = False, friction: bool = True, dry: bool = True, elliptic: bool = False
+    tree: Tree,
+    rows: int,
+    entries: int,
+    damped: bool = False,
+    friction: bool = True,
+    dry: bool = True,
+    elliptic: bool = False,
+    known: bool = False,
 ) -> dict[str, int | bool]:
     """Return what the sources ask for, of models of a tree, with at most `rows` constraint rows and `entries` of the mass
     matrix, with dampers to integrate implicitly or without, with rows of dry friction, all of which are `dry` degrees of
-    freedom and none tendons, and with elliptic cones.
+    freedom and none tendons, with elliptic cones, and with rows that are `known` again from step to step.
     """
     nv = len(tree.parent)
     sizes = {"NV": nv, "ROWS": rows, "STRIDE": row_length(nv), "ENTRIES": entries}
@@ -50,6 +59,7 @@ def solver_constants(
         "DRY": friction and dry,
         "ELLIPTIC": elliptic,
         "ELLIPTIC_ROW": ELLIPTIC_ROW,
+        "KNOWN": known and not elliptic,
     }
     return {**sizes, **kinds, **tree.constants()}
 
@@ -96,20 +106,22 @@ class ConstraintSolver:
     advance: wp.array2d
     """(worlds, nv) the accelerations that integrate velocities: `qacc`, or with dampers integrated implicitly another."""
 
-    def __init__(self, model: mujoco.MjModel, m: Any, d: Any, damped: bool = False) -> None:
+    def __init__(self, model: mujoco.MjModel, m: Any, d: Any, damped: bool = False, sides: RowSides | None = None) -> None:
         """Prepare the launch for mujoco-warp's `m` and `d` of a model, of which `why_not` says nothing; with `damped`,
-        compute what integrates dampers implicitly too. Call with their device as Warp's current one.
+        compute what integrates dampers implicitly too; with `sides`, begin with those of the last step, but with elliptic
+        cones, which have no sides where they slide. Call with their device as Warp's current one.
         """
         tree, elliptic = Tree.of(model), m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
         friction = not m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
         counts, columns = m.M_rownnz.numpy(), m.M_colind.numpy()
         dry = not model.ntendon
         rows = np.repeat(np.arange(m.nv), counts)
-        self.constants = solver_constants(tree, d.njmax, len(rows), damped, friction, dry, elliptic)
+        self.constants = solver_constants(tree, d.njmax, len(rows), damped, friction, dry, elliptic, sides is not None)
         self.wide: dict[str, Constant] | None = None
         """What wide_solver.h was asked for, where it is what solves: on a CPU."""
         if d.qacc.device.is_cpu and not elliptic and fits_wide(m.nv, d.njmax):
-            self.wide = wide_constants(tree, (rows, columns[: len(rows)]), d.njmax, damped, friction)
+            entries = rows, columns[: len(rows)]
+            self.wide = wide_constants(tree, entries, d.njmax, damped, friction, sides is not None)
         self._kernel = solver_kernel(self.constants) if self.wide is None else wide_kernel(self.wide)
         self._lanes = 1 if d.qacc.device.is_cpu else LANES
         efc, opt = d.efc, m.opt
@@ -133,6 +145,8 @@ class ConstraintSolver:
         arrays.efc_force, arrays.rounds = efc.force, d.solver_niter
         self.advance = wp.zeros_like(d.qacc) if damped else d.qacc
         arrays.timestep, arrays.damping, arrays.advance = opt.timestep, m.dof_damping, self.advance
+        nothing = wp.empty((0, 0), dtype=int)
+        arrays.row_key, arrays.last_rows = (nothing, nothing) if sides is None else (sides.key, sides.last)
         self._worlds = d.nworld
 
     @staticmethod

@@ -36,6 +36,8 @@ class StageArrays:
     joint_spring: wp.array2d[float]
     jnt_limited: wp.array[int]
     contact_touch: wp.array[int]
+    contact_mark: wp.array[int]
+    row_key: wp.array2d[int]
     impratio_invsqrt: wp.array[float]
     geom_bodyid: wp.array[int]
     geom_friction: wp.array2d[wp.vec3]
@@ -114,12 +116,21 @@ class Candidates:
 
 @wp.func
 def keep(
-    arrays: StageArrays, slot: int, most: int, world: int, touch: int, dist: float, pos: wp.vec3, frame: wp.mat33
+    arrays: StageArrays,
+    slot: int,
+    most: int,
+    world: int,
+    touch: int,
+    mark: int,
+    dist: float,
+    pos: wp.vec3,
+    frame: wp.mat33,
 ) -> None:
-    """Put a contact into a slot of its world, if there are so many."""
+    """Put a contact into a slot of its world, if there are so many; `mark` is by what it was found."""
     if slot < most:
         at = world * most + slot
         arrays.contact_touch[at] = touch
+        arrays.contact_mark[at] = mark
         arrays.contact_dist[at] = dist
         arrays.contact_pos[at] = pos
         arrays.contact_frame[at] = frame
@@ -177,7 +188,7 @@ def stage_function(constants: dict[str, int | bool], planes: bool, pairs: bool, 
                         count = 1
                 dealt = deal(count)
                 if count > 0:
-                    keep(arrays, found + (dealt & 0xFFFF), most, world, touch, hit.dist, hit.pos, hit.frame)
+                    keep(arrays, found + (dealt & 0xFFFF), most, world, touch, item, hit.dist, hit.pos, hit.frame)
                 found += dealt >> 16
         if wp.static(pairs):
             for start in range(0, items.pair_touch.shape[0], lanes):
@@ -210,7 +221,8 @@ def stage_function(constants: dict[str, int | bool], planes: bool, pairs: bool, 
                 if count > 0:
                     for k in range(2):
                         if dist[k] < margin:
-                            keep(arrays, slot, most, world, touch, dist[k], pos[k], make_frame(normal[k]))
+                            mark = items.point_touch.shape[0] + 2 * item + k
+                            keep(arrays, slot, most, world, touch, mark, dist[k], pos[k], make_frame(normal[k]))
                             slot += 1
                 found += dealt >> 16
         if wp.static(ground):
@@ -242,7 +254,8 @@ def stage_function(constants: dict[str, int | bool], planes: bool, pairs: bool, 
                     up = hits.normal[row, k]
                     depth = hits.dist[row, k] - radius
                     middle = hits.point[row, k] - up * (radius + 0.5 * depth)
-                    keep(arrays, found + (dealt & 0xFFFF) + k, most, world, touch, depth, middle, make_frame(up))
+                    mark = items.point_touch.shape[0] + 2 * items.pair_touch.shape[0] + hits.dist.shape[1] * item + k
+                    keep(arrays, found + (dealt & 0xFFFF) + k, most, world, touch, mark, depth, middle, make_frame(up))
                 found += dealt >> 16
         make_rows(world, found, arrays)
 
@@ -255,15 +268,23 @@ def shared_bytes(constants: dict[str, int | bool]) -> int:
 
 
 def stage_constants(
-    model: mujoco.MjModel, rows: int, slots: int, dim: int, frictions: bool, limits: bool, bounces: bool = False
+    model: mujoco.MjModel,
+    rows: int,
+    slots: int,
+    dim: int,
+    frictions: bool,
+    limits: bool,
+    bounces: bool = False,
+    dense_friction: bool = True,
 ) -> dict[str, int | bool]:
     """Return what contact_stage.h asks for, of a model with room for so many rows and contacts in each world, of at most
     `dim` directions, with dry friction and limits or without, and with springs of contacts that differ from world to world.
+    Without `dense_friction`, dry friction has no rows of the Jacobian, only the other numbers.
     """
     return {
         **{"NV": model.nv, "NJ": model.njnt, "ROWS": rows, "SLOTS": slots, "DIMS": dim},
         "PLAIN": max(1, frictions * model.nv + limits * model.njnt),
-        **{"FRICTIONS": frictions, "LIMITS": limits, "BOUNCES": bounces},
+        **{"FRICTIONS": frictions, "LIMITS": limits, "BOUNCES": bounces, "DENSE_FRICTION": dense_friction},
         "BALLS": bool(np.any(model.jnt_type == mujoco.mjtJoint.mjJNT_BALL)),
         "EQUALITIES": model.neq > 0 and not model.opt.disableflags & FLAGS.mjDSBL_EQUALITY,
         "ELLIPTIC": model.opt.cone == CONES.mjCONE_ELLIPTIC,

@@ -1,13 +1,14 @@
 // Rows of the constraints of one world: of dry friction, joint limits, and the `found` contacts that lie in the world's slots;
 // behind those of equalities, which are there. Constants: NV, NJ (degrees of freedom, joints), ROWS, SLOTS (most rows, most
 // contacts), PLAIN (most rows of friction and limits), DIMS (most directions of a contact), FRICTIONS, LIMITS, BALLS,
-// EQUALITIES (what there is of them), BOUNCES (whether worlds differ in the springs of contacts), ELLIPTIC (friction cones,
+// EQUALITIES (what there is of them), DENSE_FRICTION (whether the Jacobian's rows of dry friction are read), BOUNCES (whether worlds differ in the springs of contacts), ELLIPTIC (friction cones,
 // instead of pyramids), and MuJoCo's numbers: BALL, CONSTRAINT
 // (a type of contact), FRICTIONLESS, FRICTIONAL (types of rows), NARROWPHASE (a flag of overflow).
 
 // Of a contact: its offsets from the two trees' centres of mass, its axes, friction, and what its rows are made of.
 const int OFFSET = 0, FRAME = 6, FRICTION = 15, STIFFNESS = 20, PULL = 21, DAMPING = 22, SLIDING = 23, RECORD = 24;
 const int HELD = (NV + LANES - 1) / LANES;
+const int MOST_EDGES = 2 * (DIMS > 1 ? DIMS - 1 : 1);  // rows of a contact
 LEGGED_SHARED float record[SLOTS * RECORD];
 LEGGED_SHARED int directions[SLOTS], first_row[SLOTS], bodies[2 * SLOTS];
 LEGGED_SHARED float entry[3 * PLAIN];  // up to three numbers side by side are all of a row of friction or of a limit
@@ -39,8 +40,9 @@ const int width = arrays.jacobian.shape[2];  // padded
 // A number of this world's row `row`, in an array of them: some are padded.
 auto at_row = [&](const auto& array, int row) { return array.data + (long long)world * array.shape[1] + row; };
 float* jacobian = arrays.jacobian.data + (long long)world * arrays.jacobian.shape[1] * width;
-auto put = [&](int row, float stiffness, float reference, float loss) {
+auto put = [&](int row, int key, float stiffness, float reference, float loss) {
     if (row >= ROWS) return;
+    *at_row(arrays.row_key, row) = key;
     *at_row(arrays.stiffness, row) = stiffness;
     *at_row(arrays.reference, row) = reference;
     *at_row(arrays.frictionloss, row) = loss;
@@ -61,7 +63,7 @@ if (FRICTIONS) {
         rows += (int)sum(is ? 1.0f : 0.0f);
         if (!is) continue;
         const float* spring = arrays.dof_spring.data + i * SPRING;
-        put(start + place, stiffness_of(dof_weights[i], impedance(spring, 0.0f)), -spring[1] * v_in[i], losses[i]);
+        put(start + place, i, stiffness_of(dof_weights[i], impedance(spring, 0.0f)), -spring[1] * v_in[i], losses[i]);
         if (start + place < ROWS) *at_row(arrays.row_id, start + place) = i;  // by which the solver knows whose friction it is
         entry_dof[place] = i;
         for (int k = 0; k < 3; ++k) entry[3 * place + k] = k == 0 ? 1.0f : 0.0f;
@@ -103,7 +105,7 @@ if (LIMITS) {
         if (!is) continue;
         const float* spring = arrays.joint_spring.data + j * SPRING;
         const float impeded = impedance(spring, pos);
-        put(start + place, stiffness_of(dof_weights[dof], impeded), -spring[0] * impeded * pos - spring[1] * speed, 0.0f);
+        put(start + place, NV + j, stiffness_of(dof_weights[dof], impeded), -spring[0] * impeded * pos - spring[1] * speed, 0.0f);
         entry_dof[place] = dof;
         for (int k = 0; k < 3; ++k) entry[3 * place + k] = pulled[k];
     }
@@ -187,8 +189,9 @@ if (lane == 0) {
     if (world == 0) arrays.nacon.data[0] = arrays.contact_dist.shape[0];  // all slots; empty ones have no rows
 }
 meet();
-EACH(k, (start + plain < ROWS ? plain : ROWS - start) * NV) {
-    const int place = k / NV, i = k % NV, at = i - entry_dof[place];
+const int unread = DENSE_FRICTION ? 0 : frictions;
+EACH(k, ((start + plain < ROWS ? plain : ROWS - start) - unread) * NV) {
+    const int place = unread + k / NV, i = k % NV, at = i - entry_dof[place];
     jacobian[(start + place) * width + i] = at >= 0 && at < 3 ? entry[3 * place + at] : 0.0f;
 }
 float moved[HELD][6], speeds[HELD];
@@ -199,7 +202,7 @@ for (int q = 0, i = lane; q < HELD; ++q, i += LANES) {
 }
 for (int c = 0; c < contacts; ++c) {
     const float* of = record + c * RECORD;
-    const int dim = directions[c], row = first_row[c];
+    const int dim = directions[c], row = first_row[c], mark = arrays.contact_mark.data[(long long)world * SLOTS + c];
     const int* carried_by = arrays.body_isdofancestor.data;
     const int of_body = arrays.body_isdofancestor.shape[1];
     float speed[DIMS];
@@ -249,7 +252,7 @@ for (int c = 0; c < contacts; ++c) {
             stiffness /= root_ratio * root_ratio * (r > 1 ? rest * rest : 1.0f);
             reference = -of[SLIDING] * along;
         }
-        put(row + r, stiffness, reference, 0.0f);
+        put(row + r, NV + NJ + MOST_EDGES * mark + r, stiffness, reference, 0.0f);
         if (ELLIPTIC && row + r < ROWS) {
             *at_row(arrays.row_type, row + r) = dim == 1 ? FRICTIONLESS : FRICTIONAL;
             *at_row(arrays.row_id, row + r) = world * SLOTS + c;

@@ -30,12 +30,15 @@ from legged.physics.fused.contact_kernel import (
     stage_kernel,
 )
 from legged.physics.fused.native import LANES, SHARED_BYTES
+from legged.physics.fused.row_sides import RowSides
 
 FIXED = (
     *("geom_size", "geom_margin", "geom_priority", "geom_solmix", "geom_solimp", "jnt_solref", "jnt_solimp"),
     *("dof_solref", "dof_solimp", "pair_margin", "pair_friction", "pair_solref", "pair_solimp"),
 )
 """Arrays of the model that are read once, in which worlds may not differ."""
+OWN_ARRAYS = ("jnt_limited", "contact_touch", "contact_mark", "row_key", "impratio_invsqrt", "dof_spring", "joint_spring")
+"""Of the launch, beside those of touches, that are not mujoco-warp's under a name of NAMES."""
 FLAGS = mujoco.mjtDisableBit
 
 
@@ -75,6 +78,8 @@ class ContactStage:
         ]
         round_pairs = [k for k in range(len(pairs)) if not on_planes[k]]
 
+        self.sides = RowSides.of(d)
+        """By what rows are known again, for the solver to begin with what it last found out about them."""
         self._arrays = self._stage_arrays(model, m, d)
         self._arrays.jnt_limited = wp.array(limited, dtype=int)
         items = self._candidates(model, d, points, round_pairs, [(met[p.geom], p) for p in probes])
@@ -82,9 +87,8 @@ class ContactStage:
         self.inputs = [self._arrays, items, *ground_of]
         """What the launch takes, beside the number of lanes."""
         dim, slots = max((touch.dim for touch in self.touches), default=1), d.naconmax // d.nworld
-        self.constants = stage_constants(
-            model, d.njmax, slots, dim, frictions, bool(limited.any()), "geom_solref" in randomized
-        )
+        bounces, dense_friction = "geom_solref" in randomized, d.qacc.device.is_cpu or model.ntendon > 0
+        self.constants = stage_constants(model, d.njmax, slots, dim, frictions, bool(limited.any()), bounces, dense_friction)
         """What contact_stage.h was asked for."""
         self.kinds = bool(points), bool(round_pairs), bool(probes)
         """Whether points on planes, pairs of round shapes and probes of the ground may touch."""
@@ -157,12 +161,11 @@ class ContactStage:
         arrays.touch_bounce = wp.array(bounces, dtype=wp.vec2)
         arrays.dof_spring = springs(model.dof_solref, model.dof_solimp)
         arrays.joint_spring = springs(model.jnt_solref, model.jnt_solimp)
-        arrays.contact_touch = wp.zeros(d.naconmax, dtype=int)
+        arrays.contact_touch, arrays.contact_mark = wp.zeros(d.naconmax, dtype=int), wp.zeros(d.naconmax, dtype=int)
+        arrays.row_key = self.sides.key
         arrays.impratio_invsqrt = m.opt.impratio_invsqrt
         for name in StageArrays.vars:  # type: ignore[attr-defined]
-            if name in ("jnt_limited", "contact_touch", "impratio_invsqrt", "dof_spring", "joint_spring"):
-                continue
-            if name.startswith("touch_"):
+            if name in OWN_ARRAYS or name.startswith("touch_"):
                 continue
             path = NAMES.get(name, name.replace("contact_", "contact.", 1))
             owner, _, field = path.rpartition(".")

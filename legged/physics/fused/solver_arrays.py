@@ -8,7 +8,7 @@ Vector5 = wp.types.vector(length=5, dtype=wp.float32)
 @wp.struct
 class SolverArrays:
     """Tables of our own; what the solver reads of mujoco-warp's model and data; and what it writes: from `qacc` to `rounds`,
-    and where there are dampers `advance`.
+    where there are dampers `advance`, and of rows that have a `row_key` which side they end on, in `last_rows`.
     """
 
     dof_depth: wp.array[int]
@@ -44,3 +44,5 @@ class SolverArrays:
     efc_force: wp.array2d[float]
     rounds: wp.array[int]
     advance: wp.array2d[float]
+    row_key: wp.array2d[int]
+    last_rows: wp.array2d[int]

@@ -15,6 +15,7 @@ import mujoco_warp as mjw
 import warp as wp
 
 from legged.physics.fused.constraint_solver import ConstraintSolver
+from legged.physics.fused.row_sides import RowSides
 from legged.physics.fused.smooth_dynamics import BALL, FREE, SmoothDynamics, has_dampers
 
 NEFC, BROADPHASE, NARROWPHASE = (int(getattr(mjw.OverflowType, n)) for n in ("NEFC", "BROADPHASE", "NARROWPHASE"))
@@ -93,13 +94,15 @@ def integrate(of: StateArrays):
 class TorqueStep:
     """Launches on mujoco-warp's arrays all of a step but contacts and constraint rows, which are made in between."""
 
-    def __init__(self, model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = ()) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = (), sides: RowSides | None = None
+    ) -> None:
         """Prepare the launches for mujoco-warp's `m` and `d` of a `model` of which neither `why_not` nor that of
-        `ConstraintSolver` says anything, in whose arrays `randomized` worlds differ. Call with their device as Warp's
-        current one.
+        `ConstraintSolver` says anything, in whose arrays `randomized` worlds differ, with what makes rows known again, if
+        there is such. Call with their device as Warp's current one.
         """
         self.dynamics = SmoothDynamics(model, m, d, randomized)
-        self.solver = ConstraintSolver(model, m, d, damped=has_dampers(model, randomized))
+        self.solver = ConstraintSolver(model, m, d, damped=has_dampers(model, randomized), sides=sides)
         of = self.state = StateArrays()
         of.timestep, of.jnt_type, of.jnt_qposadr, of.jnt_dofadr = m.opt.timestep, m.jnt_type, m.jnt_qposadr, m.jnt_dofadr
         of.advance, of.qacc = self.solver.advance, d.qacc

@@ -2,7 +2,7 @@
 // worlds side by side in vector registers, of friction pyramids. Worlds with fewer rows than others have empty ones, and those
 // that are done wait for the others of their block. The block's worlds are those from `start` on, before `end`. Constants: WIDE,
 // NV (degrees of freedom), ROWS (most constraint rows), ENTRIES (of the mass matrix that are not zero), DAMPED (whether dampers
-// are integrated implicitly), FRICTION (whether there may be rows of dry friction), COUPLED (whether a row may move degrees of
+// are integrated implicitly), KNOWN (whether rows are known again from step to step), FRICTION (whether there may be rows of dry friction), COUPLED (whether a row may move degrees of
 // freedom of several branches). And of the tree: PATH_START and PATH_LENGTH (NV each), where the path of a degree of freedom
 // from the root to itself begins in PATHS, and how long it is; ENTRY_PLACE (ENTRIES), where an entry of the mass matrix is
 // among those of all paths.
@@ -12,7 +12,8 @@ typedef float Wide __attribute__((vector_size(4 * WIDE), may_alias));
 typedef int Mask __attribute__((vector_size(4 * WIDE), may_alias));
 const Wide ZERO = Wide{};
 const Wide ONE = ZERO + 1.0f;
-const float TINY = 1e-15f, INFINITE = 3.0e38f;
+const float TINY = 1e-15f, INFINITE = 3.0e38f, ENOUGH = 0.1f;
+const int UNKNOWN = -3, SLIPPING_BACK = -2, SLIPPING = -1, IDLE = 0, HOLDING = 1;  // row_sides.py
 const int SPARSE = PATH_START[NV - 1] + PATH_LENGTH[NV - 1], DENSE = NV * (NV + 1) / 2;
 
 auto any_of = [](const Mask& mask) {
@@ -102,7 +103,26 @@ auto along_row = [&](int r, const Wide* v) {
 times_inertia(a, Ma);
 for (int r = 0; r < rows; ++r) {
     x[r] += along_row(r, a);
-    sides[r] = Mask{} - 3;
+    sides[r] = Mask{} + UNKNOWN;
+}
+// The sides of the last step, but after a reset, which leaves no acceleration to begin with. Here 0 is what has curvature, -1
+// the least force, 2 the greatest; both lists are in the order of their keys.
+auto last_rows = [&](int w) { return arrays.last_rows.data + (long long)at[w] * arrays.last_rows.shape[1]; };
+auto row_keys = [&](int w) { return arrays.row_key.data + (long long)at[w] * arrays.row_key.shape[1]; };
+Mask guess = Mask{};  // worlds of which there are any
+for (int w = 0; KNOWN && w < WIDE; ++w) {
+    bool moving = false;
+    for (int i = 0; i < NV; ++i) moving |= a[i][w] != 0.0f;
+    const int* last = last_rows(w);
+    const int had = moving ? last[0] : 0;
+    guess[w] = had > 0 ? -1 : 0;
+    for (int r = equalities[w], k = 0; r < own_rows[w]; ++r) {
+        const int key = row_keys(w)[r];
+        while (k < had && last[1 + k] >> 2 < key) ++k;
+        if (k == had || last[1 + k] >> 2 != key) continue;
+        const int side = (last[1 + k] & 3) - 2;
+        sides[r][w] = side == HOLDING ? 0 : side == SLIPPING_BACK ? 2 : -1;
+    }
 }
 
 // Of the system H s = g of a tree in which row i has entries for its path alone, from g in s the solution there; of each row
@@ -175,7 +195,10 @@ auto sparse_path = [](int i, int t) { return PATHS[PATH_START[i] + t]; };
 [[maybe_unused]] auto dense_path = [](int, int t) { return t; };
 
 Mask active = Mask{} - 1, rounds = Mask{};
+Wide alpha = ZERO;  // of the last step; a whole one on which no row changes sides leads to the lowest point
 for (int round = 0;; ++round) {
+    // The first step goes all the way to the lowest point of the quadratic function that the sides of the last step make.
+    const bool guessing = KNOWN && round == 0 && any_of(guess);
     // Forces, whether rows changed sides, and the gradient.
     Mask changed = Mask{};
     bool coupled = false;
@@ -183,7 +206,12 @@ for (int round = 0;; ++round) {
     for (int i = 0; i < NV; ++i) pushed[i] = ZERO;
     for (int r = 0; r < rows; ++r) {
         const Wide pull = -D[r] * x[r];
-        const Mask low = pull <= least[r], high = pull >= greatest[r];
+        Mask low = pull <= least[r], high = pull >= greatest[r];
+        if (guessing) {
+            const Mask known = guess & (sides[r] != UNKNOWN);
+            low = known ? sides[r] == -1 : low;
+            high = known ? sides[r] == 2 : high;
+        }
         force[r] = low ? least[r] : high ? greatest[r] : pull;
         curvature[r] = low | high ? ZERO : D[r];
         const Mask side = low - 2 * high;  // a mask that is set is -1
@@ -201,8 +229,9 @@ for (int round = 0;; ++round) {
         s[i] = -grad[i];
     }
     if (round == most_rounds) break;
-    active &= ~(scale * scale * squares < tolerance * tolerance);
-    if (round > 0) active &= changed;
+    const Mask whole = guessing ? guess : Mask{};  // worlds that go all the way
+    active &= whole | ~(scale * scale * squares < tolerance * tolerance);
+    active &= changed | (alpha != ONE);
     if (!any_of(active)) break;
     // The step s = -H^-1 grad.
     if (COUPLED && coupled) {
@@ -225,13 +254,17 @@ for (int round = 0;; ++round) {
         length += s[i] * s[i];
         decrement -= s[i] * grad[i];
     }
-    active &= scale * 0.5f * decrement >= tolerance;  // else there is nothing to gain; also where something is not a number
+    active &= scale * 0.5f * decrement >= (whole ? ZERO - INFINITE : ZERO + tolerance);  // else there is nothing to gain; also where something is not a number
     if (!any_of(active)) break;
     for (int r = 0; r < rows; ++r) jv[r] = along_row(r, s);
-    const Wide flat = tolerance * tolerance * ls_tolerance * ls_tolerance * length / (scale * scale);  // squared
-    Wide alpha = ONE, low = ZERO, high = -ONE;
-    Mask searching = active;
-    for (int k = 0; k < most_searches; ++k) {
+    // It need not be followed to its lowest point: what is left of its slope goes in the next round. Squared:
+    const Wide least_slope = tolerance * tolerance * ls_tolerance * ls_tolerance * length / (scale * scale);
+    const Wide slope_left = ENOUGH * ENOUGH * decrement * decrement;
+    const Wide flat = least_slope > slope_left ? least_slope : slope_left;
+    alpha = ONE;
+    Wide low = ZERO, high = -ONE;
+    Mask searching = active & ~whole;
+    for (int k = 0; k < most_searches && any_of(searching); ++k) {
         Wide first = slope + alpha * bend, second = bend;
         for (int r = 0; r < rows; ++r) {
             const Wide pull = -D[r] * (x[r] + alpha * jv[r]);
@@ -248,7 +281,6 @@ for (int round = 0;; ++round) {
         const Mask outside = (high > 0.0f) & ((next <= low) | (next >= high));
         alpha = searching ? (outside ? 0.5f * (low + high) : next) : alpha;
     }
-    alpha = active ? alpha : ZERO;
     for (int i = 0; i < NV; ++i) {
         a[i] = active ? a[i] + alpha * s[i] : a[i];
         Ma[i] = active ? Ma[i] + alpha * Ms[i] : Ma[i];
@@ -277,4 +309,12 @@ for (int w = 0; w < WIDE && start + w < end; ++w) {
     }
     for (int r = 0; r < own_rows[w]; ++r) arrays.efc_force.data[world * arrays.efc_force.shape[1] + r] = force[r][w];
     arrays.rounds.data[world] = rounds[w];
+    if (KNOWN) {
+        int* last = last_rows(w);
+        last[0] = own_rows[w] - equalities[w];
+        for (int r = equalities[w]; r < own_rows[w]; ++r) {
+            const int side = sides[r][w] == 0 ? HOLDING : sides[r][w] == 2 ? SLIPPING_BACK : r < plain[w] ? SLIPPING : IDLE;
+            last[1 + r - equalities[w]] = row_keys(w)[r] << 2 | (side + 2);
+        }
+    }
 }

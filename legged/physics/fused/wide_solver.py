@@ -22,10 +22,11 @@ STACK_BYTES = 2 * 1024 * 1024
 
 
 def wide_constants(
-    tree: Tree, entries: tuple[np.ndarray, np.ndarray], rows: int, damped: bool, friction: bool
+    tree: Tree, entries: tuple[np.ndarray, np.ndarray], rows: int, damped: bool, friction: bool, known: bool = False
 ) -> dict[str, Constant]:
     """Return what wide_solver.h asks for, of models of a tree whose mass matrix has `entries` in these rows and columns, with
-    at most `rows` constraint rows, dampers to integrate implicitly or none, and rows of dry friction or none.
+    at most `rows` constraint rows, dampers to integrate implicitly or none, rows of dry friction or none, and rows that are
+    `known` again from step to step or not.
     """
     nv = len(tree.parent)
     paths = [tree.path(i) for i in range(nv)]
@@ -33,6 +34,7 @@ def wide_constants(
     lower = [(max(pair), min(pair)) for pair in zip(*(side.tolist() for side in entries), strict=True)]
     return {
         **{"WIDE": WIDE, "NV": nv, "ROWS": rows, "ENTRIES": len(lower), "DAMPED": damped, "FRICTION": friction},
+        "KNOWN": known,
         "COUPLED": bool(tree.constants()["SPLIT"]),
         "PATH_START": tuple(starts[:-1].tolist()),
         "PATH_LENGTH": tuple(map(len, paths)),

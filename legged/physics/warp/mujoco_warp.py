@@ -229,14 +229,15 @@ class MujocoWarpPhysics(WarpPhysics):
         if self.why_library:
             self._solver = ConstraintSolver(self.model, self._m, self._d)
         else:
-            self._fused_step = TorqueStep(self.model, self._m, self._d, per_world)
             no_contacts = ContactStage.why_not(self.model, self._m, self._d, per_world)
             if no_contacts:
                 self.why_library = f"for contacts alone, {no_contacts}"
             else:
                 self._contacts = ContactStage(self.model, self._m, self._d, per_world, self._on_cells)
-                if BlockStep.fits(self._fused_step):
-                    self._blocks = BlockStep(self._fused_step, self._contacts, threads)
+            sides = None if self._contacts is None else self._contacts.sides
+            self._fused_step = TorqueStep(self.model, self._m, self._d, per_world, sides)
+            if self._contacts is not None and BlockStep.fits(self._fused_step):
+                self._blocks = BlockStep(self._fused_step, self._contacts, threads)
 
     def _why_no_blocks(self, quantities: Collection[str]) -> str:
         """Return what keeps a step from being made in blocks of worlds, or what would take longer than it gains."""
@@ -270,6 +271,8 @@ class MujocoWarpPhysics(WarpPhysics):
 
     def state_tensors(self) -> dict[str, Tensor]:
         own = {"act": wp.to_torch(self._d.act), "warmstart": wp.to_torch(self._d.qacc_warmstart)}
+        if self._contacts is not None:
+            own["last_rows"] = wp.to_torch(self._contacts.sides.last)
         return {**super().state_tensors(), **own, **self._of_last_step()}
 
     def randomize(self, field: str, values: Tensor) -> None:
