@@ -10,6 +10,8 @@ from typing import Any
 import warp as wp
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from legged.physics.warp.launcher import Launcher
+
 NO_LAUNCH = ("detach", "empty", "empty_strided", "empty_like", "new_empty", "lift_fresh", "alias", "_unsafe_view")
 OURS = (*(f"legged.physics.warp.{of}_kernels" for of in ("task", "actuator", "network", "random")), "add_velocities")
 """Kernels that stand for torch's launches: their module, or their name."""
@@ -39,17 +41,27 @@ class Launches(TorchDispatchMode):
 
 @contextmanager
 def counting() -> Iterator[Counter[str]]:
-    """Count in the block; physics engines' own launches are left out."""
-    launch, launches = wp.launch, Launches()
+    """Count in the block; physics engines' own launches are left out. What a `Launcher` launches counts once, also where it
+    has kept the launch of a step before.
+    """
+    launch, by_launcher, launches = wp.launch, Launcher.launch, Launches()
 
     def noted(kernel: Any, *args: Any, **kwargs: Any) -> Any:
         if kernel.module.name in OURS or kernel.key in OURS:
             launches.note(sys._getframe(1))
         return launch(kernel, *args, **kwargs)
 
-    wp.launch = noted
+    def noted_once(launcher: Launcher, kernel: Any, *args: Any, **kwargs: Any) -> None:
+        launches.note(sys._getframe(1))
+        wp.launch = launch
+        try:
+            by_launcher(launcher, kernel, *args, **kwargs)
+        finally:
+            wp.launch = noted
+
+    wp.launch, Launcher.launch = noted, noted_once  # type: ignore[method-assign]
     try:
         with launches:
             yield launches.by_part
     finally:
-        wp.launch = launch
+        wp.launch, Launcher.launch = launch, by_launcher  # type: ignore[method-assign]

@@ -1,5 +1,7 @@
 """Kicks of the base and forces on bodies, each robot at its own moments."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
@@ -8,6 +10,9 @@ from legged.math import masked_set_, uniform
 from legged.mdp.draws import Draws
 from legged.mdp.uniform_numbers import UniformNumbers
 from legged.physics import Physics
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
 
 AXES = ("x", "y", "z")
 TURNS = ("roll", "pitch", "yaw")
@@ -28,24 +33,23 @@ class Kicks:
 
     STATE = ("time_left",)
 
-    def __init__(self, cfg: KickConfig, dt: float, pace: int, numbers: UniformNumbers) -> None:
+    def __init__(self, cfg: KickConfig, dt: float, pace: int, numbers: UniformNumbers, kernels: "TaskKernels | None") -> None:
         """Spread the first kicks over a whole interval; `dt` is the control step [s], and an iteration has `pace`
         of them.
         """
-        self._dt = dt
+        self._dt, self._kernels = dt, kernels
         num_envs, device = numbers.num_envs, numbers.device
         self._draws = _draws(cfg, (*AXES, *TURNS), ("interval_s",), numbers, pace)
         self._even = self._draws.ask(numbers)
         self.time_left = uniform(0.0, cfg.interval_s[1], (num_envs,), device)
         """(N,) time until the next kick [s]."""
-        self._velocity, self._next = torch.zeros(num_envs, 6, device=device), torch.zeros(num_envs, device=device)
+        self._drawn = torch.zeros(num_envs, 7, device=device)
+        self._velocity, self._next = self._drawn[:, :6], self._drawn[:, 6]
         self._due = torch.zeros(num_envs, dtype=torch.bool, device=device)
 
     def draw(self, steps: Tensor) -> None:
         """Draw a kick for every robot, after so many `steps` of training. Runs beside the step."""
-        drawn = self._draws.values(self._even.values, steps)
-        self._velocity.copy_(drawn[:, :6])
-        self._next.copy_(drawn[:, 6])
+        self._draws.write(self._even.values, steps, self._drawn, self._kernels)
 
     def act(self, physics: Physics, mask: Tensor) -> None:
         """Kick the robots of `mask` (N,) that are due."""
@@ -64,9 +68,17 @@ class Forces:
 
     STATE = ("left", "force")
 
-    def __init__(self, cfg: ForceConfig, body: int, dt: float, pace: int, numbers: UniformNumbers) -> None:
+    def __init__(
+        self,
+        cfg: ForceConfig,
+        body: int,
+        dt: float,
+        pace: int,
+        numbers: UniformNumbers,
+        kernels: "TaskKernels | None",
+    ) -> None:
         """Push the `body` of that number in the model; spread the first pushes over a whole interval."""
-        self._dt, self._body = dt, body
+        self._dt, self._body, self._kernels = dt, body, kernels
         num_envs, device = numbers.num_envs, numbers.device
         self._draws = _draws(cfg, AXES, ("interval_s", "duration_s"), numbers, pace)
         self._even = self._draws.ask(numbers)
@@ -75,15 +87,12 @@ class Forces:
         self.left[:, 1] = uniform(0.0, cfg.interval_s[1], (num_envs,), device)
         self.force = torch.zeros(num_envs, 3, device=device)
         """(N, 3) force now, world frame [N]."""
-        self._fresh = torch.zeros(num_envs, 3, device=device)
-        self._times = torch.zeros(num_envs, 2, device=device)
+        self._drawn = torch.zeros(num_envs, 5, device=device)
+        """(N, 5) of the next push its force, the interval and how long it lasts."""
 
     def draw(self, steps: Tensor) -> None:
         """Draw a push for every robot, after so many `steps` of training. Runs beside the step."""
-        drawn = self._draws.values(self._even.values, steps)
-        self._fresh.copy_(drawn[:, :3])
-        torch.clamp(drawn[:, 4], min=self._dt, out=self._times[:, 0])
-        torch.add(drawn[:, 3], self._times[:, 0], out=self._times[:, 1])
+        self._draws.write(self._even.values, steps, self._drawn, self._kernels)
 
     def act(self, physics: Physics, mask: Tensor) -> None:
         """Begin and end pushes; those of robots that are not in `mask` (N,) end."""
@@ -91,14 +100,15 @@ class Forces:
         on_body = physics.forces[:, self._body, :3]
         if physics.kernels is not None:
             moment = (self._dt, 0.5 * self._dt)
-            physics.kernels.push_bodies(mask, self._fresh, self._times, *moment, self.left, self.force, on_body)
+            physics.kernels.push_bodies(mask, self._drawn, *moment, self.left, self.force, on_body)
             return
         self.left.sub_(self._dt)
         passed = self.left <= 0.5 * self._dt
         due = passed[:, 1] & mask
         self.force.masked_fill_((passed[:, 0] | ~mask).unsqueeze(1), 0.0)
-        masked_set_(self.force, due, self._fresh)
-        masked_set_(self.left, due, self._times)
+        masked_set_(self.force, due, self._drawn[:, :3])
+        lasting = self._drawn[:, 4].clamp(min=self._dt)
+        masked_set_(self.left, due, torch.stack([lasting, self._drawn[:, 3] + lasting], dim=1))
         on_body.add_(self.force)
 
 
@@ -114,10 +124,12 @@ class Disturbances:
         numbers: UniformNumbers,
     ) -> None:
         """Make those that `cfg` names; `dt` is the control step [s]. Numbers that they draw are of `numbers`."""
-        self.kicks = {name: Kicks(kick, dt, steps_per_iteration, numbers) for name, kick in cfg.kicks.items()}
+        self.kicks = {
+            name: Kicks(kick, dt, steps_per_iteration, numbers, physics.kernels) for name, kick in cfg.kicks.items()
+        }
         """Name -> kicks of the base."""
         self.forces = {
-            name: Forces(force, body_number(physics, force.body), dt, steps_per_iteration, numbers)
+            name: Forces(force, body_number(physics, force.body), dt, steps_per_iteration, numbers, physics.kernels)
             for name, force in cfg.forces.items()
         }
         """Name -> force that acts on a body."""

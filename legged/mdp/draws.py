@@ -2,12 +2,16 @@
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from legged.config.schema import DrawConfig
 from legged.mdp.uniform_numbers import Drawn, UniformNumbers
+
+if TYPE_CHECKING:
+    from legged.physics.warp.task_kernels import TaskKernels
 
 KINDS = ("uniform", "log_uniform", "gaussian")
 
@@ -57,6 +61,21 @@ class Draws:
         self._neutral = tensor(neutral)
         if within:
             self._neutral = torch.minimum(torch.maximum(self._neutral, self._least), self._most)
+        self.table, self.source = self._table(columns)
+        """(V, 8) all of it, and (V,) of which even number each column is made: what a launch is told."""
+
+    def _table(self, columns: Sequence[DrawConfig]) -> tuple[Tensor, Tensor]:
+        """Return columns of the distribution's place in `KINDS`; middle and spread of normal ones; the range's ends; pace and
+        first share of those that grow, 0 and 1 of others; and the neutral value.
+        """
+        count, like = len(columns), self.low
+        source = torch.tensor([self._order.index(i) for i in range(count)], device=like.device)
+        middle, spread = torch.zeros(2, count, device=like.device)
+        of_normal = [i for i in self._order if columns[i].distribution == "gaussian"]
+        middle[of_normal], spread[of_normal] = self._middle, self._spread
+        kind = torch.tensor([float(KINDS.index(draw.distribution)) for draw in columns], device=like.device)
+        pace, first = self._pace or (torch.zeros_like(kind), torch.ones_like(kind))
+        return torch.stack([kind, middle, spread, self._least, self._most, pace, first, self._neutral], dim=1), source
 
     def ask(self, numbers: UniformNumbers) -> Drawn:
         """Ask for the even numbers that `values` is made of."""
@@ -66,6 +85,13 @@ class Draws:
         """Draw (count, V) numbers, not within a step; those that grow have not yet."""
         even = self.low + torch.rand(count, len(self.low), device=self.low.device) * (self.high - self.low)
         return self.values(even, torch.zeros((), device=even.device))
+
+    def write(self, even: Tensor, steps: Tensor, out: Tensor, kernels: "TaskKernels | None") -> None:
+        """Write `values` into `out` (N, V), by one launch where there are `kernels`."""
+        if kernels is None:
+            out.copy_(self.values(even, steps))
+        else:
+            kernels.make_draws(even, self.source, self.table, steps.view(1), out)
 
     def values(self, even: Tensor, steps: Tensor) -> Tensor:
         """Return (N, V) numbers from even ones, (N, V) within `low` and `high`, after so many `steps` of training, ()."""

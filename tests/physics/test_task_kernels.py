@@ -20,6 +20,7 @@ from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
 from legged.mdp.disturbances import Forces, Kicks
+from legged.mdp.draws import Draws
 from legged.mdp.height_map_errors import HeightMapErrors
 from legged.mdp.height_scan import HeightScan
 from legged.mdp.randomization import Pushes, Randomization
@@ -208,15 +209,23 @@ class NoPhysics:
         self.pushed[:, 0] = mask
         self.pushed[:, 1:] = delta
 
+    def choose_variants(self, mask, chosen):
+        self.chosen = torch.where(mask, chosen, -1)
 
-def test_numbers_are_drawn_again_alike():
+
+@pytest.mark.parametrize("chosen", [(), ("link_mass",), ("link_mass", "alone")])
+def test_numbers_are_drawn_again_alike(chosen):
+    """With masses of links, worlds choose among models of which constants were derived, also where nothing else is drawn."""
     ranges = {**varying("p_gain", "velocity_limit"), **varying("d_gain", when="reset"), "joint_offset": (0.5, 1.5)}
+    if chosen:
+        ranges = {**varying("link_mass", when="reset"), **({} if "alone" in chosen else ranges)}
     numbers, parts, engines = [], [], []
     for kernels in (None, TaskKernels(nullcontext)):
         torch.manual_seed(3)
         numbers.append(UniformNumbers(N, CPU))
         engines.append(NoPhysics(kernels))
         parts.append(Randomization(ranges, N, CPU))
+        parts[-1].widen(dict.fromkeys(ranges, 3))
         parts[-1].prepare(engines[-1], numbers[-1], DT, 24)
     for step in range(20):
         reset = chance(0.1, N)
@@ -246,6 +255,25 @@ def test_the_control_law_varies_alike_and_keeps_what_was_drawn_at_the_start():
     torch.testing.assert_close(laws[1].stiffness, drawn["p_gain"][:, None] * torch.as_tensor(robot.stiffness).float())
 
 
+def test_numbers_of_all_distributions_are_made_alike():
+    """Exponentials and normal ones but for their last bits; on the way from a value that is neutral too."""
+    columns = [
+        DrawConfig((1.0, 2.0), distribution="gaussian", grow=(0.0, 10.0)),
+        DrawConfig((3.0, 4.0), grow=(2.0, 4.0)),
+        DrawConfig((5.0, 60.0), distribution="log_uniform"),
+        DrawConfig((7.0, 8.0), distribution="gaussian", std=0.1),
+    ]
+    draws = Draws(columns, [1.0, 0.0, 5.0, 7.5], CPU, 24)
+    even = draws.low + torch.rand(N, 4) * (draws.high - draws.low)
+    for iteration in (0.0, 1.0, 2.5, 3.5, 20.0):
+        steps, found = torch.tensor(24.0 * iteration), torch.zeros(2, N, 4)
+        for out, kernels in zip(found, (None, TaskKernels(nullcontext)), strict=True):
+            draws.write(even, steps, out, kernels)
+        torch.testing.assert_close(found[1], found[0], rtol=1e-6, atol=0.0)
+        torch.testing.assert_close(found[0], draws.values(even, steps), rtol=0.0, atol=0.0)
+    assert found[0].std(dim=0).min() > 0.05
+
+
 def test_kicks_and_forces_come_and_end_alike():
     kick = KickConfig(interval_s=(0.1, 0.3), x=(-1.0, 1.0), yaw=(-0.5, 0.5))
     force = ForceConfig(body="", interval_s=(0.05, 0.2), duration_s=(0.04, 0.1), y=(-50.0, 50.0))
@@ -254,7 +282,7 @@ def test_kicks_and_forces_come_and_end_alike():
         torch.manual_seed(3)
         numbers.append(UniformNumbers(N, CPU))
         engines.append(NoPhysics(kernels))
-        parts.append([Kicks(kick, DT, 24, numbers[-1]), Forces(force, 1, DT, 24, numbers[-1])])
+        parts.append([Kicks(kick, DT, 24, numbers[-1], kernels), Forces(force, 1, DT, 24, numbers[-1], kernels)])
     kicked = 0
     for step in range(40):
         mask = chance(0.9, N)

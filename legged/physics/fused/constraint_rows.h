@@ -40,7 +40,8 @@ const int DRY_DOFS = DRY ? NV : 1;  // of each degree of freedom what its row of
 LEGGED_SHARED float dry_D[DRY_DOFS], dry_loss[DRY_DOFS], dry_reference[DRY_DOFS], dry_curvature[DRY_DOFS];
 LEGGED_SHARED signed char dry_sides[DRY_DOFS];
 LEGGED_SHARED short dry_row[DRY_DOFS];
-float a[DOFS], Ma[DOFS], Ms[DOFS], smooth[DOFS], grad[DOFS], s[DOFS];
+float a[DOFS], Ms[DOFS], grad[DOFS], s[DOFS];
+float rest[DOFS];  // what constraints have to push: M a - qfrc_smooth
 const float TINY = 1e-15f;
 const int UNKNOWN = -3;
 
@@ -54,6 +55,7 @@ const int width = arrays.jacobian.shape[2];  // padded
 // A number of row r; arrays differ in how many rows they have room for.
 auto number_of = [&](const auto& array, int r) { return array.data[(long long)world * array.shape[1] + efc_row(r)]; };
 const float* jacobian = arrays.jacobian.data + (long long)world * arrays.jacobian.shape[1] * width;
+auto smooth = [&](int i) { return arrays.qfrc_smooth.data[world * arrays.qfrc_smooth.shape[1] + i]; };
 // Calls `use(r, row)` with `row` the Jacobian's: those in shared memory and the others, in few worlds, are read differently.
 auto with_row = [&](int r, auto use) {
     if (r < KEPT) use(r, static_cast<const float*>(J + r * STRIDE));
@@ -124,7 +126,6 @@ EACH_ROW(r) {
 }
 EACH_DOF(i) {
     OF(a, i) = arrays.warmstart.data[world * arrays.warmstart.shape[1] + i];
-    OF(smooth, i) = arrays.qfrc_smooth.data[world * arrays.qfrc_smooth.shape[1] + i];
     shown[i] = OF(a, i);
 }
 meet();
@@ -148,23 +149,23 @@ meet();
 EACH_DOF(i) {
     float total = 0.0f;
     UNROLLED for (int j = 0; j < NV; ++j) total += M[i * STRIDE + j] * shown[j];
-    OF(Ma, i) = total;
+    OF(rest, i) = total - smooth(i);
 }
 EACH_ROW(r) x[r] += along_row(r);
 // The sides of the last step, but after a reset, which leaves no acceleration to begin with.
-[[maybe_unused]] int* last_rows = KNOWN ? arrays.last_rows.data + (long long)world * arrays.last_rows.shape[1] : nullptr;
-[[maybe_unused]] const int* row_keys = KNOWN ? arrays.row_key.data + (long long)world * arrays.row_key.shape[1] + ne : nullptr;
+[[maybe_unused]] auto last_rows = [&](int k) -> int& { return arrays.last_rows.data[(long long)world * arrays.last_rows.shape[1] + k]; };
+[[maybe_unused]] auto key_of = [&](int row) { return arrays.row_key.data[(long long)world * arrays.row_key.shape[1] + row]; };
 int had = 0;  // rows in the last step
 if (KNOWN) {
     bool moving = false;
     EACH_DOF(i) moving |= OF(a, i) != 0.0f;
-    if (any(moving)) had = last_rows[0];
+    if (any(moving)) had = last_rows(0);
     int* before = reinterpret_cast<int*>(force);
-    EACH(k, had) before[k] = last_rows[1 + k];
+    EACH(k, had) before[k] = last_rows(1 + k);
     meet();
     // Of the k-th row after equalities; it often has the place that it had.
     auto side_of = [&](int k) {
-        const int key = row_keys[k];
+        const int key = key_of(ne + k);
         int place = k;
         if (k >= had || before[k] >> 2 != key) {
             place = 0;

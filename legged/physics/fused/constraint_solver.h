@@ -56,9 +56,7 @@ while (true) {
         float pushed_of[DOFS] = {};
         each_pushing([&](int r, const float* row) { EACH_DOF(i) OF(pushed_of, i) += row[i] * force[r]; });
         EACH_DOF(i) {
-            const float pushed = DRY ? OF(pushed_of, i) - OF(dragged, i) : OF(pushed_of, i);
-            arrays.qfrc_constraint.data[world * arrays.qfrc_constraint.shape[1] + i] = pushed;
-            OF(grad, i) = OF(Ma, i) - OF(smooth, i) - pushed;
+            OF(grad, i) = OF(rest, i) - (DRY ? OF(pushed_of, i) - OF(dragged, i) : OF(pushed_of, i));
             squares += OF(grad, i) * OF(grad, i);
         }
         squares = sum(squares);
@@ -68,7 +66,7 @@ while (true) {
         }
     }
     // The step s = -H^-1 grad, or the acceleration.
-    EACH_DOF(i) shown[i] = OF(s, i) = DAMPED && advancing ? OF(Ma, i) - OF(grad, i) : -OF(grad, i);
+    EACH_DOF(i) shown[i] = OF(s, i) = DAMPED && advancing ? OF(rest, i) + smooth(i) - OF(grad, i) : -OF(grad, i);
     meet();
     if (SPLIT && (advancing || !several)) solve(Branches{}); else solve(Path{});
     if (DAMPED && advancing) {
@@ -82,7 +80,7 @@ while (true) {
         float total = 0.0f;
         UNROLLED for (int j = 0; j < NV; ++j) total += M[i * STRIDE + j] * shown[j];
         OF(Ms, i) = total;
-        sums[0] += OF(s, i) * (OF(Ma, i) - OF(smooth, i));
+        sums[0] += OF(s, i) * OF(rest, i);
         sums[1] += OF(s, i) * total;
         sums[2] += OF(s, i) * OF(s, i);
         sums[3] -= OF(s, i) * OF(grad, i);
@@ -127,7 +125,7 @@ while (true) {
     }
     EACH_DOF(i) {
         OF(a, i) += alpha * OF(s, i);
-        OF(Ma, i) += alpha * OF(Ms, i);
+        OF(rest, i) += alpha * OF(Ms, i);
     }
     if (ELLIPTIC) meet();
     EACH_ROW(r) x[r] += alpha * jv[r];
@@ -137,7 +135,8 @@ while (true) {
 
 EACH_DOF(i) {
     arrays.qacc.data[world * arrays.qacc.shape[1] + i] = OF(a, i);
-    arrays.inertial.data[world * arrays.inertial.shape[1] + i] = OF(Ma, i);
+    arrays.inertial.data[world * arrays.inertial.shape[1] + i] = OF(rest, i) + smooth(i);
+    arrays.qfrc_constraint.data[world * arrays.qfrc_constraint.shape[1] + i] = OF(rest, i) - OF(grad, i);
 }
 EACH_ROW(r) arrays.efc_force.data[(long long)world * arrays.efc_force.shape[1] + efc_row(r)] = force[r];
 if (DRY) EACH_DOF(i) {
@@ -145,7 +144,7 @@ if (DRY) EACH_DOF(i) {
 }
 if (lane == 0) arrays.rounds.data[world] = round;
 if (KNOWN) {
-    EACH_ROW(r) if (r >= ne) last_rows[1 + efc_row(r) - ne] = row_keys[efc_row(r) - ne] << 2 | (sides[r] + 2);
-    if (DRY) EACH_DOF(i) if (dry_row[i] >= 0) last_rows[1 + dry_row[i] - ne] = i << 2 | (dry_sides[i] + 2);
-    if (lane == 0) last_rows[0] = of_all - ne;
+    EACH_ROW(r) if (r >= ne) last_rows(1 + efc_row(r) - ne) = key_of(efc_row(r)) << 2 | (sides[r] + 2);
+    if (DRY) EACH_DOF(i) if (dry_row[i] >= 0) last_rows(1 + dry_row[i] - ne) = i << 2 | (dry_sides[i] + 2);
+    if (lane == 0) last_rows(0) = of_all - ne;
 }

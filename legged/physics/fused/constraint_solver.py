@@ -71,7 +71,7 @@ def blocks(constants: dict[str, int | bool]) -> int:
     nv, rows, stride = constants["NV"], constants["ROWS"], constants["STRIDE"]
     pitch, path = (4 * ((n + 4) // 4) for n in (constants["DEPTH"], nv))
     board = max(constants["WIDTH"] * pitch, path if constants["SPLIT"] else 0)
-    floats = (constants["KEPT_ROWS"] + nv + 1) * stride + 2 * board + constants["CORNER"]
+    floats = (constants["KEPT_ROWS"] + nv + 1) * stride + 2 * board
     taken = 4 * floats + (20 + (13 if constants["ELLIPTIC"] else 0)) * rows + (19 * nv if constants["DRY"] else 0)
     return max(4, min(32, MULTIPROCESSOR_BYTES // (taken + BYTES_OF_A_BLOCK) // 4 * 4))
 

@@ -2,17 +2,18 @@
 // (Featherstone, Rigid Body Dynamics Algorithms, 2008, section 6.5). Where no constraint row couples branches, H has an entry
 // for a degree of freedom and those on its path to the root alone, so that a row of H is as short as the path, and all that
 // have the same depth are eliminated at once. Otherwise the tree is a path. Constants: ROOT (degrees of freedom that all
-// paths begin with, at most 6; each lane solves for them by itself), DEPTH (most on one path), WIDTH (most of the same depth
-// outside the root), SPLIT (whether there are branches), TRIANGLE (of the root's entries of H, that many) and CORNER (with
-// those of g).
+// paths begin with, at most 6), DEPTH (most on one path), WIDTH (most of the same depth outside the root), SPLIT (whether there
+// are branches), TRIANGLE (of the root's entries of H, that many) and CORNER (with those of g).
 
 #if defined(__CUDA_ARCH__)
 #define EVERY_LIMB(i) UNROLLED for (int slot = 0; slot < LIMBS; ++slot) if (const int i = dof_at(slot); true)
 #define EACH_LIMB(i) EVERY_LIMB(i) if (i >= ROOT && i < NV)
-#define EACH_CORNER(n) if (const int n = lane; n < CORNER)
+#define EVERY_CORNER(n) if (const int n = lane; true)
+#define EACH_CORNER(n) EVERY_CORNER(n) if (n < CORNER)
 #define OF_CORNER(values, n) values[0]
 const int LIMBS = NV > 32 && NV - ROOT > 32 ? 2 : 1, CORNERS = 1;
-// What the lane of a limb has.
+// What the lane of an entry of the root has, and that of a limb.
+auto from_corner = [&](const float* values, int n) { return __shfl_sync(0xffffffffu, values[0], n); };
 auto from_limb = [&](const float* values, int i) {
     if (NV <= 32) return __shfl_sync(0xffffffffu, values[0], i);
     const float one = __shfl_sync(0xffffffffu, values[0], (i - ROOT) & 31);
@@ -23,14 +24,16 @@ auto from_limb = [&](const float* values, int i) {
 #else
 #define EVERY_LIMB(i) for (int i = ROOT; i < NV; ++i)
 #define EACH_LIMB(i) EVERY_LIMB(i)
-#define EACH_CORNER(n) for (int n = 0; n < CORNER; ++n)
+#define EVERY_CORNER(n) for (int n = 0; n < CORNER; ++n)
+#define EACH_CORNER(n) EVERY_CORNER(n)
 #define OF_CORNER(values, n) values[n]
 const int LIMBS = NV, CORNERS = CORNER > 0 ? CORNER : 1;
+auto from_corner = [&](const float* values, int n) { return values[n]; };
 auto from_limb = [&](const float* values, int i) { return values[i]; };
 #endif
 const int CHAIN = DEPTH > ROOT ? DEPTH - ROOT : 1, PITCH = 4 * ((DEPTH + 4) / 4), LONG_PITCH = 4 * ((NV + 4) / 4);
 const int BOARD = SPLIT && WIDTH * PITCH < LONG_PITCH ? LONG_PITCH : WIDTH * PITCH;
-LEGGED_SHARED float boards[2 * BOARD], corner[CORNER > 0 ? CORNER : 1];
+LEGGED_SHARED float boards[2 * BOARD];
 struct Branches { enum { value = 1 }; };
 struct Path { enum { value = 0 }; };
 
@@ -42,7 +45,7 @@ EACH_LIMB(i) {
     UNROLLED for (int t = ROOT; t < DEPTH; ++t) OF(path_of, i)[t - ROOT] = SPLIT ? arrays.dof_path.data[t * NV + i] : t;
 }
 // Of an entry of the root: its row and column; the right-hand side has columns of its own.
-int row_of[CORNERS], column_of[CORNERS];
+int row_of[CORNERS] = {}, column_of[CORNERS] = {};
 EACH_CORNER(n) {
     int i = 0;
     while ((i + 1) * (i + 2) / 2 <= n) ++i;
@@ -58,7 +61,7 @@ bool advancing = false;
 auto solve = [&](auto tree) {
     constexpr bool branches = decltype(tree)::value;
     constexpr int height = branches ? DEPTH : NV, pitch = branches ? PITCH : LONG_PITCH;
-    float H[LIMBS][height], over[LIMBS], C[CORNERS];
+    float H[LIMBS][height], over[LIMBS], C[CORNERS] = {};
     // Hessian M + J^T diag(curvature) J, or M + h D.
     EACH_LIMB(i) {
         UNROLLED for (int e = 0; e < height; ++e)
@@ -149,24 +152,25 @@ auto solve = [&](auto tree) {
             }
         }
     }
-    // The root: every lane does the same, without a word to others.
-    EACH_CORNER(n) corner[n] = OF_CORNER(C, n);
-    meet();
-    float R[CORNER > 0 ? CORNER : 1], root[ROOT > 0 ? ROOT : 1], root_over[ROOT > 0 ? ROOT : 1];
-    UNROLLED for (int n = 0; n < CORNER; ++n) R[n] = corner[n];
+    // The root, of which each lane has an entry: H = L^T diag(1 / over) L again, then its solution, which all lanes get.
+    float root[ROOT > 0 ? ROOT : 1], root_over[ROOT > 0 ? ROOT : 1];
+    meet();  // `shown` was read, and is written
     UNROLLED for (int k = ROOT - 1; k >= 0; --k) {
-        const float* row = R + k * (k + 1) / 2;
-        root_over[k] = inverse(most(row[k], TINY));
-        UNROLLED for (int i = 0; i < ROOT; ++i) if (i < k) {
-            const float part = row[i] * root_over[k];
-            R[TRIANGLE + i] -= part * R[TRIANGLE + k];
-            UNROLLED for (int j = 0; j < ROOT; ++j) if (j <= i) R[i * (i + 1) / 2 + j] -= part * row[j];
+        const int row = k * (k + 1) / 2;
+        root_over[k] = inverse(most(from_corner(C, row + k), TINY));
+        EVERY_CORNER(n) {
+            const int i = OF_CORNER(row_of, n), j = OF_CORNER(column_of, n);
+            const float one = from_corner(C, i < k ? row + i : 0), other = from_corner(C, j < 0 ? TRIANGLE + k : j < k ? row + j : 0);
+            if (i < k) OF_CORNER(C, n) -= one * root_over[k] * other;
         }
     }
     UNROLLED for (int k = 0; k < ROOT; ++k) {
-        root[k] = R[TRIANGLE + k];
-        UNROLLED for (int j = 0; j < ROOT; ++j) if (j < k) root[k] -= R[k * (k + 1) / 2 + j] * root[j];
-        root[k] *= root_over[k];
+        root[k] = from_corner(C, TRIANGLE + k) * root_over[k];
+        EVERY_CORNER(n) {
+            const int i = OF_CORNER(row_of, n);
+            const float part = from_corner(C, i > k ? i * (i + 1) / 2 + k : 0);
+            if (OF_CORNER(column_of, n) < 0 && i > k) OF_CORNER(C, n) -= part * root[k];
+        }
         if (lane == 0) shown[k] = root[k];
     }
     // Back from the root to the leaves.

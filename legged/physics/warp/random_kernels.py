@@ -35,6 +35,58 @@ def find_moments(
         steps[0] = steps[0] + 1.0
 
 
+@wp.func
+def drawn_value(even: float, column: int, table: wp.array2d[float], steps: float) -> float:
+    """Return a number of a column of `Draws.table` from an even one."""
+    value = even
+    kind = table[column, 0]
+    if kind > 0.0:
+        value = wp.where(kind == 1.0, wp.exp(even), wp.erfinv(even) * table[column, 2] + table[column, 1])
+        value = wp.min(wp.max(value, table[column, 3]), table[column, 4])
+    share = wp.min(wp.max(table[column, 6] + table[column, 5] * steps, 0.0), 1.0)
+    neutral = table[column, 7]
+    if share < 0.5:
+        return neutral + share * (value - neutral)
+    return value - (value - neutral) * (1.0 - share)
+
+
+@wp.kernel
+def make_draws(
+    even: wp.array2d[float],
+    source: wp.array[wp.int64],
+    table: wp.array2d[float],
+    steps: wp.array[float],
+    drawn: wp.array2d[float],
+):
+    """One thread a robot and column."""
+    robot, column = wp.tid()
+    drawn[robot, column] = drawn_value(even[robot, int(source[column])], column, table, steps[0])
+
+
+@wp.kernel
+def make_fresh(
+    even: wp.array2d[float],
+    source: wp.array[wp.int64],
+    table: wp.array2d[float],
+    steps: wp.array[float],
+    place: wp.array[wp.int64],
+    choice: wp.array2d[float],
+    variants: wp.array2d[float],
+    chosen: wp.array[wp.int64],
+    fresh: wp.array2d[float],
+):
+    """One thread a robot and column of what is drawn; places beyond those of the table are columns of the variants."""
+    robot, column = wp.tid()
+    variant = wp.clamp(int(choice[robot, 0]), 0, variants.shape[0] - 1)
+    if column == 0:
+        chosen[robot] = wp.int64(variant)
+    at = int(place[column])
+    if at < table.shape[0]:
+        fresh[robot, column] = drawn_value(even[robot, int(source[at])], at, table, steps[0])
+    else:
+        fresh[robot, column] = variants[variant, at - table.shape[0]]
+
+
 @wp.kernel
 def take_fresh(due: wp.array2d[wp.bool], moment: wp.array[wp.int64], fresh: wp.array2d[float], drawn: wp.array2d[float]):
     """One thread a robot and number."""
@@ -88,22 +140,21 @@ def find_kicks(
 @wp.kernel
 def push_bodies(
     mask: wp.array[wp.bool],
-    fresh: wp.array2d[float],
-    times: wp.array2d[float],
+    drawn: wp.array2d[float],
     dt: float,
     last_moment: float,
     left: wp.array2d[float],
     force: wp.array2d[float],
     total: wp.array2d[float],
 ):
-    """One thread a robot."""
+    """One thread a robot. Of a new push there are the force's three numbers, the interval and how long it lasts."""
     robot = wp.tid()
     lasting, pause = left[robot, 0] - dt, left[robot, 1] - dt
     ends = lasting <= last_moment or not mask[robot]
     begins = pause <= last_moment and mask[robot]
     if begins:
-        lasting = wp.float32(times[robot, 0])
-        pause = wp.float32(times[robot, 1])
+        lasting = wp.max(drawn[robot, 4], dt)
+        pause = drawn[robot, 3] + lasting
     left[robot, 0] = lasting
     left[robot, 1] = pause
     for i in range(3):
@@ -111,7 +162,7 @@ def push_bodies(
         if ends:
             now = 0.0
         if begins:
-            now = wp.float32(fresh[robot, i])
+            now = wp.float32(drawn[robot, i])
         force[robot, i] = now
         total[robot, i] = total[robot, i] + now
 

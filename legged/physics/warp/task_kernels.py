@@ -14,6 +14,8 @@ from legged.physics.warp.random_kernels import (
     advance_map,
     find_kicks,
     find_moments,
+    make_draws,
+    make_fresh,
     push_bodies,
     take_fresh,
     vary_control,
@@ -324,6 +326,14 @@ class TaskKernels(Launcher):
     def find_pushes(self, *arguments: Tensor | float) -> None:
         """As the first half of `Pushes.push`."""
         self.launch(find_pushes, len(arguments[0]), arguments)  # type: ignore[arg-type]
+
+    def make_draws(self, *arguments: Tensor) -> None:
+        """As `Draws.values`: the last argument is written."""
+        self.launch(make_draws, tuple(arguments[-1].shape), arguments)
+
+    def make_fresh(self, *arguments: Tensor) -> None:
+        """As `Randomization.draw`: the last two arguments are written."""
+        self.launch(make_fresh, tuple(arguments[-1].shape), arguments)
 
     def find_moments(self, *arguments: Tensor) -> None:
         """As the first half of `Randomization.redraw`."""
