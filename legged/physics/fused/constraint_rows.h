@@ -1,8 +1,8 @@
 // The constraint rows of one world, and who holds what. Constants: NV (degrees of freedom, at most 64), ROWS (most constraint
 // rows), KEPT_ROWS (of the Jacobian in shared memory), STRIDE (from one row of a matrix to the next), ENTRIES (of the mass
 // matrix that are not zero), FRICTION (whether there may be rows of dry friction), DRY (whether they are all of degrees of
-// freedom), SPLIT (whether there are branches), ROOT (degrees of freedom before the first branch), KNOWN (whether rows are known
-// again from step to step; sides are those of row_sides.py).
+// freedom), SPLIT (whether there are branches), ROOT (degrees of freedom before the first branch), KNOWN (whether rows are
+// known again from step to step; sides are those of row_sides.py).
 //
 // On a GPU each lane holds what belongs to one degree of freedom or two (a row of a matrix too), in registers; what all lanes
 // read often, and what belongs to constraint rows, is in shared memory. On the CPU one thread holds everything, and the same
@@ -153,7 +153,9 @@ EACH_DOF(i) {
 }
 EACH_ROW(r) x[r] += along_row(r);
 // The sides of the last step, but after a reset, which leaves no acceleration to begin with.
-[[maybe_unused]] auto last_rows = [&](int k) -> int& { return arrays.last_rows.data[(long long)world * arrays.last_rows.shape[1] + k]; };
+[[maybe_unused]] auto last_rows = [&](int k) -> int& {
+    return arrays.last_rows.data[(long long)world * arrays.last_rows.shape[1] + k];
+};
 [[maybe_unused]] auto key_of = [&](int row) { return arrays.row_key.data[(long long)world * arrays.row_key.shape[1] + row]; };
 int had = 0;  // rows in the last step
 if (KNOWN) {

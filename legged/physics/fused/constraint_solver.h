@@ -20,8 +20,8 @@ while (true) {
             } else {
                 float piece = sides[r];
                 const bool given = guessing && sides[r] != UNKNOWN;
-                force[r] = given ? -rub_on(D[r], FRICTION && !DRY && r < nf ? number_of(arrays.frictionloss, r) : 0.0f, x[r], piece)
-                                 : -pull(r, x[r], piece);
+                const float loss = FRICTION && !DRY && r < nf ? number_of(arrays.frictionloss, r) : 0.0f;
+                force[r] = given ? -rub_on(D[r], loss, x[r], piece) : -pull(r, x[r], piece);
                 curvature[r] = most(piece, 0.0f);
                 side = piece > 0.0f ? 1 : (int)piece;
             }
@@ -87,7 +87,8 @@ while (true) {
     }
     sum_four(sums);
     const float slope = sums[0], bend = sums[1], length = sums[2], decrement = sums[3];
-    if (!(scale * 0.5f * decrement >= (guessing ? -INFINITE : tolerance))) {  // nothing to gain; also where something is not a number
+    // Nothing to gain; also where something is not a number.
+    if (!(scale * 0.5f * decrement >= (guessing ? -INFINITE : tolerance))) {
         if (!DAMPED) break;
         advancing = true;
         continue;

@@ -1,9 +1,11 @@
 // Rows of the constraints of one world: of dry friction, joint limits, and the `found` contacts that lie in the world's slots;
 // behind those of equalities, which are there. Constants: NV, NJ (degrees of freedom, joints), ROWS, SLOTS (most rows, most
 // contacts), PLAIN (most rows of friction and limits), DIMS (most directions of a contact), FRICTIONS, LIMITS, BALLS,
-// EQUALITIES (what there is of them), DENSE_FRICTION (whether the Jacobian's rows of dry friction are read), BOUNCES (whether worlds differ in the springs of contacts), ELLIPTIC (friction cones,
-// instead of pyramids), and MuJoCo's numbers: BALL, CONSTRAINT
-// (a type of contact), FRICTIONLESS, FRICTIONAL (types of rows), NARROWPHASE (a flag of overflow).
+// EQUALITIES (what there is of them), DENSE_FRICTION (whether the Jacobian's rows of dry friction are read), BOUNCES (whether
+// worlds differ in the springs of contacts), ELLIPTIC (friction cones, instead of pyramids), and MuJoCo's numbers: BALL,
+// CONSTRAINT (a type of contact), FRICTIONLESS, FRICTIONAL (types of rows), NARROWPHASE (a flag of overflow).
+// A row has a key, by which the solver knows it again: rising from row to row, first of degrees of freedom, then of joints, then
+// of what found a contact.
 
 // Of a contact: its offsets from the two trees' centres of mass, its axes, friction, and what its rows are made of.
 const int OFFSET = 0, FRAME = 6, FRICTION = 15, STIFFNESS = 20, PULL = 21, DAMPING = 22, SLIDING = 23, RECORD = 24;
@@ -105,7 +107,8 @@ if (LIMITS) {
         if (!is) continue;
         const float* spring = arrays.joint_spring.data + j * SPRING;
         const float impeded = impedance(spring, pos);
-        put(start + place, NV + j, stiffness_of(dof_weights[dof], impeded), -spring[0] * impeded * pos - spring[1] * speed, 0.0f);
+        const float reference = -spring[0] * impeded * pos - spring[1] * speed;
+        put(start + place, NV + j, stiffness_of(dof_weights[dof], impeded), reference, 0.0f);
         entry_dof[place] = dof;
         for (int k = 0; k < 3; ++k) entry[3 * place + k] = pulled[k];
     }

@@ -160,7 +160,8 @@ auto solve = [&](auto tree) {
         root_over[k] = inverse(most(from_corner(C, row + k), TINY));
         EVERY_CORNER(n) {
             const int i = OF_CORNER(row_of, n), j = OF_CORNER(column_of, n);
-            const float one = from_corner(C, i < k ? row + i : 0), other = from_corner(C, j < 0 ? TRIANGLE + k : j < k ? row + j : 0);
+            const float one = from_corner(C, i < k ? row + i : 0);
+            const float other = from_corner(C, j < 0 ? TRIANGLE + k : j < k ? row + j : 0);
             if (i < k) OF_CORNER(C, n) -= one * root_over[k] * other;
         }
     }

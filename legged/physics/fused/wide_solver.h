@@ -2,10 +2,10 @@
 // worlds side by side in vector registers, of friction pyramids. Worlds with fewer rows than others have empty ones, and those
 // that are done wait for the others of their block. The block's worlds are those from `start` on, before `end`. Constants: WIDE,
 // NV (degrees of freedom), ROWS (most constraint rows), ENTRIES (of the mass matrix that are not zero), DAMPED (whether dampers
-// are integrated implicitly), KNOWN (whether rows are known again from step to step), FRICTION (whether there may be rows of dry friction), COUPLED (whether a row may move degrees of
-// freedom of several branches). And of the tree: PATH_START and PATH_LENGTH (NV each), where the path of a degree of freedom
-// from the root to itself begins in PATHS, and how long it is; ENTRY_PLACE (ENTRIES), where an entry of the mass matrix is
-// among those of all paths.
+// are integrated implicitly), KNOWN (whether rows are known again from step to step), FRICTION (whether there may be rows of dry
+// friction), COUPLED (whether a row may move degrees of freedom of several branches). And of the tree: PATH_START and PATH_LENGTH
+// (NV each), where the path of a degree of freedom from the root to itself begins in PATHS, and how long it is; ENTRY_PLACE
+// (ENTRIES), where an entry of the mass matrix is among those of all paths.
 
 // Numbers of all worlds; and masks, all of whose bits are set where something is so.
 typedef float Wide __attribute__((vector_size(4 * WIDE), may_alias));
@@ -254,7 +254,8 @@ for (int round = 0;; ++round) {
         length += s[i] * s[i];
         decrement -= s[i] * grad[i];
     }
-    active &= scale * 0.5f * decrement >= (whole ? ZERO - INFINITE : ZERO + tolerance);  // else there is nothing to gain; also where something is not a number
+    // Else there is nothing to gain; also where something is not a number.
+    active &= scale * 0.5f * decrement >= (whole ? ZERO - INFINITE : ZERO + tolerance);
     if (!any_of(active)) break;
     for (int r = 0; r < rows; ++r) jv[r] = along_row(r, s);
     // It need not be followed to its lowest point: what is left of its slope goes in the next round. Squared:
