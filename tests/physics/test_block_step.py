@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from mechanisms import FusedWorlds, relative_error
+from mechanisms import EVERY_ROW, FusedWorlds, relative_error
 from reference import heaps, snapshot
 
 from legged.config.schema import SimConfig
@@ -19,29 +19,6 @@ from legged.physics.warp.mujoco_warp import MujocoWarpPhysics
 CPU = torch.device("cpu")
 COUNT = 2 * WIDE + 5
 """Worlds: two blocks, and a part of one."""
-EVERY_ROW = """
-<mujoco>
-  <option timestep="0.004" cone="pyramidal" impratio="5" iterations="50" ls_iterations="50" gravity="1 0 -9"/>
-  <default><geom contype="0" conaffinity="1"/></default>
-  <worldbody>
-    <geom type="plane" size="5 5 .1" contype="1" conaffinity="0"/>
-    <body pos="0 0 .099">
-      <freejoint/><geom type="box" size=".1 .1 .1" mass="3" friction=".7"/>
-      <body pos=".1 0 .1">
-        <joint type="hinge" axis="0 1 0" frictionloss="0.8" damping=".1"/>
-        <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass=".4"/>
-        <body pos=".3 0 0">
-          <joint type="hinge" axis="0 0 1" limited="true" range="-0.2 0.2"/>
-          <geom type="capsule" fromto="0 0 0 .2 0 0" size=".02" mass=".2"/>
-        </body>
-      </body>
-    </body>
-    <body pos="1 0 1"><joint name="left" type="slide" axis="0 0 1"/><geom size=".05" mass="1"/></body>
-    <body pos="1.5 0 1"><joint name="right" type="slide" axis="0 0 1"/><geom size=".05" mass="2"/></body>
-  </worldbody>
-  <equality><joint joint1="left" joint2="right" polycoef="0 -1 0 0 0"/></equality>
-</mujoco>
-"""
 
 
 def rolled(robot, count: int, threads: int, broken: int | None = None) -> torch.Tensor:

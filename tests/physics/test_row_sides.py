@@ -7,36 +7,12 @@ import numpy as np
 import pytest
 import torch
 from devices import CUDA, on_gpu
-from mechanisms import FusedWorlds, relative_error
+from mechanisms import EVERY_ROW, FusedWorlds, relative_error
 from reference import heaps
 
 from legged.physics.fused import constraint_solver
 from legged.physics.fused.row_sides import HOLDING, IDLE, SLIPPING, SLIPPING_BACK, UNKNOWN
 
-CRAWLER = """
-<mujoco>
-  <option timestep="0.004" impratio="5" iterations="50" ls_iterations="50" gravity="1 0 -9"/>
-  <default><geom contype="0" conaffinity="1"/></default>
-  <worldbody>
-    <geom type="plane" size="5 5 .1" contype="1" conaffinity="0"/>
-    <body pos="0 0 .099">
-      <freejoint/><geom type="box" size=".1 .1 .1" mass="3" friction=".7"/>
-      <body pos=".1 0 .1">
-        <joint type="hinge" axis="0 1 0" frictionloss="0.8" damping=".1"/>
-        <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass=".4"/>
-        <body pos=".3 0 0">
-          <joint type="hinge" axis="0 0 1" limited="true" range="-0.2 0.2"/>
-          <geom type="capsule" fromto="0 0 0 .2 0 0" size=".02" mass=".2"/>
-        </body>
-      </body>
-    </body>
-    <body pos="1 0 1"><joint name="left" type="slide" axis="0 0 1"/><geom size=".05" mass="1"/></body>
-    <body pos="1.5 0 1"><joint name="right" type="slide" axis="0 0 1"/><geom size=".05" mass="2"/></body>
-  </worldbody>
-  <equality><joint joint1="left" joint2="right" polycoef="0 -1 0 0 0"/></equality>
-</mujoco>
-"""
-"""Rows of every kind: a box that slides, with an arm that rubs, is damped and has a limit, and two masses that are tied."""
 COUNT = 19
 HERE = [pytest.param("cpu", "wide", id="blocks"), pytest.param("cpu", "lanes", id="lanes")]
 SOURCES = [*HERE, on_gpu(CUDA, "lanes", id="cuda")]
@@ -45,7 +21,7 @@ SOURCES = [*HERE, on_gpu(CUDA, "lanes", id="cuda")]
 
 def crawlers(device: str, source: str, known: bool = True) -> FusedWorlds:
     """Return worlds that have just been put down, and slide."""
-    model = mujoco.MjModel.from_xml_string(CRAWLER)
+    model = mujoco.MjModel.from_xml_string(EVERY_ROW)
     rng = np.random.default_rng(0)
     qpos = np.tile(model.qpos0, (COUNT, 1)) + np.pad(rng.uniform(-0.2, 0.2, (COUNT, model.nq - 7)), ((0, 0), (7, 0)))
     qpos[:, 2] += rng.uniform(-2e-3, 0.05, COUNT)

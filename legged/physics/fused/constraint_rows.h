@@ -2,7 +2,7 @@
 // rows), KEPT_ROWS (of the Jacobian in shared memory), STRIDE (from one row of a matrix to the next), ENTRIES (of the mass
 // matrix that are not zero), FRICTION (whether there may be rows of dry friction), DRY (whether they are all of degrees of
 // freedom), SPLIT (whether there are branches), ROOT (degrees of freedom before the first branch), KNOWN (whether rows are
-// known again from step to step; sides are those of row_sides.py).
+// known again from step to step), and the sides of row_sides.py.
 //
 // On a GPU each lane holds what belongs to one degree of freedom or two (a row of a matrix too), in registers; what all lanes
 // read often, and what belongs to constraint rows, is in shared memory. On the CPU one thread holds everything, and the same
@@ -43,7 +43,6 @@ LEGGED_SHARED short dry_row[DRY_DOFS];
 float a[DOFS], Ms[DOFS], grad[DOFS], s[DOFS];
 float rest[DOFS];  // what constraints have to push: M a - qfrc_smooth
 const float TINY = 1e-15f;
-const int UNKNOWN = -3;
 
 const int ne = arrays.equalities.data[world], frictions = FRICTION ? arrays.frictions.data[world] : 0;
 const int of_all = arrays.nefc.data[world] < ROWS ? arrays.nefc.data[world] : ROWS;
@@ -88,8 +87,8 @@ auto along_row = [&](int r) {
 };
 // The same where it is on this side, or would be.
 [[maybe_unused]] auto rub_on = [](float d, float loss, float at, float& side) {
-    if (side == 0.0f) return 0.0f;
-    if (side < 0.0f) return side == -1.0f ? loss : -loss;
+    if (side == IDLE) return 0.0f;
+    if (side < IDLE) return side == SLIPPING ? loss : -loss;
     side = d;
     return d * at;
 };

@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from legged.physics.fused.native import LANES, Constant, native_source
-from legged.physics.fused.row_sides import RowSides
+from legged.physics.fused.row_sides import SIDES, RowSides
 from legged.physics.fused.solver_arrays import SolverArrays
 from legged.physics.fused.tree import MOST_DOFS, Tree
 from legged.physics.fused.wide_solver import WIDE, fits_wide, wide_constants, wide_kernel
@@ -61,7 +61,7 @@ def solver_constants(
         "ELLIPTIC_ROW": ELLIPTIC_ROW,
         "KNOWN": known and not elliptic,
     }
-    return {**sizes, **kinds, **tree.constants()}
+    return {**sizes, **kinds, **SIDES, **tree.constants()}
 
 
 def blocks(constants: dict[str, int | bool]) -> int:

@@ -14,6 +14,8 @@ import warp as wp
 UNKNOWN, SLIPPING_BACK, SLIPPING, IDLE, HOLDING = -3, -2, -1, 0, 1
 """Sides: of rows that nothing is known of; of dry friction whose force is its greatest, forwards or backwards; of rows that
 do not push; and of those whose force is that of a spring. A row that was there is kept as 4 * its key + its side + 2."""
+SIDES = {"UNKNOWN": UNKNOWN, "SLIPPING_BACK": SLIPPING_BACK, "SLIPPING": SLIPPING, "IDLE": IDLE, "HOLDING": HOLDING}
+"""What native sources call them."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ typedef int Mask __attribute__((vector_size(4 * WIDE), may_alias));
 const Wide ZERO = Wide{};
 const Wide ONE = ZERO + 1.0f;
 const float TINY = 1e-15f, INFINITE = 3.0e38f, ENOUGH = 0.1f;
-const int UNKNOWN = -3, SLIPPING_BACK = -2, SLIPPING = -1, IDLE = 0, HOLDING = 1;  // row_sides.py
 const int SPARSE = PATH_START[NV - 1] + PATH_LENGTH[NV - 1], DENSE = NV * (NV + 1) / 2;
 
 auto any_of = [](const Mask& mask) {
