@@ -101,6 +101,14 @@ class Parameter:
             return int(drawn)
         return min(max(float(f"{drawn:.{DIGITS}g}"), self.low), self.high)
 
+    def drawn(self, value: Any) -> Any:
+        """Return what is drawn for a value of the setting; None if it is none of those that are tried."""
+        if self.kind == "choice":
+            return next((text for text in self.choices if json.loads(text) == value), None)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not self.low <= value <= self.high:
+            return None
+        return value if self.value(value) == value else None
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -114,6 +122,17 @@ class Plan:
     parameters: tuple[Parameter, ...]
     task: str
     """What a command is given as its --task: a name, or a YAML file."""
+
+    @property
+    def own(self) -> dict[str, Any]:
+        """Dotted path -> the task's own value of each setting that is swept, which trials are to do better than."""
+        task = to_dict(self.cfg)
+        return {one.path: value_at(task, one.path) for one in self.parameters}
+
+    @property
+    def own_drawn(self) -> dict[str, Any]:
+        """Dotted path -> what is drawn for the task's own value; None where it is none of those that are tried."""
+        return {one.path: one.drawn(self.own[one.path]) for one in self.parameters}
 
     @property
     def folder(self) -> Path:

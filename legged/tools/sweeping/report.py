@@ -46,7 +46,7 @@ def write_report(trials: Trials, module: str | None = None) -> list[str]:
         draw_history(plan, all_trials, folder / "history.png")
         draw_parallel(plan, ranked, folder / "parallel.png")
         written += [folder / name for name in ("best.yaml", "history.png", "parallel.png")]
-        lines.append(f"best: trial {best.number}, {plan.objective_text}: {best.value:.4g}")
+        lines.append(f"best: trial {best.number}, {plan.objective_text}: {best.value:.4g}{_beside_own(plan, ranked)}")
         importance = importances(trials)
         if importance:
             draw_importance(plan, importance, folder / "importance.png")
@@ -66,6 +66,18 @@ def settings(plan: Plan, trial: "FrozenTrial") -> dict[str, Any]:
     return {one.path: one.value(trial.params[one.path]) for one in plan.parameters if one.path in trial.params}
 
 
+def own_trial(plan: Plan, trials: Sequence["FrozenTrial"]) -> "FrozenTrial | None":
+    """Return the trial that has the task's own settings, if there is one."""
+    return next((trial for trial in trials if settings(plan, trial) == plan.own), None)
+
+
+def _beside_own(plan: Plan, ranked: Sequence["FrozenTrial"]) -> str:
+    own = own_trial(plan, ranked)
+    if own is None:
+        return ""
+    return f"; the task's own settings: trial {own.number}, {own.value:.4g}, rank {ranked.index(own) + 1} of {len(ranked)}"
+
+
 def table(plan: Plan, trials: Sequence["FrozenTrial"], module: str | None = None) -> str:
     """Return all trials as Markdown: those with a value by rank, then those that were ended early, then the others."""
     order = {"PRUNED": 0, "RUNNING": 1, "WAITING": 2, "FAIL": 3}
@@ -73,7 +85,9 @@ def table(plan: Plan, trials: Sequence["FrozenTrial"], module: str | None = None
     others = sorted((t for t in trials if t.state.name != "COMPLETE"), key=lambda t: (order[t.state.name], t.number))
     paths = [one.path for one in plan.parameters]
     sign = -1.0 if plan.negated else 1.0
-    lines = [f"# {plan.name}", "", f"`{plan.cfg.task}`, for the {plan.objective_text}.", ""]
+    own = own_trial(plan, trials)
+    besides = f" Trial {own.number} has the task's own settings." if own is not None else ""
+    lines = [f"# {plan.name}", "", f"`{plan.cfg.task}`, for the {plan.objective_text}.{besides}", ""]
     heads = ["rank", "trial", plan.objective_text, *(f"`{path}`" for path in paths), "run"]
     lines += [_row(heads), _row(["--:", "--:", "--:", *["--:"] * len(paths), ":--"])]
     for rank, trial in enumerate(ranked, 1):
@@ -156,6 +170,7 @@ def draw_history(plan: Plan, trials: Sequence["FrozenTrial"], path: Path) -> Non
     there = [trial for trial in trials if trial.state.name == "COMPLETE"]
     early = [trial.number for trial in trials if trial.state.name == "PRUNED"]
     numbers, values = [trial.number for trial in there], [float(trial.value or 0.0) for trial in there]
+    own = own_trial(plan, there)
     pick = min if plan.minimize else max
     best = [pick(values[: i + 1]) for i in range(len(values))]
     with figure(path, (7.0, 3.6)) as (drawn, axes):
@@ -163,6 +178,8 @@ def draw_history(plan: Plan, trials: Sequence["FrozenTrial"], path: Path) -> Non
         axis.plot(numbers, values, "o", ms=4, color=BLUE, label="trial")
         until = max([*numbers, *early])
         axis.step([*numbers, until], [*best, best[-1]], where="post", color=VERMILLION, label="best so far")
+        if own is not None:
+            axis.axhline(float(own.value or 0.0), color="black", lw=1.0, ls="--", label="the task's own settings")
         if early:
             low = axis.get_ylim()[0]
             axis.plot(early, [low] * len(early), "x", ms=6, color=GREY, clip_on=False, zorder=5, label="ended early")
@@ -170,7 +187,7 @@ def draw_history(plan: Plan, trials: Sequence["FrozenTrial"], path: Path) -> Non
         axis.set_xlabel("trial")
         axis.set_ylabel(plan.objective_text)
         axis.grid(alpha=0.3)
-        drawn.legend(loc="outside upper center", ncols=3, frameon=False)
+        drawn.legend(loc="outside upper center", ncols=4, frameon=False)
 
 
 def draw_importance(plan: Plan, importance: dict[str, float], path: Path) -> None:
