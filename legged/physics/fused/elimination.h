@@ -6,6 +6,7 @@
 // are branches), TRIANGLE (of the root's entries of H, that many) and CORNER (with those of g).
 
 #if defined(__CUDA_ARCH__)
+#define UNROLLED_ALONG _Pragma("unroll turns")
 #define EVERY_LIMB(i) UNROLLED for (int slot = 0; slot < LIMBS; ++slot) if (const int i = dof_at(slot); true)
 #define EACH_LIMB(i) EVERY_LIMB(i) if (i >= ROOT && i < NV)
 #define EVERY_CORNER(n) if (const int n = lane; true)
@@ -22,6 +23,7 @@ auto from_limb = [&](const float* values, int i) {
     return i < ROOT + 32 ? one : other;
 };
 #else
+#define UNROLLED_ALONG
 #define EVERY_LIMB(i) for (int i = ROOT; i < NV; ++i)
 #define EACH_LIMB(i) EVERY_LIMB(i)
 #define EVERY_CORNER(n) for (int n = 0; n < CORNER; ++n)
@@ -61,10 +63,13 @@ bool advancing = false;
 auto solve = [&](auto tree) {
     constexpr bool branches = decltype(tree)::value;
     constexpr int height = branches ? DEPTH : NV, pitch = branches ? PITCH : LONG_PITCH;
+    // Worlds in which a row couples branches are few: there loops are not unrolled, so that H is in slow memory. In registers its
+    // long rows would crowd out what every world needs.
+    [[maybe_unused]] constexpr int turns = branches || !SPLIT ? height : 1;
     float H[LIMBS][height], over[LIMBS], C[CORNERS] = {};
     // Hessian M + J^T diag(curvature) J, or M + h D.
     EACH_LIMB(i) {
-        UNROLLED for (int e = 0; e < height; ++e)
+        UNROLLED_ALONG for (int e = 0; e < height; ++e)
             OF(H, i)[e] = M[i * STRIDE + (branches && e >= ROOT ? OF(path_of, i)[e - ROOT] : e)];
     }
     EACH_CORNER(n) {
@@ -75,7 +80,7 @@ auto solve = [&](auto tree) {
         const float weight = curvature[r];
         EACH_LIMB(i) {
             const float part = weight * row[i];
-            UNROLLED for (int e = 0; e < height; ++e)
+            UNROLLED_ALONG for (int e = 0; e < height; ++e)
                 OF(H, i)[e] += part * row[branches && e >= ROOT ? OF(path_of, i)[e - ROOT] : e];
         }
         EACH_CORNER(n) {
@@ -84,7 +89,7 @@ auto solve = [&](auto tree) {
         }
         if (ELLIPTIC && directions[r] > 0 && bent[r] != 0.0f) {
             EACH_LIMB(i) {
-                UNROLLED for (int e = 0; e < height; ++e)
+                UNROLLED_ALONG for (int e = 0; e < height; ++e)
                     OF(H, i)[e] += bend_of(r, i, branches && e >= ROOT ? OF(path_of, i)[e - ROOT] : e);
             }
             EACH_CORNER(n) {
@@ -95,7 +100,7 @@ auto solve = [&](auto tree) {
     });
     if (DRY && !(DAMPED && advancing)) {
         EACH_LIMB(i) {
-            UNROLLED for (int e = ROOT; e < height; ++e)
+            UNROLLED_ALONG for (int e = ROOT; e < height; ++e)
                 OF(H, i)[e] += e == (branches ? OF(depth_of, i) : i) ? dry_curvature[i] : 0.0f;
         }
         EACH_CORNER(n) {
@@ -107,7 +112,7 @@ auto solve = [&](auto tree) {
         const float h = arrays.timestep.data[world % arrays.timestep.shape[0]];
         const float* damping = arrays.damping.data + (long long)(world % arrays.damping.shape[0]) * NV;
         EACH_LIMB(i) {
-            UNROLLED for (int e = ROOT; e < height; ++e)
+            UNROLLED_ALONG for (int e = ROOT; e < height; ++e)
                 OF(H, i)[e] += e == (branches ? OF(depth_of, i) : i) ? h * damping[i] : 0.0f;
         }
         EACH_CORNER(n) {
@@ -116,7 +121,7 @@ auto solve = [&](auto tree) {
         }
     }
     // Limbs, from the leaves to the root: H = L^T diag(1 / over) L. A row of the board is the right-hand side, `over`, and H.
-    UNROLLED for (int t = height - 1; t >= ROOT; --t) {
+    UNROLLED_ALONG for (int t = height - 1; t >= ROOT; --t) {
         float* board = boards + (t & 1) * BOARD;
         EACH_LIMB(i) {
             const float pivot = OF(H, i)[t];  // read by all: the compiler takes it for H[depth] else, no longer in a register
@@ -124,7 +129,7 @@ auto solve = [&](auto tree) {
                 float* row = board + (branches ? OF(place_of, i) * pitch : 0);
                 row[0] = OF(s, i);
                 row[1] = OF(over, i) = inverse(most(pivot, TINY));
-                UNROLLED for (int e = 0; e < height; ++e) if (e < t) row[2 + e] = OF(H, i)[e];
+                UNROLLED_ALONG for (int e = 0; e < height; ++e) if (e < t) row[2 + e] = OF(H, i)[e];
             }
         }
         meet();
@@ -139,7 +144,7 @@ auto solve = [&](auto tree) {
                 ROLLED for (int n = from; n < to; ++n) {
                     const float* row = board + n * pitch;
                     const float part = row[2 + own] * row[1];
-                    UNROLLED for (int e = 0; e < height; ++e) if (e < t) OF(H, i)[e] -= part * row[2 + e];
+                    UNROLLED_ALONG for (int e = 0; e < height; ++e) if (e < t) OF(H, i)[e] -= part * row[2 + e];
                     OF(s, i) -= part * row[0];
                 }
             }
@@ -176,9 +181,9 @@ auto solve = [&](auto tree) {
     }
     // Back from the root to the leaves.
     EACH_LIMB(i) {
-        UNROLLED for (int e = 0; e < ROOT; ++e) OF(s, i) -= OF(H, i)[e] * root[e];
+        UNROLLED_ALONG for (int e = 0; e < ROOT; ++e) OF(s, i) -= OF(H, i)[e] * root[e];
     }
-    UNROLLED for (int t = ROOT; t < height; ++t) {
+    UNROLLED_ALONG for (int t = ROOT; t < height; ++t) {
         EACH_LIMB(i) {
             if ((branches ? OF(depth_of, i) : i) == t) OF(s, i) *= OF(over, i);
         }
