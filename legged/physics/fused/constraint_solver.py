@@ -76,20 +76,13 @@ def blocks(constants: dict[str, int | bool]) -> int:
     return max(4, min(32, MULTIPROCESSOR_BYTES // (taken + BYTES_OF_A_BLOCK) // 4 * 4))
 
 
-def solver_function(constants: dict[str, int | bool]) -> Any:
-    """Return what solves one world, all of its lanes together, for some `solver_constants`."""
+def solver_kernel(constants: dict[str, int | bool]) -> Any:
+    """Return the kernel for some `solver_constants`; launched for (worlds, lanes)."""
 
     @wp.func_native(native_source(SOURCE, constants))
     def solve_world(
         world: int, most_rounds: int, most_searches: int, tolerance: float, ls_tolerance: float, arrays: SolverArrays
     ) -> None: ...
-
-    return solve_world
-
-
-def solver_kernel(constants: dict[str, int | bool]) -> Any:
-    """Return the kernel for some `solver_constants`; launched for (worlds, lanes)."""
-    solve_world = solver_function(constants)
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=(LANES, blocks(constants)))
     def solve_constraints(

@@ -1,4 +1,4 @@
-"""A physics step in few launches: one before contacts, and one for constraint forces and integration; on a CPU two.
+"""A physics step in few launches: one before contacts, one for constraint forces, one for integration.
 
 mujoco-warp launches a stage for everything that a model might have: gravity compensation, external forces, muscles with
 lengths and activations, fluids, tendons. At 4096 worlds a launch costs microseconds whether it finds anything or not;
@@ -14,11 +14,9 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
-from legged.physics.fused.constraint_solver import ConstraintSolver, blocks, solver_function
-from legged.physics.fused.native import LANES
+from legged.physics.fused.constraint_solver import ConstraintSolver
 from legged.physics.fused.row_sides import RowSides
 from legged.physics.fused.smooth_dynamics import BALL, FREE, SmoothDynamics, has_dampers
-from legged.physics.fused.solver_arrays import SolverArrays
 
 NEFC, BROADPHASE, NARROWPHASE = (int(getattr(mjw.OverflowType, n)) for n in ("NEFC", "BROADPHASE", "NARROWPHASE"))
 FREE_JOINT, BALL_JOINT = wp.constant(FREE), wp.constant(BALL)
@@ -93,38 +91,6 @@ def integrate(of: StateArrays):
     integrate_joint(world, joint, of)
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-__syncwarp();
-#endif
-""")
-def meet() -> None:
-    """Let the lanes of a world see what the others have written."""
-    ...
-
-
-def finish_kernel(constants: dict[str, int | bool]) -> Any:
-    """Return the kernel that solves a world and moves it on, for some `solver_constants`; launched for (worlds, lanes)."""
-    solve_world = solver_function(constants)
-
-    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(LANES, blocks(constants)))
-    def finish_step(
-        most_rounds: int,
-        most_searches: int,
-        tolerance: float,
-        ls_tolerance: float,
-        solver: SolverArrays,
-        state: StateArrays,
-    ) -> None:
-        world, lane = wp.tid()  # type: ignore[misc]
-        solve_world(world, most_rounds, most_searches, tolerance, ls_tolerance, solver)
-        meet()
-        for joint in range(lane, state.jnt_type.shape[0], LANES):
-            integrate_joint(world, joint, state)
-
-    return finish_step
-
-
 class TorqueStep:
     """Launches on mujoco-warp's arrays all of a step but contacts and constraint rows, which are made in between."""
 
@@ -143,7 +109,6 @@ class TorqueStep:
         of.nefc, of.nacon, of.ncollision, of.most_rows, of.most_contacts = d.nefc, d.nacon, d.ncollision, d.njmax, d.naconmax
         of.qpos, of.qvel, of.warmstart, of.overflow = d.qpos, d.qvel, d.qacc_warmstart, d.overflow
         self.worlds, self.joints = d.nworld, m.njnt
-        self._finish = None if d.qacc.device.is_cpu else finish_kernel(self.solver.constants)
 
     @staticmethod
     def why_not(model: mujoco.MjModel, randomized: Collection[str] = ()) -> str:
@@ -160,9 +125,5 @@ class TorqueStep:
 
     def finish(self) -> None:
         """Compute, with the rows of constraints made, their forces, the next state and warm start, and overflow flags."""
-        if self._finish is None:
-            self.solver.solve()
-            wp.launch(integrate, dim=(self.worlds, self.joints), inputs=[self.state])
-        else:
-            inputs = [*self.solver.settings, self.solver.arrays, self.state]
-            wp.launch(self._finish, dim=(self.worlds, LANES), inputs=inputs, block_dim=LANES)
+        self.solver.solve()
+        wp.launch(integrate, dim=(self.worlds, self.joints), inputs=[self.state])
