@@ -92,15 +92,17 @@ def code_state() -> str:
     package = Path(__file__).resolve().parents[1]
     version = f"legged {_version()}\n"
     try:
-        if Path(_git(package.parent, "rev-parse", "--show-toplevel").strip()).resolve() != package.parent:
+        top, commit = _git(package.parent, "rev-parse", "--show-toplevel", "HEAD").splitlines()
+        if Path(top).resolve() != package.parent:
             return f"{version}not in a git repository of its own\n"
         _git(package.parent, "ls-files", "--error-unmatch", f"{package.name}/__init__.py", "pyproject.toml")
         project = tomllib.loads((package.parent / "pyproject.toml").read_text(encoding="utf-8"))
         if project.get("project", {}).get("name") != package.name:
             return f"{version}not in a git repository of its own\n"
-        commit = _git(package.parent, "rev-parse", "HEAD").strip()
         status = _git(package.parent, "status", "--short")
-        return f"{version}commit {commit}\n{status}\n{_git(package.parent, 'diff', '--no-ext-diff', '--no-color', 'HEAD')}"
+        changed = any(not line.startswith("??") for line in status.splitlines())
+        difference = _git(package.parent, "diff", "--no-ext-diff", "--no-color", "HEAD") if changed else ""
+        return f"{version}commit {commit}\n{status}\n{difference}"
     except FileNotFoundError:
         return f"{version}git is not on the PATH: the commit is not known\n"
     except subprocess.CalledProcessError:
