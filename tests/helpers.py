@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import re
 import subprocess
 import sys
@@ -22,6 +23,8 @@ TASK = "anymal_c_flat"
 JOINTS = 12
 POLICY = Path(__file__).resolve().parents[1] / "resources" / "policies" / TASK
 """The policy of that task which comes with the package."""
+POLICY_ITERATION = json.loads((POLICY / "timing.json").read_text())["iterations"] - 1
+"""The last iteration of its training, counted from 0."""
 
 # One thread: the tests share their cores with whatever else runs.
 ENGINE = [("sim.physics", "mujoco"), ("sim.threads", 1)]

@@ -5,7 +5,7 @@ import shutil
 from dataclasses import replace
 
 import pytest
-from helpers import POLICY, small_config
+from helpers import POLICY, POLICY_ITERATION, small_config
 
 from legged.config import override
 from legged.errors import ConfigError
@@ -105,7 +105,7 @@ def test_what_failed_is_a_line_and_no_part_of_the_mean():
     assert task["mean"]["engines"]["mujoco"]["rmse_lin"] == {"mean": 0.04, "worst": 0.1}  # nobody was measured in the other
     text = markdown([task])
     _, of_all, _, failed, third = cells_of(text)
-    assert failed[1:] == ["2", "4", "600", "failed", *["-"] * 6]
+    assert failed[1:] == ["2", "4", str(FLAT.train.runner.max_iterations), "failed", *["-"] * 6]
     assert third[4:9] == ["20.0 +2", "5.0 *", "27.0", "100,000", "- (-)"]
     assert of_all[5] == "5.0 *"
     assert "- anymal_c_flat, seed 1: evaluation in mujoco_warp failed: no memory\n" in text
@@ -123,8 +123,8 @@ def test_runs_are_found_in_folders_and_beside_shipped_policies(tmp_path):
     shutil.copy(POLICY / "config.yaml", folder)
     assert read_run(folder).failure == "it left no checkpoint"
     shutil.copy(POLICY / "model.pt", folder / "model_99.pt")
-    assert read_run(folder).failure == "stopped after 100 of 300 iterations"
-    shutil.copy(POLICY / "model.pt", folder / "model_299.pt")
+    assert read_run(folder).failure == f"stopped after 100 of {POLICY_ITERATION + 1} iterations"
+    shutil.copy(POLICY / "model.pt", folder / f"model_{POLICY_ITERATION}.pt")
     for path in (folder, folder.parent, tmp_path / "logs"):
         (found,) = find_runs([path])
         assert (found.folder, found.failure, found.timing) == (folder, "", None)
@@ -136,10 +136,10 @@ def test_an_evaluation_of_another_checkpoint_is_neither_in_the_table_nor_shipped
     """As after evaluate --checkpoint best: it is not what the policy that would be shipped is worth."""
     for name in ("config.yaml", "evaluation_mujoco.json"):
         shutil.copy(POLICY / name, tmp_path)
-    shutil.copy(POLICY / "model.pt", tmp_path / "model_299.pt")
+    shutil.copy(POLICY / "model.pt", tmp_path / f"model_{POLICY_ITERATION}.pt")
     assert [*read_run(tmp_path).results] == ["mujoco"]
     path = tmp_path / "evaluation_mujoco.json"
-    path.write_text(path.read_text().replace('"model_299.pt"', '"model_best.pt"'))
+    path.write_text(path.read_text().replace(f'"model_{POLICY_ITERATION}.pt"', '"model_best.pt"'))
     found = read_run(tmp_path)
     assert not found.results
     assert found.notes == ("its evaluation in mujoco is of model_best.pt, not of its last policy",)

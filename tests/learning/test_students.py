@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import POLICY, TASK, TINY_TRAINING, call, checkpoints, tiny_run
+from helpers import POLICY, POLICY_ITERATION, TASK, TINY_TRAINING, call, checkpoints, tiny_run
 from test_resume import EVENTFUL, content, same
 
 from legged.config import to_dict
@@ -135,7 +135,7 @@ def test_the_loss_and_the_teacher_are_told(capsys):
     assert call(train.main, [*arguments, *TINY_TRAINING]) == 0
     out = capsys.readouterr().out
     assert "teacher: " in out
-    assert f"{TASK}/model.pt ({TASK}, iteration 299)" in out
+    assert f"{TASK}/model.pt ({TASK}, iteration {POLICY_ITERATION})" in out
     assert "behaviour loss 0." in out
 
 

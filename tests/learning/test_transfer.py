@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import POLICY, TASK, TINY_TRAINING, call, checkpoints, run_folders, tiny_run
+from helpers import POLICY, POLICY_ITERATION, TASK, TINY_TRAINING, call, checkpoints, run_folders, tiny_run
 
 import legged
 from legged.learning.captured import CapturedRunner
@@ -104,7 +104,8 @@ def test_a_transferred_run_counts_from_0_says_where_it_comes_from_and_is_resumed
     assert steps == {(3 + 2) * 20}
     before, after = content(source, 2)["actor_state_dict"], saved["actor_state_dict"]
     assert not torch.equal(before["mlp.0.weight"], after["mlp.0.weight"])  # it has trained on
-    assert (before["mlp.0.weight"] - after["mlp.0.weight"]).abs().max() < 0.1
+    # From where it was, not from new weights, which differ by as much as they are long, times the root of two.
+    assert (before["mlp.0.weight"] - after["mlp.0.weight"]).norm() < 0.5 * before["mlp.0.weight"].norm()
     resumed = tiny_run("--resume", "--task", OTHER, "--load_run", str(folder), iterations=4)
     assert content(resumed, 3)["infos"]["transferred_from"] == origin
     assert "transferred_from" not in content(source, 2)["infos"]
@@ -159,7 +160,7 @@ def test_an_optimiser_of_another_kind_begins_anew(capsys):
 def test_a_shipped_policy_is_named_by_its_task_or_its_path(capsys, name):
     sizes = [f"train.policy.{network}_hidden_dims=[128, 64, 32]" for network in ("actor", "critic")]
     out = said(capsys, "--load_run", name, *sizes)
-    assert f"policies/{TASK} ({TASK}, iteration 299): actor and critic (128, 64, 32), Adam's state" in out
+    assert f"policies/{TASK} ({TASK}, iteration {POLICY_ITERATION}): actor and critic (128, 64, 32)" in out
 
 
 def test_the_newest_run_of_another_tasks_folder_is_taken(capsys):

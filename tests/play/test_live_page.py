@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import ENGINE, POLICY, TASK, wait_for
+from helpers import ENGINE, POLICY, POLICY_ITERATION, TASK, wait_for
 from PIL import Image
 
 from legged.learning.run_folder import run_config
@@ -145,7 +145,7 @@ def test_a_browser_draws_the_robot_and_moves_it():
         wrong: list[str] = []
         window.on("pageerror", lambda error: wrong.append(str(error)))
         window.goto(url(HOST, shown.port))
-        window.wait_for_selector("text=iteration 300")
+        window.wait_for_selector(f"text=iteration {POLICY_ITERATION + 1}")
         slider = window.locator("[role=slider]").first
         slider.focus()
         window.keyboard.press("End")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import ENGINE, POLICY, TASK
+from helpers import ENGINE, POLICY, POLICY_ITERATION, TASK
 
 from legged.learning.checkpoint import read_checkpoint, write_checkpoint
 from legged.learning.run_folder import BEST, BEST_MODEL, CONFIG_FILE, SHIPPED_MODEL, run_config
@@ -205,7 +205,7 @@ def test_robots_are_put_onto_chosen_tiles_and_keep_their_policy(session):
     session.go_to("stairs_up", 0.7)
     try:
         assert session.place() == "stairs_up, step height 0.176 m"  # 0.05 + 0.18 * 0.7
-        assert session.iteration == 300
+        assert session.iteration == POLICY_ITERATION + 1
         tiles = torch.tensor(session.task.terrain.origins[0, :, :2], dtype=torch.float32)
         away = torch.cdist(session.task.base_pos[:, :2], tiles).min(dim=1).values
         assert float(away.max()) < 0.5
