@@ -96,10 +96,10 @@ def task_and_runner(kind=Runner, *overrides, num_envs=12):
 def test_a_rollout_is_that_of_rsl_rl(scale):
     """Observations, actions and ends of episodes bit by bit, with noise, commands and resets drawn alike; values, rewards
     with bootstrapped time-outs and returns to float tolerance, because all steps are judged at once. The observation
-    stored at t is the one that was acted on.
+    stored at t is the one that was acted on. Noise times a power of two is exact: rsl-rl rounds it before it is added.
     """
-    scaled = ("train.algorithm.reward_scale", scale)
-    first, runner = task_and_runner(Runner, scaled)
+    scaled = [("train.algorithm.reward_scale", scale), ("train.policy.init_noise_std", 0.5)]
+    first, runner = task_and_runner(Runner, *scaled)
     stock = runner.alg
     torch.manual_seed(7)
     first.reset()
@@ -113,7 +113,7 @@ def test_a_rollout_is_that_of_rsl_rl(scale):
             torch.testing.assert_close(learned_from[~extras["time_outs"]], scale * rewards[~extras["time_outs"]])
         stock.compute_returns(observations)
 
-    second, captured = task_and_runner(CapturedRunner, scaled)
+    second, captured = task_and_runner(CapturedRunner, *scaled)
     torch.manual_seed(7)
     second.reset()
     second.episode_length_buf = torch.arange(12) + second.max_episode_length - 6

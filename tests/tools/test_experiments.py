@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from helpers import POLICY, TASK, call, tiny_run
+from helpers import POLICY, POLICY_ITERATION, TASK, call, tiny_run
 from torch.utils.tensorboard import SummaryWriter
 
 from legged.config import to_dict
@@ -88,22 +88,23 @@ def test_runs_are_in_one_table_newest_first(capsys):
 
 def test_an_evaluation_of_another_checkpoint_than_the_last_is_called_that(capsys):
     """As after evaluate --checkpoint best, or of a training that went on afterwards."""
+    last = f"model_{POLICY_ITERATION}.pt"
     folders = [write_run(stamp) for stamp in STAMPS[:2]]
     for folder in folders:
         (folder / "model_4.pt").touch()
         shutil.copyfile(POLICY / "evaluation_mujoco.json", folder / "evaluation_mujoco.json")
     path = folders[1] / "evaluation_mujoco.json"
-    of_the_last = path.read_text().replace('"model_299.pt"', '"model_4.pt"')
+    of_the_last = path.read_text().replace(f'"{last}"', '"model_4.pt"')
     path.write_text(of_the_last)
     assert experiments.main([]) == 0
-    assert [row["evaluated"] for row in table()] == ["model_299.pt", ""]
+    assert [row["evaluated"] for row in table()] == [last, ""]
     assert report.main([*map(str, folders)]) == 0
-    said = "In C MuJoCo it is of `model_299.pt`, which is not the last policy."
+    said = f"In C MuJoCo it is of `{last}`, which is not the last policy."
     assert [said in (folder / "report.md").read_text() for folder in folders] == [True, False]
     assert experiments.main(["--compare", *map(str, folders)]) == 0
     text = Path("logs/comparison.md").read_text().replace("\\", "")
     assert text.count("which is not its last policy") == 1
-    assert f"({STAMPS[0]}): of `model_299.pt`" in text
+    assert f"({STAMPS[0]}): of `{last}`" in text
     (folders[0] / "evaluation_mujoco.json").write_text(of_the_last)
     assert experiments.main([]) == 0
     assert "evaluated" not in table()[0]

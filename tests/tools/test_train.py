@@ -11,5 +11,5 @@ from legged.tools.train import describe
 def test_one_robot_is_no_robots(count, says):
     cfg = task_config("anymal_c_flat", [("env.num_envs", count), ("sim.physics", "mujoco"), ("sim.threads", 1)], on_cpu=True)
     assert describe(cfg, torch.device("cpu")).startswith(
-        f"anymal_c_flat: {says} 600 iterations, no GPU in use: C MuJoCo on 1 core,"
+        f"anymal_c_flat: {says} {cfg.train.runner.max_iterations} iterations, no GPU in use: C MuJoCo on 1 core,"
     )
