@@ -89,7 +89,8 @@ def _main(argv: list[str] | None) -> int:
     trials.keep_to(devices[0].type)
     jobs = args.jobs or len(devices)
     print(f"{plan.name}: {plan.given.trials} trials of {plan.cfg.task} for the {plan.objective_text}; {jobs} at once")
-    beyond = [f"{path} {shown(plan.own[path])}" for path, drawn in plan.own_drawn.items() if drawn is None]
+    own = plan.own
+    beyond = [f"{path} {shown(own[path])}" for path, drawn in plan.own_drawn.items() if drawn is None]
     if beyond:
         print(f"no trial has the task's own settings, of which these are not among those tried: {', '.join(beyond)}")
     again = trials.take_back()

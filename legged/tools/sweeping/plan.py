@@ -132,7 +132,8 @@ class Plan:
     @property
     def own_drawn(self) -> dict[str, Any]:
         """Dotted path -> what is drawn for the task's own value; None where it is none of those that are tried."""
-        return {one.path: one.drawn(self.own[one.path]) for one in self.parameters}
+        own = self.own
+        return {one.path: one.drawn(own[one.path]) for one in self.parameters}
 
     @property
     def folder(self) -> Path:

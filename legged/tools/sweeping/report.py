@@ -68,7 +68,8 @@ def settings(plan: Plan, trial: "FrozenTrial") -> dict[str, Any]:
 
 def own_trial(plan: Plan, trials: Sequence["FrozenTrial"]) -> "FrozenTrial | None":
     """Return the trial that has the task's own settings, if there is one."""
-    return next((trial for trial in trials if settings(plan, trial) == plan.own), None)
+    own = plan.own
+    return next((trial for trial in trials if settings(plan, trial) == own), None)
 
 
 def _beside_own(plan: Plan, ranked: Sequence["FrozenTrial"]) -> str:

@@ -74,8 +74,9 @@ class Trials:
             known = self.study.user_attrs.get(SWEEP)
             if known is None:
                 self.study.set_user_attr(SWEEP, plan.identity)
-                if None not in plan.own_drawn.values():
-                    self.study.enqueue_trial(plan.own_drawn, skip_if_exists=True)
+                own = plan.own_drawn
+                if None not in own.values():
+                    self.study.enqueue_trial(own, skip_if_exists=True)
         except ConfigError:
             raise
         except Exception as error:  # of SQLAlchemy, drivers and file systems, each of its own kind
