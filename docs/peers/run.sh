@@ -7,6 +7,7 @@
 #   MJLAB_PYTHON=python      the interpreter that has mjlab; MJLAB_PATH, if it is set, becomes its PYTHONPATH
 #   OURS_PYTHON=python       the one that has this package; OURS_PATH likewise
 #   MJLAB_SECONDS=600        mjlab's training ends at the first checkpoint after this time
+#   MJLAB_RESUME=            set to anything: mjlab's training goes on from the newest checkpoint in FOLDER, with its time
 #   OURS_ITERATIONS=         iterations of ours; the task's own number by default
 #   EVERY=10                 iterations from checkpoint to checkpoint
 #   NUM_ENVS=4096  DEVICE=cuda:0  JOBS=2 (checkpoint sets that are judged at the same time)
@@ -36,7 +37,7 @@ for robot in $robots; do
   name=${robot^} # Go1, G1: mjlab's spelling
   if [[ " $phases " == *" mjlab "* ]]; then
     mjlab "$root/docs/peers/train_mjlab.py" "Mjlab-Velocity-Flat-Unitree-$name" --out "mjlab_$robot" --every "$every" \
-      --num-envs "$num_envs" --seconds "${MJLAB_SECONDS:-600}" --device "$device" >"mjlab_$robot.log" 2>&1 || {
+      --num-envs "$num_envs" --seconds "${MJLAB_SECONDS:-600}" --device "$device" ${MJLAB_RESUME:+--resume} >>"mjlab_$robot.log" 2>&1 || {
       tail -n 20 "mjlab_$robot.log"
       exit 1
     }

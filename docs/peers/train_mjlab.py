@@ -5,6 +5,7 @@
 Runs in an environment with mjlab 1.6, not with this package. Writes into --out: an ONNX file every so many iterations, whose
 metadata have `wall_s`, the seconds since this process began less those spent on such files, and `iterations`; layout.yaml,
 how the policy sees and drives the robot; robot.xml, its model with actuators; and training.json with steps per second.
+`--resume` goes on from the newest checkpoint in --out, with its `wall_s`: building the task a second time is not counted.
 """
 
 import time
@@ -61,6 +62,8 @@ class TimedRunner(MjlabOnPolicyRunner):
 
     folder: Path
     seconds: float
+    began_s = STARTED_S
+    """The time from which `wall_s` is counted [s]."""
     exporting_s = 0.0
     """Time spent on ONNX files so far [s]."""
     written: list[dict[str, Any]]
@@ -73,7 +76,7 @@ class TimedRunner(MjlabOnPolicyRunner):
         """
         super().save(path, infos)  # waits for the device
         before = time.perf_counter()
-        wall_s = before - STARTED_S - self.exporting_s
+        wall_s = before - self.began_s - self.exporting_s
         done = self.current_learning_iteration + 1
         name = f"policy_{done:05d}.onnx"
         self.export_policy_to_onnx(str(self.folder), name)
@@ -87,6 +90,17 @@ class TimedRunner(MjlabOnPolicyRunner):
         if wall_s >= self.seconds:
             raise TimeIsUp
 
+    def resume(self) -> None:
+        """Go on from the newest checkpoint that has an ONNX file, at its iteration and its time."""
+        for path in sorted(self.folder.glob("policy_*.onnx")):
+            noted = {entry.key: entry.value for entry in onnx.load(path).metadata_props}
+            done, wall_s = int(noted["iterations"]), float(noted["wall_s"])
+            self.written.append({"file": path.name, "iterations": done, "wall_s": wall_s})
+        newest = self.written[-1]
+        self.load(str(self.folder / f"model_{newest['iterations'] - 1}.pt"))
+        self.current_learning_iteration = newest["iterations"]  # rsl-rl would do the last one again
+        self.began_s = time.perf_counter() - newest["wall_s"]
+
 
 def main() -> None:
     """Train, and write."""
@@ -95,6 +109,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--iterations", type=int, help="mjlab's own number by default")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="end at the first checkpoint after this time")
+    parser.add_argument("--resume", action="store_true", help="go on from the newest checkpoint in --out")
     parser.add_argument("--every", type=int, default=25, help="iterations from ONNX file to ONNX file")
     parser.add_argument("--num-envs", type=int, default=4096)
     parser.add_argument("--seed", type=int, default=42)
@@ -113,6 +128,8 @@ def main() -> None:
     env = RslRlVecEnvWrapper(task, clip_actions=learning.clip_actions)
     runner = TimedRunner(env, asdict(learning), str(args.out), args.device)
     runner.folder, runner.seconds, runner.written = args.out, args.seconds, []
+    if args.resume:
+        runner.resume()
     with suppress(TimeIsUp):
         runner.learn(args.iterations or learning.max_iterations, init_at_random_ep_len=True)
     result = {
