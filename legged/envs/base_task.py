@@ -289,8 +289,17 @@ class BaseTask(ObservingTask, PrivilegedTerms, SavedTask, VecEnv):
     def reset_idx(self, mask: Tensor) -> None:
         """Begin new episodes in the environments of `mask` (N,), in the states that were drawn."""
         if self.randomization.redrawn:
-            self.redraw(mask)
+            with self._beside.fork():
+                self.redraw(mask)
         self.physics.write(mask, self.reset_qpos, self.reset_qvel)
+        self.forget(mask)
+        if self.randomization.redrawn:
+            self._beside.join()
+
+    def forget(self, mask: Tensor) -> None:
+        """Forget the past of the environments of `mask` (N,), whose episodes begin. Runs beside `redraw`: what depends on
+        properties that are drawn again comes later in `reset_idx`.
+        """
         self.rewards.reset(mask)
         masked_set_(self.actions, mask, 0.0)
         masked_set_(self.episode_length_buf, mask, 0)

@@ -249,7 +249,10 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
     def reset_idx(self, mask: Tensor) -> None:
         torch.add(self.env_origins, self._spawn.values, out=self.reset_qpos[:, :3])
         super().reset_idx(mask)
-        self.control.reset(mask)
+        self.control.reset(mask)  # an actuator's past is at angles that may just have been drawn
+
+    def forget(self, mask: Tensor) -> None:
+        super().forget(mask)
         self.contacts.reset(mask)
 
     def reset(self) -> TensorDict:

@@ -53,6 +53,6 @@ class RandomizedTask:
 
     def redraw(self, mask: Tensor) -> None:
         """Draw again what is randomised and due, where episodes begin in the environments of `mask` (N,); only called where
-        something is drawn more than once.
+        something is drawn more than once. Runs beside `forget`.
         """
         self.randomization.redraw(self.physics, mask)

@@ -127,13 +127,15 @@ class Randomization:
         self._place, self._moment = (torch.tensor(values, device=device) for values in (place, moment))
         self._fresh, self._none = torch.zeros_like(self.drawn), torch.zeros(1, 1, device=device)
         self._due = torch.zeros(worlds, 2 + len(intervals), dtype=torch.bool, device=device)
-        self._any_due = torch.zeros(worlds, dtype=torch.bool, device=device)
+        self._any_due, self._chosen_due = torch.zeros(2, worlds, dtype=torch.bool, device=device)
         self._kernels = physics.kernels
         self._interval = torch.tensor([float(max(1, round(each / dt))) for each in intervals], device=device)
         self.steps_left = torch.floor(torch.rand(worlds, len(intervals), device=device) * self._interval) + 1.0
         """(N, I) control steps until the next draw of each interval; the first ones are spread over a whole interval."""
         self.STATE = (*self.STATE, "steps_left")
+        self._chosen, self._chosen_at = self._new_chosen, 0
         if self.chosen_fields:
+            self._chosen = self.chosen
             draw = self.draws[self.chosen_fields[0]]
             self._chosen_at = 1 if draw.when == "reset" else 2 + intervals.index(draw.interval_s)
         known = {n: c for n, c in self.columns.items() if n in MODEL_FIELDS and n not in self.chosen_fields}
@@ -164,15 +166,17 @@ class Randomization:
         """Let the worlds that are due take what was drawn, within a step, where episodes begin in those of `reset` (N,)."""
         if self._kernels is not None:
             found = (self.steps_left, self._due, self._any_due, self.steps.view(1))
-            self._kernels.find_moments(reset, self._interval, *found)
+            choice = (self._chosen_at, self._new_chosen, self._chosen, self._chosen_due)
+            self._kernels.find_moments(reset, self._interval, *found, *choice)
             self._kernels.take_fresh(self._due, self._moment, self._fresh, self.drawn)
         else:
             self._find_moments(reset)
             torch.where(self._due.index_select(1, self._moment), self._fresh, self.drawn, out=self.drawn)
+            if self.chosen_fields:
+                self._chosen_due.copy_(self._due[:, self._chosen_at])
+                masked_set_(self.chosen, self._chosen_due, self._new_chosen)
         if self.chosen_fields:
-            chosen = self._due[:, self._chosen_at].contiguous()
-            masked_set_(self.chosen, chosen, self._new_chosen)
-            physics.choose_variants(chosen, self.chosen)
+            physics.choose_variants(self._chosen_due, self.chosen)
         if self._of_model:
             physics.redraw(self._any_due)
 

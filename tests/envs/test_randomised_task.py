@@ -358,6 +358,6 @@ def test_what_grows_begins_with_nothing_also_where_its_range_leaves_out_0():
     for begun, share in ((0, 0.0), (150, 0.5), (200, 1.0)):
         task.disturbances.steps.fill_(begun * steps)
         task.disturbances.draw()
-        for drawn, low, high in ((kicks._velocity[:, 0], 0.5, 1.0), (forces._drawn[:, 2], -300.0, -200.0)):
+        for drawn, low, high in ((kicks.velocity[:, 0], 0.5, 1.0), (forces.drawn[:, 2], -300.0, -200.0)):
             assert (drawn >= share * low - 1e-5).all()
             assert (drawn <= share * high + 1e-5).all()

@@ -2,6 +2,7 @@
 
 from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -19,7 +20,7 @@ from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
-from legged.mdp.disturbances import Forces, Kicks
+from legged.mdp.disturbances import Disturbances
 from legged.mdp.draws import Draws
 from legged.mdp.height_map_errors import HeightMapErrors
 from legged.mdp.height_scan import HeightScan
@@ -203,11 +204,11 @@ class NoPhysics:
     """What the parts below ask of an engine."""
 
     def __init__(self, kernels) -> None:
-        self.kernels, self.forces, self.pushed = kernels, torch.zeros(N, 3, 6), torch.zeros(N, 7)
+        self.kernels, self.forces, self.pushed = kernels, torch.zeros(N, 3, 6), torch.zeros(N, 6)
+        self.model = SimpleNamespace(jnt_bodyid=[1])
 
     def push(self, mask, delta):
-        self.pushed[:, 0] = mask
-        self.pushed[:, 1:] = delta
+        self.pushed += torch.where(mask[:, None], delta, 0.0)
 
     def choose_variants(self, mask, chosen):
         self.chosen = torch.where(mask, chosen, -1)
@@ -274,32 +275,43 @@ def test_numbers_of_all_distributions_are_made_alike():
     assert found[0].std(dim=0).min() > 0.05
 
 
-def test_kicks_and_forces_come_and_end_alike():
+@pytest.mark.parametrize("of", ["kicks and forces", "kicks", "forces"])
+def test_kicks_and_forces_come_and_end_alike(of):
+    """Two of each: what a robot gets of two kicks at once is their sum, and so are two forces on one body."""
     kick = KickConfig(interval_s=(0.1, 0.3), x=(-1.0, 1.0), yaw=(-0.5, 0.5))
-    force = ForceConfig(body="", interval_s=(0.05, 0.2), duration_s=(0.04, 0.1), y=(-50.0, 50.0))
+    trip = KickConfig(interval_s=(0.2, 0.2), y=(-1.0, 1.0), grow=(0.0, 1.0))
+    pull = ForceConfig(body="", interval_s=(0.05, 0.2), duration_s=(0.04, 0.1), y=(-50.0, 50.0))
+    lift = ForceConfig(body="", interval_s=(0.1, 0.1), duration_s=(0.02, 0.1), z=(0.0, 50.0))
+    cfg = LeggedDomainRandConfig(
+        kicks={"kick": kick, "trip": trip} if "kicks" in of else {},
+        forces={"pull": pull, "lift": lift} if "forces" in of else {},
+    )
     numbers, parts, engines = [], [], []
     for kernels in (None, TaskKernels(nullcontext)):
         torch.manual_seed(3)
         numbers.append(UniformNumbers(N, CPU))
         engines.append(NoPhysics(kernels))
-        parts.append([Kicks(kick, DT, 24, numbers[-1], kernels), Forces(force, 1, DT, 24, numbers[-1], kernels)])
+        parts.append(Disturbances(cfg, engines[-1], DT, 24, numbers[-1]))
     kicked = 0
     for step in range(40):
         mask = chance(0.9, N)
-        for both, drawn, engine in zip(parts, numbers, engines, strict=True):
+        for part, drawn, engine in zip(parts, numbers, engines, strict=True):
             torch.manual_seed(step)
+            engine.pushed.zero_()
             drawn.draw()
-            engine.forces.zero_()
-            for part in both:
-                part.draw(torch.zeros(()))
-                part.act(engine, mask)
-        for part in zip(*parts, strict=True):
-            assert_same(part)
-        for name in ("forces", "pushed"):
-            torch.testing.assert_close(*(getattr(engine, name) for engine in engines), rtol=0.0, atol=0.0)
-        kicked += int(engines[1].pushed[:, 0].sum())
-    assert 40 * N * DT / 0.3 * 0.7 < kicked < 40 * N * DT / 0.1
-    assert (engines[1].forces[:, 1, 1] != 0.0).any()
+            part.draw()
+            part.act(engine, mask)
+        assert_same(parts)
+        torch.testing.assert_close(engines[1].forces, engines[0].forces, rtol=0.0, atol=0.0)
+        torch.testing.assert_close(engines[1].pushed, engines[0].pushed, rtol=1e-6, atol=1e-7)
+        kicked += int((engines[1].pushed[:, 0] != 0.0).sum())
+    assert parts[1].steps == 40.0
+    assert (kicked > 0) == ("kicks" in of)
+    if "kicks" in of:
+        assert 40 * N * DT / 0.3 * 0.7 < kicked < 40 * N * DT / 0.1
+    both = engines[1].forces[:, 1, 1:3] != 0.0
+    assert both.any(dim=0).all() == ("forces" in of)
+    assert not engines[1].forces[:, [0, 2]].any()
 
 
 @pytest.mark.parametrize(

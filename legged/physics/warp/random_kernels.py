@@ -17,8 +17,14 @@ def find_moments(
     due: wp.array2d[wp.bool],
     any_due: wp.array[wp.bool],
     steps: wp.array[float],
+    chosen_at: int,
+    new_chosen: wp.array[wp.int64],
+    chosen: wp.array[wp.int64],
+    chosen_due: wp.array[wp.bool],
 ):
-    """One thread a robot. The first moment is never, the second a reset, the others are intervals."""
+    """One thread a robot. The first moment is never, the second a reset, the others are intervals. At moment `chosen_at`
+    another variant is chosen, never if it is 0.
+    """
     robot = wp.tid()
     something = wp.bool(reset[robot])
     due[robot, 1] = something
@@ -31,6 +37,11 @@ def find_moments(
         steps_left[robot, k] = left
         due[robot, 2 + k] = now
     any_due[robot] = something
+    due[robot, 0] = False
+    if due[robot, chosen_at]:
+        chosen[robot] = new_chosen[robot]
+    if chosen_at > 0:
+        chosen_due[robot] = due[robot, chosen_at]
     if robot == 0:
         steps[0] = steps[0] + 1.0
 
@@ -119,52 +130,64 @@ def vary_control(
 
 
 @wp.kernel
-def find_kicks(
-    mask: wp.array[wp.bool],
-    following: wp.array[float],
-    dt: float,
-    last_moment: float,
-    time_left: wp.array[float],
-    due: wp.array[wp.bool],
-):
-    """One thread a robot."""
-    robot = wp.tid()
-    left = time_left[robot] - dt
-    now = left <= last_moment and mask[robot]
-    if now:
-        left = wp.float32(following[robot])
-    time_left[robot] = left
-    due[robot] = now
-
-
-@wp.kernel
-def push_bodies(
+def disturb(
     mask: wp.array[wp.bool],
     drawn: wp.array2d[float],
     dt: float,
     last_moment: float,
+    bodies: wp.array[int],
+    time_left: wp.array2d[float],
     left: wp.array2d[float],
     force: wp.array2d[float],
-    total: wp.array2d[float],
+    steps: wp.array[float],
+    due: wp.array[wp.bool],
+    velocity: wp.array2d[float],
+    total: wp.array3d[float],
 ):
-    """One thread a robot. Of a new push there are the force's three numbers, the interval and how long it lasts."""
+    """One thread a robot. Of each kick seven numbers are drawn, the velocity's six and the interval; then of each push five,
+    the force's three, the interval and how long it lasts.
+    """
     robot = wp.tid()
-    lasting, pause = left[robot, 0] - dt, left[robot, 1] - dt
-    ends = lasting <= last_moment or not mask[robot]
-    begins = pause <= last_moment and mask[robot]
-    if begins:
-        lasting = wp.max(drawn[robot, 4], dt)
-        pause = drawn[robot, 3] + lasting
-    left[robot, 0] = lasting
-    left[robot, 1] = pause
-    for i in range(3):
-        now = wp.float32(force[robot, i])
-        if ends:
-            now = 0.0
+    goes_on = wp.bool(mask[robot])
+    if robot == 0:
+        steps[0] = steps[0] + 1.0
+    for i in range(6):
+        velocity[robot, i] = 0.0
+    kicked = wp.bool(False)
+    at = wp.int32(0)
+    for k in range(time_left.shape[1]):
+        until = time_left[robot, k] - dt
+        if until <= last_moment and goes_on:
+            until = wp.float32(drawn[robot, at + 6])
+            kicked = True
+            for i in range(6):
+                velocity[robot, i] = velocity[robot, i] + drawn[robot, at + i]
+        time_left[robot, k] = until
+        at += 7
+    due[robot] = kicked
+
+    if bodies.shape[0] > 0:
+        for body in range(total.shape[1]):
+            for i in range(6):
+                total[robot, body, i] = 0.0
+    for k in range(bodies.shape[0]):
+        lasting, pause = left[robot, 2 * k] - dt, left[robot, 2 * k + 1] - dt
+        ends = lasting <= last_moment or not goes_on
+        begins = pause <= last_moment and goes_on
         if begins:
-            now = wp.float32(drawn[robot, i])
-        force[robot, i] = now
-        total[robot, i] = total[robot, i] + now
+            lasting = wp.max(drawn[robot, at + 4], dt)
+            pause = drawn[robot, at + 3] + lasting
+        left[robot, 2 * k] = lasting
+        left[robot, 2 * k + 1] = pause
+        for i in range(3):
+            now = wp.float32(force[robot, 3 * k + i])
+            if ends:
+                now = 0.0
+            if begins:
+                now = wp.float32(drawn[robot, at + i])
+            force[robot, 3 * k + i] = now
+            total[robot, bodies[k], i] = total[robot, bodies[k], i] + now
+        at += 5
 
 
 @wp.kernel

@@ -12,11 +12,10 @@ from legged.physics.warp.launcher import Launcher
 from legged.physics.warp.network_kernels import run_lstm, run_mlp
 from legged.physics.warp.random_kernels import (
     advance_map,
-    find_kicks,
+    disturb,
     find_moments,
     make_draws,
     make_fresh,
-    push_bodies,
     take_fresh,
     vary_control,
 )
@@ -335,9 +334,9 @@ class TaskKernels(Launcher):
         """As `Randomization.draw`: the last two arguments are written."""
         self.launch(make_fresh, tuple(arguments[-1].shape), arguments)
 
-    def find_moments(self, *arguments: Tensor) -> None:
+    def find_moments(self, *arguments: Tensor | float) -> None:
         """As the first half of `Randomization.redraw`."""
-        self.launch(find_moments, len(arguments[0]), arguments)
+        self.launch(find_moments, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def take_fresh(self, *arguments: Tensor) -> None:
         """As its second half: the last argument is written."""
@@ -347,13 +346,9 @@ class TaskKernels(Launcher):
         """As `Control.vary`."""
         self.launch(vary_control, tuple(arguments[-1].shape), arguments)
 
-    def find_kicks(self, *arguments: Tensor | float) -> None:
-        """As `Kicks.act`, but for the kick itself."""
-        self.launch(find_kicks, len(arguments[0]), arguments)  # type: ignore[arg-type]
-
-    def push_bodies(self, *arguments: Tensor | float) -> None:
-        """As `Forces.act`: the last argument (N, 3) has the sum of forces on a body."""
-        self.launch(push_bodies, len(arguments[0]), arguments)  # type: ignore[arg-type]
+    def disturb(self, *arguments: Tensor | float) -> None:
+        """As `Disturbances.act`, but for the kicks themselves."""
+        self.launch(disturb, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def advance_map(self, holes: Tensor, *arguments: Tensor | float) -> None:
         """As `HeightMapErrors.advance`: `holes` (N, P) and the last two arguments are written."""
