@@ -144,50 +144,54 @@ def disturb(
     velocity: wp.array2d[float],
     total: wp.array3d[float],
 ):
-    """One thread a robot. Of each kick seven numbers are drawn, the velocity's six and the interval; then of each push five,
-    the force's three, the interval and how long it lasts.
+    """One thread a robot and body, of which the first, the world, has the kicks. Of each kick seven numbers are drawn, the
+    velocity's six and the interval; then of each push five, the force's three, the interval and how long it lasts.
     """
-    robot = wp.tid()
+    robot, body = wp.tid()
     goes_on = wp.bool(mask[robot])
-    if robot == 0:
-        steps[0] = steps[0] + 1.0
-    for i in range(6):
-        velocity[robot, i] = 0.0
-    kicked = wp.bool(False)
-    at = wp.int32(0)
-    for k in range(time_left.shape[1]):
-        until = time_left[robot, k] - dt
-        if until <= last_moment and goes_on:
-            until = wp.float32(drawn[robot, at + 6])
-            kicked = True
-            for i in range(6):
-                velocity[robot, i] = velocity[robot, i] + drawn[robot, at + i]
-        time_left[robot, k] = until
-        at += 7
-    due[robot] = kicked
+    kicks = time_left.shape[1]
+    if body == 0:
+        if robot == 0:
+            steps[0] = steps[0] + 1.0
+        kicked = wp.bool(False)
+        change = wp.spatial_vector()
+        for k in range(kicks):
+            until = time_left[robot, k] - dt
+            if until <= last_moment and goes_on:
+                until = wp.float32(drawn[robot, 7 * k + 6])
+                kicked = True
+                for i in range(6):
+                    change[i] += drawn[robot, 7 * k + i]
+            time_left[robot, k] = until
+        due[robot] = kicked
+        for i in range(6):
+            velocity[robot, i] = change[i]
 
-    if bodies.shape[0] > 0:
-        for body in range(total.shape[1]):
-            for i in range(6):
-                total[robot, body, i] = 0.0
+    if bodies.shape[0] == 0:
+        return
+    pushed = wp.vec3()
     for k in range(bodies.shape[0]):
-        lasting, pause = left[robot, 2 * k] - dt, left[robot, 2 * k + 1] - dt
-        ends = lasting <= last_moment or not goes_on
-        begins = pause <= last_moment and goes_on
-        if begins:
-            lasting = wp.max(drawn[robot, at + 4], dt)
-            pause = drawn[robot, at + 3] + lasting
-        left[robot, 2 * k] = lasting
-        left[robot, 2 * k + 1] = pause
-        for i in range(3):
-            now = wp.float32(force[robot, 3 * k + i])
-            if ends:
-                now = 0.0
+        if bodies[k] == body:
+            at = 7 * kicks + 5 * k
+            lasting, pause = left[robot, 2 * k] - dt, left[robot, 2 * k + 1] - dt
+            ends = lasting <= last_moment or not goes_on
+            begins = pause <= last_moment and goes_on
             if begins:
-                now = wp.float32(drawn[robot, at + i])
-            force[robot, 3 * k + i] = now
-            total[robot, bodies[k], i] = total[robot, bodies[k], i] + now
-        at += 5
+                lasting = wp.max(drawn[robot, at + 4], dt)
+                pause = drawn[robot, at + 3] + lasting
+            left[robot, 2 * k] = lasting
+            left[robot, 2 * k + 1] = pause
+            for i in range(3):
+                now = wp.float32(force[robot, 3 * k + i])
+                if ends:
+                    now = 0.0
+                if begins:
+                    now = wp.float32(drawn[robot, at + i])
+                force[robot, 3 * k + i] = now
+                pushed[i] += now
+    for i in range(3):
+        total[robot, body, i] = pushed[i]
+        total[robot, body, 3 + i] = 0.0
 
 
 @wp.kernel

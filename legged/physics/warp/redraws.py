@@ -17,9 +17,6 @@ ADD, SCALE, INVERSE = wp.constant(HOW["add"]), wp.constant(HOW["scale"]), wp.con
 MOST_ARRAYS = 14
 """Arrays that one launch writes, at most: those of all fields are fewer."""
 
-LANES = wp.constant(32)
-"""Threads of a world: few worlds are drawn again in a step, and those of the others only look whether they are."""
-
 wp.set_module_options({"enable_backward": False})
 
 
@@ -88,44 +85,40 @@ def write_drawn(
     ratios: wp.array[float],
     to: Arrays,
 ):
-    """LANES threads a world, which share the numbers that change: the model's own, changed by one field after the other.
-    `place` has a number's array and its place there, `entry` the column of a value, how it changes the number, and whether
-    it is a restitution.
+    """One thread a world and number that changes: the model's own, changed by one field after the other. `place` has its
+    array and its place there, `entry` the column of a value, how it changes the number, and whether it is a restitution.
     """
-    world, lane = wp.tid()
+    world, n = wp.tid()
     if not mask[world]:
         return
-    for n in range(lane, own.shape[0], LANES):
-        number = own[n]
-        for k in range(first[n], first[n + 1]):
-            value = drawn[world, entry[k, 0]]
-            bounce = entry[k, 2]
-            if bounce > 0:
-                points = ratios.shape[0] - 1
-                at = wp.clamp(value, 0.0, 1.0) * float(points)
-                low = wp.min(int(at), points - 1)
-                value = ratios[low] + (at - float(low)) * (ratios[low + 1] - ratios[low])
-                if bounce == INVERSE:
-                    value = 1.0 / value
-            value = value * weight[k]
-            if entry[k, 1] == SCALE:
-                number = number * value
-            elif entry[k, 1] == ADD:
-                number = number + value
-            else:
-                number = value
-        put(to, place[n, 0], world, place[n, 1], number)
+    number = own[n]
+    for k in range(first[n], first[n + 1]):
+        value = drawn[world, entry[k, 0]]
+        bounce = entry[k, 2]
+        if bounce > 0:
+            points = ratios.shape[0] - 1
+            at = wp.clamp(value, 0.0, 1.0) * float(points)
+            low = wp.min(int(at), points - 1)
+            value = ratios[low] + (at - float(low)) * (ratios[low + 1] - ratios[low])
+            if bounce == INVERSE:
+                value = 1.0 / value
+        value = value * weight[k]
+        if entry[k, 1] == SCALE:
+            number = number * value
+        elif entry[k, 1] == ADD:
+            number = number + value
+        else:
+            number = value
+    put(to, place[n, 0], world, place[n, 1], number)
 
 
 @wp.kernel
 def copy_variants(
     mask: wp.array[wp.bool], chosen: wp.array[wp.int64], variants: wp.array2d[float], place: wp.array2d[int], to: Arrays
 ):
-    """LANES threads a world, which share the numbers of a variant; `place` has a number's array and its place there."""
-    world, lane = wp.tid()
-    if not mask[world]:
-        return
-    for n in range(lane, place.shape[0], LANES):
+    """One thread a world and number of a variant; `place` has the number's array and its place there."""
+    world, n = wp.tid()
+    if mask[world]:
         put(to, place[n, 0], world, place[n, 1], variants[int(chosen[world]), n])
 
 
@@ -180,7 +173,7 @@ class Redraws:
             wp.from_torch(ratios),
             _arrays(list(arrays.values())),
         ]
-        self._dim = (len(drawn), LANES)
+        self._dim = (len(drawn), len(changes))
 
     def launch(self, mask: Tensor) -> None:
         """Write the rows of the worlds of `mask` (N,)."""
@@ -199,7 +192,7 @@ class Variants:
         place = [(number, at) for number, width in enumerate(widths) for at in range(width)]
         targets = [array for _, array in arrays.values()]
         self._inputs = [wp.from_torch(self._variants), wp.array(place, dtype=int, ndim=2), _arrays(targets)]
-        self._dim = (len(targets[0]), LANES)
+        self._dim = (len(targets[0]), len(place))
 
     @staticmethod
     def _side_by_side(made: Mapping[str, Tensor]) -> Tensor:

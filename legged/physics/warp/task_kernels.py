@@ -347,8 +347,9 @@ class TaskKernels(Launcher):
         self.launch(vary_control, tuple(arguments[-1].shape), arguments)
 
     def disturb(self, *arguments: Tensor | float) -> None:
-        """As `Disturbances.act`, but for the kicks themselves."""
-        self.launch(disturb, len(arguments[0]), arguments)  # type: ignore[arg-type]
+        """As `Disturbances.act`, but for the kicks themselves; the last argument (N, bodies, 6) has the forces."""
+        total: Tensor = arguments[-1]  # type: ignore[assignment]
+        self.launch(disturb, (len(total), max(total.shape[1], 1)), arguments)
 
     def advance_map(self, holes: Tensor, *arguments: Tensor | float) -> None:
         """As `HeightMapErrors.advance`: `holes` (N, P) and the last two arguments are written."""
