@@ -68,6 +68,17 @@ def inertia_in_air(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int
     return np.asarray(1.0 / _inverse_inertia(model, qpos)[1][dofs, dofs])
 
 
+def standing_torques(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int], feet: Sequence[int]) -> np.ndarray:
+    """Return the torques (D,) of the hinges `joints` (ids) that hold the robot at rest in the pose `qpos` [N m], where its
+    `feet`, shapes (ids), carry the base with the smallest forces that do.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    jacobian = np.vstack([_jacobian(model, data, foot) for foot in feet])
+    return _static_torques(data, jacobian)[model.jnt_dofadr[list(joints)]]
+
+
 def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """Return the joint-space inertia, (V, V) for V degrees of freedom, of a state whose positions were computed."""
     columns = np.zeros((model.nv, model.nv))

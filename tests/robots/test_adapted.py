@@ -384,6 +384,10 @@ def test_gains_of_position_actuators_are_taken_where_they_hold(tmp_path):
     assert guesses.stiffness == {}
     assert any("gains of the file's position actuators are left out" in line for line in tree.said)
     assert all(hinge.passive["damping"] == 0.5 for hinge in tree.hinges)
+    path.write_text(scene(POSITIONS.replace('kp="40"', 'kp="2"')))
+    tree = read_robot(path)
+    assert make_ready(tree).stiffness == {}
+    assert any("left out: under the robot's weight" in line for line in tree.said)
     path.write_text(scene().replace('damping="0.5"', ""))  # deviations would go on for ever
     tree = read_robot(path)
     assert make_ready(tree).stiffness == {}

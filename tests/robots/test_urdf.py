@@ -6,7 +6,9 @@ import pytest
 from importing_fixtures import LEG_MASS, LEGS, TRUNK, urdf
 
 from legged.errors import ConfigError
+from legged.robots.gains import standing_torques
 from legged.robots.importing.guess import make_ready, read_robot
+from legged.robots.importing.legs import Poser
 from legged.robots.importing.mend import mend
 from legged.robots.importing.mjcf import read_mjcf
 from legged.robots.importing.shapes import fit_meshes, name_shapes
@@ -258,6 +260,45 @@ def test_meshes_are_found_where_packages_are(read, tmp_path, where, named):
     assert "1 box" in said(tree, "1 collision meshes become")
 
 
+def test_what_a_knee_holds_under_the_weight(tmp_path):
+    """A foot carries 13 g / 4 = 31.87 N. It is under the hip, and the knee 0.2 sin(0.7) = 0.1288 m behind both: 4.106 N m,
+    less what the shank's 0.2 kg at half of that and the foot's 0.05 kg weigh, 0.126 and 0.063 N m. Thighs and shanks have
+    their masses 0.0644 m behind the hips, so the robot's is 4 * 1.2 * 0.0644 / 13 = 0.0238 m behind the middle of feet that
+    are 0.2 m before and behind it: a hind foot carries 31.87 * 0.0238 / 0.2 = 3.79 N more, which is 0.488 N m.
+    """
+    path = tmp_path / "toy.urdf"
+    path.write_text(urdf())
+    tree = read_robot(path)
+    make_ready(tree)
+    poser = Poser(tree)
+    angles = {f"{leg}_{joint}": angle for leg in LEGS for joint, angle in (("thigh", 0.7), ("calf", -1.4))}
+    qpos = poser.pose(angles).qpos
+    knees = [int(poser.model.joint(f"{leg}_calf").id) for leg in LEGS]
+    feet = [int(poser.model.geom(f"{leg}_foot").id) for leg in LEGS]
+    torques = standing_torques(poser.model, qpos, knees, feet)
+    even = 4.106 - 0.126 - 0.063
+    np.testing.assert_allclose(np.abs(torques), [even - 0.488, even - 0.488, even + 0.488, even + 0.488], atol=3e-3)
+
+
+@pytest.mark.parametrize("place", ["assets", "assets/fine", "../assets"])
+def test_a_mesh_that_lies_in_another_folder_than_the_file_says_is_found_by_its_name(read, tmp_path, place):
+    """The toy is read in toy/urdf/. Of two that are called so nobody knows which is meant."""
+    folder = tmp_path / "toy" / "urdf" / place
+    folder.mkdir(parents=True)
+    (folder / "box.obj").write_text(OBJ)
+    child = f'<inertial><mass value="1"/>{UNIT}</inertial><collision>{MESH.format("meshes/box.obj")}</collision>'
+    tree = read(urdf(arm(child=child)))
+    (box,) = [shape for shape in tree.shapes if shape.link == "arm_link"]
+    np.testing.assert_allclose(np.sort(box.size), [0.1, 0.2, 0.3], atol=1e-6)
+    assert said(tree, "meshes are not where the file says") == f"meshes are not where the file says, but in: {place}/"
+    other = tmp_path / "toy" / "urdf" / "other"
+    other.mkdir()
+    (other / "box.obj").write_text(OBJ)
+    tree = read(urdf(arm(child=child)))
+    assert not [shape for shape in tree.shapes if shape.link == "arm_link"]
+    assert "left out: meshes/box.obj" in said(tree, "collision meshes that are not to be found")
+
+
 def test_a_mesh_that_is_missing_or_of_a_kind_that_nobody_reads_is_left_out(read, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "trimesh", None)  # as if it were not installed
     (tmp_path / "toy" / "urdf").mkdir(parents=True)
@@ -267,7 +308,11 @@ def test_a_mesh_that_is_missing_or_of_a_kind_that_nobody_reads_is_left_out(read,
     tree = read(urdf(arm(child=child)))
     line = said(tree, "visual meshes are left out")
     assert "nice.dae: MuJoCo does not read .dae; pip install trimesh pycollada" in line
-    assert "'package://toy/nowhere.stl' is not to be found" in line
+    missing = said(tree, "visual meshes that are not to be found")
+    assert (
+        missing
+        == "visual meshes that are not to be found in the folders around the file are left out: package://toy/nowhere.stl"
+    )
     assert "arm" in [hinge.name for hinge in tree.hinges]
 
 

@@ -92,6 +92,43 @@ def test_the_stance_is_that_of_a_two_link_leg(added):
         np.testing.assert_allclose(data.geom(f"{leg}_foot").xpos[:2], [x, y], atol=0.005)
 
 
+def test_the_box_of_its_inertia_stands_for_a_trunk_without_a_shape(added):
+    """A box of 6 kg and 0.6 x 0.4 x 0.2 m has moments of 6 (0.4^2 + 0.2^2) / 12 = 0.1, 0.2 and 0.26 kg m^2. Without it a
+    robot would lie on its back, or in the ground, and its episode go on.
+    """
+    bare = """
+    <link name="trunk"><inertial><origin xyz="0.02 0 0.01"/><mass value="6"/>
+     <inertia ixx="0.1" iyy="0.2" izz="0.26" ixy="0" ixz="0" iyz="0"/></inertial>
+     <collision><geometry><mesh filename="nowhere.stl"/></geometry></collision></link>
+    """
+    out = added(urdf(trunk=bare), "--name", "bare_toy")
+    assert "guess: nothing of the trunk collides, so the box that has the base's inertia does" in out
+    assert "guess: contact that ends an episode: trunk\n" in out
+    robot = load_robot("mine/bare_toy")
+    assert [robot.contact_names[i] for i in robot.termination_indices] == ["trunk"]
+    box = mujoco.MjModel.from_xml_path(str(robot.model_path)).geom("trunk")
+    np.testing.assert_allclose(np.sort(box.size), [0.1, 0.2, 0.3], atol=1e-4)
+    np.testing.assert_allclose(box.pos, [0.02, 0.0, 0.01], atol=1e-6)
+    turned = np.zeros(9)
+    mujoco.mju_quat2Mat(turned, box.quat)
+    np.testing.assert_allclose(np.abs(turned.reshape(3, 3)) @ box.size, [0.3, 0.2, 0.1], atol=1e-4)
+
+
+def test_a_robot_that_can_not_stand_on_what_looks_like_its_feet_is_refused(tmp_path, capsys):
+    """Thighs that only point backwards, at least 1.3 rad from down, and knees that hardly bend."""
+    arms = (
+        urdf()
+        .replace('lower="-1.5" upper="3"', 'lower="1.3" upper="1.6"')
+        .replace('lower="-2.7" upper', 'lower="-0.6" upper')
+    )
+    (tmp_path / "toy.urdf").write_text(arms)
+    assert call(add_robot.main, ["toy.urdf", "--out", "mine"]) == 2
+    error = capsys.readouterr().err
+    assert "toy.urdf: it can't stand on " in error
+    assert error.count("\n") == 1
+    assert not Path("mine").exists()
+
+
 @pytest.mark.parametrize(
     ("hind", "called"), [(("hl", "hr"), "robot with 3 legs"), (("hl", "hr", "ml", "mr"), "robot with 5 legs")]
 )
@@ -238,7 +275,7 @@ def test_legs_that_nothing_touches_get_feet(added):
     text = re.sub(r"<collision>.*?</collision>", "", urdf().replace('<box size="0.5 0.16 0.1"/>', ""), flags=re.DOTALL)
     out = added(text, "--name", "twelfth_toy")
     assert "legs end in links that nothing touches, without a foot: a ball is added at the end of: fl_calf, fr_calf" in out
-    assert "neither base nor trunk has a shape" in out
+    assert "guess: nothing of the trunk collides, so the box that has the base's inertia does" in out
     model = mujoco.MjModel.from_xml_path("mine/twelfth_toy/twelfth_toy.xml")
     np.testing.assert_allclose(model.geom("fl_foot").pos, [0, 0, -0.12], atol=1e-9)
 

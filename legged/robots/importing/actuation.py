@@ -1,15 +1,19 @@
 """Torque limits and gains that a file states, and whether they hold here: the law of the joints is an explicit one."""
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 
-from legged.robots.gains import TIME_STEP, VELOCITY_LIMIT, mass_matrix
+from legged.robots.gains import TIME_STEP, VELOCITY_LIMIT, mass_matrix, standing_torques
 from legged.robots.importing.legs import Leg, Poser
 from legged.robots.importing.tree import Tree
 
 SHARE, ELSEWHERE = 0.4, 0.1
 """Guess of a torque limit, in weight times height of the base: of a leg, of other joints."""
 GRAVITY = 9.81
+SAG = 1.0
+"""Gains of a file under which a joint gives way by more than this are none to stand with [rad]."""
 
 
 def guess_efforts(tree: Tree, legs: list[Leg], height: float) -> None:
@@ -38,10 +42,10 @@ def speed_limits(tree: Tree) -> dict[str, float]:
     return {hinge.name: hinge.velocity or VELOCITY_LIMIT for hinge in driven}
 
 
-def take_gains(tree: Tree, angles: dict[str, float]) -> tuple[dict[str, float], dict[str, float]]:
+def take_gains(tree: Tree, angles: dict[str, float], feet: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
     """Return P and D gains [N m/rad], [N m s/rad] of the file's position actuators by hinge; the damping of a hinge whose
     actuator has none is its D gain, and leaves the hinge. Empty, where the file has none, nothing is damped, or
-    they would not hold.
+    they would not hold the robot up on the shapes `feet` in the pose at `angles` [rad].
     """
     driven = [hinge for hinge in tree.hinges if hinge.driven]
     stated = [hinge for hinge in driven if hinge.stiffness]
@@ -64,12 +68,29 @@ def take_gains(tree: Tree, angles: dict[str, float]) -> tuple[dict[str, float], 
             f" them makes deviations grow by {growth:.3g} a step"
         )
         return {}, {}
+    sags = _sags(tree, angles, stiffness, feet)
+    worst = max(sags, key=lambda name: sags[name])
+    if sags[worst] > SAG:
+        tree.say(
+            f"gains of the file's position actuators are left out: under the robot's weight {worst} would give way by"
+            f" {sags[worst]:.2g} rad"
+        )
+        return {}, {}
     for hinge in driven:
         if not hinge.damping and "damping" in hinge.passive:
             del hinge.passive["damping"]
             tree.say("damping of joints whose actuators have none is their D gain instead", hinge.name)
     tree.say("gains are those of the file's position actuators")
     return stiffness, damping
+
+
+def _sags(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], feet: Sequence[str]) -> dict[str, float]:
+    """Return how far each joint gives way under the robot's weight [rad], with the base level on its feet."""
+    poser = Poser(tree)
+    data = poser.pose(angles)
+    shapes = [int(poser.model.geom(name).id) for name in feet]
+    torques = standing_torques(poser.model, data.qpos, [int(poser.model.joint(name).id) for name in stiffness], shapes)
+    return {name: abs(float(torque)) / gain for (name, gain), torque in zip(stiffness.items(), torques, strict=True)}
 
 
 def _growth(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], damping: dict[str, float]) -> float:

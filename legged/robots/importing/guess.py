@@ -13,7 +13,7 @@ from legged.robots.importing.inverse_kinematics import GOOD, standing_angles
 from legged.robots.importing.legs import Leg, Poser, face_forward, find_legs
 from legged.robots.importing.mend import mend
 from legged.robots.importing.mjcf import read_mjcf
-from legged.robots.importing.shapes import fit_meshes, free_name, name_shapes
+from legged.robots.importing.shapes import fit_meshes, free_name, give_trunk, name_shapes
 from legged.robots.importing.text import model_of
 from legged.robots.importing.tree import Shape, Tree
 from legged.robots.importing.urdf import read_urdf
@@ -27,6 +27,10 @@ SOLE = re.compile(r"foot|feet|toe|sole|heel", re.IGNORECASE)
 """In the names of what stands on the ground behind a toe."""
 ABOVE = 1.03
 """Spawn height, in that of the standing base."""
+WIDEST = 0.8
+"""Largest half length of a trunk that is guessed, in the distance from the base to the farthest foot."""
+LOST_FOOT = 0.25
+"""A foot that is so far from where it should stand, in the length of a leg, is none."""
 LOST = 1e-6
 """Largest part of a robot's mass that rounding may lose."""
 
@@ -55,6 +59,8 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
     mend(tree, hold, LIGHT)
     face_forward(tree)
     legs = find_legs(tree)
+    if not any(shape.collides for i in _trunk(tree, legs) for shape in tree.links[i].shapes):
+        give_trunk(tree, WIDEST * _reach(tree, legs))
     name_shapes(tree)
     _name_feet(tree, legs)
     _name_passive(tree, legs)
@@ -64,15 +70,13 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
     height = standing_height(poser.model, tree.links[0].name, poser.pose(angles).qpos)
     guess_efforts(tree, legs, height)
     if gains is None:
-        stiffness, damping = take_gains(tree, angles)
+        stiffness, damping = take_gains(tree, angles, [shape.name for leg in legs for shape in leg.feet])
     else:
         stiffness, damping = ({hinge.name: gain for hinge in tree.hinges if hinge.driven} for gain in gains)
     _check_mass(tree)
     feet = [shape.name for leg in legs for shape in leg.feet]
     tree.say(f"guess: a {called(len(legs))} with feet", ", ".join(feet))
     ending, penalized = (_named_apart(tree, role) for role in _roles(tree, legs, feet))
-    if not ending:
-        tree.say("guess: neither base nor trunk has a shape, so no contact ends an episode")
     return Guesses(
         base=tree.links[0].name,
         spawn_height=round(ABOVE * height, 3),
@@ -146,12 +150,10 @@ def _roles(tree: Tree, legs: list[Leg], feet: Sequence[str]) -> tuple[list[str],
     """Return the shapes whose contact ends an episode, those of the base and of what carries arms and a head, and those whose
     contact is penalised: thighs, shanks, and what arms end in. Hips are next to the base, and hardly touch; heels stand.
     """
-    poser = Poser(tree)
-    poser.pose({})
     of_legs = {i for leg in legs for i in leg.links}
     before = {i for leg in legs for i in leg.links[-2:-1]}  # of a leg that ends in a toe, it has the heel
     soles = {shape.name for i in before for shape in tree.links[i].shapes if SOLE.search(f"{shape.link} {shape.name}")}
-    in_the_middle = [i for i in range(len(tree.links)) if i not in of_legs and abs(poser.point(i, np.zeros(3))[1]) < MIDDLE]
+    in_the_middle = _trunk(tree, legs)
     ends = [i for i in range(1, len(tree.links)) if not tree.children(i) and i not in of_legs and i not in in_the_middle]
     limbs = [i for leg in legs for i in (leg.links[1:] if len(leg.links) > 2 else leg.links)[-3:]]
     found = []
@@ -160,6 +162,21 @@ def _roles(tree: Tree, legs: list[Leg], feet: Sequence[str]) -> tuple[list[str],
         found.append([shape.name for shape in shapes if shape.name not in soles.union(feet)])
     ending, penalized = found
     return ending, penalized
+
+
+def _trunk(tree: Tree, legs: list[Leg]) -> list[int]:
+    """Return the links in the middle that are of no leg: the base, and what carries arms and a head."""
+    poser = Poser(tree)
+    poser.pose({})
+    of_legs = {i for leg in legs for i in leg.links}
+    return [i for i in range(len(tree.links)) if i not in of_legs and abs(poser.point(i, np.zeros(3))[1]) < MIDDLE]
+
+
+def _reach(tree: Tree, legs: list[Leg]) -> float:
+    """Return how far the farthest foot is from the base with all joints at 0 [m]."""
+    poser = Poser(tree)
+    poser.pose({})
+    return max(float(np.linalg.norm(poser.point(leg.end, leg.tip))) for leg in legs)
 
 
 def _draw_what_is_bare(tree: Tree) -> None:
@@ -172,7 +189,11 @@ def _draw_what_is_bare(tree: Tree) -> None:
 
 
 def _default_pose(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], str]:
-    """Return joint angles to stand in, and where they come from."""
+    """Return joint angles to stand in, and where they come from.
+
+    Raises:
+        ConfigError: it does not stand on its legs.
+    """
     if tree.home is not None:
         angles = {hinge.name: tree.home.get(hinge.name, 0.0) for hinge in tree.hinges}
         within = all(h.range is None or h.range[0] - 1e-6 <= angles[h.name] <= h.range[1] + 1e-6 for h in tree.hinges)
@@ -186,6 +207,12 @@ def _default_pose(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], str]:
         tree.say(f"the keyframe '{tree.home_name}' is no stance (its feet are not level, or a joint is beyond its range)")
     angles, miss = standing_angles(tree, legs)
     tree.say("guess: the default pose is a stance by inverse kinematics: base level, feet under the hips, knees bent")
+    if miss > LOST_FOOT:
+        feet = ", ".join(tree.links[leg.end].name for leg in legs)
+        raise ConfigError(
+            f"{tree.source}: it can't stand on {feet}: with the base level and these under its hips, one is {miss:.0%}"
+            f" of a leg's length from where it should be. Are they feet? --hold keeps joints still that are of no leg"
+        )
     if miss > GOOD:
         tree.say(f"guess: in that pose a foot is {miss:.0%} of a leg's length from where it should be; look at it")
     return angles, "guess: a stance by inverse kinematics"

@@ -4,6 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from glob import escape
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -29,12 +30,16 @@ class MeshProblem(Exception):
     """A mesh can't be used; its text says why."""
 
 
+class MeshMissing(MeshProblem):
+    """There is no such file."""
+
+
 def find(name: str, folder: Path, roots: Sequence[Path]) -> Path:
     """Return the file that a URDF in `folder` means by `name`: a path, `file://` or `package://`; a package is looked for in
     the folders above, and in `roots`.
 
     Raises:
-        MeshProblem: there is none.
+        MeshMissing: there is none.
     """
     path = re.sub(r"^(package|file|model):/*", lambda m: "/" if m[1] == "file" else "", unquote(name.strip()))
     parts = [part for part in Path(path).parts if part not in ("/", "\\")]
@@ -46,7 +51,21 @@ def find(name: str, folder: Path, roots: Sequence[Path]) -> Path:
     for option in options:
         if option.is_file():
             return option.resolve()
-    raise MeshProblem(f"mesh '{name}' is not to be found beside {folder.name}/ or above it")
+    raise MeshMissing(f"mesh '{name}' is not to be found beside {folder.name}/ or above it")
+
+
+def find_by_name(name: str, folder: Path) -> Path:
+    """Return the one file that is called as `name` ends, in folders within `folder` or beside it: paths may be wrong.
+
+    Raises:
+        MeshMissing: there is none, or there are several.
+    """
+    last = escape(Path(unquote(name.strip())).name)
+    patterns = [(folder, f"{deep}{last}") for deep in ("*/", "*/*/")] + [(folder.parent, f"*/{last}")]
+    found = {path.resolve() for place, pattern in patterns if last for path in place.glob(pattern) if path.is_file()}
+    if len(found) != 1:
+        raise MeshMissing(f"mesh '{name}' is not to be found beside {folder.name}/ or above it")
+    return found.pop()
 
 
 def read(path: Path, scale: Vector) -> list[tuple[Mesh, Vector | None]]:

@@ -2,9 +2,15 @@
 
 import re
 
+import mujoco
+import numpy as np
+
 from legged.robots.importing.meshes import MeshProblem, fitted
 from legged.robots.importing.tree import Shape, Tree
 from legged.robots.robot_model import TAKEN
+
+THINNEST = 0.02
+"""Smallest half length of a trunk that was guessed, in the largest one allowed."""
 
 
 def fit_meshes(tree: Tree) -> None:
@@ -37,6 +43,19 @@ def _let_the_drawn_collide(tree: Tree) -> None:
             Shape(s.kind, s.size.copy(), s.pos.copy(), s.quat.copy(), True, s.link, s.name, s.mesh, friction=s.friction)
             for s in link.shapes
         ]
+
+
+def give_trunk(tree: Tree, widest: float) -> None:
+    """Let the box that has the inertia of the base stand for its shape, with half lengths of at most `widest` [m]."""
+    base = tree.links[0]
+    moments, axes = np.linalg.eigh(base.inertia)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    half = np.sqrt(np.maximum(1.5 * (moments.sum() - 2.0 * moments) / base.mass, 0.0))  # of a box I_x = m (b^2 + c^2) / 3
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, axes.ravel())
+    size = np.clip(half, THINNEST * widest, widest)
+    base.shapes.append(Shape("box", size, base.com.copy(), quat, True, base.name))
+    tree.say("guess: nothing of the trunk collides, so the box that has the base's inertia does")
 
 
 def name_shapes(tree: Tree) -> None:

@@ -1,6 +1,7 @@
 """URDF files -> Tree. MuJoCo's own reader welds the base to the world, whose mass is lost then, and knows no packages."""
 
 import math
+import os
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ import numpy as np
 from legged.config.checks import shown
 from legged.errors import ConfigError, suggest
 from legged.robots.importing import meshes
-from legged.robots.importing.meshes import MeshProblem
+from legged.robots.importing.meshes import MeshMissing, MeshProblem
 from legged.robots.importing.tree import Hinge, Link, Shape, Tree, Vector, matrix, quat_about, quat_of_rpy, quat_product
 
 MOST_TURNS = 1e3
@@ -250,15 +251,29 @@ class _Shapes:
     ) -> list[Shape]:
         name = given.get("filename", "")
         scale = _numbers(given, "scale", 3, self.path) if given.get("scale") else np.ones(3)
+        kind = "collision" if collides else "visual"
         try:
-            parts = meshes.read(meshes.find(name, self.path.parent.resolve(), self.roots), scale)
+            parts = meshes.read(self._file(name), scale)
+        except MeshMissing:
+            self.tree.say(f"{kind} meshes that are not to be found in the folders around the file are left out", name)
+            return []
         except (MeshProblem, OSError) as problem:
-            self.tree.say(f"{'collision' if collides else 'visual'} meshes are left out", str(problem))
+            self.tree.say(f"{kind} meshes are left out", str(problem))
             return []
         return [
             Shape("mesh", np.zeros(3), pos, quat, collides, link, mesh=mesh, rgba=rgba if colour is None else colour)
             for mesh, colour in parts
         ]
+
+    def _file(self, name: str) -> Path:
+        """Return the mesh that the file means by `name`, or else the only one of that name nearby."""
+        folder = self.path.parent.resolve()
+        try:
+            return meshes.find(name, folder, self.roots)
+        except MeshMissing:
+            found = meshes.find_by_name(name, folder)
+        self.tree.say("meshes are not where the file says, but in", os.path.relpath(found.parent, folder) + "/")
+        return found
 
 
 def _origin(element: ET.Element, path: Path) -> tuple[Vector, Vector]:
