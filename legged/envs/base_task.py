@@ -288,13 +288,9 @@ class BaseTask(ObservingTask, PrivilegedTerms, SavedTask, VecEnv):
 
     def reset_idx(self, mask: Tensor) -> None:
         """Begin new episodes in the environments of `mask` (N,), in the states that were drawn."""
-        if self.randomization.redrawn:
-            with self._beside.fork():
-                self.redraw(mask)
-        self.physics.write(mask, self.reset_qpos, self.reset_qvel)
-        self.forget(mask)
-        if self.randomization.redrawn:
-            self._beside.join()
+        with self.redrawing(mask):
+            self.physics.write(mask, self.reset_qpos, self.reset_qvel)
+            self.forget(mask)
 
     def forget(self, mask: Tensor) -> None:
         """Forget the past of the environments of `mask` (N,), whose episodes begin. Runs beside `redraw`: what depends on

@@ -1,11 +1,14 @@
 """The part of a task that gives what differs from environment to environment to those that it concerns."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import ClassVar
 
 from torch import Tensor, device
 
 from legged.config.schema import TaskConfig
 from legged.errors import ConfigError
+from legged.graph.step_graph import Branch
 from legged.mdp.randomization import Randomization
 from legged.physics import MODEL_FIELDS, Physics, Scene, check_ranges, make_physics, row_counts
 from legged.process.startup import stage_ended
@@ -20,6 +23,7 @@ class RandomizedTask:
     physics: Physics
     randomization: Randomization
     QUANTITIES: ClassVar[tuple[str, ...]]
+    _beside: Branch
     field_rows: dict[str, int]
     """Field that can be randomised -> how many joints, bodies or shapes have it."""
 
@@ -50,6 +54,17 @@ class RandomizedTask:
     def apply_randomization(self) -> None:
         """Give what was drawn to all that it concerns, when a state was put back."""
         self.randomization.apply(self.physics)
+
+    @contextmanager
+    def redrawing(self, mask: Tensor) -> Iterator[None]:
+        """Draw again, beside the block, what is due, where episodes begin in the environments of `mask` (N,)."""
+        if not self.randomization.redrawn:
+            yield
+            return
+        with self._beside.fork():
+            self.redraw(mask)
+        yield
+        self._beside.join()
 
     def redraw(self, mask: Tensor) -> None:
         """Draw again what is randomised and due, where episodes begin in the environments of `mask` (N,); only called where

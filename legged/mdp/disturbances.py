@@ -34,6 +34,7 @@ class Kicks:
     def __init__(self, cfg: KickConfig, dt: float, time_left: Tensor) -> None:
         """Spread the first kicks over a whole interval; `dt` is the control step [s]."""
         self.columns, self.start = _columns(cfg, (*AXES, *TURNS), ("interval_s",))
+        """How its numbers are drawn, and from what they grow."""
         self._dt = dt
         self.time_left = time_left
         """(N,) time until the next kick [s]."""
@@ -61,6 +62,7 @@ class Forces:
     def __init__(self, cfg: ForceConfig, body: int, dt: float, left: Tensor, force: Tensor) -> None:
         """Push the `body` of that number in the model; spread the first pushes over a whole interval."""
         self.columns, self.start = _columns(cfg, AXES, ("interval_s", "duration_s"))
+        """How its numbers are drawn, and from what they grow."""
         self._dt, self.body = dt, body
         self.left, self.force = left, force
         """(N, 2) time that the push now lasts on, and until the next one begins [s]; (N, 3) force now, world frame [N]."""
