@@ -263,7 +263,8 @@ for (int round = 0;; ++round) {
     const Wide flat = least_slope > slope_left ? least_slope : slope_left;
     alpha = ONE;
     Wide low = ZERO, high = -ONE;
-    Mask searching = active & ~whole;
+    // Nor does it pay to look before the second step: the sides that it goes by are mostly right.
+    Mask searching = KNOWN && round == 1 ? Mask{} : active & ~whole;
     for (int k = 0; k < most_searches && any_of(searching); ++k) {
         Wide first = slope + alpha * bend, second = bend;
         for (int r = 0; r < rows; ++r) {
