@@ -36,6 +36,7 @@ cd "$out"
 for robot in $robots; do
   name=${robot^} # Go1, G1: mjlab's spelling
   if [[ " $phases " == *" mjlab "* ]]; then
+    [[ -n ${MJLAB_RESUME:-} ]] || : >"mjlab_$robot.log"
     mjlab "$root/docs/peers/train_mjlab.py" "Mjlab-Velocity-Flat-Unitree-$name" --out "mjlab_$robot" --every "$every" \
       --num-envs "$num_envs" --seconds "${MJLAB_SECONDS:-600}" --device "$device" ${MJLAB_RESUME:+--resume} >>"mjlab_$robot.log" 2>&1 || {
       tail -n 20 "mjlab_$robot.log"

@@ -96,6 +96,8 @@ class TimedRunner(MjlabOnPolicyRunner):
             noted = {entry.key: entry.value for entry in onnx.load(path).metadata_props}
             done, wall_s = int(noted["iterations"]), float(noted["wall_s"])
             self.written.append({"file": path.name, "iterations": done, "wall_s": wall_s})
+        if not self.written:
+            raise SystemExit(f"--resume: there is no policy_*.onnx in {self.folder}")
         newest = self.written[-1]
         self.load(str(self.folder / f"model_{newest['iterations'] - 1}.pt"))
         self.current_learning_iteration = newest["iterations"]  # rsl-rl would do the last one again
