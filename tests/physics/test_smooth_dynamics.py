@@ -7,9 +7,11 @@ import warp as wp
 from mechanisms import CROOKED, EVERY_JOINT, FusedWorlds, c_worlds, packaged, random_motion, relative_error
 
 from legged.config.schema import SimConfig
-from legged.physics.fused.smooth_dynamics import SmoothDynamics
+from legged.physics.fused.smooth_dynamics import SmoothDynamics, shared_bytes
 from legged.physics.scene import RobotScene
 from legged.physics.warp.compile import launched
+from legged.process.paths import data_folder
+from legged.robots.robot import load_robot
 
 MODELS = {
     "shipped": lambda robot: RobotScene(robot).model(SimConfig()),
@@ -18,6 +20,7 @@ MODELS = {
     "half cheetah": lambda _: packaged("half_cheetah.xml"),
     "humanoid": lambda _: packaged("humanoid.xml"),
 }
+ROBOTS = sorted(path.parent.name for path in (data_folder("resources") / "robots").glob("*/robot.yaml"))
 DRAWN = (
     "body_mass",
     "body_inertia",
@@ -154,3 +157,12 @@ def test_what_it_computes_is_not_refused(robot):
 @pytest.mark.parametrize("array", ["body_gravcomp", "dof_dampingpoly", "actuator_armature", "tendon_stiffness"])
 def test_worlds_that_differ_in_what_it_does_not_read_are_refused(array):
     assert array in SmoothDynamics.why_not(mujoco.MjModel.from_xml_string(CROOKED), ("geom_friction", array))
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_all_worlds_of_a_training_run_at_once(name):
+    """An H100 has 132 multiprocessors of 228 KiB, so for 4096 worlds each has to hold 32, with the 2 KiB that CUDA and Warp take
+    of each. A G1 once had room for 24, so that its launch took twice as long.
+    """
+    model = RobotScene(load_robot(name)).model(SimConfig())
+    assert 132 * ((228 * 1024) // (shared_bytes(model) + 2 * 1024)) >= 4096

@@ -8,8 +8,6 @@ LANES = 32
 """Threads that compute one world on a GPU; on the CPU it is one."""
 SHARED_BYTES = 48 * 1024
 """Memory that a block of threads may share."""
-Part = tuple[int, int]
-"""A part of all worlds: the first one, and how many."""
 Constant = int | bool | tuple[int, ...]
 """What a source may be told: a number, whether something is so, or a table."""
 

@@ -1,13 +1,20 @@
 // Poses, inertias and forces but those of constraints, of one world: trees of free, ball, slide and hinge joints in any order.
 // Constants: NB, NV, NJ, NG, NT (bodies, degrees of freedom, joints, shapes, trees), DEPTH (levels of bodies below the world),
-// BALLS, SLIDES, ONE_MOTOR, SPRINGS, BALL_SPRINGS, DAMPERS, GEARS, GAINS, AFFINE_BIAS, CONTROL_LIMITS, FORCE_LIMITS,
-// JOINT_LIMITS, PUSHED (whether forces act on bodies from outside), EQUALITIES, SITES (what there is of them; the latter two: bodies and sites that equality constraints hold),
-// FREE, BALL, SLIDE, AFFINE (MuJoCo's numbers of types), and for each array of the model VARIES_<array>: whether worlds may
-// differ in it. What a model has not is left out by the compiler.
+// OF_INERTIA, OF_MOTION, OF_BODY (from one row in shared memory to the next), BALLS, SLIDES, ONE_MOTOR, SPRINGS, BALL_SPRINGS,
+// DAMPERS, GEARS, GAINS, AFFINE_BIAS, CONTROL_LIMITS, FORCE_LIMITS, JOINT_LIMITS, PUSHED (whether forces act on bodies from
+// outside), EQUALITIES, SITES (what there is of them; the latter two: bodies and sites that equality constraints hold), FREE,
+// BALL, SLIDE, AFFINE (MuJoCo's numbers of types), and for each array of the model VARIES_<array>: whether worlds may differ in
+// it. What a model has not is left out by the compiler.
 
-LEGGED_SHARED float pos[NB * 3], quat[NB * 4], centre[NB * 3], inertia[NB * 10], carried[NB * 10];
-LEGGED_SHARED float anchor[NJ * 3], axis[NJ * 3], motion[NV * 6];
-LEGGED_SHARED float velocity[NB * 6], acceleration[NB * 6], force[NB * 6];
+LEGGED_SHARED float centre[NB * 3], inertia[NB * OF_INERTIA], motion[NV * OF_MOTION], speed[NV];
+// Poses make room for motions once nobody needs them any more, so that a multiprocessor holds more worlds.
+const int POSES = 7 * NB + 6 * NJ, MOTIONS = OF_BODY * NB;
+LEGGED_SHARED float place[POSES > MOTIONS ? POSES : MOTIONS];
+float *pos = place, *quat = pos + 3 * NB, *anchor = quat + 4 * NB, *axis = anchor + 3 * NJ;
+float* of_bodies = place;  // of each body: first velocity and acceleration, then all that it carries, its inertia and forces
+const int CARRIED = 0, VELOCITY = 0, ACCELERATION = 10, FORCE = 10;
+// Where a body's numbers wait until its inertia is made of them.
+const int TURN = 0, MAIN = 4, MASS = 7;
 
 // This world's row, of `length` floats, in an array of the model: mostly all worlds share one, or each has its own.
 auto row_of = [&](const auto& array, int length, bool varies) {
@@ -31,28 +38,46 @@ auto momentum = [&](const float* body, const float* v, float* out) {
 
 const float* q_in = arrays.qpos.data + (long long)world * arrays.qpos.shape[1];
 const float* v_in = arrays.qvel.data + (long long)world * arrays.qvel.shape[1];
-const float* masses = ROW(body_mass, NB);
-const int* levels = arrays.body_level.data;
 const int* subtree = arrays.body_subtree.data;  // how many bodies a body carries, itself included: those that follow it
+// What is packed into a number of a body, and of a joint.
+auto parent_of = [](int packed) { return packed & 0xff; };
+auto first_of = [](int packed) { return (packed >> 8) & 0xff; };
+auto count_of = [](int packed) { return (packed >> 16) & 0xf; };
+auto level_of = [](int packed) { return packed >> 20; };
+auto type_of = [](int packed) { return packed & 0xf; };
+auto address_of = [](int packed) { return (packed >> 4) & 0xfff; };
+auto dof_of = [](int packed) { return packed >> 16; };
 
 meet();  // of the world before
-EACH(b, NB) if (levels[b] == 0) {
-    const float* gravity = ROW(gravity, 3);
+// All that is far away is asked for at once, and all joints turn at once: below, what one body waits for all others wait for.
+EACH(b, NB) {
+    for (int k = 0; k < 3; ++k) centre[b * 3 + k] = ROW(body_ipos, NB * 3)[b * 3 + k];
+    for (int k = 0; k < 4; ++k) inertia[b * OF_INERTIA + TURN + k] = ROW(body_iquat, NB * 4)[b * 4 + k];
+    for (int k = 0; k < 3; ++k) inertia[b * OF_INERTIA + MAIN + k] = ROW(body_inertia, NB * 3)[b * 3 + k];
+    inertia[b * OF_INERTIA + MASS] = ROW(body_mass, NB)[b];
+    if (level_of(arrays.body_packed.data[b]) > 0) continue;
     for (int k = 0; k < 3; ++k) pos[b * 3 + k] = 0.0f;
     for (int k = 0; k < 4; ++k) quat[b * 4 + k] = k == 0 ? 1.0f : 0.0f;
-    for (int k = 0; k < 6; ++k) velocity[b * 6 + k] = 0.0f;
-    for (int k = 0; k < 6; ++k) acceleration[b * 6 + k] = k < 3 ? 0.0f : -gravity[k - 3];
+}
+EACH(i, NV) speed[i] = v_in[i];
+EACH(j, NJ) {
+    const int packed = arrays.joint_packed.data[j], type = type_of(packed), at = address_of(packed);
+    if (type == FREE || (BALLS && type == BALL)) continue;
+    const float change = q_in[at] - ROW(qpos0, arrays.qpos0.shape[1])[at];
+    const bool slides = SLIDES && type == SLIDE;
+    anchor[j * 3] = slides ? change : cosf(0.5f * change);
+    if (!slides) anchor[j * 3 + 1] = sinf(0.5f * change);
 }
 meet();
 // Poses, level by level away from the world.
 for (int level = 1; level <= DEPTH; ++level) {
-    EACH(b, NB) if (levels[b] == level) {
-        const int parent = arrays.body_parentid.data[b];
-        const int first = arrays.body_jntadr.data[b], last = first + arrays.body_jntnum.data[b];
+    EACH(b, NB) if (const int of_body = arrays.body_packed.data[b]; level_of(of_body) == level) {
+        const int parent = parent_of(of_body), first = first_of(of_body), last = first + count_of(of_body);
         float p[3], q[4], moved[3];
-        const bool floats = first < last && arrays.jnt_type.data[first] == FREE;  // such a body has no other joint
+        const int of_first = first < last ? arrays.joint_packed.data[first] : -1;
+        const bool floats = first < last && type_of(of_first) == FREE;  // such a body has no other joint
         if (floats) {
-            const int at = arrays.jnt_qposadr.data[first];
+            const int at = address_of(of_first);
             for (int k = 0; k < 3; ++k) anchor[first * 3 + k] = p[k] = q_in[at + k];
             for (int k = 0; k < 4; ++k) q[k] = q_in[at + 3 + k];
         } else {
@@ -61,8 +86,9 @@ for (int level = 1; level <= DEPTH; ++level) {
             multiply(quat + parent * 4, ROW(body_quat, NB * 4) + b * 4, q);
         }
         for (int j = floats ? last : first; j < last; ++j) {
-            const int at = arrays.jnt_qposadr.data[j];
-            [[maybe_unused]] const int type = arrays.jnt_type.data[j];
+            [[maybe_unused]] const int packed = j == first ? of_first : arrays.joint_packed.data[j], type = type_of(packed);
+            // How far it slid, or of half the angle.
+            [[maybe_unused]] const float path = anchor[j * 3], cosine = path, sine = anchor[j * 3 + 1];
             const float* at_body = ROW(jnt_pos, NJ * 3) + j * 3;
             const float* about = ROW(jnt_axis, NJ * 3) + j * 3;
             float turn[4], before[4];
@@ -70,17 +96,14 @@ for (int level = 1; level <= DEPTH; ++level) {
             for (int k = 0; k < 3; ++k) anchor[j * 3 + k] = p[k] + moved[k];
             rotate(q, about, axis + j * 3);
             if (BALLS && type == BALL) {
-                for (int k = 0; k < 4; ++k) turn[k] = q_in[at + k];
+                for (int k = 0; k < 4; ++k) turn[k] = q_in[address_of(packed) + k];
                 normalize(turn);
+            } else if (SLIDES && type == SLIDE) {
+                for (int k = 0; k < 3; ++k) p[k] += axis[j * 3 + k] * path;
+                continue;
             } else {
-                const float change = q_in[at] - ROW(qpos0, arrays.qpos0.shape[1])[at];
-                if (SLIDES && type == SLIDE) {
-                    for (int k = 0; k < 3; ++k) p[k] += axis[j * 3 + k] * change;
-                    continue;
-                }
-                const float half = 0.5f * change;
-                turn[0] = cosf(half);
-                for (int k = 0; k < 3; ++k) turn[1 + k] = sinf(half) * about[k];
+                turn[0] = cosine;
+                for (int k = 0; k < 3; ++k) turn[1 + k] = sine * about[k];
             }
             for (int k = 0; k < 4; ++k) before[k] = q[k];
             multiply(before, turn, q);
@@ -117,22 +140,23 @@ EACH(n, SITES) {
     rotate(quat + b * 4, ROW(site_pos, SITES * 3) + n * 3, moved);
     for (int k = 0; k < 3; ++k) out[k] = pos[b * 3 + k] + moved[k];
 }
-// Centres of mass of the trees: all lanes add up the same.
+// Centres of mass, of bodies and of trees.
 EACH(b, NB) {
     float moved[3];
-    rotate(quat + b * 4, ROW(body_ipos, NB * 3) + b * 3, moved);
+    rotate(quat + b * 4, centre + b * 3, moved);
     for (int k = 0; k < 3; ++k) centre[b * 3 + k] = pos[b * 3 + k] + moved[k];
 }
-meet();
 float coms[NT * 3];
 for (int t = 0; t < NT; ++t) {
     const int root = arrays.tree_root.data[t];
-    float com[3] = {0.0f, 0.0f, 0.0f}, mass = 0.0f;
-    for (int b = root; b < root + subtree[root]; ++b) {
-        mass += masses[b];
-        for (int k = 0; k < 3; ++k) com[k] += masses[b] * centre[b * 3 + k];
+    float total[4] = {0.0f, 0.0f, 0.0f, 0.0f};  // mass times place, and mass
+    EACH(b, NB) if (b >= root && b < root + subtree[root]) {
+        const float m = inertia[b * OF_INERTIA + MASS];
+        for (int k = 0; k < 3; ++k) total[k] += m * centre[b * 3 + k];
+        total[3] += m;
     }
-    for (int k = 0; k < 3; ++k) coms[t * 3 + k] = com[k] / mass;
+    sum_four(total);
+    for (int k = 0; k < 3; ++k) coms[t * 3 + k] = total[k] / total[3];
     if (lane == 0) {
         float* out = reinterpret_cast<float*>(arrays.subtree_com.data) + ((long long)world * NB + root) * 3;
         for (int k = 0; k < 3; ++k) out[k] = coms[t * 3 + k];
@@ -141,26 +165,25 @@ for (int t = 0; t < NT; ++t) {
 auto com_of = [&](int b) { return coms + (NT == 1 ? 0 : 3 * arrays.body_tree.data[b]); };
 // Inertias about it.
 EACH(b, NB) {
+    float* out = inertia + b * OF_INERTIA;
     float q[4], R[9], I[6];
-    multiply(quat + b * 4, ROW(body_iquat, NB * 4) + b * 4, q);
+    multiply(quat + b * 4, out + TURN, q);
     to_matrix(q, R);
-    const float* main = ROW(body_inertia, NB * 3) + b * 3;
+    const float main[3] = {out[MAIN], out[MAIN + 1], out[MAIN + 2]}, m = out[MASS];
     const int one[6] = {0, 1, 2, 0, 0, 1}, other[6] = {0, 1, 2, 1, 2, 2};
     for (int n = 0; n < 6; ++n) {
         I[n] = 0.0f;
         for (int k = 0; k < 3; ++k) I[n] += R[one[n] * 3 + k] * main[k] * R[other[n] * 3 + k];
     }
     const float* com = com_of(b);
-    const float m = masses[b];
     const float x = centre[b * 3] - com[0], y = centre[b * 3 + 1] - com[1], z = centre[b * 3 + 2] - com[2];
-    float* out = inertia + b * 10;
     out[0] = I[0] + m * (y * y + z * z); out[1] = I[1] + m * (x * x + z * z); out[2] = I[2] + m * (x * x + y * y);
     out[3] = I[3] - m * x * y; out[4] = I[4] - m * x * z; out[5] = I[5] - m * y * z;
     out[6] = m * x; out[7] = m * y; out[8] = m * z; out[9] = m;
 }
 // How each degree of freedom moves the bodies that it carries.
 EACH(i, NV) {
-    float* out = motion + i * 6;
+    float* out = motion + i * OF_MOTION;
     const int packed = arrays.dof_packed.data[i];  // one look-up instead of a chain of them
     const int b = packed & 0xff, j = (packed >> 8) & 0xff, type = (packed >> 16) & 0xf, of_joint = packed >> 20;
     const int turning = type == FREE ? of_joint - 3 : of_joint;  // about which axis of the body, of a free or ball joint
@@ -184,88 +207,100 @@ EACH(i, NV) {
     for (int k = 0; k < 6; ++k) shown[k] = out[k];
 }
 meet();
-EACH(b, NB)
-    for (int k = 0; k < 10; ++k) {
-        float total = 0.0f;
-        for (int c = b; c < b + subtree[b]; ++c) total += inertia[c * 10 + k];
-        carried[b * 10 + k] = total;
-    }
 // How fast axes of motion turn, which equality constraints take into account.
 [[maybe_unused]] float* turning_axes = reinterpret_cast<float*>(arrays.cdof_dot.data) + (long long)world * NV * 6;
 // Velocities, and accelerations as if no joint accelerated, level by level.
+EACH(b, NB) if (level_of(arrays.body_packed.data[b]) == 0) {
+    const float* gravity = ROW(gravity, 3);
+    for (int k = 0; k < 6; ++k) of_bodies[b * OF_BODY + VELOCITY + k] = 0.0f;
+    for (int k = 0; k < 6; ++k) of_bodies[b * OF_BODY + ACCELERATION + k] = k < 3 ? 0.0f : -gravity[k - 3];
+}
+meet();
 for (int level = 1; level <= DEPTH; ++level) {
-    EACH(b, NB) if (levels[b] == level) {
-        const int parent = arrays.body_parentid.data[b];
-        const int first = arrays.body_jntadr.data[b], last = first + arrays.body_jntnum.data[b];
+    EACH(b, NB) if (const int of_body = arrays.body_packed.data[b]; level_of(of_body) == level) {
+        const int first = first_of(of_body), last = first + count_of(of_body);
+        const float* of_parent = of_bodies + parent_of(of_body) * OF_BODY;
         float v[6], a[6], now[6], c[3], d[3];
-        for (int k = 0; k < 6; ++k) { v[k] = velocity[parent * 6 + k]; a[k] = acceleration[parent * 6 + k]; }
+        for (int k = 0; k < 6; ++k) { v[k] = of_parent[VELOCITY + k]; a[k] = of_parent[ACCELERATION + k]; }
         for (int j = first; j < last; ++j) {
-            const int type = arrays.jnt_type.data[j];
-            int from = arrays.jnt_dofadr.data[j];
+            const int packed = arrays.joint_packed.data[j], type = type_of(packed);
+            int from = dof_of(packed);
             if (type == FREE) {
-                for (int k = 0; k < 3; ++k) v[3 + k] += v_in[from + k];
+                for (int k = 0; k < 3; ++k) v[3 + k] += speed[from + k];
                 if (EQUALITIES) for (int k = 0; k < 18; ++k) turning_axes[from * 6 + k] = 0.0f;
                 from += 3;
             }
             const int to = from + (type == FREE || (BALLS && type == BALL) ? 3 : 1);  // three turn at once
             for (int k = 0; k < 6; ++k) now[k] = v[k];
             for (int i = from; i < to; ++i) {
-                const float* s = motion + i * 6;
+                const float* s = motion + i * OF_MOTION;
                 cross(now, s, c);
-                for (int k = 0; k < 3; ++k) a[k] += c[k] * v_in[i];
+                for (int k = 0; k < 3; ++k) a[k] += c[k] * speed[i];
                 cross(now, s + 3, c);
                 cross(now + 3, s, d);
-                for (int k = 0; k < 3; ++k) a[3 + k] += (c[k] + d[k]) * v_in[i];
-                for (int k = 0; k < 6; ++k) v[k] += s[k] * v_in[i];
+                for (int k = 0; k < 3; ++k) a[3 + k] += (c[k] + d[k]) * speed[i];
+                for (int k = 0; k < 6; ++k) v[k] += s[k] * speed[i];
                 if (EQUALITIES) {
                     cross(now, s, turning_axes + i * 6);
                     for (int k = 0; k < 3; ++k) turning_axes[i * 6 + 3 + k] = c[k] + d[k];
                 }
             }
         }
-        for (int k = 0; k < 6; ++k) { velocity[b * 6 + k] = v[k]; acceleration[b * 6 + k] = a[k]; }
+        float* own = of_bodies + b * OF_BODY;
+        for (int k = 0; k < 6; ++k) { own[VELOCITY + k] = v[k]; own[ACCELERATION + k] = a[k]; }
     }
     meet();
 }
-if (EQUALITIES) EACH(k, 6 * NB) reinterpret_cast<float*>(arrays.cvel.data)[(long long)world * 6 * NB + k] = velocity[k];
-EACH(i, NV) {
-    float f[6];
-    momentum(carried + arrays.dof_bodyid.data[i] * 10, motion + i * 6, f);
-    for (int k = arrays.M_rowadr.data[i]; k < arrays.M_rowadr.data[i] + arrays.M_rownnz.data[i]; ++k) {
-        const int j = arrays.M_colind.data[k];
-        float total = i == j ? ROW(dof_armature, NV)[i] : 0.0f;
-        for (int n = 0; n < 6; ++n) total += motion[j * 6 + n] * f[n];
-        arrays.M.data[(long long)world * arrays.M.shape[1] + k] = total;
-    }
-}
 EACH(b, NB) {
-    float p[6], along[6], c[3], d[3];
-    momentum(inertia + b * 10, velocity + b * 6, p);
-    momentum(inertia + b * 10, acceleration + b * 6, along);
-    cross(velocity + b * 6, p, c);
-    cross(velocity + b * 6 + 3, p + 3, d);
-    for (int k = 0; k < 3; ++k) force[b * 6 + k] = along[k] + c[k] + d[k];
-    cross(velocity + b * 6, p + 3, c);
-    for (int k = 0; k < 3; ++k) force[b * 6 + 3 + k] = along[3 + k] + c[k];
+    float* own = of_bodies + b * OF_BODY;
+    float v[6], a[6], p[6], along[6], c[3], d[3], f[6];
+    for (int k = 0; k < 6; ++k) { v[k] = own[VELOCITY + k]; a[k] = own[ACCELERATION + k]; }
+    float* shown = reinterpret_cast<float*>(arrays.cvel.data) + ((long long)world * NB + b) * 6;
+    if (EQUALITIES) for (int k = 0; k < 6; ++k) shown[k] = v[k];
+    momentum(inertia + b * OF_INERTIA, v, p);
+    momentum(inertia + b * OF_INERTIA, a, along);
+    cross(v, p, c);
+    cross(v + 3, p + 3, d);
+    for (int k = 0; k < 3; ++k) f[k] = along[k] + c[k] + d[k];
+    cross(v, p + 3, c);
+    for (int k = 0; k < 3; ++k) f[3 + k] = along[3 + k] + c[k];
     if (PUSHED) {  // at its centre of mass: force, then torque
         const float* push = reinterpret_cast<const float*>(arrays.xfrc_applied.data) + ((long long)world * NB + b) * 6;
         const float* com = com_of(b);
         float arm[3];
         for (int k = 0; k < 3; ++k) arm[k] = centre[b * 3 + k] - com[k];
         cross(arm, push, c);
-        for (int k = 0; k < 3; ++k) force[b * 6 + k] -= c[k] + push[3 + k];
-        for (int k = 0; k < 3; ++k) force[b * 6 + 3 + k] -= push[k];
+        for (int k = 0; k < 3; ++k) f[k] -= c[k] + push[3 + k];
+        for (int k = 0; k < 3; ++k) f[3 + k] -= push[k];
     }
+    for (int k = 0; k < 10; ++k) own[CARRIED + k] = inertia[b * OF_INERTIA + k];
+    for (int k = 0; k < 6; ++k) own[FORCE + k] = f[k];
 }
 meet();
+// Towards the world, bodies pass on what they carry; a lane has one of the sixteen numbers.
+EACH(k, 16)
+    for (int b = NB - 1; b > 0; --b)
+        if (const int parent = arrays.body_parentid.data[b]; parent > 0)
+            of_bodies[parent * OF_BODY + k] += of_bodies[b * OF_BODY + k];
+meet();
+EACH(i, NV) {
+    float f[6];
+    momentum(of_bodies + arrays.dof_bodyid.data[i] * OF_BODY + CARRIED, motion + i * OF_MOTION, f);
+    const int start = arrays.M_rowadr.data[i], stop = start + arrays.M_rownnz.data[i];
+    for (int k = start; k < stop; ++k) {
+        const int j = arrays.M_colind.data[k];
+        float total = i == j ? ROW(dof_armature, NV)[i] : 0.0f;
+        for (int n = 0; n < 6; ++n) total += motion[j * OF_MOTION + n] * f[n];
+        arrays.M.data[(long long)world * arrays.M.shape[1] + k] = total;
+    }
+}
 EACH(i, NV) {
     const int packed = arrays.dof_packed.data[i], b = packed & 0xff;
     [[maybe_unused]] const int j = (packed >> 8) & 0xff, type = (packed >> 16) & 0xf;
     [[maybe_unused]] const int at = SPRINGS || AFFINE_BIAS ? arrays.jnt_qposadr.data[j] : 0;
     const long long out = (long long)world * NV + i;
     float total = 0.0f;
-    for (int c = b; c < b + subtree[b]; ++c)
-        for (int k = 0; k < 6; ++k) total -= motion[i * 6 + k] * force[c * 6 + k];
+    for (int k = 0; k < 6; ++k) total -= motion[i * OF_MOTION + k] * of_bodies[b * OF_BODY + FORCE + k];
     // Motors, all of them on slides and hinges.
     float driven = 0.0f;
     // Mostly a degree of freedom has one motor at most, and a motor one control, in the same order.
@@ -281,7 +316,7 @@ EACH(i, NV) {
         if (GAINS) push *= ROW(actuator_gainprm, 10 * arrays.actuator_gainprm.shape[1])[10 * u];
         if (AFFINE_BIAS && arrays.actuator_biastype.data[u] == AFFINE) {
             const float* bias = ROW(actuator_biasprm, 10 * arrays.actuator_biasprm.shape[1]) + 10 * u;
-            push += bias[0] + bias[1] * (gear * q_in[at]) + bias[2] * (gear * v_in[i]);
+            push += bias[0] + bias[1] * (gear * q_in[at]) + bias[2] * (gear * speed[i]);
         }
         if (FORCE_LIMITS && arrays.actuator_forcelimited.data[u])
             push = clamped(push, ROW(actuator_forcerange, 2 * arrays.actuator_forcerange.shape[1]) + 2 * u);
@@ -309,7 +344,7 @@ EACH(i, NV) {
             }
             passive -= ROW(jnt_stiffness, NJ)[j] * bent;
         }
-        if (DAMPERS) passive -= ROW(dof_damping, NV)[i] * v_in[i];
+        if (DAMPERS) passive -= ROW(dof_damping, NV)[i] * speed[i];
         arrays.qfrc_passive.data[out] = passive;
         total += passive;
     }

@@ -50,6 +50,9 @@ NEEDED_STAGES = ("ACTUATION", "CLAMPCTRL", "DAMPER", "EULERDAMP", "GRAVITY", "SP
 """Stages that a model may ask to leave out, and that are not left out here."""
 PUSHED = "xfrc_applied"
 """What forces that act from outside are called among the arrays in which worlds differ."""
+ROW_LENGTHS = {"OF_INERTIA": 11, "OF_MOTION": 7, "OF_BODY": 17}
+"""Numbers of an inertia, of an axis of motion, and of what a body passes on, and one more: an odd number of them, so that
+lanes that read one each meet different banks of shared memory."""
 MOST_BLOCKS = 32
 """Blocks that a multiprocessor holds at most: with few enough registers for so many, 4096 worlds run at once on an H100."""
 
@@ -62,20 +65,17 @@ class DynamicsArrays:
     `geom_xpos` on what it writes.
     """
 
-    body_level: wp.array[int]
+    body_packed: wp.array[int]
     body_subtree: wp.array[int]
     body_tree: wp.array[int]
     tree_root: wp.array[int]
     motor_start: wp.array[int]
     motor: wp.array[int]
     motor_of_dof: wp.array[int]
+    joint_packed: wp.array[int]
     dof_packed: wp.array[int]
     body_parentid: wp.array[int]
-    body_jntadr: wp.array[int]
-    body_jntnum: wp.array[int]
-    jnt_type: wp.array[int]
     jnt_qposadr: wp.array[int]
-    jnt_dofadr: wp.array[int]
     jnt_actfrclimited: wp.array[bool]
     dof_bodyid: wp.array[int]
     geom_bodyid: wp.array[int]
@@ -144,7 +144,8 @@ def dynamics_constants(model: mujoco.MjModel, randomized: Collection[str] = ()) 
     trees = _trees(model)
     return {
         **{"NB": model.nbody, "NV": model.nv, "NJ": model.njnt, "NG": model.ngeom},
-        **{"NT": len(trees["tree_root"]), "DEPTH": int(trees["body_level"].max())},
+        **{"NT": len(trees["tree_root"]), "DEPTH": int((trees["body_packed"] >> 20).max())},
+        **ROW_LENGTHS,
         "BALLS": bool(np.any(model.jnt_type == BALL)),
         "SLIDES": bool(np.any(model.jnt_type == SLIDE)),
         "ONE_MOTOR": _one_motor(model),
@@ -164,6 +165,13 @@ def dynamics_constants(model: mujoco.MjModel, randomized: Collection[str] = ()) 
         **{"FREE": FREE, "BALL": BALL, "SLIDE": SLIDE, "AFFINE": AFFINE},
         **{f"VARIES_{name}": name in randomized for name in OF_MODEL},
     }
+
+
+def shared_bytes(model: mujoco.MjModel) -> int:
+    """Return what smooth_dynamics.h takes of a block's shared memory."""
+    bodies, joints, dofs = model.nbody, model.njnt, model.nv
+    place = max(7 * bodies + 6 * joints, ROW_LENGTHS["OF_BODY"] * bodies)
+    return 4 * ((3 + ROW_LENGTHS["OF_INERTIA"]) * bodies + (1 + ROW_LENGTHS["OF_MOTION"]) * dofs + place)
 
 
 def dynamics_kernel(constants: dict[str, int | bool]) -> Any:
@@ -202,7 +210,7 @@ class SmoothDynamics:
         `randomized` worlds differ. Call with their device as Warp's current one.
         """
         arrays = self.arrays = DynamicsArrays()
-        tables = _trees(model) | _motors(model) | _dofs(model)
+        tables = _trees(model) | _motors(model) | _joints(model)
         for name in DynamicsArrays.vars:  # type: ignore[attr-defined]
             if name in tables:
                 value = wp.array(tables[name], dtype=int)
@@ -240,7 +248,7 @@ class SmoothDynamics:
             return "the model has no joints"
         if max(model.nbody, model.njnt) > 255:
             return f"it has {model.nbody} bodies and {model.njnt} joints"
-        if 4 * (48 * model.nbody + 6 * model.njnt + 6 * model.nv) > SHARED_BYTES:
+        if shared_bytes(model) > SHARED_BYTES:
             return f"{model.nbody} bodies do not fit a GPU's shared memory"
         if not np.isin(model.eq_type, (CONNECT, WELD, JOINT)).all():
             return "the model has equality constraints of tendons or flexes"
@@ -272,9 +280,10 @@ def _why_not_motors(model: mujoco.MjModel, scalar: np.ndarray) -> str:
 
 
 def _trees(model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """Return of each body how many levels it is below the world, how many bodies it carries (itself included), and the
-    index of its tree; and of each tree its first body. A tree hangs from the world; one without joints is left out, and its
-    bodies say 0.
+    """Return of each body how many bodies it carries (itself included), the index of its tree, and, packed into one number,
+    its parent, its first joint, how many joints it has and how many levels it is below the world; and of each tree its first
+    body. A tree hangs from the world; one without joints is left out, and its bodies say 0. `why_not` admits fewer than 256
+    bodies and joints.
     """
     parent = model.body_parentid
     level, subtree = np.zeros(model.nbody, dtype=int), np.ones(model.nbody, dtype=int)
@@ -286,7 +295,13 @@ def _trees(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     tree = np.zeros(model.nbody, dtype=int)
     for t, root in enumerate(roots):
         tree[root : root + subtree[root]] = t
-    return {"body_level": level, "body_subtree": subtree, "body_tree": tree, "tree_root": roots}
+    joints = np.maximum(model.body_jntadr, 0) << 8 | model.body_jntnum << 16
+    return {
+        "body_packed": parent | joints | level << 20,
+        "body_subtree": subtree,
+        "body_tree": tree,
+        "tree_root": roots,
+    }
 
 
 def _motors(model: mujoco.MjModel) -> dict[str, np.ndarray]:
@@ -306,10 +321,13 @@ def _one_motor(model: mujoco.MjModel) -> bool:
     return len(set(joints.tolist())) == model.nu and bool((model.actuator_ctrladr == np.arange(model.nu)).all())
 
 
-def _dofs(model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """Return of each degree of freedom its body, its joint, the joint's type and its place in the joint, packed into one
-    number: `why_not` admits fewer than 256 bodies and joints.
+def _joints(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """Return of each joint its type, where its position begins and which degree of freedom is its first; and of each degree
+    of freedom its body, its joint, the joint's type and its place in the joint, packed into one number each.
     """
     joint = model.dof_jntid
     place = np.arange(model.nv) - model.jnt_dofadr[joint]
-    return {"dof_packed": model.dof_bodyid | joint << 8 | model.jnt_type[joint] << 16 | place << 20}
+    return {
+        "joint_packed": model.jnt_type | model.jnt_qposadr << 4 | model.jnt_dofadr << 16,
+        "dof_packed": model.dof_bodyid | joint << 8 | model.jnt_type[joint] << 16 | place << 20,
+    }
