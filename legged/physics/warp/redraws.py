@@ -9,6 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from legged.physics.fields import FIELDS, own_array
+from legged.physics.fused.native import LANES
 from legged.physics.randomized_model import RandomizedModel
 
 HOW = {"set": 0, "add": 1, "scale": 2}
@@ -75,6 +76,7 @@ def put(to: Arrays, array: int, world: int, at: int, number: float) -> None:
 
 @wp.kernel
 def write_drawn(
+    lanes: int,
     mask: wp.array[wp.bool],
     drawn: wp.array2d[float],
     place: wp.array2d[int],
@@ -85,41 +87,58 @@ def write_drawn(
     ratios: wp.array[float],
     to: Arrays,
 ):
-    """One thread a world and number that changes: the model's own, changed by one field after the other. `place` has its
-    array and its place there, `entry` the column of a value, how it changes the number, and whether it is a restitution.
+    """So many threads a world, which share the numbers that change: the model's own, changed by one field after the other.
+    `place` has its array and its place there, `entry` the column of a value, how it changes the number, and whether it is a
+    restitution.
     """
-    world, n = wp.tid()
+    world, lane = wp.tid()
     if not mask[world]:
         return
-    number = own[n]
-    for k in range(first[n], first[n + 1]):
-        value = drawn[world, entry[k, 0]]
-        bounce = entry[k, 2]
-        if bounce > 0:
-            points = ratios.shape[0] - 1
-            at = wp.clamp(value, 0.0, 1.0) * float(points)
-            low = wp.min(int(at), points - 1)
-            value = ratios[low] + (at - float(low)) * (ratios[low + 1] - ratios[low])
-            if bounce == INVERSE:
-                value = 1.0 / value
-        value = value * weight[k]
-        if entry[k, 1] == SCALE:
-            number = number * value
-        elif entry[k, 1] == ADD:
-            number = number + value
-        else:
-            number = value
-    put(to, place[n, 0], world, place[n, 1], number)
+    for n in range(lane, own.shape[0], lanes):
+        number = own[n]
+        for k in range(first[n], first[n + 1]):
+            value = drawn[world, entry[k, 0]]
+            bounce = entry[k, 2]
+            if bounce > 0:
+                points = ratios.shape[0] - 1
+                at = wp.clamp(value, 0.0, 1.0) * float(points)
+                low = wp.min(int(at), points - 1)
+                value = ratios[low] + (at - float(low)) * (ratios[low + 1] - ratios[low])
+                if bounce == INVERSE:
+                    value = 1.0 / value
+            value = value * weight[k]
+            if entry[k, 1] == SCALE:
+                number = number * value
+            elif entry[k, 1] == ADD:
+                number = number + value
+            else:
+                number = value
+        put(to, place[n, 0], world, place[n, 1], number)
 
 
 @wp.kernel
 def copy_variants(
-    mask: wp.array[wp.bool], chosen: wp.array[wp.int64], variants: wp.array2d[float], place: wp.array2d[int], to: Arrays
+    lanes: int,
+    mask: wp.array[wp.bool],
+    chosen: wp.array[wp.int64],
+    variants: wp.array2d[float],
+    place: wp.array2d[int],
+    to: Arrays,
 ):
-    """One thread a world and number of a variant; `place` has the number's array and its place there."""
-    world, n = wp.tid()
-    if mask[world]:
-        put(to, place[n, 0], world, place[n, 1], variants[int(chosen[world]), n])
+    """So many threads a world, which share the numbers of a variant; `place` has the number's array and its place there."""
+    world, lane = wp.tid()
+    if not mask[world]:
+        return
+    row = int(chosen[world])
+    for n in range(lane, variants.shape[1], lanes):
+        put(to, place[n, 0], world, place[n, 1], variants[row, n])
+
+
+def _lanes() -> int:
+    """Return how many threads a world has. Few worlds begin anew in a step: a thread for each number of all worlds would keep
+    a GPU busy with nothing, and hold up what runs beside.
+    """
+    return 1 if wp.get_device().is_cpu else LANES
 
 
 def _arrays(arrays: Sequence[Tensor]) -> Any:
@@ -173,11 +192,11 @@ class Redraws:
             wp.from_torch(ratios),
             _arrays(list(arrays.values())),
         ]
-        self._dim = (len(drawn), len(changes))
+        self._dim = (len(drawn), _lanes())
 
     def launch(self, mask: Tensor) -> None:
         """Write the rows of the worlds of `mask` (N,)."""
-        wp.launch(write_drawn, dim=self._dim, inputs=[wp.from_torch(mask), *self._inputs])
+        wp.launch(write_drawn, dim=self._dim, inputs=[self._dim[1], wp.from_torch(mask), *self._inputs])
 
 
 class Variants:
@@ -192,7 +211,7 @@ class Variants:
         place = [(number, at) for number, width in enumerate(widths) for at in range(width)]
         targets = [array for _, array in arrays.values()]
         self._inputs = [wp.from_torch(self._variants), wp.array(place, dtype=int, ndim=2), _arrays(targets)]
-        self._dim = (len(targets[0]), len(place))
+        self._dim = (len(targets[0]), _lanes())
 
     @staticmethod
     def _side_by_side(made: Mapping[str, Tensor]) -> Tensor:
@@ -205,4 +224,5 @@ class Variants:
 
     def launch(self, mask: Tensor, chosen: Tensor) -> None:
         """Copy those `chosen` (N,) into the worlds of `mask` (N,)."""
-        wp.launch(copy_variants, dim=self._dim, inputs=[wp.from_torch(mask), wp.from_torch(chosen), *self._inputs])
+        inputs = [self._dim[1], wp.from_torch(mask), wp.from_torch(chosen), *self._inputs]
+        wp.launch(copy_variants, dim=self._dim, inputs=inputs)
