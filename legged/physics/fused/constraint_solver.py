@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from legged.physics.fused.native import LANES, Constant, native_source
+from legged.physics.fused.native import LANES, Constant, lanes_of, native_source
 from legged.physics.fused.row_sides import SIDES, RowSides
 from legged.physics.fused.solver_arrays import SolverArrays
 from legged.physics.fused.tree import MOST_DOFS, Tree
@@ -123,7 +123,7 @@ class ConstraintSolver:
             entries = rows, columns[: len(rows)]
             self.wide = wide_constants(tree, entries, d.njmax, damped, friction, sides is not None)
         self._kernel = solver_kernel(self.constants) if self.wide is None else wide_kernel(self.wide)
-        self._lanes = 1 if d.qacc.device.is_cpu else LANES
+        self._lanes = lanes_of(d.qacc.device)
         efc, opt = d.efc, m.opt
         self.settings = [
             opt.iterations,

@@ -29,7 +29,7 @@ from legged.physics.fused.contact_kernel import (
     stage_constants,
     stage_kernel,
 )
-from legged.physics.fused.native import LANES, SHARED_BYTES
+from legged.physics.fused.native import SHARED_BYTES, lanes_of
 from legged.physics.fused.row_sides import RowSides
 
 FIXED = (
@@ -93,7 +93,7 @@ class ContactStage:
         self.kinds = bool(points), bool(round_pairs), bool(probes)
         """Whether points on planes, pairs of round shapes and probes of the ground may touch."""
         self._kernel = stage_kernel(self.constants, *self.kinds)
-        self._lanes = 1 if d.qacc.device.is_cpu else LANES
+        self._lanes = lanes_of(d.qacc.device)
 
     @staticmethod
     def why_not(model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = ()) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 SOURCES = Path(__file__).parent
 LANES = 32
@@ -10,6 +11,11 @@ SHARED_BYTES = 48 * 1024
 """Memory that a block of threads may share."""
 Constant = int | bool | tuple[int, ...]
 """What a source may be told: a number, whether something is so, or a table."""
+
+
+def lanes_of(device: Any) -> int:
+    """Return how many threads share a world's work on a Warp device."""
+    return 1 if device.is_cpu else LANES
 
 
 def native_source(files: Iterable[str], constants: Mapping[str, Constant]) -> str:

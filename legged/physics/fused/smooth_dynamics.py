@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from legged.physics.fused.native import LANES, SHARED_BYTES, native_source
+from legged.physics.fused.native import LANES, SHARED_BYTES, lanes_of, native_source
 from legged.physics.fused.tree import CONNECT, JOINT, SITE, WELD
 
 FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("FREE", "BALL", "SLIDE", "HINGE"))
@@ -220,7 +220,7 @@ class SmoothDynamics:
         self.constants = dynamics_constants(model, randomized)
         """What smooth_dynamics.h was asked for."""
         self._kernel = dynamics_kernel(self.constants)
-        self._lanes = 1 if d.qacc.device.is_cpu else LANES
+        self._lanes = lanes_of(d.qacc.device)
         self._worlds = d.nworld
 
     @staticmethod

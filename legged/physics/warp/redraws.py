@@ -9,7 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from legged.physics.fields import FIELDS, own_array
-from legged.physics.fused.native import LANES
+from legged.physics.fused.native import lanes_of
 from legged.physics.randomized_model import RandomizedModel
 
 HOW = {"set": 0, "add": 1, "scale": 2}
@@ -134,13 +134,6 @@ def copy_variants(
         put(to, place[n, 0], world, place[n, 1], variants[row, n])
 
 
-def _lanes() -> int:
-    """Return how many threads a world has. Few worlds begin anew in a step: a thread for each number of all worlds would keep
-    a GPU busy with nothing, and hold up what runs beside.
-    """
-    return 1 if wp.get_device().is_cpu else LANES
-
-
 def _arrays(arrays: Sequence[Tensor]) -> Any:
     """Return where numbers are written, of arrays (N, ...)."""
     assert len(arrays) <= MOST_ARRAYS
@@ -192,7 +185,8 @@ class Redraws:
             wp.from_torch(ratios),
             _arrays(list(arrays.values())),
         ]
-        self._dim = (len(drawn), _lanes())
+        # Few worlds begin anew in a step: a thread for each number of all worlds would keep a GPU busy with nothing.
+        self._dim = (len(drawn), lanes_of(wp.get_device()))
 
     def launch(self, mask: Tensor) -> None:
         """Write the rows of the worlds of `mask` (N,)."""
@@ -211,7 +205,7 @@ class Variants:
         place = [(number, at) for number, width in enumerate(widths) for at in range(width)]
         targets = [array for _, array in arrays.values()]
         self._inputs = [wp.from_torch(self._variants), wp.array(place, dtype=int, ndim=2), _arrays(targets)]
-        self._dim = (len(targets[0]), _lanes())
+        self._dim = (len(targets[0]), lanes_of(wp.get_device()))
 
     @staticmethod
     def _side_by_side(made: Mapping[str, Tensor]) -> Tensor:
