@@ -56,24 +56,58 @@ class StateArrays:
 
 
 @wp.func
+def three(of: wp.array2d[float], world: int, at: int) -> wp.vec3:
+    """Return three numbers of a world's row, from `at` on."""
+    return wp.vec3(of[world, at], of[world, at + 1], of[world, at + 2])
+
+
+@wp.func
+def put_three(to: wp.array2d[float], world: int, at: int, numbers: wp.vec3) -> None:
+    """Write three numbers into a world's row, from `at` on."""
+    for k in range(3):
+        to[world, at + k] = numbers[k]
+
+
+@wp.func
+def turn_joint(world: int, at: int, dof: int, h: float, of: StateArrays) -> None:
+    """Move on what of a joint is a quaternion, which is at `at` in qpos, with three degrees of freedom."""
+    velocity, gain = three(of.qvel, world, dof), three(of.advance, world, dof)
+    acceleration = three(of.qacc, world, dof)
+    quat = wp.vec4(of.qpos[world, at], of.qpos[world, at + 1], of.qpos[world, at + 2], of.qpos[world, at + 3])
+    velocity += h * gain
+    quat = turned_by(quat, h * velocity)
+    put_three(of.qvel, world, dof, velocity)
+    put_three(of.warmstart, world, dof, acceleration)
+    for k in range(4):
+        of.qpos[world, at + k] = quat[k]
+
+
+@wp.func
 def integrate_joint(world: int, joint: int, of: StateArrays) -> None:
-    """Move one joint on by semi-implicit Euler; with a world's first, set the flags of what found no room."""
+    """Move one joint on by semi-implicit Euler; with a world's first, set the flags of what found no room.
+
+    All is read before anything is written: a compiler lets no read pass a write, and each would be waited for.
+    """
     h = of.timestep[world % of.timestep.shape[0]]
     at, dof = of.jnt_qposadr[joint], of.jnt_dofadr[joint]
     kind = of.jnt_type[joint]
-    moving = wp.where(kind == FREE_JOINT, 3, wp.where(kind == BALL_JOINT, 0, 1))  # numbers in qpos, before any quaternion
-    turning = wp.where(moving == 1, 0, 3)  # degrees of freedom of the quaternion
-    for k in range(dof, dof + moving + turning):
-        of.qvel[world, k] += h * of.advance[world, k]
-        of.warmstart[world, k] = of.qacc[world, k]
-    for k in range(moving):
-        of.qpos[world, at + k] += h * of.qvel[world, dof + k]
-    if turning > 0:
-        i, v = at + moving, dof + moving
-        quat = wp.vec4(of.qpos[world, i], of.qpos[world, i + 1], of.qpos[world, i + 2], of.qpos[world, i + 3])
-        quat = turned_by(quat, h * wp.vec3(of.qvel[world, v], of.qvel[world, v + 1], of.qvel[world, v + 2]))
-        for k in range(4):
-            of.qpos[world, i + k] = quat[k]
+    if kind == FREE_JOINT:
+        velocity, gain = three(of.qvel, world, dof), three(of.advance, world, dof)
+        acceleration, place = three(of.qacc, world, dof), three(of.qpos, world, at)
+        velocity += h * gain
+        put_three(of.qvel, world, dof, velocity)
+        put_three(of.warmstart, world, dof, acceleration)
+        put_three(of.qpos, world, at, place + h * velocity)
+        turn_joint(world, at + 3, dof + 3, h, of)
+    elif kind == BALL_JOINT:
+        turn_joint(world, at, dof, h, of)
+    else:
+        speed = of.qvel[world, dof] + h * of.advance[world, dof]
+        angle = of.qpos[world, at] + h * speed
+        last = of.qacc[world, dof]
+        of.qvel[world, dof] = speed
+        of.warmstart[world, dof] = last
+        of.qpos[world, at] = angle
     if joint > 0:
         return
     if of.nefc[world] > of.most_rows:

@@ -272,22 +272,33 @@ def add_rewards(
     sums: wp.array2d[float],
     total: wp.array[float],
 ):
-    """One thread a robot; rows are terms."""
+    """One thread a robot; rows are terms. Of four terms all is read before anything is written: a compiler lets no read pass
+    a write, and each would be waited for.
+    """
     robot = wp.tid()
     clipped, whole = wp.float32(0.0), wp.float32(0.0)
-    for term in range(values.shape[0]):
-        value = values[term, robot] * factors[term, 0]
-        number = wp.abs(value) < largest
-        fine[term, robot] = number
-        if not (number and valid[robot]):
-            value = 0.0
-        last[term, robot] = value
-        sums[term, robot] = sums[term, robot] + value
-        if only_positive:
-            clipped += value * before_clip[term, 0]
-            whole += value * (1.0 - before_clip[term, 0])
-        else:
-            whole += value
+    counts = valid[robot]
+    for first in range(0, values.shape[0], 4):
+        given, before = wp.vec4(), wp.vec4()
+        for k in range(4):
+            if first + k < values.shape[0]:
+                given[k] = values[first + k, robot]
+                before[k] = sums[first + k, robot]
+        for k in range(4):
+            term = first + k
+            if term < values.shape[0]:
+                value = given[k] * factors[term, 0]
+                number = wp.abs(value) < largest
+                fine[term, robot] = number
+                if not (number and counts):
+                    value = 0.0
+                last[term, robot] = value
+                sums[term, robot] = before[k] + value
+                if only_positive:
+                    clipped += value * before_clip[term, 0]
+                    whole += value * (1.0 - before_clip[term, 0])
+                else:
+                    whole += value
     total[robot] = wp.max(clipped, 0.0) + whole
 
 
