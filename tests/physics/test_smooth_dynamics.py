@@ -161,8 +161,8 @@ def test_worlds_that_differ_in_what_it_does_not_read_are_refused(array):
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_all_worlds_of_a_training_run_at_once(name):
-    """An H100 has 132 multiprocessors of 228 KiB, so for 4096 worlds each has to hold 32, with the 2 KiB that CUDA and Warp take
-    of each. A G1 once had room for 24, so that its launch took twice as long.
+    """An H100 has 132 multiprocessors of 228 KiB, so for 4096 worlds each has to hold 32, with the 2 KiB that CUDA and Warp
+    take of each. A G1 once had room for 24, so that its launch took twice as long.
     """
     model = RobotScene(load_robot(name)).model(SimConfig())
     assert 132 * ((228 * 1024) // (shared_bytes(model) + 2 * 1024)) >= 4096

@@ -13,6 +13,8 @@ import torch
 import warp as wp
 
 from legged.physics.feet import FootChains
+from legged.physics.fused.contact_kernel import Vector5
+from legged.physics.fused.native import lanes_of
 from legged.physics.robot_state import RobotState
 from legged.robots.robot import Robot
 
@@ -110,6 +112,54 @@ def add_contact_forces(
 
 
 @wp.kernel
+def sum_contact_forces(
+    slots: int,
+    rows: int,
+    elliptic: bool,
+    geom: wp.array[wp.vec2i],
+    dim: wp.array[int],
+    address: wp.array2d[int],
+    friction: wp.array[Vector5],
+    frame: wp.array[wp.mat33],
+    efc_force: wp.array2d[float],
+    contact_of_geom: wp.array[int],
+    contact_forces: wp.array2d[wp.vec3],
+):
+    """The same in one launch, where each world has its contacts in `slots` of its own: one thread a world and tracked shape.
+
+    Of a cone the rows have the force along its axes; of a pyramid its edges', each of them the normal plus or minus friction
+    times a tangent.
+    """
+    world, shape = wp.tid()
+    total = wp.vec3(0.0)
+    for c in range(world * slots, (world + 1) * slots):
+        row = address[c, 0]
+        if row < 0:  # nor has any that follows a row
+            break
+        first, second = contact_of_geom[geom[c][0]], contact_of_geom[geom[c][1]]
+        if first == shape or second == shape:
+            force = wp.vec3(0.0)
+            if elliptic or dim[c] == 1:
+                for k in range(3):
+                    if k < dim[c] and row + k < rows:
+                        force[k] = efc_force[world, row + k]
+            else:
+                for k in range(dim[c] - 1):
+                    edge = row + 2 * k
+                    up = wp.where(edge < rows, efc_force[world, wp.min(edge, rows - 1)], 0.0)
+                    down = wp.where(edge + 1 < rows, efc_force[world, wp.min(edge + 1, rows - 1)], 0.0)
+                    force[0] += up + down
+                    if k < 2:
+                        force[k + 1] = (up - down) * friction[c][k]
+            on_second = force @ frame[c]
+            if first == shape:
+                total -= on_second
+            if second == shape:
+                total += on_second
+    contact_forces[world, shape] = total
+
+
+@wp.kernel
 def read_flags(overflow: wp.array[int], lost: int, overflowed: wp.array[wp.bool]):
     """One thread a world, where no robot is read."""
     world = wp.tid()
@@ -119,6 +169,7 @@ def read_flags(overflow: wp.array[int], lost: int, overflowed: wp.array[wp.bool]
 
 @wp.kernel
 def write_states(
+    lanes: int,
     mask: wp.array[wp.bool],
     new_qpos: wp.array2d[float],
     new_qvel: wp.array2d[float],
@@ -129,31 +180,30 @@ def write_states(
     warmstart: wp.array2d[float],
     contact_forces: wp.array2d[wp.vec3],
 ):
-    """One thread a world. Clears what would carry over a step: controls, activations and the solver's warm start."""
-    world = wp.tid()
+    """So many threads a world. Clears what would carry over a step: controls, activations and the solver's warm start."""
+    world, lane = wp.tid()
     if not mask[world]:
         return
-    for i in range(qpos.shape[1]):
+    for i in range(lane, qpos.shape[1], lanes):
         qpos[world, i] = new_qpos[world, i]
-    for i in range(qvel.shape[1]):
+    for i in range(lane, qvel.shape[1], lanes):
         qvel[world, i] = new_qvel[world, i]
-    for i in range(ctrl.shape[1]):
+    for i in range(lane, ctrl.shape[1], lanes):
         ctrl[world, i] = 0.0
-    for i in range(act.shape[1]):
+    for i in range(lane, act.shape[1], lanes):
         act[world, i] = 0.0
-    for i in range(warmstart.shape[1]):
+    for i in range(lane, warmstart.shape[1], lanes):
         warmstart[world, i] = 0.0
-    for i in range(contact_forces.shape[1]):
+    for i in range(lane, contact_forces.shape[1], lanes):
         contact_forces[world, i] = wp.vec3(0.0)
 
 
 @wp.kernel
 def add_velocities(mask: wp.array[wp.bool], delta: wp.array2d[float], qvel: wp.array2d[float]):
-    """One thread a world."""
-    world = wp.tid()
+    """One thread a world and degree of freedom."""
+    world, i = wp.tid()
     if mask[world]:
-        for i in range(delta.shape[1]):
-            qvel[world, i] = qvel[world, i] + delta[world, i]
+        qvel[world, i] = qvel[world, i] + delta[world, i]
 
 
 @dataclass(frozen=True)
@@ -190,14 +240,15 @@ class StateExchange:
         mujoco-warp's own reset_data would drop the contacts of all worlds.
         """
         own = self._arrays
-        inputs = [wp.from_torch(mask), wp.from_torch(qpos.contiguous()), wp.from_torch(qvel.contiguous())]
+        lanes = lanes_of(wp.get_device())
+        inputs = [lanes, wp.from_torch(mask), wp.from_torch(qpos.contiguous()), wp.from_torch(qvel.contiguous())]
         outputs = [own.qpos, own.qvel, own.ctrl, own.act, own.warmstart, self._contact_forces]
-        wp.launch(write_states, dim=len(mask), inputs=inputs, outputs=outputs)
+        wp.launch(write_states, dim=(len(mask), lanes), inputs=inputs, outputs=outputs)
 
     def push(self, mask: torch.Tensor, delta: torch.Tensor, qvel: torch.Tensor) -> None:
         """Add `delta` (N, K) to the first K of `qvel` in the worlds of `mask` (N,)."""
         inputs = [wp.from_torch(mask), wp.from_torch(delta), wp.from_torch(qvel)]
-        wp.launch(add_velocities, dim=len(mask), inputs=inputs)
+        wp.launch(add_velocities, dim=tuple(delta.shape), inputs=inputs)
 
     def kinematics(self) -> None:
         """Read everything but forces; clears the overflow flags."""
@@ -264,9 +315,17 @@ class MujocoWarpExchange(RobotExchange):
         self._contact_of_geom = wp.array(shapes, dtype=int)
         self._contact_ids = wp.array(range(d.naconmax), dtype=int)
         self._forces = wp.zeros(d.naconmax, dtype=wp.spatial_vector)
+        self.slots = 0
+        """How many contacts each world has room for in slots of its own (`ContactStage`); 0 where all share a pool."""
 
     def contact_forces(self) -> None:
         m, d = self._m, self._d
+        if self.slots:
+            of, elliptic = d.contact, m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+            inputs = [self.slots, d.njmax, elliptic, of.geom, of.dim, of.efc_address, of.friction, of.frame, d.efc.force]
+            inputs.append(self._contact_of_geom)
+            wp.launch(sum_contact_forces, dim=self._contact_forces.shape, inputs=inputs, outputs=[self._contact_forces])
+            return
         mjw.contact_force(m, d, self._contact_ids, True, self._forces)
         self._contact_forces.zero_()
         wp.launch(

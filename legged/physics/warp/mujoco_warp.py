@@ -135,6 +135,8 @@ class MujocoWarpPhysics(WarpPhysics):
             self._choose_step(sim.step, sim.threads or max(1, available_cores() // Ranks.now().local_count))
             if only_blocks and (self._blocks is None or quantities):
                 raise NoBlocks(self._why_no_blocks(quantities))
+        if self._contacts is not None and isinstance(self._exchange, MujocoWarpExchange):
+            self._exchange.slots = self._contacts.constants["SLOTS"]
         exchanges = (self._exchange.kinematics, self._exchange.contact_forces, self.kernels.name_module)
         constants = (self._set_constants,) if any(FIELDS[name].derived for name in randomized) else ()
         self.compiled = compile_ahead(self._wp_device, (self._step, self._update_quantities, *exchanges, *constants))

@@ -1,0 +1,33 @@
+"""Contact forces on shapes: those of slots, summed by shape, are those that mujoco-warp finds contact by contact."""
+
+import pytest
+import torch
+from reference import heaps, roll
+
+
+@pytest.mark.parametrize(
+    "sim",
+    [{}, {"cone": "elliptic"}, {"self_collisions": True}, {"njmax": 10}],
+    ids=["pyramids", "cones", "shapes", "no room"],
+)
+def test_sums_by_shape_are_mujoco_warps_forces(robot, make_physics, sim):
+    """Of robots in a heap, with feet, legs and trunks on the ground; also with rows that found no room, within a contact."""
+    physics = make_physics("mujoco_warp", step="fused", **sim)
+    states = heaps(robot, 6, seed=4)
+    states.write(physics)
+    roll(physics, states.dof_pos, 80)  # they land
+    exchange, forces = physics._exchange, physics.robot_state.contact_forces
+    found = []
+    for _ in range(5):
+        roll(physics, states.dof_pos, 4)
+        slots, exchange.slots = exchange.slots, 0
+        exchange.contact_forces()
+        contact_by_contact, exchange.slots = forces.clone(), slots
+        forces.fill_(7.0)
+        exchange.contact_forces()
+        torch.testing.assert_close(forces, contact_by_contact, atol=1e-3, rtol=1e-5)
+        found.append(forces.clone())
+    assert exchange.slots == 24
+    assert (torch.stack(found).norm(dim=3) > 50.0).sum() > 30
+    if "njmax" in sim:
+        assert (physics._d.nefc.numpy() > physics._d.njmax).any()
