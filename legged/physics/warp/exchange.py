@@ -1,4 +1,4 @@
-"""Between an engine's arrays and the task: one Warp launch to write states, one to read kinematics, two for forces.
+"""Between an engine's arrays and the task: one Warp launch to write states, one to read kinematics, one or three for forces.
 
 The same formulas in torch (mujoco.py, feet.py) take some 140 launches a control step, a third of its time at 4096 robots.
 """
