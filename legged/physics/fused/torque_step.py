@@ -86,7 +86,8 @@ def turn_joint(world: int, at: int, dof: int, h: float, of: StateArrays) -> None
 def integrate_joint(world: int, joint: int, of: StateArrays) -> None:
     """Move one joint on by semi-implicit Euler; with a world's first, set the flags of what found no room.
 
-    All is read before anything is written: a compiler lets no read pass a write, and each would be waited for.
+    All is read before anything is written, of a free joint once for its place and once for its turn: a compiler lets no read
+    pass a write, and each would be waited for.
     """
     h = of.timestep[world % of.timestep.shape[0]]
     at, dof = of.jnt_qposadr[joint], of.jnt_dofadr[joint]
