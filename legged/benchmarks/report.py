@@ -15,6 +15,7 @@ def report(task: BaseTask, result: dict[str, Any]) -> str:
     lines = [
         f"{task.cfg.task}, {task.num_envs} robots, {where}, {how}",
         f"  control step  {result['control_step_ms']:.3f} ms  ({result['env_steps_per_s']:,.0f} robot steps/s)",
+        *([f"  moved by {result['policy']}"] if "policy" in result else []),
         f"  physics alone {result['physics_ms']:.3f} ms  (control step = {result['ratio']:.3f} x physics)",
         *([f"  mujoco_warp.step alone {result['library_ms']:.3f} ms"] if "library_ms" in result else []),
         *([f"  mujoco-warp's own launches: {task.physics.why_library}"] if task.physics.why_library else []),

@@ -6,14 +6,50 @@ from statistics import median
 from typing import Any
 
 import torch
+from tensordict import TensorDict
+from torch import Tensor
 
 from legged.envs import BaseTask
 from legged.graph.step_graph import StepGraph
 
+Turn = tuple[Callable[[], object], Callable[[], object]]
+"""What is done before something is timed, and what is timed."""
+
+
+class Driver:
+    """Decides what robots do: at random, or as a policy does, which is not timed."""
+
+    def __init__(self, task: BaseTask, act: Callable[[TensorDict], Tensor] | None) -> None:
+        """Take a policy `act`, observations -> actions, or none."""
+        self._task, self._act = task, act
+        self._table = 0.3 * torch.randn(32, task.num_envs, task.num_actions, device=torch.device(task.device))
+        self._made = 0
+        self._kept: dict[str, Tensor] = {}
+        self.actions = torch.zeros_like(self._table[0])
+        """(N, D) of the next control step."""
+
+    def decide(self) -> None:
+        """Choose `actions`."""
+        self.put_back()
+        random = self._table[self._made % len(self._table)]
+        self.actions.copy_(random if self._act is None else self._act(self._task.get_observations()))
+        self._made += 1
+
+    def keep(self) -> None:
+        """Remember the physics' state, if a policy acts: it would not know what robots did without it."""
+        if self._act is not None:
+            self._kept = {name: tensor.clone() for name, tensor in self._task.physics.state_tensors().items()}
+
+    def put_back(self) -> None:
+        """Let robots be where they were at the last `keep`."""
+        if self._kept:
+            self._task.physics.load_state(self._kept)
+
 
 @torch.inference_mode()
-def time_steps(task: BaseTask, steps: int, repeats: int) -> dict[str, Any]:
-    """Return milliseconds per control step: the task's step, and the physics in it alone.
+def time_steps(task: BaseTask, steps: int, repeats: int, act: Callable[[TensorDict], Tensor] | None = None) -> dict[str, Any]:
+    """Return milliseconds per control step: the task's step, and the physics in it alone, under random actions or those of a
+    policy `act`, observations -> actions.
 
     Physics alone is `decimation` engine steps of the same model under the torques of the moment; on a GPU it is one
     graph too, and so are as many of mujoco-warp's own steps, where ours are made of its parts. All are timed in turns,
@@ -21,16 +57,19 @@ def time_steps(task: BaseTask, steps: int, repeats: int) -> dict[str, Any]:
     controller or resets would soon simulate heaps of fallen robots.
     """
     device = torch.device(task.device)
-    actions = 0.3 * torch.randn(32, task.num_envs, task.num_actions, device=device)
-    for i in range(50):  # robots land and spread over the states of a training
-        task.step(actions[i % 32])
+    driver = Driver(task, act)
+    for _ in range(50):  # robots land and spread over the states of a training
+        driver.decide()
+        task.step(driver.actions)
     steps_of = {"physics": task.physics.step}
     library = task.physics.library_step
     if library is not None and (device.type == "cuda" or task.cfg.sim.physics != "auto"):  # on a CPU it takes minutes
         steps_of["library"] = library
     alone = {name: _control_period(task, step) for name, step in steps_of.items()}
-    turns = [lambda i: task.step(actions[i % 32]), *(lambda _, run=run: run() for run in alone.values())]
+    turns: list[Turn] = [(driver.decide, lambda: task.step(driver.actions))]
+    turns += [(driver.put_back if k else driver.keep, run) for k, run in enumerate(alone.values())]
     results = [_time_in_turns(turns, steps, device) for _ in range(repeats)]
+    driver.put_back()
     control, *others = (sorted(times) for times in zip(*results, strict=True))
     control_ms = median(control)
     times: dict[str, Any] = {}
@@ -58,31 +97,33 @@ def _control_period(task: BaseTask, step: Callable[[], None]) -> Callable[[], No
     return StepGraph(run, torch.device(task.device), enabled=True) if task.captured else run
 
 
-def _time_in_turns(functions: Sequence[Callable[[int], object]], steps: int, device: torch.device) -> list[float]:
-    """Return mean milliseconds per call of each function, called in turns; on a GPU, waiting for the host raises."""
-    totals = [0.0] * len(functions)
+def _time_in_turns(turns: Sequence[Turn], steps: int, device: torch.device) -> list[float]:
+    """Return mean milliseconds per call of what each turn times; on a GPU, waiting for the host raises."""
+    totals = [0.0] * len(turns)
     if device.type != "cuda":
-        for i in range(steps):
-            for k, function in enumerate(functions):
+        for _ in range(steps):
+            for k, (prepare, function) in enumerate(turns):
+                prepare()
                 start = time.perf_counter()
-                function(i)
+                function()
                 totals[k] += time.perf_counter() - start
         return [total / steps * 1e3 for total in totals]
-    events = [[torch.cuda.Event(enable_timing=True) for _ in range(len(functions) + 1)] for _ in range(steps)]
+    marks = [[[torch.cuda.Event(enable_timing=True) for _ in range(2)] for _ in turns] for _ in range(steps)]
     synchronize(device)
     torch.cuda.set_sync_debug_mode("error")
     try:
-        for i in range(steps):
-            events[i][0].record()
-            for k, function in enumerate(functions):
-                function(i)
-                events[i][k + 1].record()
+        for step in range(steps):
+            for (first, last), (prepare, function) in zip(marks[step], turns, strict=True):
+                prepare()
+                first.record()
+                function()
+                last.record()
     finally:
         torch.cuda.set_sync_debug_mode("default")
     synchronize(device)
-    for marks in events:
-        for k in range(len(functions)):
-            totals[k] += marks[k].elapsed_time(marks[k + 1])
+    for of_step in marks:
+        for k, (first, last) in enumerate(of_step):
+            totals[k] += first.elapsed_time(last)
     return [total / steps for total in totals]
 
 

@@ -1,6 +1,9 @@
 """Time of a control step, of the physics in it, and of a training iteration around it:
 `python -m legged.tools.benchmark --task anymal_c [--num_envs 8192]`.
 
+Robots are moved by random actions, which flail their legs, or as `--policy` says by one that has learned to walk: of physics
+that differs from robot to robot, or has dry friction, more is to be computed where they flail.
+
 With `--grounds` the task is timed on a plane, on its terrain met by our collider, and by mujoco-warp's general one; with
 `--scale 1024,4096,16384` with each of these numbers of robots, in a process of its own. With `--startup` nothing of this is
 timed, but the way to the first iteration of a training, beside `import torch`.
@@ -29,9 +32,12 @@ from legged.commandline.parser import CommandParser
 from legged.config import LeggedConfig, override
 from legged.config.networks import learns_from_teacher
 from legged.errors import ConfigError
+from legged.learning.checkpoint import check_fits, read_checkpoint
 from legged.learning.teacher import find_teacher, with_teacher
 from legged.physics import resolve_physics
-from legged.process.paths import make_folder, ready_to_write_file, write_text
+from legged.policies.actor import Actor
+from legged.policies.restore import policy_of
+from legged.process.paths import make_folder, ready_to_write_file, relative, write_text
 from legged.registry import make_task, task_config
 
 GROUNDS: dict[str, list[tuple[str, Any]]] = {
@@ -68,6 +74,7 @@ def build_parser() -> CommandParser:
     parser.add_argument("--runner", choices=list(LOOPS), help="time this training loop only (train.runner.loop)")
     parser.add_argument("--kernels", type=int, metavar="COUNT", help="also list this many kernels that take longest (GPU)")
     parser.add_argument("--startup", action="store_true", help="time how a training begins, beside importing torch, instead")
+    parser.add_argument("--policy", help="what moves the robots, a run folder or a task; random actions without it")
     parser.add_argument("--json", type=Path, help="also write the result to this file")
     return parser
 
@@ -85,6 +92,8 @@ def _main(argv: list[str] | None) -> int:
         ready_to_write_file("--json", args.json)
     if args.kernels is not None and device.type != "cuda":
         raise ConfigError(f"--kernels: needs a GPU, and the task is on {device}")
+    if args.kernels is not None and args.policy is not None:
+        raise ConfigError("--kernels: lists what is launched under random actions; leave it or --policy out")
     if args.startup:
         start_times = time_start(sys.argv[1:] if argv is None else argv, args.repeats)
         print(start_report(start_times), flush=True)
@@ -104,6 +113,9 @@ def _main(argv: list[str] | None) -> int:
     if args.grounds and (not isinstance(cfg, LeggedConfig) or cfg.terrain.mesh_type == "plane"):
         raise ConfigError(f"--grounds: the task '{cfg.task}' has no terrain")
     count = args.iterations if args.iterations is not None else (3 if device.type == "cpu" else 20)
+    policy = None if args.policy is None else policy_of(args.policy, "--policy").checkpoint
+    if policy is not None:
+        check_fits(policy, read_checkpoint(policy), cfg)
     teacher = find_teacher(cfg) if learns_from_teacher(cfg) and count > 0 and not args.grounds else None
     cfg = cfg if teacher is None else with_teacher(cfg, teacher)
     results = {}
@@ -112,7 +124,13 @@ def _main(argv: list[str] | None) -> int:
         task = make_task(override(cfg, changes), device, graph=not args.no_graph)
         synchronize(device)
         build_s = time.perf_counter() - start
-        result = {**time_steps(task, args.steps, args.repeats), "build_s": build_s}
+        actor = None
+        if policy is not None:
+            actor = Actor(task, device)
+            actor.load(policy)
+        result = {**time_steps(task, args.steps, args.repeats, actor), "build_s": build_s}
+        if policy is not None:
+            result["policy"] = relative(policy)
         if args.kernels is not None:
             times = kernel_times(task, KERNEL_STEPS)
             result["kernels"] = [vars(time) for time in times]

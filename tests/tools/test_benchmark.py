@@ -3,17 +3,19 @@
 import json
 
 import pytest
-from helpers import TASK, call, small_config, small_task
+import torch
+from helpers import POLICY, TASK, call, small_config, small_task
 
 from legged import registry
 from legged.benchmarks.iteration_times import loops_of, time_iterations
 from legged.benchmarks.report import report
 from legged.benchmarks.scale import others
-from legged.benchmarks.step_times import time_steps
+from legged.benchmarks.step_times import Driver, time_steps
 from legged.learning.captured import CapturedRunner
 from legged.learning.runner import Runner
 from legged.learning.student_runner import StudentRunner
 from legged.learning.teacher import find_teacher, with_teacher
+from legged.policies.actor import Actor
 from legged.registry import make_task
 from legged.tools import benchmark
 
@@ -58,6 +60,36 @@ def test_why_a_step_is_mujoco_warps_own_is_said():
     task = make_task(small_config(("sim.physics", "mujoco_warp"), ("sim.step", "library"), num_envs=2))
     text = report(task, time_steps(task, 1, 1) | {"build_s": 0.0})
     assert "  mujoco-warp's own launches: sim.step=library\n" in text
+
+
+def test_a_policy_is_named(capsys):
+    arguments = ["--policy", TASK, "--steps", "2", "--repeats", "1", "--iterations", "0"]
+    assert benchmark.main(["--task", TASK, *SMALL, *arguments]) == 0
+    assert f"resources/policies/{TASK}/model.pt" in capsys.readouterr().out
+
+
+def test_robots_of_a_policy_are_where_it_moved_them():
+    """Physics alone is timed in turns with their steps, and leaves no trace."""
+    places = []
+    for timed in (True, False):
+        task = small_task(num_envs=4)
+        actor = Actor(task, "cpu")
+        actor.load(POLICY / "model.pt")
+        if timed:
+            assert time_steps(task, 20, 1, actor)["physics_ms"] > 0.0
+        else:
+            driver = Driver(task, actor)
+            with torch.inference_mode():
+                for _ in range(70):
+                    driver.decide()
+                    task.step(driver.actions)
+        places.append(task.physics.qpos.clone())
+    assert torch.equal(*places)
+
+
+def test_a_policy_of_another_robot_is_refused(capsys):
+    assert benchmark.main(["--task", TASK, *SMALL, "--policy", "go2_flat", "--iterations", "0"]) == 2
+    assert "go2" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", [Runner, CapturedRunner])
