@@ -113,11 +113,15 @@ class Answers:
         self.thread.start()
 
     def listen(self):
-        while not self.ends:
+        while True:
+            if self.ends:
+                self.socket.settimeout(0.0)  # what has arrived by then is heard, though this thread may come late to it
             try:
                 data, self.client = self.socket.recvfrom(60_000)
             except TimeoutError:
                 continue
+            except BlockingIOError:
+                return
             opened = open_packet(data)
             self.heard.append(opened)
             if opened[0] == HELLO:
