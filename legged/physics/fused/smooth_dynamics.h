@@ -280,12 +280,12 @@ meet();
 // Towards the world, bodies pass on what they carry; a lane has one of the sixteen numbers.
 EACH(k, 16)
     for (int b = NB - 1; b > 0; --b)
-        if (const int parent = arrays.body_parentid.data[b]; parent > 0)
+        if (const int parent = parent_of(arrays.body_packed.data[b]); parent > 0)
             of_bodies[parent * OF_BODY + k] += of_bodies[b * OF_BODY + k];
 meet();
 EACH(i, NV) {
     float f[6];
-    momentum(of_bodies + arrays.dof_bodyid.data[i] * OF_BODY + CARRIED, motion + i * OF_MOTION, f);
+    momentum(of_bodies + (arrays.dof_packed.data[i] & 0xff) * OF_BODY + CARRIED, motion + i * OF_MOTION, f);
     const int start = arrays.M_rowadr.data[i], stop = start + arrays.M_rownnz.data[i];
     for (int k = start; k < stop; ++k) {
         const int j = arrays.M_colind.data[k];
@@ -297,7 +297,7 @@ EACH(i, NV) {
 EACH(i, NV) {
     const int packed = arrays.dof_packed.data[i], b = packed & 0xff;
     [[maybe_unused]] const int j = (packed >> 8) & 0xff, type = (packed >> 16) & 0xf;
-    [[maybe_unused]] const int at = SPRINGS || AFFINE_BIAS ? arrays.jnt_qposadr.data[j] : 0;
+    [[maybe_unused]] const int at = SPRINGS || AFFINE_BIAS ? address_of(arrays.joint_packed.data[j]) : 0;
     const long long out = (long long)world * NV + i;
     float total = 0.0f;
     for (int k = 0; k < 6; ++k) total -= motion[i * OF_MOTION + k] * of_bodies[b * OF_BODY + FORCE + k];

@@ -305,24 +305,27 @@ class MujocoWarpExchange(RobotExchange):
         model: mujoco.MjModel,
         robot: Robot,
         state: RobotState,
+        slots: int = 0,
     ) -> None:
-        """`m`, `d` are mujoco-warp's model and data; call with their device as Warp's current one."""
+        """`m`, `d` are mujoco-warp's model and data, in which each world has so many `slots` of its own for contacts
+        (`ContactStage`), or none where all share a pool. Call with their device as Warp's current one.
+        """
         super().__init__(arrays_of(d), overflowed, model, robot, state)
         self._m, self._d = m, d
         shapes = [-1] * model.ngeom
         for name, contact in zip(robot.shape_names, robot.contact_of_shape, strict=True):
             shapes[model.geom(name).id] = contact
         self._contact_of_geom = wp.array(shapes, dtype=int)
-        self._contact_ids = wp.array(range(d.naconmax), dtype=int)
-        self._forces = wp.zeros(d.naconmax, dtype=wp.spatial_vector)
-        self.slots = 0
-        """How many contacts each world has room for in slots of its own (`ContactStage`); 0 where all share a pool."""
+        self._slots = slots
+        if not slots:
+            self._contact_ids = wp.array(range(d.naconmax), dtype=int)
+            self._forces = wp.zeros(d.naconmax, dtype=wp.spatial_vector)
 
     def contact_forces(self) -> None:
         m, d = self._m, self._d
-        if self.slots:
+        if self._slots:
             of, elliptic = d.contact, m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
-            inputs = [self.slots, d.njmax, elliptic, of.geom, of.dim, of.efc_address, of.friction, of.frame, d.efc.force]
+            inputs = [self._slots, d.njmax, elliptic, of.geom, of.dim, of.efc_address, of.friction, of.frame, d.efc.force]
             inputs.append(self._contact_of_geom)
             wp.launch(sum_contact_forces, dim=self._contact_forces.shape, inputs=inputs, outputs=[self._contact_forces])
             return

@@ -119,12 +119,6 @@ class MujocoWarpPhysics(WarpPhysics):
                 self._on_cells = TerrainContact(self._m, self._d, self.model, floor, terrain.height_map, shapes)
             d = self._d
             self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
-            if scene.robot is None:
-                self._exchange = StateExchange(arrays_of(d), self.overflowed)
-            else:
-                self.robot_state = robot_state(self.qpos, self.qvel, scene.robot)
-                self._joints = DrivenJoints(self.qpos, self.qvel, self.robot_state, scene.robot)
-                self._exchange = MujocoWarpExchange(self._m, d, self.overflowed, self.model, scene.robot, self.robot_state)
             if pushed:
                 self.forces = wp.to_torch(d.xfrc_applied).view(num_envs, self.model.nbody, 6)
             sample = mujoco.MjData(self.model)
@@ -135,8 +129,14 @@ class MujocoWarpPhysics(WarpPhysics):
             self._choose_step(sim.step, sim.threads or max(1, available_cores() // Ranks.now().local_count))
             if only_blocks and (self._blocks is None or quantities):
                 raise NoBlocks(self._why_no_blocks(quantities))
-        if self._contacts is not None and isinstance(self._exchange, MujocoWarpExchange):
-            self._exchange.slots = self._contacts.constants["SLOTS"]
+            if scene.robot is None:
+                self._exchange = StateExchange(arrays_of(d), self.overflowed)
+            else:
+                self.robot_state = robot_state(self.qpos, self.qvel, scene.robot)
+                self._joints = DrivenJoints(self.qpos, self.qvel, self.robot_state, scene.robot)
+                slots = 0 if self._contacts is None else int(self._contacts.constants["SLOTS"])
+                of = (self.model, scene.robot, self.robot_state)
+                self._exchange = MujocoWarpExchange(self._m, d, self.overflowed, *of, slots)
         exchanges = (self._exchange.kinematics, self._exchange.contact_forces, self.kernels.name_module)
         constants = (self._set_constants,) if any(FIELDS[name].derived for name in randomized) else ()
         self.compiled = compile_ahead(self._wp_device, (self._step, self._update_quantities, *exchanges, *constants))
