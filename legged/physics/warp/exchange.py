@@ -13,9 +13,9 @@ import torch
 import warp as wp
 
 from legged.physics.feet import FootChains
-from legged.physics.fused.contact_kernel import Vector5
 from legged.physics.fused.native import lanes_of
 from legged.physics.robot_state import RobotState
+from legged.physics.warp.contact_forces import add_contact_forces, sum_contact_forces
 from legged.robots.robot import Robot
 
 # Contacts or constraint rows were dropped; the other bits (iteration caps) are no loss.
@@ -88,75 +88,6 @@ def read_kinematics(
         projected_gravity[world] = rotate_inverse(quat, wp.vec3(0.0, 0.0, -1.0))
         overflowed[world] = (overflow[world] & lost) != 0
         overflow[world] = 0
-
-
-@wp.kernel
-def add_contact_forces(
-    nacon: wp.array[int],
-    geom: wp.array[wp.vec2i],
-    worldid: wp.array[int],
-    force: wp.array[wp.spatial_vector],
-    contact_of_geom: wp.array[int],
-    contact_forces: wp.array2d[wp.vec3],
-):
-    """One thread a contact: its force on the second shape, and the reaction on the first, world frame [N]."""
-    i = wp.tid()
-    if i >= nacon[0]:
-        return
-    on_second = wp.spatial_top(force[i])
-    first, second = contact_of_geom[geom[i][0]], contact_of_geom[geom[i][1]]
-    if first >= 0:
-        wp.atomic_add(contact_forces, worldid[i], first, -on_second)
-    if second >= 0:
-        wp.atomic_add(contact_forces, worldid[i], second, on_second)
-
-
-@wp.kernel
-def sum_contact_forces(
-    slots: int,
-    rows: int,
-    elliptic: bool,
-    geom: wp.array[wp.vec2i],
-    dim: wp.array[int],
-    address: wp.array2d[int],
-    friction: wp.array[Vector5],
-    frame: wp.array[wp.mat33],
-    efc_force: wp.array2d[float],
-    contact_of_geom: wp.array[int],
-    contact_forces: wp.array2d[wp.vec3],
-):
-    """The same in one launch, where each world has its contacts in `slots` of its own: one thread a world and tracked shape.
-
-    Of a cone the rows have the force along its axes; of a pyramid its edges', each of them the normal plus or minus friction
-    times a tangent.
-    """
-    world, shape = wp.tid()
-    total = wp.vec3(0.0)
-    for c in range(world * slots, (world + 1) * slots):
-        row = address[c, 0]
-        if row < 0:  # nor has any that follows a row
-            break
-        first, second = contact_of_geom[geom[c][0]], contact_of_geom[geom[c][1]]
-        if first == shape or second == shape:
-            force = wp.vec3(0.0)
-            if elliptic or dim[c] == 1:
-                for k in range(3):
-                    if k < dim[c] and row + k < rows:
-                        force[k] = efc_force[world, row + k]
-            else:
-                for k in range(dim[c] - 1):
-                    edge = row + 2 * k
-                    up = wp.where(edge < rows, efc_force[world, wp.min(edge, rows - 1)], 0.0)
-                    down = wp.where(edge + 1 < rows, efc_force[world, wp.min(edge + 1, rows - 1)], 0.0)
-                    force[0] += up + down
-                    if k < 2:
-                        force[k + 1] = (up - down) * friction[c][k]
-            on_second = force @ frame[c]
-            if first == shape:
-                total -= on_second
-            if second == shape:
-                total += on_second
-    contact_forces[world, shape] = total
 
 
 @wp.kernel
@@ -325,9 +256,10 @@ class MujocoWarpExchange(RobotExchange):
         m, d = self._m, self._d
         if self._slots:
             of, elliptic = d.contact, m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
-            inputs = [self._slots, d.njmax, elliptic, of.geom, of.dim, of.efc_address, of.friction, of.frame, d.efc.force]
-            inputs.append(self._contact_of_geom)
-            wp.launch(sum_contact_forces, dim=self._contact_forces.shape, inputs=inputs, outputs=[self._contact_forces])
+            lanes = lanes_of(self._contact_forces.device)
+            inputs = [lanes, self._slots, d.njmax, elliptic, of.geom, of.dim, of.efc_address, of.friction, of.frame]
+            inputs += [d.efc.force, self._contact_of_geom]
+            wp.launch(sum_contact_forces, dim=(d.nworld, lanes), inputs=inputs, outputs=[self._contact_forces])
             return
         mjw.contact_force(m, d, self._contact_ids, True, self._forces)
         self._contact_forces.zero_()
