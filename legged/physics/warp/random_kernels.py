@@ -121,12 +121,16 @@ def vary_control(
 ):
     """One thread a robot and joint; `nominal` has stiffness, damping, torque limit and default angle, by joint."""
     robot, joint = wp.tid()
-    stiffness[robot, joint] = nominal[0, joint] * p_gain[robot, joint]
-    damping[robot, joint] = nominal[1, joint] * d_gain[robot, joint]
+    # All is read before anything is written: a compiler lets no read pass a write, and each would be waited for.
+    p = nominal[0, joint] * p_gain[robot, joint]
+    d = nominal[1, joint] * d_gain[robot, joint]
     most = nominal[2, joint] * torque_limit[robot, joint]
+    middle = nominal[3, joint] - offset[robot, joint]
+    stiffness[robot, joint] = p
+    damping[robot, joint] = d
     highest[robot, joint] = most
     lowest[robot, joint] = -most
-    zero[robot, joint] = nominal[3, joint] - offset[robot, joint]
+    zero[robot, joint] = middle
 
 
 @wp.kernel
@@ -172,23 +176,23 @@ def disturb(
     pushed = wp.vec3()
     for k in range(bodies.shape[0]):
         if bodies[k] == body:
+            # All is read before anything is written, as above.
             at = 7 * kicks + 5 * k
             lasting, pause = left[robot, 2 * k] - dt, left[robot, 2 * k + 1] - dt
-            ends = lasting <= last_moment or not goes_on
-            begins = pause <= last_moment and goes_on
-            if begins:
-                lasting = wp.max(drawn[robot, at + 4], dt)
-                pause = drawn[robot, at + 3] + lasting
+            now = wp.vec3(force[robot, 3 * k], force[robot, 3 * k + 1], force[robot, 3 * k + 2])
+            new = wp.vec3(drawn[robot, at], drawn[robot, at + 1], drawn[robot, at + 2])
+            new_pause, new_lasting = wp.float32(drawn[robot, at + 3]), wp.max(drawn[robot, at + 4], dt)
+            if lasting <= last_moment or not goes_on:
+                now = wp.vec3()
+            if pause <= last_moment and goes_on:
+                lasting = new_lasting
+                pause = new_pause + lasting
+                now = new
             left[robot, 2 * k] = lasting
             left[robot, 2 * k + 1] = pause
             for i in range(3):
-                now = wp.float32(force[robot, 3 * k + i])
-                if ends:
-                    now = 0.0
-                if begins:
-                    now = wp.float32(drawn[robot, at + i])
-                force[robot, 3 * k + i] = now
-                pushed[i] += now
+                force[robot, 3 * k + i] = now[i]
+            pushed += now
     for i in range(3):
         total[robot, body, i] = pushed[i]
         total[robot, body, 3 + i] = 0.0

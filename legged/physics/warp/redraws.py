@@ -9,12 +9,14 @@ import warp as wp
 from torch import Tensor
 
 from legged.physics.fields import FIELDS, own_array
-from legged.physics.fused.native import lanes_of
 from legged.physics.randomized_model import RandomizedModel
 
 HOW = {"set": 0, "add": 1, "scale": 2}
 BOUNCE = {"": 0, "ratio": 1, "inverse": 2}
 ADD, SCALE, INVERSE = wp.constant(HOW["add"]), wp.constant(HOW["scale"]), wp.constant(BOUNCE["inverse"])
+THREADS = 128
+"""Threads of a GPU that share the numbers of a world. Few worlds take any in a step; a thread for each number of all would
+keep it busy with nothing, and a warp would wait some ten times for what it needs to know of a number."""
 MOST_ARRAYS = 14
 """Arrays that one launch writes, at most: those of all fields are fewer."""
 
@@ -76,7 +78,7 @@ def put(to: Arrays, array: int, world: int, at: int, number: float) -> None:
 
 @wp.kernel
 def write_drawn(
-    lanes: int,
+    threads: int,
     mask: wp.array[wp.bool],
     drawn: wp.array2d[float],
     place: wp.array2d[int],
@@ -91,10 +93,10 @@ def write_drawn(
     `place` has its array and its place there, `entry` the column of a value, how it changes the number, and whether it is a
     restitution.
     """
-    world, lane = wp.tid()
+    world, thread = wp.tid()
     if not mask[world]:
         return
-    for n in range(lane, own.shape[0], lanes):
+    for n in range(thread, own.shape[0], threads):
         number = own[n]
         for k in range(first[n], first[n + 1]):
             value = drawn[world, entry[k, 0]]
@@ -118,7 +120,7 @@ def write_drawn(
 
 @wp.kernel
 def copy_variants(
-    lanes: int,
+    threads: int,
     mask: wp.array[wp.bool],
     chosen: wp.array[wp.int64],
     variants: wp.array2d[float],
@@ -126,12 +128,17 @@ def copy_variants(
     to: Arrays,
 ):
     """So many threads a world, which share the numbers of a variant; `place` has the number's array and its place there."""
-    world, lane = wp.tid()
+    world, thread = wp.tid()
     if not mask[world]:
         return
     row = int(chosen[world])
-    for n in range(lane, variants.shape[1], lanes):
+    for n in range(thread, variants.shape[1], threads):
         put(to, place[n, 0], world, place[n, 1], variants[row, n])
+
+
+def _threads() -> int:
+    """Return how many threads share a world on Warp's current device."""
+    return 1 if wp.get_device().is_cpu else THREADS
 
 
 def _arrays(arrays: Sequence[Tensor]) -> Any:
@@ -185,8 +192,7 @@ class Redraws:
             wp.from_torch(ratios),
             _arrays(list(arrays.values())),
         ]
-        # Few worlds begin anew in a step: a thread for each number of all worlds would keep a GPU busy with nothing.
-        self._dim = (len(drawn), lanes_of(wp.get_device()))
+        self._dim = (len(drawn), _threads())
 
     def launch(self, mask: Tensor) -> None:
         """Write the rows of the worlds of `mask` (N,)."""
@@ -205,7 +211,7 @@ class Variants:
         place = [(number, at) for number, width in enumerate(widths) for at in range(width)]
         targets = [array for _, array in arrays.values()]
         self._inputs = [wp.from_torch(self._variants), wp.array(place, dtype=int, ndim=2), _arrays(targets)]
-        self._dim = (len(targets[0]), lanes_of(wp.get_device()))
+        self._dim = (len(targets[0]), _threads())
 
     @staticmethod
     def _side_by_side(made: Mapping[str, Tensor]) -> Tensor:
