@@ -17,6 +17,7 @@ from legged.config.networks import groups_in
 from legged.config.schema import TaskConfig
 from legged.envs.actions import as_actions, ordinary_tensors
 from legged.envs.checks import check_task
+from legged.envs.judging import JudgingTask
 from legged.envs.observing import ObservingTask
 from legged.envs.privileged_terms import PrivilegedTerms
 from legged.envs.saved import SavedTask
@@ -25,17 +26,14 @@ from legged.errors import ConfigError
 from legged.graph.step_graph import Branch, StepGraph
 from legged.math import masked_set_
 from legged.mdp.faults import LARGEST_STATE, Faults
-from legged.mdp.metrics import Metrics
 from legged.mdp.mirror_images import MirrorImages
 from legged.mdp.observations import ObservationGroup, ObservationTerms
-from legged.mdp.rewards import Rewards
-from legged.mdp.terminations import Terminations
 from legged.mdp.uniform_numbers import UniformNumbers
 from legged.physics import Scene
 from legged.process.ranks import Ranks
 
 
-class BaseTask(ObservingTask, PrivilegedTerms, SavedTask, VecEnv):
+class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
     """N environments on one device. A subclass says what the world is (`make_scene`), how an episode begins (`draw_reset`)
     and which terms there are; the rest are hooks.
     """
@@ -134,7 +132,7 @@ class BaseTask(ObservingTask, PrivilegedTerms, SavedTask, VecEnv):
         self._action_input = torch.zeros_like(self.actions)
         self._clipped_actions = torch.zeros_like(self.actions)
         self._in_bounds = torch.ones_like(self.valid)
-        self._beside = Branch(device)  # type: ignore[arg-type]
+        self._beside, self._aside = Branch(device), Branch(device)  # type: ignore[arg-type]
         self.numbers = UniformNumbers(n, device)  # type: ignore[arg-type]
         """What a step draws at random; subclasses ask it for theirs in `_init_buffers`."""
         self.step_watcher: StepWatcher | None = None
@@ -148,31 +146,15 @@ class BaseTask(ObservingTask, PrivilegedTerms, SavedTask, VecEnv):
 
     def _collect_terms(self) -> None:
         """Find the terms that the configuration names."""
-        cfg, device, kernels = self.cfg, self.device, self.physics.kernels
-        scales = {name: scale for name, scale in cfg.rewards.scales.items() if scale != 0.0}
-        unit = self.dt if cfg.rewards.times_dt else 1.0
-        self.rewards = Rewards(
-            self._methods("_reward_", scales), scales, unit, cfg.rewards.only_positive_rewards, self.rew_buf, kernels
-        )
-        self.episode_sums = self.rewards.episode_sums
-        failures, time_outs = self.active_terminations()
-        self.terminations = Terminations(
-            self._methods("_terminate_", failures),
-            self._methods("_terminate_", time_outs),
-            self.terminated_buf,
-            self.time_out_buf,
-            self.reset_buf,
-        )
+        cfg = self.cfg
+        self._collect_judgements()
         groups = groups_in(cfg)
         # Those of the largest group first, so that it finds them side by side.
         in_order = [name for group in sorted(groups.values(), key=lambda g: -len(g.terms)) for name in group.terms]
         self.observation_terms = ObservationTerms(self._methods("_obs_", dict.fromkeys(in_order)))
         self.observation_terms.sensors = self.make_sensors()
         self.observation_groups: dict[str, ObservationGroup] = {name: self._group(name) for name in groups}
-        self.faults = Faults(self.rewards.names, self.observation_terms, self.num_envs, device)  # type: ignore[arg-type]
-        metrics = self._methods("_metric_", sorted(self.terms("_metric_")))
-        full = cfg.env.episode_length_s if cfg.rewards.times_dt else self.max_episode_length
-        self.metrics = Metrics(metrics, self.rewards.names, self.terminations.names, full, self.num_envs, device)  # type: ignore[arg-type]
+        self.faults = Faults(self.rewards.names, self.observation_terms, self.num_envs, self.device)  # type: ignore[arg-type]
 
     def _methods(self, prefix: str, names: Any) -> dict[str, Callable[[], Tensor]]:
         """Return the methods `<prefix><name>` by name."""
@@ -205,24 +187,31 @@ class BaseTask(ObservingTask, PrivilegedTerms, SavedTask, VecEnv):
             self.draw()
         self.sense()
         self.advance()
+        self.look_ahead()
         self.check_termination()
         if type(self).check_termination is not BaseTask.check_termination:
             self._settle_endings()
-        with self._beside.fork():
+        with self._aside.fork():
             self.measure()
         self.compute_reward()
         self._beside.join()
+        self._aside.join()
         if self.step_watcher is not None:
             self.step_watcher.take()
         with self._beside.fork():
-            self.faults.check_rewards(self.rewards.fine, self.valid)
+            self.record()
+        with self._aside.fork():
+            self.look_for_faults()
         self.update_curricula()
+        self._beside.join()
         self.reset_idx(self.reset_buf)
         self.disturb(~self.reset_buf)
+        self._aside.join()
         self.sense()
         self.ask()
         self.observe()
         self.remember()
+        self._beside.join()
 
     def take_actions(self) -> None:
         """Clip the actions; one that is no number counts as 0."""
@@ -264,6 +253,7 @@ class BaseTask(ObservingTask, PrivilegedTerms, SavedTask, VecEnv):
         largest = torch.linalg.vector_norm(state, torch.inf, dim=1)
         torch.lt(largest, LARGEST_STATE, out=self._in_bounds)  # so is NaN not
         torch.logical_and(self._in_bounds, self.faults.sound, out=self.valid)
+        self._endings_ahead.join()
         self.terminations.evaluate(self.valid, self.episode_length_buf >= self.max_episode_length)
 
     def _settle_endings(self) -> None:
@@ -272,16 +262,6 @@ class BaseTask(ObservingTask, PrivilegedTerms, SavedTask, VecEnv):
         """
         self.time_out_buf.logical_and_(self.reset_buf)
         torch.gt(self.reset_buf, self.time_out_buf, out=self.terminated_buf)
-
-    def measure(self) -> None:
-        """Record metrics and faults of the step. Runs beside the rewards."""
-        self.metrics.add_step(self.valid, self.physics.overflowed, self.terminations.found)
-        self.faults.check_state(self._in_bounds, self._clipped_actions)
-
-    def compute_reward(self) -> None:
-        """Judge the step, before anything is reset; record the episodes that end."""
-        self.rewards.compute(self.valid)
-        self.metrics.add_episodes(self.reset_buf, self.terminated_buf, self.episode_length_buf, self.rewards.sums)
 
     def update_curricula(self) -> None:
         """Judge the episodes that end (`reset_buf`), for what becomes harder: a hook."""
@@ -307,7 +287,7 @@ class BaseTask(ObservingTask, PrivilegedTerms, SavedTask, VecEnv):
         """Renew what is asked of the robots; `reset_buf` says whose episodes have just begun: a hook."""
 
     def observe(self) -> None:
-        """Write the observation groups."""
+        """Write the observation groups; what is no number in them is looked for beside what follows."""
         self.observation_terms.evaluate(self.reset_buf)
         with self._beside.fork():
             self.faults.check_observations(self.reset_buf)
@@ -315,7 +295,6 @@ class BaseTask(ObservingTask, PrivilegedTerms, SavedTask, VecEnv):
             group.advance()
             group.compute()
             group.restart(self.reset_buf)
-        self._beside.join()
 
     def remember(self) -> None:
         """Keep of this step what the next one compares with."""
@@ -347,6 +326,7 @@ class BaseTask(ObservingTask, PrivilegedTerms, SavedTask, VecEnv):
             self.ask()
             self.observe()
             self.remember()
+            self._beside.join()
             self.metrics.flush()
             self._steps_since_log = 0
         return self.get_observations()

@@ -86,7 +86,7 @@ EXTENDED = {
     "advance": "time would stand still: episode_length_buf and self.contacts",
     "check_termination": "falls would not be counted, nor robots put back whose physics blew up; what ends an episode is a"
     " method _terminate_<name>, listed in terminations.failures or terminations.time_outs",
-    "compute_reward": "rewards of episodes and falls would not be counted; a reward is a method _reward_<name>, with its"
+    "compute_reward": "every step would be worth nothing, and so every episode; a reward is a method _reward_<name>, with its"
     " scale in rewards.scales",
     "draw": "all episodes would begin alike, under the same commands",
     "remember": "last_actions and last_dof_vel would be those of the start",

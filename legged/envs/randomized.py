@@ -24,6 +24,7 @@ class RandomizedTask:
     randomization: Randomization
     QUANTITIES: ClassVar[tuple[str, ...]]
     _beside: Branch
+    _aside: Branch
     field_rows: dict[str, int]
     """Field that can be randomised -> how many joints, bodies or shapes have it."""
 
@@ -65,9 +66,12 @@ class RandomizedTask:
             self.redraw(mask)
         yield
         self._beside.join()
+        self._aside.join()
 
     def redraw(self, mask: Tensor) -> None:
         """Draw again what is randomised and due, where episodes begin in the environments of `mask` (N,); only called where
         something is drawn more than once. Runs beside `forget`.
         """
-        self.randomization.redraw(self.physics, mask)
+        self.randomization.redraw(mask)
+        with self._aside.fork():
+            self.randomization.rewrite(self.physics)

@@ -57,7 +57,7 @@ class Metrics:
     def add_episodes(self, ended: Tensor, failed: Tensor, length: Tensor, reward_sums: Tensor) -> None:
         """Take in episodes that end at this step: masks (N,), lengths in steps (N,), reward sums (terms, N)."""
         self._ended.add_(torch.stack([ended, failed]))
-        self._lengths.add_(ended * length)
+        self._lengths.addcmul_(ended, length)
         self._rewards.add_(torch.where(ended, reward_sums, self._zero))
 
     def flush(self) -> dict[str, Tensor]:

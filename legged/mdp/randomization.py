@@ -162,7 +162,7 @@ class Randomization:
             parts.append(self.variants.index_select(0, self._new_chosen))
         torch.index_select(torch.cat(parts, dim=1), 1, self._place, out=self._fresh)
 
-    def redraw(self, physics: Physics, reset: Tensor) -> None:
+    def redraw(self, reset: Tensor) -> None:
         """Let the worlds that are due take what was drawn, within a step, where episodes begin in those of `reset` (N,)."""
         if self._kernels is not None:
             found = (self.steps_left, self._due, self._any_due, self.steps.view(1))
@@ -175,6 +175,9 @@ class Randomization:
             if self.chosen_fields:
                 self._chosen_due.copy_(self._due[:, self._chosen_at])
                 masked_set_(self.chosen, self._chosen_due, self._new_chosen)
+
+    def rewrite(self, physics: Physics) -> None:
+        """Give the physics what has been drawn again, within a step."""
         if self.chosen_fields:
             physics.choose_variants(self._chosen_due, self.chosen)
         if self._of_model:

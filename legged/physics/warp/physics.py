@@ -11,6 +11,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from legged.graph.step_graph import Branch
 from legged.physics.base import Physics
 from legged.physics.robot_state import DrivenJoints
 from legged.physics.warp.exchange import StateExchange
@@ -37,6 +38,7 @@ class WarpPhysics(Physics):
         self._wp_device = wp.device_from_torch(device)
         self.kernels = TaskKernels(self._on_device)
         self._forces_read = False
+        self._beside = Branch(device)
         self._advance: Callable[[], Any] = self._step
 
     @abstractmethod
@@ -74,13 +76,16 @@ class WarpPhysics(Physics):
         self._forces_read = False
 
     def refresh(self) -> None:
+        forces_read, self._forces_read = self._forces_read, True
+        if not forces_read:  # once a step: a reset in between has cleared its worlds' forces
+            with self._beside.fork(), self._on_device():
+                self._exchange.contact_forces()
         with self._on_device():
             if self._joints is not None:
                 self._joints.read()
             self._exchange.kinematics()
-            if not self._forces_read:  # once a step: a reset in between has cleared its worlds' forces
-                self._exchange.contact_forces()
-                self._forces_read = True
+        if not forces_read:
+            self._beside.join()
 
     def write(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         with self._on_device():
