@@ -187,7 +187,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
             self.draw()
         self.sense()
         self.advance()
-        self.look_ahead()
+        self._look_ahead()
         self.check_termination()
         if type(self).check_termination is not BaseTask.check_termination:
             self._settle_endings()
@@ -199,9 +199,9 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         if self.step_watcher is not None:
             self.step_watcher.take()
         with self._beside.fork():
-            self.record()
+            self._record()
         with self._aside.fork():
-            self.look_for_faults()
+            self._look_for_faults()
         self.update_curricula()
         self._beside.join()
         self.reset_idx(self.reset_buf)

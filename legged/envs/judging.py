@@ -15,7 +15,8 @@ from legged.mdp.terminations import Terminations
 from legged.physics import Physics
 
 REWARD_LINES = 5
-"""Lines of work among which rewards are shared out: with so many they take as long as `check_termination`."""
+"""Lines of work among which rewards are shared out: with so many, those of an ANYmal take an H100 49 us instead of 90, and
+`check_termination` beside them 34."""
 LATE = frozenset({"termination"})
 """Rewards of ours that ask which episodes end."""
 
@@ -65,7 +66,7 @@ class JudgingTask:
         names = self.rewards.names, self.terminations.names
         self.metrics = Metrics(metrics, *names, full, self.num_envs, self.device)
 
-    def look_ahead(self) -> None:
+    def _look_ahead(self) -> None:
         """Evaluate what can be while it is judged which episodes end. Runs beside `check_termination`."""
         self._endings_ahead.find()
         self._rewards_ahead.find()
@@ -81,11 +82,11 @@ class JudgingTask:
         self._rewards_ahead.join()
         self.rewards.compute(self.valid)
 
-    def record(self) -> None:
+    def _record(self) -> None:
         """Take in the episodes that end. Runs beside the curricula."""
         self.metrics.add_episodes(self.reset_buf, self.terminated_buf, self.episode_length_buf, self.rewards.sums)
 
-    def look_for_faults(self) -> None:
+    def _look_for_faults(self) -> None:
         """Find out which states, actions and rewards are no numbers. Runs beside all that comes before `observe`."""
         self.faults.check_state(self._in_bounds, self._clipped_actions)
         self.faults.check_rewards(self.rewards.fine, self.valid)
