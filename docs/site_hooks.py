@@ -15,11 +15,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from legged.commandline.listing import module_of, robots, tasks, tools
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from legged.commandline.listing import module_of, robots, tasks, tools
 from legged.config.reference import FieldText, fields
 from legged.config.schema import LeggedConfig
 

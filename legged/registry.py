@@ -93,9 +93,9 @@ def import_tasks(name: str) -> None:
         run_module(name)
 
 
-def register_file(path: str, flag: str = "--task") -> str:
+def register_file(path: str, flag: str = "TASK") -> str:
     """Make the YAML file at `path` a task, which is called by the file's name without ending; returns that name. `flag` is
-    the one that names the file.
+    the option or argument that names the file.
 
     Raises:
         ConfigError: there is no such file, or another task is called so.
@@ -128,7 +128,7 @@ def _entry(name: str) -> _Entry:
         return _REGISTERED[name]
     path = data_folder("cfg") / f"{name}.yaml"
     if not is_plain_name(name) or not path.is_file():
-        raise ConfigError(f"--task: there is no task {shown(name)}{suggest(name[:100], task_names(), 'tasks')}")
+        raise ConfigError(f"TASK: there is no task {shown(name)}{suggest(name[:100], task_names(), 'tasks')}")
     return _Entry(path, path.parent, None)
 
 

@@ -15,8 +15,8 @@ from urllib.parse import unquote, urlparse
 
 import pytest
 import yaml
-
 from legged.commandline.listing import robots, tasks, tools
+
 from legged.config.reference import fields
 from legged.config.schema import LeggedConfig
 

@@ -53,5 +53,5 @@ class ActuatorConfig:
     """Draw each robot's delay anew in every control step; a target that has arrived is then not taken back for an older one.
     """
     network: str = ""
-    """File of a learned actuator (`python -m legged.tools.fit_actuator`), relative to the file that names it: torque from
+    """File of a learned actuator (`legged fit-actuator`), relative to the file that names it: torque from
     target, angle and velocity, in place of the P law."""

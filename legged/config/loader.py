@@ -293,7 +293,7 @@ def _merge_overrides(
     """Lay overrides of the command line over `data`, each of them checked by itself: a later one must not hide it."""
     for key, value in overrides:
         if key == "task":
-            raise ConfigError("command line: task: can't be overridden; choose the task with --task")
+            raise ConfigError("command line: task: can't be overridden; name the task first")
         if key.count(".") > DEEPEST:
             raise ConfigError(f"command line: {shown(key)}: more than {DEEPEST} sections inside each other")
         layer = nest(key, robot_path(value, Path.cwd()) if key == "robot" else copy.deepcopy(value))

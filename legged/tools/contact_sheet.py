@@ -12,10 +12,10 @@ from pathlib import Path
 import torch
 
 from legged.commandline.command import run_main
-from legged.commandline.parser import CommandParser, add_import_argument
 from legged.errors import ConfigError
 from legged.play.contact_sheet import film, sheet, walker, write_sheet
 from legged.policies.restore import TrainedPolicy, policy_of
+from legged.process.command_parser import CommandParser, add_import_argument
 from legged.process.paths import ready_to_write_file
 from legged.registry import import_tasks
 

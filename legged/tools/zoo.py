@@ -21,13 +21,13 @@ import torch
 
 from legged.commandline.arguments import pick_device
 from legged.commandline.command import EXIT_FAILED, run_main
-from legged.commandline.parser import CommandParser, add_import_argument
 from legged.commandline.stopping import stopping_on_signals
 from legged.errors import ConfigError
 from legged.evaluation.judged_run import JudgedRun, find_runs
 from legged.evaluation.run_table import markdown, summary
 from legged.evaluation.success import TYPES_HELP
 from legged.learning.timing import read_timing
+from legged.process.command_parser import CommandParser, add_import_argument
 from legged.process.cores import available_cores
 from legged.process.paths import make_folder, ready_to_write, relative, write_text
 from legged.process.ranks import Ranks
@@ -45,7 +45,7 @@ from legged.tools.campaign.plan import (
     trainings_of,
 )
 from legged.tools.campaign.shipping import ship
-from legged.tools.evaluate import ROBOTS, check_points
+from legged.cli.evaluate.common import ROBOTS, check_points
 
 OUT = Path("logs") / "zoo"
 VANISHED = "it ended, and there is no finished run of its configuration"

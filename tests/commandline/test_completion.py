@@ -7,9 +7,9 @@ import shutil
 import subprocess
 
 import pytest
-
 from legged.commandline.completion import words_of
 from legged.commandline.listing import robots, tasks
+
 from legged.tools import completion
 
 BASH = """

@@ -5,13 +5,13 @@ import shutil
 import sys
 from pathlib import Path
 
+import legged.tools.train
 import pytest
 import torch
 from helpers import TASK, call, kept_global_state, run_folders, tiny_run
 
 import legged.policies.restore
 import legged.registry
-import legged.tools.train
 from legged.tools import benchmark, evaluate, play, train
 
 SMALLER = (

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from handmade import made_by_hand
 from helpers import small_config
+from legged.tools.episodes import LIST
 
 from legged.episodes.page import page_name
 from legged.episodes.parquet import TABLE
 from legged.episodes.statistics_report import NAME
 from legged.episodes.stored import ABOUT, ARRAYS, CONFIG, load_config, load_episodes, save_episodes
 from legged.errors import ConfigError, RunError
-from legged.tools.episodes import LIST
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

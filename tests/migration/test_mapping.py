@@ -11,13 +11,13 @@ from legged.config.loader import to_dict
 from legged.config.schema import LeggedConfig
 from legged.config.yaml_files import parse
 from legged.envs import LeggedRobot
+from legged.migration.found import Found, Place
+from legged.migration.legged_gym_defaults import ENVIRONMENT, LEARNING
+from legged.migration.mapping import map_settings
+from legged.migration.robot_entries import map_robot
+from legged.migration.settings import SAME_REWARDS
+from legged.migration.writer import robot_yaml, task_yaml
 from legged.robots.robot import load_robot
-from legged.tools.migration.found import Found, Place
-from legged.tools.migration.legged_gym_defaults import ENVIRONMENT, LEARNING
-from legged.tools.migration.mapping import map_settings
-from legged.tools.migration.robot_entries import map_robot
-from legged.tools.migration.settings import SAME_REWARDS
-from legged.tools.migration.writer import robot_yaml, task_yaml
 
 pytestmark = pytest.mark.usefixtures("workplace", "own_registry")
 

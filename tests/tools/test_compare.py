@@ -5,9 +5,9 @@ import warnings
 
 import pytest
 from helpers import call
+from legged.tools.compare import main
 
 from legged.evaluation.comparison import grouped, shares, spread
-from legged.tools.compare import main
 
 RULE = {"distance_m": 4.0, "time_s": 20.0, "vx": 0.75}
 

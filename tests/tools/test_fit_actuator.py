@@ -12,11 +12,11 @@ from simulated_motor import TRUTH, simulated_log
 
 from legged.config import load_config
 from legged.errors import ConfigError
+from legged.fitting.log import check_alike, read_log
+from legged.fitting.parametric import SMOOTHING, Drive, delayed, fit_drive
 from legged.mdp.actuator import Friction, MotorCurve
 from legged.mdp.actuator_network import NetworkWeights
 from legged.tools import fit_actuator
-from legged.tools.fitting.log import check_alike, read_log
-from legged.tools.fitting.parametric import SMOOTHING, Drive, delayed, fit_drive
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

@@ -21,12 +21,12 @@ from legged.physics import RobotScene
 from legged.process.headless import off_screen_library
 from legged.registry import make_task, task_config
 from legged.robots.robot import load_robot
+from legged.simulated_robot.film import make_film
+from legged.simulated_robot.link import Link
+from legged.simulated_robot.robot import SimulatedRobot
+from legged.simulated_robot.server import Server
 from legged.terrain import Terrain, TileSpec
 from legged.tools import deploy, fit_actuator, simulate_robot
-from legged.tools.simulator.film import make_film
-from legged.tools.simulator.link import Link
-from legged.tools.simulator.robot import SimulatedRobot
-from legged.tools.simulator.server import Server
 
 POLICIES = Path(__file__).resolve().parents[2] / "resources" / "policies"
 SMALL_TERRAIN = [

@@ -17,9 +17,9 @@ from legged.mdp.actuator_network import NetworkWeights
 from legged.mdp.control import Control
 from legged.policies.export import export
 from legged.robots.robot import load_robot
+from legged.simulated_robot.motors import Motors, motors_config
+from legged.simulated_robot.robot import SimulatedRobot
 from legged.tools import deploy, simulate_robot
-from legged.tools.simulator.motors import Motors, motors_config
-from legged.tools.simulator.robot import SimulatedRobot
 
 ROBOT = load_robot("anymal_c")
 DT = 0.005

@@ -22,12 +22,12 @@ from legged.learning.run_folder import checkpoints, run_config
 from legged.learning.timing import read_timing
 from legged.process.paths import data_folder
 from legged.registry import task_names
+from legged.sweeping import study, worker
+from legged.sweeping.plan import Parameter, plan_sweep, read_sweep
+from legged.sweeping.report import importances, ranking, settings
+from legged.sweeping.study import Trials, is_dead, me
+from legged.sweeping.worker import NoValue, Worker
 from legged.tools import sweep
-from legged.tools.sweeping import study, worker
-from legged.tools.sweeping.plan import Parameter, plan_sweep, read_sweep
-from legged.tools.sweeping.report import importances, ranking, settings
-from legged.tools.sweeping.study import Trials, is_dead, me
-from legged.tools.sweeping.worker import NoValue, Worker
 
 pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
 pytestmark = pytest.mark.usefixtures("workplace")

@@ -6,10 +6,10 @@ import pytest
 import yaml
 from helpers import call
 
+from legged.sweeping.plan import plan_sweep, read_sweep
+from legged.sweeping.report import ranking, settings
+from legged.sweeping.study import Trials
 from legged.tools import sweep
-from legged.tools.sweeping.plan import plan_sweep, read_sweep
-from legged.tools.sweeping.report import ranking, settings
-from legged.tools.sweeping.study import Trials
 
 pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
 pytestmark = pytest.mark.usefixtures("workplace")

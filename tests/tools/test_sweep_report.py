@@ -11,10 +11,10 @@ import yaml
 from helpers import call
 
 from legged.config import parse_override
+from legged.sweeping.plan import plan_sweep, read_sweep
+from legged.sweeping.report import importances, table
+from legged.sweeping.study import Trials
 from legged.tools import sweep
-from legged.tools.sweeping.plan import plan_sweep, read_sweep
-from legged.tools.sweeping.report import importances, table
-from legged.tools.sweeping.study import Trials
 
 optuna = pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
 pytestmark = pytest.mark.usefixtures("workplace")

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from legged.tools.train import describe
 
 from legged.registry import task_config
-from legged.tools.train import describe
 
 
 @pytest.mark.parametrize(("count", "says"), [(1, "1 robot,"), (2, "2 robots,")])

@@ -35,7 +35,7 @@ def report_at_end(folder: Path, film_with: Sequence[str] | None) -> None:
 
 def _film(folder: Path, flags: Sequence[str]) -> str:
     """Film the policy in another process; return why there is no film, nothing if there is."""
-    command = [sys.executable, "-m", "legged.tools.report", str(folder), "--film", *flags]
+    command = [sys.executable, "-m", "legged", "runs", "report", str(folder), "--film", *flags]
     alone = {key: text for key, text in child_environment().items() if key not in ("RANK", "LOCAL_RANK", "WORLD_SIZE")}
     alone["CUDA_VISIBLE_DEVICES"] = ""  # it draws on the CPU, and a GPU's memory may be full
     try:

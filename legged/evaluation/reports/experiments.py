@@ -50,9 +50,9 @@ def experiments_parts(records: Sequence[Record], beside: Path, ending: str, seed
     head = list(rows[0]) if rows else []
     shown = [name for name in head if any(_text(row[name]) not in EMPTY for row in rows)]
     text = (
-        f"{len(newest)} runs, newest first, made by `python -m legged.tools.experiments`. What changed is a note to the run"
+        f"{len(newest)} runs, newest first, made by `legged runs`. What changed is a note to the run"
         " (`--note`), else its own name and what it sets otherwise than its task as it is now. RMSE, falls and stairs are"
-        " those of the evaluation, without noise and pushes, by `python -m legged.tools.evaluate`; stairs are the highest"
+        " those of the evaluation, without noise and pushes, by `legged evaluate`; stairs are the highest"
         " steps that nine robots of ten got up, and nine got down. Terrain level, return and velocity error are those of the"
         " end of training, with both. A commit with a + had changes that were not committed."
     )

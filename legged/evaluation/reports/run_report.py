@@ -96,7 +96,7 @@ def report_parts(record: Record) -> list[Part]:
         parts += [Heading("Curves"), Paragraph("There is no TensorBoard file with values in this folder.")]
     parts += evaluation_parts(record.results, record.another_policy) or [
         Heading("Evaluation"),
-        Paragraph(f"None yet: `{command_on(record, 'evaluate', '--load_run')}`"),
+        Paragraph(f"None yet: `{command_on(record, 'evaluate')}`"),
     ]
     if record.problems:
         parts += [Heading("What could not be read"), *(Paragraph(text) for text in record.problems)]
@@ -107,13 +107,10 @@ def report_parts(record: Record) -> list[Part]:
     return parts
 
 
-def command_on(record: Record, tool: str, *before: str) -> str:
-    """Return the command that does something with a run, whose folder follows on the words `before`, as it can be pasted
-    into a shell: with what says where a task of somebody's own is, and with the folder's path, for its experiment need not be
-    called as the task is.
-    """
+def command_on(record: Record, command: str) -> str:
+    """Return a command on a run as it can be pasted into a shell, with the option that names its user-defined task."""
     given = Given(record.task) if record.given is None else record.given
-    return shlex.join(["python", "-m", f"legged.tools.{tool}", *given.flags, *before, relative(record.folder)])
+    return shlex.join(["legged", *command.split(), *given.flags, relative(record.folder)])
 
 
 def _facts(record: Record) -> list[list[Cell]]:
@@ -169,7 +166,7 @@ def _differences(record: Record) -> list[Part]:
     heading = Heading("Settings other than the task's")
     found = from_task_file(record)
     if found is None:
-        told = f", and `{command_on(record, 'report')}` says where it is" if record.given is not None else ""
+        told = f", and `{command_on(record, 'runs report')}` says where it is" if record.given is not None else ""
         text = f"There is no task '{record.task}' here to compare with{told}; config.yaml has all settings."
         changes = {} if record.given is None else record.given.changes
         set_there: list[list[Cell]] = [[Mono(path), Mono(words(value))] for path, value in changes.items()]
