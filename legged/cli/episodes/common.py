@@ -76,19 +76,19 @@ def wish_of(args: argparse.Namespace) -> Wish:
     return Wish(args.episodes, robots, args.as_trained, command, args.terrain, args.difficulty, changes)
 
 
-def _command(text: str) -> tuple[float, ...]:
+def _command(text: str) -> tuple[float, float, float]:
     """Return vx, vy [m/s] and yaw rate [rad/s].
 
     Raises:
         ConfigError: the text is not three numbers.
     """
     try:
-        values = tuple(float(part) for part in text.split(","))
+        vx, vy, yaw = (float(part) for part in text.split(","))
     except ValueError:
-        values = ()
-    if len(values) != 3 or not all(abs(value) <= 100.0 for value in values):
+        vx = vy = yaw = float("nan")
+    if not all(abs(value) <= 100.0 for value in (vx, vy, yaw)):
         raise ConfigError(f"--command: expected three numbers of at most 100 like 0.5,0,0.2, got '{text}'")
-    return values
+    return vx, vy, yaw
 
 
 def check_listing(args: argparse.Namespace) -> None:

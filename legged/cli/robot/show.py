@@ -30,7 +30,7 @@ def build_parser() -> CommandParser:
 def _main(argv: list[str] | None) -> int:
     robot = load_robot(build_parser().parse_args(argv).robot, "ROBOT")
     print(f"{robot.name}: {robot.mass:.4g} kg, {robot.height:.3g} m high, {robot.num_dof} joints, {relative(robot.folder)}")
-    Console(width=110).print(joints_table(robot))
+    Console(width=130).print(joints_table(robot))
     for what, names in (
         ("feet", robot.feet_names),
         ("contact is penalised", [robot.contact_names[i] for i in robot.penalised_indices]),
