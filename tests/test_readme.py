@@ -14,7 +14,6 @@ from legged.registry import import_tasks, make_task, task_config
 from legged.tools import (
     benchmark,
     compare,
-    contact_sheet,
     episodes,
     evaluate,
     experiments,
@@ -24,7 +23,6 @@ from legged.tools import (
     show_terrain,
     train,
     warmup,
-    zoo,
 )
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -85,8 +83,6 @@ def test_the_readme_names_every_task():
         ("python -m legged.tools.plot", plot.main),
         ("python -m legged.tools.warmup", warmup.main),
         ("python -m legged.tools.show_terrain", show_terrain.main),
-        ("python -m legged.tools.zoo", zoo.main),
-        ("python -m legged.tools.contact_sheet", contact_sheet.main),
         ("python -m legged.tools.report", report.main),
         ("python -m legged.tools.experiments", experiments.main),
     ],
