@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from helpers import ENGINE, call, small_task
+from legged.tools import train
 from test_docs_tasks import fenced, named
 
 from legged import math as legged_math
@@ -17,7 +18,6 @@ from legged.config.schema import LeggedConfig
 from legged.envs import LeggedRobot
 from legged.envs.legged_gym_names import COMPUTED, CONSTANT, KEPT, PLAIN
 from legged.terrain import TERRAIN_TYPES
-from legged.tools import train
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGE = (DOCS / "migrating.md").read_text(encoding="utf-8")

@@ -8,6 +8,7 @@ import pytest
 import torch
 import yaml
 from helpers import call, small_task
+from legged.tools import fit_actuator
 from simulated_motor import TRUTH, simulated_log
 
 from legged.config import load_config
@@ -16,7 +17,6 @@ from legged.fitting.log import check_alike, read_log
 from legged.fitting.parametric import SMOOTHING, Drive, delayed, fit_drive
 from legged.mdp.actuator import Friction, MotorCurve
 from legged.mdp.actuator_network import NetworkWeights
-from legged.tools import fit_actuator
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

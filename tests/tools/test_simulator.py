@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 from helpers import CALM, ENGINE, call
+from legged.tools import deploy, fit_actuator, simulate_robot
 
 from legged.config.schema import SimConfig, TerrainConfig
 from legged.deploy.udp import UdpRobot
@@ -26,7 +27,6 @@ from legged.simulated_robot.link import Link
 from legged.simulated_robot.robot import SimulatedRobot
 from legged.simulated_robot.server import Server
 from legged.terrain import Terrain, TileSpec
-from legged.tools import deploy, fit_actuator, simulate_robot
 
 POLICIES = Path(__file__).resolve().parents[2] / "resources" / "policies"
 SMALL_TERRAIN = [

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import call, small_task
+from legged.tools import deploy, simulate_robot
 
 from legged.config.schema import ActuatorConfig, LeggedControlConfig, SimConfig
 from legged.deploy.contract import read_contract
@@ -19,7 +20,6 @@ from legged.policies.export import export
 from legged.robots.robot import load_robot
 from legged.simulated_robot.motors import Motors, motors_config
 from legged.simulated_robot.robot import SimulatedRobot
-from legged.tools import deploy, simulate_robot
 
 ROBOT = load_robot("anymal_c")
 DT = 0.005

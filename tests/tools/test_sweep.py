@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import pytest
 import yaml
 from helpers import call, wait_for
+from legged.tools import sweep
 
 from legged.errors import ConfigError
 from legged.evaluation.reports.record import read_note
@@ -27,7 +28,6 @@ from legged.sweeping.plan import Parameter, plan_sweep, read_sweep
 from legged.sweeping.report import importances, ranking, settings
 from legged.sweeping.study import Trials, is_dead, me
 from legged.sweeping.worker import NoValue, Worker
-from legged.tools import sweep
 
 pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
 pytestmark = pytest.mark.usefixtures("workplace")

@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 import yaml
 from helpers import call
+from legged.tools import sweep
 
 from legged.sweeping.plan import plan_sweep, read_sweep
 from legged.sweeping.report import ranking, settings
 from legged.sweeping.study import Trials
-from legged.tools import sweep
 
 pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
 pytestmark = pytest.mark.usefixtures("workplace")

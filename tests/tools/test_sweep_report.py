@@ -9,12 +9,12 @@ import pytest
 import torch
 import yaml
 from helpers import call
+from legged.tools import sweep
 
 from legged.config import parse_override
 from legged.sweeping.plan import plan_sweep, read_sweep
 from legged.sweeping.report import importances, table
 from legged.sweeping.study import Trials
-from legged.tools import sweep
 
 optuna = pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
 pytestmark = pytest.mark.usefixtures("workplace")
