@@ -1,11 +1,11 @@
-"""Contacts of simple shapes with a height map, as one Warp kernel behind mujoco-warp's own collisions.
+"""Contacts of simple shapes with a height map, in one Warp kernel after mujoco-warp's own collisions.
 
-mujoco-warp meets a height field with a general convex solver (GJK) on triangular prisms: ten times the cost of this,
-and a riser becomes a ramp one cell wide. Here a contact is a few lookups (ground.py).
+mujoco-warp collides with a height field by a general convex solver (GJK) on triangular prisms. That costs ten times as much,
+and a riser becomes a ramp one cell wide. Here a contact needs only a few lookups (ground.py).
 
 Conventions: the normal points from the terrain (first geom) to the robot's shape; `dist` is negative in penetration; the
-contact point lies halfway between the two surfaces, as in MuJoCo. Friction directions follow from the normal alone,
-where MuJoCo turns them along a capsule on a plane; the friction cone is the same.
+contact point lies halfway between the two surfaces, as in MuJoCo. Friction directions follow from the normal alone, whereas
+MuJoCo aligns them with a capsule on a plane; the friction cone is the same.
 """
 
 from collections.abc import Iterable
@@ -40,7 +40,7 @@ MODEL_FIELDS = (
     "pair_adhesion",
     "pair_friction",
 )
-"""Of mujoco-warp's model, in the kernel's order."""
+"""Arrays of mujoco-warp's model, in the order of the kernel's arguments."""
 CONTACT_FIELDS = (
     "dist",
     "pos",
@@ -58,7 +58,7 @@ CONTACT_FIELDS = (
     "geomcollisionid",
     "adhesion",
 )
-"""Of its contacts, in the kernel's order."""
+"""Arrays of mujoco-warp's contacts, in the order of the kernel's arguments."""
 
 
 @wp.kernel
@@ -108,7 +108,7 @@ def touch_ground(
     contact_adhesion: wp.array[float],
     nacon: wp.array[int],
 ):
-    """One thread a world and probe: finds up to MOST hits, then appends them to the contacts."""
+    """Find up to MOST hits of a feature, and append them to the contacts. One thread per world and feature."""
     world, probe = wp.tid()
     geom = probe_geom[probe]
     radius = probe_radius[probe]
@@ -179,16 +179,16 @@ def touch_ground(
 
 
 class TerrainContact:
-    """Appends the contacts with a height map to mujoco-warp's, at the end of its collision stage."""
+    """Appends the contacts with a height map to mujoco-warp's contacts, at the end of its collision stage."""
 
     def __init__(
         self, m: Any, d: Any, model: mujoco.MjModel, terrain: int, height_map: HeightMap, shapes: Iterable[int]
     ) -> None:
-        """`m`, `d` are mujoco-warp's model and data; `terrain` is the static geom that stands for the map, `shapes` are
-        the geoms that meet it. Call with their device as Warp's current one.
+        """Register the collider with mujoco-warp's model `m` and data `d`. `terrain` is the static geom that represents the
+        map; `shapes` are the geoms that collide with it. Warp's current device must be that of `m` and `d`.
 
         Raises:
-            ConfigError: a colliding shape that has no probes.
+            ConfigError: a colliding shape is of a type without contact features.
         """
         self.terrain = terrain
         self.probes = probes = list(probes_of(model, shapes))

@@ -1,4 +1,4 @@
-"""Newton's solvers behind the interface: on a GPU, or on Warp's CPU device."""
+"""Newton's solvers behind the `Physics` interface, on a GPU or on Warp's CPU device."""
 
 from collections.abc import Collection, Mapping
 
@@ -20,8 +20,8 @@ from legged.physics.warp.physics import WarpPhysics
 
 
 class NewtonPhysics(WarpPhysics):
-    """N worlds in one of Newton's solvers (`sim.solver`). The state that the task sees is a copy in its own conventions,
-    made after every step and written back by resets and pushes.
+    """N worlds in one of Newton's solvers (`sim.solver`). The task's state is a copy in the task's conventions: it is read
+    after every step, and written back by resets and pushes.
     """
 
     _exchange: NewtonExchange
@@ -35,7 +35,11 @@ class NewtonPhysics(WarpPhysics):
         randomized: Collection[str] = (),
         pushed: bool = False,
     ) -> None:
-        """Build the scene on `device` and place all robots at the model's initial state; compiles on first use."""
+        """Build the scene on `device` and set all robots to the model's initial state. Kernels are compiled on first use.
+
+        Raises:
+            ConfigError: the robot has meshes, and a package that Newton needs to read them is not installed.
+        """
         super().__init__(num_envs, sim.dt, device)
         robot = scene.robot
         self.model = scene.model(sim, "none")
@@ -46,9 +50,10 @@ class NewtonPhysics(WarpPhysics):
         self._quantities = {}
         self._randomized, self._scene = tuple(randomized), scene
         self._fields: SolverFields | None = None
-        """What is randomised beside friction and the base's mass, or within steps; the MuJoCo solver's."""
+        """Arrays of the MuJoCo solver that fields change. None if only friction and the base's mass are randomised, and only
+        at start-up."""
         self.forces = torch.zeros(num_envs, self.model.nbody, 6, device=device) if pushed else None
-        # Newton's masks have one place more than there are worlds: for what is in none of them.
+        # Newton's masks have N + 1 entries; the last is for objects outside all worlds.
         self._mask = torch.zeros(num_envs + 1, dtype=torch.bool, device=device)
         self._wp_mask = wp.from_torch(self._mask)
         with wp.ScopedDevice(self._wp_device):
@@ -65,7 +70,7 @@ class NewtonPhysics(WarpPhysics):
         self.compiled = compile_ahead(self._wp_device, (self._step, self._put, self._forget, *exchanges))
         if self._wp_device.is_cpu:
             self._advance = self._record_step()
-        with wp.ScopedDevice(self._wp_device):  # what was tried left its traces
+        with wp.ScopedDevice(self._wp_device):  # restore the initial state after the trial launches
             self.qpos.copy_(start)
             self.qvel.zero_()
             self._mask[:-1].fill_(True)
@@ -80,11 +85,11 @@ class NewtonPhysics(WarpPhysics):
         self._exchange.read()
 
     def _forget(self) -> None:
-        """Clear what the worlds of `_mask` would carry over a step."""
+        """Clear the solver's memory of earlier steps in the worlds of `_mask`."""
         self._simulation.forget(self._wp_mask)
 
     def _put(self) -> None:
-        """The task's state of the worlds of `_mask` into Newton's joints and bodies."""
+        """Copy the task's state of the worlds of `_mask` to Newton's joints and bodies."""
         self._exchange.put(self._wp_mask)
         self._simulation.place_bodies(self._wp_mask)
 
@@ -98,7 +103,7 @@ class NewtonPhysics(WarpPhysics):
             self.forces.masked_fill_(mask.view(-1, 1, 1), 0.0)
 
     def load_state(self, saved: Mapping[str, Tensor]) -> None:
-        """As every engine, but a solver's own memory (warm starts, matched contacts) begins anew."""
+        """Load a state as in `Physics`, except that the solver's own memory (warm starts, matched contacts) is cleared."""
         super().load_state(saved)
         with self._on_device():
             self._mask[:-1].fill_(True)
@@ -139,7 +144,7 @@ class NewtonPhysics(WarpPhysics):
             self._solvers_fields().choose(mask, chosen)
 
     def _solvers_fields(self) -> SolverFields:
-        """Return the arrays of the solver that fields change, which are made when they are first asked for."""
+        """Return the arrays of the solver that fields change; create them on the first call."""
         if self._fields is None:
             base_com, robot = self._exchange.base_com, self._scene
             self._fields = SolverFields(robot, self.model, self._simulation, base_com, self._randomized)
@@ -160,6 +165,6 @@ class NewtonPhysics(WarpPhysics):
         self._notify(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
 
     def _notify(self, changed: newton.ModelFlags) -> None:
-        """Tell the solver what has changed."""
+        """Notify the solver of changed model arrays."""
         with self._on_device():
             self._simulation.solver.notify_model_changed(changed)
