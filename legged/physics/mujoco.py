@@ -180,8 +180,7 @@ class _RobotReader:
     """Computes the fields of RobotState that are not views of qpos and qvel."""
 
     def __init__(self, batch: Batch, state: RobotState, robot: Robot, qpos: Tensor, qvel: Tensor) -> None:
-        """Read from the model of `batch`, which has contact sensors, and from the task's `qpos` (N, nq) and `qvel` (N, nv).
-        """
+        """Read the contact sensors of the model of `batch`, and the task's `qpos` (N, nq) and `qvel` (N, nv)."""
         self.stepped = False
         """True if the sensors hold forces that `state` does not hold yet."""
         self._state = state

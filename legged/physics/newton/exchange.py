@@ -140,8 +140,7 @@ def flag_lost_contacts(count: wp.array[int], capacity: int, overflow: wp.array[i
 
 @wp.kernel
 def take_flags(flags: wp.array[Any], lost: int, overflow: wp.array[int]):
-    """Move the solver's flags to `overflow`, since the solver clears them at its next step, or never. One thread per world.
-    """
+    """Move the solver's flags to `overflow`: the solver clears them at its next step, or never. One thread per world."""
     world = wp.tid()
     if (int(flags[world]) & lost) != 0:
         overflow[world] = 1

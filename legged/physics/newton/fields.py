@@ -59,7 +59,7 @@ class SolverFields:
             True: RandomizedModel(scene, model, motors, torch.float32, device),
             False: RandomizedModel(inside, solver.mj_model, others, torch.float32, device),
         }
-        """True for the model of motor fields, False for the solver's model."""
+        """Models that fields change: True -> the motors', False -> the solver's."""
         self.gains, self.limits = (
             torch.tensor(own, dtype=torch.float32, device=device).repeat(worlds, 1, 1)
             for own in (model.actuator_gainprm, model.actuator_forcerange)

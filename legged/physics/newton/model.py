@@ -91,7 +91,7 @@ def build_newton_model(
         ground.ke, ground.kd, ground.kf = setup.springs
     if terrain is None:
         scene.add_ground_plane(cfg=ground, label=FLOOR)
-    elif meets_cells(setup, sim):
+    elif uses_cell_collider(setup, sim):
         scene.add_ground_plane(height=float(terrain.height_map.corners.min()) - DEPTH, cfg=ground, label=FLOOR)
     else:
         _add_height_field(scene, terrain, ground)
@@ -101,7 +101,7 @@ def build_newton_model(
     return model, layout
 
 
-def meets_cells(setup: SolverSetup, sim: SimConfig) -> bool:
+def uses_cell_collider(setup: SolverSetup, sim: SimConfig) -> bool:
     """Return True if the height-map collider, which appends to mujoco-warp's contacts, replaces Newton's height field."""
     return setup.own_contacts and sim.terrain_collider == "cells"
 

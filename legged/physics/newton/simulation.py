@@ -12,7 +12,7 @@ from newton.solvers import SolverBase, SolverMuJoCo, SolverSteel
 
 from legged.config.schema import SimConfig
 from legged.physics.collider.terrain_contact import TerrainContact
-from legged.physics.newton.model import build_newton_model, meets_cells
+from legged.physics.newton.model import build_newton_model, uses_cell_collider
 from legged.physics.newton.solvers import SOLVERS
 from legged.physics.newton.springs import launch_spring_forces
 from legged.physics.warp.exchange import LOST
@@ -32,8 +32,7 @@ def push_bodies(forces: wp.array3d[float], bodies: wp.array[int], count: int, bo
 
 
 class Simulation:
-    """N worlds in Newton's own conventions. A step consists of Warp launches on fixed arrays, so that a graph can capture it.
-    """
+    """N worlds in Newton's own conventions. A step is Warp launches on fixed arrays, so that a graph can capture it."""
 
     def __init__(self, robot: Robot, sim: SimConfig, num_envs: int, terrain: Terrain | None, device: Any) -> None:
         """Build the scene and its solver. `device` is a Warp device, and must be Warp's current one.
@@ -55,8 +54,8 @@ class Simulation:
             # Newton warns about any MuJoCo version but 3.17; the engine tests run with the installed version.
             warnings.filterwarnings("ignore", "MuJoCo dependency version mismatch", newton.NewtonWarning)
             self.solver = setup.make(self.model, sim)
-        if terrain is not None and meets_cells(setup, sim):
-            self._meet_cells(terrain)
+        if terrain is not None and uses_cell_collider(setup, sim):
+            self._add_cell_collider(terrain)
         if self._pipeline is None:
             capacity = self.solver.get_max_contact_count()
             self.contacts = newton.Contacts(capacity, 0, device=device)
@@ -76,7 +75,7 @@ class Simulation:
             self.force = self._observables.contact_f
         """(contacts,) force on the first shape of each contact in the last substep, world frame [N]."""
 
-    def _meet_cells(self, terrain: Terrain) -> None:
+    def _add_cell_collider(self, terrain: Terrain) -> None:
         """Register mujoco_warp's height-map collider, with vertical faces, in Newton's MuJoCo solver."""
         solver = self.solver
         assert isinstance(solver, SolverMuJoCo)

@@ -1,5 +1,4 @@
-"""Contents of one world, independent of the engine: a robot on a ground, or a model from a file that includes its own floor.
-"""
+"""Contents of one world, independent of the engine: a robot on a ground, or a file's model with its own floor."""
 
 from abc import ABC, abstractmethod
 from typing import Literal
