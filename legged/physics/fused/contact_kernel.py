@@ -1,4 +1,4 @@
-"""The kernel that finds contacts and makes rows of constraints, its arrays and its constants."""
+"""Kernel that finds contacts and makes constraint rows, with its arrays and constants."""
 
 from typing import Any
 
@@ -15,14 +15,16 @@ from legged.physics.collider.probes import look
 from legged.physics.fused.native import LANES, native_source
 
 SOURCE = ("contact_stage.h",)
-"""Of what the native function is put together."""
+"""Source files of the native function."""
 Vector5 = wp.types.vector(length=5, dtype=wp.float32)
 FLAGS, CONES = mujoco.mjtDisableBit, mujoco.mjtCone
 
 
 @wp.struct
 class StageArrays:
-    """Tables of our own, and what the launch reads of mujoco-warp's model and data; from `equalities` on what it writes."""
+    """Arrays of the kernel. It reads its own tables and arrays of mujoco-warp's model and data, and writes the arrays from
+    `equalities` on. Arrays `touch_*` have one row per `ContactPair`.
+    """
 
     touch_geom: wp.array[wp.vec2i]
     touch_margin: wp.array[float]
@@ -92,12 +94,14 @@ NAMES = {
     "row_type": "efc.type",
     "row_id": "efc.id",
 }
-"""What mujoco-warp's data calls them, where it is something else."""
+"""Array -> its name in mujoco-warp's data, where the names differ."""
 
 
 @wp.struct
 class Candidates:
-    """What may touch, item by item: points of shapes on planes, pairs of spheres and capsules, probes of the ground."""
+    """Candidates for contacts: points of shapes on planes, pairs of spheres and capsules, and contact features above the
+    height map. Arrays `*_touch` hold the index of the candidate's `ContactPair`.
+    """
 
     point_touch: wp.array[int]
     point_kind: wp.array[int]
@@ -126,7 +130,7 @@ def keep(
     pos: wp.vec3,
     frame: wp.mat33,
 ) -> None:
-    """Put a contact into a slot of its world, if there are so many; `mark` is by what it was found."""
+    """Write a contact into a slot of its world, if the slot exists. `mark` identifies the candidate that made the contact."""
     if slot < most:
         at = world * most + slot
         arrays.contact_touch[at] = touch
@@ -137,7 +141,9 @@ def keep(
 
 
 def stage_kernel(constants: dict[str, int | bool], planes: bool, pairs: bool, ground: bool) -> Any:
-    """Return the kernel for some `stage_constants`, of models of which these may touch; launched for (worlds, lanes)."""
+    """Return the kernel for a set of `stage_constants`. The flags tell which kinds of candidates a model has: points on
+    `planes`, `pairs` of round shapes, contact features on the `ground`. It is launched for (worlds, lanes).
+    """
     contacts_of_world = stage_function(constants, planes, pairs, ground)
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=(LANES, 32))
@@ -149,7 +155,7 @@ def stage_kernel(constants: dict[str, int | bool], planes: bool, pairs: bool, gr
 
 
 def stage_function(constants: dict[str, int | bool], planes: bool, pairs: bool, ground: bool) -> Any:
-    """Return what the kernel does for one world, by one of so many lanes."""
+    """Return the device function of the kernel, which one lane calls for one world."""
     most = int(constants["SLOTS"])
 
     @wp.func_native(native_source(("deal.h",), {}))
@@ -263,7 +269,7 @@ def stage_function(constants: dict[str, int | bool], planes: bool, pairs: bool, 
 
 
 def shared_bytes(constants: dict[str, int | bool]) -> int:
-    """Return what contact_stage.h takes of a block's shared memory for some `stage_constants`."""
+    """Return the shared memory of a block [bytes] that contact_stage.h uses with a set of `stage_constants`."""
     return 112 * constants["SLOTS"] + 16 * constants["PLAIN"]
 
 
@@ -277,9 +283,17 @@ def stage_constants(
     bounces: bool = False,
     dense_friction: bool = True,
 ) -> dict[str, int | bool]:
-    """Return what contact_stage.h asks for, of a model with room for so many rows and contacts in each world, of at most
-    `dim` directions, with dry friction and limits or without, and with springs of contacts that differ from world to world.
-    Without `dense_friction`, dry friction has no rows of the Jacobian, only the other numbers.
+    """Return the constants of contact_stage.h.
+
+    Args:
+        model: MuJoCo's model.
+        rows: largest number of constraint rows per world.
+        slots: largest number of contacts per world.
+        dim: largest number of directions of a contact.
+        frictions: True if there are rows of dry friction.
+        limits: True if there are rows of joint limits.
+        bounces: True if the springs of contacts differ between worlds.
+        dense_friction: False if the rows of dry friction need no entries in the Jacobian.
     """
     return {
         **{"NV": model.nv, "NJ": model.njnt, "ROWS": rows, "SLOTS": slots, "DIMS": dim},

@@ -1,12 +1,12 @@
-"""Contacts and all rows of constraints in one launch: a warp of threads for each world.
+"""Contacts and all constraint rows in one launch: one warp of threads per world.
 
-mujoco-warp takes some ten launches for it, and keeps the contacts of all worlds in one pool, in the order in which threads
-find room there. Here each world has slots of its own in mujoco-warp's arrays of contacts, filled in the order of the shapes;
-what reads them by a row's contact, or a contact's rows, finds what it knows.
+mujoco-warp needs about ten launches, and keeps the contacts of all worlds in one pool, in the order in which threads append
+them. Here each world has its own slots in mujoco-warp's contact arrays, which are filled in the order of the shapes. Indices
+from rows to contacts and from contacts to rows stay valid, so code that reads these arrays works unchanged.
 
-First, lanes look at points of shapes on planes, at pairs of spheres and capsules, and at what the ground of cells offers;
-then (contact_stage.h) they make rows of dry friction, joint limits and those contacts. Rows of equalities are
-mujoco-warp's own.
+The lanes first test points of shapes against planes, pairs of spheres and capsules, and contact features against the height
+map. Then (contact_stage.h) they make the rows of dry friction, joint limits and contacts. The rows of equality constraints
+are mujoco-warp's own.
 """
 
 from collections.abc import Collection
@@ -36,14 +36,14 @@ FIXED = (
     *("geom_size", "geom_margin", "geom_priority", "geom_solmix", "geom_solimp", "jnt_solref", "jnt_solimp"),
     *("dof_solref", "dof_solimp", "pair_margin", "pair_friction", "pair_solref", "pair_solimp"),
 )
-"""Arrays of the model that are read once, in which worlds may not differ."""
+"""Model arrays that are read once at construction, so they must not differ between worlds."""
 OWN_ARRAYS = ("jnt_limited", "contact_touch", "contact_mark", "row_key", "impratio_invsqrt", "dof_spring", "joint_spring")
-"""Of the launch, beside those of touches, that are not mujoco-warp's under a name of NAMES."""
+"""Arrays of the kernel, apart from `touch_*`, that are not arrays of mujoco-warp."""
 FLAGS = mujoco.mjtDisableBit
 
 
 class ContactStage:
-    """The collision stage and the rows of constraints of all worlds, from poses and velocities in mujoco-warp's data."""
+    """Collision detection and constraint rows of all worlds, from poses and velocities in mujoco-warp's data."""
 
     def __init__(
         self,
@@ -53,9 +53,9 @@ class ContactStage:
         randomized: Collection[str] = (),
         on_cells: TerrainContact | None = None,
     ) -> None:
-        """Prepare the launch for mujoco-warp's `m` and `d` of a `model` of which `why_not` says nothing, in whose arrays
-        `randomized` worlds differ, with the ground of cells that it stands on, if any. Call with their device as Warp's
-        current one.
+        """Prepare the launch for mujoco-warp's `m` and `d` of a `model` for which `why_not` is empty. `randomized` names the
+        arrays in which worlds differ; `on_cells` is the height-map collider, if the model stands on a height map. Warp's
+        current device must be that of `m` and `d`.
         """
         self._m, self._d = m, d
         flags = model.opt.disableflags
@@ -79,26 +79,27 @@ class ContactStage:
         round_pairs = [k for k in range(len(pairs)) if not on_planes[k]]
 
         self.sides = RowSides.of(d)
-        """By what rows are known again, for the solver to begin with what it last found out about them."""
+        """Keys of the rows, with which the solver finds their states of the last step."""
         self._arrays = self._stage_arrays(model, m, d)
         self._arrays.jnt_limited = wp.array(limited, dtype=int)
         items = self._candidates(model, d, points, round_pairs, [(met[p.geom], p) for p in probes])
         ground_of = (Ground(), Hits()) if on_cells is None else (on_cells.ground, on_cells.hits)
         self.inputs = [self._arrays, items, *ground_of]
-        """What the launch takes, beside the number of lanes."""
+        """Arguments of the launch after the number of lanes."""
         dim, slots = max((touch.dim for touch in self.touches), default=1), d.naconmax // d.nworld
         bounces, dense_friction = "geom_solref" in randomized, d.qacc.device.is_cpu or model.ntendon > 0
         self.constants = stage_constants(model, d.njmax, slots, dim, frictions, bool(limited.any()), bounces, dense_friction)
-        """What contact_stage.h was asked for."""
+        """Constants of contact_stage.h."""
         self.kinds = bool(points), bool(round_pairs), bool(probes)
-        """Whether points on planes, pairs of round shapes and probes of the ground may touch."""
+        """Flags for the kinds of candidates that the model has: points on planes, pairs of round shapes, and contact features
+        on the ground."""
         self._kernel = stage_kernel(self.constants, *self.kinds)
         self._lanes = lanes_of(d.qacc.device)
 
     @staticmethod
     def why_not(model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = ()) -> str:
-        """Return what of a model, and of mujoco-warp's `m` and `d` of it, has no rows here, where worlds differ in the arrays
-        `randomized`; empty if nothing.
+        """Return the reason why a model, with mujoco-warp's `m` and `d` and worlds that differ in the arrays `randomized`, is
+        not supported; empty if it is.
         """
         if drawn := [name for name in FIXED if name in randomized]:
             return f"{drawn[0]} differs between worlds"
@@ -122,14 +123,14 @@ class ContactStage:
         return touches.why_not(model, touches.pairs_of(m))
 
     def launch(self) -> None:
-        """Find the contacts and make the rows, of where shapes are and how they move."""
+        """Find the contacts and make the constraint rows, for the current poses and velocities."""
         if self.equalities:
             self.launch_equalities()
         inputs = [self._lanes, *self.inputs]
         wp.launch(self._kernel, dim=(self._d.nworld, self._lanes), inputs=inputs, block_dim=self._lanes)
 
     def launch_equalities(self) -> None:
-        """Make the rows of equality constraints, which come before all others."""
+        """Make the rows of equality constraints, which precede all others."""
         opt = self._m.opt
         flags = opt.disableflags
         opt.disableflags |= FLAGS.mjDSBL_FRICTIONLOSS | FLAGS.mjDSBL_LIMIT | FLAGS.mjDSBL_CONTACT
@@ -137,7 +138,7 @@ class ContactStage:
         opt.disableflags = flags
 
     def _stage_arrays(self, model: mujoco.MjModel, m: Any, d: Any) -> Any:
-        """Return what contact_stage.h reads and writes."""
+        """Return the arrays that the kernel reads and writes."""
         arrays, every = StageArrays(), self.touches
         timestep, safe = float(model.opt.timestep), touches.is_safe(model)
 
@@ -174,7 +175,7 @@ class ContactStage:
         return arrays
 
     def _candidates(self, model: mujoco.MjModel, d: Any, points: list, round_pairs: list[int], probes: list) -> Any:
-        """Return what the lanes look at."""
+        """Return the candidates for contacts."""
         items = Candidates()
         items.point_touch = wp.array([p.touch for p in points], dtype=int)
         items.point_kind = wp.array([p.kind for p in points], dtype=int)

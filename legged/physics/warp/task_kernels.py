@@ -314,79 +314,79 @@ class TaskKernels(Launcher):
         wp.launch(hold_joints, dim=1)
 
     def hold_joints(self, dim: tuple[int, ...], *arguments: Tensor) -> None:
-        """Launch `Control.compute` for joints under PD control. The last argument is written."""
+        """Launch the kernel of `Control.compute` for joints under PD control. The last argument is written."""
         self.launch(hold_joints, dim, arguments)
 
     def drive_joints(self, dim: tuple[int, ...], *arguments: Tensor | float) -> None:
-        """Launch `Actuator.drive` for joints under PD control. The last argument is written."""
+        """Launch the kernel of `Actuator.drive` for joints under PD control. The last argument is written."""
         self.launch(drive_joints, dim, arguments)
 
     def run_mlp(self, error: Tensor, *arguments: Tensor | float) -> None:
-        """Launch `ActuatorNetwork.torques` of an MLP. The last argument is written."""
+        """Launch the kernel of `ActuatorNetwork.torques` of an MLP. The last argument is written."""
         self.launch(run_mlp, tuple(error.shape), (error, *arguments))
 
     def run_lstm(self, error: Tensor, *arguments: Tensor | float) -> None:
-        """Launch `ActuatorNetwork.torques` of an LSTM. The last argument is written."""
+        """Launch the kernel of `ActuatorNetwork.torques` of an LSTM. The last argument is written."""
         self.launch(run_lstm, tuple(error.shape), (error, *arguments))
 
     def advance_feet(self, forces: Tensor, *arguments: Tensor | float) -> None:
-        """Launch `FeetContacts.update`."""
+        """Launch the kernel of `FeetContacts.update`."""
         self.launch(advance_feet, tuple(forces.shape[:2]), (forces, *arguments), vectors=1)
 
     def renew_commands(self, *arguments: Tensor | float) -> None:
-        """Launch `Commands.update`."""
+        """Launch the kernel of `Commands.update`."""
         self.launch(renew_commands, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def find_pushes(self, *arguments: Tensor | float) -> None:
-        """Launch the first half of `Pushes.push`."""
+        """Launch the kernel of the first half of `Pushes.push`."""
         self.launch(find_pushes, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def make_draws(self, *arguments: Tensor) -> None:
-        """Launch `Draws.values`. The last argument is written."""
+        """Launch the kernel of `Draws.values`. The last argument is written."""
         self.launch(make_draws, tuple(arguments[-1].shape), arguments)
 
     def make_fresh(self, *arguments: Tensor) -> None:
-        """Launch `Randomization.draw`. The last two arguments are written."""
+        """Launch the kernel of `Randomization.draw`. The last two arguments are written."""
         self.launch(make_fresh, tuple(arguments[-1].shape), arguments)
 
     def find_moments(self, *arguments: Tensor | float) -> None:
-        """Launch the first half of `Randomization.redraw`."""
+        """Launch the kernel of the first half of `Randomization.redraw`."""
         self.launch(find_moments, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def take_fresh(self, *arguments: Tensor) -> None:
-        """Launch the second half of `Randomization.redraw`. The last argument is written."""
+        """Launch the kernel of the second half of `Randomization.redraw`. The last argument is written."""
         self.launch(take_fresh, tuple(arguments[-1].shape), arguments)
 
     def vary_control(self, *arguments: Tensor) -> None:
-        """Launch `Control.vary`."""
+        """Launch the kernel of `Control.vary`."""
         self.launch(vary_control, tuple(arguments[-1].shape), arguments)
 
     def disturb(self, *arguments: Tensor | float) -> None:
-        """Launch `Disturbances.act`, except the kicks themselves. The last argument, (N, bodies, 6), receives the forces."""
+        """Launch the kernel of `Disturbances.act`, except the kicks themselves. The last argument, (N, bodies, 6), receives the forces."""
         total: Tensor = arguments[-1]  # type: ignore[assignment]
         self.launch(disturb, (len(total), max(total.shape[1], 1)), arguments)
 
     def advance_map(self, holes: Tensor, *arguments: Tensor | float) -> None:
-        """Launch `HeightMapErrors.advance`. `holes` (N, P) and the last two arguments are written."""
+        """Launch the kernel of `HeightMapErrors.advance`. `holes` (N, P) and the last two arguments are written."""
         self.launch(advance_map, (len(holes), max(holes.shape[1], 1)), (*arguments, holes))
 
     def follow_commands(self, commands: Tensor, *arguments: Tensor) -> None:
-        """Launch the first half of `CommandCurriculum.update`."""
+        """Launch the kernel of the first half of `CommandCurriculum.update`."""
         self.launch(follow_commands, tuple(commands.shape), (commands, *arguments))
 
     def widen_commands(self, *arguments: Tensor | float) -> None:
-        """Launch the second half of `CommandCurriculum.update`."""
+        """Launch the kernel of the second half of `CommandCurriculum.update`."""
         self.launch(widen_commands, 1, arguments)
 
     def scan_heights(self, base_pos: Tensor, base_quat: Tensor, points_x: Tensor, *arguments: Tensor | float) -> None:
-        """Launch `HeightScan.update`."""
+        """Launch the kernel of `HeightScan.update`."""
         dim = (len(base_pos), len(points_x))
         self.launch(scan_heights, dim, (base_pos, base_quat, points_x, *arguments))
 
     def move_levels(self, *arguments: Tensor | float) -> None:
-        """Launch `TerrainCurriculum.update`, except the sums over robots."""
+        """Launch the kernel of `TerrainCurriculum.update`, except the sums over robots."""
         self.launch(move_levels, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def add_rewards(self, values: Tensor, *arguments: Tensor | float) -> None:
-        """Launch `Rewards.compute` for known values of the terms."""
+        """Launch the kernel of `Rewards.compute` for known values of the terms."""
         self.launch(add_rewards, values.shape[1], (values, *arguments))
