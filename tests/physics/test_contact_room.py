@@ -12,7 +12,7 @@ from mechanisms import FusedWorlds
 from legged.physics.fused.contact_kernel import shared_bytes, stage_constants
 from legged.physics.fused.contact_stage import ContactStage
 from legged.physics.fused.native import SOURCES
-from legged.physics.warp.exchange import LOST
+from legged.physics.warp.state_io import LOST
 
 BOX = """
 <mujoco>

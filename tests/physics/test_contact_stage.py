@@ -13,7 +13,7 @@ from reference import heaps, random_states, roll
 
 from legged.config.schema import TerrainConfig
 from legged.physics import ModelScene, RobotScene
-from legged.physics.collider.touches import spring_of, touch_of
+from legged.physics.collider.contact_pairs import contact_pair, spring_of
 from legged.physics.fused.contact_stage import ContactStage
 from legged.terrain import Terrain, TileSpec
 
@@ -324,7 +324,7 @@ def test_springs_of_two_shapes_are_mixed_as_in_c_mujoco(priority, solrefs):
     )
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    touch = touch_of(model, 0, 1)
+    touch = contact_pair(model, 0, 1)
     np.testing.assert_allclose(touch.solref, data.contact[0].solref, rtol=1e-12)
     np.testing.assert_allclose(touch.solimp, data.contact[0].solimp, rtol=1e-12)
 

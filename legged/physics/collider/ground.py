@@ -118,7 +118,7 @@ def leave_sideways(ground: Ground, i: int, j: int, p: wp.vec3, top: Hit) -> Hit:
 
 
 @wp.func
-def beside(ground: Ground, i: int, j: int, ni: int, nj: int, p: wp.vec3) -> Hit:
+def hit_neighbour(ground: Ground, i: int, j: int, ni: int, nj: int, p: wp.vec3) -> Hit:
     """Return the hit of a point over cell (i, j) with its neighbour (ni, nj): the neighbour's face, its rim, or its surface
     where that rises.
     """
@@ -264,7 +264,7 @@ def around_point(ground: Ground, p: wp.vec3, near: float, faces_only: bool, hits
             y = ground.y + float(j + dj) * ground.cell
             dy = p[1] - wp.clamp(p[1], y, y + ground.cell)
             if (di != 0 or dj != 0) and dx * dx + dy * dy < near * near:
-                hit = beside(ground, i, j, i + di, j + dj, p)
+                hit = hit_neighbour(ground, i, j, i + di, j + dj, p)
                 if hit.face and hit.dist < near:
                     count = add(hits, row, count, hit)
                 elif hit.dist < crease.dist:

@@ -8,10 +8,10 @@ import warp as wp
 from mujoco_warp._src.collision_primitive_core import capsule_capsule, mat23f
 from mujoco_warp._src.math import make_frame
 
-from legged.physics.collider import touches
+from legged.physics.collider import contact_pairs
 
-POINT, END, CORNER = wp.constant(touches.POINT), wp.constant(touches.END), wp.constant(touches.CORNER)
-RIM = wp.constant(touches.RIM)
+POINT, END, CORNER = wp.constant(contact_pairs.POINT), wp.constant(contact_pairs.END), wp.constant(contact_pairs.CORNER)
+RIM = wp.constant(contact_pairs.RIM)
 FAR = wp.constant(1e6)
 """Distance of shapes that do not touch [m]."""
 

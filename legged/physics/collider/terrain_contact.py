@@ -17,8 +17,8 @@ from mujoco_warp._src.collision_core import contact_margin_gap, contact_material
 from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import vec5
 
+from legged.physics.collider.contact_features import contact_features, find_hits
 from legged.physics.collider.ground import Ground, Hits, ground_of, room_for_hits
-from legged.physics.collider.probes import look, probes_of
 from legged.terrain import HeightMap
 
 MODEL_FIELDS = (
@@ -66,11 +66,11 @@ def touch_ground(
     ground: Ground,
     hits: Hits,
     terrain: int,
-    probe_geom: wp.array[int],
-    probe_kind: wp.array[int],
-    probe_start: wp.array[wp.vec3],
-    probe_end: wp.array[wp.vec3],
-    probe_radius: wp.array[float],
+    feature_geom: wp.array[int],
+    feature_kind: wp.array[int],
+    feature_start: wp.array[wp.vec3],
+    feature_end: wp.array[wp.vec3],
+    feature_radius: wp.array[float],
     geom_condim: wp.array[int],
     geom_priority: wp.array[int],
     geom_solmix: wp.array2d[float],
@@ -109,15 +109,17 @@ def touch_ground(
     nacon: wp.array[int],
 ):
     """Find up to MOST hits of a feature, and append them to the contacts. One thread per world and feature."""
-    world, probe = wp.tid()
-    geom = probe_geom[probe]
-    radius = probe_radius[probe]
+    world, feature = wp.tid()
+    geom = feature_geom[feature]
+    radius = feature_radius[feature]
     geoms = wp.vec2i(terrain, geom)
     margin, gap = contact_margin_gap(geom_margin, geom_gap, pair_margin, pair_gap, geoms, -1, world)
     near = radius + margin + gap
     position, turn = geom_xpos[world, geom], geom_xmat[world, geom]
-    row = world * probe_geom.shape[0] + probe
-    count = look(ground, probe_kind[probe], position, turn, probe_start[probe], probe_end[probe], near, hits, row)
+    row = world * feature_geom.shape[0] + feature
+    count = find_hits(
+        ground, feature_kind[feature], position, turn, feature_start[feature], feature_end[feature], near, hits, row
+    )
     if count == 0:
         return
     condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
@@ -191,27 +193,27 @@ class TerrainContact:
             ConfigError: a colliding shape is of a type without contact features.
         """
         self.terrain = terrain
-        self.probes = probes = list(probes_of(model, shapes))
-        largest = max(probe.reach for probe in probes) + float((model.geom_margin + model.geom_gap).max())
-        longest = max(probe.length for probe in probes)
+        self.features = features = list(contact_features(model, shapes))
+        largest = max(feature.reach for feature in features) + float((model.geom_margin + model.geom_gap).max())
+        longest = max(feature.length for feature in features)
         self.ground = ground_of(height_map, largest, longest)
-        self.hits = room_for_hits(d.nworld * len(probes))
+        self.hits = room_for_hits(d.nworld * len(features))
         self._inputs = [
             self.ground,
             self.hits,
             terrain,
-            wp.array([probe.geom for probe in probes], dtype=int),
-            wp.array([probe.kind for probe in probes], dtype=int),
-            wp.array([probe.start for probe in probes], dtype=wp.vec3),
-            wp.array([probe.end for probe in probes], dtype=wp.vec3),
-            wp.array([probe.radius for probe in probes], dtype=float),
+            wp.array([feature.geom for feature in features], dtype=int),
+            wp.array([feature.kind for feature in features], dtype=int),
+            wp.array([feature.start for feature in features], dtype=wp.vec3),
+            wp.array([feature.end for feature in features], dtype=wp.vec3),
+            wp.array([feature.radius for feature in features], dtype=float),
             *(getattr(m, name) for name in MODEL_FIELDS),
             d.geom_xpos,
             d.geom_xmat,
             d.naconmax,
         ]
         self._outputs = [*(getattr(d.contact, name) for name in CONTACT_FIELDS), d.nacon]
-        self._dim = (d.nworld, len(probes))
+        self._dim = (d.nworld, len(features))
         m.callback.contactfilter = self._append
 
     def _append(self, m: Any, d: Any) -> None:

@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from legged.physics.fused.active_set import ROW_STATES, ActiveSet
 from legged.physics.fused.native import LANES, Constant, lanes_of, native_source
-from legged.physics.fused.row_sides import SIDES, RowSides
 from legged.physics.fused.solver_arrays import SolverArrays
 from legged.physics.fused.tree import MOST_DOFS, Tree
 from legged.physics.fused.wide_solver import WIDE, fits_wide, wide_constants, wide_kernel
@@ -71,7 +71,7 @@ def solver_constants(
         "ELLIPTIC_ROW": ELLIPTIC_ROW,
         "KNOWN": known and not elliptic,
     }
-    return {**sizes, **kinds, **SIDES, **tree.constants()}
+    return {**sizes, **kinds, **ROW_STATES, **tree.constants()}
 
 
 def blocks(constants: dict[str, int | bool]) -> int:
@@ -118,7 +118,9 @@ class ConstraintSolver:
     advance: wp.array2d
     """(worlds, nv) accelerations that integrate velocities: `qacc`, or another array if dampers are integrated implicitly."""
 
-    def __init__(self, model: mujoco.MjModel, m: Any, d: Any, damped: bool = False, sides: RowSides | None = None) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, m: Any, d: Any, damped: bool = False, active_set: ActiveSet | None = None
+    ) -> None:
         """Prepare the launch for mujoco-warp's `m` and `d` of a model for which `why_not` is empty. With `damped`, also
         compute the acceleration with implicitly integrated dampers. With `active_set`, start from the states of the last
         step; elliptic cones do not use it, since a sliding cone's cost is not quadratic. Warp's current device must be that
@@ -129,12 +131,12 @@ class ConstraintSolver:
         counts, columns = m.M_rownnz.numpy(), m.M_colind.numpy()
         dry = not model.ntendon
         rows = np.repeat(np.arange(m.nv), counts)
-        self.constants = solver_constants(tree, d.njmax, len(rows), damped, friction, dry, elliptic, sides is not None)
+        self.constants = solver_constants(tree, d.njmax, len(rows), damped, friction, dry, elliptic, active_set is not None)
         self.wide: dict[str, Constant] | None = None
         """Constants of wide_solver.h if it is the solver, which is on a CPU; None otherwise."""
         if d.qacc.device.is_cpu and not elliptic and fits_wide(m.nv, d.njmax):
             entries = rows, columns[: len(rows)]
-            self.wide = wide_constants(tree, entries, d.njmax, damped, friction, sides is not None)
+            self.wide = wide_constants(tree, entries, d.njmax, damped, friction, active_set is not None)
         self._kernel = solver_kernel(self.constants) if self.wide is None else wide_kernel(self.wide)
         self._lanes = lanes_of(d.qacc.device)
         efc, opt = d.efc, m.opt
@@ -159,7 +161,7 @@ class ConstraintSolver:
         self.advance = wp.zeros_like(d.qacc) if damped else d.qacc
         arrays.timestep, arrays.damping, arrays.advance = opt.timestep, m.dof_damping, self.advance
         nothing = wp.empty((0, 0), dtype=int)
-        arrays.row_key, arrays.last_rows = (nothing, nothing) if sides is None else (sides.key, sides.last)
+        arrays.row_key, arrays.last_rows = (nothing, nothing) if active_set is None else (active_set.key, active_set.last)
         self._worlds = d.nworld
 
     @staticmethod

@@ -10,8 +10,8 @@ from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import ConstraintType, ContactType
 
 from legged.physics.collider import shapes
+from legged.physics.collider.contact_features import find_hits
 from legged.physics.collider.ground import Ground, Hits
-from legged.physics.collider.probes import look
 from legged.physics.fused.native import LANES, native_source
 
 SOURCE = ("contact_stage.h",)
@@ -108,11 +108,11 @@ class Candidates:
     point_place: wp.array[wp.vec3]
     point_radius: wp.array[float]
     pair_touch: wp.array[int]
-    probe_touch: wp.array[int]
-    probe_kind: wp.array[int]
-    probe_start: wp.array[wp.vec3]
-    probe_end: wp.array[wp.vec3]
-    probe_radius: wp.array[float]
+    feature_touch: wp.array[int]
+    feature_kind: wp.array[int]
+    feature_start: wp.array[wp.vec3]
+    feature_end: wp.array[wp.vec3]
+    feature_radius: wp.array[float]
     geom_size: wp.array[wp.vec3]
     geom_xpos: wp.array2d[wp.vec3]
     geom_xmat: wp.array2d[wp.mat33]
@@ -158,8 +158,8 @@ def stage_function(constants: dict[str, int | bool], planes: bool, pairs: bool, 
     """Return the device function of the kernel, which one lane calls for one world."""
     most = int(constants["SLOTS"])
 
-    @wp.func_native(native_source(("deal.h",), {}))
-    def deal(count: int) -> int:  # type: ignore[empty-body]
+    @wp.func_native(native_source(("prefix_sum.h",), {}))
+    def prefix_sum(count: int) -> int:  # type: ignore[empty-body]
         ...
 
     @wp.func_native(native_source(SOURCE, constants))
@@ -192,10 +192,10 @@ def stage_function(constants: dict[str, int | bool], planes: bool, pairs: bool, 
                     )
                     if hit.dist < arrays.touch_margin[touch]:
                         count = 1
-                dealt = deal(count)
+                packed = prefix_sum(count)
                 if count > 0:
-                    keep(arrays, found + (dealt & 0xFFFF), most, world, touch, item, hit.dist, hit.pos, hit.frame)
-                found += dealt >> 16
+                    keep(arrays, found + (packed & 0xFFFF), most, world, touch, item, hit.dist, hit.pos, hit.frame)
+                found += packed >> 16
         if wp.static(pairs):
             for start in range(0, items.pair_touch.shape[0], lanes):
                 item = start + lane
@@ -222,47 +222,47 @@ def stage_function(constants: dict[str, int | bool], planes: bool, pairs: bool, 
                         for k in range(2):
                             if dist[k] < margin:
                                 count += 1
-                dealt = deal(count)
-                slot = found + (dealt & 0xFFFF)
+                packed = prefix_sum(count)
+                slot = found + (packed & 0xFFFF)
                 if count > 0:
                     for k in range(2):
                         if dist[k] < margin:
                             mark = items.point_touch.shape[0] + 2 * item + k
                             keep(arrays, slot, most, world, touch, mark, dist[k], pos[k], make_frame(normal[k]))
                             slot += 1
-                found += dealt >> 16
+                found += packed >> 16
         if wp.static(ground):
-            for start in range(0, items.probe_touch.shape[0], lanes):
+            for start in range(0, items.feature_touch.shape[0], lanes):
                 item = start + lane
                 touch = wp.int32(0)
                 radius = wp.float32(0.0)
-                row = world * items.probe_touch.shape[0] + item
+                row = world * items.feature_touch.shape[0] + item
                 count = wp.int32(0)
-                if item < items.probe_touch.shape[0]:
-                    touch = items.probe_touch[item]
+                if item < items.feature_touch.shape[0]:
+                    touch = items.feature_touch[item]
                     geom = arrays.touch_geom[touch][1]
-                    radius = items.probe_radius[item]
+                    radius = items.feature_radius[item]
                     near = radius + arrays.touch_margin[touch]
                     position, turn = items.geom_xpos[world, geom], items.geom_xmat[world, geom]
-                    count = look(
+                    count = find_hits(
                         cells,
-                        items.probe_kind[item],
+                        items.feature_kind[item],
                         position,
                         turn,
-                        items.probe_start[item],
-                        items.probe_end[item],
+                        items.feature_start[item],
+                        items.feature_end[item],
                         near,
                         hits,
                         row,
                     )
-                dealt = deal(count)
+                packed = prefix_sum(count)
                 for k in range(count):
                     up = hits.normal[row, k]
                     depth = hits.dist[row, k] - radius
                     middle = hits.point[row, k] - up * (radius + 0.5 * depth)
                     mark = items.point_touch.shape[0] + 2 * items.pair_touch.shape[0] + hits.dist.shape[1] * item + k
-                    keep(arrays, found + (dealt & 0xFFFF) + k, most, world, touch, mark, depth, middle, make_frame(up))
-                found += dealt >> 16
+                    keep(arrays, found + (packed & 0xFFFF) + k, most, world, touch, mark, depth, middle, make_frame(up))
+                found += packed >> 16
         make_rows(world, found, arrays)
 
     return contacts_of_world

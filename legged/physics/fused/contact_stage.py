@@ -17,9 +17,10 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from legged.physics.collider import touches
+from legged.physics.collider import contact_pairs
 from legged.physics.collider.ground import Ground, Hits
 from legged.physics.collider.terrain_contact import TerrainContact
+from legged.physics.fused.active_set import ActiveSet
 from legged.physics.fused.contact_kernel import (
     NAMES,
     Candidates,
@@ -30,7 +31,6 @@ from legged.physics.fused.contact_kernel import (
     stage_kernel,
 )
 from legged.physics.fused.native import SHARED_BYTES, lanes_of
-from legged.physics.fused.row_sides import RowSides
 
 FIXED = (
     *("geom_size", "geom_margin", "geom_priority", "geom_solmix", "geom_solimp", "jnt_solref", "jnt_solimp"),
@@ -64,33 +64,36 @@ class ContactStage:
         limited = np.array(model.jnt_limited, dtype=int) * (not flags & FLAGS.mjDSBL_LIMIT)
         contacts = not flags & FLAGS.mjDSBL_CONTACT
         self.equalities = model.neq > 0 and not flags & FLAGS.mjDSBL_EQUALITY
-        all_pairs = touches.pairs_of(m) if contacts else []
-        pairs = [touches.touch_of(model, *pair) for pair in all_pairs]
-        probes = on_cells.probes if on_cells is not None and contacts else []
-        met = {probe.geom: len(pairs) + k for k, probe in enumerate({p.geom: p for p in probes}.values())}
+        all_pairs = contact_pairs.pairs_of(m) if contacts else []
+        pairs = [contact_pairs.contact_pair(model, *pair) for pair in all_pairs]
+        features = on_cells.features if on_cells is not None and contacts else []
+        met = {feature.geom: len(pairs) + k for k, feature in enumerate({p.geom: p for p in features}.values())}
         assert on_cells is not None or not met
         ground = -1 if on_cells is None else on_cells.terrain
-        self.touches = [*pairs, *(touches.touch_of(model, ground, geom) for geom in met)]
+        self.contact_pairs = [*pairs, *(contact_pairs.contact_pair(model, ground, geom) for geom in met)]
         """Pairs of shapes that may touch."""
-        on_planes = [model.geom_type[touch.geoms[0]] == touches.KINDS.mjGEOM_PLANE for touch in pairs]
+        on_planes = [model.geom_type[touch.geoms[0]] == contact_pairs.KINDS.mjGEOM_PLANE for touch in pairs]
         points = [
-            point for k, touch in enumerate(pairs) if on_planes[k] for point in touches.plane_points(model, k, touch.geoms[1])
+            point
+            for k, touch in enumerate(pairs)
+            if on_planes[k]
+            for point in contact_pairs.plane_points(model, k, touch.geoms[1])
         ]
         round_pairs = [k for k in range(len(pairs)) if not on_planes[k]]
 
-        self.sides = RowSides.of(d)
+        self.active_set = ActiveSet.of(d)
         """Keys of the rows, with which the solver finds their states of the last step."""
         self._arrays = self._stage_arrays(model, m, d)
         self._arrays.jnt_limited = wp.array(limited, dtype=int)
-        items = self._candidates(model, d, points, round_pairs, [(met[p.geom], p) for p in probes])
+        items = self._candidates(model, d, points, round_pairs, [(met[p.geom], p) for p in features])
         ground_of = (Ground(), Hits()) if on_cells is None else (on_cells.ground, on_cells.hits)
         self.inputs = [self._arrays, items, *ground_of]
         """Arguments of the launch after the number of lanes."""
-        dim, slots = max((touch.dim for touch in self.touches), default=1), d.naconmax // d.nworld
+        dim, slots = max((touch.dim for touch in self.contact_pairs), default=1), d.naconmax // d.nworld
         bounces, dense_friction = "geom_solref" in randomized, d.qacc.device.is_cpu or model.ntendon > 0
         self.constants = stage_constants(model, d.njmax, slots, dim, frictions, bool(limited.any()), bounces, dense_friction)
         """Constants of contact_stage.h."""
-        self.kinds = bool(points), bool(round_pairs), bool(probes)
+        self.kinds = bool(points), bool(round_pairs), bool(features)
         """Flags for the kinds of candidates that the model has: points on planes, pairs of round shapes, and contact features
         on the ground."""
         self._kernel = stage_kernel(self.constants, *self.kinds)
@@ -103,7 +106,7 @@ class ContactStage:
         """
         if drawn := [name for name in FIXED if name in randomized]:
             return f"{drawn[0]} differs between worlds"
-        if "geom_solref" in randomized and not touches.alike_springs(model, touches.pairs_of(m)):
+        if "geom_solref" in randomized and not contact_pairs.alike_springs(model, contact_pairs.pairs_of(m)):
             return "restitution differs between worlds, and shapes that touch have springs of their own"
         if m.is_sparse:
             return "mujoco-warp keeps Jacobians sparse"
@@ -120,7 +123,7 @@ class ContactStage:
         slots = d.naconmax // d.nworld
         if shared_bytes(stage_constants(model, d.njmax, slots, dim=6, frictions=True, limits=True)) > SHARED_BYTES:
             return f"{slots} contacts a world (sim.nconmax) do not fit a GPU's shared memory"
-        return touches.why_not(model, touches.pairs_of(m))
+        return contact_pairs.why_not(model, contact_pairs.pairs_of(m))
 
     def launch(self) -> None:
         """Find the contacts and make the constraint rows, for the current poses and velocities."""
@@ -139,17 +142,17 @@ class ContactStage:
 
     def _stage_arrays(self, model: mujoco.MjModel, m: Any, d: Any) -> Any:
         """Return the arrays that the kernel reads and writes."""
-        arrays, every = StageArrays(), self.touches
-        timestep, safe = float(model.opt.timestep), touches.is_safe(model)
+        arrays, every = StageArrays(), self.contact_pairs
+        timestep, safe = float(model.opt.timestep), contact_pairs.is_safe(model)
 
         def spring(solref: np.ndarray, solimp: np.ndarray) -> np.ndarray:
-            return touches.spring_of(solref, solimp, timestep, safe)
+            return contact_pairs.spring_of(solref, solimp, timestep, safe)
 
         def springs(solrefs: Any, solimps: Any) -> wp.array:
             made = [spring(*pair) for pair in zip(solrefs, solimps, strict=True)]
-            return wp.array(np.reshape(made, (-1, touches.SPRING)), dtype=float)
+            return wp.array(np.reshape(made, (-1, contact_pairs.SPRING)), dtype=float)
 
-        own = [t.solreffriction.any() and not touches.is_mixed(t.solreffriction) for t in every]
+        own = [t.solreffriction.any() and not contact_pairs.is_mixed(t.solreffriction) for t in every]
         sliding = [spring(t.solreffriction if has else t.solref, t.solimp)[1] for t, has in zip(every, own, strict=True)]
         arrays.touch_geom = wp.array([t.geoms for t in every], dtype=wp.vec2i)
         arrays.touch_margin = wp.array([t.margin for t in every], dtype=float)
@@ -158,12 +161,14 @@ class ContactStage:
         arrays.touch_friction = wp.array([t.friction for t in every], dtype=Vector5)
         arrays.touch_spring = springs([t.solref for t in every], [t.solimp for t in every])
         arrays.touch_sliding = wp.array(sliding, dtype=float)
-        bounces = [(2.0 * timestep * safe, float(np.clip(t.solimp[1], touches.LEAST, touches.GREATEST))) for t in every]
+        bounces = [
+            (2.0 * timestep * safe, float(np.clip(t.solimp[1], contact_pairs.LEAST, contact_pairs.GREATEST))) for t in every
+        ]
         arrays.touch_bounce = wp.array(bounces, dtype=wp.vec2)
         arrays.dof_spring = springs(model.dof_solref, model.dof_solimp)
         arrays.joint_spring = springs(model.jnt_solref, model.jnt_solimp)
         arrays.contact_touch, arrays.contact_mark = wp.zeros(d.naconmax, dtype=int), wp.zeros(d.naconmax, dtype=int)
-        arrays.row_key = self.sides.key
+        arrays.row_key = self.active_set.key
         arrays.impratio_invsqrt = m.opt.impratio_invsqrt
         for name in StageArrays.vars:  # type: ignore[attr-defined]
             if name in OWN_ARRAYS or name.startswith("touch_"):
@@ -174,7 +179,7 @@ class ContactStage:
             setattr(arrays, name, getattr(source, field))
         return arrays
 
-    def _candidates(self, model: mujoco.MjModel, d: Any, points: list, round_pairs: list[int], probes: list) -> Any:
+    def _candidates(self, model: mujoco.MjModel, d: Any, points: list, round_pairs: list[int], features: list) -> Any:
         """Return the candidates for contacts."""
         items = Candidates()
         items.point_touch = wp.array([p.touch for p in points], dtype=int)
@@ -182,11 +187,11 @@ class ContactStage:
         items.point_place = wp.array([p.place for p in points], dtype=wp.vec3)
         items.point_radius = wp.array([p.radius for p in points], dtype=float)
         items.pair_touch = wp.array(round_pairs, dtype=int)
-        items.probe_touch = wp.array([touch for touch, _ in probes], dtype=int)
-        items.probe_kind = wp.array([p.kind for _, p in probes], dtype=int)
-        items.probe_start = wp.array([p.start for _, p in probes], dtype=wp.vec3)
-        items.probe_end = wp.array([p.end for _, p in probes], dtype=wp.vec3)
-        items.probe_radius = wp.array([p.radius for _, p in probes], dtype=float)
+        items.feature_touch = wp.array([touch for touch, _ in features], dtype=int)
+        items.feature_kind = wp.array([p.kind for _, p in features], dtype=int)
+        items.feature_start = wp.array([p.start for _, p in features], dtype=wp.vec3)
+        items.feature_end = wp.array([p.end for _, p in features], dtype=wp.vec3)
+        items.feature_radius = wp.array([p.radius for _, p in features], dtype=float)
         items.geom_size = wp.array(model.geom_size, dtype=wp.vec3)
         items.geom_xpos, items.geom_xmat = d.geom_xpos, d.geom_xmat
         return items

@@ -14,8 +14,8 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
+from legged.physics.fused.active_set import ActiveSet
 from legged.physics.fused.constraint_solver import ConstraintSolver
-from legged.physics.fused.row_sides import RowSides
 from legged.physics.fused.smooth_dynamics import BALL, FREE, SmoothDynamics, has_dampers
 
 NEFC, BROADPHASE, NARROWPHASE = (int(getattr(mjw.OverflowType, n)) for n in ("NEFC", "BROADPHASE", "NARROWPHASE"))
@@ -132,14 +132,14 @@ class TorqueStep:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = (), sides: RowSides | None = None
+        self, model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = (), active_set: ActiveSet | None = None
     ) -> None:
         """Prepare the launches for mujoco-warp's `m` and `d` of a `model` for which `why_not` and `ConstraintSolver.why_not`
         are empty. `randomized` names the arrays in which worlds differ; `active_set` holds the rows' states of the last step,
         if they have keys. Warp's current device must be that of `m` and `d`.
         """
         self.dynamics = SmoothDynamics(model, m, d, randomized)
-        self.solver = ConstraintSolver(model, m, d, damped=has_dampers(model, randomized), sides=sides)
+        self.solver = ConstraintSolver(model, m, d, damped=has_dampers(model, randomized), active_set=active_set)
         of = self.state = StateArrays()
         of.timestep, of.jnt_type, of.jnt_qposadr, of.jnt_dofadr = m.opt.timestep, m.jnt_type, m.jnt_qposadr, m.jnt_dofadr
         of.advance, of.qacc = self.solver.advance, d.qacc

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from legged.physics.fused.active_set import ROW_STATES
 from legged.physics.fused.native import Constant, native_source
-from legged.physics.fused.row_sides import SIDES
 from legged.physics.fused.solver_arrays import SolverArrays
 from legged.physics.fused.tree import Tree
 
@@ -43,7 +43,7 @@ def wide_constants(
     return {
         **{"WIDE": WIDE, "NV": nv, "ROWS": rows, "ENTRIES": len(lower), "DAMPED": damped, "FRICTION": friction},
         "KNOWN": known,
-        **SIDES,
+        **ROW_STATES,
         "COUPLED": bool(tree.constants()["SPLIT"]),
         "PATH_START": tuple(starts[:-1].tolist()),
         "PATH_LENGTH": tuple(map(len, paths)),

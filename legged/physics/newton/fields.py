@@ -19,7 +19,7 @@ from legged.physics.fields import DERIVED, FIELDS, GRAVITY, changed_arrays
 from legged.physics.newton.simulation import Simulation
 from legged.physics.randomized_model import RandomizedModel
 from legged.physics.scene import Scene
-from legged.physics.warp.redraws import Redraws, Variants
+from legged.physics.warp.randomize_kernels import Redraws, Variants
 
 MOTORS = ("motor_strength", "actuator_gain", "torque_limit")
 """Fields of the motors, which convert controls to torques outside the solver."""

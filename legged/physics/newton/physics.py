@@ -10,9 +10,9 @@ from torch import Tensor
 from legged.config.schema import SimConfig
 from legged.errors import suggest
 from legged.physics.fields import NEWTONS_FIELDS
-from legged.physics.newton.exchange import NewtonExchange
 from legged.physics.newton.fields import SolverFields
 from legged.physics.newton.simulation import Simulation
+from legged.physics.newton.state_io import NewtonStateIO
 from legged.physics.robot_state import robot_state
 from legged.physics.scene import RobotScene
 from legged.physics.warp.compile import compile_ahead
@@ -24,7 +24,7 @@ class NewtonPhysics(WarpPhysics):
     after every step, and written back by resets and pushes.
     """
 
-    _exchange: NewtonExchange
+    _state_io: NewtonStateIO
 
     def __init__(
         self,
@@ -59,15 +59,15 @@ class NewtonPhysics(WarpPhysics):
         with wp.ScopedDevice(self._wp_device):
             self._simulation = Simulation(robot, sim, num_envs, scene.terrain, self._wp_device)
             task = tuple(wp.from_torch(tensor) for tensor in (self.qpos, self.qvel, self.ctrl))
-            self._exchange = NewtonExchange(self._simulation, task, self.overflowed, self.model, robot, self.robot_state)
+            self._state_io = NewtonStateIO(self._simulation, task, self.overflowed, self.model, robot, self.robot_state)
             if set(randomized) - set(NEWTONS_FIELDS):
-                self._exchange.motors = self._solvers_fields()
+                self._state_io.motors = self._solvers_fields()
             if self.forces is not None:
                 self._simulation.push_with(self.forces, self.model)
-            self._exchange.read()
+            self._state_io.read()
             start = self.qpos.clone()
-        exchanges = (self._exchange.kinematics, self._exchange.contact_forces, self.kernels.name_module)
-        self.compiled = compile_ahead(self._wp_device, (self._step, self._put, self._forget, *exchanges))
+        launches = (self._state_io.kinematics, self._state_io.contact_forces, self.kernels.name_module)
+        self.compiled = compile_ahead(self._wp_device, (self._step, self._put, self._forget, *launches))
         if self._wp_device.is_cpu:
             self._advance = self._record_step()
         with wp.ScopedDevice(self._wp_device):  # restore the initial state after the trial launches
@@ -79,10 +79,10 @@ class NewtonPhysics(WarpPhysics):
         self.refresh()
 
     def _step(self) -> None:
-        self._exchange.apply_torques()
+        self._state_io.apply_torques()
         self._simulation.step(self.dt)
-        self._exchange.note_lost_contacts()
-        self._exchange.read()
+        self._state_io.note_lost_contacts()
+        self._state_io.read()
 
     def _forget(self) -> None:
         """Clear the solver's memory of earlier steps in the worlds of `_mask`."""
@@ -90,14 +90,14 @@ class NewtonPhysics(WarpPhysics):
 
     def _put(self) -> None:
         """Copy the task's state of the worlds of `_mask` to Newton's joints and bodies."""
-        self._exchange.put(self._wp_mask)
+        self._state_io.put(self._wp_mask)
         self._simulation.place_bodies(self._wp_mask)
 
     def write(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         with self._on_device():
             self._mask[:-1].copy_(mask)
             self._forget()
-            self._exchange.write(mask, qpos, qvel)
+            self._state_io.write(mask, qpos, qvel)
             self._put()
         if self.forces is not None:
             self.forces.masked_fill_(mask.view(-1, 1, 1), 0.0)
@@ -146,7 +146,7 @@ class NewtonPhysics(WarpPhysics):
     def _solvers_fields(self) -> SolverFields:
         """Return the arrays of the solver that fields change; create them on the first call."""
         if self._fields is None:
-            base_com, robot = self._exchange.base_com, self._scene
+            base_com, robot = self._state_io.base_com, self._scene
             self._fields = SolverFields(robot, self.model, self._simulation, base_com, self._randomized)
         return self._fields
 

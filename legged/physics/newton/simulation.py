@@ -15,7 +15,7 @@ from legged.physics.collider.terrain_contact import TerrainContact
 from legged.physics.newton.model import build_newton_model, uses_cell_collider
 from legged.physics.newton.solvers import SOLVERS
 from legged.physics.newton.springs import launch_spring_forces
-from legged.physics.warp.exchange import LOST
+from legged.physics.warp.state_io import LOST
 from legged.robots.robot import Robot
 from legged.robots.robot_model import FLOOR
 from legged.terrain import Terrain

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from legged.config.schema import SimConfig
 from legged.errors import ConfigError
+from legged.physics.collider.contact_pairs import DEFAULT_SOLREF, is_mixed
 from legged.physics.collider.terrain_contact import TerrainContact
-from legged.physics.collider.touches import DEFAULT_SOLREF, is_mixed
 from legged.physics.fields import DERIVED, FIELDS, GRAVITY, changed_arrays
 from legged.physics.fused.block_step import BlockStep
 from legged.physics.fused.constraint_solver import ConstraintSolver, ask_for_dense_rows
@@ -25,9 +25,9 @@ from legged.physics.randomized_model import RandomizedModel, keep_centres_apart
 from legged.physics.robot_state import DrivenJoints, robot_state
 from legged.physics.scene import Scene
 from legged.physics.warp.compile import compile_ahead
-from legged.physics.warp.exchange import MujocoWarpExchange, StateExchange, arrays_of
 from legged.physics.warp.physics import WarpPhysics
-from legged.physics.warp.redraws import Redraws, Variants
+from legged.physics.warp.randomize_kernels import Redraws, Variants
+from legged.physics.warp.state_io import MujocoWarpStateIO, StateIO, arrays_of
 from legged.process.cores import available_cores
 from legged.process.ranks import Ranks
 from legged.robots.robot_model import FLOOR, disabled_groups
@@ -130,16 +130,16 @@ class MujocoWarpPhysics(WarpPhysics):
             if only_blocks and (self._blocks is None or quantities):
                 raise NoBlocks(self._why_no_blocks(quantities))
             if scene.robot is None:
-                self._exchange = StateExchange(arrays_of(d), self.overflowed)
+                self._state_io = StateIO(arrays_of(d), self.overflowed)
             else:
                 self.robot_state = robot_state(self.qpos, self.qvel, scene.robot)
                 self._joints = DrivenJoints(self.qpos, self.qvel, self.robot_state, scene.robot)
                 slots = 0 if self._contacts is None else int(self._contacts.constants["SLOTS"])
                 of = (self.model, scene.robot, self.robot_state)
-                self._exchange = MujocoWarpExchange(self._m, d, self.overflowed, *of, slots)
-        exchanges = (self._exchange.kinematics, self._exchange.contact_forces, self.kernels.name_module)
+                self._state_io = MujocoWarpStateIO(self._m, d, self.overflowed, *of, slots)
+        launches = (self._state_io.kinematics, self._state_io.contact_forces, self.kernels.name_module)
         constants = (self._set_constants,) if any(FIELDS[name].derived for name in randomized) else ()
-        self.compiled = compile_ahead(self._wp_device, (self._step, self._update_quantities, *exchanges, *constants))
+        self.compiled = compile_ahead(self._wp_device, (self._step, self._update_quantities, *launches, *constants))
         self.library_step = self._library_step
         if self._blocks is not None:
             with self._on_device():
@@ -243,8 +243,8 @@ class MujocoWarpPhysics(WarpPhysics):
                 self.why_library = f"for contacts alone, {no_contacts}"
             else:
                 self._contacts = ContactStage(self.model, self._m, self._d, per_world, self._on_cells)
-            sides = None if self._contacts is None else self._contacts.sides
-            self._fused_step = TorqueStep(self.model, self._m, self._d, per_world, sides)
+            active_set = None if self._contacts is None else self._contacts.active_set
+            self._fused_step = TorqueStep(self.model, self._m, self._d, per_world, active_set)
             if self._contacts is not None and BlockStep.fits(self._fused_step):
                 self._blocks = BlockStep(self._fused_step, self._contacts, threads)
 
@@ -281,13 +281,13 @@ class MujocoWarpPhysics(WarpPhysics):
     def state_tensors(self) -> dict[str, Tensor]:
         own = {"act": wp.to_torch(self._d.act), "warmstart": wp.to_torch(self._d.qacc_warmstart)}
         if self._contacts is not None:
-            own["last_rows"] = wp.to_torch(self._contacts.sides.last)
+            own["last_rows"] = wp.to_torch(self._contacts.active_set.last)
         return {**super().state_tensors(), **own, **self._of_last_step()}
 
     def load_state(self, saved: Mapping[str, Tensor]) -> None:
         # the state comes from a version whose solver did not keep the active set
         if self._contacts is not None and "last_rows" not in saved:
-            saved = {**saved, "last_rows": torch.zeros_like(wp.to_torch(self._contacts.sides.last))}
+            saved = {**saved, "last_rows": torch.zeros_like(wp.to_torch(self._contacts.active_set.last))}
         super().load_state(saved)
 
     def randomize(self, field: str, values: Tensor) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from legged.graph.step_graph import Branch
 from legged.physics.base import Physics
 from legged.physics.robot_state import DrivenJoints
-from legged.physics.warp.exchange import StateExchange
+from legged.physics.warp.state_io import StateIO
 from legged.physics.warp.task_kernels import TaskKernels
 
 
@@ -28,7 +28,7 @@ class WarpPhysics(Physics):
 
     capturable = True
     kernels: TaskKernels
-    _exchange: StateExchange
+    _state_io: StateIO
     _joints: DrivenJoints | None = None
 
     def __init__(self, num_envs: int, dt: float, device: torch.device) -> None:
@@ -38,7 +38,7 @@ class WarpPhysics(Physics):
         self._wp_device = wp.device_from_torch(device)
         self.kernels = TaskKernels(self._on_device)
         self._forces_read = False
-        self._beside = Branch(device)
+        self._forces_stream = Branch(device)
         self._advance: Callable[[], Any] = self._step
 
     @abstractmethod
@@ -78,22 +78,22 @@ class WarpPhysics(Physics):
     def refresh(self) -> None:
         forces_read, self._forces_read = self._forces_read, True
         if not forces_read:  # read forces once per step, since a reset after that has cleared those of its worlds
-            with self._beside.fork(), self._on_device():
-                self._exchange.contact_forces()
+            with self._forces_stream.fork(), self._on_device():
+                self._state_io.contact_forces()
         with self._on_device():
             if self._joints is not None:
                 self._joints.read()
-            self._exchange.kinematics()
+            self._state_io.kinematics()
         if not forces_read:
-            self._beside.join()
+            self._forces_stream.join()
 
     def write(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         with self._on_device():
-            self._exchange.write(mask, qpos, qvel)
+            self._state_io.write(mask, qpos, qvel)
 
     def push(self, mask: Tensor, delta: Tensor) -> None:
         with self._on_device():
-            self._exchange.push(mask, delta, self.qvel)
+            self._state_io.push(mask, delta, self.qvel)
 
     def state_tensors(self) -> dict[str, Tensor]:
         state = {"qpos": self.qpos, "qvel": self.qvel}

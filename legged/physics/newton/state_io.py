@@ -15,7 +15,7 @@ import warp as wp
 from legged.physics.newton.fields import SolverFields
 from legged.physics.newton.simulation import Simulation
 from legged.physics.robot_state import RobotState
-from legged.physics.warp.exchange import EngineArrays, RobotExchange, rotate, rotate_inverse
+from legged.physics.warp.state_io import EngineArrays, RobotStateIO, rotate, rotate_inverse
 from legged.robots.robot import Robot
 
 
@@ -147,7 +147,7 @@ def take_flags(flags: wp.array[Any], lost: int, overflow: wp.array[int]):
     flags[world] = flags.dtype(0)
 
 
-class NewtonExchange(RobotExchange):
+class NewtonStateIO(RobotStateIO):
     """Launches of the kernels above on the fixed arrays of a simulation and of the task."""
 
     def __init__(

@@ -15,9 +15,9 @@ import numpy as np
 import warp as wp
 
 from legged.errors import ConfigError
+from legged.physics.collider.contact_pairs import kind_of
 from legged.physics.collider.ground import NOTHING, Ground, Hits, around_point, between_ends, cell_of, surface
 from legged.physics.collider.shapes import rim_point
-from legged.physics.collider.touches import kind_of
 
 AT, BETWEEN, RIM, DISC = (wp.constant(k) for k in range(4))
 """Kinds of features. AT: a sphere at `start`. BETWEEN: the segment between `start` and `end`, without its ends. RIM: the
@@ -30,7 +30,7 @@ cylinder."""
 
 
 @dataclass(frozen=True)
-class Probe:
+class ContactFeature:
     """Part of a geom that is tested against the height map, in the geom's frame [m]."""
 
     geom: int
@@ -51,7 +51,7 @@ class Probe:
         return float(np.linalg.norm(self.end - self.start)) if self.kind == BETWEEN else 0.0
 
 
-def probes_of(model: mujoco.MjModel, shapes: Iterable[int]) -> Iterator[Probe]:
+def contact_features(model: mujoco.MjModel, shapes: Iterable[int]) -> Iterator[ContactFeature]:
     """Yield the contact features of the geoms `shapes`.
 
     Raises:
@@ -62,20 +62,20 @@ def probes_of(model: mujoco.MjModel, shapes: Iterable[int]) -> Iterator[Probe]:
         kind, size = model.geom_type[i], model.geom_size[i]
         centre, end = np.zeros(3), np.array([0.0, 0.0, size[1]])
         if kind == kinds.mjGEOM_SPHERE:
-            yield Probe(i, AT, centre, centre, size[0])
+            yield ContactFeature(i, AT, centre, centre, size[0])
         elif kind == kinds.mjGEOM_CAPSULE:
-            yield Probe(i, AT, -end, -end, size[0])
-            yield Probe(i, AT, end, end, size[0])
-            yield Probe(i, BETWEEN, -end, end, size[0])
+            yield ContactFeature(i, AT, -end, -end, size[0])
+            yield ContactFeature(i, AT, end, end, size[0])
+            yield ContactFeature(i, BETWEEN, -end, end, size[0])
         elif kind == kinds.mjGEOM_BOX:
             for signs in product((-1.0, 1.0), repeat=3):
-                yield Probe(i, AT, size * signs, size * signs, 0.0)
+                yield ContactFeature(i, AT, size * signs, size * signs, 0.0)
         elif kind == kinds.mjGEOM_CYLINDER:
             for k in range(4):
-                yield Probe(i, RIM, np.array([size[0], size[1], 0.0]), np.array([float(k), 0.0, 0.0]), 0.0)
+                yield ContactFeature(i, RIM, np.array([size[0], size[1], 0.0]), np.array([float(k), 0.0, 0.0]), 0.0)
             for centre in (-end, end):
-                yield Probe(i, DISC, centre, np.array([size[0], 0.0, 0.0]), 0.0)
-            yield Probe(i, BETWEEN, -end, end, size[0])
+                yield ContactFeature(i, DISC, centre, np.array([size[0], 0.0, 0.0]), 0.0)
+            yield ContactFeature(i, BETWEEN, -end, end, size[0])
         else:
             raise ConfigError(
                 f"terrain: shape '{model.geom(i).name}' is of type {kind_of(model, i)}; sim.terrain_collider=cells knows"
@@ -121,7 +121,7 @@ def around_disc(ground: Ground, centre: wp.vec3, axis: wp.vec3, radius: float, m
 
 
 @wp.func
-def look(
+def find_hits(
     ground: Ground,
     kind: int,
     position: wp.vec3,

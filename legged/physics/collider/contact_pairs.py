@@ -25,7 +25,7 @@ LEAST_FRICTION, LEAST, GREATEST, TINY = mujoco.mjMINMU, mujoco.mjMINIMP, mujoco.
 
 
 @dataclass(frozen=True)
-class Touch:
+class ContactPair:
     """Contact parameters of two shapes that may touch."""
 
     geoms: tuple[int, int]
@@ -43,7 +43,7 @@ class Touch:
     solimp: np.ndarray
 
 
-def touch_of(model: mujoco.MjModel, first: int, second: int, pair: int = -1) -> Touch:
+def contact_pair(model: mujoco.MjModel, first: int, second: int, pair: int = -1) -> ContactPair:
     """Return the contact parameters of two geoms, as MuJoCo combines them, or those of the explicit contact pair with index
     `pair`.
 
@@ -54,7 +54,7 @@ def touch_of(model: mujoco.MjModel, first: int, second: int, pair: int = -1) -> 
         friction = np.maximum(model.pair_friction[pair], LEAST_FRICTION)
         own = (model.pair_solref[pair], model.pair_solreffriction[pair], model.pair_solimp[pair])
         margin = float(model.pair_margin[pair])
-        return Touch((first, second), margin, int(model.pair_dim[pair]), (-1, -1), friction, *own)
+        return ContactPair((first, second), margin, int(model.pair_dim[pair]), (-1, -1), friction, *own)
     both = [first, second]
     priority, mixes = model.geom_priority[both], model.geom_solmix[both]
     dim = int(model.geom_condim[both].max())
@@ -69,7 +69,9 @@ def touch_of(model: mujoco.MjModel, first: int, second: int, pair: int = -1) -> 
     alike = priority[0] != priority[1] or (solref[:, 0] > 0.0).all()  # only one shape counts, or both have time constants
     mixed = weights @ solref if alike else solref.min(axis=0)
     margin = float(model.geom_margin[both].sum())
-    return Touch((first, second), margin, dim, rough, np.zeros(5), mixed, np.zeros(2), weights @ model.geom_solimp[both])
+    return ContactPair(
+        (first, second), margin, dim, rough, np.zeros(5), mixed, np.zeros(2), weights @ model.geom_solimp[both]
+    )
 
 
 def spring_of(solref: np.ndarray, solimp: np.ndarray, timestep: float, safe: bool) -> np.ndarray:

@@ -15,12 +15,12 @@ import warp as wp
 UNKNOWN, SLIPPING_BACK, SLIPPING, IDLE, HOLDING = -3, -2, -1, 0, 1
 """States of rows: unknown; slipping backwards or forwards, with the greatest dry friction; idle, without force; holding, with
 the force of a spring. The state of a row is stored as 4 * key + state + 2."""
-SIDES = {"UNKNOWN": UNKNOWN, "SLIPPING_BACK": SLIPPING_BACK, "SLIPPING": SLIPPING, "IDLE": IDLE, "HOLDING": HOLDING}
+ROW_STATES = {"UNKNOWN": UNKNOWN, "SLIPPING_BACK": SLIPPING_BACK, "SLIPPING": SLIPPING, "IDLE": IDLE, "HOLDING": HOLDING}
 """Names of the states in native sources."""
 
 
 @dataclass(frozen=True)
-class RowSides:
+class ActiveSet:
     """Arrays of all worlds, on Warp's current device at construction."""
 
     key: wp.array
@@ -29,6 +29,6 @@ class RowSides:
     """(N, 1 + rows) number of rows in the last step, followed by their stored states in the same order."""
 
     @classmethod
-    def of(cls, d: Any) -> "RowSides":
+    def of(cls, d: Any) -> "ActiveSet":
         """Return the active set for mujoco-warp's data `d`, with unknown states."""
         return cls(wp.zeros((d.nworld, d.njmax), dtype=int), wp.zeros((d.nworld, 1 + d.njmax), dtype=int))

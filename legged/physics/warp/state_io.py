@@ -160,7 +160,7 @@ class EngineArrays:
     """Bits of `overflow` that mean that contacts or constraint rows were dropped."""
 
 
-class StateExchange:
+class StateIO:
     """Launches of the kernels that write states and read kinematics, on fixed arrays, so that a graph can capture them."""
 
     def __init__(self, arrays: EngineArrays, overflowed: torch.Tensor) -> None:
@@ -196,7 +196,7 @@ class StateExchange:
         """Read the contact forces of tracked shapes from the last step. Does nothing without a robot."""
 
 
-class RobotExchange(StateExchange, ABC):
+class RobotStateIO(StateIO, ABC):
     """Launches for a robot with a floating base and feet."""
 
     def __init__(
@@ -233,7 +233,7 @@ class RobotExchange(StateExchange, ABC):
     def contact_forces(self) -> None: ...
 
 
-class MujocoWarpExchange(RobotExchange):
+class MujocoWarpStateIO(RobotStateIO):
     """Launches for a robot in mujoco-warp, with its contact forces."""
 
     def __init__(
