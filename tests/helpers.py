@@ -17,7 +17,7 @@ from tensordict import TensorDict
 from legged.config import TaskConfig
 from legged.envs import LeggedRobot
 from legged.registry import make_task, task_config
-from legged.tools import train
+from legged.cli import train
 
 TASK = "anymal_c_flat"
 JOINTS = 12

@@ -183,8 +183,8 @@ def watch_command(args: argparse.Namespace, folder: Path) -> str:
 
 def given_import(args: argparse.Namespace) -> list[str]:
     """Return the option by which another command finds the user-defined tasks of this one."""
-    module = args.module or args.task_file
-    return ["--import", module] if module else []
+    files = [file for file in (args.module, args.task_file) if file]
+    return ["--import", ",".join(files)] if files else []
 
 
 def register_given(args: argparse.Namespace, name: str) -> None:

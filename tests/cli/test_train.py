@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from legged.tools.train import describe
+from legged.cli.train import describe
 
 from legged.registry import task_config
 
