@@ -10,13 +10,13 @@ import yaml
 from helpers import call, small_task
 from simulated_motor import TRUTH, simulated_log
 
+from legged.cli import fit_actuator
 from legged.config import load_config
 from legged.errors import ConfigError
 from legged.fitting.log import check_alike, read_log
 from legged.fitting.parametric import SMOOTHING, Drive, delayed, fit_drive
 from legged.mdp.actuator import Friction, MotorCurve
 from legged.mdp.actuator_network import NetworkWeights
-from legged.cli import fit_actuator
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

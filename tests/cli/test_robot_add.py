@@ -12,13 +12,13 @@ import yaml
 from helpers import ENGINE, call
 from importing_fixtures import URDF_LEG, urdf
 
+from legged.cli.robot import add
 from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError
 from legged.registry import make_task, register_file, task_config
 from legged.robots.importing.folder import Guesses, _compact, robot_yaml, task_yaml
 from legged.robots.importing.tree import Tree
 from legged.robots.robot import load_robot
-from legged.cli.robot import add
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

@@ -9,8 +9,8 @@ import yaml
 from helpers import call
 from importing_fixtures import URDF_LEG, urdf
 
-from legged.robots.robot import load_robot
 from legged.cli.robot import add
+from legged.robots.robot import load_robot
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

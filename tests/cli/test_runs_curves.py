@@ -6,9 +6,9 @@ import yaml
 from PIL import Image
 from torch.utils.tensorboard import SummaryWriter
 
+from legged.cli.runs import curves
 from legged.errors import ConfigError
 from legged.evaluation import learning_curves
-from legged.cli.runs import curves
 
 
 def write_run(folder, levels):
@@ -123,13 +123,14 @@ def test_wrong_input_is_one_line(tmp_path, capsys):
     write_run(tmp_path / "run", 1.0)
     (tmp_path / "bad").mkdir()
     (tmp_path / "bad" / "events.out.tfevents.1").write_text("garbage")
-    (tmp_path / "quiet").mkdir()
+    for name in ("quiet", "empty"):
+        (tmp_path / name).mkdir()
     for name in ("run", "bad", "quiet"):
         write_config(tmp_path / name)
     for arguments, words in (
         ([tmp_path / "run", "--out", tmp_path / "run" / "config.yaml"], "config.yaml"),
         ([tmp_path / "none"], f"RUN: there is no task and no run '{tmp_path / 'none'}'"),
-        ([tmp_path], "RUN: "),
+        ([tmp_path / "empty"], f"RUN: '{tmp_path / 'empty'}' holds no run"),
         ([tmp_path / "quiet"], "quiet: holds no TensorBoard file"),
         ([tmp_path / "bad"], "bad: its TensorBoard file holds no values"),
     ):

@@ -5,8 +5,8 @@ import warnings
 
 import pytest
 from helpers import call
-from legged.cli.runs.evaluations import main
 
+from legged.cli.runs.evaluations import main
 from legged.evaluation.comparison import grouped, shares, spread
 
 RULE = {"distance_m": 4.0, "time_s": 20.0, "vx": 0.75}

@@ -309,7 +309,9 @@ def test_a_run_of_somebodys_own_task_says_how_it_is_found_again(forgotten, capsy
     assert f"There is no task 'mine' here to compare with, and `{command}`" in text
     assert "| `rewards.scales.torques` | `-0.0003` |" in text
     assert table.main(["--out", "all"]) == 0
-    assert "sim.physics mujoco, sim.threads 1, runner.num_steps_per_env 4" in read(Path("all"), "experiments.md").replace("\\", "")
+    assert "sim.physics mujoco, sim.threads 1, runner.num_steps_per_env 4" in read(Path("all"), "experiments.md").replace(
+        "\\", ""
+    )
     assert report.main(["--import", "my own.d/mine.yaml", str(folder)]) == 0
     assert "| `rewards.scales.torques` | `-0.0003` | `-1.0e-05` |" in read(folder, "report.md")
     capsys.readouterr()

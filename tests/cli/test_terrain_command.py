@@ -6,10 +6,10 @@ import pytest
 from helpers import TASK, call
 from PIL import Image
 
+from legged.cli import terrain as command
 from legged.config.schema import TerrainConfig
 from legged.rendering.paint import HIGH, LOW, MIDDLE, add_painted_terrain, color
 from legged.terrain import Terrain, TileSpec
-from legged.cli import terrain as command
 
 
 @pytest.fixture(scope="module")
