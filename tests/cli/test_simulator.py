@@ -258,7 +258,7 @@ STAIRS = """
 def test_the_program_walks_up_stairs_in_another_process(tmp_path):
     """The shipped policy that needs no more than a robot measures: 50 Hz, of which cycles none was late, 1 % of packets lost,
     up 0.1 m steps in C MuJoCo at 2 ms, with motors that are 10 ms late and rub. What a cycle takes is not judged here: other
-    tests share the cores. What the program logged is what `legged fit-actuator` reads, and it finds the friction and the delay.
+    tests share the cores. `legged fit-actuator` reads what the program logged, and finds the friction and the delay.
     """
     (tmp_path / "walk.txt").write_text(STAIRS)
     command = [sys.executable, "-m", "legged", "deploy", "sim", "anymal_c_proprio"]

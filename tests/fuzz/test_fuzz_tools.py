@@ -87,7 +87,7 @@ def test_curves_of_damaged_events(data, out, trained, run, in_new_folder):
 
 
 COMMON = {"--num-envs": SMALL_NUMBERS, "--seed": SMALL_NUMBERS}
-NAMED = {"--load-run": WORDS, "--experiment-name": WORDS}
+NAMED = {"--checkpoint": SMALL_NUMBERS, "--load-run": WORDS, "--experiment-name": WORDS}
 COMMANDS = {
     "evaluate grid": (
         grid.main,
