@@ -8,13 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import POLICY
-
-from legged import registry
-from legged.registry import import_tasks, make_task, task_config
 from legged.tools import (
     benchmark,
     compare,
-    contact_sheet,
     episodes,
     evaluate,
     experiments,
@@ -24,8 +20,10 @@ from legged.tools import (
     show_terrain,
     train,
     warmup,
-    zoo,
 )
+
+from legged import registry
+from legged.registry import import_tasks, make_task, task_config
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {path: path.read_text(encoding="utf-8") for path in (*ROOT.glob("*.md"), *sorted((ROOT / "docs").glob("*.md")))}
@@ -85,8 +83,6 @@ def test_the_readme_names_every_task():
         ("python -m legged.tools.plot", plot.main),
         ("python -m legged.tools.warmup", warmup.main),
         ("python -m legged.tools.show_terrain", show_terrain.main),
-        ("python -m legged.tools.zoo", zoo.main),
-        ("python -m legged.tools.contact_sheet", contact_sheet.main),
         ("python -m legged.tools.report", report.main),
         ("python -m legged.tools.experiments", experiments.main),
     ],

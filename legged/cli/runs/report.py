@@ -17,7 +17,7 @@ from legged.errors import ConfigError, RunError
 from legged.evaluation.reports.record import FILMS, read_record
 from legged.evaluation.reports.run_report import command_on, write_report
 from legged.learning.run_folder import NOTE_FILE, find_checkpoint, own_run, run_config
-from legged.play.contact_sheet import film, sheet, write_sheet
+from legged.play.walking_film import film, write_film
 from legged.policies.restore import TrainedPolicy
 from legged.process.command_parser import CommandParser, add_import_argument
 from legged.process.paths import ready_to_write, relative, write_text
@@ -89,7 +89,7 @@ def _film(folder: Path, checkpoint: int | str | None) -> str:
             return f"'{cfg.task}' has no velocity commands; {command} --gif makes one"
         torch.set_num_threads(1)
         policy = TrainedPolicy(cfg, find_checkpoint(folder, checkpoint))
-        write_sheet(sheet([film(policy, SIDE)], [cfg.task]), folder / FILMS[0])
+        write_film(film(policy, SIDE), folder / FILMS[0])
     except (ConfigError, RunError) as error:
         return " ".join(str(error).split())
     return ""

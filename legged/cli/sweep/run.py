@@ -23,12 +23,12 @@ from legged.process.cores import available_cores
 from legged.process.paths import ready_to_write, relative
 from legged.process.ranks import Ranks
 from legged.process.repeating import repeating
+from legged.process.worker_pool import Job, Kind, WorkerPool, why_failed
 from legged.registry import import_tasks
 from legged.sweeping.plan import Plan, plan_sweep, read_sweep, sweep_file
 from legged.sweeping.report import write_report
 from legged.sweeping.study import WHY, Trials, check_installed, finished
 from legged.sweeping.worker import Worker
-from legged.tools.campaign.crew import Crew, Job, Kind, why_failed
 
 TELL_S = 1.0
 """What other processes have done is looked at so often [s]."""
@@ -124,7 +124,7 @@ def _main(argv: list[str] | None) -> int:
         worker = Worker(plan, trials, _flags(args, names[0], on_cpu, jobs))
         stopped_by = worker.run()
     else:
-        stopped_by = _crew(args, trials, sweep_file(args.file), names, jobs)
+        stopped_by = _pool(args, trials, sweep_file(args.file), names, jobs)
     print(*write_report(trials, args.module), sep="\n")
     if stopped_by:
         return 128 + stopped_by[0]
@@ -144,11 +144,11 @@ def _flags(args: argparse.Namespace, device: str, on_cpu: bool, jobs: int) -> li
     return [*flags, f"sim.threads={max(1, available_cores() // jobs)}"] if on_cpu and jobs > 1 else flags
 
 
-def _crew(args: argparse.Namespace, trials: Trials, path: Path, devices: list[str], jobs: int) -> list[int]:
+def _pool(args: argparse.Namespace, trials: Trials, path: Path, devices: list[str], jobs: int) -> list[int]:
     """Let several processes make trials; return the signals that ended them early."""
     plan = trials.plan
     start, starts = time.perf_counter(), [0] * jobs
-    crew = Crew({Kind.TRAINING: jobs}, ())
+    pool = WorkerPool({Kind.TRAINING: jobs}, ())
 
     def job(number: int) -> Job:
         starts[number] += 1
@@ -161,15 +161,15 @@ def _crew(args: argparse.Namespace, trials: Trials, path: Path, devices: list[st
         )
 
     def done(number: int, ended: Job, code: int) -> list[Job]:
-        if code == 0 or crew.stopped:
+        if code == 0 or pool.stopped:
             return []
         say = f"{time.perf_counter() - start:7.1f} s  process {number} has ended: {why_failed(ended, code)}"
         again = code < 0 and starts[number] < MOST_STARTS
         print(f"{say}; {'another takes its place' if again else relative(ended.output)}", flush=True)
         return [job(number)] if again else []
 
-    with stopping_on_signals(crew.stop) as stopped_by, repeating(_teller(trials, start), TELL_S, at_end=True):
-        crew.run([job(number) for number in range(jobs)])
+    with stopping_on_signals(pool.stop) as stopped_by, repeating(_teller(trials, start), TELL_S, at_end=True):
+        pool.run([job(number) for number in range(jobs)])
     return stopped_by
 
 

@@ -1,4 +1,4 @@
-"""Processes side by side: as many of each kind as there is room for."""
+"""A pool of processes that run side by side, with a limit for each kind of work."""
 
 import os
 import signal
@@ -16,13 +16,13 @@ from legged.process.startup import STAGES_FILE
 
 POLL_S = 0.05
 PATIENCE_S = 10.0
-"""A process that was told to end at once has so long for it [s]."""
+"""Time that a process has to end after a signal [s]."""
 BUILT = "step captured"
-"""The stage with which the start-up of a training ends, as far as it keeps cores busy."""
+"""Last stage of a training's start-up that keeps the cores busy."""
 
 
 class Kind(Enum):
-    """What a process needs for itself."""
+    """Resource that a process needs."""
 
     TRAINING = "training"
     ON_GPU = "evaluation on the GPU"
@@ -31,30 +31,30 @@ class Kind(Enum):
 
 @dataclass(eq=False)
 class Job:
-    """A process to be run."""
+    """A process that the pool will run."""
 
     kind: Kind
     command: list[str]
     output: Path
-    """File for what it prints."""
+    """File for its standard output and errors."""
     done: Callable[["Job", int], Iterable["Job"]]
-    """Called with its exit code when it has ended; gives the jobs that follow from it."""
+    """Function that is called with the job and its exit code, and returns the jobs that follow."""
     told: bool = False
-    """Whether it was asked to end."""
+    """True after the pool has asked the process to end."""
     process: subprocess.Popen[bytes] | None = field(default=None, repr=False)
 
     @property
     def stages(self) -> Path:
-        """The file that is told when the stages of its start have ended."""
+        """File that lists the finished stages of its start-up."""
         return self.output.with_suffix(".stages")
 
     @property
     def starting(self) -> bool:
-        """Whether it still imports and builds."""
+        """True while the process imports modules and builds its task."""
         return not (self.stages.is_file() and BUILT in self.stages.read_text(encoding="utf-8"))
 
     def start(self) -> None:
-        """Start the process, in a session of its own: Ctrl-C reaches it through us alone."""
+        """Start the process in its own process group, so that Ctrl-C reaches it only through the pool."""
         make_folder(self.output.parent)
         self.stages.unlink(missing_ok=True)
         environment = child_environment() | {STAGES_FILE: str(self.stages)}
@@ -69,23 +69,22 @@ class Job:
             )
 
 
-class Crew:
-    """Runs jobs until none is left. One that fails ends nothing but itself.
+class WorkerPool:
+    """Runs jobs until the queue is empty. A job that fails does not end the others.
 
-    Trainings begin in the order in which they come, each as soon as the one before it has been built: so the start-up of one
-    falls into the training of another, and the same kernels are not compiled twice. With room for one training, each is
-    alone on the device that trains: what else needs that device waits until all have ended.
+    Trainings start in the order of the queue. Each starts when the one before it has built its task, so that start-up
+    overlaps with training and no kernel is compiled twice. Jobs of a kind in `shared` wait until every training has ended.
     """
 
     def __init__(self, room: dict[Kind, int], shared: tuple[Kind, ...]) -> None:
-        """`room` says how many of each kind run at once; `shared` are the kinds that wait until no training is left."""
+        """Take the number of jobs of each kind that run at once, and the kinds that wait for all trainings."""
         self.room, self.shared = room, shared
         self.waiting: list[Job] = []
         self.running: list[Job] = []
         self.stopped = False
 
     def run(self, jobs: Iterable[Job]) -> None:
-        """Run jobs and all that follow from them. After `stop` no other is started, and those that run may end."""
+        """Run jobs and the jobs that follow from them. After `stop`, wait for running jobs only."""
         self.waiting += jobs
         try:
             while self.running or (self.waiting and not self.stopped):
@@ -109,7 +108,7 @@ class Crew:
             self._end_at_once()
 
     def stop(self) -> None:
-        """Start no other job, and ask those that run to end; a training leaves a checkpoint. A signal may call this."""
+        """Start no more jobs and ask the running ones to end. A signal handler may call this."""
         self.stopped = True
 
     def _may_start(self, job: Job) -> bool:
@@ -122,7 +121,7 @@ class Crew:
         return not (job.kind in self.shared and trainings)
 
     def _end_at_once(self) -> None:
-        """End what still runs, because this process has to go."""
+        """End all running jobs before this process ends."""
         for number in (signal.SIGTERM, signal.SIGTERM, signal.SIGKILL):
             for job in self.running:
                 _tell(job, number)
@@ -133,14 +132,14 @@ class Crew:
 
 
 def _tell(job: Job, number: int) -> None:
-    """Send a signal to a job and to what it has started."""
+    """Send a signal to a job and to its child processes."""
     if job.process is not None and job.process.poll() is None:
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(job.process.pid, number)
 
 
 def why_failed(job: Job, code: int) -> str:
-    """Say in a line why a job failed: in its own words, else how it ended."""
+    """Return one line on why a job failed: its own error message, else its signal or exit code."""
     try:
         lines = [line for line in job.output.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     except OSError:

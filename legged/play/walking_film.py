@@ -1,13 +1,12 @@
-"""Many robots in one picture, each walking in a tile of its own with its name below."""
+"""A film of a policy that walks straight ahead, and the GIF or PNG of it."""
 
-from collections.abc import Iterator, Sequence
-from math import ceil, sqrt
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 from legged.config import LeggedConfig, override
 from legged.envs import LeggedRobot
@@ -17,34 +16,34 @@ from legged.policies.actor import Actor
 from legged.policies.restore import TrainedPolicy, restore, undisturbed
 from legged.process.paths import make_folder, relative, replacing
 from legged.rendering import RobotsCamera
-from legged.rendering.text import INK
 
 FPS = 12.5
-"""Pictures a second: a GIF counts time in hundredths of one."""
+"""Pictures per second; the duration of one, in hundredths of a second, must be whole in a GIF."""
 FILM_S, WARM_UP_S = 4.0, 2.0
-"""Length of the film, and how long a robot walks before it [s]."""
+"""Length of the film, and of the walk before it [s]."""
 SPEED = 0.6
-"""Velocity asked for, as a share of the fastest that was trained, straight ahead."""
+"""Commanded forward velocity as a share of the largest trained one."""
 FILL, GLIDE = 0.82, 0.5
-"""Share of a tile that a robot fills in its default pose, and of the way to it that the camera makes up in a picture."""
+"""Share of a picture that the robot fills in its default pose; share of the gap that the camera closes per picture."""
 SHARP = 2
-"""Pictures are drawn so many times larger than they are shown: there is no other smoothing of edges."""
+"""Pictures are rendered this many times larger, and scaled down to smooth edges."""
 MOST_BYTES = 2_000_000
-"""Of a GIF, which has fewer colours and is smaller the more tiles there are."""
+"""Size limit of a GIF."""
 SMALLER: tuple[tuple[int, float], ...] = (
     *((96, 1.0), (64, 1.0), (48, 1.0), (48, 0.92), (48, 0.84), (48, 0.76)),
     *((40, 0.7), (40, 0.6), (32, 0.5), (24, 0.4), (16, 0.3)),
 )
-"""Colours and size of what is tried, one after the other."""
-PAPER = (255, 255, 255)
+"""Colours and scale of a GIF, tried in this order until it is small enough."""
 
-Tile = list[np.ndarray]
-"""Pictures of a robot, (height, width, 3) uint8 each."""
+Film = list[np.ndarray]
+"""Pictures, each (height, width, 3) uint8."""
 
 
-def film(policy: TrainedPolicy, side: int) -> Tile:
-    """Let a robot walk straight ahead, on the type of ground that it saw most of in training, in C MuJoCo on the CPU; return
-    pictures of `side` x `side` pixels.
+def film(policy: TrainedPolicy, side: int) -> Film:
+    """Let a robot walk straight ahead in C MuJoCo on the CPU, on its most frequent terrain type of training.
+
+    Returns:
+        Pictures of `side` x `side` pixels.
 
     Raises:
         ConfigError: the policy follows no commands, or does not fit its task.
@@ -61,10 +60,10 @@ def film(policy: TrainedPolicy, side: int) -> Tile:
 
 
 def walker(policy: TrainedPolicy, where: str = "") -> LeggedConfig:
-    """Return the configuration of a policy that can be asked to walk; `where` is how an error begins.
+    """Return the configuration of a policy that follows velocity commands; `where` is the beginning of an error.
 
     Raises:
-        ConfigError: it follows no commands.
+        ConfigError: the policy follows no commands.
     """
     if not isinstance(policy.cfg, LeggedConfig):
         raise ConfigError(f"{where}'{policy.cfg.task}' follows no commands: there is no way to ask it to walk")
@@ -111,33 +110,11 @@ def _shown(picture: np.ndarray, side: int) -> np.ndarray:
     return np.asarray(Image.fromarray(picture).resize((side, side), Image.Resampling.LANCZOS))
 
 
-def sheet(tiles: Sequence[Tile], names: Sequence[str], columns: int | None = None) -> Tile:
-    """Put films side by side, each with its name below; return the pictures of all. Without `columns` the sheet is about
-    twice as wide as it is high.
-    """
-    columns = min(len(tiles), columns or ceil(sqrt(2 * len(tiles))))
-    rows = ceil(len(tiles) / columns)
-    side = tiles[0][0].shape[0]
-    font = ImageFont.load_default(size=max(10, side // 12))
-    step = side + max(14, side // 8)
-    pictures = []
-    for k in range(min(map(len, tiles))):
-        picture = Image.new("RGB", (columns * side, rows * step), PAPER)
-        draw = ImageDraw.Draw(picture)
-        for i, (tile, name) in enumerate(zip(tiles, names, strict=True)):
-            x, y = i % columns * side, i // columns * step
-            picture.paste(Image.fromarray(tile[k]), (x, y))
-            draw.text((x + side // 2, y + (side + step) // 2), name, fill=INK, font=font, anchor="mm")
-        pictures.append(np.asarray(picture))
-    return pictures
-
-
-def write_sheet(pictures: Tile, path: Path) -> str:
-    """Write a film as a GIF of at most MOST_BYTES, or the picture in its middle as a PNG, whichever the name ends with; say
-    in a line what it is.
+def write_film(pictures: Film, path: Path) -> str:
+    """Write a GIF of at most MOST_BYTES, or the film's middle picture if the name ends with .png; return a line on the file.
 
     Raises:
-        RunError: it can't be written, or would be larger however small it is drawn.
+        RunError: the file can't be written, or the GIF is too large at the smallest scale.
     """
     make_folder(path.parent)
     if path.suffix == ".png":
@@ -151,10 +128,10 @@ def write_sheet(pictures: Tile, path: Path) -> str:
             shown = f"{size[1]} x {size[2]} pixels, {colors} colours"
             return f"written: {relative(path)}, {size[0] / 1e6:.2f} MB, {len(pictures)} pictures of {shown}"
     path.unlink(missing_ok=True)
-    raise RunError(f"{relative(path)}: would be larger than {MOST_BYTES / 1e6:g} MB; show fewer robots, or smaller ones")
+    raise RunError(f"{relative(path)}: would be larger than {MOST_BYTES / 1e6:g} MB; make its pictures smaller")
 
 
-def _write_gif(pictures: Tile, path: Path, colors: int, scale: float) -> tuple[int, int, int]:
+def _write_gif(pictures: Film, path: Path, colors: int, scale: float) -> tuple[int, int, int]:
     """Write pictures in that many colours, which all of them share, and at that scale; return bytes, width and height."""
     height, width = (round(scale * length) for length in pictures[0].shape[:2])
     small = [Image.fromarray(picture).resize((width, height), Image.Resampling.LANCZOS) for picture in pictures]

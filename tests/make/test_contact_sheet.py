@@ -1,21 +1,18 @@
-"""Many robots in one picture: where tiles and names are, how large a file may be, and that a robot fills its tile."""
+"""docs/make/contact_sheet.py: tiles and names, and wrong input."""
 
-from itertools import pairwise, product
 from pathlib import Path
 
+import contact_sheet
 import numpy as np
 import pytest
-from helpers import POLICY, TASK, call, small_config, small_task
+from contact_sheet import sheet
+from helpers import POLICY, TASK, call, small_config
 from PIL import Image
 
 from legged import registry
-from legged.errors import RunError
-from legged.play import contact_sheet as sheets
-from legged.play.contact_sheet import film, sheet, walker, write_sheet
+from legged.play.walking_film import walker
 from legged.policies.restore import TrainedPolicy, policy_of
 from legged.registry import task_config
-from legged.rendering import RobotsCamera
-from legged.tools import contact_sheet
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -24,10 +21,6 @@ RED, GREEN, BLUE = (200, 30, 30), (30, 200, 30), (30, 30, 200)
 
 def plain(color, side=32, count=3):
     return [np.full((side, side, 3), color, dtype=np.uint8)] * count
-
-
-def noise(side=64, count=4):
-    return list(np.random.default_rng(0).integers(0, 255, (count, side, side, 3), dtype=np.uint8))
 
 
 def test_tiles_are_side_by_side_with_their_names_below():
@@ -47,70 +40,6 @@ def test_tiles_are_side_by_side_with_their_names_below():
 def test_a_sheet_is_about_twice_as_wide_as_high(count, shape):
     (picture,) = sheet([plain(RED, count=1)] * count, ["x"] * count)
     assert picture.shape[:2] == (46 * shape[0], 32 * shape[1])
-
-
-def test_a_png_is_the_picture_in_the_middle():
-    pictures = noise(count=5)
-    said = write_sheet(pictures, Path("new/sheet.png"))
-    assert np.array_equal(np.asarray(Image.open("new/sheet.png")), pictures[2])
-    assert said.startswith("written: new/sheet.png, 0.0")
-
-
-def test_a_gif_shows_all_in_real_time_and_is_made_smaller_until_it_is_small_enough(monkeypatch):
-    pictures = noise()
-    write_sheet(pictures, Path("large.gif"))
-    with Image.open("large.gif") as image:
-        assert (image.n_frames, image.size, image.info["duration"]) == (4, (64, 64), 80)
-    monkeypatch.setattr(sheets, "MOST_BYTES", 4000)
-    said = write_sheet(pictures, Path("small.gif"))
-    assert Path("small.gif").stat().st_size <= 4000
-    with Image.open("small.gif") as image:
-        assert image.n_frames == 4
-        assert image.size[0] < 64
-        assert f"4 pictures of {image.size[0]} x {image.size[1]} pixels" in said
-    monkeypatch.setattr(sheets, "MOST_BYTES", 100)
-    with pytest.raises(RunError, match=r"none.gif: would be larger than 0.0001 MB"):
-        write_sheet(pictures, Path("none.gif"))
-    assert not Path("none.gif").exists()
-
-
-def test_a_colour_that_is_rarely_there_keeps():
-    grey = np.random.default_rng(0).integers(120, 240, (200, 200, 1), dtype=np.uint8).repeat(3, axis=2)
-    grey[90:100, 90:100] = (240, 200, 10)  # a quarter of a percent
-    write_sheet([grey], Path("a.gif"))
-    with Image.open("a.gif") as image:
-        shown = np.asarray(image.convert("RGB"))[95, 95].astype(int)
-    assert abs(shown - (240, 200, 10)).max() < 12
-
-
-@pytest.mark.parametrize(("width", "height"), [(120, 120), (200, 80), (60, 160)])
-def test_a_robot_that_is_near_fills_its_picture(width, height):
-    task = small_task(num_envs=1)
-    task.reset()
-    camera = RobotsCamera(task, 1, width, height)
-    camera.come_near(0.8, 1.0)
-    camera.picture()
-    sides = np.array(camera.size.sides)
-    base = np.array([*camera.data.qpos[:2], 0.5 * sides[2]])
-    corners = base + 0.5 * sides * np.array(list(product((-1.0, 1.0), repeat=3)))
-    reach = np.ptp(camera.pixels(corners), axis=0) / (width, height)
-    camera.close()
-    assert reach.max() == pytest.approx(0.8, abs=0.02)
-    assert reach.min() < 0.8
-
-
-def test_the_shipped_robot_walks_through_its_tile(capsys):
-    """On stairs as well: its picture changes all the time, and its colour stays in the middle."""
-    for task in (TASK, "anymal_c"):
-        pictures = film(policy_of(task), 48)
-        assert len(pictures) == 50
-        assert {picture.shape for picture in pictures} == {(48, 48, 3)}
-        for before, after in pairwise(pictures):
-            assert (before != after).mean() > 0.05
-        for picture in pictures:
-            middle = picture[10:38, 10:38].astype(int)
-            red = (middle[..., 0] > 100) & (middle[..., 1] < 60) & (middle[..., 2] < 60)
-            assert red.mean() > 0.03
 
 
 def test_the_command_shows_tasks_and_run_folders(capsys):
@@ -138,7 +67,7 @@ def test_a_robot_that_cannot_be_asked_to_walk_is_refused_before_others_are_filme
 
 def test_the_tasks_of_its_help_can_be_shown():
     first = contact_sheet.build_parser().examples[0].split()
-    for task in first[first.index("legged.tools.contact_sheet") + 1 : first.index("--out")]:
+    for task in first[first.index("docs/make/contact_sheet.py") + 1 : first.index("--out")]:
         assert walker(policy_of(task)).task == task
 
 
