@@ -275,7 +275,7 @@ def test_a_run_is_compared_with_others_only(capsys):
 
 
 def test_the_log_of_this_project_is_one_that_the_tool_writes():
-    page = Path(table.__file__).parents[3] / "docs" / "experiments.md"
+    page = Path(table.__file__).parents[3] / "docs" / "lab" / "experiments.md"
     found = table_in(str(page))
     assert {"began", "task", "what changed", "status", "steps/s"} <= found[0].keys()
     began = [row["began"] for row in found]

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from helpers import call, small_task
-from legged.tools import deploy, simulate_robot
 
 from legged.cli.deploy import robot as simulated_robot
 from legged.cli.deploy import sim
