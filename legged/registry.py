@@ -82,16 +82,17 @@ def register(name: str, config: Path | str | Mapping[str, Any], task_class: type
 
 
 def import_tasks(name: str) -> None:
-    """Let tasks of a user's own be known: run the module of that name or path, or make the YAML file at that path one. Who
-    names a run, and not its task, has no other way to say where a file is.
+    """Register user-defined tasks: run the module of that name or path, or make the YAML file at that path a task. `name` may
+    be several, separated by commas, such as the module of a class and a YAML file that uses it.
 
     Raises:
-        ConfigError: it can't be found, or it fails.
+        ConfigError: one can't be found, or fails.
     """
-    if name.endswith(YAML_ENDINGS):
-        register_file(name, "--import")
-    else:
-        run_module(name)
+    for one in name.split(","):
+        if one.endswith(YAML_ENDINGS):
+            register_file(one, "--import")
+        else:
+            run_module(one)
 
 
 def register_file(path: str, flag: str = "TASK") -> str:
