@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 from helpers import ENGINE, call, small_task
-from legged.tools import train
 from test_docs_tasks import fenced, named
 
 from legged import math as legged_math
 from legged import registry, user_modules
+from legged.cli import train
 from legged.config.loader import to_dict
 from legged.config.schema import LeggedConfig
 from legged.envs import LeggedRobot
@@ -53,7 +53,7 @@ def test_the_class_that_was_ported_trains():
     (command,) = [text.strip() for language, text in fenced(PAGE) if not language and "trot" in text]
     arguments = command.removeprefix("python train.py ").split()
     settings = [f"{key}={value}" for key, value in ENGINE]
-    tiny = ["--num_envs", "8", "--max_iterations", "1", "--sim_device", "cpu", "train.runner.num_steps_per_env=4"]
+    tiny = ["--num-envs", "8", "--max-iterations", "1", "--sim-device", "cpu", "train.runner.num_steps_per_env=4"]
     assert call(train.main, [*arguments, *tiny, *settings]) == 0
 
 

@@ -10,6 +10,15 @@ from importlib import import_module
 from legged.commandline.light import answer, print_rows
 from legged.errors import ConfigError, suggest
 
+SECTIONS = {
+    "every day": ("train", "play", "watch", "list"),
+    "measure": ("evaluate", "runs", "episodes", "benchmark", "sweep"),
+    "your own": ("robot", "terrain", "fit-actuator", "migrate"),
+    "on a robot": ("export", "deploy"),
+    "this machine": ("warmup", "completion"),
+}
+"""Heading of the help -> the first words of its commands."""
+
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "train": ("legged.cli.train", "train a policy"),
     "play": ("legged.cli.play", "film a policy, measure it and export it"),
@@ -84,9 +93,13 @@ def _print_help(words: list[str]) -> None:
     groups = {name.partition(" ")[0] for name in COMMANDS if " " in name}
     asked = [word for word in words if word not in ("--help", "-h")]
     if not asked:
-        print("Train legged robots, see them walk, measure them.\n\nusage: legged COMMAND ...\n")
-        print_rows("commands, each with --help", {name: said for name, (_, said) in COMMANDS.items()})
-        print("\nBegin with: legged play anymal_c (a shipped policy), legged train anymal_c_flat, legged list")
+        print("Train legged robots, see them walk, measure them.\n\nusage: legged COMMAND ...  (each has --help)\n")
+        for heading, firsts in SECTIONS.items():
+            rows = {name: said for name, (_, said) in COMMANDS.items() if name.partition(" ")[0] in firsts}
+            in_order = {name: rows[name] for first in firsts for name in rows if name.partition(" ")[0] == first}
+            print_rows(heading, in_order, max(map(len, COMMANDS)))
+            print()
+        print("begin with `legged play anymal_c` (a trained policy), `legged train anymal_c_flat`, `legged list`")
         return
     if asked[0] not in groups:
         known = {name.partition(" ")[0] for name in COMMANDS}

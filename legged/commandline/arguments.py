@@ -129,7 +129,7 @@ def policy_overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
     return [change for change in overrides(args) if change[0] != "train.runner.experiment_name"]
 
 
-def pick_device(name: str | None, flag: str = "--sim_device") -> torch.device:
+def pick_device(name: str | None, flag: str = "--sim-device") -> torch.device:
     """Return the device that was asked for, else the GPU if there is one; under torchrun the GPU of this process's number.
 
     Raises:
@@ -183,8 +183,8 @@ def watch_command(args: argparse.Namespace, folder: Path) -> str:
 
 def given_import(args: argparse.Namespace) -> list[str]:
     """Return the option by which another command finds the user-defined tasks of this one."""
-    module = args.module or args.task_file
-    return ["--import", module] if module else []
+    files = [file for file in (args.module, args.task_file) if file]
+    return ["--import", ",".join(files)] if files else []
 
 
 def register_given(args: argparse.Namespace, name: str) -> None:

@@ -24,9 +24,9 @@ def answer(say: Callable[[], None]) -> int:
     return 0 if output.lost is None else FAILED
 
 
-def print_rows(title: str, rows: Mapping[str, str]) -> None:
-    """Print a title, and names with a text each, in two columns."""
-    width = max(map(len, rows), default=0)
+def print_rows(title: str, rows: Mapping[str, str], width: int = 0) -> None:
+    """Print a title, and names with a text each, in two columns, the first of at least `width` letters."""
+    width = max([width, *map(len, rows)])
     print(f"{title}:")
     for name, summary in rows.items():
         print(f"  {name:{width}}  {summary}".rstrip())

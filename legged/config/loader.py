@@ -183,6 +183,7 @@ def _merged(
                 origins.written_for = tuple(dict.fromkeys([*origins.written_for, reference]))
             if carried is not data:
                 data, name = dict(carried), f"{name} (written for {Path(layer.written_for).name})"
+                origins.carried |= {name, f"{name}: cpu"}
         cpu = data.pop("cpu", {})
         merge(merged, data, name, origins)
         if on_cpu:
@@ -316,7 +317,7 @@ def from_dict(
         merge({}, data, source, origins)
     cfg = build(schema, data, "", origins, source)
     cfg.origins.update(origins)
-    cfg.origins.written_for = origins.written_for
+    cfg.origins.written_for, cfg.origins.carried = origins.written_for, origins.carried
     return cfg
 
 

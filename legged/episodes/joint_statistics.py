@@ -53,7 +53,7 @@ class JointStatistics:
         return self.cycles[name].mean(axis=0), self.cycles[name].std(axis=0)
 
 
-def joint_statistics(episodes: Episodes, where: str = "--statistics") -> JointStatistics:
+def joint_statistics(episodes: Episodes, where: str = "POLICY") -> JointStatistics:
     """Sum up the joints of some episodes; `where` is the flag that asks for it.
 
     A cycle begins when the first foot touches down and ends when it does so the next time, if that is neither too soon nor
@@ -133,4 +133,4 @@ def check_comparable(one: JointStatistics, other: JointStatistics) -> None:
     if one.joints != other.joints:
         only = [name for name in (*one.joints, *other.joints) if (name in one.joints) != (name in other.joints)]
         differing = ", ".join(only[:4]) or "in another order"
-        raise ConfigError(f"--compare: the two have other joints ({differing}); take policies of one robot")
+        raise ConfigError(f"POLICY: the two have other joints ({differing}); take policies of one robot")

@@ -33,8 +33,8 @@ class Given:
     @property
     def flags(self) -> list[str]:
         """Options by which another command finds a user-defined task."""
-        module = self.module or (self.task if self.task.endswith(YAML_ENDINGS) else None)
-        return ["--import", module] if module else []
+        files = [file for file in (self.module, self.task) if file and (file == self.module or file.endswith(YAML_ENDINGS))]
+        return ["--import", ",".join(files)] if files else []
 
 
 def write_given(folder: Path, given: Given, before: Path | None = None) -> None:

@@ -29,7 +29,7 @@ os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
 
 
 STAGES_FILE = "LEGGED_STAGES"
-"""Environment variable: a file that is told when each stage of a start has ended, for the benchmark's --startup."""
+"""Environment variable: a file that is told when each stage of a start has ended, for `legged benchmark startup`."""
 
 
 def stage_ended(name: str) -> None:

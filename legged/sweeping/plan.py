@@ -121,7 +121,7 @@ class Plan:
     figure: str
     parameters: tuple[Parameter, ...]
     task: str
-    """What a command is given as its --task: a name, or a YAML file."""
+    """TASK as `legged train` is given it: a name, or a YAML file."""
 
     @property
     def own(self) -> dict[str, Any]:

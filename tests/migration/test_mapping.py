@@ -149,14 +149,8 @@ def test_legged_gyms_own_settings_that_mean_nothing_here_are_not_listed(migrated
 def test_a_robot_that_is_not_here_is_said_with_its_commands(migrated):
     text = GO2.replace("'FOOT'", "'foot'")
     result = migrated(text, "--out", "there")
-    assert (
-        "  python -m legged.tools.add_robot resources/robots/hound/urdf/hound.urdf --name hound_of_them --out there/robots\n"
-        in result.out
-    )
-    assert (
-        "  python -m legged.tools.migrate fork_config.py --robot there/robots/hound_of_them --out there --force\n"
-        in result.out
-    )
+    assert "  legged robot add resources/robots/hound/urdf/hound.urdf --name hound_of_them --out there/robots\n" in result.out
+    assert "  legged migrate fork_config.py --robot there/robots/hound_of_them --out there --force\n" in result.out
     assert result.data["robot"] == "robots/hound_of_them"
     assert result.data["control"]["stiffness"] == {"H": 40.0, "KFE": 80.0, "wheel": 1.0}
     assert "#   feet: [foot]" in result.text

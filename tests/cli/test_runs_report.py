@@ -17,6 +17,9 @@ from helpers import POLICY, TASK, TINY_TRAINING, call, run_folders, tiny_run
 from torch.utils.tensorboard import SummaryWriter
 
 from legged import registry
+from legged.cli import train
+from legged.cli.evaluate import grid
+from legged.cli.runs import report, table
 from legged.errors import RunError
 from legged.evaluation.learning_curves import read_scalars, smooth
 from legged.evaluation.reports import at_end
@@ -25,7 +28,6 @@ from legged.evaluation.reports.run_report import over_training, write_report
 from legged.learning.captured import CapturedRunner
 from legged.learning.given import GIVEN_FILE
 from legged.learning.timing import TIMING_FILE
-from legged.tools import evaluate, experiments, report, train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -214,7 +216,7 @@ def test_a_film_is_made_by_another_process_and_shown(monkeypatch):
     monkeypatch.setenv("RANK", "0")
     monkeypatch.setattr(at_end, "subprocess", instead_of_processes(run))
     folder = tiny_run("train.runner.report=true", iterations=1)
-    assert asked == [(["-m", "legged.tools.report", str(folder), "--film", "--task", TASK], "", False)]
+    assert asked == [(["-m", "legged", "runs", "report", str(folder), "--film"], "", False)]
     assert '<img class="film" src="data:image/gif;base64,' in read(folder)
     assert "](film.gif)" in read(folder, "report.md")
 
@@ -224,7 +226,7 @@ def test_a_film_is_made_by_another_process_and_shown(monkeypatch):
     [
         (subprocess.CompletedProcess([], 0, "no film: nothing can be rendered\nwritten: x\n", ""), "nothing can be rendered"),
         (subprocess.CompletedProcess([], -11, "", ""), "exit code -11"),
-        (subprocess.CompletedProcess([], 2, "", "a\nerror: --task: there is no task\n"), "error: --task: there is no task"),
+        (subprocess.CompletedProcess([], 2, "", "a\nerror: RUN: there is no run\n"), "error: RUN: there is no run"),
         (subprocess.TimeoutExpired([], 60), "it took longer than 60 s"),
     ],
 )
@@ -296,19 +298,21 @@ def test_a_run_of_somebodys_own_task_says_how_it_is_found_again(forgotten, capsy
     named = ["--task", "my own.d/mine.yaml", "train.runner.experiment_name=elsewhere"]
     folder = tiny_run(*named, *REPORTED, "rewards.scales.torques=-3e-4", iterations=1)
     assert "| `rewards.scales.torques` | `-0.0003` | `-1.0e-05` |" in read(folder, "report.md")
-    found = re.search(r"None yet: `python -m legged\.tools\.evaluate (.*)`", read(folder, "report.md"))
+    found = re.search(r"None yet: `legged evaluate (.*)`", read(folder, "report.md"))
     forgotten()
-    grid = ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1", "--sim_device", "cpu"]
-    assert call(evaluate.main, [*shlex.split(found[1]), *grid]) == 0  # as it stands there
+    small = ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1", "--sim-device", "cpu"]
+    assert call(grid.main, [*shlex.split(found[1]), *small]) == 0  # the words as they stand there
     forgotten()
     assert report.main([str(folder)]) == 0
     text = read(folder, "report.md")
-    command = f"python -m legged.tools.report --task 'my own.d/mine.yaml' {folder}"
+    command = f"legged runs report --import 'my own.d/mine.yaml' {folder}"
     assert f"There is no task 'mine' here to compare with, and `{command}`" in text
     assert "| `rewards.scales.torques` | `-0.0003` |" in text
-    assert experiments.main(["--markdown", "all.md"]) == 0
-    assert "sim.physics mujoco, sim.threads 1, runner.num_steps_per_env 4" in read(Path(), "all.md").replace("\\", "")
-    assert report.main(["--task", "my own.d/mine.yaml", str(folder)]) == 0
+    assert table.main(["--out", "all"]) == 0
+    assert "sim.physics mujoco, sim.threads 1, runner.num_steps_per_env 4" in read(Path("all"), "experiments.md").replace(
+        "\\", ""
+    )
+    assert report.main(["--import", "my own.d/mine.yaml", str(folder)]) == 0
     assert "| `rewards.scales.torques` | `-0.0003` | `-1.0e-05` |" in read(folder, "report.md")
     capsys.readouterr()
 
@@ -323,19 +327,22 @@ def test_a_resumed_run_keeps_what_was_set_before():
     assert any(GIVEN_FILE in text for text in read_record(first).problems)
 
 
-def test_a_task_without_commands_is_told_the_command_that_films_it(capsys):
+def test_a_task_without_commands_is_told_the_command_that_films_it(forgotten, capsys):
     """The task of a YAML file and of a module is found by it, and the run that it films is this one."""
     Path("mine.yaml").write_text("extends: half_cheetah\n", encoding="utf-8")
     Path("my tasks.py").write_text("", encoding="utf-8")
-    told = ["--import", "my tasks.py", "--task", "mine.yaml"]
-    folder = tiny_run(*told, iterations=1)
-    film = ["python", "-m", "legged.tools.play", "--task", "mine.yaml", "--import", "my tasks.py", "--load_run", str(folder)]
-    assert report.main([*told, "--film"]) == 0
-    assert f"no film: 'mine' follows no commands; {shlex.join([*film, '--gif'])} makes one\n" in capsys.readouterr().out
+    folder = tiny_run("--import", "my tasks.py", "--task", "mine.yaml", iterations=1)
+    forgotten()
+    told = ["--import", "my tasks.py,mine.yaml"]
+    film = ["legged", "play", *told, str(folder)]
+    assert report.main([*told, "mine", "--film"]) == 0
+    out = capsys.readouterr().out
+    assert "no film: 'mine' has no velocity commands" in out
+    assert f"{shlex.join([*film, '--gif'])} makes one\n" in out
 
     plain = tiny_run("--task", "half_cheetah", iterations=1)
     assert report.main([str(plain), "--film"]) == 0
-    assert f"python -m legged.tools.play --task half_cheetah --load_run {plain} --gif makes one\n" in capsys.readouterr().out
+    assert f"legged play {plain} --gif makes one\n" in capsys.readouterr().out
 
 
 # ---- command line ----------------------------------------------------------------------------------------------------
@@ -345,8 +352,8 @@ def test_runs_are_named_as_in_other_tools(capsys):
     tiny_run("train.runner.run_name=a", iterations=1)
     older = tiny_run("train.runner.run_name=b", iterations=1)
     newest = tiny_run("train.runner.run_name=c", iterations=1)
-    assert report.main(["--task", TASK]) == 0
-    assert report.main(["--task", TASK, "--load_run", older.name, "--note", "the\nolder one"]) == 0
+    assert report.main([TASK]) == 0
+    assert report.main([f"{TASK}/{older.name}", "--note", "the\nolder one"]) == 0
     assert [folder.name for folder in run_folders() if (folder / "report.html").is_file()] == [older.name, newest.name]
     assert read(older, "note.txt") == "the older one\n"
     assert "the older one" in read(older)
@@ -355,12 +362,10 @@ def test_runs_are_named_as_in_other_tools(capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], "error: --task: which run?"),
-        (["nowhere"], "error: nowhere: is no run folder (it has no config.yaml)"),
-        (["--task", "anymal_x"], "error: --task: there is no task 'anymal_x'; did you mean"),
-        (["--task", TASK, "--load_run", "x"], "error: --load_run: there is no run 'x'"),
+        (["nowhere"], "error: RUN: there is no task and no run 'nowhere'"),
+        (["anymal_cc"], "error: RUN: there is no task and no run 'anymal_cc'; did you mean 'anymal_c'?"),
+        ([TASK], f"error: RUN: '{TASK}' has no run in logs/"),
         (["x", "--checkpoint", "5"], "error: --checkpoint: 5: says which policy is filmed"),
-        (["x", "--load_run", "y"], "error: --load_run: 'y' beside run folders"),
         (["RUN", "--note", " "], "error: --note: expected a sentence of at most 1000 letters, got 0"),
     ],
 )

@@ -1,6 +1,7 @@
 """The benchmark: what it times, and that its numbers fit together."""
 
 import json
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,23 +12,23 @@ from legged.benchmarks.iteration_times import loops_of, time_iterations
 from legged.benchmarks.report import report
 from legged.benchmarks.scale import others
 from legged.benchmarks.step_times import Driver, time_steps
+from legged.cli.benchmark import ground, scale, startup, step
 from legged.learning.captured import CapturedRunner
 from legged.learning.runner import Runner
 from legged.learning.student_runner import StudentRunner
 from legged.learning.teacher import find_teacher, with_teacher
 from legged.policies.actor import Actor
 from legged.registry import make_task
-from legged.tools import benchmark
 
-SMALL = ["--sim_device", "cpu", "--num_envs", "8", "sim.physics=mujoco", "sim.threads=1", "train.runner.num_steps_per_env=4"]
+SMALL = ["--sim-device", "cpu", "--num-envs", "8", "sim.physics=mujoco", "sim.threads=1", "train.runner.num_steps_per_env=4"]
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
 
 def test_times_of_step_physics_and_iterations_are_written(tmp_path, capsys):
-    steps = ["--steps", "5", "--repeats", "3", "--iterations", "2", "--json", str(tmp_path / "b.json")]
-    assert benchmark.main(["--task", "anymal_c_flat", *SMALL, *steps]) == 0
-    result = json.loads((tmp_path / "b.json").read_text())
+    steps = ["--steps", "5", "--repeats", "3", "--iterations", "2", "--out", str(tmp_path / "times")]
+    assert step.main(["anymal_c_flat", *SMALL, *steps]) == 0
+    result = json.loads((tmp_path / "times" / "benchmark.json").read_text())
     assert 0.0 < result["physics_ms"] < result["control_step_ms"]
     assert result["ratio"] == pytest.approx(result["control_step_ms"] / result["physics_ms"])
     assert result["env_steps_per_s"] == pytest.approx(8 / result["control_step_ms"] * 1e3)
@@ -64,7 +65,7 @@ def test_why_a_step_is_mujoco_warps_own_is_said():
 
 def test_a_policy_is_named(capsys):
     arguments = ["--policy", TASK, "--steps", "2", "--repeats", "1", "--iterations", "0"]
-    assert benchmark.main(["--task", TASK, *SMALL, *arguments]) == 0
+    assert step.main([TASK, *SMALL, *arguments]) == 0
     assert f"resources/policies/{TASK}/model.pt" in capsys.readouterr().out
 
 
@@ -88,7 +89,7 @@ def test_robots_of_a_policy_are_where_it_moved_them():
 
 
 def test_a_policy_of_another_robot_is_refused(capsys):
-    assert benchmark.main(["--task", TASK, *SMALL, "--policy", "go2_flat", "--iterations", "0"]) == 2
+    assert step.main([TASK, *SMALL, "--policy", "go2_flat", "--iterations", "0"]) == 2
     assert "go2" in capsys.readouterr().err
 
 
@@ -125,15 +126,12 @@ def test_students_and_estimators_are_timed_as_they_are_trained():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (
-            ["--task", "anymal_c", "--grounds", "--sim_device", "cpu", "sim.physics=mujoco"],
-            "colliders of mujoco_warp",
-        ),
-        (["--task", "anymal_c_flat", "--grounds", "--sim_device", "cpu", "sim.physics=mujoco_warp"], "has no terrain"),
+        (["anymal_c", "sim.physics=mujoco"], "error: command line: sim.physics: colliders of mujoco_warp"),
+        (["anymal_c_flat", "sim.physics=mujoco_warp"], "error: TASK: 'anymal_c_flat' has no terrain"),
     ],
 )
 def test_grounds_need_mujoco_warp_and_terrain(arguments, words, capsys):
-    assert call(benchmark.main, arguments) == 2
+    assert call(ground.main, [*arguments, "--sim-device", "cpu"]) == 2
     assert words in capsys.readouterr().err
 
 
@@ -150,10 +148,10 @@ def test_sizes_are_compared_in_processes_of_their_own(tmp_path, capfd, monkeypat
         "register('hungry', {'extends': 'anymal_c_flat'}, Hungry)\n"
     )
     monkeypatch.chdir(tmp_path)
-    small = [text for text in SMALL if text not in ("--num_envs", "8")]
-    steps = ["--steps", "2", "--repeats", "1", "--iterations", "1", "--json", str(tmp_path / "s.json")]
-    assert benchmark.main(["--import", "hungry.py", "--task", "hungry", *small, *steps, "--scale", f"{too_many},4"]) == 0
-    result = json.loads((tmp_path / "s.json").read_text())
+    small = [text for text in SMALL if text not in ("--num-envs", "8")]
+    steps = ["--steps", "2", "--repeats", "1", "--iterations", "1", "--out", "times"]
+    assert scale.main(["--import", "hungry.py", "hungry", *small, *steps, "--robots", f"{too_many},4"]) == 0
+    result = json.loads(Path("times/benchmark.json").read_text())
     assert (result["task"], result["device"], result["loop"]) == ("hungry", "CPU", "captured")
     first, second = result["sizes"]
     assert first == {"num_envs": too_many, "failed": "out of memory"}
@@ -173,9 +171,9 @@ def test_sizes_of_a_task_that_is_a_file(tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(registry, "_REGISTERED", {})  # another test's file may be called so
     (tmp_path / "mine.yaml").write_text("extends: anymal_c_flat\n")
     monkeypatch.chdir(tmp_path)
-    small = [text for text in SMALL if text not in ("--num_envs", "8")]
+    small = [text for text in SMALL if text not in ("--num-envs", "8")]
     steps = ["--steps", "2", "--repeats", "1", "--iterations", "1"]
-    assert benchmark.main(["--task", "mine.yaml", *small, *steps, "--scale", "4"]) == 0
+    assert scale.main(["mine.yaml", *small, *steps, "--robots", "4"]) == 0
     assert capfd.readouterr().out.splitlines()[-1].split()[0] == "4"
 
 
@@ -189,19 +187,19 @@ def broken_task(folder, statement: str) -> list[str]:
         "cfg = {'extends': 'anymal_c_flat', 'observations': {'groups': {'actor': {'terms': ['broken']}}}}\n"
         "register('broken', {**cfg, 'train': {'algorithm': {'symmetry': False}}}, Broken)\n"
     )
-    return ["--task", "broken", "--import", "broken.py", "--sim_device", "cpu", "--scale", "4,5"]
+    return ["broken", "--import", "broken.py", "--sim-device", "cpu", "--robots", "4,5"]
 
 
 def test_a_size_that_fails_otherwise_is_told_too(tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert benchmark.main(broken_task(tmp_path, "os._exit(3)")) == 1
+    assert scale.main(broken_task(tmp_path, "os._exit(3)")) == 1
     rows = capfd.readouterr().out.splitlines()[-2:]
     assert [row.split() for row in rows] == [[size, "exit", "code", "3"] for size in ("4", "5")]
 
 
 def test_a_mistake_that_is_the_same_for_all_sizes_is_told_once(tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert benchmark.main(broken_task(tmp_path, "raise ValueError('no such thing')")) == 2
+    assert scale.main(broken_task(tmp_path, "raise ValueError('no such thing')")) == 2
     err = capfd.readouterr().err
     assert err.startswith("error: _obs_broken: no such thing (")
     assert err.count("\n") == 1
@@ -209,14 +207,14 @@ def test_a_mistake_that_is_the_same_for_all_sizes_is_told_once(tmp_path, capfd, 
 
 @pytest.mark.parametrize("sizes", ["", "4,", "0", "many", "-4", "1e3"])
 def test_sizes_are_numbers(sizes, capsys):
-    assert call(benchmark.main, ["--task", "anymal_c_flat", "--sim_device", "cpu", f"--scale={sizes}"]) == 2
-    assert "is not a list of numbers of robots" in capsys.readouterr().err
+    assert call(scale.main, ["anymal_c_flat", "--sim-device", "cpu", f"--robots={sizes}"]) == 2
+    assert f"error: --robots: '{sizes}' is not a list of numbers of robots" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("other", [["--num_envs", "4"], ["--grounds"]])
-def test_scale_sets_the_number_of_robots_itself(other, capsys):
-    assert call(benchmark.main, ["--task", "anymal_c", "--sim_device", "cpu", "--scale", "4", *other]) == 2
-    assert f"leave out {other[0]}" in capsys.readouterr().err
+@pytest.mark.parametrize("option", ["--num-envs", "--num_envs"])
+def test_scale_sets_the_number_of_robots_itself(option, capsys):
+    assert call(scale.main, ["anymal_c", "--sim-device", "cpu", "--robots", "4", option, "4"]) == 2
+    assert capsys.readouterr().err.startswith("error: --num-envs: --robots")
 
 
 @pytest.mark.parametrize(
@@ -226,18 +224,21 @@ def test_scale_sets_the_number_of_robots_itself(other, capsys):
         ("--repeats=0", "--repeats: must be at least 1, got 0"),
         ("--iterations=-1", "--iterations: must be at least 0, got -1"),
         ("--kernels=0", "--kernels: must be at least 1, got 0"),
-        ("--json=.", "--json: . is a folder"),
+        ("--out=taken", "taken: "),
     ],
 )
-@pytest.mark.parametrize("more", [[], ["--scale", "4"]])
-def test_options_out_of_range_are_refused(option, words, more, capsys):
-    assert call(benchmark.main, ["--task", "anymal_c_flat", "--sim_device", "cpu", option, *more]) == 2
+@pytest.mark.parametrize(("command", "more"), [(step, []), (scale, ["--robots", "4"])])
+def test_options_out_of_range_are_refused(option, words, command, more, capsys):
+    if command is scale and option.startswith("--kernels"):
+        words = "unrecognized arguments: --kernels=0"
+    Path("taken").touch()
+    assert call(command.main, ["anymal_c_flat", "--sim-device", "cpu", option, *more]) == 2
     assert words in capsys.readouterr().err
 
 
 def test_each_size_is_measured_as_the_command_line_says():
-    kept = ["--task", "x", "--physics", "newton", "--solver", "kamino", "--kernels", "3", "--steps=5", "sim.dt=0.01"]
-    own = ["--scale", "4,8", "--json=out.json", "--runner", "stock", "--num_env", "3"]
+    kept = ["x", "--physics", "newton", "--solver", "kamino", "--steps=5", "sim.dt=0.01"]
+    own = ["--robots", "4,8", "--out=times", "--runner", "stock"]
     assert others([*own[:2], *kept[:3], *own[2:], *kept[3:]]) == kept
 
 
@@ -250,18 +251,18 @@ def test_the_engine_of_a_scale_is_the_one_asked_for(capsys, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("legged.benchmarks.scale.subprocess.run", run)
-    arguments = ["--task", "anymal_c_flat", "--sim_device", "cpu", "--scale=4", "--physics", "newton", "--solver", "xpbd"]
-    assert benchmark.main(arguments) == 130
+    arguments = ["anymal_c_flat", "--sim-device", "cpu", "--robots=4", "--physics", "newton", "--solver", "xpbd"]
+    assert scale.main(arguments) == 130
     (command,) = seen
     assert command[command.index("--physics") + 1] == "newton"
     assert command[command.index("--solver") + 1] == "xpbd"
-    assert "--scale=4" not in command
+    assert "--robots=4" not in command
+    assert command[1:6] == ["-m", "legged", "benchmark", "step", "anymal_c_flat"]
 
 
-def test_a_start_is_timed_beside_importing_torch(tmp_path, capsys):
-    arguments = ["--startup", "--repeats", "1", "--json", str(tmp_path / "s.json"), "--task", "anymal_c_flat", *SMALL]
-    assert benchmark.main(arguments) == 0
-    times = json.loads((tmp_path / "s.json").read_text())
+def test_a_start_is_timed_beside_importing_torch(capsys):
+    assert startup.main(["--repeats", "1", "--out", "times", "anymal_c_flat", *SMALL]) == 0
+    times = json.loads(Path("times/benchmark.json").read_text())
     stages = list(times["stages"].values())
     assert list(times["stages"])[-2:] == ["first iteration", "end"]
     assert stages == sorted(stages)

@@ -12,13 +12,13 @@ import yaml
 from helpers import ENGINE, call
 from importing_fixtures import URDF_LEG, urdf
 
+from legged.cli.robot import add
 from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError
 from legged.registry import make_task, register_file, task_config
 from legged.robots.importing.folder import Guesses, _compact, robot_yaml, task_yaml
 from legged.robots.importing.tree import Tree
 from legged.robots.robot import load_robot
-from legged.tools import add_robot
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -28,7 +28,7 @@ def test_a_urdf_becomes_a_robot_whose_task_steps(added):
     assert "first_toy: a quadruped of 13 kg, 12 hinges, 12 motors, 13 shapes" in out
     assert "mass: 13 kg in the links of the file, 13 kg in the model" in out
     assert "guess: the default pose is a stance by inverse kinematics" in out
-    assert "train it: python train.py --task mine/first_toy_flat.yaml" in out
+    assert "train it: legged train mine/first_toy_flat.yaml" in out
     robot = load_robot("mine/first_toy")
     assert robot.mass == pytest.approx(13.0)
     assert robot.feet_names == ("fl_foot", "fr_foot", "hl_foot", "hr_foot")
@@ -42,12 +42,12 @@ def test_a_urdf_becomes_a_robot_whose_task_steps(added):
         observations, _, _, _ = built.step(torch.zeros(4, 12))
     assert torch.isfinite(observations["actor"]).all()
     assert built.base_pos[:, 2].median() > 0.6 * robot.height
-    assert "written by `python -m legged.tools.add_robot` from `toy.urdf`" in Path("mine/first_toy/PROVENANCE.md").read_text()
+    assert "written by `legged robot add` from `toy.urdf`" in Path("mine/first_toy/PROVENANCE.md").read_text()
 
 
 def test_a_file_of_which_no_model_can_be_made_is_refused_in_one_line(tmp_path, capsys):
     (tmp_path / "toy.urdf").write_text(urdf().replace('joint name="fr_hip"', 'joint name="fl_hip"'))
-    assert call(add_robot.main, ["toy.urdf", "--out", "mine"]) == 2
+    assert call(add.main, ["toy.urdf", "--out", "mine"]) == 2
     error = capsys.readouterr().err
     assert "toy.urdf: MuJoCo refuses what becomes of it: " in error
     assert "repeated name 'fl_hip'" in error
@@ -216,15 +216,15 @@ def test_a_model_of_menagerie(added, tmp_path, monkeypatch, capsys):
     added(urdf(), "--name", "eighth_toy")
     model = Path("mine/eighth_toy/eighth_toy.xml").read_text()
     (tmp_path / "menagerie" / "unitree_go2" / robot.entry(robot.default_model).file).write_text(model)
-    assert call(add_robot.main, ["menagerie:unitree_go2", "--out", "theirs"]) == 0
+    assert call(add.main, ["menagerie:unitree_go2", "--out", "theirs"]) == 0
     assert load_robot("theirs/unitree_go2").mass == pytest.approx(13.0)
     assert f"Licence: {robot.license}" in Path("theirs/unitree_go2/PROVENANCE.md").read_text()
-    assert call(add_robot.main, ["menagerie:unitree_go22"]) == 2
+    assert call(add.main, ["menagerie:unitree_go22"]) == 2
     assert "Menagerie has no such robot; did you mean 'unitree_go2'?" in capsys.readouterr().err
-    assert call(add_robot.main, ["menagerie:unitree_go1"]) == 1
+    assert call(add.main, ["menagerie:unitree_go1"]) == 1
     assert "error: menagerie:unitree_go1: 'unitree_go1' not found under MENAGERIE_ROOT" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "mujoco_menagerie", None)
-    assert call(add_robot.main, ["menagerie:unitree_go2"]) == 2
+    assert call(add.main, ["menagerie:unitree_go2"]) == 2
     assert "pip install mujoco-menagerie" in capsys.readouterr().err
 
 
@@ -247,7 +247,7 @@ def test_a_wrong_call_ends_with_one_line(tmp_path, capsys, arguments, message):
     (tmp_path / "toy.txt").write_text("hello")
     (tmp_path / "arm.urdf").write_text(urdf(legs=URDF_LEG.format(n="fl", x=0.2, y=0.1, side=0.05)))
     (tmp_path / "broken.urdf").write_text(urdf()[:-3])
-    assert call(add_robot.main, [*arguments, "--out", "mine"]) == 2
+    assert call(add.main, [*arguments, "--out", "mine"]) == 2
     err = capsys.readouterr().err
     assert message in err
     assert err.count("\n") == 1
@@ -261,7 +261,7 @@ def test_a_task_on_rough_ground_is_called_like_its_robot(added):
 
 def test_nothing_is_written_over_unless_asked(added, capsys):
     added(urdf(), "--name", "ninth_toy")
-    assert call(add_robot.main, ["toy.urdf", "--name", "ninth_toy", "--out", "mine"]) == 2
+    assert call(add.main, ["toy.urdf", "--name", "ninth_toy", "--out", "mine"]) == 2
     assert "there is mine/ninth_toy already; another name, or --force" in capsys.readouterr().err
     assert "ninth_toy" in added(urdf(), "--name", "ninth_toy", "--force")
 
@@ -277,9 +277,9 @@ def test_a_source_in_the_robots_own_folder_is_left_alone(tmp_path, capsys, force
         (tmp_path / file).write_text(text)
     (tmp_path / "go/meshes/cube.obj").write_text(cube)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
-    assert call(add_robot.main, ["go/go.xml", "--out", ".", *force]) == 2
+    assert call(add.main, ["go/go.xml", "--out", ".", *force]) == 2
     assert "go/go.xml: lies in go, the folder that the robot goes to; another --name or --out" in capsys.readouterr().err
-    assert call(add_robot.main, ["go.urdf", "--out", ".", *force]) == 2
+    assert call(add.main, ["go.urdf", "--out", ".", *force]) == 2
     message = "go/meshes/cube.obj: lies in go, the" if force else "there is go already"
     assert message in capsys.readouterr().err
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before

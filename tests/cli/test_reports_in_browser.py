@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from helpers import POLICY, TASK, kept_global_state, tiny_run
 
+from legged.cli.runs import compare, table
 from legged.evaluation.reports.run_report import write_report
-from legged.tools import experiments
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright drives the browser: pip install playwright")
 BROWSER = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
@@ -32,8 +32,8 @@ def logs(tmp_path_factory) -> Iterator[Path]:
         shutil.copy(POLICY / "play.gif", runs[0] / "film.gif")
         for run in runs:
             write_report(run)
-        assert experiments.main([]) == 0
-        assert experiments.main(["--compare", *map(str, runs)]) == 0
+        assert table.main([]) == 0
+        assert compare.main([*map(str, runs)]) == 0
         yield Path("logs").resolve()
     os.chdir(before)
 

@@ -6,9 +6,9 @@ import yaml
 from PIL import Image
 from torch.utils.tensorboard import SummaryWriter
 
+from legged.cli.runs import curves
 from legged.errors import ConfigError
 from legged.evaluation import learning_curves
-from legged.tools import plot
 
 
 def write_run(folder, levels):
@@ -37,10 +37,11 @@ def test_runs_are_read_and_averaged_over_common_iterations(tmp_path):
 
 def test_levels_get_panels_of_their_own(tmp_path):
     write_run(tmp_path / "rough", 1.0)
-    assert plot.main([str(tmp_path / "rough"), "--out", str(tmp_path / "rough.png")]) == 0
+    write_config(tmp_path / "rough")
+    assert curves.main([str(tmp_path / "rough"), "--out", str(tmp_path)]) == 0
     runs = {"flat": {"Metrics/lin_vel_rmse": (np.arange(5), np.ones(5))}}
     learning_curves.draw_runs(runs, tmp_path / "flat.png")
-    with Image.open(tmp_path / "rough.png") as rough, Image.open(tmp_path / "flat.png") as flat:
+    with Image.open(tmp_path / "learning_curve.png") as rough, Image.open(tmp_path / "flat.png") as flat:
         assert rough.height == pytest.approx(1.5 * flat.height, rel=0.02)
         assert np.asarray(rough.convert("L"))[-flat.height // 2 :].std() > 10.0
 
@@ -102,8 +103,8 @@ def test_the_line_is_that_of_the_runs_rows(tmp_path, monkeypatch):
     write_run(tmp_path / "run", 1.0)
     write_config(tmp_path / "run")
     drawn = []
-    monkeypatch.setattr(plot, "draw_runs", lambda runs, path, always: drawn.append((list(runs), set(always))))
-    assert plot.main([str(tmp_path / "run"), "--out", str(tmp_path / "x.png")]) == 0
+    monkeypatch.setattr(curves, "draw_runs", lambda runs, path, always: drawn.append((list(runs), set(always))))
+    assert curves.main([str(tmp_path / "run"), "--out", str(tmp_path)]) == 0
     assert drawn == [(["anymal_c, seed 3"], {8 / 3})]
 
 
@@ -113,21 +114,27 @@ def test_one_iteration_is_drawn(tmp_path):
     writer.add_scalar("Perf/collection_time", 0.0, 0)
     writer.add_scalar("Perf/learning_time", 0.0, 0)
     writer.close()
-    assert plot.main([str(tmp_path / "run"), "--out", str(tmp_path / "new" / "x.png")]) == 0
-    assert (tmp_path / "new" / "x.png").stat().st_size > 1000
+    write_config(tmp_path / "run")
+    assert curves.main([str(tmp_path / "run"), "--out", str(tmp_path / "new")]) == 0
+    assert (tmp_path / "new" / "learning_curve.png").stat().st_size > 1000
 
 
 def test_wrong_input_is_one_line(tmp_path, capsys):
     write_run(tmp_path / "run", 1.0)
     (tmp_path / "bad").mkdir()
     (tmp_path / "bad" / "events.out.tfevents.1").write_text("garbage")
+    for name in ("quiet", "empty"):
+        (tmp_path / name).mkdir()
+    for name in ("run", "bad", "quiet"):
+        write_config(tmp_path / name)
     for arguments, words in (
-        ([tmp_path / "run", "--out", tmp_path], "is a folder; the name of a file is wanted"),
-        ([tmp_path / "run", "--out", tmp_path / "a.txt"], "--out: must end in .png, got 'a.txt'"),
-        ([tmp_path / "none"], "none: holds no TensorBoard file"),
+        ([tmp_path / "run", "--out", tmp_path / "run" / "config.yaml"], "config.yaml"),
+        ([tmp_path / "none"], f"RUN: there is no task and no run '{tmp_path / 'none'}'"),
+        ([tmp_path / "empty"], f"RUN: '{tmp_path / 'empty'}' holds no run"),
+        ([tmp_path / "quiet"], "quiet: holds no TensorBoard file"),
         ([tmp_path / "bad"], "bad: its TensorBoard file holds no values"),
     ):
-        assert plot.main([str(argument) for argument in arguments]) == 2
+        assert curves.main([str(argument) for argument in arguments]) == 2
         err = capsys.readouterr().err
         assert words in err
         assert len(err.splitlines()) == 1
@@ -139,8 +146,9 @@ def test_a_run_that_was_killed_while_it_logged_is_drawn(tmp_path):
     writer.add_scalar("Metrics/lin_vel_rmse", 0.5, 0)
     writer.add_scalar("Perf/collection_time", 1.0, 0)
     writer.close()
-    assert plot.main([str(tmp_path / "run"), "--out", str(tmp_path / "curve.png")]) == 0
-    assert Image.open(tmp_path / "curve.png").size[0] > 100
+    write_config(tmp_path / "run")
+    assert curves.main([str(tmp_path / "run"), "--out", str(tmp_path)]) == 0
+    assert Image.open(tmp_path / "learning_curve.png").size[0] > 100
 
 
 def test_a_run_in_which_no_episode_ended_on_some_type_is_drawn(tmp_path):

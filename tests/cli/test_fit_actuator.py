@@ -11,6 +11,7 @@ from helpers import call, small_task
 from legged.tools import fit_actuator
 from simulated_motor import TRUTH, simulated_log
 
+from legged.cli import fit_actuator
 from legged.config import load_config
 from legged.errors import ConfigError
 from legged.fitting.log import check_alike, read_log
@@ -41,7 +42,7 @@ def test_a_peak_of_the_friction_that_the_log_does_not_show_is_not_invented(tmp_p
     drive = fit_drive(read_log(tmp_path / "log.npz"), longest_delay=0.02)
     assert drive.coulomb == drive.breakaway == pytest.approx(TRUTH["coulomb"], rel=0.05)
     assert drive.viscous == pytest.approx(TRUTH["viscous"], rel=0.05)
-    flags = ["--updates", "5", "--out", "fit", "--longest_delay", "0.01"]
+    flags = ["--updates", "5", "--out", "fit", "--longest-delay", "0.01"]
     assert fit_actuator.main([str(tmp_path / "log.npz"), *flags]) == 0
     assert re.search(r"friction: 1\.\d+ N m \(the log shows no more to break away\), viscous 0\.2", capsys.readouterr().out)
 
@@ -149,7 +150,7 @@ def test_a_log_is_resampled_without_looking_ahead(tmp_path):
 @pytest.mark.parametrize("kind", ["mlp", "lstm"])
 def test_the_command_writes_what_a_task_reads(tmp_path, kind, capsys):
     np.savez(tmp_path / "log.npz", **simulated_log(6.0))
-    flags = ["--kind", kind, "--updates", "150", "--out", "fit", "--longest_delay", "0.01"]
+    flags = ["--joints", "joint_0,joint_1", "--kind", kind, "--updates", "150", "--out", "fit", "--longest-delay", "0.01"]
     assert fit_actuator.main([str(tmp_path / "log.npz"), *flags]) == 0
     said = capsys.readouterr().out
     assert "motor: 4" in said
@@ -173,8 +174,9 @@ def test_the_command_writes_what_a_task_reads(tmp_path, kind, capsys):
 def test_a_network_in_a_task_gives_what_the_fit_says_of_it(tmp_path):
     """The torques of a task, step by step, are those of the same network as plain torch runs it on the whole history."""
     np.savez(tmp_path / "log.npz", **simulated_log(6.0))
-    fit_actuator.main([str(tmp_path / "log.npz"), "--updates", "50", "--out", "fit"])
+    fit_actuator.main([str(tmp_path / "log.npz"), "--updates", "50", "--hidden", "8,6,4", "--out", "fit"])
     weights = NetworkWeights.load("fit/network.npz")
+    assert [layer["weight"].shape[0] for layer in weights.layers] == [8, 6, 4, 1]
     task = small_task(("control.actuator.network", "fit/network.npz"), ("control.clip_actions", 1.0))
     law = task.control
     torch.manual_seed(0)
@@ -288,7 +290,8 @@ def test_joints_with_drives_of_their_own_are_not_fitted_as_one(tmp_path, changes
         (["--joints", "knee"], "--joints: pattern 'knee' matches nothing"),
         (["--spacing", "0.007"], "--spacing: must be a whole multiple of --dt"),
         (["--dt", "0.001"], "--dt: the log was sampled every 0.0025 s"),
-        (["--hidden", "0"], "--hidden: must be 1 to 1024"),
+        (["--hidden", "8,0"], "--hidden: must be 1 to 1024, got 0"),
+        (["--hidden", "8 8"], "--hidden: expected numbers like 32,32,32, got '8 8'"),
     ],
 )
 def test_a_wrong_flag_is_one_line(tmp_path, flags, said, capsys):

@@ -5,8 +5,8 @@ import warnings
 
 import pytest
 from helpers import call
-from legged.tools.compare import main
 
+from legged.cli.runs.evaluations import main
 from legged.evaluation.comparison import grouped, shares, spread
 
 RULE = {"distance_m": 4.0, "time_s": 20.0, "vx": 0.75}
@@ -32,8 +32,8 @@ def test_seeds_are_averaged_and_their_spread_is_told(tmp_path, capsys):
     evaluation(tmp_path / "a" / "evaluation_mujoco_warp.json", rmse=0.10, stairs={0.1: 1.0, 0.2: 0.9})
     evaluation(tmp_path / "b" / "evaluation_mujoco_warp.json", rmse=0.12, stairs={0.1: 0.5, 0.2: 0.7, 0.3: 0.2})
     evaluation(tmp_path / "b" / "evaluation_mujoco.json", physics="mujoco", rmse=0.2, stairs={0.2: 0.25})
-    picture = tmp_path / "success.png"
-    assert main([str(tmp_path / "a"), str(tmp_path / "b"), "--types", "stairs_up", "--out", str(picture)]) == 0
+    picture = tmp_path / "pictures" / "success.png"
+    assert main([str(tmp_path / "a"), str(tmp_path / "b"), "--types", "stairs_up", "--out", str(picture.parent)]) == 0
     said = capsys.readouterr().out
     rows = rows_of(said)
     lines = {row[0]: row[1:] for row in rows}
@@ -62,7 +62,7 @@ def test_panels_of_types_that_one_engine_has_not_seen_are_as_wide_as_the_others(
     (tmp_path / "evaluation_mujoco_warp.json").write_text(json.dumps(there))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert main([str(tmp_path), "--out", str(tmp_path / "success.png")]) == 0
+        assert main([str(tmp_path), "--out", str(tmp_path)]) == 0
     assert "written:" in capsys.readouterr().out
 
 
@@ -88,8 +88,7 @@ def test_evaluations_under_other_conditions_are_no_seeds_of_each_other(tmp_path,
     own = evaluation(tmp_path / "1.json", rmse=0.1, stairs={0.2: 0.9})
     other = evaluation(tmp_path / "2.json", rmse=0.3, stairs={0.2: 0.1}) | {"changes": {"terrain.scan": "highest"}}
     (tmp_path / "2.json").write_text(json.dumps(other))
-    picture = tmp_path / "success.png"
-    assert main([str(tmp_path / "1.json"), str(tmp_path / "2.json"), "--out", str(picture)]) == 0
+    assert main([str(tmp_path / "1.json"), str(tmp_path / "2.json"), "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert "terrain.scan=highest" in said
     assert " seeds " not in said.replace("mean of seeds (", "")
@@ -112,7 +111,7 @@ def test_success_of_some_of_the_seeds_says_of_how_many_it_is(tmp_path, capsys):
     (tmp_path / "2.json").write_text(json.dumps(second))
     evaluation(tmp_path / "3.json")
     names = [str(tmp_path / f"{i}.json") for i in (1, 2, 3)]
-    assert main([*names, "--out", str(tmp_path / "success.png")]) == 0
+    assert main([*names, "--out", str(tmp_path)]) == 0
     rows = rows_of(capsys.readouterr().out)
     assert ["stairs_up", "0.1 m", "75.0 (50 to 100, of 2 of 3 seeds)"] in rows
     assert ["pit", "0.1 m", "100.0 (of 1 of 3 seeds)"] in rows
@@ -138,7 +137,7 @@ def test_only_sizes_of_all_seeds_are_compared(tmp_path):
         (["nowhere"], "nowhere: holds no evaluation_<physics>.json"),
         (["other.json"], "other.json: is not the result of an evaluation"),
         (["good.json", "--types", "stair_up"], "stair_up: none of the evaluations holds it; did you mean 'stairs_up'"),
-        (["flat.json", "--out", "x.png"], "--out: draws success against difficulty, and none"),
+        (["flat.json", "--out", "x"], "--out: draws success against difficulty, and none"),
     ],
 )
 def test_wrong_input_is_named(arguments, message, tmp_path, monkeypatch, capsys):
@@ -229,14 +228,17 @@ def test_a_mean_without_the_seeds_that_fell_says_of_how_many_it_is(tmp_path, cap
 
 def test_an_engine_of_another_version_and_brackets_in_names_are_shown_as_they_are(tmp_path, capsys):
     evaluation(tmp_path / "1.json", task="[/x]", physics="[red]physx", stairs={0.1: 1.0, 0.2: 0.5})
-    out = tmp_path / "new" / "x.png"
-    assert main([str(tmp_path / "1.json"), "--out", str(out)]) == 0
+    out = tmp_path / "new" / "success.png"
+    assert main([str(tmp_path / "1.json"), "--out", str(out.parent)]) == 0
     said = capsys.readouterr().out
     assert "[/x]" in said
     assert "[red]physx, 1 seed" in said
     assert out.stat().st_size > 10_000
 
 
-def test_a_picture_over_a_folder_is_refused_before_anything_is_read(tmp_path, capsys):
-    assert main([str(tmp_path / "none"), "--out", str(tmp_path)]) == 2
-    assert "is a folder; the name of a file is wanted" in capsys.readouterr().err
+def test_a_folder_that_is_a_file_is_refused_before_anything_is_read(tmp_path, capsys):
+    (tmp_path / "taken").touch()
+    assert main([str(tmp_path / "none"), "--out", str(tmp_path / "taken")]) in (1, 2)
+    err = capsys.readouterr().err
+    assert str(tmp_path / "taken") in err
+    assert str(tmp_path / "none") not in err

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from legged.tools.train import describe
 
+from legged.cli.train import describe
 from legged.registry import task_config
 
 

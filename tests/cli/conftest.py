@@ -3,16 +3,16 @@
 import pytest
 from helpers import call
 
-from legged.tools import add_robot
+from legged.cli.robot import add
 
 
 @pytest.fixture
 def added(tmp_path, capsys):
-    """added(text, *flags): what the command prints for a file of that text; its robot is ./mine/<name>."""
+    """added(text, *flags): what `legged robot add` prints for a file of that text; its robot is ./mine/<name>."""
 
     def added(text: str, *flags: str, file: str = "toy.urdf") -> str:
         (tmp_path / file).write_text(text)
-        assert call(add_robot.main, [file, "--out", "mine", *flags]) == 0, capsys.readouterr().err
+        assert call(add.main, [file, "--out", "mine", *flags]) == 0, capsys.readouterr().err
         return capsys.readouterr().out
 
     return added

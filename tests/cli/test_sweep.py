@@ -16,6 +16,8 @@ import yaml
 from helpers import call, wait_for
 from legged.tools import sweep
 
+from legged.cli.sweep import report as reporting
+from legged.cli.sweep import run as sweep
 from legged.errors import ConfigError
 from legged.evaluation.reports.record import read_note
 from legged.learning.evaluations import Evaluated
@@ -32,7 +34,7 @@ from legged.sweeping.worker import NoValue, Worker
 pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
 pytestmark = pytest.mark.usefixtures("workplace")
 
-REPOSITORY = Path(sweep.__file__).parents[2]
+REPOSITORY = Path(sweep.__file__).parents[3]
 FILE = {
     "task": "half_cheetah",
     "trials": 3,
@@ -51,7 +53,7 @@ FILE = {
         "train.policy.activation": {"choices": ["elu", "tanh"]},
     },
 }
-FLAGS = ["mine.yaml", "--sim_device", "cpu"]
+FLAGS = ["mine.yaml", "--sim-device", "cpu"]
 
 
 def written(**changes) -> Path:
@@ -294,7 +296,7 @@ def test_trials_are_ordinary_runs_and_the_report_names_the_best(capsys):
         assert (plan.folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     shares = importances(trials)
     assert set(shares) in (set(), {parameter.path for parameter in plan.parameters})
-    assert call(sweep.main, [*FLAGS, "--report"]) == 0
+    assert call(reporting.main, FLAGS) == 0
     assert f"best: trial {best.number}, last return: {best.value:.4g}" in capsys.readouterr().out
 
 
@@ -333,7 +335,7 @@ def test_a_killed_sweep_goes_on_and_loses_nothing():
     """Killed in its second trial at the latest: what was found stays, what was begun is made again with its settings."""
     changes = {"pruner": "none", "trials": 4}
     written(**changes)
-    command = [sys.executable, "-m", "legged.tools.sweep", *FLAGS]
+    command = [sys.executable, "-m", "legged", "sweep", "run", *FLAGS]
     with open("out.txt", "w") as out:
         process = subprocess.Popen(
             command, stdout=out, stderr=subprocess.STDOUT, env={**os.environ, "PYTHONPATH": str(REPOSITORY)}
@@ -374,7 +376,7 @@ def test_a_signal_ends_the_trial_with_a_checkpoint_and_it_is_tried_again():
     written(overrides=overrides)
     with open("out.txt", "w") as out:
         process = subprocess.Popen(
-            [sys.executable, "-m", "legged.tools.sweep", *FLAGS],
+            [sys.executable, "-m", "legged", "sweep", "run", *FLAGS],
             stdout=out,
             stderr=subprocess.STDOUT,
             env={**os.environ, "PYTHONPATH": str(REPOSITORY)},

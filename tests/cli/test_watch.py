@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from helpers import POLICY, TASK, TINY_TRAINING, call, run_folders
 
+from legged.cli import play, train, watch
 from legged.commandline.arguments import watch_command
 from legged.errors import ConfigError
 from legged.play.live.address import HOST, PORT, free_port, is_loopback, url
-from legged.tools import play, train, watch
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -19,22 +19,22 @@ pytestmark = pytest.mark.usefixtures("workplace")
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        ([], "--load_run: there is no run in logs; train one first, or name a task whose policy is shipped (--task)"),
-        (["--task", "anymal_c_flta"], "--task: there is no task 'anymal_c_flta'; did you mean 'anymal_c_flat'?"),
-        (["--task", TASK, "--num_envs", "17"], "--num_envs: must be from 1 to 16, got 17"),
-        (["--task", TASK, "--num_envs", "0"], "--num_envs: must be from 1 to 16, got 0"),
-        (["--task", TASK, "--port", "65536"], "--port: must be from 0 to 65535, got 65536"),
-        (["--task", TASK, "--host", "192.0.2.1"], "--host: no page can be served at '192.0.2.1'"),
-        (["--task", TASK, "--terrain", "stairs"], "--terrain: there is no terrain type 'stairs'"),
+        ([], "POLICY: there is no run in logs/; train one first, or name a task whose policy is shipped"),
+        (["anymal_c_flta"], "POLICY: there is no task and no run 'anymal_c_flta'; did you mean 'anymal_c_flat'?"),
+        ([TASK, "--num-envs", "17"], "--num-envs: must be from 1 to 16, got 17"),
+        ([TASK, "--num-envs", "0"], "--num-envs: must be from 1 to 16, got 0"),
+        ([TASK, "--port", "65536"], "--port: must be from 0 to 65535, got 65536"),
+        ([TASK, "--host", "192.0.2.1"], "--host: no page can be served at '192.0.2.1'"),
+        ([TASK, "--terrain", "stairs"], "--terrain: there is no terrain type 'stairs'"),
         (
-            ["--task", TASK, "--difficulty", "0.5"],
+            [TASK, "--difficulty", "0.5"],
             "--difficulty: anymal_c_flat stands on a plane; name a type with --terrain",
         ),
-        (["--task", "anymal_c", "--difficulty", "2"], "--difficulty: must be between 0 and 1, got 2"),
-        (["--task", "half_cheetah", "--terrain", "flat"], "--terrain: 'half_cheetah' has no terrain to choose"),
-        (["--task", "anymal_c_step", "--difficulty", "0.5"], "--difficulty: 'anymal_c_step' has no terrain to choose"),
-        (["--load_run", "nowhere"], "--load_run: there is no run 'nowhere'"),
-        (["--task", TASK, "rewards.scales.torqes=1"], "torqes"),
+        (["anymal_c", "--difficulty", "2"], "--difficulty: must be between 0 and 1, got 2"),
+        (["half_cheetah", "--terrain", "flat"], "--terrain: 'half_cheetah' has no terrain to choose"),
+        (["anymal_c_step", "--difficulty", "0.5"], "--difficulty: 'anymal_c_step' has no terrain to choose"),
+        (["nowhere"], "POLICY: there is no task and no run 'nowhere'"),
+        ([TASK, "rewards.scales.torqes=1"], "torqes"),
     ],
 )
 def test_wrong_input_is_one_line(flags, said, capsys, monkeypatch):
@@ -47,7 +47,7 @@ def test_wrong_input_is_one_line(flags, said, capsys, monkeypatch):
 
 def test_without_viser_the_error_names_what_to_install(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert call(watch.main, ["--task", TASK]) == 2
+    assert call(watch.main, [TASK]) == 2
     expected = "error: watch: needs the package viser, which is not installed here: pip install 'legged[watch]'\n"
     assert capsys.readouterr().err == expected
 
@@ -98,14 +98,14 @@ def test_train_and_play_name_the_command(capsys):
     flags = ["--task", TASK, "--sim_device", "cpu", "sim.physics=mujoco", "sim.threads=1"]
     assert call(train.main, [*flags, "--num_envs", "4", "--max_iterations", "1", *TINY_TRAINING]) == 0
     (folder,) = run_folders()
-    assert f"watch it: python -m legged.tools.watch --load_run {folder}\n" in capsys.readouterr().out
+    assert f"watch it: legged watch {folder}\n" in capsys.readouterr().out
     assert call(play.main, [*flags, "--no-video"]) == 0
-    assert f"watch it: python -m legged.tools.watch --load_run {folder}\n" in capsys.readouterr().out
-    assert call(play.main, [*flags, "--no-video", "--load_run", str(POLICY), "--out", "elsewhere"]) == 0
-    assert f"watch it: python -m legged.tools.watch --load_run {POLICY}\n" in capsys.readouterr().out
+    assert f"watch it: legged watch {folder}\n" in capsys.readouterr().out
+    assert call(play.main, [str(POLICY), *flags[2:], "--no-video", "--out", "elsewhere"]) == 0
+    assert f"watch it: legged watch {POLICY}\n" in capsys.readouterr().out
 
 
 def test_what_a_run_does_not_know_by_itself_is_part_of_the_command():
-    given = argparse.Namespace(module="my tasks.py", given_task="slow.yaml")
-    command = "python -m legged.tools.watch --import 'my tasks.py' --task slow.yaml --load_run logs/slow/1"
+    given = argparse.Namespace(module="my tasks.py", task_file="slow.yaml")
+    command = "legged watch --import 'my tasks.py,slow.yaml' logs/slow/1"
     assert watch_command(given, Path("logs/slow/1")) == command

@@ -9,8 +9,8 @@ import yaml
 from helpers import call
 from importing_fixtures import URDF_LEG, urdf
 
+from legged.cli.robot import add
 from legged.robots.robot import load_robot
-from legged.tools import add_robot
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -49,7 +49,7 @@ def test_a_robot_that_can_not_stand_on_what_looks_like_its_feet_is_refused(tmp_p
         .replace('lower="-2.7" upper', 'lower="-0.6" upper')
     )
     (tmp_path / "toy.urdf").write_text(arms)
-    assert call(add_robot.main, ["toy.urdf", "--out", "mine"]) == 2
+    assert call(add.main, ["toy.urdf", "--out", "mine"]) == 2
     error = capsys.readouterr().err
     assert "toy.urdf: it can't stand on " in error
     assert error.count("\n") == 1

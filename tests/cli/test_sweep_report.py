@@ -11,6 +11,8 @@ import yaml
 from helpers import call
 from legged.tools import sweep
 
+from legged.cli.sweep import report as reporting
+from legged.cli.sweep import run as sweep
 from legged.config import parse_override
 from legged.sweeping.plan import plan_sweep, read_sweep
 from legged.sweeping.report import importances, table
@@ -91,9 +93,9 @@ def test_a_sweep_that_was_begun_on_a_cpu_does_not_go_on_with_a_gpu_but_is_report
     trials.keep_to("cpu")
     monkeypatch.setattr(sweep, "pick_device", lambda name: torch.device("cuda"))
     assert call(sweep.main, ["mine.yaml"]) == 2
-    said = "error: --sim_device: the trials of 'sweep_mine' are trained on cpu, and those on cuda can't be compared with them"
+    said = "error: --sim-device: the trials of 'sweep_mine' are trained on cpu, and those on cuda can't be compared with them"
     assert capsys.readouterr().err.startswith(said)
-    assert call(sweep.main, ["mine.yaml", "--report"]) == 0
+    assert call(reporting.main, ["mine.yaml"]) == 0
 
 
 def test_a_task_may_be_a_file_beside_that_of_the_sweep():
@@ -106,7 +108,7 @@ def test_a_task_may_be_a_file_beside_that_of_the_sweep():
     Path("mine/short_cheetah.yaml").write_text(yaml.safe_dump(task))
     given = {"task": "short_cheetah.yaml", "trials": 1, "objective": {"figure": "return"}, "parameters": parameters}
     Path("mine/search.yaml").write_text(yaml.safe_dump(given))
-    assert call(sweep.main, ["mine/search.yaml", "--sim_device", "cpu"]) == 0
+    assert call(sweep.main, ["mine/search.yaml", "--sim-device", "cpu"]) == 0
     text = Path("logs/sweep_search/table.md").read_text()
     assert "`short_cheetah`, for the last return" in text
     assert "python train.py --task mine/short_cheetah.yaml train.algorithm.gamma=0.9" in text

@@ -13,8 +13,11 @@ import mujoco
 import numpy as np
 import pytest
 from helpers import CALM, ENGINE, call
-from legged.tools import deploy, fit_actuator, simulate_robot
+from legged.tools import fit_actuator
 
+from legged.cli import fit_actuator
+from legged.cli.deploy import robot as simulated_robot
+from legged.cli.deploy import sim
 from legged.config.schema import SimConfig, TerrainConfig
 from legged.deploy.udp import UdpRobot
 from legged.errors import RunError
@@ -196,15 +199,15 @@ def test_sources_come_every_fifth_state_at_any_time_step():
         (["--latency", "nan"], "error: --latency: must be between 0 and 1, got nan"),
         (["--sim-dt", "0"], "error: --sim-dt: must be between 0.0001 and 0.02, got 0"),
         (["--commands", "none.txt"], "error: --commands: there is no file none.txt"),
-        (["--policy", "nobody"], "error: --policy: there is no task 'nobody'"),
-        (["--simulated", "anymal_x"], "error: --simulated: there is no robot 'anymal_x'; did you mean"),
+        (["nobody"], "error: POLICY: there is no task and no run 'nobody'"),
+        (["--robot", "anymal_x"], "error: --robot: there is no robot 'anymal_x'; did you mean"),
         (["--max-tilt", "-1"], "error: --max-tilt: must be between 0.1 and 1.6, got -1"),
     ],
 )
 def test_a_wrong_flag_ends_the_command_with_one_line(flags, says, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    policy = [] if "--policy" in flags else ["--policy", "anymal_c_flat"]
-    assert call(deploy.main, [*policy, "--robot", "sim", *flags]) == 2
+    policy = [] if flags == ["nobody"] else ["anymal_c_flat"]
+    assert call(sim.main, [*policy, *flags]) == 2
     shown = capsys.readouterr().err
     assert shown.startswith(says)
     assert len(shown.splitlines()) == 1
@@ -237,8 +240,8 @@ def test_a_run_too_short_for_a_film_has_none_and_says_so(count, tmp_path, capsys
 
 
 def test_an_unknown_robot_is_not_simulated(capsys):
-    assert call(simulate_robot.main, ["anymal_x"]) == 2
-    assert "there is no robot 'anymal_x'" in capsys.readouterr().err
+    assert call(simulated_robot.main, ["anymal_x"]) == 2
+    assert "error: ROBOT: there is no robot 'anymal_x'" in capsys.readouterr().err
 
 
 STAIRS = """
@@ -256,10 +259,10 @@ STAIRS = """
 def test_the_program_walks_up_stairs_in_another_process(tmp_path):
     """The shipped policy that needs no more than a robot measures: 50 Hz, of which cycles none was late, 1 % of packets lost,
     up 0.1 m steps in C MuJoCo at 2 ms, with motors that are 10 ms late and rub. What a cycle takes is not judged here: other
-    tests share the cores. What the program logged is what `fit_actuator` reads, and it finds the friction and the delay.
+    tests share the cores. `legged fit-actuator` reads what the program logged, and finds the friction and the delay.
     """
     (tmp_path / "walk.txt").write_text(STAIRS)
-    command = [sys.executable, "-m", "legged.tools.deploy", "--policy", "anymal_c_proprio", "--robot", "sim"]
+    command = [sys.executable, "-m", "legged", "deploy", "sim", "anymal_c_proprio"]
     command += ["--commands", "walk.txt", "--terrain", "stairs_up", "--size", "0.1", "--loss", "0.01", "--out", "out"]
     command += ["--max-missed", "50", "--max-age", "0.5", "--stand-seconds", "1.9"]
     command += ["control.actuator.coulomb_friction={HAA: 1.5}", "control.actuator.delay=[2, 2]"]

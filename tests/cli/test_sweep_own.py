@@ -7,6 +7,7 @@ import yaml
 from helpers import call
 from legged.tools import sweep
 
+from legged.cli.sweep import run as sweep
 from legged.sweeping.plan import plan_sweep, read_sweep
 from legged.sweeping.report import ranking, settings
 from legged.sweeping.study import Trials
@@ -25,7 +26,7 @@ FILE = {
         "train.policy": {"actor_hidden_dims": [8], "critic_hidden_dims": [8], "activation": "elu"},
     },
 }
-FLAGS = ["mine.yaml", "--sim_device", "cpu"]
+FLAGS = ["mine.yaml", "--sim-device", "cpu"]
 
 
 def plan_of(parameters):

@@ -11,6 +11,7 @@ import yaml
 from helpers import POLICY, POLICY_ITERATION, TASK, call, tiny_run
 from torch.utils.tensorboard import SummaryWriter
 
+from legged.cli.runs import compare, report, table
 from legged.config import to_dict
 from legged.evaluation.reports.comparison import apart, comparison_parts
 from legged.evaluation.reports.document import Table
@@ -18,7 +19,6 @@ from legged.evaluation.reports.experiments import highest_stairs
 from legged.evaluation.reports.record import read_record
 from legged.learning.timing import Timing, write_timing
 from legged.registry import task_config
-from legged.tools import experiments, report
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -45,7 +45,7 @@ def rows(text: str) -> list[list[str]]:
     return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in (lines[0], *lines[2:])]
 
 
-def table(name: str = "logs/experiments.md") -> list[dict[str, str]]:
+def table_in(name: str = "logs/experiments.md") -> list[dict[str, str]]:
     head, *found = rows(Path(name).read_text(encoding="utf-8").replace("\\_", "_").replace("&nbsp;", ""))
     return [dict(zip((text.replace("\\", "") for text in head), row, strict=True)) for row in found]
 
@@ -55,9 +55,9 @@ def test_runs_are_in_one_table_newest_first(capsys):
     (folders[0] / "note.txt").write_text("first steps")
     shutil.copyfile(POLICY / "evaluation_mujoco.json", folders[2] / "evaluation_mujoco.json")
     assert report.main([str(folders[2])]) == 0
-    assert experiments.main([]) == 0
+    assert table.main([]) == 0
     assert "written: logs/experiments.html, 3 runs\n" in capsys.readouterr().out
-    found = table()
+    found = table_in()
     assert [row["began"] for row in found] == [
         f"[2026-03-01 00:00]({TASK}/{STAMPS[2]}/report.md)",
         "2026-01-02 03:04",
@@ -96,36 +96,36 @@ def test_an_evaluation_of_another_checkpoint_than_the_last_is_called_that(capsys
     path = folders[1] / "evaluation_mujoco.json"
     of_the_last = path.read_text().replace(f'"{last}"', '"model_4.pt"')
     path.write_text(of_the_last)
-    assert experiments.main([]) == 0
-    assert [row["evaluated"] for row in table()] == [last, ""]
+    assert table.main([]) == 0
+    assert [row["evaluated"] for row in table_in()] == [last, ""]
     assert report.main([*map(str, folders)]) == 0
     said = f"In C MuJoCo it is of `{last}`, which is not the last policy."
     assert [said in (folder / "report.md").read_text() for folder in folders] == [True, False]
-    assert experiments.main(["--compare", *map(str, folders)]) == 0
+    assert compare.main([*map(str, folders)]) == 0
     text = Path("logs/comparison.md").read_text().replace("\\", "")
     assert text.count("which is not its last policy") == 1
     assert f"({STAMPS[0]}): of `{last}`" in text
     (folders[0] / "evaluation_mujoco.json").write_text(of_the_last)
-    assert experiments.main([]) == 0
-    assert "evaluated" not in table()[0]
+    assert table.main([]) == 0
+    assert "evaluated" not in table_in()[0]
     capsys.readouterr()
 
 
 def test_a_page_elsewhere_leads_to_no_report():
     folder = write_run(STAMPS[0])
     assert report.main([str(folder)]) == 0
-    assert experiments.main(["logs", "--markdown", "docs/experiments.md"]) == 0
-    (row,) = table("docs/experiments.md")
+    assert table.main(["logs", "--out", "docs"]) == 0
+    (row,) = table_in("docs/experiments.md")
     assert row["began"] == "2026-01-02 03:04"
-    assert sorted(path.name for path in Path("docs").iterdir()) == ["experiments.md"]
+    assert sorted(path.name for path in Path("docs").iterdir()) == ["experiments.html", "experiments.md"]
     assert str(Path.cwd()) not in Path("docs/experiments.md").read_text()
 
 
 def test_a_folder_of_several_and_one_inside_it_name_a_run_once():
     write_run(STAMPS[0])
     other = write_run(STAMPS[1], logs="elsewhere")
-    assert experiments.main(["logs", str(other), "elsewhere", "--out", "pages"]) == 0
-    assert len(table("pages/experiments.md")) == 2
+    assert table.main(["logs", str(other), "elsewhere", "--out", "pages"]) == 0
+    assert len(table_in("pages/experiments.md")) == 2
 
 
 def test_seeds_of_a_training_share_a_row():
@@ -137,9 +137,9 @@ def test_seeds_of_a_training_share_a_row():
         result = {"task": TASK, "physics": "mujoco", "falls": seed / 100, **means}
         (folder / "evaluation_mujoco.json").write_text(json.dumps(result))
     (write_run("2025-01-01_00-00-00") / "note.txt").write_text("as it was")
-    assert experiments.main(["--seeds_share"]) == 0
+    assert table.main(["--seeds-share"]) == 0
     names = ("began", "what changed", "seed", "RMSE [m/s]", "yaw rate RMSE [rad/s]", "falls [%]", "loop [s]")
-    assert [tuple(row[name] for name in names) for row in table()] == [
+    assert [tuple(row[name] for name in names) for row in table_in()] == [
         ("2026-03-01 00:00", "s3: scales.torques -0.0002", "3", "0.500", "1.000", "3.00", "12.5"),
         ("2026-01-02 03:04", "", "1, 2", "0.055", "0.110", "1.50", "12.5"),
         ("2025-01-01 00:00", "as it was", "1", "-", "-", "-", "12.5"),
@@ -147,8 +147,8 @@ def test_seeds_of_a_training_share_a_row():
     text = Path("logs/experiments.md").read_text()
     assert text.splitlines()[2].startswith("4 runs, newest first")
     assert "share a row" in text
-    assert experiments.main([]) == 0
-    assert len(table()) == 4
+    assert table.main([]) == 0
+    assert len(table_in()) == 4
 
 
 @pytest.mark.parametrize(
@@ -179,7 +179,7 @@ def test_labels_leave_out_what_all_have():
 def test_real_runs_are_compared():
     a = tiny_run("train.runner.run_name=a", "env.episode_length_s=0.1", iterations=2)
     b = tiny_run("train.runner.run_name=b", "env.episode_length_s=0.1", "rewards.scales.torques=-3e-4", iterations=3)
-    assert experiments.main(["--compare", str(a), f"{TASK}/{b.name}"]) == 0
+    assert compare.main([str(a), f"{TASK}/{b.name}"]) == 0
     page, text = (Path(f"logs/comparison.{ending}").read_text() for ending in ("html", "md"))
     assert "| `rewards.scales.torques` | `-1.0e-05` | `-0.0003` |" in text
     assert "episode_length_s" not in text
@@ -238,7 +238,7 @@ def test_success_is_drawn_where_two_runs_have_it():
     for name in ("anymal_c", "anymal_c_blind"):
         shutil.copytree(POLICY.with_name(name), Path("logs") / name / STAMPS[0])
     runs = [f"{name}/{STAMPS[0]}" for name in ("anymal_c", "anymal_c_blind")]
-    assert experiments.main(["--compare", *runs, "--out", "pages"]) == 0
+    assert compare.main([*runs, "--out", "pages"]) == 0
     page = Path("pages/comparison.html").read_text()
     drawing = page.partition('aria-label="success: stairs up"')[2].partition("</svg>")[0]
     assert len(re.findall(r'data-name="([^"]+)"', drawing)) == 2
@@ -247,18 +247,19 @@ def test_success_is_drawn_where_two_runs_have_it():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("command", "arguments", "words"),
     [
-        ([], "error: logs: holds no run folder (there is no config.yaml in it)"),
-        (["--compare", "a"], "error: --compare: expected 2 to 8 runs, got 1"),
-        (["--compare", "a", "b"], "error: --compare: there is no run 'a'"),
-        (["--compare", "a", "b", "--markdown", "x.md"], "error: --markdown: a comparison has pictures"),
-        (["logs", "--out", "x", "--markdown", "x.md"], "error: --out: 'x' beside --markdown"),
-        (["elsewhere", "--markdown", "."], "error: --markdown: . is a folder"),
+        (table, [], "error: logs: holds no run folder (there is no config.yaml in it)"),
+        (table, ["nowhere"], "error: nowhere: "),
+        (table, ["elsewhere", "--out", "taken"], "error: taken: "),
+        (compare, ["a"], "error: RUN: expected 2 to 8 runs, got 1"),
+        (compare, ["a", "b"], "error: RUN: there is no task and no run 'a'"),
+        (compare, [TASK, TASK], f"error: RUN: '{TASK}' has no run in logs/"),
     ],
 )
-def test_a_wrong_command_line_is_one_line(arguments, words, capsys):
-    assert call(experiments.main, arguments) == 2
+def test_a_wrong_command_line_is_one_line(command, arguments, words, capsys):
+    Path("taken").touch()
+    assert call(command.main, arguments) == 2
     err = capsys.readouterr().err
     assert err.startswith(words)
     assert len(err.splitlines()) == 1
@@ -266,15 +267,16 @@ def test_a_wrong_command_line_is_one_line(arguments, words, capsys):
 
 def test_a_run_is_compared_with_others_only(capsys):
     folder = write_run(STAMPS[0])
-    assert call(experiments.main, ["--compare", str(folder), f"{TASK}/{folder.name}"]) == 2
-    assert "--compare: a run comes twice" in capsys.readouterr().err
-    assert call(experiments.main, ["--compare", str(folder), f"{TASK}/{folder.name}x"]) == 2
+    for same in (str(folder), f"{TASK}/{folder.name}", TASK):
+        assert call(compare.main, [str(folder), same]) == 2
+        assert "RUN: a run comes twice" in capsys.readouterr().err
+    assert call(compare.main, [str(folder), f"{TASK}/{folder.name}x"]) == 2
     assert f"did you mean '{TASK}/{folder.name}'" in capsys.readouterr().err
 
 
 def test_the_log_of_this_project_is_one_that_the_tool_writes():
-    page = Path(experiments.__file__).parents[2] / "docs" / "experiments.md"
-    found = table(str(page))
+    page = Path(table.__file__).parents[3] / "docs" / "lab" / "experiments.md"
+    found = table_in(str(page))
     assert {"began", "task", "what changed", "status", "steps/s"} <= found[0].keys()
     began = [row["began"] for row in found]
     assert began == sorted(began, reverse=True)

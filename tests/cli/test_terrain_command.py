@@ -6,10 +6,10 @@ import pytest
 from helpers import TASK, call
 from PIL import Image
 
+from legged.cli import terrain as command
 from legged.config.schema import TerrainConfig
 from legged.rendering.paint import HIGH, LOW, MIDDLE, add_painted_terrain, color
 from legged.terrain import Terrain, TileSpec
-from legged.tools import show_terrain
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def can_render():
 
 def shown(folder, *arguments) -> tuple[np.ndarray, np.ndarray]:
     """The map and the picture of a call."""
-    assert call(show_terrain.main, ["--task", TASK, "--out", str(folder), *arguments]) == 0
+    assert call(command.main, [TASK, "--out", str(folder), *arguments]) == 0
     assert {path.name for path in folder.iterdir()} == {"terrain.png", "terrain_map.png"}  # and nothing half written
     return tuple(np.asarray(Image.open(folder / name).convert("RGB")) for name in ("terrain_map.png", "terrain.png"))
 
@@ -72,7 +72,7 @@ def test_colours_by_height():
     ],
 )
 def test_wrong_input_is_named_and_writes_nothing(tmp_path, capsys, arguments, words):
-    assert call(show_terrain.main, ["--task", TASK, "--out", str(tmp_path / "out"), *arguments]) == 2
+    assert call(command.main, [TASK, "--out", str(tmp_path / "out"), *arguments]) == 2
     message = capsys.readouterr().err
     for word in words:
         assert word in message
