@@ -85,14 +85,14 @@ def check_engine(
     """
     for field in randomized:
         if field not in MODEL_FIELDS:
-            raise ValueError(f"there is no field '{field}' of the model to randomise{suggest(field, MODEL_FIELDS, 'fields')}")
+            raise ValueError(f"randomize: there is no model field '{field}'{suggest(field, MODEL_FIELDS, 'fields')}")
     check_quantities(quantities)
     if resolve_physics(sim.physics, device, where("sim.physics")) != "newton":
         return
     others = "sim.physics=mujoco_warp or mujoco"
     if not isinstance(scene, RobotScene):
         raise ConfigError(
-            f"{where('sim.physics')}: newton simulates robots with a floating base, not {scene.name}; {others} take any"
+            f"{where('sim.physics')}: newton simulates robots with a floating base, not {scene.name}; {others} simulate any model"
         )
     if scene.robot.passive is not None:
         raise ConfigError(

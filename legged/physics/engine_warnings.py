@@ -8,25 +8,25 @@ from contextlib import contextmanager
 import mujoco
 
 
-def teller() -> Callable[[str], None]:
+def warning_printer() -> Callable[[str], None]:
     """Return a handler that prints each kind of warning once."""
-    told: set[str] = set()
+    printed: set[str] = set()
 
-    def tell(text: str) -> None:
+    def print_warning(text: str) -> None:
         text = text.partition(" Time =")[0]
         kind = re.sub(r"\d+", "#", text)
-        if kind not in told:
-            told.add(kind)
+        if kind not in printed:
+            printed.add(kind)
             sys.stderr.write(f"warning: MuJoCo: {text}\n")  # in one write, because the engine warns from several threads
 
-    return tell
+    return print_warning
 
 
 @contextmanager
-def told_once() -> Iterator[None]:
+def each_warning_once() -> Iterator[None]:
     """Print each kind of warning once within the block. Afterwards, restore the previous handler."""
     before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(teller())
+    mujoco.set_mju_user_warning(warning_printer())
     try:
         yield
     finally:
@@ -38,4 +38,4 @@ def keep_out_of_files() -> None:
     write MUJOCO_LOG.TXT.
     """
     if mujoco.get_mju_user_warning() is None:
-        mujoco.set_mju_user_warning(teller())
+        mujoco.set_mju_user_warning(warning_printer())

@@ -48,7 +48,9 @@ class FootChains:
             feet.append(chain)
             offsets.append(offset)
         if len({len(chain) for chain in feet}) != 1 or not feet[0]:
-            raise ConfigError(f"{robot.folder}: feet: all feet must hang on the same number of bodies that turn, one or more")
+            raise ConfigError(
+                f"{robot.folder}: feet: all feet must have the same number of hinges between them and the base, at least one"
+            )
         levels = list(zip(*feet, strict=True))
         return cls(
             offset=np.array(offsets),
@@ -81,7 +83,7 @@ def _hinges(model: mujoco.MjModel, body: int, base: int, offset: np.ndarray, whe
     while body not in (0, base):
         for joint in reversed(range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])):
             if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
-                raise ConfigError(f"{where}: joint '{model.joint(joint).name}' between base and foot is no hinge")
+                raise ConfigError(f"{where}: joint '{model.joint(joint).name}' between base and foot is not a hinge")
             found.append(_Hinge(joint, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])))
             if model.qpos0[model.jnt_qposadr[joint]] != 0.0:  # a model describes its bodies at the joints' reference angles
                 _turn_back(model, found[-1])

@@ -112,8 +112,8 @@ FIELDS = {
         neutral=1.0,
     ),
     "restitution": Field(
-        "share of its speed that a shape keeps when it bounces, made by less damping of its contacts at the same stiffness;"
-        " below 0.135 the damping stays the model's",
+        "share of its speed that a shape keeps when it bounces, from a lower damping of its contacts at the same stiffness;"
+        " below 0.135 the damping ratio is 1",
         "1",
         "shapes",
         lambda scene, model: scene.shapes(model),
@@ -185,7 +185,7 @@ FIELDS = {
         (Change("dof_frictionloss", "add"),),
     ),
     "joint_offset": Field(
-        "what each joint's encoder shows beside the true angle, to the control law and in `dof_pos`",
+        "error of each joint's encoder, added to the true angle in the control law and in `dof_pos`",
         "rad",
         "joints with a motor",
         lambda _, model: np.arange(model.nu),
@@ -194,7 +194,7 @@ FIELDS = {
         each=True,
     ),
     "motor_strength": Field(
-        "factor on the force or torque that each actuator makes of what is asked of it",
+        "factor on the force or torque that each actuator produces for a control",
         "1",
         "actuators",
         lambda _, model: linear_actuators(model),
@@ -203,7 +203,7 @@ FIELDS = {
         lowest=0.0,
     ),
     "actuator_gain": Field(
-        "force or torque added per unit of control; a position servo's pull towards its target grows alike",
+        "force or torque added per unit of control; a position servo's force towards its target grows with it",
         "N m or N",
         "actuators",
         lambda _, model: linear_actuators(model),
@@ -226,7 +226,7 @@ FIELDS = {
         for name, of in (
             ("p_gain", "the stiffness of each joint's control law"),
             ("d_gain", "the damping of each joint's control law"),
-            ("velocity_limit", "each joint's velocity limit, of which rewards and torque-speed curves know"),
+            ("velocity_limit", "each joint's velocity limit in rewards and torque-speed curves"),
         )
     },
     "torque_limit": Field(

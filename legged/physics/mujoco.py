@@ -49,7 +49,7 @@ class MujocoPhysics(Physics):
             ValueError: `device` is not the CPU.
         """
         if device.type != "cpu":
-            raise ValueError(f"the engine mujoco runs on the CPU, not on {device}")
+            raise ValueError(f"the engine mujoco runs on the CPU only, not on {device}")
         keep_out_of_files()
         self.num_envs, self.dt, self.device = num_envs, sim.dt, device
         self.model = scene.model(sim, contact_sensors=True)

@@ -44,5 +44,5 @@ def found(name: str, quantities: Mapping[str, Tensor]) -> Tensor:
         ValueError: the physics was not made for this quantity.
     """
     if name not in quantities:
-        raise ValueError(f"quantity: make_physics was not told of '{name}'{suggest(name, quantities, 'it was of')}")
+        raise ValueError(f"quantity: the physics was not made for '{name}'{suggest(name, quantities, 'it was made for')}")
     return quantities[name]

@@ -40,8 +40,8 @@ class RandomizedModel:
             ValueError: the model was not made for this field, or the values have another shape.
         """
         if field not in self.rows:
-            told = suggest(field, self.rows, "those are")
-            raise ValueError(f"randomize: '{field}' is none of the fields that make_physics was told of{told}")
+            hint = suggest(field, self.rows, "it was made for")
+            raise ValueError(f"randomize: the physics was not made for the field '{field}'{hint}")
         rows = len(self.rows[field])
         if values.dim() != 1 and values.shape[1:] != (rows,):
             raise ValueError(f"randomize: values of {field} must be (N,) or (N, {rows}), not {tuple(values.shape)}")
@@ -130,14 +130,14 @@ def check_ranges(
         if not len(field.rows(scene, model)):
             raise ConfigError(f"{path}: {scene.name} has no {field.what}")
         if name == "restitution" and (model.geom_solref[field.rows(scene, model), 0] <= 0.0).any():
-            told = "contacts have a stiffness of their own (a negative solref), in place of a time constant"
-            raise ConfigError(f"{path}: {scene.name}: {told}")
+            reason = "contacts have a stiffness (a negative solref) instead of a time constant"
+            raise ConfigError(f"{path}: {scene.name}: {reason}")
         changed = given.give(name, torch.tensor([low], dtype=torch.float64)) if field.changes else {}
         for change in field.changes:
             rows = changed[change.array][:, field.rows(scene, model)]
             numbers = rows if change.column is None else rows[:, :, change.column]
             if change.least is not None and numbers.min() < change.least:
                 raise ConfigError(
-                    f"{path}: its lowest value, {low:g} ({field.meaning}), makes a {change.array} of {numbers.min():g};"
-                    f" at least {change.least:g} must be left"
+                    f"{path}: its lowest value, {low:g} ({field.meaning}), makes {change.array} {numbers.min():g};"
+                    f" it must be at least {change.least:g}"
                 )

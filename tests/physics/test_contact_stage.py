@@ -301,7 +301,7 @@ def test_a_shape_is_pushed_as_in_c_mujoco(shape):
     ("geoms", "reason"),
     [
         ('<geom name="a" type="box" size=".1 .1 .1"/>', r"shapes 'b' \(a sphere\) and 'a' \(a box\) may touch"),
-        ('<geom name="a" type="capsule" size=".1 .1" surfacevel="0 0 0 1 0 0"/>', "surfaces that move or stick"),
+        ('<geom name="a" type="capsule" size=".1 .1" surfacevel="0 0 0 1 0 0"/>', "surface velocities or adhesion"),
     ],
 )
 def test_what_it_does_not_make_is_said(geoms, reason):

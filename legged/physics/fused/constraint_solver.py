@@ -168,17 +168,17 @@ class ConstraintSolver:
     def why_not(m: Any, d: Any) -> str:
         """Return the reason why this solver does not support a model; empty if it does."""
         if not 1 <= m.nv <= MOST_DOFS:
-            return f"it takes 1 to {MOST_DOFS} degrees of freedom, the model has {m.nv}"
+            return f"the model has {m.nv} degrees of freedom; 1 to {MOST_DOFS} are supported"
         if m.is_sparse:
-            return "mujoco-warp keeps the model's Jacobians sparse"
+            return "mujoco-warp stores sparse Jacobians for the model"
         if d.njmax > MOST_ROWS:
-            return f"{d.njmax} constraint rows (sim.njmax) are more than {MOST_ROWS}"
+            return f"{d.njmax} constraint rows (sim.njmax) exceed {MOST_ROWS}"
         if m.opt.solver != mujoco.mjtSolver.mjSOL_NEWTON:
             return "the model's solver is not Newton"
         if m.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
             return "the model's integrator is not Euler"
         if m.opt.noslip_iterations:
-            return "the model asks for noslip iterations"
+            return "the model uses noslip iterations"
         if m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART:
             return "the model disables warm starts"
         if max(len(m.opt.tolerance), len(m.opt.ls_tolerance)) > 1:

@@ -107,22 +107,22 @@ class ContactStage:
         if drawn := [name for name in FIXED if name in randomized]:
             return f"{drawn[0]} differs between worlds"
         if "geom_solref" in randomized and not contact_pairs.alike_springs(model, contact_pairs.pairs_of(m)):
-            return "restitution differs between worlds, and shapes that touch have springs of their own"
+            return "restitution differs between worlds, and shapes that may touch have different solref"
         if m.is_sparse:
-            return "mujoco-warp keeps Jacobians sparse"
+            return "mujoco-warp stores sparse Jacobians for the model"
         if model.nflex or np.any(model.tendon_limited) or np.any(model.tendon_frictionloss):
             return "the model has flexes, or tendons with limits or friction"
         if np.any(model.geom_surfacevel) or np.any(model.geom_adhesion) or np.any(model.pair_adhesion):
-            return "the model has surfaces that move or stick"
+            return "the model has surface velocities or adhesion"
         if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
             return "the model's integrator is not Euler"
         if model.opt.disableflags & FLAGS.mjDSBL_CONSTRAINT:
             return "the model disables constraints"
         if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
-            return "the model overrides the parameters of contacts"
+            return "the model overrides contact parameters"
         slots = d.naconmax // d.nworld
         if shared_bytes(stage_constants(model, d.njmax, slots, dim=6, frictions=True, limits=True)) > SHARED_BYTES:
-            return f"{slots} contacts a world (sim.nconmax) do not fit a GPU's shared memory"
+            return f"{slots} contacts per world (sim.nconmax) exceed a GPU's shared memory"
         return contact_pairs.why_not(model, contact_pairs.pairs_of(m))
 
     def launch(self) -> None:

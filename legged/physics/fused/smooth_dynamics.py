@@ -24,11 +24,11 @@ FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for n
 AFFINE = int(mujoco.mjtBias.mjBIAS_AFFINE)
 SOURCE = ("smooth_dynamics.h",)
 UNKNOWN = {
-    "compensation of gravity": ("body_gravcomp",),
-    "springs that are not linear": ("jnt_stiffnesspoly", "jnt_springyield"),
-    "dampers that are not linear": ("dof_dampingpoly",),
+    "gravity compensation": ("body_gravcomp",),
+    "nonlinear springs": ("jnt_stiffnesspoly", "jnt_springyield"),
+    "nonlinear dampers": ("dof_dampingpoly",),
     "dampers or armature of actuators": ("actuator_damping", "actuator_dampingpoly", "actuator_armature"),
-    "tendons that pull": (
+    "tendons with forces or limits": (
         "tendon_stiffness",
         "tendon_stiffnesspoly",
         "tendon_damping",
@@ -237,19 +237,19 @@ class SmoothDynamics:
             if getattr(model, count):
                 return f"the model has {words}"
         if np.any(model.opt.wind) or model.opt.density or model.opt.viscosity:
-            return "the model is in a fluid"
+            return "the model is in a fluid (density, viscosity or wind)"
         if off := [
             name for name in NEEDED_STAGES if model.opt.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")
         ]:
             return f"the model disables {off[0].lower()}"
         if model.opt.enableflags or model.opt.disableactuator:
-            return "the model enables features, or disables groups of actuators"
+            return "the model enables optional features, or disables groups of actuators"
         if not model.nv:
             return "the model has no joints"
         if max(model.nbody, model.njnt) > 255:
-            return f"it has {model.nbody} bodies and {model.njnt} joints"
+            return f"the model has {model.nbody} bodies and {model.njnt} joints; at most 255 of each are supported"
         if shared_bytes(model) > SHARED_BYTES:
-            return f"{model.nbody} bodies do not fit a GPU's shared memory"
+            return f"the data of {model.nbody} bodies exceed a GPU's shared memory"
         if not np.isin(model.eq_type, (CONNECT, WELD, JOINT)).all():
             return "the model has equality constraints of tendons or flexes"
         return _why_not_motors(model, _scalar(model))
@@ -269,14 +269,14 @@ def _why_not_motors(model: mujoco.MjModel, scalar: np.ndarray) -> str:
     """Return the reason why the actuators are not supported; empty if they are. `scalar` (njnt,) marks slides and hinges."""
     on_joint = np.isin(model.actuator_trntype, (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     if not on_joint.all() or not scalar[model.actuator_trnid[:, 0]].all():
-        return "an actuator acts on something else than a slide or a hinge"
+        return "an actuator acts on neither a slide nor a hinge"
     plain = (
         (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
         & np.isin(model.actuator_biastype, (mujoco.mjtBias.mjBIAS_NONE, AFFINE))
         & (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE)
         & (model.actuator_ctrlnum == 1)
     )
-    return "" if plain.all() else "an actuator is no motor, position or velocity servo"
+    return "" if plain.all() else "an actuator is neither a motor nor a position or velocity servo"
 
 
 def _trees(model: mujoco.MjModel) -> dict[str, np.ndarray]:

@@ -119,8 +119,8 @@ class NewtonPhysics(WarpPhysics):
 
     def randomize(self, field: str, values: Tensor) -> None:
         if field not in self._randomized:
-            told = suggest(field, self._randomized, "those are")
-            raise ValueError(f"randomize: '{field}' is none of the fields that make_physics was told of{told}")
+            hint = suggest(field, self._randomized, "it was made for")
+            raise ValueError(f"randomize: the physics was not made for the field '{field}'{hint}")
         if self._fields is None:
             {"friction": self._set_friction, "added_base_mass": self._add_base_mass}[field](values.to(self.device))
             return

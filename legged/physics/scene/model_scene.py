@@ -39,11 +39,11 @@ class ModelScene(Scene):
             "delays": model.nhistory,
             "plugins": model.nplugin,
             "mocap bodies": model.nmocap,
-            "bodies that sleep": sleeps,
+            "sleeping bodies": sleeps,
         }
         for kind, count in kinds.items():
             if count:
-                raise ConfigError(f"{self.name}: it has {kind}, whose state the engines here do not keep per world")
+                raise ConfigError(f"{self.name}: it has {kind}, whose state the engines do not keep per world")
         return model
 
     def shapes(self, model: mujoco.MjModel) -> np.ndarray:

@@ -221,7 +221,7 @@ class Line:
 
     def end(self, done: int) -> None:
         """Show that `done` modules were compiled. Warp compiles the others at their launch, and reports their errors."""
-        rest = "" if done == self._total else f" of {self._total}, the others follow one by one"
+        rest = "" if done == self._total else f" of {self._total}; the others are compiled when they are launched"
         self._print(f"compiled {done} kernel modules in {time.monotonic() - self._start:.1f} s{rest}")
 
     def _print(self, text: str) -> None:

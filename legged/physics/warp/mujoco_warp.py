@@ -55,7 +55,7 @@ def absent_stages(model: mujoco.MjModel, randomized: Collection[str] = ()) -> in
 def ignored(model: mujoco.MjModel) -> str:
     """Return the first feature of a model that mujoco-warp ignores silently; empty without such a feature."""
     for group in disabled_groups(model):
-        return f"it would drive the actuators of group {group} too, which the model disables"
+        return f"it would ignore that the model disables the actuators of group {group}"
     scalar = np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE))
     for kind, limited, span, margin in (
         ("joint", (model.jnt_limited != 0) & scalar, np.diff(model.jnt_range)[:, 0], model.jnt_margin),
@@ -63,8 +63,8 @@ def ignored(model: mujoco.MjModel) -> str:
     ):
         for i in np.flatnonzero(limited & (span < 2.0 * margin)):
             return (
-                f"{kind} '{getattr(model, kind)(i).name}' may be within the margin ({margin[i]:g}) of both of its limits,"
-                f" {span[i]:g} apart, and would feel the nearer one only"
+                f"{kind} '{getattr(model, kind)(i).name}' can be within the margin ({margin[i]:g}) of both of its limits, which"
+                f" are {span[i]:g} apart, and only the nearer limit would exert force"
             )
     return ""
 
@@ -155,12 +155,14 @@ class MujocoWarpPhysics(WarpPhysics):
             ConfigError: mujoco-warp cannot simulate the model.
         """
         if reason := ignored(self.model):
-            raise ConfigError(f"sim.physics: mujoco_warp cannot simulate {scene}, mujoco might: {reason}")
+            raise ConfigError(f"sim.physics: mujoco_warp cannot simulate {scene} (try sim.physics=mujoco): {reason}")
         names = [name for name in (*PER_WORLD, *self._per_world) if name != GRAVITY and getattr(self.model, name).size]
         try:
             m = mjw.put_model(self.model, batch_sizes=dict.fromkeys(names, self.num_envs))
         except NotImplementedError as error:
-            raise ConfigError(f"sim.physics: mujoco_warp cannot simulate {scene}, mujoco might: {error}") from error
+            raise ConfigError(
+                f"sim.physics: mujoco_warp cannot simulate {scene} (try sim.physics=mujoco): {error}"
+            ) from error
         if GRAVITY in self._per_world:
             m.opt.gravity = wp.array(np.tile(self.model.opt.gravity, (self.num_envs, 1)), dtype=wp.vec3)
         return m
@@ -231,7 +233,7 @@ class MujocoWarpPhysics(WarpPhysics):
         no_solver = ConstraintSolver.why_not(self._m, self._d)
         self.why_library = no_solver or TorqueStep.why_not(self.model, per_world)
         if step == "fused" and self.why_library:
-            raise ConfigError(f"sim.step=fused: {self.why_library}; sim.step=auto takes what fits")
+            raise ConfigError(f"sim.step=fused: {self.why_library}; sim.step=auto uses the parts that support the model")
         if no_solver:
             return
         self._m.opt.run_qacc_smooth = False  # the fused solver does not start from it
@@ -240,7 +242,7 @@ class MujocoWarpPhysics(WarpPhysics):
         else:
             no_contacts = ContactStage.why_not(self.model, self._m, self._d, per_world)
             if no_contacts:
-                self.why_library = f"for contacts alone, {no_contacts}"
+                self.why_library = f"(contacts only) {no_contacts}"
             else:
                 self._contacts = ContactStage(self.model, self._m, self._d, per_world, self._on_cells)
             active_set = None if self._contacts is None else self._contacts.active_set
@@ -254,7 +256,7 @@ class MujocoWarpPhysics(WarpPhysics):
             return self.why_library
         if quantities:
             return f"mujoco-warp's own launches compute {', '.join(quantities)}"
-        return "its constraint rows take more than a thread's stack, or friction cones are elliptic"
+        return "the constraint rows exceed a thread's stack, or friction cones are elliptic"
 
     def _library_step(self) -> None:
         """Make a physics step of mujoco-warp's library."""

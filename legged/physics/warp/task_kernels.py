@@ -362,7 +362,7 @@ class TaskKernels(Launcher):
         self.launch(vary_control, tuple(arguments[-1].shape), arguments)
 
     def disturb(self, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `Disturbances.act`, without applying kicks. The last argument (N, bodies, 6) gets the forces."""
+        """Launch the kernel of `Disturbances.act` without the kicks. The last argument (N, bodies, 6) gets the forces."""
         total: Tensor = arguments[-1]  # type: ignore[assignment]
         self.launch(disturb, (len(total), max(total.shape[1], 1)), arguments)
 
