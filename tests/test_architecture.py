@@ -15,7 +15,7 @@ LONGEST = 400
 
 
 def name_of(path: Path) -> str:
-    """legged/tools/train.py -> legged.tools.train."""
+    """legged/tools/train.py -> legged.cli.train."""
     parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
@@ -39,7 +39,7 @@ def uses(path: Path, *modules: str) -> set[str]:
 
 def test_the_rules_are_applied_to_all_of_the_package():
     names = {name_of(path) for path in FILES}
-    assert {"legged.physics.warp.mujoco_warp", "legged.tools.train", "legged.envs.legged_robot", "legged"} <= names
+    assert {"legged.physics.warp.mujoco_warp", "legged.cli.train", "legged.envs.legged_robot", "legged"} <= names
     # The parser of imports sees what it should: a lazy import, and a plain one.
     assert uses(PACKAGE / "graph" / "step_graph.py", "warp") == {"warp"}
     assert uses(PACKAGE / "tools" / "train.py", "legged.learning", "torch", "warp") == {"legged.learning", "torch"}

@@ -129,7 +129,7 @@ def policy_overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
     return [change for change in overrides(args) if change[0] != "train.runner.experiment_name"]
 
 
-def pick_device(name: str | None, flag: str = "--sim_device") -> torch.device:
+def pick_device(name: str | None, flag: str = "--sim-device") -> torch.device:
     """Return the device that was asked for, else the GPU if there is one; under torchrun the GPU of this process's number.
 
     Raises:

@@ -98,8 +98,8 @@ class Trials:
             self.study.set_user_attr(DEVICE, device)
         elif known != device:
             raise ConfigError(
-                f"--sim_device: the trials of '{self.plan.name}' are trained on {known}, and those on {device} can't be"
-                f" compared with them; go on with --sim_device {known}, or give this sweep another name (name: in its file)"
+                f"--sim-device: the trials of '{self.plan.name}' are trained on {known}, and those on {device} can't be"
+                f" compared with them; go on with --sim-device {known}, or give this sweep another name (name: in its file)"
             )
 
     @property

@@ -10,7 +10,7 @@ import pytest
 from legged.commandline.completion import words_of
 from legged.commandline.listing import robots, tasks
 
-from legged.tools import completion
+from legged.cli import completion
 
 BASH = """
 source "$1"

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from helpers import TASK, TINY_TRAINING, checkpoints, run_folders
 
+from legged.cli import train
 from legged.commandline.command import run_main
 from legged.commandline.output import Output, forgiving_output, when_output_is_lost
 from legged.errors import ConfigError, RunError
-from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -163,7 +163,7 @@ def test_a_training_whose_output_goes_away_stops_with_a_checkpoint(monkeypatch, 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
 def test_a_full_disk_behind_the_output_leaves_no_traceback_at_exit():
     with open("/dev/full", "w") as full:
-        command = [sys.executable, "-m", "legged.tools.train", *ARGUMENTS, "--show"]
+        command = [sys.executable, "-m", "legged.cli.train", *ARGUMENTS, "--show"]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 1
     assert done.stderr == "error: the output can't be written: no space left on the disk\n"

@@ -9,7 +9,7 @@ from legged.commandline.arguments import overrides
 from legged.process.command_parser import CommandParser
 from legged.registry import task_config
 
-INSTALLED = {"legged.tools.train": "python train.py ", "legged.tools.play": "python play.py "}
+INSTALLED = {"legged.cli.train": "python train.py ", "legged.cli.play": "python play.py "}
 
 
 def parser_of(tool: str) -> CommandParser:
@@ -34,7 +34,7 @@ def test_help_of_a_command_shows_two_examples_that_it_can_read(tool, capsys):
             task_config(task, overrides(args))  # its settings are ones of that task
 
 
-@pytest.mark.parametrize("program", ["python train.py", "python -m legged.tools.train", "legged-train"])
+@pytest.mark.parametrize("program", ["python train.py", "python -m legged.cli.train", "legged-train"])
 def test_arguments_of_an_example_are_what_follows_the_program(program):
     assert CommandParser.arguments_of(f"{program} --task 'x y' > a.txt") == ["--task", "x y"]
 

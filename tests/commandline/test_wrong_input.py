@@ -5,11 +5,11 @@ import shutil
 import sys
 from pathlib import Path
 
-import legged.tools.train
 import pytest
 import torch
 from helpers import TASK, call, kept_global_state, run_folders, tiny_run
 
+import legged.cli.train
 import legged.policies.restore
 import legged.registry
 from legged.tools import benchmark, evaluate, play, train
@@ -47,7 +47,7 @@ def fails(monkeypatch, capsys):
         pytest.fail("the task was built before the mistake was found")
 
     monkeypatch.setattr(legged.registry, "make_task", built)
-    monkeypatch.setattr(legged.tools.train, "make_task", built)
+    monkeypatch.setattr(legged.cli.train, "make_task", built)
     monkeypatch.setattr(legged.policies.restore, "make_task", built)
     monkeypatch.setattr(benchmark, "make_task", built)
 
