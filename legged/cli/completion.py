@@ -36,7 +36,15 @@ _legged_next_keys() {{ _legged_keys | sed -n "s/^\\\\($1[^.]*[.]\\\\{{0,1\\\\}}\
 """
 IN_BASH = """
 _legged_complete_names() { compgen -W "$(_legged_names)" -- "$1"; }
-_legged_complete_keys() { compopt -o nospace; _legged_next_keys "$1"; }
+_legged_complete_keys() { _legged_next_keys "$1"; }
+"""
+LAST_IN_BASH = """
+# No blank comes after a key, which goes on or gets a value.
+_legged_complete() {
+  _shtab_legged "$@"
+  if [[ "${COMPREPLY[0]-}" == *[.=] ]]; then compopt -o nospace; fi
+}
+complete -o bashdefault -F _legged_complete legged
 """
 IN_ZSH = """
 _legged_complete_names() { compadd -- ${(f)"$(_legged_names)"} }
@@ -66,6 +74,8 @@ def _main(argv: list[str] | None) -> int:
     kinds = [getattr(import_module(module), name) for name, module in CLASSES.items()]
     lists = SCRIPT.format(cfg=shlex.quote(str(data_folder("cfg"))), keys="\n".join(keys_of(kinds)))
     print(shtab.complete(whole_parser(), shell, preamble=lists + (IN_BASH if shell == "bash" else IN_ZSH)))
+    if shell == "bash":
+        print(LAST_IN_BASH)
     return 0
 
 

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import torch
 
+from legged.cli.evaluate.common import ROBOTS, check_points
 from legged.commandline.arguments import pick_device
 from legged.commandline.command import EXIT_FAILED, run_main
 from legged.commandline.stopping import stopping_on_signals
@@ -45,7 +46,6 @@ from legged.tools.campaign.plan import (
     trainings_of,
 )
 from legged.tools.campaign.shipping import ship
-from legged.cli.evaluate.common import ROBOTS, check_points
 
 OUT = Path("logs") / "zoo"
 VANISHED = "it ended, and there is no finished run of its configuration"

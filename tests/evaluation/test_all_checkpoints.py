@@ -6,10 +6,10 @@ import pytest
 import torch
 from helpers import TASK, call, run_folders, tiny_run
 
+from legged.cli.evaluate import checkpoints
 from legged.evaluation import all_checkpoints
 from legged.evaluation.all_checkpoints import walks
 from legged.learning.checkpoint import read_checkpoint, write_checkpoint
-from legged.cli.evaluate import checkpoints
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

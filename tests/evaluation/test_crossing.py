@@ -7,9 +7,9 @@ import pytest
 from helpers import TASK, call, kept_global_state, tiny_run
 from rich.console import Console
 
+from legged.cli.evaluate import grid
 from legged.config.schema import NewtonSolver
 from legged.evaluation import crossing
-from legged.cli.evaluate import grid
 
 GRID = ["--vx=0:0.5:0.5", "--vy=0", "--yaw=0", "--robots", "1"]
 ENGINES = ["mujoco_warp", "mujoco", *(f"newton_{name}" for name in get_args(NewtonSolver))]

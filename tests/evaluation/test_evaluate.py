@@ -10,6 +10,9 @@ import torch
 from helpers import POLICY, TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
 
 from legged import make_task
+from legged.cli import play
+from legged.cli.evaluate import grid as evaluate_grid
+from legged.cli.evaluate import terrain as evaluate_terrain
 from legged.config import override
 from legged.errors import RunError
 from legged.evaluation import crossing, following, velocity_tracking
@@ -19,9 +22,6 @@ from legged.evaluation.velocity_tracking import measure_tracking
 from legged.play import schedule
 from legged.policies.restore import TrainedPolicy, undisturbed
 from legged.registry import task_config
-from legged.cli import play
-from legged.cli.evaluate import grid as evaluate_grid
-from legged.cli.evaluate import terrain as evaluate_terrain
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

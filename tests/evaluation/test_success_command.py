@@ -9,9 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import POLICY, TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
+from helpers import POLICY, call, kept_global_state, run_folders, small_config, stand, tiny_run
 
 from legged import make_task
+from legged.cli.evaluate import grid as evaluate_grid
+from legged.cli.evaluate import policy as evaluate
+from legged.cli.evaluate import terrain as evaluate_terrain
 from legged.config import override
 from legged.errors import ConfigError
 from legged.evaluation import success
@@ -30,9 +33,6 @@ from legged.learning.run_folder import find_checkpoint, run_config
 from legged.policies.restore import TrainedPolicy, undisturbed
 from legged.registry import task_config
 from legged.terrain import Terrain, TileSpec, check_terrain
-from legged.cli.evaluate import grid as evaluate_grid
-from legged.cli.evaluate import policy as evaluate
-from legged.cli.evaluate import terrain as evaluate_terrain
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

@@ -10,13 +10,13 @@ from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, small_c
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 
+from legged.cli import train
+from legged.cli.evaluate import grid as evaluate_grid
 from legged.config.schema import RunnerConfig
 from legged.evaluation.during_training import TrainingEvaluation
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.evaluations import Evaluations
 from legged.learning.timing import read_timing
-from legged.cli import train
-from legged.cli.evaluate import grid as evaluate_grid
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

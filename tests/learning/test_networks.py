@@ -10,6 +10,8 @@ import torch
 from helpers import TASK, TINY_TRAINING, call, checkpoints, small_config, small_task, tiny_run
 from tensordict import TensorDict
 
+from legged.cli import play, train
+from legged.cli.evaluate import grid as evaluate_grid
 from legged.errors import ConfigError
 from legged.learning.captured import CapturedRunner
 from legged.learning.checkpoint import check_fits, read_checkpoint
@@ -17,8 +19,6 @@ from legged.learning.networks import action_std, build_actor
 from legged.learning.run_folder import run_config
 from legged.learning.runner import Runner
 from legged.policies.restore import TrainedPolicy, restore
-from legged.cli import play, train
-from legged.cli.evaluate import grid as evaluate_grid
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

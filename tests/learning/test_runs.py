@@ -68,9 +68,7 @@ def test_a_failed_start_leaves_no_folder(monkeypatch):
 
 def test_a_first_iteration_that_fails_leaves_no_folder_and_a_later_one_its_checkpoints(monkeypatch):
     runner = (
-        legged.cli.train.CapturedRunner
-        if "captured" in str(small_config().train.runner.loop)
-        else legged.cli.train.Runner
+        legged.cli.train.CapturedRunner if "captured" in str(small_config().train.runner.loop) else legged.cli.train.Runner
     )
     save, saved = runner.save, []
 

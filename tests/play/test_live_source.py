@@ -47,7 +47,9 @@ def test_a_task_without_a_run_shows_its_shipped_policy(monkeypatch):
     assert find_watched(TASK, None).folder == run
     monkeypatch.setattr(registry, "_REGISTERED", {})
     registry.register("untrained", {"extends": TASK})
-    with pytest.raises(ConfigError, match="POLICY: 'untrained' has neither a run in logs/untrained nor a shipped policy; train it first"):
+    with pytest.raises(
+        ConfigError, match="POLICY: 'untrained' has neither a run in logs/untrained nor a shipped policy; train it first"
+    ):
         find_watched("untrained", None)
 
 

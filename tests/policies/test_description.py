@@ -6,7 +6,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-from helpers import CALM, ENGINE, TASK, call, small_config, small_task, tiny_run
+from helpers import CALM, ENGINE, call, small_config, small_task, tiny_run
 
 from legged.cli import export as export_tool
 from legged.config.schema import ObservationGroupConfig

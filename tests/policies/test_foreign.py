@@ -7,9 +7,9 @@ import numpy as np
 import onnx
 import pytest
 from helpers import call
-from legged.cli.evaluate.onnx import main
 from onnx import TensorProto, helper, numpy_helper
 
+from legged.cli.evaluate.onnx import main
 from legged.errors import ConfigError
 from legged.evaluation.playback import play
 from legged.policies.foreign import ForeignPolicy, Layout, read_layout

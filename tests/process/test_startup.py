@@ -63,7 +63,9 @@ def test_a_machine_without_git_hears_nothing_of_it(tmp_path):
 
 
 def test_the_package_lists_tasks_and_robots_without_importing_what_they_need():
-    done = subprocess.run([sys.executable, "-X", "importtime", "-m", "legged", "list"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "legged", "list"], capture_output=True, text=True, check=True
+    )
     imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
     assert "legged.cli.listing" in imported
     assert not imported & {"torch", "mujoco", "numpy", "yaml"}

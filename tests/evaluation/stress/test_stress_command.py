@@ -5,15 +5,15 @@ import json
 import numpy as np
 import pytest
 import torch
-from helpers import ENGINE, POLICY, TASK, call, kept_global_state, tiny_run
+from helpers import ENGINE, POLICY, call, kept_global_state, tiny_run
 
+from legged.cli.evaluate import stress
 from legged.evaluation import success
 from legged.evaluation.stress import measuring
 from legged.evaluation.stress.measuring import GROUND, STAIRS, Bench, Wish
 from legged.evaluation.stress.table import ALONE, Disturbance
 from legged.evaluation.success import FELL, REACHED, STUCK, Scores
 from legged.policies.restore import policy_of
-from legged.cli.evaluate import stress
 
 make = measuring._make
 pytestmark = pytest.mark.usefixtures("workplace")
