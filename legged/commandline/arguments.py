@@ -84,7 +84,7 @@ def settle_name(args: argparse.Namespace, name: str) -> None:
 
 
 def override_is_no_name(args: argparse.Namespace, name: str) -> None:
-    """Move a `key=value` that stands in the place of the positional argument `name`, which may be left out, to the overrides."""
+    """Move a `key=value` in the place of the positional argument `name`, which may be left out, to the overrides."""
     given = getattr(args, name)
     if given is not None and OVERRIDE.match(given):
         args.overrides.insert(0, given)

@@ -49,15 +49,15 @@ def test_help_of_a_command_shows_two_examples_that_it_can_read(name, capsys):
             if task is not None and hasattr(args, "overrides"):
                 task_config(task, overrides(args))  # its settings are ones of that task
         named = getattr(args, "policy", None)
-        if isinstance(named, str):
+        if isinstance(named, str) and not Path(named).is_relative_to("logs"):
             assert named.partition("/")[0] in task_names()
 
 
 def test_every_module_of_the_commands_is_one():
     folder = Path(import_module("legged.cli").__file__).parent
     found = {".".join(("legged.cli", *path.relative_to(folder).with_suffix("").parts)) for path in folder.rglob("*.py")}
-    helpers = {"main", "__init__"}
-    commands = {name for name in found if name.rpartition(".")[2] not in {*helpers, "common"}}
+    others = {"main", "__init__", "common", "worker"}
+    commands = {name for name in found if name.rpartition(".")[2] not in others}
     assert commands == set(MODULES)
 
 
@@ -191,7 +191,7 @@ def test_a_policy_is_named_in_all_ways(trained, monkeypatch, name, experiment):
 def test_an_exported_policy_is_named_by_its_folder_or_its_file(trained, monkeypatch, name):
     monkeypatch.chdir(trained)
     found = []
-    monkeypatch.setattr(onnx, "play", lambda robot, policy, *_: found.append((robot.name, policy.action_joints)) or [])
+    monkeypatch.setattr(onnx, "play", lambda robot, policy, *_: found.append((robot.name, policy.metadata)) or [])
     for words in (["evaluate", name], ["evaluate", "onnx", name]):
         assert call(main, words) == 0
     assert found[0] == found[1]

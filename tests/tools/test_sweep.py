@@ -15,6 +15,7 @@ import pytest
 import yaml
 from helpers import call, wait_for
 
+from legged.cli.sweep.worker import NoValue, Worker
 from legged.errors import ConfigError
 from legged.evaluation.reports.record import read_note
 from legged.learning.evaluations import Evaluated
@@ -26,7 +27,6 @@ from legged.sweeping import study, worker
 from legged.sweeping.plan import Parameter, plan_sweep, read_sweep
 from legged.sweeping.report import importances, ranking, settings
 from legged.sweeping.study import Trials, is_dead, me
-from legged.sweeping.worker import NoValue, Worker
 from legged.tools import sweep
 
 pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
