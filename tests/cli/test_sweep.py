@@ -14,10 +14,10 @@ from types import SimpleNamespace
 import pytest
 import yaml
 from helpers import call, wait_for
-from legged.tools import sweep
 
 from legged.cli.sweep import report as reporting
 from legged.cli.sweep import run as sweep
+from legged.cli.sweep.worker import NoValue, Worker
 from legged.errors import ConfigError
 from legged.evaluation.reports.record import read_note
 from legged.learning.evaluations import Evaluated
@@ -29,7 +29,6 @@ from legged.sweeping import study, worker
 from legged.sweeping.plan import Parameter, plan_sweep, read_sweep
 from legged.sweeping.report import importances, ranking, settings
 from legged.sweeping.study import Trials, is_dead, me
-from legged.sweeping.worker import NoValue, Worker
 
 pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
 pytestmark = pytest.mark.usefixtures("workplace")

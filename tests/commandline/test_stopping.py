@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from helpers import TASK, TINY_TRAINING, checkpoints, run_folders, wait_for
 
+from legged.cli import train
 from legged.commandline.stopping import SIGNALS, quiet_writers, stopping_on_signals
 from legged.process import startup
-from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -104,9 +104,9 @@ def test_a_second_signal_ends_a_training_at_once_in_one_line():
     assert not Path("logs").exists()  # there was no checkpoint to keep
 
 
-@pytest.mark.parametrize("module", ["legged.tools.play", "legged.tools.evaluate"])
-def test_an_interrupt_during_imports_is_one_line(module):
-    with running("-X", "importtime", "-m", module, "--task", TASK) as process:  # says on stderr what is imported
+@pytest.mark.parametrize("command", [["legged.cli.play"], ["legged", "evaluate"]])
+def test_an_interrupt_during_imports_is_one_line(command):
+    with running("-X", "importtime", "-m", *command, TASK) as process:  # says on stderr what is imported
         wait_for(lambda: "legged.process.startup" in Path("err.txt").read_text(), process)
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=30) == 130

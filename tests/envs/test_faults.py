@@ -9,6 +9,7 @@ from helpers import CALM, ENGINE, TASK, TINY_TRAINING, call, checkpoints, run_fo
 from learners import SAMPLES, fill, learner
 from rsl_rl.algorithms import PPO
 
+from legged.cli import train
 from legged.envs import LeggedRobot
 from legged.errors import RunError
 from legged.evaluation.learning_curves import read_scalars
@@ -18,7 +19,6 @@ from legged.learning.step_guard import StepGuard
 from legged.learning.watch import PATIENCE, FaultWatch
 from legged.mdp.faults import LARGEST, LARGEST_STATE
 from legged.registry import _REGISTERED, make_task, register, task_config
-from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 NAN, INF = float("nan"), float("inf")

@@ -15,11 +15,11 @@ import pytest
 import torch
 from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, small_task
 
+from legged.cli import train
 from legged.commandline.arguments import pick_device
 from legged.errors import ConfigError
 from legged.process.ranks import Ranks
 from legged.registry import make_task, task_config
-from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -31,7 +31,7 @@ TRAIN = ["--task", TASK, "--sim_device", "cpu", "--num_envs", "8", *TINY_TRAININ
 SPY = """
 import sys, torch
 from legged.process.ranks import Ranks
-from legged.tools import train
+from legged.cli import train
 from legged.learning.runner import Runner
 learn = Runner.train
 
@@ -278,7 +278,7 @@ def test_each_process_has_the_gpu_of_its_number(monkeypatch):
 def test_a_mistake_names_the_process(monkeypatch, capsys):
     as_rank(monkeypatch, 1, 2)
     assert call(train.main, ["--task", "anymal_z"]) == 2
-    assert capsys.readouterr().err.startswith("rank 1: error: --task: there is no task 'anymal_z'")
+    assert capsys.readouterr().err.startswith("rank 1: error: TASK: there is no task 'anymal_z'")
 
 
 @pytest.mark.parametrize("name", ["RANK", "LOCAL_RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE"])

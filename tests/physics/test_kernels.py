@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import warp as wp
 
+from legged.cli import warmup
 from legged.physics.warp.compile import Build, Line, compile_ahead, launched
-from legged.tools import warmup
 
 # Two modules with a kernel each, one of them launched with two block sizes, and a third that nothing launches.
 MODELS = """
@@ -116,7 +116,7 @@ def test_warp_is_itself_again_after_a_dry_run():
 
 def test_warmup_leaves_nothing_to_compile(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    arguments = ["--task", "anymal_c_flat", "--num_envs", "2", "--sim_device", "cpu", "sim.physics=mujoco_warp"]
+    arguments = ["anymal_c_flat", "--num-envs", "2", "--sim_device", "cpu", "sim.physics=mujoco_warp"]
     assert warmup.main(arguments) == 0
     out = capsys.readouterr().out
     assert "anymal_c_flat: ready in" in out
@@ -127,7 +127,7 @@ def test_warmup_leaves_nothing_to_compile(tmp_path, monkeypatch, capsys):
 
 
 def test_warmup_has_nothing_to_do_for_the_c_engine(capsys):
-    assert warmup.main(["--task", "anymal_c_flat", "--sim_device", "cpu", "sim.physics=mujoco"]) == 0
+    assert warmup.main(["anymal_c_flat", "--sim-device", "cpu", "sim.physics=mujoco"]) == 0
     assert "nothing to do" in capsys.readouterr().out
 
 

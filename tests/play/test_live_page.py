@@ -171,7 +171,7 @@ def test_a_browser_draws_the_robot_and_moves_it():
 
 def test_ctrl_c_ends_it_as_it_ends_other_tools(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
-    command = [sys.executable, "-m", "legged.tools.watch", "--task", TASK, "--num_envs", "1", "--port", "0"]
+    command = [sys.executable, "-m", "legged", "watch", TASK, "--num-envs", "1", "--port", "0"]
     with Path("out.txt").open("w") as out, Path("err.txt").open("w") as err:
         process = subprocess.Popen(command, stdout=out, stderr=err)
         try:

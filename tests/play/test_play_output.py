@@ -9,13 +9,13 @@ import pytest
 from helpers import POLICY, TASK, call, small_config, small_task, stand
 
 import legged.policies.restore
+from legged.cli import play
 from legged.envs import LeggedRobot
 from legged.errors import RunError
 from legged.play import schedule, video
 from legged.policies.actor import Actor
 from legged.policies.export import export
 from legged.process.paths import DISK_FULL
-from legged.tools import play
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

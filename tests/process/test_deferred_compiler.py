@@ -21,7 +21,7 @@ def test_a_training_does_without_the_compiler(tmp_path):
     settings = ["--task", "anymal_c_flat", "--sim_device", "cpu", "--num_envs", "2", "--max_iterations", "1", "sim.threads=1"]
     code = (
         f"{AS_A_COMMAND}sys.argv += {settings!r}\n"
-        "from legged.tools.train import main\n"
+        "from legged.cli.train import main\n"
         "assert main() == 0\n"
         "print([name for name in ('torch._dynamo.utils', 'torch._inductor', 'sympy') if name in sys.modules])\n"
     )

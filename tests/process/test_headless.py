@@ -70,7 +70,7 @@ def test_a_library_that_is_not_there_is_named(monkeypatch):
 
 def test_a_command_ends_with_one_line_and_an_import_with_an_exception():
     environment = {**os.environ, "MUJOCO_GL": "foo"}
-    command = [sys.executable, "-m", "legged.tools.plot", "run"]
+    command = [sys.executable, "-m", "legged", "runs", "curves", "run"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
     assert done.stderr.startswith("error: MUJOCO_GL: unknown value 'foo'")

@@ -12,6 +12,7 @@ import sys
 from legged.cli.evaluate import onnx
 from legged.cli.evaluate.common import check_points, evaluation_parser, grid_of, ready, settle
 from legged.cli.evaluate.episodes import ENVIRONMENTS
+from legged.cli.main import hint_at_sub_command
 from legged.commandline.command import run_main
 from legged.config import LeggedConfig
 from legged.evaluation.episodes import evaluate_episodes
@@ -36,7 +37,8 @@ def _main(argv: list[str] | None) -> int:
     args = build_parser().parse_intermixed_args(argv)
     if onnx.exported_file(args.policy) is not None:
         return onnx.evaluate([args.policy, *(["--out", str(args.out)] if args.out else [])])
-    setting = settle(args)
+    with hint_at_sub_command("evaluate", [args.policy]):
+        setting = settle(args)
     policy, device, graph, folder = setting.policy, setting.device, setting.graph, setting.folder
     if not isinstance(policy.cfg, LeggedConfig):
         ready(setting)
