@@ -14,7 +14,6 @@ from types import SimpleNamespace
 import pytest
 import yaml
 from helpers import call, wait_for
-from legged.tools import sweep
 
 from legged.cli.sweep import report as reporting
 from legged.cli.sweep import run as sweep
