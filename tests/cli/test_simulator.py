@@ -13,7 +13,6 @@ import mujoco
 import numpy as np
 import pytest
 from helpers import CALM, ENGINE, call
-from legged.tools import fit_actuator
 
 from legged.cli import fit_actuator
 from legged.cli.deploy import robot as simulated_robot

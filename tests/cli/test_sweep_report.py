@@ -9,7 +9,6 @@ import pytest
 import torch
 import yaml
 from helpers import call
-from legged.tools import sweep
 
 from legged.cli.sweep import report as reporting
 from legged.cli.sweep import run as sweep
