@@ -6,6 +6,7 @@ killed. `--film` films the policy first, where pictures can be drawn; `--note` k
 """
 
 import argparse
+import faulthandler
 import sys
 from pathlib import Path
 
@@ -26,6 +27,8 @@ from legged.registry import import_tasks, task_config
 
 SIDE = 320
 """Width and height of the film [pixels]."""
+LONGEST_FILM_S = 900.0
+"""Filming that takes longer hangs, and ends the process [s]."""
 LONGEST_NOTE = 1000
 
 
@@ -65,7 +68,10 @@ def _main(argv: list[str] | None) -> int:
     for folder in folders:
         ready_to_write(folder, 4.0)
         if args.film:
+            if argv is None:  # a library that draws may hang where no exception reaches it
+                faulthandler.dump_traceback_later(LONGEST_FILM_S, exit=True, file=2)
             why = _film(folder, args.checkpoint)
+            faulthandler.cancel_dump_traceback_later()
             print(f"no film: {why}" if why else f"written: {relative(folder / FILMS[0])}", flush=True)
         print(f"written: {relative(write_report(folder))}", flush=True)
     return 0
@@ -112,7 +118,10 @@ def _film(folder: Path, checkpoint: int | str | None) -> str:
             return f"'{cfg.task}' follows no commands; {command} --gif makes one"
         torch.set_num_threads(1)
         policy = TrainedPolicy(cfg, find_checkpoint(folder, checkpoint))
-        write_sheet(sheet([film(policy, SIDE)], [cfg.task]), folder / FILMS[0])
+        pictures = sheet([film(policy, SIDE)], [cfg.task])
+        if not exists(folder / CONFIG_FILE):
+            return "the run folder has gone"
+        write_sheet(pictures, folder / FILMS[0])
     except (ConfigError, RunError) as error:
         return " ".join(str(error).split())
     return ""
