@@ -118,6 +118,6 @@ def test_a_process_that_a_command_starts_collects_garbage_and_has_the_real_one(t
         "told = context.Queue()\n"
         "process = context.Process(target=worker.work, args=(told,))\n"
         "process.start()\n"
-        "print(told.get(timeout=HANG_S))\n"
+        f"print(told.get(timeout={HANG_S}))\n"
     )
     assert run(code) == "(True, True)\n"
