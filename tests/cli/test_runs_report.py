@@ -251,7 +251,7 @@ def test_a_run_that_is_deleted_before_it_is_filmed_stays_deleted(monkeypatch, ca
     folder = tiny_run(iterations=1)
     monkeypatch.setattr(report, "film", film)
     assert report.main([str(folder), "--film"]) == 2
-    assert capsys.readouterr().err == "X"
+    assert str(folder) in capsys.readouterr().err
     assert not folder.exists()
 
 
