@@ -77,7 +77,6 @@ FLOORS = [  # from the ground up; each part imports from the floors below it onl
     {"episodes", "fitting", "migration", "simulated_robot"},
     {"sweeping"},
     {"cli"},
-    {"tools"},
 ]
 PARTS = sorted({name_of(path).split(".")[1] for path in FILES if name_of(path) not in ("legged", "legged.__main__")})
 OF_ROBOTS = ("deploy", "errors", "process")
