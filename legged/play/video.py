@@ -5,7 +5,6 @@ import subprocess
 import time
 from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 from PIL import Image
 
@@ -64,9 +63,9 @@ class Video:
         if not (self.camera and self.folder):
             return
         self.camera.close()
-        write_mp4(self.frames, self.folder / "play.mp4", self.fps)
-        if self.gif:
+        if self.gif:  # first: it needs no encoder
             _write_gif(self.frames, self.folder / "play.gif", self.fps)
+        write_mp4(self.frames, self.folder / "play.mp4", self.fps)
         print(f"recorded {len(self.frames)} frames in {time.perf_counter() - self._start:.1f} s")
 
 
@@ -77,8 +76,10 @@ def write_mp4(frames: list[np.ndarray], path: Path, fps: float) -> None:
         RunError: it can't be written.
     """
     try:
+        import imageio_ffmpeg  # nothing but a film needs it
+
         program = imageio_ffmpeg.get_ffmpeg_exe()
-    except RuntimeError as error:
+    except (ImportError, RuntimeError) as error:
         raise RunError(f"{relative(path)}: videos need ffmpeg: pip install 'imageio[ffmpeg]' ({error})") from error
     height, width, _ = frames[0].shape
     given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]

@@ -2,9 +2,9 @@
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 import mujoco
-import mujoco.viewer
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -66,7 +66,7 @@ def view(task: LeggedRobot, act: Callable[[TensorDict], Tensor], playground: Pla
     if playground:
         print(HELP_ON_TERRAIN)
     begin_anew(task, playground, keyboard)
-    with mujoco.viewer.launch_passive(model, data, key_callback=keyboard.press, **PANELS) as window:
+    with _window(model, data, keyboard.press) as window:
         window.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
         window.cam.trackbodyid = model.body(f"0/{task.robot.file.base}").id
         window.cam.distance, window.cam.azimuth, window.cam.elevation = (
@@ -100,7 +100,7 @@ def watch(task: BaseTask, act: Callable[[TensorDict], Tensor]) -> None:
         if key == BACKSPACE:
             restart.append(key)
 
-    with mujoco.viewer.launch_passive(model, data, key_callback=press, **PANELS) as window:
+    with _window(model, data, press) as window:
         follow_root(window.cam, model)
         while window.is_running():
             begin = time.perf_counter()
@@ -113,6 +113,13 @@ def watch(task: BaseTask, act: Callable[[TensorDict], Tensor]) -> None:
                 mujoco.mj_forward(model, data)
             window.sync()
             time.sleep(max(0.0, task.dt - (time.perf_counter() - begin)))
+
+
+def _window(model: mujoco.MjModel, data: mujoco.MjData, press: Callable[[int], None]) -> Any:
+    """Open MuJoCo's viewer, whose library for windows a machine without a display may lack."""
+    import mujoco.viewer
+
+    return mujoco.viewer.launch_passive(model, data, key_callback=press, **PANELS)
 
 
 def begin_anew(task: LeggedRobot, playground: Playground | None, keyboard: Keyboard) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import mujoco
 
 from legged.errors import RunError
+from legged.process import headless
 from legged.rendering.paint import add_horizon, add_painted_terrain
 from legged.rendering.window import draw_without_window
 from legged.robots.importing.adapted import robot_spec_of
@@ -59,6 +60,8 @@ def make_renderer(model: mujoco.MjModel, width: int, height: int, instead: str =
     Raises:
         RunError: nothing can be drawn on this machine; `instead` is what the user might do then.
     """
+    if headless.NO_PICTURES:
+        raise RunError(f"cannot render here: {headless.NO_PICTURES}{instead}")
     draw_without_window()
     try:
         with warnings.catch_warnings():

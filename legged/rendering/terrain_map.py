@@ -5,13 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
-from legged.figures import figure
+from legged.figures import figure, import_matplotlib
 from legged.rendering.terrain_picture import MARGIN
 from legged.terrain import Terrain
 
 
 def draw_map(terrain: Terrain, levels: Sequence[str], path: Path) -> None:
     """Draw the heights from above, x upward and so y to the left, with tiles, their types and `levels` (R,), and origins."""
+    import_matplotlib()
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import AsinhNorm, LightSource

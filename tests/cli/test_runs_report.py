@@ -35,9 +35,9 @@ REPORTED = ["train.runner.report=true", "train.runner.film=false", "env.episode_
 FLAGS = ["--task", TASK, "--sim_device", "cpu", "--num_envs", "8", *TINY_TRAINING]
 
 
-def instead_of_processes(run) -> SimpleNamespace:
-    """What stands for the module subprocess, with another `run`."""
-    return SimpleNamespace(run=run, DEVNULL=subprocess.DEVNULL, TimeoutExpired=subprocess.TimeoutExpired)
+def instead_of_processes(start) -> SimpleNamespace:
+    """What stands for the module subprocess, with another `Popen`."""
+    return SimpleNamespace(Popen=start, DEVNULL=subprocess.DEVNULL)
 
 
 def read(folder: Path, name: str = "report.html") -> str:
@@ -203,44 +203,72 @@ def test_an_evaluation_that_lacks_its_cells_is_left_out_of_the_maps():
 # ---- film ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_film_is_made_by_another_process_and_shown(monkeypatch):
-    """What it is asked, and that its film is in the page."""
-    asked = []
+class Started:
+    """A process that has not ended: waiting for it would fail."""
 
-    def run(command, **options):
-        asked.append((command[1:], options["env"]["CUDA_VISIBLE_DEVICES"], "RANK" in options["env"]))
-        (folder,) = run_folders()
-        shutil.copyfile(POLICY.with_name("anymal_c") / "play.gif", folder / "film.gif")
-        return subprocess.CompletedProcess(command, 0, "written: film.gif\n", "")
+    pid = 0
 
+    def __init__(self, command, **options):
+        self.command, self.options = command, options
+
+    def poll(self):
+        return None
+
+
+def test_a_film_is_asked_of_another_process_and_the_report_is_there_before(monkeypatch, capsys):
     monkeypatch.setenv("RANK", "0")
-    monkeypatch.setattr(at_end, "subprocess", instead_of_processes(run))
+    monkeypatch.setattr(at_end, "subprocess", instead_of_processes(Started))
+    monkeypatch.setattr(at_end.os, "setpriority", lambda *given: niceness.append(given))
+    monkeypatch.setattr(at_end, "FILMING", [])
+    niceness = []
+    assert train.main([*FLAGS, "--max_iterations", "1", "train.runner.report=true"]) == 0
+    (folder,) = run_folders()
+    (asked,) = at_end.FILMING
+    assert asked.command[1:] == ["-m", "legged", "runs", "report", str(folder), "--film"]
+    assert (asked.options["env"]["CUDA_VISIBLE_DEVICES"], "RANK" in asked.options["env"]) == ("", False)
+    assert asked.options["start_new_session"]  # Ctrl-C and a terminal that closes are none of its business
+    assert niceness == [(os.PRIO_PROCESS, 0, at_end.NICENESS)]
+    assert "Run" in read(folder)
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert re.fullmatch(rf"report {folder}/report.html \(\d+\.\d s; a film follows, or film.log says why not\)", last)
+
+
+def test_the_other_process_writes_why_there_is_no_film_and_leaves_the_report_whole(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "disable")
     folder = tiny_run("train.runner.report=true", iterations=1)
-    assert asked == [(["-m", "legged", "runs", "report", str(folder), "--film"], "", False)]
-    assert '<img class="film" src="data:image/gif;base64,' in read(folder)
-    assert "](film.gif)" in read(folder, "report.md")
+    process = at_end.FILMING[-1]
+    assert process.wait() == 0
+    assert read(folder, at_end.LOG).startswith("no film: cannot render here")
+    assert read(folder).rstrip().endswith("</html>")
+    assert not list(folder.glob(".*"))
+
+
+def test_a_run_that_is_deleted_before_it_is_filmed_stays_deleted(monkeypatch, capsys):
+    def film(policy, side):
+        shutil.rmtree(folder)
+        return [np.zeros((32, 32, 3), dtype=np.uint8)]
+
+    folder = tiny_run(iterations=1)
+    monkeypatch.setattr(report, "film", film)
+    assert report.main([str(folder), "--film"]) == 2
+    assert capsys.readouterr().err == "X"
+    assert not folder.exists()
 
 
 @pytest.mark.parametrize(
-    ("outcome", "words"),
-    [
-        (subprocess.CompletedProcess([], 0, "no film: nothing can be rendered\nwritten: x\n", ""), "nothing can be rendered"),
-        (subprocess.CompletedProcess([], -11, "", ""), "exit code -11"),
-        (subprocess.CompletedProcess([], 2, "", "a\nerror: RUN: there is no run\n"), "error: RUN: there is no run"),
-        (subprocess.TimeoutExpired([], 60), "it took longer than 60 s"),
-    ],
+    ("why", "words"),
+    [("MUJOCO_GL: 'egl' does not work", "no film: nothing can be drawn"), ("", "no film: no such program")],
 )
-def test_without_a_film_there_is_a_report_and_a_line(outcome, words, monkeypatch, capsys):
-    def run(*_, **__):
-        if isinstance(outcome, Exception):
-            raise outcome
-        return outcome
+def test_without_a_film_there_is_a_report_and_a_line(why, words, monkeypatch, capsys):
+    def fail(*_, **__):
+        raise OSError("no such program")
 
-    monkeypatch.setattr(at_end, "subprocess", instead_of_processes(run))
+    monkeypatch.setattr(at_end.headless, "NO_PICTURES", why)
+    monkeypatch.setattr(at_end, "subprocess", instead_of_processes(fail))
     arguments = [*FLAGS, "--max_iterations", "1", "train.runner.report=true"]
     assert train.main(arguments) == 0
     last = capsys.readouterr().out.splitlines()[-1]
-    assert re.fullmatch(rf"report logs/{TASK}/[-\d_]+/report.html \(\d+\.\d s; no film: {re.escape(words)}\)", last)
+    assert re.fullmatch(rf"report logs/{TASK}/[-\d_]+/report.html \(\d+\.\d s; {words}\)", last)
 
 
 def test_the_command_films(monkeypatch, capsys):

@@ -12,7 +12,7 @@ import imageio.v3 as iio
 import mujoco
 import numpy as np
 import pytest
-from helpers import CALM, ENGINE, call
+from helpers import CALM, ENGINE, HANG_S, call
 
 from legged.cli import fit_actuator
 from legged.cli.deploy import robot as simulated_robot
@@ -265,7 +265,7 @@ def test_the_program_walks_up_stairs_in_another_process(tmp_path):
     command += ["--commands", "walk.txt", "--terrain", "stairs_up", "--size", "0.1", "--loss", "0.01", "--out", "out"]
     command += ["--max-missed", "50", "--max-age", "0.5", "--stand-seconds", "1.9"]
     command += ["control.actuator.coulomb_friction={HAA: 1.5}", "control.actuator.delay=[2, 2]"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=HANG_S, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert not report["fell"]

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
-from helpers import call, wait_for
+from helpers import HANG_S, call, wait_for
 
 from legged.cli.sweep import report as reporting
 from legged.cli.sweep import run as sweep
@@ -383,7 +383,7 @@ def test_a_signal_ends_the_trial_with_a_checkpoint_and_it_is_tried_again():
         output = Path("logs/sweep_mine/output/trial000.txt")
         wait_for(lambda: output.is_file() and "\nit " in output.read_text(), process)
         process.terminate()
-        assert process.wait(timeout=60) == 128 + signal.SIGTERM
+        assert process.wait(timeout=HANG_S) == 128 + signal.SIGTERM
     assert "stopped; it will be tried again  [0 of 3]" in Path("out.txt").read_text()
     trials = Trials(plan_of(overrides=overrides))
     assert states(trials) == ["FAIL", "WAITING"]

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, small_task
+from helpers import HANG_S, TASK, TINY_TRAINING, call, checkpoints, run_folders, small_task
 
 from legged.cli import train
 from legged.commandline.arguments import pick_device
@@ -74,7 +74,7 @@ def torchrun(output: str, *arguments: str, **environment: str):
 
 def ended(process, code: int) -> str:
     """What two processes have said, once they have ended."""
-    assert process.wait(timeout=90) == code, Path("out.txt").read_text()
+    assert process.wait(timeout=HANG_S) == code, Path("out.txt").read_text()
     return Path("out.txt").read_text()
 
 
@@ -84,7 +84,7 @@ def children(process) -> list[int]:
 
 
 def wait_for_iterations(process) -> None:
-    end = time.monotonic() + 90
+    end = time.monotonic() + HANG_S
     while "\nit 1/" not in Path("out.txt").read_text():
         assert process.poll() is None, Path("out.txt").read_text()
         assert time.monotonic() < end
@@ -171,7 +171,7 @@ def test_two_machines_learn_one_policy_into_one_run_folder():
         torchrun("other.txt", *command, GLOO_SOCKET_IFNAME="lo") as other,
     ):
         said = ended(one, 0)
-        assert other.wait(timeout=30) == 0, Path("other.txt").read_text()
+        assert other.wait(timeout=HANG_S) == 0, Path("other.txt").read_text()
     said += Path("other.txt").read_text()
     first, second = (torch.load(f"rank{r}.pt", weights_only=True) for r in (0, 1))
     for network in ("actor", "critic"):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from helpers import TASK, TINY_TRAINING, call, run_folders, small_config, tiny_run
-from legged.tools import train
 
 import legged.cli.train
 from legged.cli import train

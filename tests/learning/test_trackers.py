@@ -6,8 +6,7 @@ import types
 from pathlib import Path
 
 import pytest
-from helpers import TASK, TINY_TRAINING, call, run_folders, tiny_run
-from legged.tools import train
+from helpers import HANG_S, TASK, TINY_TRAINING, call, run_folders, tiny_run
 from rsl_rl.utils import wandb_log_writer
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -166,7 +165,7 @@ def test_a_writer_beside_the_user_is_found_by_a_program_that_lies_elsewhere():
     Path("my_lines.py").write_text("Nothing = 3")
     program = Path(legged.__file__).parents[1] / "train.py"
     arguments = [sys.executable, str(program), *ARGUMENTS, "train.runner.logger=my_lines:Nothing"]
-    done = subprocess.run(arguments, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=HANG_S, check=False)
     assert done.returncode == 2
     assert "'my_lines:Nothing' does not extend rsl_rl.utils.log_writer.LogWriter" in done.stderr
 

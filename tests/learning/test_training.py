@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, tiny_run, wait_for
+from helpers import HANG_S, TASK, TINY_TRAINING, call, checkpoints, run_folders, tiny_run, wait_for
 
 from legged.cli import train
 from legged.commandline.arguments import add_policy_arguments, policy_overrides
@@ -253,7 +253,7 @@ def test_a_signal_stops_after_the_iteration_with_a_checkpoint_of_it(number):
     with training("train.runner.save_interval=100000") as process:
         wait_for(lambda: "\nit 1/" in Path("out.txt").read_text(), process)
         process.send_signal(number)
-        assert process.wait(timeout=30) == 128 + number
+        assert process.wait(timeout=HANG_S) == 128 + number
     out = Path("out.txt").read_text()
     assert "Traceback" not in out
     assert "stopping after this iteration" in out

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import warp as wp
+from helpers import HANG_S
 
 from legged.cli import warmup
 from legged.physics.warp.compile import Build, Line, compile_ahead, launched
@@ -64,7 +65,7 @@ def start(folder: Path, cache: Path) -> subprocess.Popen:
 
 
 def finish(process: subprocess.Popen) -> str:
-    out, _ = process.communicate(timeout=120)
+    out, _ = process.communicate(timeout=HANG_S)
     assert process.returncode == 0
     assert "untouched [1.0, 1.0, 1.0, 1.0]" in out
     assert "scaled [6.0, 6.0, 6.0, 6.0]" in out
