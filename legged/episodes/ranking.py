@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from rich.markup import escape
-from rich.table import Table
 
 from legged.episodes.stored import NO_NUMBERS, TIME_UP, Episodes
 from legged.errors import ConfigError, suggest
@@ -155,20 +153,3 @@ def counts_text(figures: Figures) -> str:
     counts = Counter(term for terms in figures.ended for term in terms)
     ended = ", ".join(f"{count} by {term}" for term, count in counts.most_common())
     return f"{len(figures.ended)} episodes, {int(figures.failed.sum())} failed; ended: {ended}"
-
-
-def episodes_table(figures: Figures, order: Sequence[int], title: str) -> Table:
-    """Return those episodes as a table for the screen."""
-    table = Table(title=escape(title), title_justify="left")
-    for i, head in enumerate(heads_of(figures)):
-        table.add_column(escape(head.replace(" [", "\n[")), justify="left" if i == 1 or head == "joint" else "right")
-    for number in order:
-        table.add_row(*(escape(cell) for cell in row_of(figures, number)))
-    return table
-
-
-def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = (0,)) -> str:
-    """Return a table in Markdown; the columns `left` are text, all others numbers."""
-    lines = [f"| {' | '.join(heads)} |", f"|{'|'.join('---' if i in left else '---:' for i in range(len(heads)))}|"]
-    lines += [f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in rows]
-    return "\n".join(lines) + "\n"

@@ -5,14 +5,15 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
+import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
 from legged.errors import ConfigError, suggest
 from legged.evaluation.engines import engine_of
+from legged.evaluation.reports.charts import Line, draw_charts
 from legged.evaluation.result_file import changes_text, grid_text, tracking_of
-from legged.evaluation.success_report import TRAINED, TRAINED_LABEL, as_success
-from legged.figures import COLORS, figure
+from legged.evaluation.success_report import success_chart, types_in
 
 Key = tuple[str, str, str]
 """Task, physics, and under what conditions it was measured where those are not the policy's own or not the same for all."""
@@ -132,7 +133,7 @@ def heading(key: Key, seeds: int) -> str:
 
 def shares(results: Sequence[dict[str, Any]], terrain: str) -> dict[float, list[float]]:
     """Return size -> success of every seed that was measured on that type, for the sizes that all of those have."""
-    entries = [_types(result)[terrain] for result in results if terrain in _types(result)]
+    entries = [types_in(result)[terrain] for result in results if terrain in types_in(result)]
     found = [{point["size"]: point["share"] for point in entry["points"]} for entry in entries]
     common = set.intersection(*(set(one) for one in found)) if found else set()
     return {size: [one[size] for one in found] for size in sorted(common)}
@@ -140,14 +141,8 @@ def shares(results: Sequence[dict[str, Any]], terrain: str) -> dict[float, list[
 
 def types_of(groups: Evaluations) -> dict[str, dict[str, Any]]:
     """Return terrain type -> one of its entries, of all types that were measured."""
-    entries = [_types(result) for results in groups.values() for result in results]
+    entries = [types_in(result) for results in groups.values() for result in results]
     return {name: entry for one in entries for name, entry in one.items()}
-
-
-def _types(result: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return terrain type -> what was measured on it; nothing of an evaluation without success."""
-    found: dict[str, dict[str, Any]] = result.get("success", {}).get("types", {})
-    return found
 
 
 def success_table(groups: Evaluations) -> Table:
@@ -178,41 +173,16 @@ def _share(values: Sequence[float], seeds: int) -> str:
 
 
 def draw_comparison(groups: Evaluations, path: Path) -> None:
-    """Draw a panel a terrain type: a colour a task and its conditions, a line style an engine, a band from the worst to the
-    best seed.
-    """
-    names = types_of(groups)
-    tasks = list(dict.fromkeys((task, conditions) for task, _, conditions in groups))
-    colors = {task: COLORS[i % len(COLORS)] for i, task in enumerate(tasks)}
-    columns = min(2, len(names))
-    rows = -(-len(names) // columns)
-    with figure(path, (4.8 * columns + 0.2, 2.6 * rows + 1.0), rows, columns, share_y=True) as (drawn, axes):
-        from matplotlib.lines import Line2D
-
-        for axis in axes.flat[len(names) :]:
-            axis.set_visible(False)
-        for axis, (name, entry) in zip(axes.flat, names.items(), strict=False):
-            for (task, physics, conditions), results in groups.items():
-                found, engine, color = shares(results, name), engine_of(physics), colors[task, conditions]
-                if not found:  # no line: one without points that is not clipped takes all room from the panel
-                    continue
-                means = [mean(values) for values in found.values()]
-                axis.plot(list(found), means, engine.line, marker=engine.marker, ms=3, color=color, clip_on=False)
-                low, high = ([pick(values) for values in found.values()] for pick in (min, max))
-                axis.fill_between(list(found), low, high, color=color, alpha=0.15, lw=0)
-            entries = [_types(result).get(name) for results in groups.values() for result in results]
-            for end in {one["trained_to"] for one in entries if one is not None} - {None}:
-                axis.axvline(end, **TRAINED)
-            axis.set_title(name.replace("_", " "), fontsize="medium")
-            as_success(axis, entry)
-        for axis in axes[:, 0]:
-            axis.set_ylabel("success")
-        keys = []
-        for (task, physics, conditions), results in groups.items():
-            engine, seeds = engine_of(physics), sum("success" in result for result in results)
-            text = f"{task}, {engine.label}" + (f", {seeds} seeds" if seeds > 1 else "")
-            text += f"\n{conditions}" if conditions else ""
-            color = colors[task, conditions]
-            keys.append(Line2D([], [], color=color, ls=engine.line, marker=engine.marker, ms=4, label=text))
-        keys.append(Line2D([], [], **TRAINED, label=TRAINED_LABEL))
-        drawn.legend(handles=keys, loc="outside lower center", ncols=2, frameon=False)
+    """Draw success into a PNG file: a panel a terrain type, a line a group, with a band from the worst to the best seed."""
+    charts = []
+    for name in types_of(groups):
+        lines = []
+        for key, results in groups.items():
+            found, entries = shares(results, name), [types_in(result)[name] for result in results if name in types_in(result)]
+            if found:
+                worst, middle, best = (np.array([of(values) for values in found.values()]) for of in (min, mean, max))
+                label = heading(key, sum("success" in result for result in results))
+                lines.append((entries[0], Line(label, np.array(list(found)), middle, (worst, best), markers=True)))
+        if lines:
+            charts.append(success_chart(name.replace("_", " "), lines))
+    draw_charts(charts, path)

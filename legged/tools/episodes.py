@@ -37,15 +37,13 @@ from legged.episodes.ranking import (
     Figures,
     check_ended,
     counts_text,
-    episodes_table,
     figures_of,
     heads_of,
-    markdown_table,
     order_of,
     row_of,
 )
 from legged.episodes.rollout import MOST_EPISODES, Wish, check_wish, roll_out
-from legged.episodes.statistics_report import screen_table, tables_of, write_statistics
+from legged.episodes.statistics_report import tables_of, write_statistics
 from legged.episodes.stored import (
     ABOUT,
     ARRAYS,
@@ -57,6 +55,8 @@ from legged.episodes.stored import (
     save_episodes,
 )
 from legged.errors import ConfigError, suggest
+from legged.evaluation.reports.document import text_of
+from legged.evaluation.tables import markdown_table, screen_table
 from legged.policies.restore import TrainedPolicy, find_policy, policy_of
 from legged.process.paths import exists, ready_to_write, relative, write_text
 from legged.registry import import_tasks
@@ -84,9 +84,12 @@ def _main(argv: list[str] | None) -> int:
     figures = figures_of(episodes)
     order = order_of(figures, args.sort, args.ended)
     wanted = _pages(args.page, len(episodes)) + order[: args.worst]
-    shown = order[: args.top]
+    heads = heads_of(figures)
+    texts = [i for i, head in enumerate(heads) if head in ("ended by", "joint")]
+    rows = [row_of(figures, number) for number in order[: args.top]]
     print()
-    Console(width=130).print(episodes_table(figures, shown, f"{counts_text(figures)}; by {args.sort}"))
+    title = f"{counts_text(figures)}; by {args.sort}"
+    Console(width=130).print(screen_table(title, [head.replace(" [", "\n[") for head in heads], rows, texts))
     _write_list(folder, figures, order, args.sort)
     if args.parquet:
         write_parquet(episodes, folder)
@@ -246,7 +249,7 @@ def _folder(policy: TrainedPolicy) -> Path:
 
 def _write_list(folder: Path, figures: Figures, order: list[int], by: str) -> None:
     """Write all of the list as Markdown."""
-    text = markdown_table(heads_of(figures), [row_of(figures, number) for number in order], left=(1,))
+    text = markdown_table(heads_of(figures), [row_of(figures, number) for number in order], left=(1,)) + "\n"
     write_text(folder / LIST, f"# Episodes\n\n{counts_text(figures)}. The worst come first, by {by}.\n\n{text}")
     print(f"written: {relative(folder / LIST)}")
 
@@ -285,8 +288,9 @@ def _compare(args: argparse.Namespace) -> int:
 def _print_statistics(folder: Path, found: dict[str, JointStatistics]) -> None:
     """Print the tables of joint statistics, then write their files."""
     console = Console(width=130)
-    for table in tables_of(found):
-        console.print(screen_table(table))
+    for title, table in tables_of(found).items():
+        heads = [head.replace(", ", ",\n") for head in table.head]
+        console.print(screen_table(title, heads, [[text_of(cell) for cell in row] for row in table.rows]))
     write_statistics(folder, found, "Joint statistics" if len(found) == 1 else "Joint statistics of two policies")
 
 

@@ -1,8 +1,8 @@
 """Learning curves of runs: `python -m legged.tools.plot logs/anymal_c_flat/<run> [<run> ...] --out curve.png`.
 
-Reads the TensorBoard files; draws tracking error, return and falls over iterations, one line a run, and an axis of time on
-top, unless runs differ in the time of an iteration by more than 5 %. Of runs on terrain, also the mean level of each type and
-the shares of episodes after which robots moved up and down, as means over the runs.
+Reads the TensorBoard files and draws returns, errors, falls and metrics over iterations, one line a run. A second axis shows
+the time if the iterations of all runs take equally long within 5 %. Runs on terrain add the mean level of each type and the
+shares of episodes after which robots moved up and down, as means over the runs.
 """
 
 import sys
@@ -10,7 +10,10 @@ from pathlib import Path
 
 from legged.commandline.command import run_main
 from legged.commandline.parser import CommandParser
-from legged.evaluation.learning_curves import always_promoted, draw_runs, labels, read_config, read_scalars
+from legged.errors import ConfigError
+from legged.evaluation.learning_curves import Log, common_time, labels, read_config, read_scalars
+from legged.evaluation.reports.charts import draw_charts
+from legged.evaluation.reports.curves import levels, outcomes
 from legged.process.paths import ready_to_write_file, relative
 
 
@@ -35,10 +38,12 @@ def build_parser() -> CommandParser:
 def _main(argv: list[str] | None) -> int:
     args = build_parser().parse_args(argv)
     ready_to_write_file("--out", args.out, endings=(".png",))
-    runs = [read_scalars(run) for run in args.runs]
-    configs = [read_config(run) for run in args.runs]
-    named = dict(zip(labels(args.runs, configs), runs, strict=True))
-    draw_runs(named, args.out, {level for config in configs if (level := always_promoted(config)) is not None})
+    logs = [Log(read_scalars(run), read_config(run)) for run in args.runs]
+    runs = list(zip(labels(args.runs, [log.config for log in logs]), logs, strict=True))
+    charts = [*outcomes(runs), *levels(logs)]
+    if not charts:
+        raise ConfigError(f"{args.runs[0]}: its TensorBoard file holds no returns, errors or metrics")
+    draw_charts(charts, args.out, iteration_s=common_time([log.scalars for log in logs]))
     print(f"written: {relative(args.out)}")
     return 0
 

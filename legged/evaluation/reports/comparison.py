@@ -10,12 +10,13 @@ from legged.config.dotted import differences
 from legged.evaluation.engines import ENGINES, engine_of
 from legged.evaluation.intervals import Interval, bootstrap_mean, newcombe, normal_mean, welch, wilson
 from legged.evaluation.learning_curves import labels
+from legged.evaluation.reports.charts import curves
 from legged.evaluation.reports.curves import curves_of_runs
-from legged.evaluation.reports.differences import words
 from legged.evaluation.reports.document import Cell, Figures, Heading, Mono, Paragraph, Part, Table
-from legged.evaluation.reports.evaluation_part import BROKEN, between, falls_of, number, success_drawing, success_line
-from legged.evaluation.reports.record import Record
+from legged.evaluation.reports.evaluation_part import BROKEN, between, falls_of, number
+from legged.evaluation.reports.record import Record, words
 from legged.evaluation.result_file import changes_text, grid_text, tracking_of
+from legged.evaluation.success_report import success_chart, success_line, types_in
 
 Measured = tuple[str, Interval | None] | None
 """A figure in words, and its interval, if there are enough values for one; None where a run lacks it."""
@@ -34,7 +35,7 @@ def comparison_parts(records: Sequence[Record]) -> list[Part]:
     head = ["run", "folder", "status", "", "robots", "loop [s]", "steps/s", "commit", *(["note"] if noted else [])]
     parts: list[Part] = [Paragraph(f"All runs: {common}.")] if common else []
     parts += [Table(head, rows), Heading("Settings that differ"), _settings(names, records)]
-    drawings = curves_of_runs(list(zip(names, records, strict=True)))
+    drawings = curves_of_runs([(name, record.log) for name, record in zip(names, records, strict=True)])
     if drawings:
         parts += [Heading("Curves"), Figures("curves", drawings, "learning curves of the runs")]
     return parts + _evaluations(names, records)
@@ -209,11 +210,10 @@ def _spread(result: dict[str, Any]) -> tuple[float, float, int] | None:
 
 def _success(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> list[str]:
     """Return a drawing a terrain type that at least two of the runs have crossed."""
-    entries = [(result or {}).get("success", {}).get("types", {}) for result in results]
+    entries = [types_in(result or {}) for result in results]
     found = []
     for kind in dict.fromkeys(kind for one in entries for kind in one):
-        there = [(name, one[kind]) for name, one in zip(names, entries, strict=True) if kind in one]
+        there = [(one[kind], success_line(name, one[kind])) for name, one in zip(names, entries, strict=True) if kind in one]
         if len(there) > 1:
-            lines = [success_line(name, entry) for name, entry in there]
-            found.append(success_drawing(kind.replace("_", " "), [entry for _, entry in there], lines))
+            found.append(curves(success_chart(kind.replace("_", " "), there)))
     return found

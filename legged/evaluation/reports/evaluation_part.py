@@ -4,15 +4,12 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
-
 from legged.evaluation.engines import ENGINES, engine_of
 from legged.evaluation.intervals import wilson
+from legged.evaluation.reports.charts import curves, heat_map
 from legged.evaluation.reports.document import Cell, Figures, Heading, Number, Paragraph, Part, Table
-from legged.evaluation.reports.svg import Axes, Line, curves, heat_map
 from legged.evaluation.result_file import changes_text, tracking_of
-from legged.evaluation.success_report import PANELS as SUCCESS_PANELS
-from legged.evaluation.success_report import TRAINED_LABEL, panels_of
+from legged.evaluation.success_report import success_charts
 from legged.evaluation.tracking_report import PANELS, grid_means
 from legged.evaluation.velocity_grid import AXES
 
@@ -100,7 +97,7 @@ def _following(results: Sequence[dict[str, Any]]) -> list[Part]:
     ]
     if drawings:
         parts.append(Figures("tracking", drawings, "velocity and yaw rate errors over commands"))
-    success = _success(results)
+    success = [curves(chart) for chart in success_charts(results)]
     if success:
         parts += [
             Paragraph(
@@ -123,55 +120,6 @@ def _heat_maps(tracking: dict[str, Any], label: str) -> list[str]:
         return found
     except BROKEN:
         return []
-
-
-def _success(results: Sequence[dict[str, Any]]) -> list[str]:
-    """Return a drawing a kind of terrain: success over size, one line a type and engine."""
-    names = dict.fromkeys(name for result in results for name in result.get("success", {}).get("types", {}))
-    found = []
-    for title, types in panels_of(list(names)).items():
-        entries = [
-            (name, result["physics"], entry)
-            for name in types
-            for result in results
-            if (entry := result.get("success", {}).get("types", {}).get(name)) is not None
-        ]
-        lines = [success_line(_label(name, physics, types, results), entry) for name, physics, entry in entries]
-        panel = title if title in SUCCESS_PANELS else title.replace("_", " ")
-        found.append(success_drawing(panel, [entry for *_, entry in entries], lines))
-    return found
-
-
-def _label(name: str, physics: str, types: Sequence[str], results: Sequence[dict[str, Any]]) -> str:
-    """Return what tells a line from the others of its drawing."""
-    words = [name.replace("_", " ")] if len(types) > 1 else []
-    words += [engine_of(physics).label] if len(results) > 1 else []
-    return ", ".join(words)
-
-
-def success_line(label: str, entry: dict[str, Any]) -> Line:
-    """Return success over size of one terrain type, with its intervals where the file has them."""
-    points = sorted(entry["points"], key=lambda point: point["size"])
-    size, share = (np.array([point[key] for point in points], dtype=float) for key in ("size", "share"))
-    band = None
-    if all(isinstance(point.get(key), int | float) for point in points for key in ("low", "high")):
-        band = (np.array([point["low"] for point in points]), np.array([point["high"] for point in points]))
-    return Line(label, size, share, band, markers=True)
-
-
-def success_drawing(title: str, entries: Sequence[dict[str, Any]], lines: Sequence[Line]) -> str:
-    """Draw success over the size of a terrain type, a line an entry. Where training did not end at one size for all that were
-    trained on it, the dotted lines say whose they are.
-    """
-    ends: dict[float, list[str]] = {}
-    for entry, line in zip(entries, lines, strict=True):
-        if entry["trained_to"] is not None:
-            ends.setdefault(float(entry["trained_to"]), []).append(line.name)
-    several = len(ends) > 1
-    walls = tuple((f"{TRAINED_LABEL}: {', '.join(names)}" if several else TRAINED_LABEL, end) for end, names in ends.items())
-    what = entries[0]["what"]
-    axes = Axes(f"success: {title}", f"{what} [{entries[0]['unit']}]", unit=what, high=1.0, percent=True, walls=walls)
-    return curves(axes, lines)
 
 
 def _episodes(result: dict[str, Any]) -> list[Part]:

@@ -8,10 +8,9 @@ from typing import Any
 
 from legged.evaluation.engines import ENGINES
 from legged.evaluation.learning_curves import smooth
-from legged.evaluation.reports.differences import but_for_seeds, what_changed
-from legged.evaluation.reports.document import Cell, Link, Mono, Number, Paragraph, Part, Table
+from legged.evaluation.reports.document import Cell, Link, Mono, Number, Paragraph, Part, Table, text_of
 from legged.evaluation.reports.evaluation_part import number
-from legged.evaluation.reports.record import Record
+from legged.evaluation.reports.record import Record, but_for_seeds, what_changed
 from legged.evaluation.reports.run_report import REPORT
 from legged.evaluation.result_file import tracking_of
 
@@ -48,7 +47,7 @@ def experiments_parts(records: Sequence[Record], beside: Path, ending: str, seed
         groups.setdefault(but_for_seeds(record) if seeds_share else str(record.folder), []).append(record)
     rows = [_shared_row(group, beside, ending) for group in groups.values()]
     head = list(rows[0]) if rows else []
-    shown = [name for name in head if any(_text(row[name]) not in EMPTY for row in rows)]
+    shown = [name for name in head if any(text_of(row[name]) not in EMPTY for row in rows)]
     text = (
         f"{len(newest)} runs, newest first, made by `python -m legged.tools.experiments`. What changed is a note to the run"
         " (`--note`), else its own name and what it sets otherwise than its task as it is now. RMSE, falls and stairs are"
@@ -74,13 +73,9 @@ def _shared_row(group: Sequence[Record], beside: Path, ending: str) -> dict[str,
         shared[name] = number(mean(known) if known else None, form)
     seeds = [value for record in group if (value := _whole(record.at("env.seed"))) is not None]
     shared["seed"] = Number(", ".join(f"{seed:,d}" for seed in sorted(seeds)), min(seeds, default=None))
-    shared["evaluated"] = ", ".join(dict.fromkeys(text for row in rows if (text := _text(row["evaluated"]))))
+    shared["evaluated"] = ", ".join(dict.fromkeys(text for row in rows if (text := text_of(row["evaluated"]))))
     shared["what changed"] = what_changed(group[0], named=False)
     return shared
-
-
-def _text(cell: Cell) -> str:
-    return cell.text if isinstance(cell, Link | Number) else cell
 
 
 def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:

@@ -11,17 +11,24 @@ from pathlib import Path
 from typing import Any
 
 from legged.config import to_dict
-from legged.config.dotted import value_at
+from legged.config.dotted import MISSING, differences, flat, value_at
+from legged.config.yaml_files import dump
 from legged.errors import ConfigError
-from legged.evaluation.learning_curves import Scalars, read_config, read_scalars
+from legged.evaluation.learning_curves import Log, Scalars, read_config, read_scalars
 from legged.evaluation.result_file import file_name, read_results
 from legged.learning.given import Given, read_given
 from legged.learning.run_folder import CODE_FILE, CONFIG_FILE, NOTE_FILE, checkpoints, of_another_policy, run_config
 from legged.learning.timing import Timing, read_timing
+from legged.registry import task_config
 
 STAMP = re.compile(r"(\d{4}-\d{2}-\d{2}_\d{2}-\d{2}-\d{2})(?:_(.*))?")
 FILMS = ("film.gif", "play.gif", "play.mp4")
 """Files that show the policy, the first that is there."""
+NAMES = ("train.runner.run_name", "train.runner.experiment_name", "train.runner.report", "train.runner.film", "task")
+"""Settings that say nothing of how a policy comes to be."""
+MOST_WORDS = 4
+"""Settings that are named in a few words."""
+LONGEST_VALUE = 60
 QUIET_S = 3600.0
 """A training that has written nothing for so long is taken for ended, whatever has its process's number now [s]."""
 
@@ -108,10 +115,9 @@ class Record:
         return steps * self.robots if isinstance(steps, int) and self.robots else None
 
     @property
-    def dt(self) -> float | None:
-        """Length of a control step [s]."""
-        dt, decimation = self.at("sim.dt"), self.at("control.decimation")
-        return dt * decimation if isinstance(dt, int | float) and isinstance(decimation, int) else None
+    def log(self) -> Log:
+        """Logged values and configuration."""
+        return Log(self.scalars, self.config)
 
     def another_policy(self, result: dict[str, Any] | None) -> str:
         """Return the checkpoint that an evaluation is of; nothing where it is the last one, whose the other figures are."""
@@ -238,3 +244,55 @@ def read_note(folder: Path) -> str:
     with suppress(OSError):
         return " ".join((folder / NOTE_FILE).read_text(encoding="utf-8", errors="replace").split())
     return ""
+
+
+# ---- differences ------------------------------------------------------------------------------------------------------
+
+
+def from_task_file(record: Record) -> dict[str, list[Any]] | None:
+    """Return the settings in which a run differs from its task as it is now, each with both values; None where there is no
+    such task any more. A run that does not say on which device it was made is compared with the settings that it is nearest
+    to, those of a CPU or the others.
+    """
+    where = [record.timing.device == "cpu"] if record.timing else [False, True]
+    found = []
+    for on_cpu in where:
+        try:
+            found.append(differences([record.config, to_dict(task_config(record.task, on_cpu=on_cpu))]))
+        except (ConfigError, OSError):
+            return None
+    return min(found, key=len)
+
+
+def words(value: Any) -> str:
+    """Return a value as it would stand in a YAML file, on one line; a dash for none."""
+    if value is MISSING:
+        return "-"
+    text = dump(value, default_flow_style=True, width=1_000_000).strip().removesuffix("...").strip()
+    return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 3] + "..."
+
+
+def what_changed(record: Record, named: bool = True) -> str:
+    """Say in a few words what a run is about: somebody's note, else its own name, where it is to be `named`, and what it sets
+    otherwise than its task; where that task is not known here, what its command line set.
+    """
+    if record.note:
+        return record.note
+    found = from_task_file(record)
+    if found is not None:
+        changed = {path: own for path, (own, _) in found.items()}
+    else:
+        changed = dict(record.given.changes) if record.given is not None else {}
+    said = [
+        f"{'.'.join(path.split('.')[-2:])} {words(own)}" for path, own in changed.items() if path not in (*NAMES, "env.seed")
+    ]
+    if len(said) > MOST_WORDS:
+        said = [*said[:MOST_WORDS], f"{len(said) - MOST_WORDS} more settings"]
+    return ": ".join(text for text in (record.run_name if named else "", ", ".join(said)) if text)
+
+
+def but_for_seeds(record: Record) -> str:
+    """Return a text that is the same for all runs that differ in nothing but their seed and what they are called."""
+    told = {path: value for path, value in flat(record.config).items() if path not in (*NAMES[:-1], "env.seed")}
+    device = record.timing.device if record.timing else ""
+    return repr((sorted(told.items()), record.note, record.status, record.done, record.code.summary, device))

@@ -1,6 +1,9 @@
 """The report on one run: report.html, which needs nothing else, and report.md with pictures beside it."""
 
 import shlex
+import subprocess
+import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,7 +11,6 @@ import numpy as np
 
 from legged.evaluation.learning_curves import Scalars, smooth
 from legged.evaluation.reports.curves import curves_of_run
-from legged.evaluation.reports.differences import from_task_file, words
 from legged.evaluation.reports.document import (
     Cell,
     Figures,
@@ -20,15 +22,14 @@ from legged.evaluation.reports.document import (
     Part,
     Picture,
     Table,
-    to_html,
-    to_markdown,
+    write_pages,
 )
 from legged.evaluation.reports.evaluation_part import evaluation_parts, number
-from legged.evaluation.reports.record import Record, read_record
-from legged.evaluation.reports.svg import sheet
+from legged.evaluation.reports.record import Record, from_task_file, read_record, words
 from legged.learning.given import Given
 from legged.learning.run_folder import BEST_MODEL, CODE_FILE, checkpoints
-from legged.process.paths import relative, write_text
+from legged.process.paths import relative
+from legged.process.processes import child_environment
 
 REPORT = "report"
 """What its files are called, before their ending."""
@@ -36,6 +37,8 @@ ROWS = 10
 """Lines of the table over training."""
 LARGEST_FILM = 12 * 2**20
 """A larger film is named and not put into the page [bytes]."""
+LONGEST_FILM_S = 60.0
+"""The filming of a policy is ended after this time [s]."""
 LONGEST_DIFF = 200_000
 """Letters of a difference in the page; the whole one is in its file."""
 OVER_TRAINING = (
@@ -61,21 +64,6 @@ def write_report(folder: Path) -> Path:
     return write_pages(folder / REPORT, title_of(record), report_parts(record))
 
 
-def write_pages(stem: Path, title: str, parts: Sequence[Part]) -> Path:
-    """Write a page as <stem>.html and as <stem>.md with its pictures beside it; return the first.
-
-    Raises:
-        RunError: a file can't be written.
-    """
-    page = stem.with_name(f"{stem.name}.html")
-    write_text(page, to_html(title, parts))
-    for part in parts:
-        if isinstance(part, Figures):
-            write_text(stem.with_name(f"{stem.name}_{part.name}.svg"), sheet(part.drawings))
-    write_text(stem.with_name(f"{stem.name}.md"), to_markdown(title, parts, stem.name))
-    return page
-
-
 def title_of(record: Record) -> str:
     """Return the title of a run's report."""
     return f"{record.task}: {record.folder.resolve().name}"
@@ -91,7 +79,7 @@ def report_parts(record: Record) -> list[Part]:
     parts += _differences(record)
     if record.scalars:
         parts += [Heading("Over training"), Paragraph("Running means over nine iterations."), over_training(record)]
-        parts += [Heading("Curves"), Figures("curves", curves_of_run(record), "learning curves")]
+        parts += [Heading("Curves"), Figures("curves", curves_of_run(record.log), "learning curves")]
     else:
         parts += [Heading("Curves"), Paragraph("There is no TensorBoard file with values in this folder.")]
     parts += evaluation_parts(record.results, record.another_policy) or [
@@ -218,3 +206,43 @@ def _loop_time(scalars: Scalars) -> tuple[np.ndarray, np.ndarray]:
         return np.array([]), np.array([])
     steps = sorted(both[0].keys() & both[1].keys())
     return np.cumsum([both[0][step] + both[1][step] for step in steps]), np.array(steps)
+
+
+# ---- after a training --------------------------------------------------------------------------------------------------
+
+
+def report_at_end(folder: Path, film_with: Sequence[str] | None) -> None:
+    """Write the report on a run that has just ended, and print its path. Every failure is one printed line, because the run
+    itself is complete. `film_with` holds the flags by which another process finds the run's task; that process films the
+    policy first. It is another process because a driver that fails while it draws may end it, or never return.
+    """
+    start = time.perf_counter()
+    try:
+        why = "" if film_with is None else _film_apart(folder, film_with)
+        page = write_report(folder)
+    except KeyboardInterrupt:
+        print(f"{relative(folder)}: interrupted before its report was written", file=sys.stderr, flush=True)
+    except Exception as error:  # a report must not spoil a run
+        said = " ".join(str(error).split())[:300] or type(error).__name__
+        print(f"warning: {relative(folder)}: no report: {said}", file=sys.stderr, flush=True)
+    else:
+        without = f"; no film: {why}" if why else ""
+        print(f"report {relative(page)} ({time.perf_counter() - start:.1f} s{without})", flush=True)
+
+
+def _film_apart(folder: Path, flags: Sequence[str]) -> str:
+    """Film the policy in another process; return the reason if there is no film, else an empty text."""
+    command = [sys.executable, "-m", "legged.tools.report", str(folder), "--film", *flags]
+    alone = {key: text for key, text in child_environment().items() if key not in ("RANK", "LOCAL_RANK", "WORLD_SIZE")}
+    alone["CUDA_VISIBLE_DEVICES"] = ""  # it draws on the CPU, and a GPU's memory may be full
+    try:
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, env=alone, timeout=LONGEST_FILM_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return f"it took longer than {LONGEST_FILM_S:g} s"
+    except OSError as error:
+        return str(error)
+    if done.returncode == 0:
+        return next((line.removeprefix("no film: ") for line in done.stdout.splitlines() if line.startswith("no film: ")), "")
+    return (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1][:200]
