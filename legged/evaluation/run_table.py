@@ -8,7 +8,7 @@ from typing import Any
 
 from legged.errors import ConfigError
 from legged.evaluation.engines import ENGINES, engine_of
-from legged.evaluation.judged_run import JudgedRun
+from legged.evaluation.evaluated_run import EvaluatedRun
 from legged.evaluation.result_file import tracking_of
 from legged.process.paths import relative
 from legged.robots.robot import load_robot
@@ -27,13 +27,13 @@ COMPILED = " Start-up times with a * hold the compilation of kernels."
 Row = dict[str, Any]
 
 
-def summary(runs: Sequence[JudgedRun]) -> list[Row]:
+def summary(runs: Sequence[EvaluatedRun]) -> list[Row]:
     """Return plain numbers of each task, in the order of the first run of each: a row a seed, and their mean."""
     tasks = dict.fromkeys(run.cfg.task for run in runs)
     return [_task(task, [run for run in runs if run.cfg.task == task]) for task in tasks]
 
 
-def _task(task: str, runs: Sequence[JudgedRun]) -> Row:
+def _task(task: str, runs: Sequence[EvaluatedRun]) -> Row:
     robot, height = _robot(runs[0].cfg.robot)
     step = stairs_height(runs)
     stairs = None if step is None else {"size": step, "share_of_height": step / height if height else None}
@@ -59,7 +59,7 @@ def _robot(given: str) -> tuple[str, float | None]:
     return robot.name, robot.height
 
 
-def stairs_height(runs: Sequence[JudgedRun]) -> float | None:
+def stairs_height(runs: Sequence[EvaluatedRun]) -> float | None:
     """Return the height of the steps whose success is stated [m]: the smallest that was measured up and down, wherever
     stairs were, and is at least the share of the height that the configuration of the first run asks for; None if there is
     none.
@@ -78,7 +78,7 @@ def _shares(result: Row, terrain: str) -> dict[float, float]:
     return {point["size"]: point["share"] for point in entry["points"]}
 
 
-def _row(run: JudgedRun, step: float | None) -> Row:
+def _row(run: EvaluatedRun, step: float | None) -> Row:
     timing = {} if run.timing is None else asdict(run.timing) | {"steps_per_s": run.timing.steps_per_s}
     engines = {}
     for name, result in run.results.items():

@@ -14,7 +14,7 @@ from pathlib import Path
 from legged.commandline.command import run_main
 from legged.commandline.parser import CommandParser, add_import_argument
 from legged.errors import ConfigError, suggest
-from legged.evaluation.judged_run import folders_in
+from legged.evaluation.evaluated_run import folders_in
 from legged.evaluation.reports.comparison import comparison_parts
 from legged.evaluation.reports.document import Part, to_html, to_markdown, write_pages
 from legged.evaluation.reports.experiments import TITLE, experiments_parts

@@ -24,7 +24,7 @@ from legged.commandline.command import EXIT_FAILED, run_main
 from legged.commandline.parser import CommandParser, add_import_argument
 from legged.commandline.stopping import stopping_on_signals
 from legged.errors import ConfigError
-from legged.evaluation.judged_run import JudgedRun, find_runs
+from legged.evaluation.evaluated_run import EvaluatedRun, find_runs
 from legged.evaluation.run_table import markdown, summary
 from legged.evaluation.success import TYPES_HELP
 from legged.learning.timing import read_timing
@@ -214,7 +214,7 @@ class _Campaign:
         print(f"{time.perf_counter() - self.start:7.1f} s  {text}", flush=True)
 
 
-def _write_table(runs: Sequence[JudgedRun], out: Path) -> str:
+def _write_table(runs: Sequence[EvaluatedRun], out: Path) -> str:
     """Write table.md and table.json into a folder; return the first."""
     tasks = summary(runs)
     text = markdown(tasks)
@@ -224,7 +224,7 @@ def _write_table(runs: Sequence[JudgedRun], out: Path) -> str:
     return text
 
 
-def _finish(runs: Sequence[JudgedRun], out: Path | None, shipped: Path | None) -> None:
+def _finish(runs: Sequence[EvaluatedRun], out: Path | None, shipped: Path | None) -> None:
     """Print the table, write it if there is a folder for it, and ship the policies if there is one for them."""
     print(f"\n{markdown(summary(runs)) if out is None else _write_table(runs, out)}", end="", flush=True)
     if out is not None:

@@ -19,7 +19,7 @@ from torch.utils.tensorboard import SummaryWriter
 from legged import registry
 from legged.errors import RunError
 from legged.evaluation.learning_curves import read_scalars, smooth
-from legged.evaluation.reports import at_end
+from legged.evaluation.reports import run_report
 from legged.evaluation.reports.record import read_record
 from legged.evaluation.reports.run_report import over_training, write_report
 from legged.learning.captured import CapturedRunner
@@ -142,7 +142,7 @@ def test_a_report_that_fails_spoils_no_run(monkeypatch, capsys):
     def fail(folder):
         raise ValueError("two\nlines")
 
-    monkeypatch.setattr(at_end, "write_report", fail)
+    monkeypatch.setattr(run_report, "write_report", fail)
     arguments = [*FLAGS, *REPORTED, "--max_iterations", "1"]
     assert train.main(arguments) == 0
     (folder,) = run_folders()
@@ -152,7 +152,7 @@ def test_a_report_that_fails_spoils_no_run(monkeypatch, capsys):
     def interrupt(folder):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(at_end, "write_report", interrupt)
+    monkeypatch.setattr(run_report, "write_report", interrupt)
     assert train.main(arguments) == 0
     assert "interrupted before its report was written" in capsys.readouterr().err
 
@@ -212,7 +212,7 @@ def test_a_film_is_made_by_another_process_and_shown(monkeypatch):
         return subprocess.CompletedProcess(command, 0, "written: film.gif\n", "")
 
     monkeypatch.setenv("RANK", "0")
-    monkeypatch.setattr(at_end, "subprocess", instead_of_processes(run))
+    monkeypatch.setattr(run_report, "subprocess", instead_of_processes(run))
     folder = tiny_run("train.runner.report=true", iterations=1)
     assert asked == [(["-m", "legged.tools.report", str(folder), "--film", "--task", TASK], "", False)]
     assert '<img class="film" src="data:image/gif;base64,' in read(folder)
@@ -234,7 +234,7 @@ def test_without_a_film_there_is_a_report_and_a_line(outcome, words, monkeypatch
             raise outcome
         return outcome
 
-    monkeypatch.setattr(at_end, "subprocess", instead_of_processes(run))
+    monkeypatch.setattr(run_report, "subprocess", instead_of_processes(run))
     arguments = [*FLAGS, "--max_iterations", "1", "train.runner.report=true"]
     assert train.main(arguments) == 0
     last = capsys.readouterr().out.splitlines()[-1]

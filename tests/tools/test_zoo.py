@@ -13,7 +13,7 @@ import torch
 from helpers import TASK, TINY_TRAINING, call, run_folders, tiny_run, wait_for
 
 from legged.errors import ConfigError
-from legged.evaluation.judged_run import find_runs
+from legged.evaluation.evaluated_run import find_runs
 from legged.learning.timing import read_timing
 from legged.process.startup import STAGES_FILE
 from legged.tools import zoo

@@ -87,7 +87,7 @@ def draw_charts(charts: Sequence[Chart], path: Path, title: str = "", iteration_
         for axis in axes.flat[len(charts) :]:
             axis.set_visible(False)
         for axis, chart in zip(axes.flat, charts, strict=False):
-            _draw(axis, chart.cleaned())
+            draw_panel(axis, chart.cleaned())
             if iteration_s is not None:
                 both = (lambda x: x * iteration_s, lambda x: x / iteration_s)
                 axis.secondary_xaxis("top", functions=both).set_xlabel("training loop [s]", fontsize="small")
@@ -95,7 +95,7 @@ def draw_charts(charts: Sequence[Chart], path: Path, title: str = "", iteration_
             drawn.suptitle(title)
 
 
-def _draw(axis: Any, chart: Chart) -> None:
+def draw_panel(axis: Any, chart: Chart) -> None:
     """Draw a chart into axes of matplotlib."""
     from matplotlib.ticker import PercentFormatter
 

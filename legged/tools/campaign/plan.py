@@ -9,7 +9,7 @@ from typing import Any
 from legged.config import LeggedConfig, override, parse_override
 from legged.errors import ConfigError, suggest
 from legged.evaluation.engines import ENGINES
-from legged.evaluation.judged_run import JudgedRun, results_in, why_unfinished
+from legged.evaluation.evaluated_run import EvaluatedRun, results_in, why_unfinished
 from legged.evaluation.result_file import tracking_of
 from legged.evaluation.success import chosen_sizes
 from legged.evaluation.velocity_grid import axes_of
@@ -71,13 +71,13 @@ class Training:
         """Whether there is success on terrain to be measured."""
         return self.cfg.terrain.mesh_type != "plane"
 
-    def judged(self, order: Order) -> JudgedRun:
+    def judged(self, order: Order) -> EvaluatedRun:
         """Return what is known of it, as far as it was judged as `order` asks."""
         if self.folder is None:
-            return JudgedRun(self.cfg, self.seed, failure=self.failure or "not trained yet", notes=tuple(self.notes))
+            return EvaluatedRun(self.cfg, self.seed, failure=self.failure or "not trained yet", notes=tuple(self.notes))
         left = missing_engines(self, order)
         results = {name: result for name, result in results_in(self.folder).items() if name in {*order.engines} - {*left}}
-        return JudgedRun(self.cfg, self.seed, self.folder, read_timing(self.folder), results, notes=tuple(self.notes))
+        return EvaluatedRun(self.cfg, self.seed, self.folder, read_timing(self.folder), results, notes=tuple(self.notes))
 
 
 def trainings_of(tasks: Sequence[tuple[str, str]], seeds: Sequence[int], order: Order) -> list[Training]:

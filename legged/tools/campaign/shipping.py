@@ -10,7 +10,7 @@ import torch
 
 from legged.config.actuator import MOTORS
 from legged.errors import ConfigError, RunError
-from legged.evaluation.judged_run import SEED_FOLDER, JudgedRun
+from legged.evaluation.evaluated_run import SEED_FOLDER, EvaluatedRun
 from legged.evaluation.result_file import file_name, stress_name
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL, checkpoints, find_checkpoint, of_another_policy
@@ -26,7 +26,7 @@ JUDGED = ("evaluation_*", "stress_*", "crossing.*", "time_to_walk.json")
 PICTURES = ("*.png", "*.gif", "*.mp4")
 
 
-def ship(runs: Sequence[JudgedRun], folder: Path) -> list[str]:
+def ship(runs: Sequence[EvaluatedRun], folder: Path) -> list[str]:
     """Write `folder`/<task>/ for each task: the policy of the lowest seed that has finished, with configuration, times,
     evaluations and stress tests, and in seed_<number>/ times, evaluations and stress tests of the others. Of several runs of
     a seed the last counts. What an earlier shipment has left of these goes. Return a line on each.
@@ -61,7 +61,7 @@ def ship(runs: Sequence[JudgedRun], folder: Path) -> list[str]:
     return lines
 
 
-def _check_elsewhere(runs: Sequence[JudgedRun], folder: Path) -> None:
+def _check_elsewhere(runs: Sequence[EvaluatedRun], folder: Path) -> None:
     """Look whether all runs lie elsewhere than the policies that are made of them.
 
     Raises:
@@ -108,7 +108,7 @@ def _remove_shipment(folder: Path) -> None:
         raise RunError(f"{relative(folder)}: {reason(error)}") from error
 
 
-def _judged(run: JudgedRun) -> tuple[str, ...]:
+def _judged(run: EvaluatedRun) -> tuple[str, ...]:
     """Return the names of the files that say what a run came to: times, evaluations, and stress tests of its last policy.
 
     Raises:
@@ -126,7 +126,7 @@ def _judged(run: JudgedRun) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _copy(run: JudgedRun, folder: Path, names: Sequence[str]) -> None:
+def _copy(run: EvaluatedRun, folder: Path, names: Sequence[str]) -> None:
     """Copy the files of those names that a run has."""
     assert run.folder is not None, "those without one were left out"
     make_folder(folder)

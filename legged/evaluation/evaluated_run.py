@@ -23,7 +23,7 @@ SEED_FOLDER = re.compile(r"seed_(\d+)", re.ASCII)
 
 
 @dataclass(frozen=True)
-class JudgedRun:
+class EvaluatedRun:
     """One training. Where it failed, there may be neither folder nor times nor results."""
 
     cfg: LeggedConfig
@@ -38,7 +38,7 @@ class JudgedRun:
     """What else went wrong."""
 
 
-def read_run(folder: Path) -> JudgedRun:
+def read_run(folder: Path) -> EvaluatedRun:
     """Read a run folder, or that of a shipped policy. An evaluation of another checkpoint than the last says nothing of the
     policy that is in the table and is shipped, and one with changed fields is not comparable; they are left out, and a note
     says so. So it does of one on another grid of commands than the task's.
@@ -60,7 +60,7 @@ def read_run(folder: Path) -> JudgedRun:
             notes.append(f"its evaluation in {name} was made with {changes_text(known.pop(name))}, and is left out")
         elif tracking_of(one).get("grid") not in (None, axes_of(cfg)):
             notes.append(f"its evaluation in {name} is not on its task's grid of commands, but on {grid_text(one)}")
-    return JudgedRun(cfg, cfg.env.seed, folder, timing, known, why_unfinished(folder, cfg, timing), tuple(notes))
+    return EvaluatedRun(cfg, cfg.env.seed, folder, timing, known, why_unfinished(folder, cfg, timing), tuple(notes))
 
 
 def results_in(folder: Path) -> dict[str, dict[str, Any]]:
@@ -90,7 +90,7 @@ def why_unfinished(folder: Path, cfg: LeggedConfig, timing: Timing | None) -> st
     return f"stopped after {last} of {wanted} iterations"
 
 
-def find_runs(paths: Iterable[Path]) -> list[JudgedRun]:
+def find_runs(paths: Iterable[Path]) -> list[EvaluatedRun]:
     """Read the runs in some folders: a run folder itself, what lies in logs/ or logs/<task>/, or the folder of a shipped
     policy with those of its other seeds; each once, however often it is named. Where others lie beside them, runs of tasks
     that follow no commands and runs of a configuration that this version can't read are left out, and said to be.
@@ -98,7 +98,7 @@ def find_runs(paths: Iterable[Path]) -> list[JudgedRun]:
     Raises:
         ConfigError: a folder holds no run, none that the table is of, or something in one is damaged.
     """
-    found: list[JudgedRun] = []
+    found: list[EvaluatedRun] = []
     seen: set[Path] = set()
     left_out: dict[str, list[str]] = {}
     for path in paths:
@@ -139,9 +139,9 @@ def folders_in(path: Path) -> list[Path]:
     return folders
 
 
-def _other_seeds(folder: Path) -> list[JudgedRun]:
+def _other_seeds(folder: Path) -> list[EvaluatedRun]:
     """Read what is kept of the other seeds of a shipped policy: evaluations and times."""
     cfg = run_config(folder)
     assert isinstance(cfg, LeggedConfig), "its own seed was read before"
     numbers = {int(match[1]): path for path in folder.iterdir() if (match := SEED_FOLDER.fullmatch(path.name))}
-    return [JudgedRun(cfg, seed, path, read_timing(path), results_in(path)) for seed, path in sorted(numbers.items())]
+    return [EvaluatedRun(cfg, seed, path, read_timing(path), results_in(path)) for seed, path in sorted(numbers.items())]
