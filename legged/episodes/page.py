@@ -59,7 +59,7 @@ def _ending(episodes: Episodes, figures: Figures, number: int) -> str:
 
 
 def _conditions(about: dict[str, Any]) -> str:
-    """Say under which conditions episodes were recorded."""
+    """Return the conditions of a recording as text."""
     text = (
         "noise, pushes and randomisation as trained" if about.get("as_trained") else "without noise, pushes and randomisation"
     )

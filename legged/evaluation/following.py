@@ -1,6 +1,5 @@
-"""How well legged robots follow commands, and how hard a terrain they cross: measured, printed, drawn, written."""
+"""Evaluation of legged robots: errors on a grid of commands and success over difficulty."""
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ import torch
 from legged.config import LeggedConfig, override
 from legged.evaluation.episodes import header
 from legged.evaluation.overflows import warn_of_overflows
-from legged.evaluation.result_file import file_name
+from legged.evaluation.result_file import device_name, file_name, write_result
 from legged.evaluation.success import success_over_difficulty
 from legged.evaluation.success_report import draw_success, print_success, with_other_engines
 from legged.evaluation.tracking_report import draw_tracking, print_tracking
@@ -19,7 +18,7 @@ from legged.evaluation.velocity_grid import Grid
 from legged.evaluation.velocity_tracking import measure_tracking, ready_to_track
 from legged.physics import engine_name
 from legged.policies.restore import TrainedPolicy
-from legged.process.paths import make_folder, relative, write_text
+from legged.process.paths import relative
 from legged.terrain import BUMPS
 
 
@@ -34,9 +33,9 @@ def evaluate_following(
     folder: Path,
     where: str = "sim.physics",
 ) -> int:
-    """Measure tracking on the grid and success at all `sizes` of each terrain type, `robots` a size; print tables, then write
-    evaluation_<physics>.json and .png and success_<physics>.png into `folder`. Return the exit code. `where` says who asks
-    for the engine.
+    """Measure tracking on the grid, and success at all `sizes` of each terrain type with `robots` a size. Print tables, then
+    write evaluation_<physics>.json and .png and success_<physics>.png into `folder`. Return the exit code. `where` names the
+    setting of the engine in errors.
 
     Raises:
         RunError: a file can't be written.
@@ -50,7 +49,7 @@ def evaluate_following(
     lost = figures.pop("contact_overflows")
     rough = cfg.terrain.mesh_type != "plane"
     bumps = {"bumps": BUMPS * task.cfg.terrain.scale} if rough else {}  # [m]
-    head = header(policy, engine, torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu", asked)
+    head = header(policy, engine, device_name(device), asked)
     success = success_over_difficulty(policy, sizes, robots, asked, device, graph) if sizes else None
     result = {
         **head,
@@ -58,16 +57,15 @@ def evaluate_following(
         **({"rough": {**bumps, **figures, "contact_overflows": lost}} if rough else figures),
         **({} if success is None else {"success": success}),
     }
-    # First what is on the screen: no disk can take it away any more.
+    # The screen comes first: a full disk can't take it away.
     tracking = {**head, **bumps, **figures, "ground": "on rough ground, " if rough else ""}
     print_tracking(tracking)
     warn_of_overflows("tracking", lost)
     if success is not None:
         print_success(success)
         warn_of_overflows("success", success["contact_overflows"])
-    make_folder(folder)
     path = folder / file_name(engine)
-    write_text(path, json.dumps(result, indent=1, allow_nan=False))
+    write_result(path, result)
     written = [path, path.with_suffix(".png")]
     draw_tracking(tracking, written[1])
     if success is not None:

@@ -81,7 +81,7 @@ def labels(folders: Sequence[Path], configs: Sequence[dict[str, Any]]) -> list[s
 
 def always_promoted(config: dict[str, Any]) -> float | None:
     """Return the mean level of robots that are always promoted on terrain of R rows: 2 (R - 1) / 3. From the top row they
-    move to a random one, so row r holds robots in proportion to r + 1. Return None if the configuration has no number of rows.
+    move to a random one, so row r holds robots in proportion to r + 1. Return None if R is not known.
     """
     rows = value_at(config, "terrain.num_rows")
     return 2.0 * (rows - 1) / 3.0 if isinstance(rows, int) else None

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from legged.evaluation.engines import ENGINES, engine_of
+from legged.evaluation.json_forms import check_form
 from legged.evaluation.reports.charts import Chart, Line, draw_charts
-from legged.evaluation.result_file import check_success, file_name
+from legged.evaluation.result_file import SUCCESS, file_name
+from legged.evaluation.tables import screen_table
 from legged.terrain import TERRAIN_TYPES
 
 PANELS = {
@@ -22,40 +22,33 @@ PANELS = {
     "slopes": ("slope_up", "slope_down"),
     "rough slopes": ("rough_slope_up", "rough_slope_down"),
 }
-"""Types that share a panel; every other type has one of its own."""
+"""Types that share a panel; every other type has its own."""
 TRAINED_LABEL = "hardest of training"
 
 
 def print_success(success: dict[str, Any]) -> None:
-    """Print one line a point; sizes beyond those of training are marked."""
-    rule = success["definition"]
-    head = f"success: {rule['distance_m']:.3g} m from the start within {rule['time_s']:g} s, asked for {rule['vx']:.3g} m/s"
-    table = Table(title=escape(head), title_justify="left")
-    for name in ("terrain", "size", "success", "95 % interval", "fell", "stuck", "time to success"):
-        table.add_column(name, justify="left" if name == "terrain" else "right")
-    beyond = False
+    """Print a table with a line a point; sizes harder than those of training are marked."""
+    rule, beyond = success["definition"], False
+    title = f"success: {rule['distance_m']:.3g} m from the start within {rule['time_s']:g} s, asked for {rule['vx']:.3g} m/s"
+    rows: list[list[str] | None] = []
     for name, entry in success["types"].items():
         for i, point in enumerate(entry["points"]):
             mark = is_beyond(name, point["size"], entry["trained_to"])
             beyond |= mark
             time_s = point["mean_time_s"]
-            table.add_row(
-                escape(name) if i == 0 else "",
-                f"{point['size']:.3g} {entry['unit']}{' *' if mark else '  '}",
-                f"{point['successes']}/{point['robots']} = {100 * point['share']:.0f} %",
-                f"{100 * point['low']:.0f} to {100 * point['high']:.0f} %",
-                str(point["fell"]),
-                str(point["stuck"]),
-                "" if time_s is None else f"{time_s:.1f} s",
-            )
-        table.add_section()
-    Console(width=110).print(table)
+            row = [name if i == 0 else "", f"{point['size']:.3g} {entry['unit']}{' *' if mark else '  '}"]
+            row.append(f"{point['successes']}/{point['robots']} = {100 * point['share']:.0f} %")
+            row += [f"{100 * point['low']:.0f} to {100 * point['high']:.0f} %", str(point["fell"]), str(point["stuck"])]
+            rows.append([*row, "" if time_s is None else f"{time_s:.1f} s"])
+        rows.append(None)
+    heads = ("terrain", "size", "success", "95 % interval", "fell", "stuck", "time to success")
+    Console(width=110).print(screen_table(title, heads, rows))
     if beyond:
         print("* harder than in training")
 
 
 def is_beyond(name: str, size: float, trained_to: float | None) -> bool:
-    """Say whether a size is harder than the hardest of training; never where the type was not trained on."""
+    """Return whether a size is harder than the hardest of training; False if the type was not trained on."""
     if trained_to is None:
         return False
     kind = TERRAIN_TYPES[name]
@@ -64,7 +57,7 @@ def is_beyond(name: str, size: float, trained_to: float | None) -> bool:
 
 
 def with_other_engines(result: dict[str, Any], path: Path) -> list[dict[str, Any]]:
-    """Return `result`, and those of other engines that lie beside `path` (evaluation_<physics>.json), are of the same
+    """Return `result`, and the results of other engines next to `path` (evaluation_<physics>.json) that are of the same
     checkpoint and were measured with the same fields changed.
     """
     found = [result]
@@ -74,7 +67,7 @@ def with_other_engines(result: dict[str, Any], path: Path) -> list[dict[str, Any
             continue
         try:
             saved = json.loads(other.read_text(encoding="utf-8"))
-            check_success(saved, str(other))
+            check_form(saved, SUCCESS, str(other))
             points = [point for entry in saved["success"]["types"].values() for point in entry["points"]]
             drawable = "robots_per_point" in saved["success"] and all({"low", "high"} <= point.keys() for point in points)
             same = all(saved.get(key) == result.get(key) for key in ("task", "checkpoint", "changes"))

@@ -13,11 +13,16 @@ def markdown_table(heads: Sequence[object], rows: Sequence[Sequence[object]], le
     return "\n".join(f"| {' | '.join(line)} |" for line in (lines[0], marks, *lines[1:]))
 
 
-def screen_table(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> Table:
-    """Return a table for the screen; columns in `left` hold texts, the others numbers."""
+def screen_table(
+    title: str, heads: Sequence[str], rows: Sequence[Sequence[str] | None], left: Collection[int] = (0,)
+) -> Table:
+    """Return a table for the screen; columns in `left` hold texts, the others numbers. None among the rows is a rule."""
     table = Table(title=escape(title), title_justify="left")
     for i, head in enumerate(heads):
         table.add_column(escape(head), justify="left" if i in left else "right")
     for row in rows:
-        table.add_row(*(escape(cell) for cell in row))
+        if row is None:
+            table.add_section()
+        else:
+            table.add_row(*map(escape, row))
     return table

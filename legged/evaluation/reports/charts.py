@@ -86,8 +86,13 @@ def draw_charts(charts: Sequence[Chart], path: Path, title: str = "", iteration_
     with figure(path, (5.0 * columns, 3.0 * rows + 0.3), rows, columns) as (drawn, axes):
         for axis in axes.flat[len(charts) :]:
             axis.set_visible(False)
+        before: list[str] = []
         for axis, chart in zip(axes.flat, charts, strict=False):
             draw_panel(axis, chart.cleaned())
+            names = axis.get_legend_handles_labels()[1]
+            if names and names != before:  # one legend for panels with the same lines
+                axis.legend(fontsize="small", frameon=False)
+            before = names
             if iteration_s is not None:
                 both = (lambda x: x * iteration_s, lambda x: x / iteration_s)
                 axis.secondary_xaxis("top", functions=both).set_xlabel("training loop [s]", fontsize="small")
@@ -120,11 +125,10 @@ def draw_panel(axis: Any, chart: Chart) -> None:
     if chart.percent:
         axis.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     if not chart.log:
-        axis.set_ylim(*_y_range(chart))
+        low, high = _y_range(chart)
+        axis.set_ylim(low, 1.04 * high if chart.percent else high)  # markers at 100 % are whole
     axis.grid(alpha=0.3)
     axis.spines[["top", "right"]].set_visible(False)
-    if axis.get_legend_handles_labels()[0]:
-        axis.legend(fontsize="small", frameon=False)
 
 
 # ---- SVG -------------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""What an evaluation found, as tables and drawings: heat maps over commands, success over difficulty, returns of episodes."""
+"""The part of a report on evaluations: tables, heat maps over commands, success over difficulty, returns."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -14,21 +14,21 @@ from legged.evaluation.tracking_report import PANELS, grid_means
 from legged.evaluation.velocity_grid import AXES
 
 BROKEN = (KeyError, TypeError, ValueError, IndexError, AttributeError)
-"""What a file that lacks something of an evaluation raises where it is drawn."""
+"""Errors raised by a file that lacks a part of an evaluation."""
 
 
 def number(value: float | None, form: str = ".3f", unit: str = "") -> Number:
-    """Return a number as a cell, a dash for none and for what is not finite, which can't be sorted."""
+    """Return a number as a cell; a dash, which is not sorted, for None and for values that are not finite."""
     return Number("-", None) if value is None or not math.isfinite(value) else Number(f"{value:{form}}{unit}", value)
 
 
 def between(interval: tuple[float, float], factor: float = 1.0, form: str = ".1f") -> str:
-    """Return an interval in words."""
+    """Return an interval as text."""
     return f"{factor * interval[0]:{form}} to {factor * interval[1]:{form}}"
 
 
 def falls_of(tracking: dict[str, Any]) -> tuple[int, int] | None:
-    """Return how many robots of a command grid fell, and how many there were; None where the file does not say that."""
+    """Return the number of robots of a command grid that fell, and of all; None if the file lacks them."""
     try:
         robots = len(tracking["cells"]) * int(tracking["robots_per_cell"])
         return (round(tracking["falls"] * robots), robots) if robots > 0 else None
@@ -39,8 +39,8 @@ def falls_of(tracking: dict[str, Any]) -> tuple[int, int] | None:
 def evaluation_parts(
     results: Sequence[dict[str, Any]], another_policy: Callable[[dict[str, Any]], str] = lambda _: ""
 ) -> list[Part]:
-    """Return the part of a report on evaluations, one an engine; nothing of none. `another_policy` names the checkpoint of
-    one that is not of the run's last policy.
+    """Return the part of a report on evaluations, by engine; no part without results. `another_policy` names the checkpoint
+    of an evaluation that is not of the run's last policy.
     """
     if not results:
         return []
@@ -110,7 +110,7 @@ def _following(results: Sequence[dict[str, Any]]) -> list[Part]:
 
 
 def _heat_maps(tracking: dict[str, Any], label: str) -> list[str]:
-    """Return maps of errors over commands; none where the file lacks the cells."""
+    """Return maps of errors over commands; none if the file lacks the cells."""
     try:
         grid, found = tracking["grid"], []
         for name, over, other, title in PANELS:

@@ -1,4 +1,4 @@
-"""The report on one run: report.html, which needs nothing else, and report.md with pictures beside it."""
+"""The report on one run: report.html, which needs no other file, and report.md with its pictures."""
 
 import shlex
 import subprocess
@@ -32,15 +32,15 @@ from legged.process.paths import relative
 from legged.process.processes import child_environment
 
 REPORT = "report"
-"""What its files are called, before their ending."""
+"""Name of its files, before their ending."""
 ROWS = 10
-"""Lines of the table over training."""
+"""Rows of the table over training."""
 LARGEST_FILM = 12 * 2**20
-"""A larger film is named and not put into the page [bytes]."""
+"""A larger film is named, not shown [bytes]."""
 LONGEST_FILM_S = 60.0
 """The filming of a policy is ended after this time [s]."""
 LONGEST_DIFF = 200_000
-"""Letters of a difference in the page; the whole one is in its file."""
+"""Most letters of a difference in the page; its file holds all of it."""
 OVER_TRAINING = (
     ("Train/mean_reward", "return", 1.0, ".2f"),
     ("Train/std_reward", "standard deviation of the return", 1.0, ".2f"),
@@ -57,7 +57,7 @@ def write_report(folder: Path) -> Path:
     """Write report.html, report.md and its pictures into a run folder; return the page.
 
     Raises:
-        ConfigError: it is no run folder.
+        ConfigError: the folder is no run folder.
         RunError: a file can't be written.
     """
     record = read_record(folder)
@@ -81,7 +81,7 @@ def report_parts(record: Record) -> list[Part]:
         parts += [Heading("Over training"), Paragraph("Running means over nine iterations."), over_training(record)]
         parts += [Heading("Curves"), Figures("curves", curves_of_run(record.log), "learning curves")]
     else:
-        parts += [Heading("Curves"), Paragraph("There is no TensorBoard file with values in this folder.")]
+        parts += [Heading("Curves"), Paragraph("This folder holds no TensorBoard file with values.")]
     parts += evaluation_parts(record.results, record.another_policy) or [
         Heading("Evaluation"),
         Paragraph(f"None yet: `{command_on(record, 'evaluate', '--load_run')}`"),
@@ -96,16 +96,16 @@ def report_parts(record: Record) -> list[Part]:
 
 
 def command_on(record: Record, tool: str, *before: str) -> str:
-    """Return the command that does something with a run, whose folder follows on the words `before`, as it can be pasted
-    into a shell: with what says where a task of somebody's own is, and with the folder's path, for its experiment need not be
-    called as the task is.
+    """Return the command that applies a tool to a run, quoted for a shell. The run's folder follows the words `before`. The
+    command names the files of user-defined tasks, and the folder by its path, because its experiment may have another name
+    than its task.
     """
     given = Given(record.task) if record.given is None else record.given
     return shlex.join(["python", "-m", f"legged.tools.{tool}", *given.flags, *before, relative(record.folder)])
 
 
 def _facts(record: Record) -> list[list[Cell]]:
-    """Return what there is to say of a run in one line each."""
+    """Return the facts about a run, a line each."""
     timing, code = record.timing, record.code
     found: dict[str, str | None] = {
         "began": f"{record.began:%Y-%m-%d %H:%M:%S}",
@@ -139,7 +139,7 @@ def _facts(record: Record) -> list[list[Cell]]:
 
 
 def _film(record: Record) -> list[Part]:
-    """Return the film of a policy, if there is one that a page can hold."""
+    """Return the film of a policy, if it exists and is small enough."""
     film = record.film
     if film is None:
         return []
@@ -196,7 +196,7 @@ def _at(curve: tuple[np.ndarray, np.ndarray], step: int) -> float | None:
 
 
 def _loop_time(scalars: Scalars) -> tuple[np.ndarray, np.ndarray]:
-    """Return seconds of training loop since the log began, and the iterations at whose ends they had passed."""
+    """Return the cumulated seconds of the training loop in the log, and their iterations."""
     both = [
         dict(zip(*scalars[f"Perf/{name}_time"], strict=True))
         for name in ("collection", "learning")
