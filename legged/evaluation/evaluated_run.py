@@ -10,14 +10,13 @@ from typing import Any
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.evaluation.engines import ENGINES
+from legged.evaluation.reports.record import folders_in
 from legged.evaluation.result_file import changes_text, file_name, grid_text, read_results, tracking_of
 from legged.evaluation.velocity_grid import axes_of
-from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL, checkpoints, of_another_policy, run_config
+from legged.learning.run_folder import SHIPPED_MODEL, checkpoints, of_another_policy, run_config
 from legged.learning.timing import Timing, read_timing
 from legged.process.paths import relative
 
-DEEPEST = 3
-"""Folders inside each other in which runs are looked for: logs, tasks, runs."""
 SEED_FOLDER = re.compile(r"seed_(\d+)", re.ASCII)
 """Names of the folders of other seeds, next to a shipped policy."""
 
@@ -125,19 +124,6 @@ def why_not(folder: Path) -> str:
     except ConfigError as error:
         return f"for its configuration can't be read ({' '.join(str(error).split())})"
     return "" if isinstance(cfg, LeggedConfig) else "for their tasks follow no commands"
-
-
-def folders_in(path: Path) -> list[Path]:
-    """Return the run folders in a folder: the folder itself, or those in logs/ or logs/<task>/.
-
-    Raises:
-        ConfigError: there is no run folder.
-    """
-    levels = [sorted(path.glob("/".join(["*"] * depth + [CONFIG_FILE]))) for depth in range(DEEPEST)]
-    folders = [file.parent for level in levels for file in level]
-    if not folders:
-        raise ConfigError(f"{path}: holds no run folder (there is no {CONFIG_FILE} in it)")
-    return folders
 
 
 def _other_seeds(folder: Path) -> list[EvaluatedRun]:

@@ -14,11 +14,10 @@ from pathlib import Path
 from legged.commandline.command import run_main
 from legged.commandline.parser import CommandParser, add_import_argument
 from legged.errors import ConfigError, suggest
-from legged.evaluation.evaluated_run import folders_in
 from legged.evaluation.reports.comparison import comparison_parts
 from legged.evaluation.reports.document import Part, to_html, to_markdown, write_pages
 from legged.evaluation.reports.experiments import TITLE, experiments_parts
-from legged.evaluation.reports.record import read_record
+from legged.evaluation.reports.record import folders_in, read_record
 from legged.learning.run_folder import CONFIG_FILE, LOGS
 from legged.process.paths import exists, make_folder, ready_to_write, ready_to_write_file, relative, write_text
 from legged.registry import import_tasks

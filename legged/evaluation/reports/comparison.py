@@ -78,8 +78,8 @@ def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
         return [Heading("Evaluation"), Paragraph("No two of the runs were evaluated in the same engine.")]
     text = (
         "Brackets hold intervals of 95 %: Wilson's for shares, Newcombe's for their differences, a bootstrap over the"
-        " commands of the grid for errors, Welch's for returns. They describe one policy; another seed may differ by more. A *"
-        " marks differences whose interval excludes 0. A single command or episode has no interval."
+        " commands of the grid for errors, Welch's for returns. They describe one policy; another seed may differ by more."
+        " A * marks differences whose interval excludes 0. A single command or episode has no interval."
     )
     return [*parts, Paragraph(text)]
 

@@ -29,6 +29,8 @@ NAMES = ("train.runner.run_name", "train.runner.experiment_name", "train.runner.
 MOST_WORDS = 4
 """Most settings that a summary names."""
 LONGEST_VALUE = 60
+DEEPEST = 3
+"""Levels of folders in which runs are searched: logs, tasks, runs."""
 QUIET_S = 3600.0
 """A training that has written nothing for this long has ended, even if a process has its number [s]."""
 
@@ -128,6 +130,19 @@ class Record:
     def film(self) -> Path | None:
         """Film of its policy, if there is one."""
         return next((path for name in FILMS if (path := self.folder / name).is_file()), None)
+
+
+def folders_in(path: Path) -> list[Path]:
+    """Return the run folders in a folder: the folder itself, or those in logs/ or logs/<task>/.
+
+    Raises:
+        ConfigError: there is no run folder.
+    """
+    levels = [sorted(path.glob("/".join(["*"] * depth + [CONFIG_FILE]))) for depth in range(DEEPEST)]
+    folders = [file.parent for level in levels for file in level]
+    if not folders:
+        raise ConfigError(f"{path}: holds no run folder (there is no {CONFIG_FILE} in it)")
+    return folders
 
 
 def read_record(folder: Path) -> Record:
