@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from legged.episodes.joint_statistics import MEASURED, PHASES, SETTLE_S, JointStatistics
-from legged.evaluation.reports.document import Heading, Number, Paragraph, Part, Picture, Table, write_pages
+from legged.evaluation.reports.document import Cell, Heading, Number, Paragraph, Part, Picture, Table, write_pages
 from legged.figures import COLORS, STYLES, figure
 from legged.process.paths import relative
 
@@ -47,7 +47,9 @@ def tables_of(found: Found) -> dict[str, Table]:
     for name, title in _measured(found):
         heads = ["joint", *(f"{what}{_of(label, found)}" for label in found for what in ("mean", "standard deviation"))]
         columns = [values for one in several for values in (one.mean[name], one.std[name])]
-        rows = [[joint, *(_number(column[i]) for column in columns)] for i, joint in enumerate(several[0].joints)]
+        rows: list[list[Cell]] = [
+            [joint, *(_number(column[i]) for column in columns)] for i, joint in enumerate(several[0].joints)
+        ]
         if len(several) == 2:
             heads.append("difference of the means")
             moved = several[1].mean[name] - several[0].mean[name]

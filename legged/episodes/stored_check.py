@@ -69,8 +69,7 @@ def check_stored(about: Any, arrays: dict[str, np.ndarray], where: str) -> None:
         columns, shape = about["arrays"][name]["columns"], arrays[name].shape[1:]
         named = (len(columns),) if columns or shape else ()
         if shape not in (named, (*named, 3)):
-            wanted = f"names for an array of shape {arrays[name].shape}"
-            raise wrong_form(damaged, f"arrays.{name}.columns", wanted, columns)
+            raise wrong_form(damaged, f"arrays.{name}.columns", f"names for an array of shape {arrays[name].shape}", columns)
     if arrays["ended_by"].shape != (count, len(about["terminations"])):
         raise wrong_form(damaged, "terminations", f"{arrays['ended_by'].shape[1:]} texts", about["terminations"])
     for i, joint in enumerate(about["joints"]):
@@ -79,8 +78,7 @@ def check_stored(about: Any, arrays: dict[str, np.ndarray], where: str) -> None:
                 raise wrong_form(damaged, f"joints[{i}].{column}", f"a column of {column}", joint[column])
     for name in JOINTS:
         if name in arrays and arrays[name].shape[1:] != (len(about["joints"]),):
-            wanted = f"{arrays[name].shape[1:]} of them, as {name} has"
-            raise wrong_form(damaged, "joints", wanted, len(about["joints"]))
+            raise wrong_form(damaged, "joints", f"{arrays[name].shape[1:]} of them, as {name} has", len(about["joints"]))
     if legged:
         _check_legs(about, arrays, damaged)
 

@@ -151,17 +151,17 @@ def levels(logs: Sequence[Log]) -> list[Chart]:
     types = [tag.removeprefix(LEVEL) for tag in _tags([("", log) for log in logs], LEVEL)]
     if not types:
         return []
-    always = {level for log in logs if (level := always_promoted(log.config)) is not None}
-    level = ("always promoted", always.pop()) if len(always) == 1 else None
-    names = [name.replace("_", " ") for name in types]
-    means = [mean_of(scalars, LEVEL + name) for name in types]
-    lines = [Line(name, *mean, style=i) for i, (name, mean) in enumerate(zip(names, means, strict=True))]
-    found = [Chart("mean terrain level by type", "iteration", lines, level=level)]
+    always = {always_promoted(log.config) for log in logs} - {None}
+    highest = always.pop() if len(always) == 1 else None
+
+    def lines(beginning: str, width: int) -> list[Line]:
+        means = [mean_of(scalars, beginning + name) for name in types]
+        each = enumerate(zip(types, means, strict=True))
+        return [Line(name.replace("_", " "), steps, smooth(values, width), style=i) for i, (name, (steps, values)) in each]
+
+    level = None if highest is None else ("always promoted", highest)
+    found = [Chart("mean terrain level by type", "iteration", lines(LEVEL, 1), level=level)]
     for moved, way in (("promoted", "up"), ("demoted", "down")):
-        shares = [mean_of(scalars, f"Terrain/{moved}_{name}") for name in types]
-        lines = [
-            Line(name, steps, smooth(share, 25), style=i)
-            for i, (name, (steps, share)) in enumerate(zip(names, shares, strict=True))
-        ]
-        found.append(Chart(f"episodes after which a robot moves {way}", "iteration", lines, high=1.0, percent=True))
+        shares = lines(f"Terrain/{moved}_", 25)
+        found.append(Chart(f"episodes after which a robot moves {way}", "iteration", shares, high=1.0, percent=True))
     return [chart for chart in found if any(len(line.x) for line in chart.lines)]

@@ -5,7 +5,7 @@ import shlex
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from legged.config import parse_override
 from legged.config.loader import merge, nest
@@ -18,6 +18,7 @@ from legged.tools.sweeping.plan import Plan
 from legged.tools.sweeping.study import RUNS, WHY, Trials
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from optuna.importance import PedAnovaImportanceEvaluator
     from optuna.trial import FrozenTrial
 
@@ -162,7 +163,7 @@ def draw_figures(trials: Trials) -> list[Path]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Optuna calls these functions experimental
         history = drawing.plot_optimization_history(study, target_name=plan.objective_text)
-        if own is not None:
+        if own is not None and own.value is not None:
             history.axhline(own.value, color="black", lw=1.0, ls="--", label="the task's own settings")
             history.legend()
         drawn = {"history": history, "parallel": drawing.plot_parallel_coordinate(study, target_name=plan.objective_text)}
@@ -172,8 +173,9 @@ def draw_figures(trials: Trials) -> list[Path]:
             )
         paths = []
         for name, axes in drawn.items():
+            figure = cast("Figure", axes.figure)
             paths.append(plan.folder / f"{name}.png")
             with replacing(paths[-1]) as part:
-                axes.figure.savefig(part, dpi=DPI, format="png", bbox_inches="tight")
-            plt.close(axes.figure)
+                figure.savefig(part, dpi=DPI, format="png", bbox_inches="tight")
+            plt.close(figure)
     return paths
