@@ -170,7 +170,7 @@ def test_what_a_failure_costs_once_is_said_and_not_drawn():
     episodes["reward_parts"][:] = [[0.01, 0.0], [0.01, 0.0], [0.0, -2.0]]
     section = next(one for one in Panels(episodes, 0).sections() if one["title"] == "Reward parts")
     assert [line["label"] for line in section["panels"][0]["lines"]] == ["tracking"]
-    assert "What a failure costs, -2 once" in section["note"]
+    assert "-2 at the end" in section["note"]
 
 
 def test_parts_without_a_colour_of_their_own_are_drawn_as_one():
