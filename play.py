@@ -2,7 +2,7 @@
 
 import sys
 
-from legged.tools.play import main
+from legged.cli.play import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -2,7 +2,7 @@
 
 import sys
 
-from legged.tools.train import main
+from legged.cli.train import main
 
 if __name__ == "__main__":
     sys.exit(main())

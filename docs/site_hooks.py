@@ -19,7 +19,8 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from legged.commandline.listing import module_of, robots, tasks, tools
+from legged.cli.listing import robots, tasks
+from legged.cli.main import COMMANDS
 from legged.config.reference import FieldText, fields
 from legged.config.schema import LeggedConfig
 
@@ -104,8 +105,8 @@ def notebook_page() -> str:
 
 
 def tasks_page() -> str:
-    """Return the page that lists tasks and robots, as `python -m legged` does."""
-    lines = ["# Tasks", "", "`python train.py --task NAME` trains one of them; `--show` prints what it consists of.", ""]
+    """Return the page that lists tasks and robots, as `legged list` does."""
+    lines = ["# Tasks", "", "`legged train NAME` trains one of them; `--show` prints what it consists of.", ""]
     lines += ["| task | what is learned |", "|---|---|", *(f"| `{name}` | {text} |" for name, text in tasks().items()), ""]
     lines += ["## Robots", "", "`robot: NAME` in a task's file takes one of them.", ""]
     return "\n".join(
@@ -115,9 +116,10 @@ def tasks_page() -> str:
 
 def commands_page() -> str:
     """Return the page with what every command says of itself, its examples first."""
-    lines = ["# Commands", "", "`python -m legged` lists them, with all tasks and robots."]
-    for module, summary in tools().items():
-        parser = import_module(module_of(module)).build_parser()
+    lines = ["# Commands", "", "`legged --help` lists them; `python -m legged` is the same command."]
+    pages = {module: summary for module, summary in COMMANDS.values()} | {"legged.deploy.__main__": "run a policy on a robot"}
+    for module, summary in pages.items():
+        parser = import_module(module).build_parser()
         lines += ["", f"## {parser.prog}", "", f"{summary}.", "", "```", *parser.examples, "```", ""]
         lines += ["| argument | |", "|---|---|", *_arguments(parser)]
     return "\n".join(lines)
@@ -139,7 +141,7 @@ def configuration_page() -> str:
     intro = (
         "Every field that a task's file, or `key=value` on the command line, can set. Tasks without `LeggedRobot` have the"
         " sections `env`, `sim`, `control`, `terminations`, `domain_rand`, `rewards`, `observations`, `train` and `custom`,"
-        " and what their class adds. Defaults are those of the schema; `python train.py --task NAME --show` prints a task's"
+        " and what their class adds. Defaults are those of the schema; `legged train NAME --show` prints a task's"
         " own. Maps merge with those of what is extended; lists and numbers replace them."
     )
     lines = ["# Configuration", "", intro]

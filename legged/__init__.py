@@ -18,15 +18,28 @@ if TYPE_CHECKING or not only_lists():
 if TYPE_CHECKING:
     from legged.config import TaskConfig
     from legged.envs import LeggedRobot
+    from legged.envs.marks import concurrent, unit
     from legged.registry import make_task, register, task_config
 
-__all__ = ["HEADLESS", "ConfigError", "LeggedRobot", "TaskConfig", "make_task", "register", "task_config"]
+__all__ = [
+    "HEADLESS",
+    "ConfigError",
+    "LeggedRobot",
+    "TaskConfig",
+    "concurrent",
+    "make_task",
+    "register",
+    "task_config",
+    "unit",
+]
 _HOMES = {
     "LeggedRobot": "legged.envs",
     "TaskConfig": "legged.config",
+    "concurrent": "legged.envs",
     "make_task": "legged.registry",
     "register": "legged.registry",
     "task_config": "legged.registry",
+    "unit": "legged.envs",
 }
 """Name -> the module that it is imported from when somebody asks for it."""
 

@@ -1,6 +1,6 @@
 """Task names -> task class and configuration. Every `cfg/*.yaml` is a task; outside code adds its own."""
 
-import inspect
+import dataclasses
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -15,8 +15,9 @@ from legged.config import TaskConfig, load_config
 from legged.config.carry import carry
 from legged.config.checks import PLAIN, is_plain_name, shown
 from legged.config.loader import Carry, Registered, class_hints
-from legged.config.units import unit_in
+from legged.config.networks import groups_in
 from legged.envs import BaseTask, LeggedRobot
+from legged.envs.marks import unit_of
 from legged.errors import ConfigError, suggest
 from legged.gymnasium_ids import add_ids
 from legged.physics.fields import FIELDS
@@ -81,21 +82,22 @@ def register(name: str, config: Path | str | Mapping[str, Any], task_class: type
 
 
 def import_tasks(name: str) -> None:
-    """Let tasks of a user's own be known: run the module of that name or path, or make the YAML file at that path one. Who
-    names a run, and not its task, has no other way to say where a file is.
+    """Register user-defined tasks: run the module of that name or path, or make the YAML file at that path a task. `name` may
+    be several, separated by commas, such as the module of a class and a YAML file that uses it.
 
     Raises:
-        ConfigError: it can't be found, or it fails.
+        ConfigError: one can't be found, or fails.
     """
-    if name.endswith(YAML_ENDINGS):
-        register_file(name, "--import")
-    else:
-        run_module(name)
+    for one in name.split(","):
+        if one.endswith(YAML_ENDINGS):
+            register_file(one, "--import")
+        else:
+            run_module(one)
 
 
-def register_file(path: str, flag: str = "--task") -> str:
+def register_file(path: str, flag: str = "TASK") -> str:
     """Make the YAML file at `path` a task, which is called by the file's name without ending; returns that name. `flag` is
-    the one that names the file.
+    the option or argument that names the file.
 
     Raises:
         ConfigError: there is no such file, or another task is called so.
@@ -128,7 +130,7 @@ def _entry(name: str) -> _Entry:
         return _REGISTERED[name]
     path = data_folder("cfg") / f"{name}.yaml"
     if not is_plain_name(name) or not path.is_file():
-        raise ConfigError(f"--task: there is no task {shown(name)}{suggest(name[:100], task_names(), 'tasks')}")
+        raise ConfigError(f"TASK: there is no task {shown(name)}{suggest(name[:100], task_names(), 'tasks')}")
     return _Entry(path, path.parent, None)
 
 
@@ -192,19 +194,48 @@ def task_config(name: str, overrides: Iterable[tuple[str, Any]] = (), on_cpu: bo
     schema = _schema_of(kind)
     cfg = load_config(_entry(name), name, overrides, on_cpu, _REGISTERED, schema, _carrier(kind, schema))
     kind.check(cfg)
+    _check_units(kind, cfg)
     return cfg
+
+
+def _check_units(kind: type[BaseTask], cfg: TaskConfig) -> None:
+    """Look for terms whose numbers were carried from another robot, and which do not declare their unit.
+
+    Raises:
+        ConfigError: there is one that runs, and whose number is not 0.
+    """
+    running = {
+        "_reward_": set(cfg.rewards.scales),
+        "_obs_": {name for group in groups_in(cfg).values() for name in group.terms},
+    }
+    for section in ("rewards", "observations"):
+        for field in dataclasses.fields(getattr(cfg, section)):
+            prefix, _ = field.metadata.get("unit_of", ("", 1))
+            for name, number in getattr(getattr(cfg, section), field.name).items() if prefix in running else ():
+                path = f"{section}.{field.name}.{name}"
+                if not number or name not in running[prefix] or cfg.origins.of(path) not in cfg.origins.carried:
+                    continue
+                if unit_of(getattr(kind, prefix + name)) is None:
+                    parents = (unit_of(getattr(part, prefix + name, None)) for part in kind.__mro__)
+                    example = next((unit for unit in parents if unit is not None), "m^2/s^2")
+                    raise ConfigError(
+                        f"{cfg.origins.where(path)}: the number is carried from another robot, and"
+                        f" {kind.__name__}.{prefix}{name}"
+                        f' declares no unit to carry it by: write @unit("{example}") above the method (from legged import'
+                        ' unit), with the unit of what it returns; a plain number has @unit("1"). A docstring does not count'
+                    )
 
 
 def _carrier(kind: type[BaseTask], schema: type[TaskConfig]) -> Carry:
     """Return what carries the numbers of a configuration from the robot that they are written for to another one."""
 
-    def unit_of(name: str) -> str:
+    def unit_at(name: str) -> str:
         section, _, entry = name.rpartition(".")
         if section == "terrain.sizes":
             return TERRAIN_TYPES[entry].unit if entry in TERRAIN_TYPES else "1"
         if section == "domain_rand.ranges":
             return FIELDS[entry].unit.partition(" or ")[0] if entry in FIELDS else "1"
-        return unit_in(inspect.getdoc(getattr(kind, name, None))) or "1"
+        return unit_of(getattr(kind, name, None)) or "1"  # `_check_units` refuses terms without
 
     def carry_layer(data: Mapping[str, Any], written_for: str, robot: str, where: str) -> Mapping[str, Any]:
         if not issubclass(kind, LeggedRobot):
@@ -217,8 +248,8 @@ def _carrier(kind: type[BaseTask], schema: type[TaskConfig]) -> Carry:
         except ConfigError:
             return data  # `check` says what is wrong with it, and who named it
         factor = partial(grown, written_for=reference, robot=size)
-        carried = carry({key: value for key, value in data.items() if key != "cpu"}, schema, factor, unit_of)
-        return carried | ({"cpu": carry(data["cpu"], schema, factor, unit_of)} if "cpu" in data else {})
+        carried = carry({key: value for key, value in data.items() if key != "cpu"}, schema, factor, unit_at)
+        return carried | ({"cpu": carry(data["cpu"], schema, factor, unit_at)} if "cpu" in data else {})
 
     return carry_layer
 

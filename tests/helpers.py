@@ -14,10 +14,10 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
+from legged.cli import train
 from legged.config import TaskConfig
 from legged.envs import LeggedRobot
 from legged.registry import make_task, task_config
-from legged.tools import train
 
 TASK = "anymal_c_flat"
 JOINTS = 12

@@ -9,8 +9,9 @@ import pytest
 from helpers import call, forget_modules_of
 
 from legged import registry, user_modules
+from legged.cli import play, train
+from legged.cli.evaluate import episodes
 from legged.physics import FIELDS
-from legged.tools import evaluate, play, train
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8")
@@ -36,20 +37,20 @@ NETWORKS = (ROOT / "docs" / "networks.md").read_text(encoding="utf-8")
 TEXTS = [*fenced(PAGE), *fenced(NETWORKS), *fenced(RANDOMISATION)]
 COMMANDS = [line for language, text in TEXTS if not language for line in text.splitlines()]
 TINY = [
-    "--num_envs",
+    "--num-envs",
     "8",
-    "--max_iterations",
+    "--max-iterations",
     "1",
-    "--run_name",
+    "--run-name",
     "tiny",
     "train.runner.report=false",
     "train.runner.num_steps_per_env=4",
 ]
-ENGINE = ["--sim_device", "cpu", "sim.physics=mujoco", "sim.threads=1"]
+ENGINE = ["--sim-device", "cpu", "sim.physics=mujoco", "sim.threads=1"]
 MAINS = {
-    "python train.py": (train.main, [*TINY, *ENGINE]),
-    "python play.py": (play.main, ["--num_envs", "1", *ENGINE]),
-    "python -m legged.tools.evaluate": (evaluate.main, ENGINE),
+    "legged train": (train.main, [*TINY, *ENGINE]),
+    "legged play": (play.main, ["--num-envs", "1", *ENGINE]),
+    "legged evaluate episodes": (episodes.main, ENGINE),
 }
 
 
@@ -81,8 +82,8 @@ def lines(name: str) -> int:
 
 def task_of(command: str) -> str:
     """Return the name of the task that a command is about."""
-    words = shlex.split(command)
-    return Path(words[words.index("--task") + 1]).stem
+    program = next(name for name in MAINS if command.startswith(f"{name} "))
+    return Path(shlex.split(command.removeprefix(program))[0]).stem
 
 
 SEVERAL = {task: [c for c in COMMANDS if task_of(c) == task] for task in dict.fromkeys(map(task_of, COMMANDS))}
@@ -93,7 +94,7 @@ SEVERAL = {task: [c for c in COMMANDS if task_of(c) == task] for task in dict.fr
 def test_every_command_of_the_page_runs(files, task, capsys):
     for command in SEVERAL[task]:
         assert run(command) == 0, f"{command}: {capsys.readouterr().err}"
-        trained = command.startswith("python train.py") and "--show" not in command
+        trained = command.startswith("legged train ") and "--show" not in command
         assert not trained or list(files.glob(f"logs/{task}/*_tiny/model_0.pt"))
 
 

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from html.parser import HTMLParser
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from urllib.parse import unquote, urlparse
@@ -16,7 +17,8 @@ from urllib.parse import unquote, urlparse
 import pytest
 import yaml
 
-from legged.commandline.listing import robots, tasks, tools
+from legged.cli.listing import robots, tasks
+from legged.cli.main import COMMANDS
 from legged.config.reference import fields
 from legged.config.schema import LeggedConfig
 
@@ -105,8 +107,8 @@ def test_what_is_made_from_the_code_is_complete(site):
         assert shown in said["configuration"], text.path
     for name in (*tasks(), *robots()):
         assert f"<code>{name}</code>" in said["tasks"]
-    for tool in tools():
-        assert f'id="{tool.rpartition(".")[2]}' in said["commands"]
+    for module, _ in COMMANDS.values():
+        assert f'id="{import_module(module).build_parser().prog.replace(" ", "-")}"' in said["commands"]
     for name, anchor in PAGES.items():
         assert f'id="{anchor}"' in said[name]
 
@@ -114,7 +116,7 @@ def test_what_is_made_from_the_code_is_complete(site):
 PAGES = {
     "configuration": "trainrunner",
     "tasks": "robots",
-    "commands": "completion",
+    "commands": "legged-completion",
     "legged_robot": "legged.envs.LeggedRobot.hold_commands",
     "terms": "legged.envs.terms.Terms._reward_tracking_lin_vel",
     "base_task": "legged.envs.BaseTask.step",

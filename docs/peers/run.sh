@@ -25,11 +25,12 @@ device=${DEVICE:-cuda:0}
 mjlab() { env ${MJLAB_PATH:+PYTHONPATH="$MJLAB_PATH"} "${MJLAB_PYTHON:-python}" "$@"; }
 ours() { env ${OURS_PATH:+PYTHONPATH="$OURS_PATH"} "${OURS_PYTHON:-python}" "$@"; }
 
-judge() { # judge ROBOT LAYOUT JSON ONNX...
-  local robot=$1 layout=$2 json=$3
+judge() { # judge ROBOT LAYOUT NAME ONNX...: writes NAME.json
+  local robot=$1 layout=$2 name=$3
   shift 3
-  ours -m legged.tools.playback "$robot" "$@" --layout "$layout" --json "$json" --friction 1 --rmse 0.2 \
+  ours -m legged evaluate onnx "$@" --robot "$robot" --layout "$layout" --out "judged_$name" --friction 1 --rmse 0.2 \
     --vx=-0.5:1:0.5 --vy=-0.3:0.3:0.3 --yaw=-0.5:0.5:0.5
+  mv "judged_$name/onnx.json" "$name.json"
 }
 
 cd "$out"
@@ -45,8 +46,8 @@ for robot in $robots; do
     grep -E "^iteration|^training steps" "mjlab_$robot.log" | tail -n 2
   fi
   if [[ " $phases " == *" ours "* ]]; then
-    ours "$root/train.py" --task "${robot}_flat" --num_envs "$num_envs" --sim_device "$device" \
-      ${OURS_ITERATIONS:+--max_iterations "$OURS_ITERATIONS"} "train.runner.save_interval=$every" \
+    ours "$root/train.py" --task "${robot}_flat" --num-envs "$num_envs" --sim-device "$device" \
+      ${OURS_ITERATIONS:+--max-iterations "$OURS_ITERATIONS"} "train.runner.save_interval=$every" \
       >"ours_$robot.log" 2>&1 || {
       tail -n 20 "ours_$robot.log"
       exit 1
@@ -58,15 +59,15 @@ done
 if [[ " $phases " == *" judge "* ]]; then
   for robot in $robots; do
     if [[ -f mjlab_$robot/layout.yaml ]]; then
-      ours -m legged.tools.add_robot "mjlab_$robot/robot.xml" --name "mjlab_$robot" --out robots --force >"add_$robot.log"
-      judge "robots/mjlab_$robot" "mjlab_$robot/layout.yaml" "mjlab_$robot.json" "mjlab_$robot"/policy_*.onnx \
+      ours -m legged robot add "mjlab_$robot/robot.xml" --name "mjlab_$robot" --out robots --force >"add_$robot.log"
+      judge "robots/mjlab_$robot" "mjlab_$robot/layout.yaml" "mjlab_$robot" "mjlab_$robot"/policy_*.onnx \
         >"judged_mjlab_$robot.log" &
     fi
     if [[ -d logs/${robot}_flat ]]; then
       rm -rf "ours_$robot"
-      ours -m legged.tools.export --task "${robot}_flat" --out "ours_$robot"
+      ours -m legged export "${robot}_flat" --out "ours_$robot"
       layouts=("ours_$robot"/*/policy.json)
-      judge "$robot" "${layouts[0]}" "ours_$robot.json" "ours_$robot"/*/policy.onnx >"judged_ours_$robot.log" &
+      judge "$robot" "${layouts[0]}" "ours_$robot" "ours_$robot"/*/policy.onnx >"judged_ours_$robot.log" &
     fi
     while (($(jobs -rp | wc -l) >= ${JOBS:-2})); do wait -n; done
   done

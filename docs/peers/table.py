@@ -1,4 +1,4 @@
-"""Prints a table of what `legged.tools.playback --rmse --json` wrote: `python docs/peers/table.py mjlab_go1.json ...`."""
+"""Table of the files that `legged evaluate onnx --rmse` wrote: `python docs/peers/table.py mjlab_go1.json ...`."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""Trains a velocity task of mjlab as its authors set it up, and writes what `legged.tools.playback` needs to judge it.
+"""Trains a velocity task of mjlab as its authors set it up, and writes the layout that `legged evaluate onnx` judges it by.
 
     python docs/peers/train_mjlab.py Mjlab-Velocity-Flat-Unitree-Go1 --out peers/mjlab_go1 --iterations 500 --every 25
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,6 @@ import torch
 from legged.commandline.command import EXIT_WRONG_INPUT, LACKS_MEMORY
 from legged.config import TaskConfig
 from legged.errors import ConfigError
-from legged.process.paths import make_folder, write_text
 
 KILLED = -9
 """What a process ends with that Linux ends for want of memory."""
@@ -31,19 +31,22 @@ COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], str]], ...] = (
 """Of the table: heading, width, text."""
 
 
-def scale(args: argparse.Namespace, given: Sequence[str], cfg: TaskConfig, device: torch.device) -> int:
-    """Print a row for each number of robots in `args.scale`, write all to `args.json`; returns the exit code. `given` is the
-    command line that `args` were read from: each size is measured as it says. A size that
-    needs more memory than there is has a row that says so; one that fails for another reason too, and makes the code 1.
+@dataclass(frozen=True)
+class Scale:
+    """Figures by number of robots."""
+
+    found: dict[str, Any]
+    code: int
+    """Exit code: 1 if a size failed for another reason than want of memory."""
+
+
+def scale(sizes: Sequence[int], loop: str, given: Sequence[str], cfg: TaskConfig, device: torch.device) -> Scale:
+    """Print a row for each number of robots in `sizes`, and return all figures. `given` is the command line, which holds for
+    each size. A size that fails has a row that says why.
 
     Raises:
-        ConfigError: the numbers are none, or another option asks for one number or compares something else.
+        ConfigError: the configuration does not allow that many robots.
     """
-    sizes = numbers(args.scale)
-    for flag, value in (("--num_envs", args.num_envs), ("--grounds", args.grounds)):
-        if value:
-            raise ConfigError(f"--scale: compares numbers of robots by itself; leave out {flag}")
-    loop = args.runner or cfg.train.runner.loop
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
     print(f"{cfg.task}, {where}, {loop} training", flush=True)
     print("".join(f"{name:>{width}}" for name, width, _ in COLUMNS), flush=True)
@@ -51,10 +54,8 @@ def scale(args: argparse.Namespace, given: Sequence[str], cfg: TaskConfig, devic
     for size in sizes:
         rows.append(measure_apart(others(given), size, loop))
         print(line(rows[-1]), flush=True)
-    if args.json:
-        make_folder(args.json.parent)
-        write_text(args.json, json.dumps({"task": cfg.task, "device": where, "loop": loop, "sizes": rows}, indent=1))
-    return int(any(row.get("failed", NO_ROOM) != NO_ROOM for row in rows))
+    failed = any(row.get("failed", NO_ROOM) != NO_ROOM for row in rows)
+    return Scale({"task": cfg.task, "device": where, "loop": loop, "sizes": rows}, int(failed))
 
 
 def numbers(text: str) -> list[int]:
@@ -65,7 +66,7 @@ def numbers(text: str) -> list[int]:
     """
     parts = [part.strip().replace("_", "") for part in text.split(",")]
     if not all(part.isdecimal() and int(part) > 0 for part in parts):
-        raise ConfigError(f"--scale: '{text}' is not a list of numbers of robots, like 1024,4096,16384")
+        raise ConfigError(f"--robots: '{text}' is not a list of numbers of robots, like 1024,4096,16384")
     return [int(part) for part in parts]
 
 
@@ -76,9 +77,8 @@ def measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, A
         ConfigError: the configuration does not allow that many.
     """
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "result.json"
-        command = [sys.executable, "-m", "legged.tools.benchmark", *arguments]
-        command += ["--num_envs", str(size), "--runner", loop, "--json", str(path)]
+        command = [sys.executable, "-m", "legged", "benchmark", "step", *arguments]
+        command += ["--num-envs", str(size), "--runner", loop, "--out", folder]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode == EXIT_WRONG_INPUT:
             said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
@@ -89,15 +89,15 @@ def measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, A
             print(done.stderr, file=sys.stderr)
             said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
             return {"num_envs": size, "failed": said[-1]}
-        result = json.loads(path.read_text(encoding="utf-8"))
+        result = json.loads((Path(folder) / "benchmark.json").read_text(encoding="utf-8"))
     iterations = result.pop("iterations", {}).get(loop, {})
     return {**result, **iterations}
 
 
 def others(given: Sequence[str]) -> list[str]:
-    """Return a command line without what is different for each size, abbreviated or not."""
-    own = argparse.ArgumentParser(add_help=False)
-    for flag in ("--scale", "--json", "--num_envs", "--runner"):
+    """Return a command line without the options that differ from size to size."""
+    own = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for flag in ("--robots", "--out", "--num-envs", "--runner"):
         own.add_argument(flag)
     return own.parse_known_args(list(given))[1]
 

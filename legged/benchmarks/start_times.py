@@ -30,8 +30,8 @@ def time_start(given: Sequence[str], repeats: int) -> dict[str, Any]:
     torch_s, stages = [], []
     for _ in range(repeats + 1):
         torch_s.append(_run([sys.executable, "-c", "import torch"], {})["end"])
-        command = [sys.executable, "-m", "legged.tools.train", *without_own(given)]
-        command += ["--max_iterations", "1", "train.runner.film=false"]
+        command = [sys.executable, "-m", "legged", "train", *without_own(given)]
+        command += ["--max-iterations", "1", "train.runner.film=false"]
         with tempfile.NamedTemporaryFile() as file:
             stages.append(_run(command, {STAGES_FILE: file.name}))
     found = {name: statistics.median(run[name] for run in stages[1:]) for name in stages[0]}
@@ -61,10 +61,9 @@ def start_report(times: dict[str, Any]) -> str:
 
 
 def without_own(given: Sequence[str]) -> list[str]:
-    """Return a command line without the benchmark's own flags, abbreviated or not."""
-    own = argparse.ArgumentParser(add_help=False)
-    own.add_argument("--startup", action="store_true")
-    for flag in ("--json", "--repeats"):
+    """Return a command line without the benchmark's own options."""
+    own = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for flag in ("--out", "--repeats"):
         own.add_argument(flag)
     return own.parse_known_args(list(given))[1]
 
@@ -80,7 +79,7 @@ def _run(command: list[str], environment: dict[str, str]) -> dict[str, float]:
         end = time.time()
     if done.returncode:
         said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
-        raise RunError(f"--startup: {said[-1].removeprefix('error: ')}")
+        raise RunError(f"startup: {said[-1].removeprefix('error: ')}")
     lines = Path(environment[STAGES_FILE]).read_text(encoding="utf-8").splitlines() if environment else []
     stages = {name: float(when) - start for when, name in (text.split(" ", 1) for text in lines)}
     return {**stages, "end": end - start}

@@ -1,4 +1,4 @@
-"""Command-line arguments that train, play and evaluate share, and how they become a configuration."""
+"""Command-line arguments that several commands share, and the configuration that they make."""
 
 import argparse
 import shlex
@@ -7,34 +7,79 @@ from typing import Any
 
 import torch
 
-from legged.commandline.parser import add_import_argument
 from legged.config import parse_override
 from legged.errors import ConfigError
+from legged.process.command_parser import add_import_argument
 from legged.process.paths import relative
 from legged.process.ranks import Ranks
+from legged.process.startup import program
 from legged.registry import YAML_ENDINGS, import_tasks, register_file
 
+TASK_HELP = "a task, e.g. anymal_c_flat, or its YAML file"
+POLICY_HELP = "a task (its newest run, else the shipped policy), its YAML file, a run, or a run's folder"
 
-def add_task_arguments(parser: argparse.ArgumentParser, required: bool = True) -> None:
-    """Add --task, which a run may name as well unless it is `required`, --import, engine and devices, and free `key=value`
-    overrides.
+
+def add_task_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the positional argument TASK, --import, the options of `add_build_arguments`, and `key=value` overrides."""
+    parser.add_argument("task", metavar="TASK", help=TASK_HELP)
+    add_build_arguments(parser)
+
+
+def add_policy_arguments(parser: argparse.ArgumentParser, what: str = POLICY_HELP) -> None:
+    """Add the positional argument POLICY, --checkpoint, and what `add_build_arguments` adds."""
+    parser.add_argument("policy", metavar="POLICY", help=what)
+    add_checkpoint_argument(parser)
+    add_build_arguments(parser)
+
+
+def add_checkpoint_argument(parser: argparse.ArgumentParser) -> None:
+    """Add --checkpoint, which chooses among the checkpoints of a run."""
+    parser.add_argument("--checkpoint", type=_iteration, help="iteration of the checkpoint, or best; the latest by default")
+
+
+def add_legged_gym_arguments(parser: argparse.ArgumentParser, name: str) -> None:
+    """Add what `train` and `play` share with legged_gym: --task in place of the positional argument `name`, and the options
+    that name one of the task's runs.
     """
-    parser.add_argument("--task", required=required, help="name of the task, e.g. anymal_c_flat, or a YAML file")
+    parser.add_argument(name, nargs="?", metavar=name.upper(), help=TASK_HELP if name == "task" else POLICY_HELP)
+    parser.add_argument("--task", dest="task_option", metavar="TASK", help=f"the same as {name.upper()}, as in legged_gym")
+    parser.add_argument("--experiment-name", help="folder under logs/; the task's name by default")
+    parser.add_argument("--load-run", metavar="RUN", help="a run of the task, by name or folder; the newest by default")
+    add_checkpoint_argument(parser)
+    add_build_arguments(parser)
+
+
+def add_build_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add --import, engine, devices, and `key=value` overrides: all that says how a task is built."""
     add_import_argument(parser)
-    parser.add_argument("--num_envs", type=int, help="number of robots (env.num_envs)")
+    parser.add_argument("--num-envs", type=int, help="number of robots (env.num_envs)")
     parser.add_argument("--seed", type=int, help="random seed (env.seed)")
     parser.add_argument("--physics", metavar="ENGINE", help="mujoco_warp, mujoco or newton; that of the device by default")
     parser.add_argument("--solver", metavar="NAME", help="solver of newton (sim.solver), e.g. xpbd; mujoco by default")
-    parser.add_argument("--sim_device", help="cpu or cuda[:i]; the GPU if there is one")
+    parser.add_argument("--sim-device", help="cpu or cuda[:i]; the GPU if there is one")
     parser.add_argument("--no-graph", action="store_true", help="run the step eagerly instead of as one CUDA graph")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="any field, e.g. rewards.scales.torques=-1e-4")
 
 
-def add_run_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the flags that say which policy to load."""
-    parser.add_argument("--experiment_name", help="folder under logs/; the task's name by default")
-    parser.add_argument("--load_run", help="run folder, by name or path; the newest by default")
-    parser.add_argument("--checkpoint", type=_iteration, help="iteration of the checkpoint, or best; the latest by default")
+def settle_name(args: argparse.Namespace, name: str) -> None:
+    """Let `args.<name>` be what the positional argument or legged_gym's --task names. A `key=value` that stands in the place
+    of the positional argument is an override.
+
+    Raises:
+        ConfigError: neither or both name something.
+    """
+    given = getattr(args, name)
+    if given is not None and "=" in given and args.task_option is not None:
+        args.overrides.insert(0, given)
+        given = None
+    if given is not None and args.task_option not in (None, given):
+        raise ConfigError(f"--task: '{args.task_option}' is given beside {name.upper()} '{given}'; leave one of them out")
+    found = given if given is not None else args.task_option
+    if found is None:
+        raise ConfigError(
+            f"{name.upper()}: is missing; name {'a task' if name == 'task' else 'a task or a run'}, e.g. anymal_c"
+        )
+    setattr(args, name, found)
 
 
 def _iteration(text: str) -> int | str:
@@ -84,7 +129,7 @@ def policy_overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
     return [change for change in overrides(args) if change[0] != "train.runner.experiment_name"]
 
 
-def pick_device(name: str | None, flag: str = "--sim_device") -> torch.device:
+def pick_device(name: str | None, flag: str = "--sim-device") -> torch.device:
     """Return the device that was asked for, else the GPU if there is one; under torchrun the GPU of this process's number.
 
     Raises:
@@ -129,22 +174,24 @@ def settle_on(device: torch.device) -> None:
         torch.cuda.set_device(device)  # what names no device must not end up on the first GPU
 
 
-def register_given(args: argparse.Namespace) -> None:
-    """Let the user's module register its tasks, if one was named; a file given as --task becomes a task."""
+def watch_command(args: argparse.Namespace, folder: Path) -> str:
+    """Return the command that shows the policy of a run folder in a browser, also while it is trained. `args` are those of
+    the running command.
+    """
+    return shlex.join([*program("watch"), *given_import(args), relative(folder)])
+
+
+def given_import(args: argparse.Namespace) -> list[str]:
+    """Return the option by which another command finds the user-defined tasks of this one."""
+    files = [file for file in (args.module, args.task_file) if file]
+    return ["--import", ",".join(files)] if files else []
+
+
+def register_given(args: argparse.Namespace, name: str) -> None:
+    """Register the user-defined tasks of --import; a YAML file given as `args.<name>` becomes a task."""
     if args.module:
         import_tasks(args.module)
-    args.given_task = args.task  # what another process would have to be given
-    if args.task is not None and args.task.endswith(YAML_ENDINGS):
-        args.task = register_file(args.task)
-
-
-def watch_command(args: argparse.Namespace, folder: Path) -> str:
-    """Return the command that shows the policy of a run folder in a browser, also while it is trained; `args` were given to
-    the command that runs now.
-    """
-    words = ["python", "-m", "legged.tools.watch"]
-    if args.module:
-        words += ["--import", args.module]
-    if args.given_task.endswith(YAML_ENDINGS):  # whose name alone would mean nothing
-        words += ["--task", args.given_task]
-    return shlex.join([*words, "--load_run", relative(folder)])
+    given = getattr(args, name)
+    args.task_file = given if given is not None and given.endswith(YAML_ENDINGS) else None
+    if args.task_file:
+        setattr(args, name, register_file(given, name.upper()))

@@ -20,7 +20,7 @@ from legged.user_modules import is_of_a_module
 
 EXIT_FAILED = 1
 EXIT_WRONG_INPUT = 2
-NO_MEMORY = "out of memory; fewer robots (--num_envs) need less"
+NO_MEMORY = "out of memory; fewer robots (--num-envs) need less"
 LACKS_MEMORY = re.compile(r"(?i)out of memory|can't allocate memory|failed to allocate|bad_?alloc|unable to allocate")
 """What torch, Warp, NumPy and C++ say of it."""
 
@@ -119,7 +119,7 @@ def known_failure(error: BaseException) -> str | None:
     if isinstance(error, PermissionError) or (isinstance(error, OSError) and error.errno in (errno.EROFS, errno.EMFILE)):
         return f"{error.filename}: {reason(error)}" if error.filename else reason(error)
     if isinstance(error, RuntimeError) and LACKS_MEMORY.search(str(error)):
-        return f"out of memory ({str(error).splitlines()[0][:160]}); fewer robots (--num_envs) need less"
+        return f"out of memory ({str(error).splitlines()[0][:160]}); fewer robots (--num-envs) need less"
     return None
 
 

@@ -5,7 +5,7 @@ learned.
 from dataclasses import dataclass, field
 from typing import Literal
 
-from legged.config.bounds import LARGEST, TERMS, between, positive
+from legged.config.bounds import LARGEST, TERMS, between, positive, quantity
 
 MOTORS = "motors.npz"
 """What a copy of `network` is called in a run folder, and beside the policy.json of an export."""
@@ -27,25 +27,25 @@ class ActuatorConfig:
     the effort limit."""
     joints: tuple[str, ...] = field(default=(), metadata=TERMS)
     """Patterns of the joints that have this `model` and `network`; empty means all of them. The others have ideal motors."""
-    stall_torque: dict[str, float] = field(default_factory=dict, metadata=positive(LARGEST))
+    stall_torque: dict[str, float] = field(default_factory=dict, metadata=quantity("N m", positive(LARGEST)))
     """Joint-name pattern -> torque of a motor that is held still (dc_motor) [N m]; joints that are not named have their
     effort limit."""
-    no_load_speed: dict[str, float] = field(default_factory=dict, metadata=positive(LARGEST))
+    no_load_speed: dict[str, float] = field(default_factory=dict, metadata=quantity("rad/s", positive(LARGEST)))
     """Joint-name pattern -> speed at which the motor gives no torque (dc_motor) [rad/s]; joints that are not named have their
     velocity limit."""
-    armature: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
+    armature: dict[str, float] = field(default_factory=dict, metadata=quantity("kg m^2", between(0, LARGEST)))
     """Joint-name pattern -> inertia of rotor and gear as the joint turns them, in any `model` [kg m^2]; that of the robot's
     file where not named."""
-    coulomb_friction: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
+    coulomb_friction: dict[str, float] = field(default_factory=dict, metadata=quantity("N m", between(0, LARGEST)))
     """Joint-name pattern -> friction of a moving joint at any speed [N m]; 0 where not named."""
-    breakaway_friction: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
+    breakaway_friction: dict[str, float] = field(default_factory=dict, metadata=quantity("N m", between(0, LARGEST)))
     """Joint-name pattern -> friction that a joint must overcome to begin to move (Stribeck) [N m]; the Coulomb friction where
     not named."""
-    stribeck_velocity: float = field(default=0.1, metadata=positive(1000, low=1e-4))
+    stribeck_velocity: float = field(default=0.1, metadata=quantity("rad/s", positive(1000, low=1e-4)))
     """Speed at which the friction has come down from breakaway to Coulomb by 63 % [rad/s]."""
-    viscous_friction: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
+    viscous_friction: dict[str, float] = field(default_factory=dict, metadata=quantity("N m s/rad", between(0, LARGEST)))
     """Joint-name pattern -> friction that grows with the speed [N m s/rad]; 0 where not named."""
-    friction_smoothing: float = field(default=0.1, metadata=positive(1000, low=1e-4))
+    friction_smoothing: float = field(default=0.1, metadata=quantity("rad/s", positive(1000, low=1e-4)))
     """Speed below which Coulomb friction fades: it goes with tanh(v / friction_smoothing) [rad/s]."""
     delay: Steps = field(default=(0, 0), metadata=between(0, LONGEST_DELAY))
     """Range from which each robot's delay of targets is drawn at the start of an episode, in physics steps (sim.dt)."""
@@ -53,5 +53,5 @@ class ActuatorConfig:
     """Draw each robot's delay anew in every control step; a target that has arrived is then not taken back for an older one.
     """
     network: str = ""
-    """File of a learned actuator (`python -m legged.tools.fit_actuator`), relative to the file that names it: torque from
+    """File of a learned actuator (`legged fit-actuator`), relative to the file that names it: torque from
     target, angle and velocity, in place of the P law."""

@@ -32,9 +32,14 @@ def items(most: int, bounds: Bounds | None = None) -> Bounds:
     return {"items": most, **(bounds or {})}
 
 
+def quantity(unit: str, bounds: Bounds) -> Bounds:
+    """Return metadata: a quantity of `unit`, within `bounds`."""
+    return {**bounds, "unit": unit}
+
+
 def carried(unit: str, bounds: Bounds) -> Bounds:
     """Return metadata: a quantity of `unit` that grows with the robot (carry.py), within `bounds`."""
-    return {**bounds, "unit": unit}
+    return {**quantity(unit, bounds), "carried": unit}
 
 
 def carried_by_term(prefix: str, power: int, bounds: Bounds) -> Bounds:

@@ -1,7 +1,7 @@
 """Numbers of a configuration that was written for one robot -> those that mean the same to another, by dynamic similarity.
 
 Which numbers these are is said by their fields: `carried` (bounds.py) gives a field the unit in which it grows with the
-robot; scales and noise of terms grow by the unit of the term, which its docstring ends with; sizes of terrain types, and
+robot; scales and noise of terms grow by the unit that `@unit` declares for the term; sizes of terrain types, and
 ranges of what is randomised, by the unit of each.
 """
 
@@ -30,8 +30,8 @@ def carry(data: Mapping[str, Any], schema: type, factor: Factor, unit_of: UnitOf
         meta = fields[key].metadata
         if dataclasses.is_dataclass(hints[key]):
             carried[key] = carry(value, hints[key], factor, unit_of)  # type: ignore[arg-type]
-        elif "unit" in meta:
-            carried[key] = times(value, factor(meta["unit"]))
+        elif "carried" in meta:
+            carried[key] = times(value, factor(meta["carried"]))
         elif "unit_of" in meta:
             prefix, power = meta["unit_of"]
             carried[key] = {

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from legged.config.bounds import LONGEST_S, NAME, NAMES, TERMS, UNIT, between, items, positive
+from legged.config.bounds import LONGEST_S, NAME, NAMES, TERMS, UNIT, between, items, positive, quantity
 
 HIDDEN = items(64, between(1, 16384))
 
@@ -148,7 +148,7 @@ class RunnerConfig:
     last never are; 1 leaves out none."""
     evaluate_envs: int = field(default=256, metadata=between(1, 2**20))
     """Robots of an evaluation during training, at most; the commands of the task's grid are shared out among them."""
-    evaluate_s: float = field(default=0.0, metadata=between(0, LONGEST_S))
+    evaluate_s: float = field(default=0.0, metadata=quantity("s", between(0, LONGEST_S)))
     """Simulated time of an evaluation during training [s]; 0 takes 3 s, and a whole episode of tasks without commands."""
     best_by: str = ""
     """Figure of the evaluations during training by which model_best.pt is kept; lin_vel_rmse when empty, and the return of

@@ -18,6 +18,7 @@ from legged.config.bounds import (
     carried_by_term,
     items,
     positive,
+    quantity,
 )
 from legged.config.mdp import (
     ControlConfig,
@@ -50,7 +51,7 @@ class TerrainConfig:
     """An infinite horizontal plane, or a height map of num_rows x num_cols tiles."""
     curriculum: bool = True
     """Robots move to harder rows while they succeed; otherwise all rows are hard, and robots stay where they are."""
-    scale: float = field(default=1.0, metadata=carried("m", positive(100, low=0.01)))
+    scale: float = field(default=1.0, metadata={**positive(100, low=0.01), "carried": "m"})
     """Factor on all lengths that the types are made of, treads and sizes alike; 1 suits a robot half a metre high."""
     proportions: dict[str, float] = field(default_factory=dict, metadata=UNIT)
     """Terrain type -> share of the columns; sums to 1. Types: legged/terrain/generators.py, TERRAIN_TYPES."""
@@ -88,13 +89,13 @@ class TerrainConfig:
 class CommandRanges:
     """Largest commands that are sampled, and where a curriculum starts from."""
 
-    lin_vel_x: Range = field(default=(-1.0, 1.0), metadata=MOTION)
+    lin_vel_x: Range = field(default=(-1.0, 1.0), metadata=quantity("m/s", MOTION))
     """Forward velocity, base frame [m/s]."""
-    lin_vel_y: Range = field(default=(-1.0, 1.0), metadata=MOTION)
+    lin_vel_y: Range = field(default=(-1.0, 1.0), metadata=quantity("m/s", MOTION))
     """Leftward velocity, base frame [m/s]."""
-    ang_vel_yaw: Range = field(default=(-1.0, 1.0), metadata=MOTION)
+    ang_vel_yaw: Range = field(default=(-1.0, 1.0), metadata=quantity("rad/s", MOTION))
     """Yaw rate [rad/s]; in heading mode the clip of the heading controller, which a curriculum widens too."""
-    heading: Range = field(default=(-3.141592653589793, 3.141592653589793), metadata=MOTION)
+    heading: Range = field(default=(-3.141592653589793, 3.141592653589793), metadata=quantity("rad", MOTION))
     """Heading in the world, heading mode only [rad]."""
 
 
@@ -108,7 +109,7 @@ class CommandCurriculumConfig:
     """Share of the full range that each axis starts with."""
     step: float = field(default=0.1, metadata=positive(1, low=1e-6))
     """Share of the full range by which an axis is widened."""
-    window_s: float = field(default=1.0, metadata=positive(LONGEST_S, low=1e-5))
+    window_s: float = field(default=1.0, metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Time over which velocities are averaged before an axis is judged [s]."""
     threshold: float = field(default=0.75, metadata=UNIT)
     """Share of the velocity asked for that robots must reach on average before an axis is widened."""
@@ -120,11 +121,11 @@ class CommandsConfig:
 
     ranges: CommandRanges = CommandRanges()
     """Lowest and highest command on each axis."""
-    resampling_time_s: float = field(default=10.0, metadata=positive(LONGEST_S, low=1e-5))
+    resampling_time_s: float = field(default=10.0, metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Time a command is held [s]."""
     heading_command: bool = True
     """Sample a heading and derive the yaw rate 0.5 * wrap(heading - yaw) from it at every step."""
-    small_command: float = field(default=0.2, metadata=between(0, 100))
+    small_command: float = field(default=0.2, metadata=quantity("m/s", between(0, 100)))
     """Sampled horizontal velocities with a norm below this are set to zero [m/s]."""
     standing_share: float = field(default=0.0, metadata=UNIT)
     """Share of sampled commands that ask the robot to stand still."""
@@ -140,7 +141,7 @@ class InitStateConfig:
 
     dof_pos_factor: Range = field(default=(0.5, 1.5), metadata=MOTION)
     """Joint angles are the default ones times a number drawn from this range, per joint."""
-    yaw: Range = field(default=(0.0, 0.0), metadata=MOTION)
+    yaw: Range = field(default=(0.0, 0.0), metadata=quantity("rad", MOTION))
     """Heading of the base [rad]."""
     base_velocity: Range = field(default=(-0.5, 0.5), metadata=carried("m/s", MOTION))
     """Range of each component of the base's linear [m/s] and angular [rad/s] velocity."""
@@ -152,11 +153,11 @@ class LeggedControlConfig(ControlConfig):
 
     control_type: Literal["P", "V", "T"] = "P"
     """Action as joint position target (P), joint velocity target (V) or torque (T)."""
-    stiffness: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
+    stiffness: dict[str, float] = field(default_factory=dict, metadata=quantity("N m/rad", between(0, LARGEST)))
     """Joint-name pattern -> P gain [N m/rad]; empty takes the robot's. A pattern is a part of the joint's name."""
-    damping: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
+    damping: dict[str, float] = field(default_factory=dict, metadata=quantity("N m s/rad", between(0, LARGEST)))
     """Joint-name pattern -> D gain [N m s/rad]; empty takes the robot's."""
-    action_scale: float | dict[str, float] = field(default=0.5, metadata=positive(LARGEST))
+    action_scale: float | dict[str, float] = field(default=0.5, metadata=quantity("rad", positive(LARGEST)))
     """Target = action_scale * action + default angle (P) [rad]; one number, or joint-name pattern -> number."""
     held: tuple[str, ...] = field(default=(), metadata=TERMS)
     """Patterns of joints that have no action (P): their motors hold the default angle with the gains that they have."""
@@ -175,7 +176,7 @@ class LeggedTerminationsConfig(TerminationsConfig):
     """`left_terrain`: a robot that walked off the map is not judged for it."""
     min_base_height: float = field(default=0.0, metadata=carried("m", between(0, 100)))
     """Lowest height of the base above the ground [m]; 0 switches `base_height` off."""
-    max_tilt: float = field(default=0.0, metadata=between(0, 10))
+    max_tilt: float = field(default=0.0, metadata=quantity("rad", between(0, 10)))
     """Largest angle between the base's up axis and the vertical [rad]; 0 switches `tilt` off."""
 
 
@@ -195,7 +196,7 @@ class LeggedDomainRandConfig(DomainRandConfig):
     """Mass added to the base [kg]."""
     push_robots: bool = True
     """Set the base's horizontal velocity now and then, each robot at its own moment."""
-    push_interval_s: float = field(default=15.0, metadata=positive(LONGEST_S, low=1e-5))
+    push_interval_s: float = field(default=15.0, metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Time between two pushes of a robot [s]."""
     max_push_vel_xy: float = field(default=1.0, metadata=carried("m/s", between(0, 100)))
     """Range of a push's velocity, per world axis [m/s]."""
@@ -315,11 +316,11 @@ class LeggedObservationsConfig(ObservationsConfig):
 class EvaluationConfig:
     """What policies of the task are judged by; training does not read it."""
 
-    vx: Axis = field(default=(-1.0, 1.0, 0.5), metadata=AXIS)
+    vx: Axis = field(default=(-1.0, 1.0, 0.5), metadata=quantity("m/s", AXIS))
     """Forward velocities of the command grid: lowest, highest, step [m/s]."""
-    vy: Axis = field(default=(-1.0, 1.0, 0.5), metadata=AXIS)
+    vy: Axis = field(default=(-1.0, 1.0, 0.5), metadata=quantity("m/s", AXIS))
     """Leftward velocities of the command grid: lowest, highest, step [m/s]."""
-    yaw: Axis = field(default=(-1.0, 1.0, 0.5), metadata=AXIS)
+    yaw: Axis = field(default=(-1.0, 1.0, 0.5), metadata=quantity("rad/s", AXIS))
     """Yaw rates of the command grid: lowest, highest, step [rad/s]."""
     stairs: float = field(default=0.36, metadata=positive(10))
     """Steps, as a share of rewards.base_height_target, whose success a table of several tasks states; of the sizes that were

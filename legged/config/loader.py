@@ -183,6 +183,7 @@ def _merged(
                 origins.written_for = tuple(dict.fromkeys([*origins.written_for, reference]))
             if carried is not data:
                 data, name = dict(carried), f"{name} (written for {Path(layer.written_for).name})"
+                origins.carried |= {name, f"{name}: cpu"}
         cpu = data.pop("cpu", {})
         merge(merged, data, name, origins)
         if on_cpu:
@@ -293,7 +294,7 @@ def _merge_overrides(
     """Lay overrides of the command line over `data`, each of them checked by itself: a later one must not hide it."""
     for key, value in overrides:
         if key == "task":
-            raise ConfigError("command line: task: can't be overridden; choose the task with --task")
+            raise ConfigError("command line: task: can't be overridden; name the task first")
         if key.count(".") > DEEPEST:
             raise ConfigError(f"command line: {shown(key)}: more than {DEEPEST} sections inside each other")
         layer = nest(key, robot_path(value, Path.cwd()) if key == "robot" else copy.deepcopy(value))
@@ -316,7 +317,7 @@ def from_dict(
         merge({}, data, source, origins)
     cfg = build(schema, data, "", origins, source)
     cfg.origins.update(origins)
-    cfg.origins.written_for = origins.written_for
+    cfg.origins.written_for, cfg.origins.carried = origins.written_for, origins.carried
     return cfg
 
 

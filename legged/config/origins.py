@@ -11,6 +11,8 @@ class Origins(dict[str, str]):
         super().__init__(other or {})
         self.written_for: tuple[str, ...] = other.written_for if isinstance(other, Origins) else ()
         """Robots for which files say that their numbers are written, each once."""
+        self.carried: frozenset[str] = other.carried if isinstance(other, Origins) else frozenset()
+        """Sources whose numbers were carried from another robot (carry.py)."""
 
     def note(self, path: str, source: str) -> None:
         """Note that `source` set `path`, and forget what it replaces, above and below."""

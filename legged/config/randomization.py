@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from legged.config.bounds import LARGEST, LONGEST_S, between, carried, positive
+from legged.config.bounds import LARGEST, LONGEST_S, between, carried, positive, quantity
 
 Range = tuple[float, float]
 ITERATIONS = between(0, 10_000_000)
@@ -23,7 +23,7 @@ class DrawConfig:
     width."""
     when: Literal["start", "reset", "interval"] = "start"
     """Once before training; whenever an episode begins; or every `interval_s`, each robot at its own moment."""
-    interval_s: float = field(default=0.0, metadata=between(0, LONGEST_S))
+    interval_s: float = field(default=0.0, metadata=quantity("s", between(0, LONGEST_S)))
     """Time between two draws of a robot [s]; of `interval` only."""
     each: bool | None = None
     """One number for each part that has the property (joint, body, shape), or one for all of a robot; null as the property
@@ -37,7 +37,7 @@ class DrawConfig:
 class KickConfig:
     """Sudden changes of the base's velocity."""
 
-    interval_s: Range = field(default=(5.0, 10.0), metadata=positive(LONGEST_S, low=1e-5))
+    interval_s: Range = field(default=(5.0, 10.0), metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Range of the time between two kicks of a robot, drawn anew after each [s]."""
     x: Range = field(default=(0.0, 0.0), metadata=carried("m/s", KICK))
     """What is added to the base's velocity along x, world frame [m/s]."""
@@ -61,9 +61,9 @@ class ForceConfig:
 
     body: str = ""
     """Body of the robot's model; empty is the base."""
-    interval_s: Range = field(default=(5.0, 10.0), metadata=positive(LONGEST_S, low=1e-5))
+    interval_s: Range = field(default=(5.0, 10.0), metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Range of the time from the end of one push of a robot to the next, drawn anew after each [s]."""
-    duration_s: Range = field(default=(0.1, 0.5), metadata=positive(LONGEST_S, low=1e-5))
+    duration_s: Range = field(default=(0.1, 0.5), metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Range of the time that it lasts, in whole control steps and at least one [s]."""
     x: Range = field(default=(0.0, 0.0), metadata=carried("N", between(-LARGEST, LARGEST)))
     """Force along x at the body's centre of mass, world frame [N]."""

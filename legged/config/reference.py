@@ -4,7 +4,6 @@ import ast
 import dataclasses
 import functools
 import inspect
-import re
 import textwrap
 import types
 import typing
@@ -15,7 +14,6 @@ from typing import Any, Literal, Union
 from legged.config.bounds import SMALLEST
 from legged.config.checks import hints_of
 from legged.config.loader import to_dict
-from legged.config.units import TOKENS, exponents
 
 
 @dataclass(frozen=True)
@@ -29,7 +27,7 @@ class FieldText:
     default: Any
     """Its default as plain values; None for a section, whose fields have their own."""
     unit: str
-    """Its unit; empty if it has none, or if its meaning says it for each entry."""
+    """The unit in its metadata (`quantity` and `carried` in bounds.py); empty without one, or if each entry has its own."""
     bounds: str
     """What its numbers must be; empty where they may be any."""
     meaning: str
@@ -60,7 +58,7 @@ def fields(schema: type, defaults: Any = None, prefix: str = "") -> Iterator[Fie
             choices = (
                 ("true", "false") if hint is bool else typing.get_args(hint) if typing.get_origin(hint) is Literal else ()
             )
-            unit, bounds = unit_of(meaning), bounds_of(field.metadata)
+            unit, bounds = field.metadata.get("unit", ""), bounds_of(field.metadata)
             yield FieldText(path, kind_of(hint), to_dict(value), unit, bounds, meaning, choices)
 
 
@@ -102,15 +100,6 @@ def kind_of(hint: Any) -> str:
     if origin is dict:
         return f"a map: {kind_of(args[1])} for each name"
     return {bool: "true or false", int: "a whole number", float: "a number", str: "text", Any: "anything"}[hint]
-
-
-def unit_of(meaning: str) -> str:
-    """Return the first unit in brackets of a docstring; empty without one."""
-    return next((text for text in re.findall(r"\[([^\]]*)\]", meaning) if _is_unit(text)), "")
-
-
-def _is_unit(text: str) -> bool:
-    return any(exponents(text)) or TOKENS.findall(text) in (["rad"], ["deg"])
 
 
 def bounds_of(metadata: Mapping[str, Any]) -> str:

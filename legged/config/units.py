@@ -29,12 +29,21 @@ def exponents(unit: str) -> Exponents:
     """Return the exponents of mass, length and time of a unit such as "N^2 m^2", "rad/s^2" or "(m/s)^2"; of several,
     separated by commas, those of the first. What is no unit has none: (0, 0, 0).
     """
-    text = unit.partition(",")[0]
+    return _parsed(unit.partition(",")[0]) or (0, 0, 0)
+
+
+def is_unit(text: str) -> bool:
+    """Return whether a text is a unit, or several, separated by commas."""
+    return all(part.strip() and _parsed(part) is not None for part in text.split(","))
+
+
+def _parsed(text: str) -> Exponents | None:
+    """Return the exponents of mass, length and time of one unit; None for what is not a unit."""
     for theirs, ours in SPELLINGS.items():
         text = text.replace(theirs, ours)
     words = TOKENS.findall(text)
     found = _product(words)
-    return (0, 0, 0) if found is None or words else found
+    return None if words else found
 
 
 def _product(words: list[str]) -> Exponents | None:
@@ -55,13 +64,6 @@ def _product(words: list[str]) -> Exponents | None:
         power = sign * (int(words.pop(0)[1:]) if words and words[0][0] == "^" and words[0] != "^" else 1)
         mass, length, time = mass + power * part[0], length + power * part[1], time + power * part[2]
     return mass, length, time
-
-
-def unit_in(docstring: str | None) -> str | None:
-    """Return the unit with which the first paragraph of a docstring ends, "m/s" of "Speed [m/s]."; None without one."""
-    text = " ".join((docstring or "").partition("\n\n")[0].split())
-    found = re.search(r"\[([^\]]*)\]\.?$", text)
-    return found.group(1) if found else None
 
 
 def factor(unit: str, scale: Mapping[str, float]) -> float:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from legged.config.bounds import LONGEST_S, between, positive
+from legged.config.bounds import LONGEST_S, between, positive, quantity
 
 NewtonSolver = Literal["mujoco", "steel", "kamino", "featherstone", "xpbd", "semi_implicit"]
 
@@ -14,7 +14,7 @@ class EnvConfig:
 
     num_envs: int = field(default=4096, metadata=between(1, 2**20))
     """Robots simulated side by side, on each GPU."""
-    episode_length_s: float = field(default=20.0, metadata=positive(LONGEST_S, low=1e-5))
+    episode_length_s: float = field(default=20.0, metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Time-out of an episode [s]."""
     seed: int = field(default=1, metadata=between(0, 2**62))
     """Seed of torch's generators, and of the terrain; physics itself draws no random numbers. With several GPUs the robots of
@@ -31,7 +31,7 @@ class SimConfig:
     solver: NewtonSolver = "mujoco"
     """Solver of `newton`; the other engines have their own. Each comes with settings under which a quadruped stands:
     legged/physics/newton/solvers.py."""
-    dt: float = field(default=0.005, metadata=positive(0.1, low=1e-5))
+    dt: float = field(default=0.005, metadata=quantity("s", positive(0.1, low=1e-5)))
     """Physics step [s]; the control step is `dt * control.decimation`."""
     cone: Literal["pyramidal", "elliptic"] = "pyramidal"
     """Friction cone. Pyramidal, impratio 10: a standing ANYmal C sinks 1 cm from 2 s to 5 s; elliptic costs twice as much."""

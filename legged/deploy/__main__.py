@@ -1,4 +1,4 @@
-"""The robot's program: `python -m legged.deploy --policy FOLDER --robot udp:HOST:PORT|go2|g1`.
+"""The robot's program: `python -m legged.deploy FOLDER --robot udp:HOST:PORT|go2|g1`.
 
 It runs the policy that play.py exported into FOLDER (policy.onnx and policy.json) at its rate, under the keyboard, a gamepad
 or a file of commands, and writes a log. It needs numpy and onnxruntime; Unitree's robots need the extra `unitree-sdk2` too.
@@ -13,7 +13,6 @@ from dataclasses import fields
 from pathlib import Path
 from types import FrameType
 
-from legged.commandline.parser import CommandParser
 from legged.deploy import gamepad, keyboard
 from legged.deploy.commands import Operator, Orders, Script
 from legged.deploy.gamepad import Gamepad
@@ -30,6 +29,7 @@ from legged.deploy.udp import UdpRobot
 from legged.deploy.unitree import SdkWire, UnitreeRobot
 from legged.deploy.unitree_messages import KINDS
 from legged.errors import ConfigError, RunError, suggest
+from legged.process.command_parser import CommandParser
 
 BOUNDS = {
     "stand_seconds": (1.0, 60.0),
@@ -62,14 +62,14 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def build_parser() -> CommandParser:
-    """Return what reads the command line."""
+    """Return the parser of the command line."""
     parser = CommandParser(
-        "legged.deploy",
+        "python -m legged.deploy",
         __doc__,
-        "python -m legged.deploy --policy logs/deploy/anymal_c_proprio/exported --robot udp:127.0.0.1:40000",
-        "python -m legged.deploy --policy exported --robot go2 --network eth0 --input gamepad",
+        "python -m legged.deploy logs/deploy/anymal_c_proprio/exported --robot udp:127.0.0.1:40000",
+        "python -m legged.deploy exported --robot go2 --network eth0 --input gamepad",
     )
-    parser.add_argument("--policy", type=Path, required=True, help="folder with policy.onnx and policy.json")
+    parser.add_argument("policy", type=Path, metavar="POLICY", help="folder with policy.onnx and policy.json")
     add_program_arguments(parser)
     parser.add_argument("--robot", required=True, help=f"udp:HOST:PORT, {' or '.join(KINDS)}")
     parser.add_argument("--network", help="network interface of a robot of Unitree's, e.g. eth0; found by itself by default")

@@ -200,7 +200,7 @@ def read_contract(path: Path) -> Contract:
         was = "none: an older version of this package wrote it" if version is None else f"{version!r}"
         raise ConfigError(
             f"{path}: contract_version: got {was}; this program reads {CONTRACT_VERSION}: export the policy again"
-            f" (play.py --task {said.get('task')} --no-video)"
+            f" (legged play {said.get('task')} --no-video)"
         )
     if (control := said.get("control_type")) != "P":
         raise ConfigError(f"{path}: control_type: got {control!r}; a robot takes joint angles ('P') only")

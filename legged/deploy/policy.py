@@ -90,7 +90,7 @@ class Policy:
         path = folder if folder.suffix == ".onnx" else folder / "policy.onnx"
         for needed in (path, path.with_name("policy.json")):
             if not needed.is_file():
-                raise ConfigError(f"--policy: there is no {needed}: a folder with policy.onnx and policy.json is wanted")
+                raise ConfigError(f"POLICY: there is no {needed}: a folder with policy.onnx and policy.json is wanted")
         self.contract = read_contract(path.with_name("policy.json"))
         self._network = Network(path, self.contract)
         self._observer = Observer(self.contract)

@@ -2,5 +2,6 @@
 
 from legged.envs.base_task import BaseTask
 from legged.envs.legged_robot import LeggedRobot
+from legged.envs.marks import concurrent, unit
 
-__all__ = ["BaseTask", "LeggedRobot"]
+__all__ = ["BaseTask", "LeggedRobot", "concurrent", "unit"]

@@ -18,6 +18,7 @@ from legged.config.schema import TaskConfig
 from legged.envs.actions import as_actions, ordinary_tensors
 from legged.envs.checks import check_task
 from legged.envs.judging import JudgingTask
+from legged.envs.marks import concurrent
 from legged.envs.observing import ObservingTask
 from legged.envs.privileged_terms import PrivilegedTerms
 from legged.envs.saved import SavedTask
@@ -187,7 +188,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
             self.draw()
         self.sense()
         self.advance()
-        self._look_ahead()
+        self._start_terms()
         self.check_termination()
         if type(self).check_termination is not BaseTask.check_termination:
             self._settle_endings()
@@ -247,13 +248,14 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         """Let a control step pass, for all that counts time."""
         self.episode_length_buf.add_(1)
 
+    @concurrent
     def check_termination(self) -> None:
         """Judge which episodes end: by a term, by time, or because physics blew up."""
         state = torch.cat([self.physics.qpos, self.physics.qvel, self._clipped_actions], dim=1)
         largest = torch.linalg.vector_norm(state, torch.inf, dim=1)
         torch.lt(largest, LARGEST_STATE, out=self._in_bounds)  # so is NaN not
         torch.logical_and(self._in_bounds, self.faults.sound, out=self.valid)
-        self._endings_ahead.join()
+        self._concurrent_terminations.join()
         self.terminations.evaluate(self.valid, self.episode_length_buf >= self.max_episode_length)
 
     def _settle_endings(self) -> None:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from legged.envs.base_task import BaseTask
 from legged.envs.gymnasium_models import gymnasium_model
+from legged.envs.marks import concurrent, unit
 from legged.physics import ModelScene, Scene
 
 
@@ -42,22 +43,30 @@ class HalfCheetah(BaseTask):
         """Return the mean forward velocity over the control step, (N,) [m/s]."""
         return (self.physics.qpos[:, 0] - self.last_x) / self.dt
 
+    @unit("m, rad")
     def _obs_position(self) -> Tensor:
         """Generalised positions but x: z, pitch, and six joint angles, of the back leg first [m, rad]."""
         return self.physics.qpos[:, 1:]
 
+    @unit("m/s, rad/s")
     def _obs_velocity(self) -> Tensor:
         """Generalised velocities: x, z, pitch, and six joints [m/s, rad/s]."""
         return self.physics.qvel
 
+    @concurrent
+    @unit("m/s")
     def _reward_forward(self) -> Tensor:
         """Forward velocity [m/s]."""
         return self.x_velocity()
 
+    @concurrent
+    @unit("1")
     def _reward_control(self) -> Tensor:
         """Squared actions."""
         return self.actions.square().sum(dim=1)
 
+    @concurrent
+    @unit("m/s")
     def _metric_x_velocity(self) -> Tensor:
         """Forward velocity [m/s]."""
         return self.x_velocity()

@@ -10,10 +10,11 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from legged.config.bounds import between
+from legged.config.bounds import between, quantity
 from legged.config.schema import Range, TaskConfig
 from legged.envs.base_task import BaseTask
 from legged.envs.gymnasium_models import gymnasium_model
+from legged.envs.marks import concurrent, unit
 from legged.physics import ModelScene, Scene
 
 TORSO = 1
@@ -24,9 +25,9 @@ TORSO = 1
 class HumanoidConfig(TaskConfig):
     """What the humanoid's task has beside every task's sections."""
 
-    healthy_z: Range = field(default=(1.0, 1.5), metadata=between(0, 10))
+    healthy_z: Range = field(default=(1.0, 1.5), metadata=quantity("m", between(0, 10)))
     """Heights of the torso between which the humanoid counts as on its feet [m]."""
-    reset_noise: float = field(default=0.01, metadata=between(0, 1))
+    reset_noise: float = field(default=0.01, metadata=quantity("m, rad, m/s, rad/s", between(0, 1)))
     """An episode begins within this of the model's own positions and of rest [m, rad, m/s, rad/s]."""
 
 
@@ -69,58 +70,80 @@ class Humanoid(BaseTask):
         height = self.physics.qpos[:, 2]
         return (height >= low) & (height <= high)
 
+    @unit("m, 1, rad")
     def _obs_position(self) -> Tensor:
         """Generalised positions but x and y: z and orientation (w, x, y, z) of the torso, then the joints [m, 1, rad]."""
         return self.physics.qpos[:, 2:]
 
+    @unit("m/s, rad/s")
     def _obs_velocity(self) -> Tensor:
         """Generalised velocities: linear (world) and angular (torso's frame) of the torso, then the joints [m/s, rad/s]."""
         return self.physics.qvel
 
+    @unit("kg, m")
     def _obs_inertia(self) -> Tensor:
         """MuJoCo's cinert of each body: inertia about the centre of mass, in world axes, offset by mass, and mass [kg, m]."""
         return self.cinert[:, TORSO:].flatten(1)
 
+    @unit("rad/s, m/s")
     def _obs_body_velocity(self) -> Tensor:
         """MuJoCo's cvel of each body: angular and linear velocity about the centre of mass, in world axes [rad/s, m/s]."""
         return self.cvel[:, TORSO:].flatten(1)
 
+    @unit("N, N m")
     def _obs_actuator_force(self) -> Tensor:
         """MuJoCo's qfrc_actuator: what motors do to each degree of freedom, at the last physics step [N, N m]."""
         return self.qfrc_actuator
 
+    @concurrent
+    @unit("m/s")
     def _reward_linvel(self) -> Tensor:
         """Forward velocity of the centre of mass [m/s]."""
         return self.com_velocity[:, 0]
 
+    @concurrent
+    @unit("1")
     def _reward_alive(self) -> Tensor:
         """Being on its feet."""
         return self.healthy().float()
 
+    @concurrent
+    @unit("1")
     def _reward_quadctrl(self) -> Tensor:
         """Squared actions."""
         return self.actions.square().sum(dim=1)
 
+    @concurrent
     def _terminate_unhealthy(self) -> Tensor:
         """The torso is too low or too high."""
         return ~self.healthy()
 
+    @concurrent
+    @unit("m")
     def _metric_x_position(self) -> Tensor:
         """How far forward of where it began the centre of mass is [m]."""
         return self.com[:, 0]
 
+    @concurrent
+    @unit("m")
     def _metric_y_position(self) -> Tensor:
         """And how far to the left [m]."""
         return self.com[:, 1]
 
+    @concurrent
+    @unit("m")
     def _metric_distance_from_origin(self) -> Tensor:
         """How far from where it began the centre of mass is [m]."""
         return self.com.norm(dim=1)
 
+    @concurrent
+    @unit("m/s")
     def _metric_x_velocity(self) -> Tensor:
         """Forward velocity of the centre of mass [m/s]."""
         return self.com_velocity[:, 0]
 
+    @concurrent
+    @unit("m/s")
     def _metric_y_velocity(self) -> Tensor:
         """Velocity of the centre of mass to the left [m/s]."""
         return self.com_velocity[:, 1]

@@ -7,18 +7,19 @@ import torch
 from torch import Tensor
 
 from legged.config.schema import TaskConfig
-from legged.envs.ahead import Ahead, is_ours
+from legged.envs.concurrent_terms import ConcurrentTerms
+from legged.envs.marks import concurrent, is_concurrent
 from legged.mdp.faults import Faults
 from legged.mdp.metrics import Metrics
 from legged.mdp.rewards import Rewards
 from legged.mdp.terminations import Terminations
 from legged.physics import Physics
 
-REWARD_LINES = 5
-"""Lines of work among which rewards are shared out: with so many, those of an ANYmal take an H100 49 us instead of 90, and
-`check_termination` beside them 34."""
-LATE = frozenset({"termination"})
-"""Rewards of ours that ask which episodes end."""
+REWARD_STREAMS = 5
+"""Streams among which rewards are shared out: with so many, the rewards of an ANYmal take an H100 49 us instead of 90, and
+`check_termination` at the same time takes 34."""
+SETTLED = ("valid", "terminated_buf", "time_out_buf", "reset_buf", "rew_buf")
+"""Tensors that `check_termination` and `compute_reward` write."""
 
 
 class JudgingTask:
@@ -47,39 +48,50 @@ class JudgingTask:
     def _collect_judgements(self) -> None:
         """Find the terminations, rewards and metrics that the configuration names."""
         cfg = self.cfg.rewards
-        # Who overrides one of these may write there what our terms read.
-        plain = all(is_ours(hook) for hook in (self.check_termination, self.measure, self.compute_reward))
-        lines = (1, REWARD_LINES, 1) if plain else (0, 0, 0)
-        self._endings_ahead, self._rewards_ahead, self._metrics_ahead = (Ahead(self.device, count) for count in lines)
+        # An override of one of these may write what terms read.
+        hooks = (self.check_termination, self.measure, self.compute_reward)
+        streams = (1, REWARD_STREAMS, 1) if all(is_concurrent(hook) for hook in hooks) else (0, 0, 0)
+        self._concurrent_terminations, self._concurrent_rewards, self._concurrent_metrics = (
+            ConcurrentTerms(self.device, count, self._settled) for count in streams
+        )
         failures, time_outs = (
-            self._endings_ahead.take("_terminate_", self._methods("_terminate_", names))
+            self._concurrent_terminations.add("_terminate_", self._methods("_terminate_", names))
             for names in self.active_terminations()
         )
         self.terminations = Terminations(failures, time_outs, self.terminated_buf, self.time_out_buf, self.reset_buf)
         scales = {name: scale for name, scale in cfg.scales.items() if scale != 0.0}
         unit = self.dt if cfg.times_dt else 1.0
-        rewards = self._rewards_ahead.take("_reward_", self._methods("_reward_", scales), LATE)
+        rewards = self._concurrent_rewards.add("_reward_", self._methods("_reward_", scales))
         self.rewards = Rewards(rewards, scales, unit, cfg.only_positive_rewards, self.rew_buf, self.physics.kernels)
         self.episode_sums = self.rewards.episode_sums
-        metrics = self._metrics_ahead.take("_metric_", self._methods("_metric_", sorted(self.terms("_metric_"))))
+        names = sorted(self.terms("_metric_"))
+        metrics = self._concurrent_metrics.add("_metric_", self._methods("_metric_", names))
         full = self.cfg.env.episode_length_s if cfg.times_dt else self.max_episode_length
-        names = self.rewards.names, self.terminations.names
-        self.metrics = Metrics(metrics, *names, full, self.num_envs, self.device)
+        parts = self.rewards.names, self.terminations.names
+        self.metrics = Metrics(metrics, *parts, full, self.num_envs, self.device)
 
-    def _look_ahead(self) -> None:
-        """Evaluate what can be while it is judged which episodes end. Runs beside `check_termination`."""
-        self._endings_ahead.find()
-        self._rewards_ahead.find()
-        self._metrics_ahead.find()
+    def _settled(self) -> dict[str, Tensor]:
+        """Return the tensors that are written after `_start_terms`, by name: this step's values are not there before."""
+        named = {name: getattr(self, name) for name in SETTLED}
+        found = zip(self.terminations.names, self.terminations.found, strict=True)
+        return named | {f"terminations.found of '{name}'": tensor for name, tensor in found}
 
+    def _start_terms(self) -> None:
+        """Evaluate terms with the mark `@concurrent`, at the same time as `check_termination`."""
+        self._concurrent_terminations.start()
+        self._concurrent_rewards.start()
+        self._concurrent_metrics.start()
+
+    @concurrent
     def measure(self) -> None:
         """Take in metrics of the step. Runs beside the rewards."""
-        self._metrics_ahead.join()
+        self._concurrent_metrics.join()
         self.metrics.add_step(self.valid, self.physics.overflowed, self.terminations.found)
 
+    @concurrent
     def compute_reward(self) -> None:
         """Judge the step, before anything is reset."""
-        self._rewards_ahead.join()
+        self._concurrent_rewards.join()
         self.rewards.compute(self.valid)
 
     def _record(self) -> None:

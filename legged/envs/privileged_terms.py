@@ -9,6 +9,7 @@ from torch import Tensor
 
 from legged.config.randomization import DrawConfig, ForceConfig, draw_of
 from legged.config.schema import LeggedConfig
+from legged.envs.marks import unit
 from legged.errors import ConfigError
 from legged.mdp.mirror_images import MirrorKind
 from legged.mdp.randomization import Randomization
@@ -31,6 +32,7 @@ class PrivilegedTerms:
     device: Any
     disturbances: Any
 
+    @unit("1")
     def _obs_push_force(self) -> Tensor:
         """Forces that act on bodies from outside (domain_rand.forces), x, y and z of each in the world frame, as a share of
         the largest that is drawn [1].
@@ -99,7 +101,7 @@ def _observer(name: str, field: Field) -> Callable[[Any], Tensor]:
 
     observe.__name__ = f"_obs_{PREFIX}{name}"
     observe.__doc__ = f"{field.meaning[0].upper()}{field.meaning[1:]}, from -1 to 1 over its range [1]."
-    return observe
+    return unit("1")(observe)
 
 
 for _name, _field in FIELDS.items():

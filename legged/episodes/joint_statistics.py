@@ -53,8 +53,8 @@ class JointStatistics:
         return self.cycles[name].mean(axis=0), self.cycles[name].std(axis=0)
 
 
-def joint_statistics(episodes: Episodes, where: str = "--statistics") -> JointStatistics:
-    """Compute the statistics of some episodes; `where` is the flag for errors.
+def joint_statistics(episodes: Episodes, where: str = "POLICY") -> JointStatistics:
+    """Compute the statistics of some episodes; `where` is the argument for errors.
 
     A cycle lasts from a touch-down of the first foot to its next one, within the limits `SHORTEST_CYCLE_S`, `LONGEST_CYCLE_S`
     and `UNUSUAL`. Its values are interpolated linearly at `PHASES` points. Steps with numbers that are not finite are left
@@ -133,4 +133,4 @@ def check_comparable(one: JointStatistics, other: JointStatistics) -> None:
     if one.joints != other.joints:
         only = [name for name in (*one.joints, *other.joints) if (name in one.joints) != (name in other.joints)]
         differing = ", ".join(only[:4]) or "in another order"
-        raise ConfigError(f"--compare: the two have other joints ({differing}); take policies of one robot")
+        raise ConfigError(f"POLICY: the two have other joints ({differing}); take policies of one robot")

@@ -64,7 +64,7 @@ def check_wish(policy: TrainedPolicy, wish: Wish) -> Playground | None:
     if wish.as_trained:
         for flag in ("terrain", "difficulty"):
             if getattr(wish, flag) is not None:
-                raise ConfigError(f"--{flag}: --as_trained takes the ground of the training; leave one of them out")
+                raise ConfigError(f"--{flag}: --as-trained takes the ground of the training; leave one of them out")
         return None
     wanted: Any = override(policy.cfg, wish.changes)
     if wish.terrain is None and wish.difficulty is None:

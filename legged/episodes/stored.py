@@ -114,7 +114,7 @@ def load_episodes(folder: Path, where: str) -> Episodes:
     """
     for name in (ARRAYS, ABOUT):
         if not (folder / name).is_file():
-            raise ConfigError(f"{where}: {relative(folder)} holds no {name}; python -m legged.tools.episodes writes it")
+            raise ConfigError(f"{where}: {relative(folder)} holds no {name}; legged episodes record writes it")
     try:
         about = json.loads((folder / ABOUT).read_text(encoding="utf-8"))
         with np.load(folder / ARRAYS, allow_pickle=False) as file:

@@ -1,6 +1,5 @@
 """Errors of a policy's estimator, which predicts quantities that only the simulator knows."""
 
-import inspect
 import math
 from collections.abc import Callable
 from typing import Any
@@ -10,8 +9,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.config.networks import ESTIMATED
-from legged.config.units import unit_in
 from legged.envs import BaseTask
+from legged.envs.marks import unit_of
 from legged.learning.estimator import EstimatingModel, EstimationErrors
 
 
@@ -26,8 +25,7 @@ class EstimateMeter:
             self._errors = EstimationErrors(task.observation_groups[ESTIMATED])
             self._squares = torch.zeros(task.num_envs, len(self._errors.names), device=torch.device(task.device))
             self._counted = torch.zeros(task.num_envs, device=self._squares.device)
-            docstrings = (inspect.getdoc(getattr(type(task), f"_obs_{name}")) for name in self._errors.names)
-            self._units = [unit_in(text) for text in docstrings]
+            self._units = [unit_of(getattr(type(task), f"_obs_{name}")) for name in self._errors.names]
 
     def add(self, observations: TensorDict, counted: Tensor) -> None:
         """Add the errors of the estimates from `observations` for the robots in `counted` (N,)."""

@@ -10,7 +10,7 @@ import torch
 from legged.config import LeggedConfig, override
 from legged.evaluation.episodes import header
 from legged.evaluation.overflows import warn_of_overflows
-from legged.evaluation.result_file import device_name, file_name, write_result
+from legged.evaluation.result_file import device_name, file_name, kept_success, kept_tracking, tracking_of, write_result
 from legged.evaluation.success import success_over_difficulty
 from legged.evaluation.success_report import draw_success, print_success, with_other_engines
 from legged.evaluation.tracking_report import draw_tracking, print_tracking
@@ -24,7 +24,7 @@ from legged.terrain import BUMPS
 
 def evaluate_following(
     policy: TrainedPolicy,
-    grid: Grid,
+    grid: Grid | None,
     sizes: Mapping[str, Sequence[float]],
     robots: int,
     asked: list[tuple[str, Any]],
@@ -33,43 +33,55 @@ def evaluate_following(
     folder: Path,
     where: str = "sim.physics",
 ) -> int:
-    """Measure tracking on the grid, and success at all `sizes` of each terrain type with `robots` a size. Print tables, then
-    write evaluation_<physics>.json and .png and success_<physics>.png into `folder`. Return the exit code. `where` names the
-    setting of the engine in errors.
+    """Measure tracking on the grid, if there is one, and success at all `sizes` of each terrain type with `robots` a size.
+    Print tables, then write evaluation_<physics>.json and .png and success_<physics>.png into `folder`. Return the exit code.
+    A part that is not measured stays in the file if it is of the same checkpoint. `where` names the setting of the engine in
+    errors.
 
     Raises:
         RunError: a file can't be written.
     """
     start = time.perf_counter()
     cfg = policy.cfg
-    assert isinstance(cfg, LeggedConfig), "the task follows no commands"
+    assert isinstance(cfg, LeggedConfig), "the task has no velocity commands"
     engine = engine_name(override(cfg, asked).sim, device, where)
-    task, act = ready_to_track(policy, grid, asked, device, graph)
-    figures = measure_tracking(task, act, grid)
-    lost = figures.pop("contact_overflows")
-    rough = cfg.terrain.mesh_type != "plane"
-    bumps = {"bumps": BUMPS * task.cfg.terrain.scale} if rough else {}  # [m]
     head = header(policy, engine, device_name(device), asked)
+    tracking, lost = ({}, 0) if grid is None else _tracking(policy, grid, asked, device, graph)
     success = success_over_difficulty(policy, sizes, robots, asked, device, graph) if sizes else None
-    result = {
-        **head,
-        "wall_s": time.perf_counter() - start,
-        **({"rough": {**bumps, **figures, "contact_overflows": lost}} if rough else figures),
-        **({} if success is None else {"success": success}),
-    }
-    # The screen comes first: a full disk can't take it away.
-    tracking = {**head, **bumps, **figures, "ground": "on rough ground, " if rough else ""}
-    print_tracking(tracking)
-    warn_of_overflows("tracking", lost)
+    # The screen comes first: a full disk cannot take it away.
+    shown = {**head, **tracking_of(tracking), "ground": "on rough ground, " if "rough" in tracking else ""}
+    if tracking:
+        print_tracking(shown)
+        warn_of_overflows("tracking", lost)
     if success is not None:
         print_success(success)
         warn_of_overflows("success", success["contact_overflows"])
     path = folder / file_name(engine)
+    result = {
+        **head,
+        "wall_s": time.perf_counter() - start,
+        **(tracking or kept_tracking(path, head)),
+        **(kept_success(path, head) if success is None else {"success": success}),
+    }
     write_result(path, result)
-    written = [path, path.with_suffix(".png")]
-    draw_tracking(tracking, written[1])
+    written = [path]
+    if tracking:
+        written.append(path.with_suffix(".png"))
+        draw_tracking(shown, written[-1])
     if success is not None:
         written.append(folder / f"success_{engine}.png")
-        draw_success(with_other_engines(result, path), written[2])
+        draw_success(with_other_engines(result, path), written[-1])
     print(f"written: {', '.join(relative(one) for one in written)}")
     return 0
+
+
+def _tracking(
+    policy: TrainedPolicy, grid: Grid, asked: list[tuple[str, Any]], device: torch.device, graph: bool
+) -> tuple[dict[str, Any], int]:
+    """Return the errors over the grid, under 'rough' for a task with terrain, and the number of contacts that were lost."""
+    task, act = ready_to_track(policy, grid, asked, device, graph)
+    figures = measure_tracking(task, act, grid)
+    lost = figures.pop("contact_overflows")
+    if policy.cfg.terrain.mesh_type == "plane":  # type: ignore[attr-defined]
+        return figures, lost
+    return {"rough": {"bumps": BUMPS * task.cfg.terrain.scale, **figures, "contact_overflows": lost}}, lost

@@ -51,6 +51,27 @@ def stress_name(engine: str) -> str:
     return f"stress_{engine}.json"
 
 
+def kept_tracking(path: Path, head: dict[str, Any]) -> dict[str, Any]:
+    """Return the tracking part of the file at `path`, if that is a result with the same `head`; nothing otherwise."""
+    old = _same(path, head)
+    return {name: value for name, value in old.items() if name not in (*head, "wall_s", "success")}
+
+
+def kept_success(path: Path, head: dict[str, Any]) -> dict[str, Any]:
+    """Return the success part of the file at `path`, if that is a result with the same `head`; nothing otherwise."""
+    return {name: value for name, value in _same(path, head).items() if name == "success"}
+
+
+def _same(path: Path, head: dict[str, Any]) -> dict[str, Any]:
+    """Return the result at `path` if its head is the same, policy's file included; an empty one otherwise."""
+    try:
+        old = json.loads(path.read_text(encoding="utf-8"))
+        same = isinstance(old, dict) and all(old.get(name) == value for name, value in head.items())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return old if same and ("changes" in old) == ("changes" in head) else {}
+
+
 def read_results(paths: Iterable[Path]) -> list[dict[str, Any]]:
     """Read the results in files and folders, each file once.
 
@@ -61,7 +82,7 @@ def read_results(paths: Iterable[Path]) -> list[dict[str, Any]]:
     for path in paths:
         files = sorted(path.glob(file_name("*"))) if path.is_dir() else [path]
         if not files or not all(file.is_file() for file in files):
-            raise ConfigError(f"{path}: holds no evaluation_<physics>.json; python -m legged.tools.evaluate writes it")
+            raise ConfigError(f"{path}: holds no evaluation_<physics>.json; legged evaluate writes it")
         for file in files:
             try:
                 result = json.loads(file.read_text(encoding="utf-8"))

@@ -2,7 +2,7 @@
 
 import sys
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +19,7 @@ from legged.errors import TermError
 from legged.graph.constants import Constants, HostReadError, holds_tensors, key_of
 from legged.graph.python_state import attributes, random_states, shown
 
-__all__ = ["ForbidHostReads", "HostReadError", "calling"]
+__all__ = ["ForbidHostReads", "ForbidReads", "HostReadError", "calling"]
 
 aten = torch.ops.aten
 ON_THE_DEVICE = "say device=self.device"
@@ -192,6 +192,31 @@ class ForbidHostReads:
                 value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple | deque) else (value,)
             )
             yield from ((name, part) for part in parts if isinstance(part, Tensor))
+
+
+class ForbidReads(TorchDispatchMode):
+    """Refuses, in its block, operators that read some tensors, or a part of them."""
+
+    def __init__(self, tensors: Mapping[str, Tensor], reason: str) -> None:
+        """Refuse to read `tensors`, by the names that errors call them, for a `reason` that follows the name."""
+        super().__init__()
+        self._names = {memory_of(tensor): name for name, tensor in tensors.items()}
+        self._reason = reason
+
+    def judge(self, value: Any) -> None:
+        """Refuse a value that holds one of the tensors.
+
+        Raises:
+            HostReadError: it does.
+        """
+        for part in tree_leaves(value):
+            memory = memory_of(part)
+            if memory is not None and memory in self._names:
+                raise HostReadError(f"reads self.{self._names[memory]}, {self._reason}")
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.judge((args, kwargs))
+        return func(*args, **(kwargs or {}))
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from contextlib import contextmanager
 
 import torch
 
-from legged.graph.guard import ForbidHostReads, HostReadError, calling
+from legged.graph.guard import ForbidHostReads, ForbidReads, HostReadError, calling
 
-__all__ = ["Branch", "ForbidHostReads", "HostReadError", "StepGraph", "calling"]
+__all__ = ["Branch", "ForbidHostReads", "ForbidReads", "HostReadError", "StepGraph", "calling"]
 
 
 class Branch:

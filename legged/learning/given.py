@@ -14,6 +14,7 @@ from typing import Any
 from legged.config.checks import shown
 from legged.errors import ConfigError
 from legged.process.paths import relative, write_text
+from legged.registry import YAML_ENDINGS
 
 GIVEN_FILE = "given.json"
 
@@ -31,8 +32,9 @@ class Given:
 
     @property
     def flags(self) -> list[str]:
-        """The flags by which another command finds the task."""
-        return ["--task", self.task, *(["--import", self.module] if self.module else [])]
+        """Options by which another command finds a user-defined task."""
+        files = [file for file in (self.module, self.task) if file and (file == self.module or file.endswith(YAML_ENDINGS))]
+        return ["--import", ",".join(files)] if files else []
 
 
 def write_given(folder: Path, given: Given, before: Path | None = None) -> None:

@@ -1,10 +1,9 @@
-"""What `train.py --resume` goes on from: the run's own settings, changes on the command line, and the checkpoint."""
+"""Settings and checkpoint from which `legged train --resume` continues."""
 
-import argparse
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
-from legged.commandline.arguments import overrides
 from legged.config import LeggedConfig, TaskConfig, override, to_dict
 from legged.config.dotted import value_at
 from legged.errors import ConfigError
@@ -20,19 +19,22 @@ KEPT = ("train.algorithm.class_name", "train.distillation.teacher")
 """Settings that a resumed training can't change."""
 
 
-def resumed(args: argparse.Namespace) -> tuple[TaskConfig, Path, list[str]]:
-    """Find the configuration to go on with, the checkpoint to go on from, and a line for each setting that the command line
-    changes. All that can be wrong is found here, before anything is built.
+def resumed(
+    task: str, asked: Iterable[tuple[str, Any]], load_run: str | None, iteration: int | str | None
+) -> tuple[TaskConfig, Path, list[str]]:
+    """Return the configuration to continue with, the checkpoint to continue from, and a line for each setting that `asked`
+    changes. `load_run` names a run of the task, None the newest; `iteration` is a number, 'best' or None for the latest. All
+    that can be wrong is found here, before anything is built.
 
     Raises:
-        ConfigError: there is no such run, it is of another task, robot, observation or network, or it has finished.
+        ConfigError: there is no such run, it has another task, robot, observation or network, or it has finished.
     """
-    asked = overrides(args)
+    asked = list(asked)
     folders = [(key, value) for key, value in asked if key == "train.runner.experiment_name"]
-    folder = find_run(task_config(args.task, folders), args.load_run)
-    before = run_config(folder)
-    if before.task != args.task:
-        raise ConfigError(f"--load_run: {relative(folder)} was trained on '{before.task}', not on '{args.task}'")
+    folder = find_run(task_config(task, folders), load_run)
+    before = run_config(folder, "--load-run")
+    if before.task != task:
+        raise ConfigError(f"--load-run: {relative(folder)} was trained on '{before.task}', not on '{task}'")
     cfg = override(before, asked)
     if isinstance(cfg, LeggedConfig) and isinstance(before, LeggedConfig) and cfg.robot != before.robot:
         raise ConfigError(
@@ -43,7 +45,7 @@ def resumed(args: argparse.Namespace) -> tuple[TaskConfig, Path, list[str]]:
         if old != new:
             raise ConfigError(f"{cfg.origins.where(key)}: a resumed training keeps its own, '{old}'; got '{new}'")
     task_class(cfg.task).check(cfg)
-    path = find_checkpoint(folder, args.checkpoint)
+    path = find_checkpoint(folder, iteration)
     saved = read_checkpoint(path)
     check_fits(path, saved, cfg)
     if "optimizer_state_dict" not in saved:
@@ -52,7 +54,7 @@ def resumed(args: argparse.Namespace) -> tuple[TaskConfig, Path, list[str]]:
     done, until = saved["iter"] + 1, cfg.train.runner.max_iterations
     if done >= until:
         raise ConfigError(
-            f"--resume: {relative(path)} has finished {done} iterations of {until}; --max_iterations sets a larger total"
+            f"--resume: {relative(path)} has finished {done} iterations of {until}; --max-iterations sets a larger total"
         )
     return cfg, path, changes(before, cfg, (key for key, _ in asked))
 

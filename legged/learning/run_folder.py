@@ -13,12 +13,13 @@ from pathlib import Path
 
 from legged.config import TaskConfig, from_dict, to_yaml
 from legged.config.actuator import MOTORS
+from legged.config.checks import shown
 from legged.config.legged import LeggedConfig
 from legged.config.loader import actuator_path, read_yaml
 from legged.errors import ConfigError, suggest
 from legged.learning.given import GIVEN_FILE
 from legged.process.paths import data_folder, exists, make_folder, not_made, relative, write_bytes, write_text
-from legged.registry import task_schema
+from legged.registry import YAML_ENDINGS, register_file, task_config, task_names, task_schema
 
 LOGS = Path("logs")
 CONFIG_FILE = "config.yaml"
@@ -139,38 +140,78 @@ def find_run(cfg: TaskConfig, load_run: str | None) -> Path:
         if not runs:
             shipped = ", and the package has no policy of this task"
             which = shipped if load_run is None and not exists(data_folder("resources") / "policies" / cfg.task) else ""
-            where = "--load_run" if load_run else f"'{cfg.task}'"
+            where = "--load-run" if load_run else f"'{cfg.task}'"
             raise ConfigError(f"{where}: there is no run with a checkpoint in {relative(parent)}{which}; train one first")
         return runs[-1]
     for folder in (parent / str(load_run), Path(str(load_run))):
         with suppress(OSError, ValueError):  # no name of a folder
             if str(load_run).strip() and folder.is_dir():
                 return folder
-    raise ConfigError(f"--load_run: there is no run '{load_run}'{suggest(str(load_run), [p.name for p in runs], 'runs')}")
+    raise ConfigError(f"--load-run: there is no run '{load_run}'{suggest(str(load_run), [p.name for p in runs], 'runs')}")
 
 
-def find_run_of_any_task(cfg: TaskConfig, load_run: str, where: str = "--load_run") -> Path:
-    """Return the run folder that `load_run` names: as `find_run` does; or below logs/ as <experiment>/<run>; or the newest of
-    an experiment; or a policy that comes with this package, by the name of its task or as resources/policies/<task>. An error
-    begins with `where`.
+def run_named(name: str, where: str, begun: bool = False) -> Path:
+    """Return the run folder that a user names. `name` is a run's folder; or `<experiment>/<run>` below logs/; or a task, or
+    its YAML file, whose newest run counts, or else its shipped policy; or an experiment, whose newest run counts. A run needs
+    a checkpoint, unless `begun` allows one that has only begun. `where` is the argument that gave the name.
+
+    Raises:
+        ConfigError: there is no such run.
+    """
+    top = data_folder("resources").parent
+    with suppress(OSError, ValueError):  # not the name of a folder
+        for folder in (parent / name for parent in (Path(), LOGS, top) if name.strip()):
+            if exists(folder / CONFIG_FILE):
+                return folder
+    is_run = _has_begun if begun else checkpoints
+    if name.endswith(YAML_ENDINGS):
+        name = register_file(name, where)
+    if name in task_names():
+        experiment = experiment_folder(task_config(name))
+        runs = [run for run in experiment.glob("*") if is_run(run)]
+        shipped = shipped_policy(name)
+        if not runs and shipped is None:
+            raise ConfigError(
+                f"{where}: '{name}' has neither a run in {relative(experiment)} nor a shipped policy; train it first"
+            )
+        return max(runs, key=_last_saved) if runs else shipped or experiment
+    with suppress(OSError, ValueError):
+        for folder in (parent / name for parent in (Path(), LOGS) if name.strip()):
+            runs = [run for run in folder.glob("*") if is_run(run)]
+            if runs:
+                return max(runs, key=_last_saved)
+    known = [f"{run.parent.name}/{run.name}" for run in LOGS.glob("*/*") if is_run(run)]
+    if exists(Path(name)) and Path(name).is_dir():
+        raise ConfigError(f"{where}: {shown(name)} holds no run: it has no {CONFIG_FILE}, nor has a folder in it")
+    raise ConfigError(f"{where}: there is no task and no run {shown(name)}{suggest(name[:100], [*task_names(), *known])}")
+
+
+def own_run(name: str, where: str) -> Path:
+    """Return the folder of one of the user's own runs, named as for `run_named`; it may have begun only.
+
+    Raises:
+        ConfigError: there is no such run, or the name is that of a shipped policy.
+    """
+    folder = run_named(name, where, begun=True)
+    if folder.resolve().parent == data_folder("resources") / "policies":
+        raise ConfigError(f"{where}: '{name}' has no run in {LOGS}/; its shipped policy is not a run")
+    return folder
+
+
+def newest_run(where: str) -> Path:
+    """Return the run folder in logs/ that was begun or written to last.
 
     Raises:
         ConfigError: there is none.
     """
-    if load_run == "-1":
-        return find_run(cfg, None)
-    shipped = data_folder("resources")
-    parents = (experiment_folder(cfg), Path(), LOGS, shipped.parent, shipped / "policies")
-    for folder in (parent / load_run for parent in parents if load_run.strip()):
-        with suppress(OSError, ValueError):  # no name of a folder
-            if checkpoints(folder):
-                return folder
-            runs = [run for run in folder.glob("*") if checkpoints(run)]
-            if runs:
-                return max(runs, key=_last_saved)
-    known = [f"{run.parent.name}/{run.name}" for run in LOGS.glob("*/*") if checkpoints(run)]
-    known += [policy.name for policy in (shipped / "policies").glob("*") if checkpoints(policy)]
-    raise ConfigError(f"{where}: there is no run '{load_run}'{suggest(load_run, known, 'runs')}")
+    runs = [run for run in LOGS.glob("*/*") if _has_begun(run)]
+    if not runs:
+        raise ConfigError(f"{where}: there is no run in {LOGS}/; train one first, or name a task whose policy is shipped")
+    return max(runs, key=_last_saved)
+
+
+def _has_begun(folder: Path) -> bool:
+    return exists(folder / CONFIG_FILE)
 
 
 def find_checkpoint(folder: Path, checkpoint: int | str | None) -> Path:
@@ -187,7 +228,7 @@ def find_checkpoint(folder: Path, checkpoint: int | str | None) -> Path:
         return folder / BEST_MODEL
     found = checkpoints(folder)
     if not found:
-        raise ConfigError(f"--load_run: {relative(folder)} holds no checkpoint (model_<iteration>.pt)")
+        raise ConfigError(f"{relative(folder)}: holds no checkpoint (model_<iteration>.pt)")
     if checkpoint is None or checkpoint == -1:
         return found[max(found)]
     if checkpoint not in found:
@@ -211,23 +252,29 @@ def shipped_policy(task: str) -> Path | None:
     return folder if (folder / SHIPPED_MODEL).is_file() else None
 
 
-def run_config(folder: Path) -> TaskConfig:
-    """Return the configuration that a run was trained with.
+def run_config(folder: Path, where: str = "POLICY") -> TaskConfig:
+    """Return the configuration that a run was trained with. `where` is the argument that named the run.
 
     Raises:
         ConfigError: the folder has none, or it no longer fits the schema.
     """
     path = folder / CONFIG_FILE
     if not path.is_file():
-        raise ConfigError(f"--load_run: {relative(folder)} is no run folder (it has no {CONFIG_FILE})")
+        raise ConfigError(f"{where}: {relative(folder)} is not a run folder (it has no {CONFIG_FILE})")
     data = read_yaml(path)
     actuator_path(data, folder)
     return from_dict(data, source=str(path), schema=task_schema(str(data.get("task", ""))))
 
 
 def _last_saved(folder: Path) -> float:
-    """When the latest checkpoint of a run was written; evaluations and videos in its folder do not count."""
-    return max(path.stat().st_mtime for path in checkpoints(folder).values())
+    """Return when the latest checkpoint of a run was written, or, before the first one, when the run began [s since 1970].
+    Evaluations and videos in the folder do not count.
+    """
+    stamps = []
+    for path in list(checkpoints(folder).values()) or [folder / CONFIG_FILE]:
+        with suppress(OSError):  # removed meanwhile
+            stamps.append(path.stat().st_mtime)
+    return max(stamps, default=0.0)
 
 
 def checkpoints(folder: Path) -> dict[int, Path]:

@@ -21,7 +21,7 @@ from legged.learning.checkpoint import (
     networks,
     read_checkpoint,
 )
-from legged.learning.run_folder import find_checkpoint, find_run_of_any_task, run_config
+from legged.learning.run_folder import find_checkpoint, run_config, run_named
 from legged.learning.transfer import made_for
 from legged.process.paths import exists, relative
 from legged.registry import task_class
@@ -71,7 +71,7 @@ def find_teacher(cfg: TaskConfig) -> Teacher:
     if not name:
         raise ConfigError(f"--teacher: '{cfg.task}' learns from a teacher, and none is named; --teacher RUN does")
     file = Path(name) if name.endswith(".pt") and exists(Path(name)) else None
-    path = file or find_checkpoint(find_run_of_any_task(cfg, name, where), None)
+    path = file or find_checkpoint(run_named(name, where), None)
     there, saved = run_config(path.parent), read_checkpoint(path)
     check_joints(f"{where}: {relative(path)}", made_for(path, saved), cfg)
     check_networks_fit(relative(path), {name: part for name, part in saved.items() if name != "critic_state_dict"}, there)

@@ -1,12 +1,10 @@
-"""What `train.py --transfer` begins with: the networks that were trained on another task."""
+"""Networks of another training, with which `legged train --transfer` begins."""
 
-import argparse
 from collections.abc import Iterable, Mapping
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-from legged.commandline.arguments import overrides
 from legged.config import LeggedConfig, TaskConfig
 from legged.config.networks import groups_of, learns_from_teacher
 from legged.envs import BaseTask
@@ -22,7 +20,7 @@ from legged.learning.checkpoint import (
     read_checkpoint,
 )
 from legged.learning.networks import action_std
-from legged.learning.run_folder import find_checkpoint, find_run_of_any_task, run_config
+from legged.learning.run_folder import find_checkpoint, run_config, run_named
 from legged.process.paths import relative
 from legged.registry import task_config
 from legged.robots.robot import load_robot
@@ -34,23 +32,19 @@ Terms = dict[str, int | None]
 """Term -> its width, None where that is not known, in order."""
 
 
-def transferred(args: argparse.Namespace, on_cpu: bool) -> tuple[TaskConfig, Path]:
-    """Find the configuration to train with, which is the task's own, and the checkpoint to begin with. What can be known
-    without building the task is compared here.
+def transferred(
+    task: str, overrides: Iterable[tuple[str, Any]], source: str, iteration: int | str | None, on_cpu: bool
+) -> tuple[TaskConfig, Path]:
+    """Return the configuration to train `task` with, and the checkpoint to begin with: that of the run that `source` names as
+    POLICY, at an iteration, 'best' or None for the latest. All that can be compared without building the task is compared.
 
     Raises:
-        ConfigError: the flags do not go together, there is no such run, or its robot, observations or networks are others.
+        ConfigError: there is no such run, or its robot, observations or networks are others.
     """
-    if args.resume:
-        raise ConfigError(
-            "--transfer: begins a new training with the networks of another, --resume goes on with one; give either"
-        )
-    if args.load_run is None:
-        raise ConfigError("--transfer: needs --load_run, the run or shipped policy whose networks are taken")
-    cfg = task_config(args.task, overrides(args), on_cpu)
+    cfg = task_config(task, overrides, on_cpu)
     if learns_from_teacher(cfg):
         raise ConfigError(f"--transfer: '{cfg.task}' learns from a teacher, and begins anew; --teacher names that one")
-    path = find_checkpoint(find_run_of_any_task(cfg, args.load_run), args.checkpoint)
+    path = find_checkpoint(run_named(source, "--transfer"), iteration)
     check_source(path, read_checkpoint(path), cfg)
     return cfg, path
 

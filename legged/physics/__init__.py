@@ -52,7 +52,7 @@ def resolve_physics(name: str, device: torch.device, where: str = "sim.physics",
     if name == "auto":
         return "mujoco_warp" if device.type == "cuda" or num_envs >= MANY_WORLDS else "mujoco"
     if name == "mujoco" and device.type != "cpu":
-        raise ConfigError(f"{where}: 'mujoco' is the C engine and runs on the CPU; add --sim_device cpu (got {device})")
+        raise ConfigError(f"{where}: 'mujoco' is the C engine and runs on the CPU; add --sim-device cpu (got {device})")
     if name == "newton" and find_spec("newton") is None:
         raise ConfigError(f"{where}: 'newton' needs the package newton, which is not installed here: pip install newton")
     return name

@@ -8,9 +8,9 @@ from legged.config.actuator import MOTORS
 from legged.config.loader import to_dict
 from legged.config.networks import ESTIMATED, groups_of
 from legged.config.task import TaskConfig
-from legged.config.units import unit_in
 from legged.deploy.contract import CONTRACT_VERSION, need_of
 from legged.envs import BaseTask, LeggedRobot
+from legged.envs.marks import unit_of
 from legged.mdp.observations import ObservationTerm
 from legged.policies.model_description import describe_control
 from legged.robots.crouch import crouch
@@ -129,11 +129,11 @@ def noise_in(cfg: TaskConfig, group: str) -> dict[str, float]:
 
 
 def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any], noise: float) -> dict[str, Any]:
-    """Return one observation term, with the half width of its noise; unit, frame and formula are those that its method's
-    docstring says.
+    """Return one observation term, with the half width of its noise. The unit is that of the mark `@unit`; frame and formula
+    are words of the method's docstring.
     """
-    docstring = inspect.getdoc(getattr(type(task), f"_obs_{term.name}"))
-    text = " ".join((docstring or "").partition("\n\n")[0].split())
+    method = getattr(type(task), f"_obs_{term.name}")
+    text = " ".join((inspect.getdoc(method) or "").partition("\n\n")[0].split())
     entry: dict[str, Any] = {
         "name": term.name,
         "group": group["name"],
@@ -142,7 +142,7 @@ def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any], 
         "scale": [float(value) for value in term.scale],
         "needs": need_of(term.name),
         "noise": noise,
-        "unit": unit_in(docstring),
+        "unit": unit_of(method),
         "frame": next((frame for frame in FRAMES if frame in text), None),
         "formula": text or None,
     }
@@ -163,9 +163,9 @@ def describe_estimator(task: BaseTask) -> dict[str, Any]:
         return {}
     targets = []
     for term in task.observation_groups[ESTIMATED].terms:
-        docstring, size = inspect.getdoc(getattr(type(task), f"_obs_{term.name}")), term.columns.stop - term.columns.start
+        unit, size = unit_of(getattr(type(task), f"_obs_{term.name}")), term.columns.stop - term.columns.start
         scale = [float(value) for value in term.scale]
-        targets.append({"name": term.name, "size": size, "scale": scale, "unit": unit_in(docstring)})
+        targets.append({"name": term.name, "size": size, "scale": scale, "unit": unit})
     return {"estimator": {"targets": targets, "latent": task.cfg.train.policy.estimator.latent}}
 
 

@@ -1,6 +1,5 @@
 """Finding a trained policy and putting it back into its task."""
 
-import argparse
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,14 +7,13 @@ from typing import Any
 
 import torch
 
-from legged.commandline.arguments import overrides
 from legged.config import TaskConfig, override
 from legged.errors import ConfigError
 from legged.learning.checkpoint import check_fits, read_checkpoint
-from legged.learning.run_folder import CONFIG_FILE, find_checkpoint, find_run, run_config, shipped_policy
+from legged.learning.run_folder import find_checkpoint, run_config, run_named
 from legged.policies.actor import Actor
-from legged.process.paths import exists, relative
-from legged.registry import YAML_ENDINGS, make_task, register_file, task_class, task_config, task_names
+from legged.process.paths import relative
+from legged.registry import make_task, task_class, task_names
 from legged.terrain import Terrain
 
 
@@ -38,62 +36,22 @@ class TrainedPolicy:
         return Path("logs") / what / self.folder.name if self.folder.parent.name == "policies" else self.folder
 
 
-def find_policy(args: argparse.Namespace) -> TrainedPolicy:
-    """Find what --task, --load_run and --checkpoint name: the newest run of the task, else the policy that is shipped.
+def policy_of(name: str, checkpoint: int | str | None = None, where: str = "POLICY") -> TrainedPolicy:
+    """Return the policy that a user names: by a task, whose newest run or else shipped policy it is; by the task's YAML file;
+    by a run, `<experiment>/<run>` below logs/; or by a folder. `checkpoint` is an iteration, 'best' or None for the latest;
+    `where` is the argument that gave the name.
 
     Raises:
-        ConfigError: there is none, or it is of another task.
+        ConfigError: there is no such policy or checkpoint, or its task is not known.
     """
-    flags = [(key, value) for key, value in overrides(args) if key == "train.runner.experiment_name"]
-    task = task_config(args.task, flags)
-    folder = _newest(task) if args.load_run is None and args.checkpoint is None else find_run(task, args.load_run)
-    cfg = run_config(folder)
-    if cfg.task != args.task:
-        raise ConfigError(f"--load_run: {relative(folder)} was trained on '{cfg.task}', not on '{args.task}'")
-    return TrainedPolicy(cfg, find_checkpoint(folder, args.checkpoint))
-
-
-def policy_of(name: str, where: str = "--task") -> TrainedPolicy:
-    """Return the policy in the run folder `name`, or that of a shipped policy; else of the task of that name, or in that YAML
-    file: of its newest run, or the one that is shipped. `where` is how an error about the name begins.
-
-    Raises:
-        ConfigError: there is none, or it is of a task that nobody has named the file or the module of.
-    """
-    folder = Path(name)
-    if not exists(folder / CONFIG_FILE):
-        try:
-            task = task_config(register_file(name) if name.endswith(YAML_ENDINGS) else name)
-        except ConfigError as error:
-            raise ConfigError(str(error).replace("--task:", f"{where}:", 1)) from error
-        try:
-            folder = _newest(task)
-        except ConfigError as error:
-            raise ConfigError(
-                f"'{name}': there is neither a run nor a shipped policy of this task; train one first"
-            ) from error
-    cfg = run_config(folder)
-    if cfg.task not in task_names():  # a run does not say where the file of its task lies, nor of what class it is
+    folder = run_named(name, where)
+    cfg = run_config(folder, where)
+    if cfg.task not in task_names():  # a run says neither where the file of its task lies nor which class it has
         raise ConfigError(
-            f"{where}: {relative(folder)} was trained on a task of your own, '{cfg.task}': name the YAML file of the task,"
-            " whose newest run is taken, or import the module that registers it"
+            f"{where}: {relative(folder)} was trained on a user-defined task, '{cfg.task}': --import FILE says where it is"
+            " defined"
         )
-    return TrainedPolicy(cfg, find_checkpoint(folder, None))
-
-
-def _newest(task: TaskConfig) -> Path:
-    """Return the folder of a task's newest run, or else of the policy that is shipped for it.
-
-    Raises:
-        ConfigError: there is neither.
-    """
-    try:
-        return find_run(task, None)
-    except ConfigError:
-        folder = shipped_policy(task.task)
-        if folder is None:
-            raise
-        return folder
+    return TrainedPolicy(cfg, find_checkpoint(folder, checkpoint))
 
 
 def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:

@@ -29,7 +29,7 @@ os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
 
 
 STAGES_FILE = "LEGGED_STAGES"
-"""Environment variable: a file that is told when each stage of a start has ended, for the benchmark's --startup."""
+"""Environment variable: a file that is told when each stage of a start has ended, for `legged benchmark startup`."""
 
 
 def stage_ended(name: str) -> None:
@@ -63,9 +63,9 @@ def is_a_command() -> None:
 
 
 def command_of_ours() -> str | None:
-    """Return how this process was started, if as one of our commands: 'script' (train.py, play.py), 'module' (python -m
-    legged...) or 'installed' (legged-train, legged-play). What such a process starts by multiprocessing is no command, though
-    Python gives it the same arguments.
+    """Return how this process was started, if as a command of this package: 'script' (train.py, play.py), 'module' (python -m
+    legged) or 'installed' (legged). A process that such a one starts by multiprocessing is no command, though Python gives it
+    the same arguments.
     """
     given = sys.orig_argv
     processes = sys.modules.get("multiprocessing.process")
@@ -75,18 +75,32 @@ def command_of_ours() -> str | None:
         name = given[given.index("-m") + 1]
         return "module" if name == "legged" or name.startswith("legged.") else None
     script = Path(sys.argv[0]) if sys.argv and sys.argv[0] else Path("-")
-    if script.stem in ("legged-train", "legged-play"):
+    if script.stem == "legged":
         return "installed"
     top = Path(__file__).resolve().parents[2]
     return "script" if script.name in ("train.py", "play.py") and script.resolve().parent == top else None
 
 
+def program(command: str) -> list[str]:
+    """Return the words that call a command of `legged` in the way in which this process was called."""
+    how = command_of_ours()
+    if how == "script" and command in ("train", "play"):
+        return ["python", str(Path(sys.argv[0]).with_name(f"{command}.py"))]
+    return [*(["python", "-m"] if how == "module" else []), "legged", *command.split()]
+
+
 def only_lists() -> bool:
-    """Return whether this process is `python -m legged`, which lists what there is and imports none of it. Python calls a
-    module '-m' until it has found its file, so that another program's `-m legged` is not meant.
+    """Return whether this process prints help or a list and needs no heavy import: `legged`, `legged --help`, `legged list`.
+    Python calls a module '-m' until it has found its file, so that another program's `-m legged` is not meant.
     """
     given = sys.orig_argv
-    return sys.argv[:1] == ["-m"] and given[given.index("-m") + 1] == "legged"
+    if sys.argv[:1] == ["-m"] and given[given.index("-m") + 1] == "legged":
+        words = given[given.index("-m") + 2 :]
+    elif sys.argv and Path(sys.argv[0]).stem == "legged":
+        words = sys.argv[1:]
+    else:
+        return False
+    return words[:1] in ([], ["--help"], ["-h"], ["list"])
 
 
 def in_main_thread() -> bool:

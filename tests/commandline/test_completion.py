@@ -7,7 +7,6 @@ import shutil
 import subprocess
 
 import pytest
-
 from legged.commandline.completion import words_of
 from legged.commandline.listing import robots, tasks
 from legged.tools import completion
@@ -59,7 +58,6 @@ def written(shell: str) -> str:
 def test_tasks_are_those_of_the_installation(complete):
     assert complete("python train.py --task ") == set(tasks())
     assert complete("python train.py --task=h1") == {"--task=h1", "--task=h1_flat"}
-    assert complete("python -m legged.tools.zoo anymal_c_fl") == {"anymal_c_flat"}
     assert complete("python -m legged.tools.report --task anymal_c_fl") == {"anymal_c_flat"}
     assert complete("python -m legged.tools.migrate --task anymal_c_fl") == set()  # that is a name of legged_gym's
 

@@ -3,10 +3,10 @@
 from importlib import import_module
 
 import pytest
+from legged.commandline.listing import module_of, tasks, tools
 
 from legged.commandline.arguments import overrides
-from legged.commandline.listing import module_of, tasks, tools
-from legged.commandline.parser import CommandParser
+from legged.process.command_parser import CommandParser
 from legged.registry import task_config
 
 INSTALLED = {"legged.tools.train": "python train.py ", "legged.tools.play": "python play.py "}

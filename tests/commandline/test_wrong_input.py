@@ -5,14 +5,14 @@ import shutil
 import sys
 from pathlib import Path
 
+import legged.tools.train
 import pytest
 import torch
 from helpers import TASK, call, kept_global_state, run_folders, tiny_run
+from legged.tools import benchmark, evaluate, play, train
 
 import legged.policies.restore
 import legged.registry
-import legged.tools.train
-from legged.tools import benchmark, evaluate, play, train
 
 SMALLER = (
     'observations.groups.actor.terms=["base_ang_vel", "projected_gravity", "commands", "dof_pos", "dof_vel"]'  # 33 numbers

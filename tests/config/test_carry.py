@@ -5,8 +5,11 @@ import yaml
 
 from legged.config.carry import carry
 from legged.config.legged import LeggedConfig
-from legged.config.units import exponents, factor, unit_in
+from legged.config.units import exponents, factor, is_unit
+from legged.envs.half_cheetah import HalfCheetah
+from legged.envs.humanoid import Humanoid
 from legged.envs.legged_robot import LeggedRobot
+from legged.envs.marks import unit, unit_of
 from legged.errors import ConfigError
 from legged.registry import register, task_config
 
@@ -50,11 +53,9 @@ def test_a_robot_twice_as_high_and_eight_times_as_heavy():
     assert factor("rad", scale) == 1.0
 
 
-def test_the_unit_of_a_term_ends_the_first_paragraph_of_its_docstring():
-    assert unit_in("Squared torques [N^2 m^2].\n\nSee [1].") == "N^2 m^2"
-    assert unit_in("Speed\n    of the base [m/s]") == "m/s"
-    assert unit_in("Number of shapes.") is None
-    assert unit_in(None) is None
+def test_what_is_a_unit():
+    assert all(is_unit(text) for text in ("m", "N^2 m^2", "m/s, m/s, rad/s", "m, 1, rad", "1", "(m/s)^2", "m²·s⁻²"))
+    assert not any(is_unit(text) for text in ("", "metres", "0 to 1", "(m", "m)", "m^", "m,", "m apart"))
 
 
 def test_fields_grow_by_their_unit_and_scales_of_terms_against_it():
@@ -74,12 +75,105 @@ def test_fields_grow_by_their_unit_and_scales_of_terms_against_it():
     }
 
 
-@pytest.mark.parametrize("name", sorted(LeggedConfig().rewards.scales))
-def test_rewards_whose_unit_is_not_one_say_so(name):
-    """A reward of our own that measures something physical must be carried: its docstring has to end with the unit."""
-    unit = unit_in(getattr(LeggedRobot, f"_reward_{name}").__doc__)
-    counted = ("tracking_lin_vel", "tracking_ang_vel", "collision", "action_rate")
-    assert (unit is None) == (name in counted)
+@pytest.mark.parametrize("kind", [LeggedRobot, HalfCheetah, Humanoid])
+def test_every_reward_and_observation_declares_its_unit(kind):
+    for prefix in ("_reward_", "_obs_"):
+        for name in kind.terms(prefix):
+            assert is_unit(unit_of(getattr(kind, prefix + name)) or ""), name
+
+
+def test_rewards_whose_unit_is_one():
+    """A reward that measures something physical must be carried, and these do not."""
+    counted = {name for name in LeggedRobot.terms("_reward_") if unit_of(getattr(LeggedRobot, f"_reward_{name}")) == "1"}
+    tracking = {"tracking_lin_vel", "tracking_ang_vel"}
+    assert counted == tracking | {"orientation", "action_rate", "collision", "termination", "stumble", "no_fly"}
+
+
+@pytest.mark.parametrize("text", ["metres", "", "m^", "[m]", 3])
+def test_a_mark_with_a_wrong_unit_is_refused(text):
+    with pytest.raises(
+        ConfigError, match=r'^@unit\(.*\): expected powers and products of m, .* such as @unit\("m\^2/s\^2"\)'
+    ):
+        unit(text)
+
+
+def test_docstrings_change_no_number(monkeypatch):
+    """All terms have another unit in their docstring, and Go2 has the same numbers, worked by hand: torques grow by the mass
+    and the height, accelerations of joints and velocities with the height.
+    """
+    for prefix in ("_reward_", "_obs_"):
+        for name in LeggedRobot.terms(prefix):
+            monkeypatch.setattr(getattr(LeggedRobot, prefix + name), "__doc__", "Something else [kg^3 m^5].")
+    cfg = task_config("go2_flat")
+    mass, height = 15.019 / 52.13485, 0.3235036 / 0.5488202
+    assert cfg.rewards.scales["torques"] == pytest.approx(-1.0e-5 / (mass * height) ** 2, rel=1e-4)
+    assert cfg.rewards.scales["dof_acc"] == pytest.approx(-2.5e-7 * height**2, rel=1e-4)
+    assert cfg.rewards.scales["lin_vel_z"] == pytest.approx(-2.0 / height, rel=1e-4)
+    assert cfg.rewards.scales["base_height"] == pytest.approx(-57.6, abs=0.05)
+    assert cfg.rewards.scales["tracking_lin_vel"] == 2.0
+    assert cfg.rewards.base_height_target == pytest.approx(0.5 * height, rel=1e-4)
+
+
+SLIP = {"rewards": {"scales": {"slip": -0.1}}}
+FOR_GO2 = {"written_for": "anymal_c", "extends": "anymal_c_flat", "robot": "go2"}
+
+
+class Bare(LeggedRobot):
+    def _reward_slip(self):
+        """Squared speed of feet [m^2/s^2]."""
+        return self.feet_vel.square().sum(dim=(1, 2))
+
+
+class Marked(LeggedRobot):
+    @unit("m^2/s^2")
+    def _reward_slip(self):
+        return self.feet_vel.square().sum(dim=(1, 2))
+
+
+class Overridden(LeggedRobot):
+    def _reward_torques(self):
+        return self.torques.abs().sum(dim=1)
+
+
+def test_a_user_defined_reward_is_carried_by_its_mark():
+    register("carry_marked", {**FOR_GO2, **SLIP}, Marked)
+    speed = 0.3235036 / 0.5488202  # squared
+    assert task_config("carry_marked").rewards.scales["slip"] == pytest.approx(-0.1 / speed, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("kind", "config", "message"),
+    [
+        (Bare, {**FOR_GO2, **SLIP}, r'rewards\.scales\.slip: .* Bare\._reward_slip declares no unit .*@unit\("m\^2/s\^2"\)'),
+        (
+            Overridden,
+            {"extends": "go2_flat"},
+            r'rewards\.scales\.torques: .* Overridden\._reward_torques declares no unit .*@unit\("N\^2 m\^2"\)',
+        ),
+    ],
+)
+def test_a_carried_term_without_a_unit_is_refused(kind, config, message):
+    """With a unit in its docstring, too, for that is not read; and where it overrides a term with a unit."""
+    register("carry_bare", config, kind)
+    with pytest.raises(ConfigError, match=message):
+        task_config("carry_bare")
+
+
+@pytest.mark.parametrize(
+    ("kind", "config"),
+    [
+        (Bare, {"extends": "go2_flat", **SLIP}),
+        (Bare, {**FOR_GO2, "robot": "anymal_c", **SLIP}),
+        (Bare, {**FOR_GO2, "rewards": {"scales": {"slip": 0.0}}}),
+        (Overridden, {"extends": "go2_flat", "rewards": {"scales": {"torques": -0.1}}}),
+        (Overridden, {"extends": "go2_flat", "rewards": {"scales": {"torques": 0.0}}}),
+        (Overridden, {"extends": "anymal_c_flat"}),
+    ],
+)
+def test_a_term_whose_number_is_not_carried_needs_no_unit(kind, config):
+    register("carry_none", config, kind)
+    scales = config.get("rewards", {}).get("scales", {"torques": -1e-5})
+    assert scales.items() <= task_config("carry_none").rewards.scales.items()
 
 
 @pytest.fixture

@@ -188,10 +188,10 @@ def test_files_of_two_exports_are_refused(folder, tmp_path):
 
 
 def test_folders_without_an_export_are_refused(folder, tmp_path):
-    with pytest.raises(ConfigError, match=r"--policy: there is no .*policy\.onnx"):
+    with pytest.raises(ConfigError, match=r"POLICY: there is no .*policy\.onnx"):
         Policy(tmp_path)
     (tmp_path / "policy.onnx").write_bytes(b"no network")
-    with pytest.raises(ConfigError, match=r"--policy: there is no .*policy\.json"):
+    with pytest.raises(ConfigError, match=r"POLICY: there is no .*policy\.json"):
         Policy(tmp_path)
     changed(folder, tmp_path)
     with pytest.raises(ConfigError, match=r"policy\.onnx: onnxruntime cannot read it"):

@@ -11,12 +11,13 @@ from helpers import call, tiny_run
 from importing_fixtures import urdf
 
 from legged import registry
+from legged.cli.deploy import sim
+from legged.cli.robot import add
 from legged.errors import RunError
-from legged.tools import add_robot, deploy
 
 LISTENS = "import os, time; print('listening at 127.0.0.1:1', flush=True); "
 GOOD_REPORT = (
-    "import sys; open(sys.argv[sys.argv.index('--report') + 1], 'w').write('"
+    "import sys; open(sys.argv[sys.argv.index('--out') + 1] + '/report.json', 'w').write('"
     '{"fell": false, "time": 1.0, "distance": 0.5, "climbed": 0.0, "largest_lean": 0.1, "lost": 0, "sent": 9, "received": 9}'
     "')"
 )
@@ -32,8 +33,8 @@ def run(policy_folder, tmp_path, monkeypatch):
             source = program if "legged.deploy" in command else simulator
             return starts([sys.executable, "-c", source, *command[3:]], **settings)
 
-        monkeypatch.setattr(deploy.subprocess, "Popen", start)
-        return call(deploy.main, ["--policy", str(policy_folder), "--robot", "sim", "--out", str(tmp_path)])
+        monkeypatch.setattr(sim.subprocess, "Popen", start)
+        return call(sim.main, [str(policy_folder), "--out", str(tmp_path)])
 
     return run
 
@@ -69,12 +70,12 @@ def test_a_program_that_does_not_end_leaves_no_simulator_behind(policy_folder, t
         program.stdout.readline()
         raise RunError("what goes wrong here")
 
-    monkeypatch.setattr(deploy.subprocess, "Popen", start)
-    monkeypatch.setattr(deploy, "_wait", fails)
-    monkeypatch.setattr(deploy, "END_S", 0.2)
+    monkeypatch.setattr(sim.subprocess, "Popen", start)
+    monkeypatch.setattr(sim, "_wait", fails)
+    monkeypatch.setattr(sim, "END_S", 0.2)
     try:
         with pytest.raises(subprocess.TimeoutExpired):
-            deploy.main(["--policy", str(policy_folder), "--robot", "sim", "--out", str(tmp_path)])
+            sim.main([str(policy_folder), "--out", str(tmp_path)])
         assert started[0].poll() is not None
     finally:
         for process in started:
@@ -92,8 +93,8 @@ def test_a_program_that_refuses_ends_the_simulator_at_once(code, run, capsys):
 
 
 def test_a_policy_without_commands_is_none_for_a_robot(capsys):
-    assert call(deploy.main, ["--policy", "half_cheetah", "--robot", "sim"]) == 2
-    assert "--policy: 'half_cheetah' follows no commands" in capsys.readouterr().err
+    assert call(sim.main, ["half_cheetah"]) == 2
+    assert "POLICY: 'half_cheetah' follows no commands" in capsys.readouterr().err
 
 
 @pytest.fixture
@@ -101,7 +102,7 @@ def own_run(workplace, monkeypatch, capsys):
     """A run of a robot of one's own, in mine/, whose task no later command knows by its name."""
     monkeypatch.setattr(registry, "_REGISTERED", {})
     Path("toy.urdf").write_text(urdf())
-    assert call(add_robot.main, ["toy.urdf", "--out", "mine"]) == 0
+    assert call(add.main, ["toy.urdf", "--out", "mine"]) == 0
     folder = tiny_run("--task", "mine/toy_flat.yaml", iterations=1)
     registry._REGISTERED.clear()
     capsys.readouterr()
@@ -113,33 +114,33 @@ def test_a_robot_of_ones_own_is_simulated_without_naming_it(own_run, monkeypatch
     moved away from there, and where a run is named whose task nobody knows, an error says what to name.
     """
     simulated = []
-    monkeypatch.setattr(deploy, "_run_both", lambda args, exported, robot, folder: (simulated.append(robot), (0, None))[1])
+    monkeypatch.setattr(sim, "_run_both", lambda args, exported, robot, folder: (simulated.append(robot), (0, None))[1])
 
     def error(*flags):
-        assert call(deploy.main, ["--robot", "sim", *map(str, flags)]) == 2
+        assert call(sim.main, [*map(str, flags)]) == 2
         return capsys.readouterr().err
 
-    assert "--policy: logs/toy_flat/" in (said := error("--policy", own_run))
-    assert "was trained on a task of your own, 'toy_flat': name the YAML file of the task" in said
+    assert "POLICY: logs/toy_flat/" in (said := error(own_run))
+    assert "was trained on a user-defined task, 'toy_flat': --import FILE" in said
     robot = Path("mine/toy").resolve()
-    assert call(deploy.main, ["--policy", "mine/toy_flat.yaml", "--robot", "sim"]) == 0
-    assert call(deploy.main, ["--policy", str(own_run / "exported"), "--robot", "sim"]) == 0
+    assert call(sim.main, ["mine/toy_flat.yaml"]) == 0
+    assert call(sim.main, [str(own_run / "exported")]) == 0
     assert simulated == [str(robot)] * 2
     (own_run / "exported").rename("moved")
-    assert "moved/policy.json: robot: 'toy' does not come with this package; --simulated FOLDER" in error("--policy", "moved")
-    assert call(deploy.main, ["--policy", "moved", "--robot", "sim", "--simulated", "mine/toy"]) == 0
+    assert "moved/policy.json: robot: 'toy' does not come with this package; --robot FOLDER" in error("moved")
+    assert call(sim.main, ["moved", "--robot", "mine/toy"]) == 0
     assert simulated[-1] == str(robot)
 
 
 def test_a_run_that_has_gone_on_is_exported_again(workplace, monkeypatch, capsys):
     """Its export was once taken for its newest policy, whatever had been learned since. Who names the export gets it."""
     folder = tiny_run(iterations=1)
-    monkeypatch.setattr(deploy, "_run_both", lambda args, exported, robot, folder: (0, None))
+    monkeypatch.setattr(sim, "_run_both", lambda args, exported, robot, folder: (0, None))
     policy, (checkpoint,) = folder / "exported" / "policy.onnx", folder.glob("model_*.pt")
 
     def says(name):
         capsys.readouterr()
-        assert call(deploy.main, ["--policy", str(name), "--robot", "sim"]) == 0
+        assert call(sim.main, [str(name)]) == 0
         return "exported" in capsys.readouterr().out
 
     assert says(folder)
@@ -150,8 +151,8 @@ def test_a_run_that_has_gone_on_is_exported_again(workplace, monkeypatch, capsys
     assert says(folder)
 
 
-def test_a_policy_that_is_not_there_is_named_by_its_flag(workplace, capsys):
-    assert call(deploy.main, ["--policy", "nonsense", "--robot", "sim"]) == 2
-    assert capsys.readouterr().err.startswith("error: --policy: there is no task 'nonsense'")
-    assert call(deploy.main, ["--policy", "nonsense.yaml", "--robot", "sim"]) == 2
-    assert capsys.readouterr().err == "error: --policy: there is no file 'nonsense.yaml'\n"
+def test_a_policy_that_is_not_there_is_named(workplace, capsys):
+    assert call(sim.main, ["nonsense"]) == 2
+    assert capsys.readouterr().err.startswith("error: POLICY: there is no task and no run 'nonsense'")
+    assert call(sim.main, ["nonsense.yaml"]) == 2
+    assert capsys.readouterr().err == "error: POLICY: there is no file 'nonsense.yaml'\n"

@@ -222,7 +222,7 @@ def test_a_program_that_is_asked_to_end_brakes_the_robot_for_a_second_and_says_g
     contract = read_contract(policy_folder / "policy.json")
     there = Answers(facts_for(contract))
     (tmp_path / "lie.txt").write_text("0 damping\n")
-    command = [sys.executable, "-m", "legged.deploy", "--policy", str(policy_folder), "--robot", f"udp:{there.address}"]
+    command = [sys.executable, "-m", "legged.deploy", str(policy_folder), "--robot", f"udp:{there.address}"]
     with open(tmp_path / "out", "w") as out:
         command += ["--commands", "lie.txt", "--log", "log.npz"]
         program = subprocess.Popen(command, cwd=tmp_path, stdout=out, stderr=subprocess.STDOUT, start_new_session=True)
@@ -255,7 +255,7 @@ def test_whoever_interrupts_a_program_that_waits_for_a_robot_does_not_wait(polic
         silent.bind(("127.0.0.1", 0))
         silent.settimeout(60.0)
         address = f"127.0.0.1:{silent.getsockname()[1]}"
-        command = [sys.executable, "-m", "legged.deploy", "--policy", str(policy_folder), "--robot", f"udp:{address}"]
+        command = [sys.executable, "-m", "legged.deploy", str(policy_folder), "--robot", f"udp:{address}"]
         program = subprocess.Popen([*command, "--commands", "lie.txt"], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
         try:
             silent.recv(100)

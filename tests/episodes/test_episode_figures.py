@@ -108,7 +108,7 @@ def test_steps_and_cycles_without_numbers_are_left_out_and_counted():
     assert len(found.cycle_s) == 1
     assert "A: 2 episodes, 61 control steps; 3 more are left out" in notes_of({"A": found})
     episodes["joint_pos"][:] = np.nan
-    with pytest.raises(ConfigError, match="--statistics: physics blew up: no step of 'by_hand'"):
+    with pytest.raises(ConfigError, match="POLICY: physics blew up: no step of 'by_hand'"):
         joint_statistics(episodes)
 
 
@@ -151,7 +151,7 @@ def test_two_policies_are_compared_joint_by_joint():
     row = tables_of(both)["torque [N m]"].rows[1]
     assert [text_of(cell) for cell in row] == ["right_hip", "3.000", "0.000", "5.500", "0.000", "+2.500"]
     other.about["joints"] = [*other.about["joints"][:3], {**other.about["joints"][3], "name": "tail"}]
-    with pytest.raises(ConfigError, match=r"--compare: the two have other joints \(right_knee, tail\)"):
+    with pytest.raises(ConfigError, match=r"POLICY: the two have other joints \(right_knee, tail\)"):
         check_comparable(both["A"], joint_statistics(other))
 
 

@@ -10,12 +10,12 @@ import pytest
 from handmade import made_by_hand
 from helpers import small_config
 
+from legged.cli.episodes.common import LIST
 from legged.episodes.page import page_name
 from legged.episodes.parquet import TABLE
 from legged.episodes.statistics_report import NAME
 from legged.episodes.stored import ABOUT, ARRAYS, CONFIG, load_config, load_episodes, save_episodes
 from legged.errors import ConfigError, RunError
-from legged.tools.episodes import LIST
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -29,11 +29,11 @@ def saved() -> Path:
 
 def test_episodes_come_back_as_they_were():
     folder = saved()
-    found, want = load_episodes(folder, "--stored"), made_by_hand(3, 5)
+    found, want = load_episodes(folder, "FOLDER"), made_by_hand(3, 5)
     assert found.about == want.about
     assert found.arrays.keys() == want.arrays.keys()
     np.testing.assert_array_equal(found["joint_pos"], np.random.default_rng(0).normal(size=(8, 4)).astype(np.float32))
-    assert load_config(folder, "--stored").task == "anymal_c_flat"
+    assert load_config(folder, "FOLDER").task == "anymal_c_flat"
     with np.load(folder / ARRAYS) as plain:  # as somebody reads it who knows nothing of this package
         np.testing.assert_allclose(plain["time"], 0.02 * np.array([1, 2, 3, 1, 2, 3, 4, 5]), rtol=1e-6)
         assert plain["episode"].tolist() == [0] * 3 + [1] * 5
@@ -55,7 +55,7 @@ def test_numbers_are_never_described_by_an_earlier_recording(full, monkeypatch):
         save_episodes(made_by_hand(4, 4), small_config(), folder)
     if {path: path.read_bytes() for path in folder.iterdir()} != before:
         with pytest.raises(ConfigError, match=f"kept holds no {ABOUT}"):
-            load_episodes(folder, "--stored")
+            load_episodes(folder, "FOLDER")
 
 
 def test_a_recording_takes_away_what_was_made_of_the_one_before_it():
@@ -66,7 +66,7 @@ def test_a_recording_takes_away_what_was_made_of_the_one_before_it():
         (folder / name).write_text(name)
     save_episodes(made_by_hand(4, 4), small_config(), folder)
     assert {path.name for path in folder.iterdir()} == {ARRAYS, ABOUT, CONFIG, *own}
-    assert load_episodes(folder, "--stored").lengths.tolist() == [4, 4]
+    assert load_episodes(folder, "FOLDER").lengths.tolist() == [4, 4]
 
 
 def cut(path: Path):
@@ -113,8 +113,8 @@ def test_damaged_episodes_are_refused(damage, words):
     folder = saved()
     damage(folder)
     with pytest.raises(ConfigError, match=words) as caught:
-        load_episodes(folder, "--stored")
-    assert re.match("--stored: kept", str(caught.value))
+        load_episodes(folder, "FOLDER")
+    assert re.match("FOLDER: kept", str(caught.value))
 
 
 def test_a_folder_without_configuration_is_told():

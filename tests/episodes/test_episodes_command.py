@@ -8,21 +8,22 @@ import numpy as np
 import pytest
 from helpers import POLICY, TASK, call, tiny_run
 
+from legged.cli.episodes import compare, record, statistics, stored
 from legged.episodes import film
 from legged.episodes.stored import ABOUT, ARRAYS
 from legged.errors import RunError
 from legged.policies import restore
-from legged.tools import episodes
 
 pytestmark = pytest.mark.usefixtures("workplace")
-FEW = ["--physics", "mujoco", "--episodes", "3", "--num_envs", "2", "sim.threads=1"]
-HERE = ["--task", TASK, "--load_run", str(POLICY), *FEW, "env.episode_length_s=1.2"]
+FEW = ["--physics", "mujoco", "--episodes", "3", "--num-envs", "2", "sim.threads=1"]
+HERE = [str(POLICY), *FEW, "env.episode_length_s=1.2"]
 
 
 def test_a_policy_is_recorded_listed_and_summed_up(capsys):
-    assert call(episodes.main, [*HERE, "--out", "out", "--statistics", "--sort", "energy"]) == 0
+    assert call(record.main, [*HERE, "--out", "out", "--sort", "energy"]) == 0
     out = capsys.readouterr().out
     assert "3 episodes, 0 failed; ended: 3 by time; by energy" in out
+    assert call(statistics.main, ["out", "--out", "out"]) == 0
     assert {path.name for path in Path("out").iterdir()} == {
         ARRAYS,
         ABOUT,
@@ -48,21 +49,21 @@ def test_a_policy_is_recorded_listed_and_summed_up(capsys):
 def test_a_run_has_its_episodes_beside_it_and_they_are_listed_again(capsys, monkeypatch):
     run = tiny_run("env.episode_length_s=0.4")
     capsys.readouterr()
-    assert call(episodes.main, ["--task", TASK, *FEW]) == 0
+    assert call(record.main, [TASK, *FEW]) == 0
     assert (run / "episodes" / ARRAYS).is_file()
     monkeypatch.setattr(restore, "make_task", lambda *_: pytest.fail("simulated"))
     capsys.readouterr()
-    assert call(episodes.main, ["--stored", str(run / "episodes"), "--sort", "torque", "--top", "1"]) == 0
+    assert call(stored.main, [str(run / "episodes"), "--sort", "torque", "--top", "1"]) == 0
     out = capsys.readouterr().out
     assert len(re.findall(r"(?m)^│ +\d+ │", out)) == 1
-    assert call(episodes.main, ["--stored", str(run / "episodes"), "--page", "3"]) == 2
+    assert call(stored.main, [str(run / "episodes"), "--page", "3"]) == 2
     assert "--page: there is no episode 3; they are 0 to 2" in capsys.readouterr().err
 
 
 def test_a_page_says_what_was_changed_for_its_episodes(capsys):
     tiny_run("env.episode_length_s=0.1")
     asked = ["observations.add_noise=true", "domain_rand.push_robots=true"]
-    assert call(episodes.main, ["--task", TASK, *FEW, "--page", "0", "--out", "out", *asked]) == 0
+    assert call(record.main, [TASK, *FEW, "--page", "0", "--out", "out", *asked]) == 0
     about = json.loads(Path("out/episodes.json").read_text())
     assert about["changes"] == {"observations.add_noise": True, "domain_rand.push_robots": True}
     said = "randomisation, but with domain_rand.push_robots=True, observations.add_noise=True"
@@ -74,7 +75,7 @@ def test_where_nothing_can_be_drawn_a_page_has_a_stick_figure(monkeypatch, capsy
         raise RunError("cannot render here")
 
     monkeypatch.setattr(film, "camera_of", fail)
-    assert call(episodes.main, [*HERE, "--out", "out", "--worst", "1"]) == 0
+    assert call(record.main, [*HERE, "--out", "out", "--worst", "1"]) == 0
     (page,) = Path("out").glob("episode_*.html")
     text = page.read_text()
     data = json.loads(text.partition('id="data">')[2].partition("</script>")[0])
@@ -92,8 +93,8 @@ def test_where_nothing_can_be_drawn_a_page_has_a_stick_figure(monkeypatch, capsy
 def test_other_tasks_show_what_they_have(capsys, monkeypatch):
     monkeypatch.setattr(film, "MOST_PICTURES", 4)
     policy = POLICY.parent / "half_cheetah"
-    few = ["--load_run", str(policy), *FEW, "env.episode_length_s=1"]
-    assert call(episodes.main, ["--task", "half_cheetah", *few, "--out", "out", "--page", "0"]) == 0
+    few = [str(policy), *FEW, "env.episode_length_s=1"]
+    assert call(record.main, [*few, "--out", "out", "--page", "0"]) == 0
     assert "mean power [W]" in Path("out/episodes.md").read_text()
     text = Path("out/episode_000.html").read_text()
     data = json.loads(text.partition('id="data">')[2].partition("</script>")[0])
@@ -101,13 +102,13 @@ def test_other_tasks_show_what_they_have(capsys, monkeypatch):
     assert data["steps"] == 20
     assert len(data["film"].get("pictures") or data["film"]["places"]) == 4
     capsys.readouterr()
-    assert call(episodes.main, ["--stored", "out", "--sort", "tracking"]) == 2
+    assert call(stored.main, ["out", "--sort", "tracking"]) == 2
     assert "--sort: tracking: these episodes have no such figure" in capsys.readouterr().err
 
 
 def test_a_table_of_all_steps_is_written(monkeypatch, capsys):
     parquet = pytest.importorskip("pyarrow.parquet")
-    assert call(episodes.main, [*HERE, "--out", "out", "--parquet"]) == 0
+    assert call(record.main, [*HERE, "--out", "out", "--parquet"]) == 0
     table = parquet.read_table("out/episodes.parquet").to_pydict()
     with np.load("out/episodes.npz") as file:
         for column, want in (
@@ -122,7 +123,7 @@ def test_a_table_of_all_steps_is_written(monkeypatch, capsys):
 
 def test_without_its_package_a_table_is_refused(monkeypatch, capsys):
     monkeypatch.setattr("legged.episodes.parquet.find_spec", lambda _: None)
-    assert call(episodes.main, [*HERE, "--parquet"]) == 2
+    assert call(record.main, [*HERE, "--parquet"]) == 2
     assert capsys.readouterr().err == (
         "error: --parquet: needs pyarrow, which is not installed: pip install 'legged[parquet]'\n"
     )
@@ -130,47 +131,62 @@ def test_without_its_package_a_table_is_refused(monkeypatch, capsys):
 
 def test_two_policies_are_compared(capsys):
     changes = ["env.episode_length_s=1.2", *FEW]
-    assert call(episodes.main, [*HERE, "--out", "out"]) == 0
+    assert call(record.main, [*HERE, "--out", "out"]) == 0
     other = str(POLICY.parent / "anymal_c_step")
-    assert call(episodes.main, ["--compare", "out", other, *changes, "--out", "both"]) == 0
+    assert call(compare.main, ["out", other, *changes, "--out", "both"]) == 0
     text = Path("both/joint_statistics.md").read_text()
     assert "difference of the means" in text
     assert "anymal_c_flat (shipped)" in text
     assert "anymal_c_step (shipped)" in text
     capsys.readouterr()
     cheetah = str(POLICY.parent / "half_cheetah")
-    assert call(episodes.main, ["--compare", "out", cheetah, "--episodes", "1", "--physics", "mujoco", "sim.threads=1"]) == 2
-    assert "--compare: the two have other joints" in capsys.readouterr().err
+    assert call(compare.main, ["out", cheetah, "--episodes", "1", "--physics", "mujoco", "sim.threads=1"]) == 2
+    assert "POLICY: the two have other joints" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], "--task: one of --task, --stored and --compare says whose episodes; none is given"),
-        (["--task", TASK, "--stored", "x"], "got --task and --stored"),
-        (["--stored", "nowhere"], "--stored: nowhere holds no episodes.npz"),
-        (["--stored", "x", "--episodes", "3"], "--episodes: nothing is simulated with --stored"),
-        (["--compare", "a", "b", "--worst", "1"], "--worst: --compare makes tables of joints only"),
-        (["--compare", "a", "b"], "'a'"),
+        (["anymal_c_flt"], "POLICY: there is no task and no run 'anymal_c_flt'; did you mean 'anymal_c_flat'?"),
         ([*HERE, "--sort", "energi"], "--sort: there is no order 'energi'; did you mean 'energy'?"),
         ([*HERE, "--episodes", "0"], "--episodes: must be at least 1, got 0"),
         ([*HERE, "--episodes", "100000"], "--episodes: must be at most 4,096, got 100,000"),
-        ([*HERE, "--num_envs", "9"], "--num_envs: 9 robots have no more than 3 episodes to run"),
+        ([*HERE, "--num-envs", "9"], "--num-envs: 9 robots have no more than 3 episodes to run"),
         ([*HERE, "--ended", "contakt"], "--ended: contakt: no episode ends by it; did you mean 'contact'?"),
         ([*HERE, "--page", "two"], "--page: expected numbers of episodes like 3 or 3,17, got 'two'"),
         ([*HERE, "--page", "7"], "--page: there is no episode 7; they are 0 to 2"),
         ([*HERE, "--top", "-1"], "--top: must be at least 0"),
-        ([*HERE, "--command", "1", "0", "nan"], "--command: velocities must be numbers"),
+        ([*HERE, "--command", "1,0,nan"], "--command: expected three numbers of at most 100 like 0.5,0,0.2, got '1,0,nan'"),
+        ([*HERE, "--command", "1,0"], "--command: expected three numbers of at most 100 like 0.5,0,0.2, got '1,0'"),
         ([*HERE, "--terrain", "stares_up"], "--terrain: "),
-        ([*HERE, "--as_trained", "--terrain", "pit"], "--terrain: --as_trained takes the ground of the training"),
+        ([*HERE, "--as-trained", "--terrain", "pit"], "--terrain: --as-trained takes the ground of the training"),
         ([*HERE, "--difficulty", "2"], "--difficulty: must be between 0 and 1"),
-        (["--task", "half_cheetah", "--command", "1", "0", "0"], "--command: 'half_cheetah' follows no commands"),
-        (["--task", "half_cheetah", "--terrain", "pit"], "--terrain: 'half_cheetah' has no terrain to choose"),
+        (["half_cheetah", "--command=-1,0,0"], "--command: 'half_cheetah' follows no commands"),
+        (["half_cheetah", "--terrain", "pit"], "--terrain: 'half_cheetah' has no terrain to choose"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_is_built(arguments, words, capsys, monkeypatch):
     monkeypatch.setattr(restore, "make_task", lambda *_: pytest.fail("built"))
-    assert call(episodes.main, arguments) == 2
+    assert call(record.main, arguments) == 2
     err = capsys.readouterr().err
     assert words in err
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "words"),
+    [
+        (stored, ["nowhere"], "FOLDER: nowhere holds no episodes.npz"),
+        (stored, ["nowhere", "--sort", "energi"], "--sort: there is no order 'energi'; did you mean 'energy'?"),
+        (stored, ["nowhere", "--episodes", "3"], "unrecognized arguments: --episodes"),
+        (compare, ["a", "b"], "POLICY: there is no task and no run 'a'"),
+        (compare, [TASK, "b"], "POLICY: there is no task and no run 'b'"),
+        (compare, [TASK, TASK, "--worst", "1"], "unrecognized arguments: --worst"),
+        (statistics, ["a", "--episodes", "0"], "--episodes: must be at least 1, got 0"),
+        (statistics, ["a"], "POLICY: there is no task and no run 'a'"),
+    ],
+)
+def test_the_other_commands_refuse_too(command, arguments, words, capsys, monkeypatch):
+    monkeypatch.setattr(restore, "make_task", lambda *_: pytest.fail("built"))
+    assert call(command.main, arguments) == 2
+    assert words in capsys.readouterr().err

@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from outcomes import refused_in_a_line
 
+from legged.cli import play, train
 from legged.learning.checkpoint import check_fits, read_checkpoint
 from legged.learning.run_folder import run_config
 from legged.learning.runner import Runner
 from legged.learning.transfer import check_source
 from legged.policies.restore import TrainedPolicy, restore
 from legged.registry import make_task
-from legged.tools import play, train
 
 TENSORS = st.sampled_from(
     [

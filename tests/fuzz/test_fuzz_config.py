@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from outcomes import refused_in_a_line
 
+from legged.cli import train
 from legged.config import from_dict, load_config, to_yaml
 from legged.config.loader import parse_override
 from legged.learning.runner import Runner
 from legged.process.paths import data_folder
 from legged.registry import make_task, task_config
-from legged.tools import train
 
 TASKS = ["anymal_c_flat", "anymal_c", "anymal_c_proprio"]
 CHEAP = [("sim.physics", "mujoco"), ("sim.threads", 1), ("env.num_envs", 4), ("train.runner.num_steps_per_env", 2)]

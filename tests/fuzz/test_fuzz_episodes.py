@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from draws import HOW, TEXTS, VALUES, mutated, places
-from helpers import POLICY, TASK, kept_global_state
+from helpers import POLICY, kept_global_state
 from hypothesis import given
 from hypothesis import strategies as st
 
+from legged.cli.episodes import record, stored
 from legged.episodes.joint_statistics import joint_statistics
 from legged.episodes.panels import Panels
 from legged.episodes.ranking import figures_of
 from legged.episodes.statistics_report import tables_of
 from legged.episodes.stored import ABOUT, ARRAYS, load_episodes
 from legged.errors import ConfigError
-from legged.tools import episodes
 
 FEW = ["--physics=mujoco", "--episodes=2", "sim.threads=1", "env.episode_length_s=1.2"]
 
@@ -27,13 +27,13 @@ FEW = ["--physics=mujoco", "--episodes=2", "sim.threads=1", "env.episode_length_
 def recorded(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("recorded")
     with kept_global_state():
-        assert episodes.main(["--task", TASK, "--load_run", str(POLICY), *FEW, "--out", str(folder)]) == 0
+        assert record.main([str(POLICY), *FEW, "--out", str(folder)]) == 0
     return folder
 
 
 def looked_at(folder: Path) -> None:
     """Everything that is made of stored episodes but pictures."""
-    found = load_episodes(folder, "--stored")
+    found = load_episodes(folder, "FOLDER")
     figures_of(found)
     for number in range(len(found)):
         json.dumps(Panels(found, number).sections(), allow_nan=False)
@@ -50,7 +50,7 @@ def test_damaged_words(data, how, value, recorded, run, in_new_folder):
         Path("kept", ABOUT).write_text(text, encoding="utf-8", errors="replace")
         with contextlib.suppress(ConfigError):
             looked_at(folder / "kept")
-        assert run(episodes.main, ["--stored", "kept"]).code in (0, 2)
+        assert run(stored.main, ["kept"]).code in (0, 2)
 
 
 @given(data=st.data())
@@ -83,14 +83,14 @@ def test_arrays_of_another_kind(data, name, recorded, in_new_folder):
 NUMBERS = st.sampled_from(["-1", "0", "1", "2", "0.5", "1e9", "nan", "inf", "x", ""])
 FLAGS = {
     "--episodes": NUMBERS,
-    "--num_envs": NUMBERS,
+    "--num-envs": NUMBERS,
     "--top": NUMBERS,
     "--sort": st.one_of(st.sampled_from(["fell", "torque", "tracking"]), TEXTS),
     "--ended": st.one_of(st.just("time"), TEXTS),
     "--page": st.one_of(st.sampled_from(["9", "0,x", ",", "1e3"]), TEXTS),
     "--difficulty": NUMBERS,
     "--out": TEXTS,
-    "--stored": TEXTS,
+    "--command": st.one_of(st.sampled_from(["0.5,0,0.2", "nan,0,0", "1,2", ",,"]), TEXTS),
 }
 
 
@@ -99,5 +99,5 @@ def test_any_command_line(flags, run, in_new_folder):
     with in_new_folder():
         if any(flag.startswith("--page=") and flag[7:].strip(", ").isdecimal() for flag in flags):
             flags = [flag for flag in flags if not flag.startswith("--page=")]  # no pictures here
-        arguments = ["--task", TASK, "--load_run", str(POLICY), "--sim_device", "cpu", *FEW, "env.episode_length_s=0.1"]
-        assert run(episodes.main, [*arguments, *flags]).code in (0, 1, 2)
+        arguments = [str(POLICY), "--sim-device", "cpu", *FEW, "env.episode_length_s=0.1"]
+        assert run(record.main, [*arguments, *flags]).code in (0, 1, 2)

@@ -9,8 +9,8 @@ from helpers import TASK, checkpoints, run_folders
 from hypothesis import given
 from hypothesis import strategies as st
 
+from legged.cli import play, train
 from legged.learning.run_folder import run_config
-from legged.tools import play, train
 
 SMALL = ["sim.threads=1", "train.runner.num_steps_per_env=4", "train.runner.report=false"]
 NUMBER = st.sampled_from([1, 2, 3, 5, 7, 12])

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from importing_fixtures import urdf
 from outcomes import refused_in_a_line
 
+from legged.cli.robot import add
 from legged.process.paths import data_folder
 from legged.registry import make_task, task_config
-from legged.tools import add_robot
 
 SOURCE = data_folder("resources") / "robots" / "anymal_c"
 MODEL = (SOURCE / "anymal_c.xml").read_text()
@@ -74,6 +74,6 @@ def test_a_changed_urdf(text, in_new_folder):
     with in_new_folder() as folder:
         (folder / "toy.urdf").write_text(text, encoding="utf-8", errors="replace")
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as err:
-            code = call(add_robot.main, [str(folder / "toy.urdf"), "--name", "drawn_toy", "--out", str(folder)])
+            code = call(add.main, [str(folder / "toy.urdf"), "--name", "drawn_toy", "--out", str(folder)])
         assert code in (0, 2)
         assert err.getvalue().count("\n") == (1 if code else 0), err.getvalue()

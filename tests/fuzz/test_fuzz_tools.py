@@ -10,9 +10,13 @@ from helpers import TASK, TINY_TRAINING
 from hypothesis import given
 from hypothesis import strategies as st
 
+from legged.cli import play, terrain, train
+from legged.cli.benchmark import step
+from legged.cli.evaluate import checkpoints, grid
+from legged.cli.evaluate import terrain as success
+from legged.cli.runs import compare, curves, evaluations, report, table
 from legged.process.paths import data_folder
 from legged.registry import _REGISTERED
-from legged.tools import benchmark, compare, evaluate, experiments, play, plot, report, show_terrain, train
 
 POLICIES = data_folder("resources") / "policies"
 EVALUATIONS = [POLICIES / "anymal_c" / "evaluation_mujoco.json", POLICIES / TASK / "evaluation_mujoco.json"]
@@ -34,16 +38,16 @@ GRID = st.one_of(st.sampled_from(["0", "0.5:0:1", "-1:1:1", "0:1:1e-9", "1:0:1",
     data=st.data(),
     how=HOW,
     value=VALUES,
-    flags=flags_of({"--types": st.one_of(TYPES, WORDS), "--out": st.sampled_from(["a.png", "b/c.png", ".", "/proc/x.png"])}),
+    flags=flags_of({"--types": st.one_of(TYPES, WORDS), "--out": st.sampled_from(["a", "b/c", ".", "/proc/x"])}),
 )
-def test_compare_of_a_damaged_evaluation(data, how, value, flags, run, in_new_folder):
+def test_a_table_of_a_damaged_evaluation(data, how, value, flags, run, in_new_folder):
     source = data.draw(st.sampled_from(EVALUATIONS))
     content = json.loads(source.read_text())
     content.get("rough", content)["cells"] = content.get("rough", content)["cells"][:2]
     path = data.draw(st.sampled_from(places(content)))
     with in_new_folder():
         Path("evaluation_mujoco.json").write_text(json.dumps(mutated(content, path, how, value)), encoding="utf-8")
-        assert run(compare.main, ["evaluation_mujoco.json", str(source), *flags]).code in (0, 1, 2)
+        assert run(evaluations.main, ["evaluation_mujoco.json", str(source), *flags]).code in (0, 1, 2)
 
 
 def damaged(data, path: Path) -> None:
@@ -69,42 +73,49 @@ def test_reports_of_damaged_runs(data, how, value, trained, run, in_new_folder):
         files = [*runs[0].glob("events.*"), *(runs[0] / name for name in ("config.yaml", "timing.json", "code.diff"))]
         damaged(data, data.draw(st.sampled_from(files)))
         assert run(report.main, [str(one) for one in runs]).code == 0
-        assert run(experiments.main, []).code == 0
-        assert run(experiments.main, ["--compare", *map(str, runs)]).code == 0
+        assert run(table.main, []).code == 0
+        assert run(compare.main, [*map(str, runs)]).code == 0
 
 
-@given(data=st.data(), out=st.sampled_from(["a.png", "b/c.png", ".", "x.nonsense", "/proc/a.png"]))
-def test_plot_of_damaged_events(data, out, trained, run, in_new_folder):
+@given(data=st.data(), out=st.sampled_from(["a", "b/c", ".", "/proc/a"]))
+def test_curves_of_damaged_events(data, out, trained, run, in_new_folder):
     with in_new_folder() as folder:
         shutil.copytree(trained, folder / "run")
         (events,) = (folder / "run").glob("events.*")
         damaged(data, events)
-        assert run(plot.main, ["run", "--out", out]).code in (0, 1, 2)
+        assert run(curves.main, ["run", "--out", out]).code in (0, 1, 2)
 
 
-COMMON = {"--num_envs": SMALL_NUMBERS, "--seed": SMALL_NUMBERS, "--load_run": WORDS, "--checkpoint": SMALL_NUMBERS}
+COMMON = {"--num-envs": SMALL_NUMBERS, "--seed": SMALL_NUMBERS}
+NAMED = {"--checkpoint": SMALL_NUMBERS, "--load-run": WORDS, "--experiment-name": WORDS}
 COMMANDS = {
-    "evaluate": (
-        evaluate.main,
-        {"--vx": GRID, "--vy": GRID, "--robots": SMALL_NUMBERS, "--types": TYPES, "--robots-per-point": SMALL_NUMBERS},
+    "evaluate grid": (
+        grid.main,
+        {"--vx": GRID, "--vy": GRID, "--robots": SMALL_NUMBERS, "--checkpoint": SMALL_NUMBERS},
         ["--yaw=0", "--robots=1", "--vx=0", "--vy=0"],
+    ),
+    "evaluate terrain": (
+        success.main,
+        {"--types": TYPES, "--robots-per-point": SMALL_NUMBERS, "--checkpoint": SMALL_NUMBERS},
+        ["--robots-per-point=1"],
     ),
     "play": (
         play.main,
-        {"--difficulty": SMALL_NUMBERS, "--terrain": st.one_of(TYPES, WORDS), "--out": WORDS},
+        {"--difficulty": SMALL_NUMBERS, "--terrain": st.one_of(TYPES, WORDS), "--checkpoint": SMALL_NUMBERS, "--out": WORDS}
+        | NAMED,
         ["--no-video"],
     ),
-    "evaluate --all-checkpoints": (
-        evaluate.main,
+    "evaluate checkpoints": (
+        checkpoints.main,
         {"--rmse": SMALL_NUMBERS, "--falls": SMALL_NUMBERS},
-        ["--all-checkpoints", "--robots=1", "--vx=0", "--vy=0"],
+        ["--robots=1", "--vx=0", "--vy=0"],
     ),
-    "benchmark": (
-        benchmark.main,
-        {"--steps": SMALL_NUMBERS, "--repeats": SMALL_NUMBERS, "--iterations": SMALL_NUMBERS, "--json": WORDS},
-        ["--num_envs=2", "--steps=1", "--repeats=1", "--iterations=0"],
+    "benchmark step": (
+        step.main,
+        {"--steps": SMALL_NUMBERS, "--repeats": SMALL_NUMBERS, "--iterations": SMALL_NUMBERS, "--out": WORDS},
+        ["--num-envs=2", "--steps=1", "--repeats=1", "--iterations=0"],
     ),
-    "show_terrain": (show_terrain.main, {"--types": TYPES, "--difficulty": SMALL_NUMBERS, "--out": WORDS}, []),
+    "terrain": (terrain.main, {"--types": TYPES, "--difficulty": SMALL_NUMBERS, "--out": WORDS}, []),
 }
 
 
@@ -112,14 +123,14 @@ COMMANDS = {
 def test_any_command_line(data, name, trained, run, in_new_folder):
     """Small settings come first; what is drawn, after them."""
     main, own, small = COMMANDS[name]
-    others = {flag: values for flag, values in COMMON.items() if name != "show_terrain" or flag == "--seed"}
+    others = {flag: values for flag, values in COMMON.items() if name != "terrain" or flag == "--seed"}
     flags = data.draw(flags_of({**others, **own}))
     expensive = {"--steps=1e9", "--steps=10000000000", "--repeats=10000000000", "--iterations=10000000000"}
     if expensive & {*flags}:
         return
     with in_new_folder() as folder:
         shutil.copytree(trained, folder / "logs" / TASK / "run")
-        assert run(main, ["--task", TASK, "--sim_device", "cpu", "sim.threads=1", *small, *flags]).code in (0, 1, 2)
+        assert run(main, [TASK, "--sim-device", "cpu", "sim.threads=1", *small, *flags]).code in (0, 1, 2)
 
 
 MODULE = f'''import torch
@@ -159,8 +170,8 @@ def test_a_damaged_module_of_a_user(text, run, in_new_folder):
     try:
         with in_new_folder():
             Path("mine.py").write_text(text, encoding="utf-8", errors="replace")
-            arguments = ["--import", "mine.py", "--task", "mine", "--sim_device", "cpu", "--num_envs", "4"]
-            assert run(train.main, [*arguments, "--max_iterations", "1", *TINY_TRAINING]).code in (0, 1, 2)
+            arguments = ["--import", "mine.py", "mine", "--sim-device", "cpu", "--num-envs", "4"]
+            assert run(train.main, [*arguments, "--max-iterations", "1", *TINY_TRAINING]).code in (0, 1, 2)
     finally:
         _REGISTERED.clear()
         _REGISTERED.update(before)

@@ -1,4 +1,5 @@
-"""Learners that know nothing of this package train in its tasks, and what docs/gymnasium.md shows works."""
+"""Learners that know nothing of this package train in its tasks, and what docs/gymnasium.md and docs/lab/ppo_cheetah.md
+show works."""
 
 import re
 from pathlib import Path
@@ -8,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 from envs_of_gymnasium import ONE_THREAD
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
 @pytest.mark.parametrize("task", ["half_cheetah", "anymal_c_flat"])
@@ -31,28 +34,28 @@ def test_stable_baselines3_learns_for_a_few_hundred_steps(task):
     assert np.isfinite(env.get_episode_rewards()).all()
 
 
-@pytest.fixture
-def examples() -> list[str]:
-    page = Path(__file__).resolve().parents[2] / "docs" / "gymnasium.md"
-    return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+def example(page: str) -> str:
+    """Return the only block of Python of a page of docs/."""
+    (code,) = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+    return code
 
 
 def run(code: str) -> dict:
     names: dict = {}
-    exec(compile(code, "docs/gymnasium.md", "exec"), names)
+    exec(compile(code, "an example of docs/", "exec"), names)
     return names
 
 
-def test_the_first_example_of_the_page_runs(examples, pictures):
-    found = run(examples[0])
+def test_the_example_of_the_page_runs(pictures):
+    found = run(example("gymnasium.md"))
     assert found["observations"].shape == (64, 48)
     assert found["truncated"]
     assert found["picture"].shape == (270, 480, 3)
 
 
-def test_the_learner_of_the_page_learns(examples, capsys):
+def test_the_learner_of_the_lab_learns(capsys):
     """Few and small updates: the code runs, episodes end within them, and the networks change."""
-    code = examples[1]
+    code = example("lab/ppo_cheetah.md")
     numbers = "ENVS, STEPS, UPDATES = 64, 32, 150\n"
     assert numbers in code
     task = "DEVICE, to_numpy=False)"

@@ -5,18 +5,18 @@ import subprocess
 import threading
 from pathlib import Path
 
+import legged.tools.train
 import numpy as np
 import pytest
 import torch
 from helpers import TASK, TINY_TRAINING, call, run_folders, small_config, tiny_run
+from legged.tools import train
 
-import legged.tools.train
 from legged.errors import ConfigError, RunError
 from legged.learning import run_folder as runs
 from legged.learning.run_folder import checkpoints, code_state, create_run, discard_run, find_checkpoint, run_config
 from legged.mdp.actuator_network import NetworkWeights
 from legged.policies.restore import TrainedPolicy
-from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

@@ -5,14 +5,14 @@ import sys
 import types
 from pathlib import Path
 
+import legged.tools.train
 import pytest
 from helpers import TASK, TINY_TRAINING, call, run_folders, tiny_run
+from legged.tools import train
 from rsl_rl.utils import wandb_log_writer
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-import legged.tools.train
 from legged.learning.checkpoint import read_checkpoint
-from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from legged.errors import ConfigError
-from legged.tools.migration.expressions import CannotEvaluateError, Evaluator, Numbers
-from legged.tools.migration.found import Found, members
-from legged.tools.migration.modules import Tree
-from legged.tools.migration.translation import plain
+from legged.migration.expressions import CannotEvaluateError, Evaluator, Numbers
+from legged.migration.found import Found, members
+from legged.migration.modules import Tree
+from legged.migration.translation import plain
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

@@ -11,13 +11,13 @@ from legged.config.loader import to_dict
 from legged.config.schema import LeggedConfig
 from legged.config.yaml_files import parse
 from legged.envs import LeggedRobot
+from legged.migration.found import Found, Place
+from legged.migration.legged_gym_defaults import ENVIRONMENT, LEARNING
+from legged.migration.mapping import map_settings
+from legged.migration.robot_entries import map_robot
+from legged.migration.settings import SAME_REWARDS
+from legged.migration.writer import robot_yaml, task_yaml
 from legged.robots.robot import load_robot
-from legged.tools.migration.found import Found, Place
-from legged.tools.migration.legged_gym_defaults import ENVIRONMENT, LEARNING
-from legged.tools.migration.mapping import map_settings
-from legged.tools.migration.robot_entries import map_robot
-from legged.tools.migration.settings import SAME_REWARDS
-from legged.tools.migration.writer import robot_yaml, task_yaml
 
 pytestmark = pytest.mark.usefixtures("workplace", "own_registry")
 
@@ -149,14 +149,8 @@ def test_legged_gyms_own_settings_that_mean_nothing_here_are_not_listed(migrated
 def test_a_robot_that_is_not_here_is_said_with_its_commands(migrated):
     text = GO2.replace("'FOOT'", "'foot'")
     result = migrated(text, "--out", "there")
-    assert (
-        "  python -m legged.tools.add_robot resources/robots/hound/urdf/hound.urdf --name hound_of_them --out there/robots\n"
-        in result.out
-    )
-    assert (
-        "  python -m legged.tools.migrate fork_config.py --robot there/robots/hound_of_them --out there --force\n"
-        in result.out
-    )
+    assert "  legged robot add resources/robots/hound/urdf/hound.urdf --name hound_of_them --out there/robots\n" in result.out
+    assert "  legged migrate fork_config.py --robot there/robots/hound_of_them --out there --force\n" in result.out
     assert result.data["robot"] == "robots/hound_of_them"
     assert result.data["control"]["stiffness"] == {"H": 40.0, "KFE": 80.0, "wheel": 1.0}
     assert "#   feet: [foot]" in result.text

@@ -7,11 +7,11 @@ import pytest
 from forks import ANYMAL_FLAT, BASE, FLAT, GO2, MIXINS, OUR_BASE, REGISTERED, TWO, built, line_of, written
 from helpers import call
 
+from legged.cli import migrate, train
 from legged.config import from_dict
 from legged.config.schema import STATE_TERMS
 from legged.config.yaml_files import read_yaml
 from legged.robots.robot import load_robot
-from legged.tools import migrate, train
 
 pytestmark = pytest.mark.usefixtures("workplace", "own_registry")
 
@@ -188,8 +188,8 @@ def test_the_only_configuration_may_be_given_another_name(migrated):
 
 def test_the_file_that_is_written_shows(migrated, capsys):
     result = migrated(ANYMAL_FLAT)
-    assert "see what it comes to: python train.py --task my_anymal_c_flat.yaml --show" in result.out
-    assert call(train.main, ["--task", str(result.path), "--sim_device", "cpu", "--show"]) == 0
+    assert "legged train my_anymal_c_flat.yaml --show\n" in result.out
+    assert call(train.main, [str(result.path), "--sim-device", "cpu", "--show"]) == 0
     shown = capsys.readouterr().out
     assert from_dict(read_yaml(Path(written(shown, "shown.yaml")))).commands.resampling_time_s == 4.0
 

@@ -10,11 +10,11 @@ import torch
 import warp as wp
 from devices import on_gpu
 from helpers import call
+from legged.tools.train import main
 from reference import heaps, random_states, roll
 
 from legged.errors import ConfigError
 from legged.physics.fused.constraint_solver import ConstraintSolver
-from legged.tools.train import main
 
 EVERY_ROW = """
 <mujoco>

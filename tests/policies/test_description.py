@@ -8,6 +8,7 @@ import pytest
 import torch
 from helpers import CALM, ENGINE, TASK, call, small_config, small_task, tiny_run
 
+from legged import unit
 from legged.config.schema import ObservationGroupConfig
 from legged.envs import LeggedRobot
 from legged.learning.runner import Runner
@@ -219,24 +220,25 @@ def test_gains_are_a_number_for_each_joint_whatever_is_drawn_for_them():
     assert told["default_joint_angles"] == usual["default_joint_angles"]
 
 
-def test_a_term_of_the_users_is_described_by_its_docstring():
+def test_a_user_defined_term_is_described_by_its_docstring_and_its_unit():
     class Mine(LeggedRobot):
         MIRRORED = {**LeggedRobot.MIRRORED, "feet": "feet", "bare": "same"}
 
+        @unit("1")
         def _obs_feet(self):
             """Which feet are on the ground,
-            in the world frame [1].
+            in the world frame [m].
 
             Not part of the formula [m].
             """
             return self.contacts.in_contact.float()
 
-        def _obs_bare(self):
+        def _obs_bare(self):  # without docstring and unit
             return self.base_pos[:, 2:]
 
     cfg = small_config()
     cfg.observations.groups["actor"] = ObservationGroupConfig(("feet", "bare"))
     feet, bare = describe(Mine(cfg))["observation"]
-    assert feet["formula"] == "Which feet are on the ground, in the world frame [1]."
+    assert feet["formula"] == "Which feet are on the ground, in the world frame [m]."
     assert (feet["unit"], feet["frame"], feet["size"]) == ("1", "world frame", 4)
     assert (bare["unit"], bare["frame"], bare["formula"]) == (None, None, None)

@@ -7,13 +7,13 @@ import numpy as np
 import onnx
 import pytest
 from helpers import call
+from legged.tools.playback import main
 from onnx import TensorProto, helper, numpy_helper
 
 from legged.errors import ConfigError
 from legged.evaluation.playback import play
 from legged.policies.foreign import ForeignPolicy, Layout, read_layout
 from legged.robots.robot import load_robot
-from legged.tools.playback import main
 
 WIDTH = 12 + 3 + 1 + 2 + 2 + 12 + 12 + 3 + 2  # of holosoma's layout for twelve joints
 

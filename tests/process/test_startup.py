@@ -62,8 +62,9 @@ def test_a_machine_without_git_hears_nothing_of_it(tmp_path):
 
 
 def test_the_package_lists_its_commands_and_knows_their_short_names(capsys):
-    from legged.__main__ import main
     from legged.commandline.listing import tools
+
+    from legged.__main__ import main
 
     assert {"legged.tools.train", "legged.tools.play", "legged.tools.evaluate", "legged.tools.compare"} <= tools().keys()
     assert main([]) == 0

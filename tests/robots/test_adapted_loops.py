@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from helpers import call
 
+from legged.cli.robot import add
 from legged.robots.importing.adapted import robot_spec_of
 from legged.robots.importing.mend import mend
 from legged.robots.importing.mjcf import read_mjcf
 from legged.robots.importing.text import mjcf_of
 from legged.robots.robot import load_robot
-from legged.tools import add_robot
 
 ARMS = """
 <mujoco>
@@ -130,7 +130,7 @@ def test_hinges_without_a_motor_become_passive_joints(tmp_path, capsys):
         f'<mujoco><worldbody><body name="trunk"><freejoint/><geom type="box" size="0.25 0.08 0.05" mass="6"/>{legs}</body>'
         f"</worldbody><actuator>{motors}</actuator></mujoco>"
     )
-    assert call(add_robot.main, ["springs.xml", "--out", "mine"]) == 0, capsys.readouterr().err
+    assert call(add.main, ["springs.xml", "--out", "mine"]) == 0, capsys.readouterr().err
     assert "are called differently: fl -> fl_passive" in capsys.readouterr().out
     robot = load_robot("mine/springs")
     assert robot.joint_names == tuple(f"{n}_{joint}" for n in sides for joint in ("hip", "knee"))

@@ -49,9 +49,9 @@ def experiments_parts(records: Sequence[Record], beside: Path, ending: str, seed
     head = list(rows[0]) if rows else []
     shown = [name for name in head if any(text_of(row[name]) not in EMPTY for row in rows)]
     text = (
-        f"{len(newest)} runs, newest first, made by `python -m legged.tools.experiments`. The column `what changed` shows the"
+        f"{len(newest)} runs, newest first, made by `legged runs`. The column `what changed` shows the"
         " note of a run (`--note`), else its name and the settings that differ from its task's files. RMSE, falls and stairs"
-        " come from `python -m legged.tools.evaluate`, without noise and pushes; stairs are the highest steps that nine of"
+        " come from `legged evaluate`, without noise and pushes; stairs are the highest steps that nine of"
         " ten robots climb, and nine of ten descend. Terrain level, return and velocity error are those at the end of"
         " training, with noise and pushes. A + marks a commit with uncommitted changes."
     )

@@ -84,7 +84,7 @@ def report_parts(record: Record) -> list[Part]:
         parts += [Heading("Curves"), Paragraph("This folder holds no TensorBoard file with values.")]
     parts += evaluation_parts(record.results, record.another_policy) or [
         Heading("Evaluation"),
-        Paragraph(f"None yet: `{command_on(record, 'evaluate', '--load_run')}`"),
+        Paragraph(f"None yet: `{command_on(record, 'evaluate')}`"),
     ]
     if record.problems:
         parts += [Heading("What could not be read"), *(Paragraph(text) for text in record.problems)]
@@ -95,13 +95,10 @@ def report_parts(record: Record) -> list[Part]:
     return parts
 
 
-def command_on(record: Record, tool: str, *before: str) -> str:
-    """Return the command that applies a tool to a run, quoted for a shell. The run's folder follows the words `before`. The
-    command names the files of user-defined tasks, and the folder by its path, because its experiment may have another name
-    than its task.
-    """
+def command_on(record: Record, command: str) -> str:
+    """Return a command on a run, quoted for a shell, with the option that names its user-defined task."""
     given = Given(record.task) if record.given is None else record.given
-    return shlex.join(["python", "-m", f"legged.tools.{tool}", *given.flags, *before, relative(record.folder)])
+    return shlex.join(["legged", *command.split(), *given.flags, relative(record.folder)])
 
 
 def _facts(record: Record) -> list[list[Cell]]:
@@ -157,7 +154,7 @@ def _differences(record: Record) -> list[Part]:
     heading = Heading("Settings other than the task's")
     found = from_task_file(record)
     if found is None:
-        told = f", and `{command_on(record, 'report')}` says where it is" if record.given is not None else ""
+        told = f", and `{command_on(record, 'runs report')}` says where it is" if record.given is not None else ""
         text = f"There is no task '{record.task}' here to compare with{told}; config.yaml has all settings."
         changes = {} if record.given is None else record.given.changes
         set_there: list[list[Cell]] = [[Mono(path), Mono(words(value))] for path, value in changes.items()]
@@ -232,7 +229,7 @@ def report_at_end(folder: Path, film_with: Sequence[str] | None) -> None:
 
 def _film_apart(folder: Path, flags: Sequence[str]) -> str:
     """Film the policy in another process; return the reason if there is no film, else an empty text."""
-    command = [sys.executable, "-m", "legged.tools.report", str(folder), "--film", *flags]
+    command = [sys.executable, "-m", "legged", "runs", "report", str(folder), "--film", *flags]
     alone = {key: text for key, text in child_environment().items() if key not in ("RANK", "LOCAL_RANK", "WORLD_SIZE")}
     alone["CUDA_VISIBLE_DEVICES"] = ""  # it draws on the CPU, and a GPU's memory may be full
     try:

@@ -1,28 +1,11 @@
 """Which policy is on show: a run folder, of which the newest checkpoint counts, or the best, also while it is trained."""
 
-import argparse
 import time
-from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from legged.commandline.arguments import overrides
 from legged.config import TaskConfig
-from legged.errors import ConfigError, suggest
-from legged.learning.run_folder import (
-    BEST,
-    BEST_MODEL,
-    CONFIG_FILE,
-    LOGS,
-    checkpoints,
-    experiment_folder,
-    find_checkpoint,
-    run_config,
-    shipped_policy,
-)
-from legged.process.paths import data_folder, exists, relative
-from legged.registry import task_config
+from legged.learning.run_folder import BEST, BEST_MODEL, checkpoints, find_checkpoint, newest_run, run_config, run_named
 
 NEWEST = "newest"
 """The checkpoint that is followed, unless it is the BEST, which a training keeps where it evaluates its policy."""
@@ -40,71 +23,19 @@ class Watched:
     """Which checkpoint of the training is followed at first: NEWEST or BEST."""
 
 
-def find_watched(args: argparse.Namespace) -> Watched:
-    """Find what --task, --load_run and --checkpoint name: the newest run of all, or of the task, or else the policy that is
-    shipped for the task. The run may be so young that it has no checkpoint yet.
+def find_watched(name: str | None, checkpoint: int | str | None) -> Watched:
+    """Return the run that `name` names as POLICY; without a name the newest run of all. The run may be so young that it has
+    no checkpoint yet. `checkpoint` is an iteration, BEST, or None for the newest.
 
     Raises:
-        ConfigError: there is none, it is of another task, or it has no such checkpoint.
+        ConfigError: there is no such run, or it has no such checkpoint.
     """
-    flags = [(key, value) for key, value in overrides(args) if key == "train.runner.experiment_name"]
-    task = None if args.task is None else task_config(args.task, flags)
-    experiment = (
-        experiment_folder(task) if task is not None else LOGS / args.experiment_name if args.experiment_name else None
-    )
-    folder = _newest(task, experiment) if args.load_run in (None, "-1") else _named(args.load_run, experiment)
+    folder = newest_run("POLICY") if name is None else run_named(name, "POLICY", begun=True)
     cfg = run_config(folder)
-    if args.task is not None and cfg.task != args.task:
-        raise ConfigError(f"--load_run: {relative(folder)} was trained on '{cfg.task}', not on '{args.task}'")
-    if args.checkpoint in (None, -1):
+    if checkpoint in (None, -1):
         return Watched(cfg, folder)
-    find_checkpoint(folder, args.checkpoint)
-    return Watched(cfg, folder, choice=BEST) if args.checkpoint == BEST else Watched(cfg, folder, args.checkpoint)
-
-
-def _newest(task: TaskConfig | None, experiment: Path | None) -> Path:
-    """Return the run folder that was begun or written to last, or else what is shipped for the task."""
-    where = LOGS.glob("*/*") if experiment is None else experiment.glob("*")
-    runs = [folder for folder in where if exists(folder / CONFIG_FILE)]
-    if runs:
-        return max(runs, key=_last_written)
-    shipped = None if task is None else shipped_policy(task.task)
-    if shipped is None:
-        place = relative(experiment or LOGS)
-        instead = (
-            "train one first" if task is not None else "train one first, or name a task whose policy is shipped (--task)"
-        )
-        raise ConfigError(f"--load_run: there is no run in {place}; {instead}")
-    return shipped
-
-
-def _named(name: str, experiment: Path | None) -> Path:
-    """Return the run folder of that name: a path, a name in the experiment or in any, or a policy that is shipped."""
-    shipped = data_folder("resources") / "policies"
-    parents = [*([experiment] if experiment is not None else []), Path(), LOGS, shipped.parent.parent, shipped]
-    with suppress(OSError, ValueError):  # no name of a folder
-        for folder in (parent / name for parent in parents if name.strip()):
-            if exists(folder / CONFIG_FILE):
-                return folder
-        found = [folder for folder in LOGS.glob("*/*") if folder.name == name and exists(folder / CONFIG_FILE)]
-        if found:
-            return max(found, key=_last_written)
-    known = [f"{run.parent.name}/{run.name}" for run in LOGS.glob("*/*") if exists(run / CONFIG_FILE)]
-    known += [policy.name for policy in shipped.glob("*") if checkpoints(policy)]
-    raise ConfigError(f"--load_run: there is no run '{name}'{suggest(name, known, 'runs')}")
-
-
-def _last_written(folder: Path) -> float:
-    """Return when a run was begun, or its latest checkpoint written [s since 1970]."""
-    return max(_stamps([folder / CONFIG_FILE, *checkpoints(folder).values()]), default=0.0)
-
-
-def _stamps(paths: Iterable[Path]) -> list[float]:
-    found = []
-    for path in paths:
-        with suppress(OSError):  # it has gone in between
-            found.append(path.stat().st_mtime)
-    return found
+    find_checkpoint(folder, checkpoint)
+    return Watched(cfg, folder, choice=BEST) if checkpoint == BEST else Watched(cfg, folder, int(checkpoint or 0))
 
 
 class CheckpointFollower:
@@ -152,6 +83,8 @@ class CheckpointFollower:
 
 
 def age(path: Path) -> float | None:
-    """Return how long ago a file was written [s]; None if it has gone."""
-    stamps = _stamps([path])
-    return max(0.0, time.time() - stamps[0]) if stamps else None
+    """Return how long ago a file was written [s]; None if it has been removed."""
+    try:
+        return max(0.0, time.time() - path.stat().st_mtime)
+    except OSError:
+        return None

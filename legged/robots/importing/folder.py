@@ -50,7 +50,7 @@ def write_folder(folder: Path, tree: Tree, guesses: Guesses, source: str, licenc
     """
     make_folder(folder)
     files = _write_meshes(folder / "meshes", tree)
-    remarks = [f"Written by legged.tools.add_robot from {source}: see PROVENANCE.md. Metres, kilograms, radians."]
+    remarks = [f"Written by legged robot add from {source}: see PROVENANCE.md. Metres, kilograms, radians."]
     names = {name: path.relative_to(folder) for name, path in files.items()}
     write_text(folder / f"{tree.name}.xml", mjcf_of(tree, names, guesses.spawn_height, remarks))
     write_text(folder / "robot.yaml", robot_yaml(tree, guesses))
@@ -89,7 +89,7 @@ def robot_yaml(tree: Tree, guesses: Guesses) -> str:
     """Return the text of robot.yaml, with what was guessed in comments."""
     g = guesses
     lines = [
-        f"# {tree.name}: how the task uses {tree.name}.xml. Written by legged.tools.add_robot; sources: PROVENANCE.md.",
+        f"# {tree.name}: how the task uses {tree.name}.xml. Written by legged robot add; sources: PROVENANCE.md.",
         "# Lines marked 'guess' were not in the file: look at them. Patterns are parts of names; the longest match wins.",
         *(f"# {line}" for line in tree.said),
         f"model: {_name(f'{tree.name}.xml')}",
@@ -145,7 +145,7 @@ def _provenance(tree: Tree, source: str, licence: str) -> str:
         [
             f"# Where the numbers of {tree.name} come from",
             "",
-            f"`{tree.name}.xml` and the meshes were written by `python -m legged.tools.add_robot` from `{source}`.",
+            f"`{tree.name}.xml` and the meshes were written by `legged robot add` from `{source}`.",
             f"Licence: {licence}. What was done to the numbers:",
             "",
             *(f"- {line}" for line in tree.said),
@@ -159,7 +159,7 @@ def _provenance(tree: Tree, source: str, licence: str) -> str:
 def task_yaml(name: str, robot: str, extends: str, symmetric: bool) -> str:
     """Return the text of a task on flat ground; `robot` is a name, or a path relative to the task's file."""
     lines = [
-        f"# {name} follows velocity commands on flat ground. Written by legged.tools.add_robot.",
+        f"# {name} follows velocity commands on flat ground. Written by legged robot add.",
         f"extends: {_name(extends)}",
         f"robot: {_name(robot)}",
     ]

@@ -1,0 +1,1 @@
+"""The `legged` command: one module for each sub-command."""

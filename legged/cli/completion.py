@@ -1,0 +1,116 @@
+"""Print a completion script for a shell: `legged completion bash > ~/.legged-completion`.
+
+The script completes commands, options, tasks, runs, and dotted keys of the configuration (`train.runner.<TAB>`). Source it in
+the shell's start-up file, and write it again after an update of the package.
+"""
+
+import argparse
+import shlex
+import sys
+from collections.abc import Iterable
+from importlib import import_module
+
+import shtab
+
+from legged.cli.main import COMMANDS
+from legged.commandline.command import run_main
+from legged.config.reference import fields
+from legged.envs import BaseTask, LeggedRobot
+from legged.physics.fields import FIELDS
+from legged.process.command_parser import CommandParser
+from legged.process.paths import data_folder
+from legged.registry import CLASSES
+from legged.terrain import TERRAIN_TYPES
+
+COMPLETED = {"task": "names", "policy": "names", "task_option": "names", "runs": "names", "overrides": "keys"}
+"""Argument -> the shell function that lists its values: names of tasks and runs, or keys of the configuration."""
+SCRIPT = """
+_legged_names() {{ (cd {cfg} && printf '%s\\n' *.yaml | sed 's/[.]yaml$//'); ls -d logs/*/* 2>/dev/null | sed 's/^logs.//'; }}
+_legged_keys() {{
+cat <<'END'
+{keys}
+END
+}}
+# Keys that begin with $1, up to the next dot.
+_legged_next_keys() {{ _legged_keys | sed -n "s/^\\\\($1[^.]*[.]\\\\{{0,1\\\\}}\\\\).*/\\\\1/p" | sort -u; }}
+"""
+IN_BASH = """
+_legged_complete_names() { compgen -W "$(_legged_names)" -- "$1"; }
+_legged_complete_keys() { compopt -o nospace; _legged_next_keys "$1"; }
+"""
+IN_ZSH = """
+_legged_complete_names() { compadd -- ${(f)"$(_legged_names)"} }
+_legged_complete_keys() { compadd -S '' -- ${(f)"$(_legged_next_keys "$PREFIX")"} }
+"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def build_parser() -> CommandParser:
+    """Return the parser of the command line."""
+    parser = CommandParser(
+        "legged completion",
+        __doc__,
+        "legged completion bash > ~/.legged-completion",
+        "legged completion zsh > ~/.legged-completion",
+    )
+    parser.add_argument("shell", choices=("bash", "zsh"), help="the shell that reads the script")
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    shell = build_parser().parse_args(argv).shell
+    kinds = [getattr(import_module(module), name) for name, module in CLASSES.items()]
+    lists = SCRIPT.format(cfg=shlex.quote(str(data_folder("cfg"))), keys="\n".join(keys_of(kinds)))
+    print(shtab.complete(whole_parser(), shell, preamble=lists + (IN_BASH if shell == "bash" else IN_ZSH)))
+    return 0
+
+
+def whole_parser() -> argparse.ArgumentParser:
+    """Return a parser of all commands, whose arguments know how they are completed."""
+    whole = argparse.ArgumentParser("legged")
+    commands = whole.add_subparsers()
+    groups: dict[str, argparse._SubParsersAction] = {}
+    for name, (module, summary) in COMMANDS.items():
+        group, _, inside = name.partition(" ")
+        parser = import_module(module).build_parser()
+        for action in parser._actions:
+            if action.dest in COMPLETED:
+                function = f"_legged_complete_{COMPLETED[action.dest]}"
+                action.complete = {"bash": function, "zsh": function}
+        if inside and group not in groups:
+            parent = commands.choices.get(group) or commands.add_parser(group, help=f"commands of legged {group}")
+            for action in parent._get_positional_actions():
+                parent._remove_action(action)
+            groups[group] = parent.add_subparsers()
+        place = groups[group] if inside else commands
+        place.add_parser(inside or group, help=summary, parents=[parser], add_help=False, conflict_handler="resolve")
+    return whole
+
+
+def keys_of(kinds: Iterable[type[BaseTask]]) -> list[str]:
+    """Return `key=` for all fields that tasks of these classes have, with the entries of maps by term, terrain type or
+    property of the model.
+    """
+    found: set[str] = set()
+    for kind in kinds:
+        entries: dict[str, Iterable[str]] = {
+            "rewards.scales": kind.terms("_reward_"),
+            "observations.scales": kind.terms("_obs_"),
+            "observations.noise": kind.terms("_obs_"),
+            "domain_rand.ranges": FIELDS,
+        }
+        if issubclass(kind, LeggedRobot):
+            entries |= {"terrain.proportions": TERRAIN_TYPES, "terrain.sizes": TERRAIN_TYPES}
+        for text in fields(kind.Config):
+            if not text.is_section:
+                found |= {f"{text.path.replace('<name>', group)}=" for group in ("actor", "critic")}
+            found |= {f"{text.path}.{name}=" for name in entries.get(text.path, ())}
+    return sorted(found)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,157 @@
+"""Serve a simulated robot over UDP: `legged deploy robot anymal_c --terrain stairs_up`.
+
+C MuJoCo simulates the robot in real time on this machine, with its own time step, behind a link that may delay and lose
+packets. The command prints the port at which it listens; `python -m legged.deploy exported --robot udp:127.0.0.1:PORT` runs a
+policy on it.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from legged.commandline.command import run_main
+from legged.config import parse_override
+from legged.config.schema import SimConfig, TerrainConfig
+from legged.deploy.contract import SCANS, Contract, read_contract
+from legged.deploy.pace import take_priority
+from legged.errors import ConfigError
+from legged.mdp.actuator import with_rotors
+from legged.process.command_parser import CommandParser
+from legged.process.paths import make_folder, ready_to_write, replacing, write_text
+from legged.robots.robot import Robot, load_robot
+from legged.simulated_robot.film import POSES
+from legged.simulated_robot.motors import Motors, motors_config
+from legged.simulated_robot.robot import SimulatedRobot
+from legged.simulated_robot.server import Server
+from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, terrain_type
+
+LISTENING = "listening at "
+"""What the line with the address begins with."""
+REPORT = "report.json"
+PRIORITY = 10
+"""Below that of the program."""
+BORDER = 10.0
+"""Level ground around the tile [m]."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def build_parser() -> CommandParser:
+    """Return the parser of the command line."""
+    parser = CommandParser(
+        "legged deploy robot",
+        __doc__,
+        "legged deploy robot anymal_c",
+        "legged deploy robot go2 --terrain stairs_up --size 0.12 --latency 0.01 --loss 0.01",
+        "legged deploy robot go2 control.actuator.model=dc_motor 'control.actuator.delay=[5, 10]'",
+    )
+    parser.add_argument("robot", metavar="ROBOT", help="name of a robot, or its folder")
+    add_simulation_arguments(parser)
+    parser.add_argument(
+        "--contract", type=Path, help="policy.json whose motors and map the robot has; ideal motors without one"
+    )
+    parser.add_argument(
+        "--out", type=Path, help=f"folder for {REPORT} and {POSES}, 25 poses a second of the first half minute"
+    )
+    parser.add_argument("--seconds", type=float, default=3600.0, help="end after so long; default 3600")
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_intermixed_args(argv)
+    check_simulation(args)
+    if not args.seconds > 0.0:
+        raise ConfigError(f"--seconds: must be above 0, got {args.seconds:g}")
+    if args.out is not None:
+        ready_to_write(args.out)
+        make_folder(args.out)
+    robot = load_robot(args.robot, "ROBOT")
+    sim = SimConfig(dt=args.sim_dt, iterations=100, ls_iterations=50)
+    contract = None if args.contract is None else read_contract(args.contract)
+    (robot, motors), scan = motors_of(args, robot, contract), scan_of(contract)
+    server = Server(SimulatedRobot(robot, terrain_of(args), sim, motors, scan), args.latency, args.loss, args.seed)
+    take_priority(PRIORITY)  # motors and sensors of a robot do not wait for other processes either
+    print(f"{LISTENING}127.0.0.1:{server.port}", flush=True)
+    report = server.run(args.seconds)
+    if args.out is not None:
+        with replacing(args.out / POSES) as part:
+            np.save(part, np.array(server.poses))
+        write_text(args.out / REPORT, json.dumps(report, indent=1))
+    print(json.dumps(report), flush=True)
+    return 0
+
+
+def add_simulation_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the flags that say what is simulated."""
+    parser.add_argument("--terrain", metavar="TYPE", help="type of the tile it starts on, e.g. stairs_up; a plane by default")
+    parser.add_argument("--size", type=float, help="of the tile's type, in its unit, e.g. the height of a step [m]")
+    parser.add_argument(
+        "--cell", type=float, default=0.1, help="edge of the tile's cells [m], of which treads have whole ones; default 0.1"
+    )
+    parser.add_argument("--sim-dt", type=float, default=0.002, help="physics step [s]; default 0.002")
+    parser.add_argument("--latency", type=float, default=0.0, help="of packets, in each direction [s]; default 0")
+    parser.add_argument("--loss", type=float, default=0.0, help="share of packets lost, in each direction; default 0")
+    parser.add_argument("--seed", type=int, default=1, help="of the loss, and of the motors' delay; default 1")
+    parser.add_argument("--ideal-motors", action="store_true", help="whatever the policy was trained with")
+    parser.add_argument(
+        "overrides", nargs="*", metavar="key=value", help="of control.actuator, e.g. control.actuator.model=ideal"
+    )
+
+
+def check_simulation(args: argparse.Namespace) -> None:
+    """Look for numbers that make no sense.
+
+    Raises:
+        ConfigError: there is one.
+    """
+    largest = 0.0
+    if args.terrain is not None:
+        largest = terrain_type(args.terrain, "--terrain").largest
+    elif args.size is not None:
+        raise ConfigError("--size: a plane has no size; name a type of tiles with --terrain")
+    for flag, value, low, high in (
+        ("--size", args.size, 0.0, largest),
+        ("--cell", args.cell, 0.02, 1.0),
+        ("--sim-dt", args.sim_dt, 1e-4, 0.02),
+        ("--latency", args.latency, 0.0, 1.0),
+        ("--loss", args.loss, 0.0, 0.9),
+    ):
+        if value is not None and not low <= value <= high:
+            raise ConfigError(f"{flag}: must be between {low:g} and {high:g}, got {value:g}")
+
+
+def motors_of(args: argparse.Namespace, robot: Robot, contract: Contract | None) -> tuple[Robot, Motors]:
+    """Return the robot with the motors that the flags ask for, their rotors and their laws: those of the training of the
+    policy in `contract`, unless told otherwise.
+
+    Raises:
+        ConfigError: as `motors_config`.
+    """
+    changes = [parse_override(text) for text in args.overrides]
+    cfg, counted = motors_config(robot, contract, args.ideal_motors, changes, args.sim_dt)
+    return with_rotors(robot, cfg), Motors(robot, cfg, args.sim_dt, counted, args.seed)
+
+
+def scan_of(contract: Contract | None) -> str:
+    """Return what a point of the heights reads for the policy in `contract`."""
+    term = None if contract is None else contract.sources.get("heights")
+    return SCANS[0] if term is None else term.scan
+
+
+def terrain_of(args: argparse.Namespace) -> Terrain | None:
+    """Return the ground that the flags ask for: one tile, and level ground around it."""
+    if args.terrain is None:
+        return None
+    cfg = TerrainConfig(mesh_type="height_map", border_size=BORDER, horizontal_scale=args.cell)
+    size = TERRAIN_TYPES[args.terrain].sized(0.5, cfg.scale) if args.size is None else args.size
+    return Terrain.of_tiles([[TileSpec(args.terrain, size)]], cfg, np.random.default_rng(args.seed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

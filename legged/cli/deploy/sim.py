@@ -1,0 +1,225 @@
+"""Run the robot's program against a simulated robot: `legged deploy sim anymal_c_proprio`.
+
+The command exports the policy if necessary. It starts the simulated robot in one process and the program of the real robot
+(`python -m legged.deploy`) in another one; they talk over UDP. At the end it prints how far the robot got.
+"""
+
+import argparse
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from legged.cli.deploy.robot import LISTENING, REPORT, add_simulation_arguments, check_simulation, motors_of, terrain_of
+from legged.commandline.arguments import POLICY_HELP
+from legged.commandline.command import EXIT_WRONG_INPUT, run_main
+from legged.config import LeggedConfig
+from legged.deploy.__main__ import add_program_arguments, limits_of
+from legged.deploy.contract import Contract, read_contract
+from legged.errors import ConfigError, RunError
+from legged.learning.run_folder import CONFIG_FILE, checkpoints, run_config
+from legged.policies.export import EXPORTED, export
+from legged.policies.restore import policy_of, restore, undisturbed
+from legged.process.command_parser import CommandParser, add_import_argument
+from legged.process.paths import exists, ready_to_write, relative
+from legged.process.startup import INTERRUPTED, in_main_thread
+from legged.registry import import_tasks
+from legged.robots.robot import Robot, load_robot
+from legged.simulated_robot.film import make_film
+
+ROOM_MB = 16.0
+"""What the disk must have room for: the exported policy and the log [MiB]."""
+END_S = 20.0
+"""A process that was asked to end must do so within so long [s]."""
+DID_NOT_RUN = (EXIT_WRONG_INPUT, INTERRUPTED)
+"""Exit codes of a program that has moved no robot."""
+SIMULATED = ("terrain", "size", "cell", "sim_dt", "latency", "loss", "seed")
+PASSED_ON = ("input", "gamepad", "commands", "seconds", "stand_seconds", "max_tilt", "max_age", "max_missed")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def build_parser() -> CommandParser:
+    """Return the parser of the command line."""
+    parser = CommandParser(
+        "legged deploy sim",
+        __doc__,
+        "legged deploy sim anymal_c_proprio",
+        "legged deploy sim anymal_c_proprio --terrain stairs_up --size 0.17 --film",
+        "legged deploy sim anymal_c_proprio 'control.actuator.delay=[4, 4]'",
+    )
+    parser.add_argument("policy", metavar="POLICY", help=f"an exported folder or its ONNX file, {POLICY_HELP}")
+    add_import_argument(parser)
+    parser.add_argument("--robot", metavar="ROBOT", help="name or folder of the robot; the policy's by default")
+    add_simulation_arguments(parser)
+    add_program_arguments(parser)
+    parser.add_argument("--out", type=Path, help="folder for log.npz and report.json; logs/deploy/<task> by default")
+    parser.add_argument("--film", action="store_true", help="draw the first half minute as film.mp4")
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_intermixed_args(argv)
+    limits_of(args)
+    check_simulation(args)
+    if args.commands is not None and not exists(args.commands):
+        raise ConfigError(f"--commands: there is no file {args.commands}")
+    if args.module:
+        import_tasks(args.module)
+    exported = _exported(args.policy)
+    contract = read_contract(exported / "policy.json")
+    robot = _simulated(args.robot, exported, contract)
+    motors_of(args, robot, contract)
+    folder = args.out or Path("logs") / "deploy" / contract.task
+    ready_to_write(folder, ROOM_MB)
+    folder.mkdir(parents=True, exist_ok=True)
+    code, report = _run_both(args, exported, str(robot.folder), folder)
+    if report is None:
+        return code
+    print(f"{relative(folder / REPORT)}: {_told(report)}")
+    if args.film:
+        make_film(robot, terrain_of(args), folder)
+    return code
+
+
+def _exported(name: str) -> Path:
+    """Return the folder with the export that `name` means; one is made of a run, where its newest checkpoint has none yet, or
+    of a shipped policy.
+
+    Raises:
+        ConfigError: there is none of that name, or it is of a task without commands.
+    """
+    given = Path(name).parent if name.endswith(".onnx") else Path(name)
+    if exists(given / "policy.onnx"):
+        return given
+    if exists(given / EXPORTED / "policy.onnx") and not _outdated(given):
+        return given / EXPORTED
+    policy = policy_of(name)
+    if not isinstance(policy.cfg, LeggedConfig):
+        raise ConfigError(f"POLICY: '{policy.cfg.task}' follows no commands; the program is for legged robots that do")
+    folder = policy.output("deploy") / EXPORTED
+    changes = [*undisturbed(1, 1.0), ("sim.physics", "mujoco")]
+    task, act = restore(policy, changes, torch.device("cpu"), graph=False)
+    export(task, act.network, folder, trained=policy.cfg)
+    print(f"exported {relative(folder / 'policy.onnx')}")
+    return folder
+
+
+def _outdated(run: Path) -> bool:
+    """Return whether the export in a run folder is older than the run's newest checkpoint: the training has gone on."""
+    saved = checkpoints(run)
+    return bool(saved) and saved[max(saved)].stat().st_mtime > (run / EXPORTED / "policy.onnx").stat().st_mtime
+
+
+def _simulated(given: str | None, exported: Path, contract: Contract) -> Robot:
+    """Return the robot that is simulated: the one `given`, else the policy's. Of a robot of one's own a contract has the name
+    alone; its folder is known to the configuration of the run that the export lies in.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if given is not None:
+        return load_robot(given, "--robot")
+    for folder in exported.absolute().parents[:2]:  # of an export of one checkpoint, and of those of all
+        if exists(folder / CONFIG_FILE):
+            cfg = run_config(folder)
+            if isinstance(cfg, LeggedConfig) and Path(cfg.robot).name == contract.robot:
+                return load_robot(cfg.robot, "--robot")
+    try:
+        return load_robot(contract.robot)
+    except ConfigError as error:
+        said = f"{relative(contract.path)}: robot: '{contract.robot}' does not come with this package"
+        raise ConfigError(f"{said}; --robot FOLDER says where it lies") from error
+
+
+def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path) -> tuple[int, dict[str, Any] | None]:
+    """Run the simulated robot and the program to their ends; return the program's exit code and the robot's report, None if
+    the program did not run.
+
+    Raises:
+        RunError: the simulated robot does not start, fails, or does not end.
+    """
+    report = folder / REPORT
+    report.unlink(missing_ok=True)  # of another run
+    simulator = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "legged", "deploy", "robot", robot, "--out", str(folder)),
+            *(["--ideal-motors"] if args.ideal_motors else []),
+            *("--contract", str(exported / "policy.json"), *_flags(args, SIMULATED), *args.overrides),
+        ],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,  # Ctrl-C is for the program, which brakes the robot first
+    )
+    program = None
+    if in_main_thread():  # who ends this process means all three
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    try:
+        assert simulator.stdout is not None
+        line = simulator.stdout.readline()
+        if not line.startswith(LISTENING):
+            raise RunError(f"the simulated robot did not start (exit code {simulator.wait(END_S)})")
+        address = line.removeprefix(LISTENING).strip()
+        program = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "legged.deploy", str(exported), "--robot", f"udp:{address}"),
+                *("--log", str(folder / "log.npz"), *_flags(args, PASSED_ON)),
+            ]
+        )
+        code = _wait(program)
+        if code in DID_NOT_RUN:  # it has said why
+            return code, None
+        try:
+            simulator.communicate(timeout=END_S)
+        except subprocess.TimeoutExpired as error:
+            raise RunError("the simulated robot did not hear the program's goodbye") from error
+        if simulator.returncode:
+            raise RunError(f"the simulated robot failed (exit code {simulator.returncode}): there is no report of this run")
+    finally:
+        try:
+            if program is not None and program.poll() is None:
+                program.terminate()
+                program.wait(END_S)
+        finally:
+            simulator.kill()
+            simulator.wait()
+    return code, json.loads(report.read_text(encoding="utf-8"))
+
+
+def _wait(program: subprocess.Popen) -> int:
+    """Wait for the program, which a Ctrl-C of the terminal reaches by itself; return its exit code."""
+    while True:
+        try:
+            return program.wait()
+        except KeyboardInterrupt:
+            continue
+
+
+def _flags(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
+    """Return the flags of those names that were given, or have a default."""
+    given = {name: getattr(args, name) for name in names}
+    return [
+        word for name, value in given.items() if value is not None for word in (f"--{name.replace('_', '-')}", str(value))
+    ]
+
+
+def _told(report: dict[str, Any]) -> str:
+    """Say in one line what became of the robot."""
+    lost = report["lost"] / max(1, report["sent"] + report["received"])
+    lean, share = report["largest_lean"], 100.0 * lost
+    return (
+        f"{'fell' if report['fell'] else 'did not fall'}, {report['time']:.1f} s, {report['distance']:.2f} m away,"
+        f" {report['climbed']:+.2f} m higher, largest lean {lean:.2f} rad, {share:.1f} % of packets lost"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,87 @@
+"""Record episodes and list the worst: `legged episodes record anymal_c_flat --worst 1`.
+
+Robots run whole episodes under a policy. episodes.npz and .json hold every state, command, action, torque, contact and reward
+term; the episodes that went worst are listed. With --page or --worst each of those gets a page with a film next to plots, all
+with one cursor.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from legged.cli.episodes.common import (
+    add_listing_arguments,
+    add_recording_arguments,
+    check_listing,
+    device_of,
+    engine_from,
+    folder_of,
+    pages,
+    show,
+    wish_of,
+)
+from legged.commandline.arguments import POLICY_HELP, add_checkpoint_argument, register_given
+from legged.commandline.command import run_main
+from legged.episodes.ranking import check_ended
+from legged.episodes.rollout import check_wish, roll_out
+from legged.episodes.stored import ABOUT, ARRAYS, NO_NUMBERS, TIME_UP, Episodes, save_episodes
+from legged.policies.restore import policy_of
+from legged.process.command_parser import CommandParser
+from legged.process.paths import ready_to_write, relative
+
+STEP_BYTES = 1200
+"""Largest room that a control step of a robot takes on the disk [bytes]."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def build_parser() -> CommandParser:
+    """Return the parser of the command line."""
+    parser = CommandParser(
+        "legged episodes record",
+        __doc__,
+        "legged episodes record anymal_c_flat --worst 1",
+        "legged episodes record anymal_c --episodes 100 --sort torque --worst 3",
+    )
+    parser.add_argument("policy", metavar="POLICY", help=POLICY_HELP)
+    add_checkpoint_argument(parser)
+    add_recording_arguments(parser)
+    add_listing_arguments(parser)
+    parser.add_argument("--out", type=Path, help="folder for all files; episodes/ in the run folder by default")
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_intermixed_args(argv)
+    check_listing(args)
+    episodes, folder = _recorded(args)
+    show(episodes, folder, args)
+    return 0
+
+
+def _recorded(args: argparse.Namespace) -> tuple[Episodes, Path]:
+    """Record episodes of the policy that the command line names; return them and the folder where they are stored."""
+    register_given(args, "policy")
+    wish = wish_of(args)
+    device = device_of(args)
+    policy = policy_of(args.policy, args.checkpoint)
+    pages(args.page, wish.episodes)
+    if args.ended is not None:  # before the recording replaces an older one
+        terms = policy.cfg.terminations
+        check_ended(args.ended, [*terms.failures, *terms.time_outs, TIME_UP, NO_NUMBERS])
+    check_wish(policy, wish)
+    folder = args.out or folder_of(policy)
+    steps = round(policy.cfg.env.episode_length_s / policy.cfg.dt)
+    ready_to_write(folder, 8.0 + wish.episodes * steps * STEP_BYTES / 2**20)
+    episodes, cfg = roll_out(policy, wish, device, not args.no_graph, engine_from(args))
+    save_episodes(episodes, cfg, folder)
+    print(f"{policy.cfg.task}: {relative(policy.checkpoint)}, {len(episodes)} episodes in {episodes.about['physics']}")
+    print(f"written: {relative(folder / ARRAYS)} and {ABOUT}")
+    return episodes, folder
+
+
+if __name__ == "__main__":
+    sys.exit(main())

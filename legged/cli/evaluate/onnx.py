@@ -1,0 +1,274 @@
+"""ONNX policies in plain MuJoCo, foreign ones too: `legged evaluate onnx exported/policy.onnx`.
+
+One robot on a plane follows commands in C MuJoCo, and the velocities that it reaches are printed. They show whether model,
+frames, joint order and gains are those of the training. For an exported policy of this package, the policy.json beside it
+says which robot it controls and how; for a foreign one, --robot and --layout do. With --vx, --vy or --yaw a grid of commands
+is measured as by `legged evaluate grid`; with --rmse also which of several files, such as the checkpoints of a training, is
+the first that follows it.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from legged.commandline.command import run_main
+from legged.errors import ConfigError
+from legged.evaluation.playback import SETTLING_S, Played, follow, play
+from legged.evaluation.velocity_grid import AXES, AXIS, Grid, axis_values, check_size
+from legged.learning.run_folder import CONFIG_FILE
+from legged.policies.foreign import ForeignPolicy, Layout, read_layout
+from legged.policies.own_layout import was_trained_with_other_motors
+from legged.process.command_parser import CommandParser
+from legged.process.paths import exists, ready_to_write, relative, write_text
+from legged.robots.robot import Robot, load_robot
+
+COMMANDS = ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.8), (-0.5, 0.0, 0.0))
+"""vx, vy [m/s], yaw rate [rad/s]."""
+SECONDS, HOLD_S = 8.0, Grid.hold_s
+"""Default length of a single command, and of one of a grid [s]."""
+MOST_CELLS = 10_000
+"""Largest number of commands of a grid: each takes seconds of one robot."""
+RESULT = "onnx.json"
+EXPORTED = ("policy.onnx", "policy.json")
+"""Files of an exported folder: the network, and what it expects of a robot."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(evaluate, argv)
+
+
+def exported_file(name: str) -> Path | None:
+    """Return the ONNX file that POLICY names, itself or by its exported folder; None if it names something else."""
+    path = Path(name)
+    if path.suffix == ".onnx":
+        return path
+    inside = path / EXPORTED[0]
+    return inside if exists(inside) and not exists(path / CONFIG_FILE) else None
+
+
+def build_parser() -> CommandParser:
+    """Return the parser of the command line."""
+    parser = CommandParser(
+        "legged evaluate onnx",
+        __doc__,
+        "legged evaluate onnx logs/go1_flat/2026-11-22_05-38-19/exported --vx=-0.5:1:0.5 --rmse 0.2",
+        "legged evaluate onnx policy.onnx --robot g1 --layout holosoma",
+    )
+    parser.add_argument("policy", nargs="+", metavar="POLICY", help="ONNX files, or exported folders")
+    parser.add_argument("--robot", help="name or folder of the robot; that of the policy.json by default")
+    parser.add_argument(
+        "--layout",
+        help="what the observation is made of: a YAML file, 'holosoma', or a policy.json; the one beside the file by default",
+    )
+    parser.add_argument(
+        "--command", action="append", metavar="VX,VY,YAW", help="a command [m/s, m/s, rad/s]; may be repeated"
+    )
+    for axis, unit in AXES.items():
+        parser.add_argument(f"--{axis}", help=f"low:high:step of a grid of commands [{unit}]; {AXIS} if another is given")
+    parser.add_argument("--seconds", type=float, help=f"length of each command; {SECONDS:g}, of a grid's {HOLD_S:g}")
+    parser.add_argument("--friction", type=float, default=0.8, help="between robot and ground; 0.8 by default")
+    parser.add_argument("--rmse", type=float, help="largest mean velocity RMSE of a grid that is followed [m/s]")
+    parser.add_argument("--out", type=Path, help=f"folder for {RESULT}; without it nothing is written")
+    return parser
+
+
+def evaluate(argv: list[str] | None) -> int:
+    """Evaluate the policies that the arguments name; return the exit code.
+
+    Raises:
+        ConfigError: an argument or a file is wrong.
+    """
+    args = build_parser().parse_args(argv)
+    grid = _grid(args)
+    settling = grid.settle_s if grid else SETTLING_S
+    seconds = args.seconds if args.seconds is not None else grid.hold_s if grid else SECONDS
+    if not settling < seconds <= 1000.0:
+        raise ConfigError(f"--seconds: must be above {settling:g}, which it has to settle, and at most 1000, got {seconds}")
+    if not 0.0 <= args.friction <= 10.0:
+        raise ConfigError(f"--friction: must be from 0 to 10, got {args.friction}")
+    commands = [_command(text) for text in args.command or ()] or COMMANDS
+    files = [_file(name) for name in args.policy]
+    given = args.layout or str(_description(files))
+    if args.out is not None:
+        ready_to_write(args.out)
+    layout = read_layout(given, "--layout")
+    robot = load_robot(args.robot or _robot_in(given), "--robot")
+    policies = [ForeignPolicy(path, layout, robot) for path in files]
+    if given.endswith(".json") and was_trained_with_other_motors(Path(given)):
+        told = "the policy was trained with motors that are not ideal (its actuator says which); here they are"
+        print(f"warning: {given}: {told}", file=sys.stderr, flush=True)
+    if grid:
+        result = _follow_all(robot, layout, policies, files, args, grid)
+    else:
+        played = [play(robot, policy, commands, seconds, args.friction) for policy in policies]
+        for path, rows in zip(files, played, strict=True):
+            Console(width=100).print(_table(rows, path.name))
+        result = {
+            "robot": robot.name,
+            "friction": args.friction,
+            "seconds": seconds,
+            "policies": [
+                {"file": str(path), "commands": [_row(row) for row in rows]} for path, rows in zip(files, played, strict=True)
+            ],
+        }
+    if args.out is not None:
+        write_text(args.out / RESULT, json.dumps(result, indent=1))
+        print(f"written: {relative(args.out / RESULT)}")
+    return 0
+
+
+def _file(name: str) -> Path:
+    """Return the ONNX file that POLICY names.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    path = exported_file(name)
+    if path is None or not exists(path) or not path.is_file():
+        raise ConfigError(f"POLICY: there is no ONNX file '{name}', nor is it an exported folder (with {EXPORTED[0]})")
+    return path
+
+
+def _description(files: list[Path]) -> Path:
+    """Return the policy.json beside the first file.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    path = files[0].with_name(EXPORTED[1])
+    if not exists(path):
+        raise ConfigError(f"{files[0]}: no {EXPORTED[1]} lies beside it; --layout says what its observation is made of")
+    return path
+
+
+def _robot_in(layout: str) -> str:
+    """Return the robot that a policy.json names.
+
+    Raises:
+        ConfigError: the layout is another file.
+    """
+    if not layout.endswith(".json"):
+        raise ConfigError(f"--robot: is missing; the layout '{layout}' names none")
+    return str(json.loads(Path(layout).read_text(encoding="utf-8")).get("robot", ""))
+
+
+def _command(text: str) -> tuple[float, ...]:
+    """Return vx, vy [m/s] and yaw rate [rad/s].
+
+    Raises:
+        ConfigError: the text is not three numbers.
+    """
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 3 or not all(abs(value) <= 100.0 for value in values):
+        raise ConfigError(f"--command: expected three numbers of at most 100 like 0.5,0,0.2, got '{text}'")
+    return values
+
+
+def _grid(args: argparse.Namespace) -> Grid | None:
+    """Return the grid that the command line asks for; None without --vx, --vy and --yaw.
+
+    Raises:
+        ConfigError: it is malformed, or single commands are asked for too.
+    """
+    if all(getattr(args, axis) is None for axis in AXES):
+        if args.rmse is not None:
+            raise ConfigError("--rmse: is a limit of a grid of commands; add --vx, --vy or --yaw")
+        return None
+    if args.command:
+        raise ConfigError("--command: is no part of a grid; leave out either it or --vx, --vy and --yaw")
+    if args.rmse is not None and not 0.0 < args.rmse <= 100.0:
+        raise ConfigError(f"--rmse: must be above 0 and at most 100, got {args.rmse}")
+    given = {axis: AXIS if getattr(args, axis) is None else getattr(args, axis) for axis in AXES}
+    vx, vy, yaw = (axis_values(f"--{axis}", text) for axis, text in given.items())
+    grid = Grid(vx, vy, yaw, robots=1, hold_s=HOLD_S if args.seconds is None else args.seconds)
+    check_size(grid)
+    if grid.num_cells > MOST_CELLS:
+        raise ConfigError(f"--vx, --vy, --yaw: {grid.num_cells:,} commands; at most {MOST_CELLS:,} are possible")
+    return grid
+
+
+def _follow_all(
+    robot: Robot,
+    layout: Layout,
+    policies: list[ForeignPolicy],
+    files: list[Path],
+    args: argparse.Namespace,
+    grid: Grid,
+) -> dict[str, Any]:
+    """Measure every policy on the grid, print a line on each, and return all figures; of policies that say after how many
+    seconds of training they were written, the earliest comes first.
+    """
+    marks = [_marks(policy) for policy in policies]
+    order = sorted(range(len(policies)), key=lambda i: marks[i].get("wall_s", 0.0))
+    heads = ("seconds", "velocity RMSE", "worst", "yaw rate RMSE", "worst", "falls")
+    print(f"{robot.name}: {grid.num_cells} commands, {grid.hold_s:g} s each; errors in m/s and rad/s")
+    print("".join(f"{head:>15}" for head in heads) + "  file", flush=True)
+    rows: list[dict[str, Any]] = []
+    for i in order:
+        row = {"file": str(files[i]), **marks[i], **follow(robot, policies[i], grid, args.friction)}
+        rows.append(row)
+        errors = [row[name][part] for name in ("rmse_lin", "rmse_ang") for part in ("mean", "worst")]
+        figures = [f"{row['wall_s']:.1f}" if "wall_s" in row else "-"]
+        figures += ["-" if error is None else f"{error:.3f}" for error in errors]
+        print("".join(f"{text:>15}" for text in (*figures, f"{100 * row['falls']:.1f} %")) + f"  {row['file']}", flush=True)
+    result = {
+        "robot": robot.name,
+        "friction": args.friction,
+        "sim_dt": layout.sim_dt,
+        "grid": grid.axes,
+        "hold_s": grid.hold_s,
+        "settle_s": grid.settle_s,
+        "policies": rows,
+    }
+    if args.rmse is None:
+        return result
+    first = next((row for row in rows if _follows(row, args.rmse)), None)
+    when = f" after {first['wall_s']:.1f} s of training" if first and "wall_s" in first else ""
+    print(f"velocity RMSE <= {args.rmse:g} m/s without a fall: {first['file'] + when if first else 'none'}")
+    return {**result, "rmse": args.rmse, "first": first and {k: v for k, v in first.items() if k != "cells"}}
+
+
+def _follows(row: dict[str, Any], rmse: float) -> bool:
+    mean = row["rmse_lin"]["mean"]
+    return row["falls"] == 0.0 and mean is not None and mean <= rmse
+
+
+def _marks(policy: ForeignPolicy) -> dict[str, float]:
+    """Return what the file says of its training: seconds and iterations, as far as they are numbers."""
+    found = {}
+    for name in ("wall_s", "iterations"):
+        try:
+            found[name] = float(policy.metadata[name])
+        except (KeyError, ValueError):
+            continue
+    return found
+
+
+def _row(row: Played) -> dict[str, Any]:
+    """Return a command's figures for JSON: what is not defined is null."""
+    velocity = None if row.fell_after is not None else list(row.velocity)
+    height = None if velocity is None else row.height
+    return {"command": list(row.command), "velocity": velocity, "lowest_base": height, "fell_after": row.fell_after}
+
+
+def _table(rows: list[Played], name: str) -> Table:
+    table = Table(title=f"{name}: velocities after {SETTLING_S:g} s, base frame [m/s, m/s, rad/s]")
+    for heading in ("command", "reached", "lowest base [m]", "fell after"):
+        table.add_column(heading, justify="right")
+    for row in rows:
+        command, reached = (" ".join(f"{value:6.2f}" for value in values) for values in (row.command, row.velocity))
+        table.add_row(command, reached, f"{row.height:.3f}", "-" if row.fell_after is None else f"{row.fell_after:.2f} s")
+    return table
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,53 @@
+"""Measure a policy: `legged evaluate anymal_c_flat`.
+
+A policy that follows velocity commands is measured over a grid of commands and, if it was trained on terrain, on terrain of
+growing size, as `legged evaluate grid` and `legged evaluate terrain` do. Other policies run full episodes, as with
+`legged evaluate episodes`. An ONNX file or an exported folder is measured as by `legged evaluate onnx`.
+
+The tables are printed; evaluation_<physics>.json and pictures are written beside the checkpoint.
+"""
+
+import sys
+
+from legged.cli.evaluate import onnx
+from legged.cli.evaluate.common import check_points, evaluation_parser, grid_of, ready, settle
+from legged.cli.evaluate.episodes import ENVIRONMENTS
+from legged.commandline.command import run_main
+from legged.config import LeggedConfig
+from legged.evaluation.episodes import evaluate_episodes
+from legged.evaluation.following import evaluate_following
+from legged.evaluation.success import chosen_sizes
+from legged.process.command_parser import CommandParser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def build_parser() -> CommandParser:
+    """Return the parser of the command line."""
+    return evaluation_parser(
+        "evaluate", __doc__, "legged evaluate anymal_c --physics mujoco", "legged evaluate half_cheetah --seed 3"
+    )
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_intermixed_args(argv)
+    if onnx.exported_file(args.policy) is not None:
+        return onnx.evaluate([args.policy, *(["--out", str(args.out)] if args.out else [])])
+    setting = settle(args)
+    policy, device, graph, folder = setting.policy, setting.device, setting.graph, setting.folder
+    if not isinstance(policy.cfg, LeggedConfig):
+        ready(setting)
+        return evaluate_episodes(policy, ENVIRONMENTS, setting.asked, device, graph, folder, setting.where)
+    grid = grid_of(setting)
+    sizes = chosen_sizes(policy.cfg, None, False, setting.judged.terrain.scale)
+    ready(setting)
+    return evaluate_following(
+        policy, grid, sizes, check_points(None, False), setting.asked, device, graph, folder, setting.where
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

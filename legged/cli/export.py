@@ -1,0 +1,79 @@
+"""Export every checkpoint of a run: `legged export go1_flat`.
+
+Each checkpoint becomes FOLDER/<iterations>/ with policy.onnx, policy.pt, policy.weights and policy.json. Their metadata hold
+the iteration and the seconds from the start of the training's process (`wall_s`). `legged evaluate onnx` finds the first of
+them that walks. `legged play` exports the last checkpoint alone.
+"""
+
+import sys
+from pathlib import Path
+
+import torch
+
+from legged.commandline.arguments import add_policy_arguments, policy_overrides, register_given, settle_on
+from legged.commandline.command import run_main
+from legged.config import LeggedConfig
+from legged.errors import ConfigError
+from legged.learning.checkpoint import read_checkpoint
+from legged.learning.run_folder import checkpoints
+from legged.policies.export import EXPORTED, export
+from legged.policies.restore import policy_of, restore, undisturbed
+from legged.process.command_parser import CommandParser
+from legged.process.paths import ready_to_write, relative
+
+MEGABYTES = 5.0
+"""What the files of one policy need at most [MiB]."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def build_parser() -> CommandParser:
+    """Return the parser of the command line."""
+    parser = CommandParser(
+        "legged export",
+        __doc__,
+        "legged export go1_flat --out policies",
+        "legged export anymal_c_flat/2026-11-22_05-38-19",
+    )
+    add_policy_arguments(parser)
+    parser.add_argument(
+        "--out",
+        type=Path,
+        help="folder for the folders; exported/ in the run folder by default, or logs/export/ for a shipped policy",
+    )
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_intermixed_args(argv)
+    register_given(args, "policy")
+    if args.checkpoint is not None:
+        raise ConfigError("--checkpoint: all checkpoints of the run are exported; leave it out")
+    device = torch.device("cpu")
+    settle_on(device)
+    policy = policy_of(args.policy)
+    paths = checkpoints(policy.folder)
+    if not paths:
+        raise ConfigError(f"POLICY: {relative(policy.folder)} has no checkpoints of a training")
+    folder = args.out or policy.output("export") / EXPORTED
+    ready_to_write(folder, MEGABYTES * len(paths))
+    # The C engine needs no compiler, and one robot is enough: nothing is simulated.
+    calm = undisturbed(1, 1.0) if isinstance(policy.cfg, LeggedConfig) else [("env.num_envs", 1)]
+    changes = [*calm, ("sim.physics", "mujoco"), *policy_overrides(args)]
+    task, act = restore(policy, changes, device, graph=False)
+    for path in paths.values():
+        iterations = act.load(path)
+        training: dict[str, float] = {"iterations": iterations}
+        seconds = (read_checkpoint(path).get("infos") or {}).get("wall_s")
+        if isinstance(seconds, int | float):
+            training["wall_s"] = seconds
+        export(task, act.network, folder / f"{iterations:05d}", training, policy.cfg)
+    print(f"exported {len(paths)} checkpoint{'s' if len(paths) != 1 else ''} to {relative(folder)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,56 @@
+"""Tasks and robots of this installation: `legged list`.
+
+They are read from their files, so that a list takes no time.
+"""
+
+import sys
+from pathlib import Path
+
+from legged.commandline.light import answer, print_rows
+from legged.process.command_parser import CommandParser
+from legged.process.paths import data_folder
+
+
+def build_parser() -> CommandParser:
+    """Return the parser of the command line."""
+    parser = CommandParser("legged list", __doc__, "legged list", "legged list robots")
+    parser.add_argument("what", nargs="?", choices=("tasks", "robots"), help="one of the two lists; both by default")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    what = build_parser().parse_args(argv).what
+    return answer(lambda: _list(what))
+
+
+def _list(what: str | None) -> None:
+    if what in (None, "tasks"):
+        print_rows("tasks, each for `legged train TASK`", tasks())
+    if what in (None, "robots"):
+        print_rows("robots, each for `robot: NAME` in a task's file", robots())
+
+
+def tasks() -> dict[str, str]:
+    """Return task -> the first sentence of the comment at the head of its file."""
+    return {path.stem: _comment(path).partition(". ")[0].rstrip(".") for path in sorted(data_folder("cfg").glob("*.yaml"))}
+
+
+def robots() -> dict[str, str]:
+    """Return robot -> the model that its robot.yaml names in its first line; empty without such a comment."""
+    files = sorted((data_folder("resources") / "robots").glob("*/robot.yaml"))
+    return {path.parent.name: _comment(path).partition(": ")[0].partition(". ")[0] for path in files}
+
+
+def _comment(path: Path) -> str:
+    """Return the comment at the head of a YAML file, without line ends."""
+    found: list[str] = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if not line.startswith("#"):
+            break
+        found.append(line.lstrip("# "))
+    return " ".join(found)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,117 @@
+"""The `legged` command: finds the sub-command that was typed and runs it.
+
+Nothing heavy is imported here: `legged --help` answers before torch would be loaded.
+"""
+
+import sys
+from collections.abc import Mapping
+from importlib import import_module
+
+from legged.commandline.light import answer, print_rows
+from legged.errors import ConfigError, suggest
+
+SECTIONS = {
+    "every day": ("train", "play", "watch", "list"),
+    "measure": ("evaluate", "runs", "episodes", "benchmark", "sweep"),
+    "your own": ("robot", "terrain", "fit-actuator", "migrate"),
+    "on a robot": ("export", "deploy"),
+    "this machine": ("warmup", "completion"),
+}
+"""Heading of the help -> the first words of its commands."""
+
+COMMANDS: Mapping[str, tuple[str, str]] = {
+    "train": ("legged.cli.train", "train a policy"),
+    "play": ("legged.cli.play", "film a policy, measure it and export it"),
+    "watch": ("legged.cli.watch", "watch a policy in the browser, also while it is trained"),
+    "evaluate": ("legged.cli.evaluate.policy", "measure a policy: what fits its task"),
+    "evaluate grid": ("legged.cli.evaluate.grid", "velocity errors over a grid of commands"),
+    "evaluate terrain": ("legged.cli.evaluate.terrain", "success against the size of stairs, gaps, slopes, ..."),
+    "evaluate stress": ("legged.cli.evaluate.stress", "disturbances, unknown ground and other solver settings"),
+    "evaluate checkpoints": ("legged.cli.evaluate.checkpoints", "the first checkpoint of a run that walks"),
+    "evaluate episodes": ("legged.cli.evaluate.episodes", "returns and lengths of episodes, for tasks without commands"),
+    "evaluate gymnasium": ("legged.cli.evaluate.gymnasium", "returns in Gymnasium's own environment"),
+    "evaluate onnx": ("legged.cli.evaluate.onnx", "ONNX policies, foreign ones too, in plain MuJoCo"),
+    "runs": ("legged.cli.runs.table", "all runs in one table (as `runs table`)"),
+    "runs table": ("legged.cli.runs.table", "all runs in one table"),
+    "runs report": ("legged.cli.runs.report", "a page about one run: settings, curves, evaluations, film"),
+    "runs compare": ("legged.cli.runs.compare", "settings, curves and evaluations of several runs side by side"),
+    "runs evaluations": ("legged.cli.runs.evaluations", "evaluation files side by side, seeds averaged"),
+    "runs curves": ("legged.cli.runs.curves", "learning curves of runs as a picture"),
+    "episodes record": ("legged.cli.episodes.record", "record episodes and list the worst"),
+    "episodes list": ("legged.cli.episodes.stored", "list recorded episodes, make pages of them"),
+    "episodes statistics": ("legged.cli.episodes.statistics", "mean and standard deviation of every joint"),
+    "episodes compare": ("legged.cli.episodes.compare", "joint statistics of two policies side by side"),
+    "sweep run": ("legged.cli.sweep.run", "search settings by many trainings"),
+    "sweep report": ("legged.cli.sweep.report", "table and figures of a sweep"),
+    "benchmark step": ("legged.cli.benchmark.step", "times of a control step and of training iterations"),
+    "benchmark scale": ("legged.cli.benchmark.scale", "speed against the number of robots"),
+    "benchmark ground": ("legged.cli.benchmark.ground", "speed on a plane, on terrain and with general contacts"),
+    "benchmark startup": ("legged.cli.benchmark.startup", "how long a training takes to begin"),
+    "robot add": ("legged.cli.robot.add", "turn a URDF or MJCF file into a robot and a task"),
+    "robot show": ("legged.cli.robot.show", "joints, limits, gains and feet of a robot"),
+    "terrain": ("legged.cli.terrain", "pictures of a task's terrain"),
+    "export": ("legged.cli.export", "export every checkpoint of a run to ONNX"),
+    "deploy sim": ("legged.cli.deploy.sim", "run the robot's program against a simulated robot"),
+    "deploy robot": ("legged.cli.deploy.robot", "serve a simulated robot over UDP"),
+    "fit-actuator": ("legged.cli.fit_actuator", "fit a motor model to a log of a real motor"),
+    "migrate": ("legged.cli.migrate", "translate a legged_gym configuration"),
+    "warmup": ("legged.cli.warmup", "compile and cache the kernels of a task"),
+    "completion": ("legged.cli.completion", "print a completion script for a shell"),
+    "list": ("legged.cli.listing", "list tasks and robots"),
+}
+"""Words of a command -> its module, which has `build_parser` and `main`, and a summary."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command whose words begin `argv`, that of this process by default; return its exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    name, rest = split(words)
+    if name is None:
+        return answer(lambda: _print_help(words))
+    module = import_module(COMMANDS[name][0])
+    if argv is not None:
+        return module.main(rest)  # type: ignore[no-any-return]
+    sys.argv = [sys.argv[0], *rest]
+    return module.main()  # type: ignore[no-any-return]
+
+
+def split(words: list[str]) -> tuple[str | None, list[str]]:
+    """Return the command that the first words name, None if they name none, and the words after it."""
+    for count in (2, 1):
+        name = " ".join(words[:count])
+        if len(words) >= count and name in COMMANDS:
+            return name, words[count:]
+    return None, words
+
+
+def _print_help(words: list[str]) -> None:
+    """Print the commands, or those of a group.
+
+    Raises:
+        ConfigError: the words name neither a command nor a group of commands.
+    """
+    groups = {name.partition(" ")[0] for name in COMMANDS if " " in name}
+    asked = [word for word in words if word not in ("--help", "-h")]
+    if not asked:
+        print("Train legged robots, see them walk, measure them.\n\nusage: legged COMMAND ...  (each has --help)\n")
+        for heading, firsts in SECTIONS.items():
+            rows = {name: said for name, (_, said) in COMMANDS.items() if name.partition(" ")[0] in firsts}
+            in_order = {name: rows[name] for first in firsts for name in rows if name.partition(" ")[0] == first}
+            print_rows(heading, in_order, max(map(len, COMMANDS)))
+            print()
+        print("begin with `legged play anymal_c` (a trained policy), `legged train anymal_c_flat`, `legged list`")
+        return
+    if asked[0] not in groups:
+        known = {name.partition(" ")[0] for name in COMMANDS}
+        raise ConfigError(f"legged: there is no command '{asked[0]}'{suggest(asked[0], known, 'commands')}")
+    inside = {name: said for name, (_, said) in COMMANDS.items() if name.startswith(f"{asked[0]} ")}
+    if len(asked) > 1:
+        names = [name.partition(" ")[2] for name in inside]
+        raise ConfigError(
+            f"legged {asked[0]}: there is no sub-command '{asked[1]}'{suggest(asked[1], names, 'sub-commands')}"
+        )
+    print_rows(f"commands of `legged {asked[0]}`, each with --help", inside)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,162 @@
+"""Translate a legged_gym configuration into a task: `legged migrate legged_gym/envs/go2/go2_config.py --robot go2`.
+
+The file and the files that it extends are read, not run; the classes of legged_gym itself are built in. The command writes
+<task>.yaml with the settings that differ from the defaults, and robots/<task>/robot.yaml if the robot's pose or contacts
+differ. It lists every setting without a counterpart, with file and line.
+"""
+
+import argparse
+import os
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+from legged.commandline.command import run_main
+from legged.config.checks import PLAIN, is_plain_name, shown
+from legged.config.yaml_files import read_yaml
+from legged.errors import ConfigError
+from legged.migration.choice import Choice, choose
+from legged.migration.mapping import map_settings
+from legged.migration.modules import Tree
+from legged.migration.robot_entries import asset_of, map_robot, names_of
+from legged.migration.translation import Lost, Translation
+from legged.migration.writer import robot_yaml, task_yaml
+from legged.process.command_parser import CommandParser
+from legged.process.paths import data_folder, exists, make_folder, ready_to_write, relative, write_text
+from legged.registry import register_file, task_config
+from legged.robots.robot import Robot, load_robot
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def build_parser() -> CommandParser:
+    """Return the parser of the command line."""
+    parser = CommandParser(
+        "legged migrate",
+        __doc__,
+        "legged migrate legged_gym/envs/go2/go2_config.py --robot go2",
+        "legged migrate legged_gym/envs/__init__.py --task go2 --out tasks",
+    )
+    parser.add_argument("file", metavar="FILE", type=Path, help="a Python file with configuration classes")
+    parser.add_argument("--task", help="which of its classes or registered tasks; or how the only one is to be called")
+    parser.add_argument("--robot", help="robot under resources/robots/, or a folder; by the asset's name, if there is one")
+    parser.add_argument("--out", type=Path, default=Path("."), help="folder for the files that are written")
+    parser.add_argument("--force", action="store_true", help="write over files of the same names")
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
+    if not (exists(args.file) and args.file.is_file()):
+        raise ConfigError(f"file: there is no file {shown(str(args.file))}")
+    tree = Tree()
+    choice = choose(tree, args.file, args.task)
+    task = _task_name(choice.task)
+    result = map_settings(choice.environment, choice.learner)
+    robot = _robot(args.robot, result)
+    entries = map_robot(result, robot)
+    # Notes of files that nobody knows of would be noise: a loop beside the classes is none of their settings.
+    lost = [*(Lost(place, text, "", "") for place, text in tree.notes), *result.lost]
+    path = args.out / f"{task}.yaml"
+    folder = args.out / "robots" / task
+    with_folder = robot is not None and bool(entries)
+    for file in (path, *([folder / "robot.yaml"] if with_folder else [])):
+        if exists(file) and not args.force:
+            raise ConfigError(f"--out: {relative(file)} is there already; --force writes over it")
+    ready_to_write(args.out)
+    make_folder(args.out)
+    result.settings["robot"] = _robot_setting(robot, with_folder, task, result)
+    if with_folder:
+        assert robot is not None
+        make_folder(folder)
+        write_text(folder / "robot.yaml", _robot_text(robot, entries, folder, args.file))
+    head = [f"Written by legged migrate from {relative(args.file)}, {_described(choice, tree)}."]
+    if robot is None and entries:
+        head += ["The robot of this task is not here yet. These entries of its robot.yaml are the configuration's:"]
+        head += [f"  {line}" for line in robot_yaml([], entries).splitlines()]
+    write_text(path, task_yaml(head, result.settings, result.comments, lost))
+    _report(args, path, result, lost, robot)
+    return 0
+
+
+def _task_name(name: str) -> str:
+    """Return a name that no task of this package has."""
+    if not is_plain_name(name):
+        raise ConfigError(f"--task: the name of a task must be {PLAIN}; got {shown(name)}")
+    return f"my_{name}" if exists(data_folder("cfg") / f"{name}.yaml") else name
+
+
+def _described(choice: Choice, tree: Tree) -> str:
+    parts = [choice.environment.__name__]
+    parts += [choice.learner.__name__] if choice.learner is not None else ["no learner's configuration"]
+    text = " and ".join(parts)
+    if tree.built_in:
+        text += f"; {', '.join(sorted(tree.built_in))} as legged_gym v1.0.2 has them"
+    return text
+
+
+def _robot(asked: str | None, result: Translation) -> Robot | None:
+    """Return the robot that was asked for, or one of this package that is called as the asset is."""
+    if asked is not None:
+        return load_robot(asked, "--robot")
+    robots = data_folder("resources") / "robots"
+    for name in names_of(result):
+        if is_plain_name(name) and exists(robots / name / "robot.yaml"):
+            return load_robot(name, "asset.name")
+    return None
+
+
+def _robot_setting(robot: Robot | None, with_folder: bool, task: str, result: Translation) -> str:
+    if with_folder:
+        return f"robots/{task}"
+    if robot is None:
+        return f"robots/{next(filter(is_plain_name, names_of(result)), task)}"
+    ours = data_folder("resources") / "robots" / robot.name
+    return robot.name if ours.resolve() == robot.folder else str(robot.folder)
+
+
+def _robot_text(robot: Robot, entries: dict[str, Any], folder: Path, source: Path) -> str:
+    """Return the robot.yaml of a robot that is another one's model, posed and touched as the configuration says."""
+    data = read_yaml(robot.folder / "robot.yaml") | entries
+    data["model"] = os.path.relpath(robot.model_path, folder.resolve())
+    changed = ", ".join(entries)
+    return robot_yaml([f"The model of {robot.name} as {relative(source)} has it: {changed} are that file's."], data)
+
+
+def _asset(file: Path, result: Translation) -> str:
+    """Return the path of the robot's file, as far as it is found above a configuration; else as that names it."""
+    asset = asset_of(result)
+    found = (relative(folder / asset) for folder in file.resolve().parents if asset and exists(folder / asset))
+    return next(found, asset or "FILE.urdf")
+
+
+def _report(args: argparse.Namespace, path: Path, result: Translation, lost: list[Lost], robot: Robot | None) -> None:
+    print(f"written: {relative(path)}, {len(result.settings)} settings that differ from the defaults")
+    for entry in lost:
+        print(f"not mapped: {entry}")
+    if robot is None:
+        folder = args.out / result.settings["robot"]
+        add = ["robot", "add", _asset(args.file, result), "--name", folder.name, "--out", str(folder.parent)]
+        again = ["migrate", str(args.file), "--robot", str(folder), "--out", str(args.out), "--force"]
+        again += ["--task", args.task] if args.task else []
+        print(
+            "the robot is still missing:",
+            *(f"  legged {shlex.join(words)}" for words in (add, again)),
+            sep="\n",
+        )
+        return
+    try:
+        name = register_file(str(path))
+        task_config(name)
+    except ConfigError as error:
+        print(f"it does not load yet: {error}")
+        return
+    print(f"show the whole configuration: legged train {relative(path)} --show")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

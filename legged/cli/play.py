@@ -1,0 +1,173 @@
+"""Film a policy, measure it and export it: `legged play anymal_c_flat`, or `python play.py --task anymal_c_flat`.
+
+On a display a window opens first, in which the robot follows the arrow keys.
+"""
+
+import argparse
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+
+from legged.commandline.arguments import (
+    add_legged_gym_arguments,
+    pick_device,
+    policy_overrides,
+    register_given,
+    settle_name,
+    settle_on,
+    watch_command,
+)
+from legged.commandline.command import run_main
+from legged.config import LeggedConfig, override
+from legged.envs import BaseTask, LeggedRobot
+from legged.errors import ConfigError, RunError
+from legged.learning.run_folder import find_run, run_config
+from legged.play.outing import EPISODE_S, walk_out
+from legged.play.playground import SETTING, Playground
+from legged.play.rollout import roll_out
+from legged.play.schedule import follow_schedule, schedule_s
+from legged.play.video import Video
+from legged.play.viewer import view, watch
+from legged.policies.actor import Actor
+from legged.policies.episodes import for_episodes
+from legged.policies.export import EXPORTED, export
+from legged.policies.restore import TrainedPolicy, policy_of, restore, undisturbed
+from legged.process.command_parser import CommandParser
+from legged.process.headless import HEADLESS
+from legged.process.paths import ready_to_write, relative
+from legged.registry import task_config
+from legged.rendering import window_opens
+
+ROOM_MB = 24.0
+"""What the disk must have room for: the film and the exported policy [MiB]."""
+MOST_SHOWN = 9
+"""Robots in the picture on a plane."""
+SHOWN_ON_A_PLANE = 4
+"""Robots there are, if nobody says how many."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def build_parser() -> CommandParser:
+    """Return the parser of the command line."""
+    parser = CommandParser(
+        "legged play",
+        __doc__,
+        "legged play anymal_c --terrain stairs_up --difficulty 0.8",
+        "legged play anymal_c_flat/2026-11-22_05-38-19 --headless --gif",
+    )
+    add_legged_gym_arguments(parser, "policy")
+    parser.add_argument("--terrain", metavar="TYPE", help="type of the tiles, e.g. stairs_up; the task's own by default")
+    parser.add_argument("--difficulty", type=float, help="of the tiles, 0 to 1; 0.5 and 0.8 by default")
+    parser.add_argument("--headless", action="store_true", help="record even where there is a display")
+    parser.add_argument("--gif", action="store_true", help="also write a GIF")
+    parser.add_argument("--no-video", action="store_true", help="export and measure only")
+    parser.add_argument("--out", type=Path, help="folder for video and exported/; the run folder by default")
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_intermixed_args(argv)
+    if args.gif and args.no_video:
+        raise ConfigError("--gif: asks for a film, and --no-video for none; leave out one of them")
+    settle_name(args, "policy")
+    register_given(args, "policy")
+    device = pick_device(args.sim_device)
+    settle_on(device)
+    policy = policy_of(_named(args), args.checkpoint)
+    asked = policy_overrides(args)
+    folder = args.out or policy.output("play")
+    graph = not args.no_graph
+    if isinstance(policy.cfg, LeggedConfig):
+        playground, task, act = _on_ground(args, policy, asked, device, graph, folder)
+    else:
+        for flag in ("terrain", "difficulty"):
+            if getattr(args, flag) is not None:
+                raise ConfigError(f"--{flag}: '{policy.cfg.task}' has no terrain to choose; its ground is that of its model")
+        playground = None
+        policy, changes = for_episodes(policy, args.num_envs if args.num_envs is not None else SHOWN_ON_A_PLANE)
+        ready_to_write(folder, ROOM_MB)
+        task, act = restore(policy, [*changes, *asked], device, graph)
+    print(f"{policy.cfg.task}: {relative(policy.checkpoint)}\nwatch it: {watch_command(args, policy.folder)}")
+
+    differences = export(task, act.network, folder / EXPORTED, trained=policy.cfg)
+    for name, difference in differences.items():
+        print(f"exported {relative(folder / EXPORTED / name)}, largest difference to the policy {difference:.1e}")
+
+    if not (HEADLESS or args.headless or args.no_video):
+        if not window_opens():
+            print("no window opens on this display: recording only")
+        elif isinstance(task, LeggedRobot):
+            view(task, act, playground)
+        else:
+            watch(task, act)
+    elif not (args.no_video or args.headless) and "DISPLAY" in os.environ:
+        print(f"the display {os.environ['DISPLAY']} (DISPLAY) does not answer: recording only")
+    shown = min(task.num_envs, len(playground.order) if playground else MOST_SHOWN)
+    video, failure = _video(task, shown, None if args.no_video else folder, args.gif)
+    if not isinstance(task, LeggedRobot):
+        result = roll_out(task, act, video)
+    else:
+        result = walk_out(task, act, playground, video) if playground else follow_schedule(task, act, video)
+    Console(width=90).print(result)
+    if failure is None:
+        video.write()
+        return 0
+    raise failure
+
+
+def _named(args: argparse.Namespace) -> str:
+    """Return the policy's name as POLICY; legged_gym's options say which of the task's runs it is.
+
+    Raises:
+        ConfigError: there is no such run, or it is of another task.
+    """
+    if args.load_run is None and args.experiment_name is None:
+        return str(args.policy)
+    flags = [("train.runner.experiment_name", args.experiment_name)] if args.experiment_name else []
+    folder = find_run(task_config(args.policy, flags), args.load_run)
+    trained_on = run_config(folder, "--load-run").task
+    if trained_on != args.policy:
+        raise ConfigError(f"--load-run: {relative(folder)} was trained on '{trained_on}', not on '{args.policy}'")
+    return str(folder)
+
+
+def _on_ground(
+    args: argparse.Namespace,
+    policy: TrainedPolicy,
+    asked: list[tuple[str, Any]],
+    device: torch.device,
+    graph: bool,
+    folder: Path,
+) -> tuple[Playground | None, LeggedRobot, Actor]:
+    """Build a task of legged robots on the ground that the command line asks for, if it asks for one."""
+    wanted: LeggedConfig = override(policy.cfg, asked)  # type: ignore[assignment]
+    playground = Playground.of(wanted, args.terrain, args.difficulty)
+    count = args.num_envs if args.num_envs is not None else len(playground.order) if playground else SHOWN_ON_A_PLANE
+    seconds = EPISODE_S if playground else schedule_s()
+    changes = [*undisturbed(count, seconds), *(SETTING if playground else ()), *asked, ("env.num_envs", count)]
+    terrain = None
+    if playground:
+        changes += playground.changes(wanted)
+        terrain = playground.build(override(policy.cfg, changes))  # type: ignore[arg-type]
+    ready_to_write(folder, ROOM_MB)
+    return playground, *restore(policy, changes, device, graph=graph, terrain=terrain)
+
+
+def _video(task: BaseTask, count: int, folder: Path | None, gif: bool) -> tuple[Video, RunError | None]:
+    """Return what films the robots; where nothing can be rendered, what films nothing, and why: they are measured still."""
+    try:
+        return Video(task, count, folder, gif), None
+    except RunError as error:
+        return Video(task, count, None), error
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,159 @@
+"""Turn a URDF or MJCF file into a robot and a task: `legged robot add my_robot.urdf`.
+
+The command writes a robot folder (MJCF, meshes, robot.yaml, PROVENANCE.md) and a task on flat ground, and prints what it
+guessed.
+"""
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+
+from legged.commandline.command import run_main
+from legged.config.checks import PLAIN, is_plain_name, shown
+from legged.errors import ConfigError, suggest
+from legged.process.command_parser import CommandParser
+from legged.process.paths import data_folder, exists, make_folder, ready_to_write, relative, write_text
+from legged.registry import register_file, task_config
+from legged.robots.importing.folder import Guesses, called, task_yaml, write_folder
+from legged.robots.importing.guess import make_ready, read_robot
+from legged.robots.importing.menagerie import PREFIX, menagerie_model
+from legged.robots.importing.mend import plain
+from legged.robots.importing.tree import Tree
+from legged.robots.robot import load_robot
+
+ROOM_MB = 100.0
+"""What the disk must have room for [MiB]."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def build_parser() -> CommandParser:
+    """Return the parser of the command line."""
+    parser = CommandParser(
+        "legged robot add",
+        __doc__,
+        "legged robot add path/to/my_robot.urdf --out mine",
+        "legged robot add menagerie:unitree_go2 --name my_go2",
+    )
+    parser.add_argument("source", metavar="SOURCE", help="a URDF, an MJCF file, or menagerie:NAME")
+    parser.add_argument("--name", help="of the robot; that of the file by default")
+    parser.add_argument("--out", type=Path, help="folder for the robot's folder and its task; this clone's own by default")
+    parser.add_argument("--extends", metavar="TASK", help="task to take rewards from; base/quadruped_flat or base/biped_flat")
+    parser.add_argument("--hold", metavar="PATTERN", action="append", default=[], help="joints to hold; may be repeated")
+    parser.add_argument("--packages", type=Path, action="append", default=[], help="where to look for package:// as well")
+    parser.add_argument("--stiffness", type=float, help="P gain of all joints [N m/rad]; the file's, or a rule's, by default")
+    parser.add_argument("--damping", type=float, help="D gain of all joints [N m s/rad]")
+    parser.add_argument("--force", action="store_true", help="write over a robot of that name")
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
+    gains = _gains(args)
+    path, source, licence = _source(args.source)
+    name = args.name or plain(Path(args.source.removeprefix(PREFIX)).stem).lower()
+    if not is_plain_name(name):
+        raise ConfigError(f"--name: the name of a robot must be {PLAIN}; got {shown(name)}")
+    folder, task = _places(name, args.out, args.extends)
+    _check_apart(path, folder)
+    if not args.force and (exists(folder) or exists(task)):
+        taken = folder if exists(folder) else task
+        raise ConfigError(f"--name: there is {relative(taken)} already; another name, or --force to write over it")
+    if args.extends is not None:
+        _check_task(args.extends, task)
+    ready_to_write(folder, ROOM_MB)
+    tree = read_robot(path, [root.resolve() for root in args.packages])
+    for mesh in (shape.mesh for link in tree.links for shape in link.shapes):
+        if mesh is not None and mesh.file is not None:
+            _check_apart(mesh.file, folder)
+    tree.name = name
+    guesses = make_ready(tree, args.hold, gains)
+    megabytes = write_folder(folder, tree, guesses, source, licence)
+    robot = load_robot(str(folder))
+    where = name if folder.parent == data_folder("resources") / "robots" else f"./{name}"
+    extends = args.extends or f"base/{'biped' if guesses.legs == 2 else 'quadruped'}_flat"
+    make_folder(task.parent)
+    symmetric = robot.mirror is not None and robot.mirror.uneven_joint(robot.default_dof_pos) is None
+    write_text(task, task_yaml(name, where, extends, symmetric))
+    _report(tree, guesses, folder, task, megabytes)
+    task_config(register_file(str(task)), on_cpu=True)
+    own = task.parent == data_folder("cfg")
+    print(f"train it: legged train {shlex.quote(str(task.stem if own else relative(task)))}")
+    return 0
+
+
+def _gains(args: argparse.Namespace) -> tuple[float, float] | None:
+    if (args.stiffness is None) != (args.damping is None):
+        raise ConfigError("--stiffness and --damping: give both or neither")
+    for flag in ("stiffness", "damping"):
+        value = getattr(args, flag)
+        if value is not None and not 0.0 <= value <= 1e6:
+            raise ConfigError(f"--{flag}: must be between 0 and 1e6, got {value:g}")
+    return None if args.stiffness is None else (args.stiffness, args.damping)
+
+
+def _source(given: str) -> tuple[Path, str, str]:
+    """Return the file, what it is called in PROVENANCE.md, and its licence as far as it is known."""
+    if given.startswith(PREFIX):
+        path, licence = menagerie_model(given.removeprefix(PREFIX))
+        return path, f"MuJoCo Menagerie, {given.removeprefix(PREFIX)}/{path.name}", licence
+    path = Path(given)
+    if not exists(path) or not path.is_file():
+        raise ConfigError(f"{shown(given)}: there is no such file; a URDF, an MJCF file, or {PREFIX}NAME is wanted")
+    beside = [other.name for folder in (path.parent, path.parent.parent) for other in sorted(folder.glob("LICENSE*"))]
+    return path.absolute(), path.name, f"see {beside[0]} beside the source" if beside else "that of the source; look it up"
+
+
+def _check_apart(source: Path, folder: Path) -> None:
+    """Look whether a file that is read lies outside the folder that is written, where it could be written over."""
+    if source.resolve().is_relative_to(folder.resolve()):
+        raise ConfigError(
+            f"{relative(source)}: lies in {relative(folder)}, the folder that the robot goes to; another --name or --out"
+        )
+
+
+def _check_task(name: str, beside: Path) -> None:
+    """Look whether there is a task that the new one, in the file `beside` it, can extend."""
+    folders = (data_folder("cfg"), beside.parent)
+    if not any(exists(folder / f"{name.removesuffix('.yaml')}.yaml") for folder in folders):
+        names = {path.relative_to(folders[0]).with_suffix("").as_posix() for path in folders[0].rglob("*.yaml")}
+        raise ConfigError(f"--extends: there is no task {shown(name)}{suggest(name[:100], names, 'tasks')}")
+
+
+def _places(name: str, out: Path | None, extends: str | None) -> tuple[Path, Path]:
+    """Return the robot's folder and its task's file. As the tasks in cfg/, one that extends a `..._flat` or a `..._real` ends
+    like it, and one on rough ground is called like its robot; without `extends` it is a flat one.
+    """
+    like = "_flat" if extends is None else extends.removesuffix(".yaml")
+    file = name + next((ending for ending in ("_flat", "_real") if like.endswith(ending)), "") + ".yaml"
+    if out is not None:
+        return out / name, out / file
+    robots, tasks = data_folder("resources") / "robots", data_folder("cfg")
+    if robots.resolve().is_relative_to(Path(sys.modules["legged"].__file__ or ".").resolve().parent):
+        return Path(name), Path(file)  # an installed package is no place for robots
+    return robots / name, tasks / file
+
+
+def _report(tree: Tree, guesses: Guesses, folder: Path, task: Path, megabytes: float) -> None:
+    """Print what was found, changed and guessed."""
+    driven = sum(hinge.driven for hinge in tree.hinges)
+    mass = sum(link.mass for link in tree.links)
+    counts = f"{len(tree.hinges)} hinges, {driven} motors, {len(tree.shapes)} shapes"
+    print(f"{tree.name}: a {called(guesses.legs)} of {mass:.4g} kg, {counts}")
+    for line in tree.said:
+        print(f"  {line}")
+    for title, names in (("is penalised", guesses.penalized), ("ends an episode", guesses.terminating)):
+        print(f"  guess: contact that {title}: {', '.join(names) or 'none'}")
+    print(f"  guess: spawn height {guesses.spawn_height:g} m")
+    angles = ", ".join(f"{name} {angle:g}" for name, angle in guesses.angles.items() if angle)
+    print(f"  default pose [rad]: {angles or 'all 0'}")
+    meshes = f", {megabytes:.1f} MiB of meshes" if megabytes else ""
+    print(f"written: {relative(folder)}/ ({tree.name}.xml, robot.yaml, PROVENANCE.md{meshes}) and {relative(task)}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,81 @@
+"""Evaluation files side by side: `legged runs evaluations logs/anymal_c/RUN logs/anymal_c/RUN`.
+
+Evaluations of one task in one engine count as its seeds: the tables give their mean and the largest deviation from it, the
+picture their mean and range. Evaluations with other fields changed, or on another grid of commands, are kept apart.
+"""
+
+import sys
+from pathlib import Path
+
+from rich.console import Console
+
+from legged.commandline.command import run_main
+from legged.errors import ConfigError
+from legged.evaluation.comparison import (
+    draw_comparison,
+    episodes_comparison,
+    grouped,
+    keep_types,
+    success_table,
+    tracking_table,
+    types_of,
+)
+from legged.evaluation.result_file import read_results
+from legged.process.command_parser import CommandParser
+from legged.process.paths import make_folder, ready_to_write, relative
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def build_parser() -> CommandParser:
+    """Return the parser of the command line."""
+    parser = CommandParser(
+        "legged runs evaluations",
+        __doc__,
+        "legged runs evaluations logs/anymal_c_flat/2026-11-22_05-38-19 logs/anymal_c_flat/2026-11-22_06-02-41",
+        "legged runs evaluations logs/anymal_c/*/evaluation_mujoco.json --types stairs_up,slope_up --out pictures",
+    )
+    parser.add_argument(
+        "paths", nargs="+", type=Path, metavar="PATH", help="evaluation_<physics>.json files, or folders that hold them"
+    )
+    parser.add_argument("--types", help="terrain types to show, e.g. stairs_up,slope_up; all by default")
+    parser.add_argument("--out", type=Path, help="folder for success.png, a picture of success against difficulty")
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
+    if args.out:
+        ready_to_write(args.out)
+    results = read_results(args.paths)
+    if args.types:
+        keep_types(results, [name.strip() for name in args.types.split(",")])
+    groups = grouped(results)
+    episodes = {key: results for key, results in groups.items() if all("episodes" in result for result in results)}
+    following = {key: results for key, results in groups.items() if not any("episodes" in result for result in results)}
+    for task, physics, _ in groups.keys() - episodes.keys() - following.keys():
+        raise ConfigError(f"{task} in {physics}: some evaluations are of commands, others of episodes; compare them apart")
+    console = Console(width=130)
+    if following:
+        console.print(tracking_table(following))
+    if episodes:
+        console.print(episodes_comparison(episodes))
+    with_success = {key: results for key, results in following.items() if any("success" in result for result in results)}
+    if not types_of(with_success):
+        with_success = {}
+    if with_success:
+        console.print(success_table(with_success))
+    if args.out:
+        if not with_success:
+            raise ConfigError("--out: draws success against difficulty, and none of the evaluations holds that")
+        make_folder(args.out)
+        draw_comparison(with_success, args.out / "success.png")
+        print(f"written: {relative(args.out / 'success.png')}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

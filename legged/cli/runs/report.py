@@ -1,0 +1,99 @@
+"""A page about a run: `legged runs report anymal_c_flat`.
+
+report.html is written into the run's folder: settings, curves, evaluations and the film on one page that needs no network.
+report.md and its pictures lie beside it. A training writes its report when it ends; this command writes it again, after an
+evaluation or for a run that was killed. `--film` films the policy first; `--note` keeps a sentence about the run.
+"""
+
+import sys
+from pathlib import Path
+
+import torch
+
+from legged.commandline.arguments import add_checkpoint_argument
+from legged.commandline.command import run_main
+from legged.config import LeggedConfig
+from legged.errors import ConfigError, RunError
+from legged.evaluation.reports.record import FILMS, read_record
+from legged.evaluation.reports.run_report import command_on, write_report
+from legged.learning.run_folder import NOTE_FILE, find_checkpoint, own_run, run_config
+from legged.play.walking_film import film, write_film
+from legged.policies.restore import TrainedPolicy
+from legged.process.command_parser import CommandParser, add_import_argument
+from legged.process.paths import ready_to_write, relative, write_text
+from legged.registry import import_tasks
+
+SIDE = 320
+"""Width and height of the film [pixels]."""
+LONGEST_NOTE = 1000
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def build_parser() -> CommandParser:
+    """Return what reads the command line."""
+    parser = CommandParser(
+        "legged runs report",
+        __doc__,
+        "legged runs report anymal_c_flat/2026-11-22_05-38-19",
+        "legged runs report anymal_c_flat --film",
+    )
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="runs or their folders, or a task, whose newest run counts")
+    add_checkpoint_argument(parser)
+    add_import_argument(parser)
+    parser.add_argument("--film", action="store_true", help=f"film the policy again, into {FILMS[0]}")
+    parser.add_argument("--note", help=f"a sentence about the run, kept in its {NOTE_FILE}")
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_args(argv)
+    if args.checkpoint is not None and not args.film:
+        raise ConfigError(f"--checkpoint: {args.checkpoint}: says which policy is filmed; add --film")
+    if args.module:
+        import_tasks(args.module)
+    folders = [own_run(name, "RUN") for name in args.runs]
+    if args.note is not None:
+        write_note(folders, args.note)
+    for folder in folders:
+        ready_to_write(folder, 4.0)
+        if args.film:
+            why = _film(folder, args.checkpoint)
+            print(f"no film: {why}" if why else f"written: {relative(folder / FILMS[0])}", flush=True)
+        print(f"written: {relative(write_report(folder))}", flush=True)
+    return 0
+
+
+def write_note(folders: list[Path], text: str) -> None:
+    """Write a sentence into run folders.
+
+    Raises:
+        ConfigError: it is empty or too long.
+        RunError: it can't be written.
+    """
+    if not text.strip() or len(text) > LONGEST_NOTE:
+        raise ConfigError(f"--note: expected a sentence of at most {LONGEST_NOTE} letters, got {len(text.strip())}")
+    for folder in folders:
+        write_text(folder / NOTE_FILE, " ".join(text.split()) + "\n")
+
+
+def _film(folder: Path, checkpoint: int | str | None) -> str:
+    """Film the policy of a run; return why that is impossible, or an empty text."""
+    try:
+        cfg = run_config(folder)
+        if not isinstance(cfg, LeggedConfig):
+            command = command_on(read_record(folder), "play")
+            return f"'{cfg.task}' has no velocity commands; {command} --gif makes one"
+        torch.set_num_threads(1)
+        policy = TrainedPolicy(cfg, find_checkpoint(folder, checkpoint))
+        write_film(film(policy, SIDE), folder / FILMS[0])
+    except (ConfigError, RunError) as error:
+        return " ".join(str(error).split())
+    return ""
+
+
+if __name__ == "__main__":
+    sys.exit(main())

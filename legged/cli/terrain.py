@@ -1,0 +1,81 @@
+"""Pictures of a task's terrain: `legged terrain anymal_c`.
+
+terrain_map.png shows the whole grid of tiles from above, terrain.png one tile of each type with a robot on it. `--types`
+shows other types than the task's.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from PIL import Image
+
+from legged.commandline.arguments import add_task_arguments, overrides, register_given
+from legged.commandline.command import run_main
+from legged.config import LeggedConfig
+from legged.errors import ConfigError
+from legged.process.command_parser import CommandParser
+from legged.process.paths import make_folder, ready_to_write, relative, replacing
+from legged.registry import task_config
+from legged.rendering.terrain_map import draw_map
+from legged.rendering.terrain_picture import picture_of_types, tiles
+from legged.terrain import Terrain, check_terrain, terrain_types
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def build_parser() -> CommandParser:
+    """Return the parser of the command line."""
+    parser = CommandParser(
+        "legged terrain",
+        __doc__,
+        "legged terrain anymal_c",
+        "legged terrain anymal_c --types gap,pit,waves --difficulty 0.7",
+    )
+    add_task_arguments(parser)
+    parser.add_argument("--types", help="types side by side instead of the task's own grid, e.g. stairs_up,gap")
+    parser.add_argument("--difficulty", type=float, default=0.5, help="of the tiles in the picture, 0 to 1")
+    parser.add_argument("--out", type=Path, default=Path("."), help="folder for the two PNG files")
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_intermixed_args(argv)
+    register_given(args, "task")
+    if not 0.0 <= args.difficulty <= 1.0:
+        raise ConfigError(f"--difficulty: must be between 0 and 1, got {args.difficulty:g}")
+    cfg = task_config(args.task, overrides(args), on_cpu=True)
+    if not isinstance(cfg, LeggedConfig):
+        raise ConfigError(f"TASK: '{args.task}' has no terrain to show; its ground is that of its model")
+    ready_to_write(args.out)
+    if args.types is None:
+        if cfg.terrain.mesh_type == "plane":
+            raise ConfigError(
+                f"{args.task}: stands on a plane (terrain.mesh_type), there is no terrain to show; --types shows types of"
+                " your choice"
+            )
+        check_terrain(cfg.terrain, cfg.origins)
+        terrain = Terrain.build(cfg.terrain, cfg.env.seed)
+        types: Sequence[str] = terrain.type_names
+        levels = [f"{row / cfg.terrain.num_rows:g}" if cfg.terrain.curriculum else "" for row in range(cfg.terrain.num_rows)]
+    else:
+        types = terrain_types("--types", args.types)
+        sizes = replace(cfg.terrain, mesh_type="height_map", num_rows=1, num_cols=len(types), max_init_terrain_level=0)
+        check_terrain(replace(sizes, proportions=dict.fromkeys(types, 1.0 / len(types))), cfg.origins)
+        terrain = tiles(cfg.terrain, [types[::-1]], args.difficulty, cfg.env.seed)  # the map's first column is the rightmost
+        levels = [f"{args.difficulty:g}"]
+    make_folder(args.out)
+    map_path, picture_path = args.out / "terrain_map.png", args.out / "terrain.png"
+    draw_map(terrain, levels, map_path)
+    with replacing(picture_path) as part:
+        Image.fromarray(picture_of_types(cfg, types, args.difficulty)).save(part, format="PNG")
+    print(f"written: {relative(map_path)}, {relative(picture_path)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

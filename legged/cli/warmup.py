@@ -1,0 +1,51 @@
+"""Compile and cache the kernels of a task: `legged warmup anymal_c`.
+
+The task is built as `legged train` builds it with the same arguments. Warp's cache then holds all of its kernels for this
+machine's GPU, or for its CPU with sim.physics=mujoco_warp, and the next training starts without compiling.
+"""
+
+import sys
+import time
+
+from legged.commandline.arguments import add_task_arguments, overrides, pick_device, register_given, settle_on
+from legged.commandline.command import run_main
+from legged.physics import kernel_cache, resolve_physics
+from legged.process.command_parser import CommandParser
+from legged.process.startup import STARTED_S
+from legged.registry import make_task, task_config
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def build_parser() -> CommandParser:
+    """Return the parser of the command line."""
+    parser = CommandParser(
+        "legged warmup",
+        __doc__,
+        "legged warmup anymal_c",
+        "legged warmup go2_flat --num-envs 8192",
+    )
+    add_task_arguments(parser)
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    start = STARTED_S if argv is None else time.perf_counter()
+    args = build_parser().parse_intermixed_args(argv)
+    register_given(args, "task")
+    device = pick_device(args.sim_device)
+    cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
+    if resolve_physics(cfg.sim.physics, device, num_envs=cfg.env.num_envs) == "mujoco":
+        print(f"{cfg.task}: nothing to do, C MuJoCo compiles no kernels")
+        return 0
+    settle_on(device)
+    make_task(cfg, device, graph=not args.no_graph)
+    print(f"{cfg.task}: ready in {time.perf_counter() - start:.1f} s, its kernels are in {kernel_cache()}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

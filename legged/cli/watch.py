@@ -1,0 +1,94 @@
+"""Watch a policy in a browser, also while it is trained: `legged watch anymal_c_flat`.
+
+The page shows the newest checkpoint of the run, and the next one as soon as it is written. Without POLICY the newest run of
+all is shown. The page sets commands, terrain, pushes and the speed of time.
+"""
+
+import math
+import sys
+from typing import Any
+
+from legged.commandline.arguments import (
+    POLICY_HELP,
+    add_build_arguments,
+    add_checkpoint_argument,
+    pick_device,
+    policy_overrides,
+    register_given,
+    settle_on,
+)
+from legged.commandline.command import run_main
+from legged.errors import ConfigError
+from legged.play.live.address import HOST, PORT, check_port, free_port, is_loopback, url
+from legged.play.live.ground import changes_for, check_ground
+from legged.play.live.page import Page, load_viser
+from legged.play.live.session import MOST_ROBOTS, Session
+from legged.play.live.source import find_watched
+from legged.process.command_parser import CommandParser
+from legged.process.cores import available_cores
+
+ROBOTS = 4
+"""Robots there are, if nobody says how many."""
+ROBOTS_A_THREAD = 4
+"""Robots that one core simulates in real time."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run_main(_main, argv)
+
+
+def build_parser() -> CommandParser:
+    """Return the parser of the command line."""
+    parser = CommandParser(
+        "legged watch",
+        __doc__,
+        "legged watch anymal_c_flat",
+        "legged watch anymal_c_flat/2026-11-22_05-38-19 --terrain stairs_up",
+    )
+    parser.add_argument("policy", nargs="?", metavar="POLICY", help=f"{POLICY_HELP}; the newest run of all by default")
+    add_checkpoint_argument(parser)
+    add_build_arguments(parser)
+    parser.add_argument("--terrain", metavar="TYPE", help="type of the tiles, e.g. stairs_up; the task's own by default")
+    parser.add_argument("--difficulty", type=float, help="of the tiles, 0 to 1; 0.5 and 0.8 by default")
+    parser.add_argument("--host", default=HOST, help="address that is listened at; this machine alone by default")
+    parser.add_argument("--port", type=int, help=f"{PORT}, or the next one that is free, by default")
+    return parser
+
+
+def _main(argv: list[str] | None) -> int:
+    args = build_parser().parse_intermixed_args(argv)
+    if args.policy is not None and "=" in args.policy:
+        args.overrides.insert(0, args.policy)
+        args.policy = None
+    register_given(args, "policy")
+    port = free_port(args.host, None if args.port is None else check_port(args.port))
+    count = ROBOTS if args.num_envs is None else args.num_envs
+    if not 1 <= count <= MOST_ROBOTS:
+        raise ConfigError(f"--num-envs: must be from 1 to {MOST_ROBOTS}, got {count}")
+    device = pick_device(args.sim_device or "cpu")  # a GPU belongs to the training
+    settle_on(device)
+    asked = policy_overrides(args)
+    watched = find_watched(args.policy, args.checkpoint)
+    engine: list[tuple[str, Any]] = []
+    if device.type == "cpu":
+        engine = [("sim.physics", "mujoco"), ("sim.threads", min(available_cores(), math.ceil(count / ROBOTS_A_THREAD)))]
+    changes = changes_for(watched.cfg, count, [*engine, *asked])
+    ground = check_ground(watched.cfg, args.terrain, args.difficulty)
+    load_viser()
+    session = Session(watched, changes, ground, device, graph=device.type == "cuda" and not args.no_graph)
+    page = Page(session, args.host, port)
+    try:
+        print(session.title(), flush=True)
+        if not is_loopback(args.host):
+            open_to_all = "whoever reaches this machine can watch and steer; nobody is asked for a password"
+            print(f"warning: --host {args.host}: {open_to_all}", file=sys.stderr, flush=True)
+        print(f"watch it at {url(args.host, page.port)} (Ctrl-C ends it)", flush=True)
+        page.run()
+    finally:
+        page.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,56 @@
+"""Marks on the methods of a task: the unit of a term, and that a term may run before terminations are settled.
+
+A mark belongs to one method. A method that overrides it in another class has only the marks that are written above itself.
+"""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from legged.config.units import BASE, is_unit
+from legged.errors import ConfigError
+
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+def unit(text: str) -> Callable[[Method], Method]:
+    """Declare the unit of what a term returns, such as "m^2/s^2"; "1" for a plain number. Columns of several units have
+    them separated by commas; the first counts where numbers are carried to another robot (docs/scaling.md).
+
+    Raises:
+        ConfigError: the text is not a unit.
+    """
+    if not isinstance(text, str) or not is_unit(text):
+        raise ConfigError(
+            f'@unit({text!r}): expected powers and products of {", ".join(BASE)}, such as @unit("m^2/s^2") or'
+            ' @unit("rad/s, m"); a plain number has @unit("1")'
+        )
+
+    def mark(method: Method) -> Method:
+        vars(getattr(method, "__func__", method))["_unit"] = text
+        return method
+
+    return mark
+
+
+def unit_of(method: Any) -> str | None:
+    """Return the unit that a term declares; None without `@unit`."""
+    return getattr(method, "_unit", None)
+
+
+def concurrent(method: Method) -> Method:
+    """Let a reward, a termination or a metric run on a parallel stream while `check_termination` settles which episodes end.
+
+    Such a term must not read `terminated_buf`, `time_out_buf`, `reset_buf`, `valid` or `rew_buf`, which are not settled yet;
+    the first step raises a TermError if it does. It must not write what another term reads either. Terms without the mark
+    run once `check_termination` has settled which episodes end, in the order of the configuration.
+
+    BaseTask's hooks `check_termination`, `measure` and `compute_reward` have the mark too: they write nothing that a term
+    with the mark reads. Where a class overrides one of them without the mark, all terms run as if they had none.
+    """
+    vars(getattr(method, "__func__", method))["_concurrent"] = True
+    return method
+
+
+def is_concurrent(method: Any) -> bool:
+    """Return whether a method has the mark `@concurrent`."""
+    return getattr(method, "_concurrent", False)

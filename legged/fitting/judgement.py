@@ -1,0 +1,107 @@
+"""How well fits of an actuator predict torques that they were not fitted to: numbers, and a picture."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from legged.figures import figure
+from legged.fitting.log import ActuatorLog
+from legged.fitting.parametric import Drive
+
+MEASURED = "#000000"
+COLORS = {"ideal PD": "#E69F00", "parametric": "#0072B2", "network": "#D55E00"}
+"""Of the fits, after Okabe and Ito."""
+SHOWN_S = 2.0
+"""Time that the picture shows [s]."""
+POINTS = 4000
+"""Measurements in the plane of torque and speed."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What one way of prediction says of a log."""
+
+    name: str
+    log: ActuatorLog
+    """At the time step that it works at."""
+    torque: np.ndarray
+    """(T, D) [N m]."""
+
+
+def errors(fit: Fit) -> dict[str, float]:
+    """Return the root mean squared error and the largest error on held-out samples [N m], and the share of their variance
+    that is explained.
+    """
+    held = fit.log.held_out
+    measured = fit.log.torque[held]
+    wrong = fit.torque[held] - measured
+    explained = 1.0 - float(np.mean(wrong**2) / max(np.var(measured), 1e-12))
+    return {
+        "rmse": float(np.sqrt(np.mean(wrong**2))),
+        "largest": float(np.abs(wrong).max()),
+        "explained": explained,
+    }
+
+
+def actuator_section(log: ActuatorLog, drive: Drive, sim_dt: float) -> dict[str, Any]:
+    """Return the section `control.actuator` that says what was fitted, for the joints of the log."""
+
+    def named(value: float) -> dict[str, float]:
+        return {name: float(f"{value:.4g}") for name in log.joint_names}
+
+    section: dict[str, Any] = {}
+    if np.isfinite(drive.stall_torque):
+        limits = {"stall_torque": named(drive.stall_torque), "no_load_speed": named(drive.no_load_speed)}
+        section |= {"model": "dc_motor", "joints": list(log.joint_names), **limits}
+    section |= {"coulomb_friction": named(drive.coulomb), "breakaway_friction": named(drive.breakaway)}
+    section |= {"viscous_friction": named(drive.viscous), "stribeck_velocity": float(f"{drive.stribeck_velocity:.4g}")}
+    steps = drive.delay / sim_dt
+    return section | {"delay": [int(np.floor(steps + 0.05)), int(np.ceil(steps - 0.05))]}
+
+
+def draw(path: Path, log: ActuatorLog, fits: list[Fit], drive: Drive) -> None:
+    """Write a picture: torques over time and errors of each fit on held-out samples, and torque over speed.
+
+    Raises:
+        RunError: the file can't be written.
+    """
+    held = log.held_out
+    joint = int(np.argmax(log.torque[held].std(axis=0)))
+    with figure(path, (13.0, 4.6), 1, 3) as (_, axes):
+        over_time, over_speed, bars = axes[0]
+        rows = _shown(log)
+        over_time.plot(
+            (rows - rows[0]) * log.dt, log.torque[rows, joint], color=MEASURED, linewidth=2.2, label="measured", zorder=0
+        )
+        for fit in fits:
+            rows = _shown(fit.log)
+            time = (rows - rows[0]) * fit.log.dt
+            over_time.plot(time, fit.torque[rows, joint], color=COLORS[fit.name], linewidth=1.2, label=fit.name)
+        over_time.set(title=f"{log.joint_names[joint]}, held out", xlabel="time [s]", ylabel="torque [N m]")
+        over_time.legend(fontsize=8)
+        speeds, torques = log.velocity.ravel(), log.torque.ravel()
+        picked = np.linspace(0, len(speeds) - 1, min(POINTS, len(speeds))).astype(int)
+        over_speed.scatter(speeds[picked], torques[picked], s=3, color="#999999", label="measured")
+        line = np.linspace(speeds.min(), speeds.max(), 200)
+        if np.isfinite(drive.stall_torque):
+            for sign, label in ((1.0, "limits of the fitted motor"), (-1.0, None)):
+                edge = drive.torques(np.full(200, sign * 1e6), line)
+                over_speed.plot(line, edge, color=COLORS["parametric"], label=label)
+        over_speed.plot(line, -drive.friction(line), color=COLORS["network"], linestyle="--", label="fitted friction")
+        reach = 1.15 * np.abs(torques).max()
+        over_speed.set(ylim=(-reach, reach), title="all samples", xlabel="velocity [rad/s]", ylabel="torque [N m]")
+        over_speed.legend(fontsize=8)
+        values = [errors(fit)["rmse"] for fit in fits]
+        drawn = bars.bar([fit.name for fit in fits], values, color=[COLORS[fit.name] for fit in fits])
+        bars.bar_label(drawn, [f"{value:.3g}" for value in values])
+        bars.set(title="error on held-out samples", ylabel="RMSE [N m]")
+
+
+def _shown(log: ActuatorLog) -> np.ndarray:
+    """Return the first held-out samples of a log, of one run."""
+    held = log.held_out
+    start = int(np.flatnonzero(held)[0])
+    rows = np.arange(start, min(start + round(SHOWN_S / log.dt), len(held)))
+    return rows[held[rows] & (log.run[rows] == log.run[start])]

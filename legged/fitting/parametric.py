@@ -1,0 +1,195 @@
+"""A drive with known parts fitted to a log: P and D gains, delay, torque-speed line of the motor, friction of the joint.
+
+The formulas are those of legged/mdp/actuator.py. Numbers are found by Levenberg's and Marquardt's method on the squared error
+of the torque, for each delay; the delay with the least error is taken.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from legged.fitting.log import ActuatorLog
+
+SEEN = 0.002
+"""Share of samples at the motor's limit below which the limit is not told from the data."""
+MOST_ITERATIONS = 60
+DAMPING, EASIER, HARDER = 1e-3, 0.3, 4.0
+"""Of Levenberg and Marquardt: the damping at the start, and its factors after a step that helped and one that did not."""
+FINEST = 1e-9
+"""Relative improvement at which the search ends."""
+MOST_SAMPLES = 40_000
+"""Samples that the last searches look at, spread over the log."""
+ROUGHLY = 4_000
+"""Samples of the first search, over all delays."""
+SMOOTHING = 0.1
+"""Speed below which Coulomb friction fades [rad/s]."""
+WORTH = 0.005
+"""Share of the squared error that a peak of the friction at low speed has to explain, to be told from the data."""
+NARROWEST, WIDEST = 0.5 * SMOOTHING, 0.1
+"""Stribeck velocities that a log can show: at least so many rad/s, for friction fades below, and at most this share of the
+fastest speed, for a wider "peak" fits whatever else falls with speed."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Numbers of a drive; all joints of a fit share them."""
+
+    stiffness: float
+    """[N m/rad]"""
+    damping: float
+    """[N m s/rad]"""
+    coulomb: float
+    """[N m]"""
+    breakaway: float
+    """[N m]"""
+    stribeck_velocity: float
+    """[rad/s]"""
+    viscous: float
+    """[N m s/rad]"""
+    stall_torque: float = np.inf
+    """[N m]; infinite where the log shows no limit."""
+    no_load_speed: float = np.inf
+    """[rad/s]"""
+    effort: float = np.inf
+    """[N m]"""
+    delay: float = 0.0
+    """[s]"""
+
+    def torques(self, error: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Return torques [N m] for errors of the delayed target [rad] and velocities [rad/s]."""
+        asked = self.stiffness * error - self.damping * velocity
+        if np.isfinite(self.stall_torque):
+            fastest = self.no_load_speed * (1.0 + min(self.effort / self.stall_torque, 1e6))
+            share = np.clip(velocity, -fastest, fastest) / self.no_load_speed
+            low = np.maximum(self.stall_torque * (-1.0 - share), -self.effort)
+            asked = np.clip(asked, low, np.minimum(self.stall_torque * (1.0 - share), self.effort))
+        else:
+            asked = np.clip(asked, -self.effort, self.effort)
+        return asked - self.friction(velocity)
+
+    def friction(self, velocity: np.ndarray) -> np.ndarray:
+        """Return the torque by which the joint resists [N m]."""
+        slow = np.exp(-((velocity / self.stribeck_velocity) ** 2))
+        dry = self.coulomb + (self.breakaway - self.coulomb) * slow
+        return dry * np.tanh(velocity / SMOOTHING) + self.viscous * velocity
+
+    def predict(self, log: ActuatorLog) -> np.ndarray:
+        """Return the torques (T, D) of a log [N m]."""
+        return self.torques(delayed(log, self.delay / log.dt) - log.position, log.velocity)
+
+
+def delayed(log: ActuatorLog, samples: float) -> np.ndarray:
+    """Return the targets (T, D) of a log as they were some samples before, on the line between two where it is no whole
+    number of them; at the start of a run, the first target.
+    """
+    first = np.maximum.accumulate(np.where(np.r_[True, np.diff(log.run) != 0], np.arange(len(log.run)), 0))
+    whole = int(np.floor(samples))
+    share = samples - whole
+    rows = np.arange(len(log.run))
+    near, far = (log.target[np.maximum(rows - shift, first)] for shift in (whole, whole + 1))
+    return near if share == 0.0 else (1.0 - share) * near + share * far
+
+
+def fit_drive(log: ActuatorLog, longest_delay: float = 0.05) -> Drive:
+    """Return the drive that explains a log's torques best, held-out samples left out. Gains that the log states, the same
+    for all joints, are taken as they are. Without them the damping has the viscous friction in it: they can't be told apart.
+    Breakaway friction is the Coulomb friction unless the log shows a peak at low speed.
+    """
+    every = np.flatnonzero(~log.held_out)
+    effort = np.inf if log.torque_limit is None else float(log.torque_limit.max())
+
+    def search(
+        samples: float, start: Drive, limited: bool, most: int = MOST_SAMPLES, peaked: bool = True
+    ) -> tuple[float, Drive]:
+        rows = every[:: max(1, round(len(every) * len(log.joint_names) / most))]
+        position, velocity, torque = (getattr(log, name)[rows].ravel() for name in ("position", "velocity", "torque"))
+        error = delayed(log, samples)[rows].ravel() - position
+        return _search(replace(start, delay=samples * log.dt), error, velocity, torque, _free(log, limited, peaked))
+
+    # The delay first, roughly: in whole samples, with the motor's line and without.
+    start = _start(log, effort)
+    torques, speeds = np.abs(log.torque[every]), np.abs(log.velocity[every])
+    limits = replace(start, stall_torque=1.2 * torques.max(), no_load_speed=1.5 * max(speeds.max(), 1.0))
+    delays = np.arange(0, int(longest_delay / log.dt + 1e-6) + 1)
+    tried = [search(float(k), of, of is limits, ROUGHLY) for k in delays for of in (start, limits)]
+    best = min(tried, key=lambda one: one[0])[1]
+    limited = bool(np.isfinite(best.stall_torque)) and _share_limited(best, log, every) >= SEEN
+    if not limited:
+        best = replace(best, stall_torque=np.inf, no_load_speed=np.inf)
+    found = search(best.delay / log.dt, best, limited)
+    for step in (1.0, 0.5, 0.25, 0.1):
+        near = found[1].delay / log.dt + step * np.array([-1.0, 1.0])
+        found = min([found, *(search(float(k), found[1], limited) for k in near if k >= 0.0)], key=lambda one: one[0])
+    even = search(found[1].delay / log.dt, _without_peak(found[1]), limited, peaked=False)
+    told = NARROWEST <= found[1].stribeck_velocity <= WIDEST * speeds.max() and found[0] <= (1.0 - WORTH) * even[0]
+    return (found if told else even)[1]
+
+
+def _start(log: ActuatorLog, effort: float) -> Drive:
+    """Return where the search begins: the gains that are known, or those of a straight line, and little friction."""
+    if log.stiffness is not None and log.damping is not None:
+        stiffness, damping = float(log.stiffness.mean()), float(log.damping.mean())
+    else:
+        columns = np.stack([(log.target - log.position).ravel(), -log.velocity.ravel()], axis=1)
+        stiffness, damping = np.maximum(np.linalg.lstsq(columns, log.torque.ravel(), rcond=None)[0], 1e-3)
+    dry = 0.02 * float(np.abs(log.torque).max()) + 1e-6
+    return Drive(float(stiffness), float(damping), dry, dry, 2.0 * SMOOTHING, 0.05 * damping + 1e-6, effort=effort)
+
+
+def _without_peak(drive: Drive) -> Drive:
+    """Return a drive whose dry friction is the same at all speeds, about as large as the given one's."""
+    dry = max(drive.coulomb, min(drive.breakaway, float(drive.friction(np.array(5.0 * SMOOTHING)))), 1e-6)
+    return replace(drive, coulomb=dry, breakaway=dry, stribeck_velocity=2.0 * SMOOTHING)
+
+
+def _free(log: ActuatorLog, limited: bool, peaked: bool) -> tuple[str, ...]:
+    """Return the names of the numbers that are searched for; without a peak, breakaway friction is Coulomb friction."""
+    known = log.stiffness is not None and log.damping is not None
+    gains = ("viscous",) if known else ("stiffness", "damping")
+    limits = ("stall_torque", "no_load_speed") if limited else ()
+    peak = ("breakaway", "stribeck_velocity") if peaked else ()
+    return (*gains, "coulomb", *peak, *limits)
+
+
+def _search(
+    start: Drive, error: np.ndarray, velocity: np.ndarray, torque: np.ndarray, free: tuple[str, ...]
+) -> tuple[float, Drive]:
+    """Return the mean squared error and the drive with the least of it near `start`, by the logarithms of its free
+    numbers.
+    """
+    start = start if "viscous" in free else replace(start, viscous=0.0)
+
+    def drive(x: np.ndarray) -> Drive:
+        values = dict(zip(free, np.exp(x).tolist(), strict=True))
+        values.setdefault("breakaway", values["coulomb"])
+        return replace(start, **values)
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        return drive(x).torques(error, velocity) - torque
+
+    x = np.log([getattr(start, name) for name in free])
+    left = residual(x)
+    cost, weight = float(left @ left), DAMPING
+    for _ in range(MOST_ITERATIONS):
+        jacobian = np.stack([(residual(x + 1e-4 * unit) - left) / 1e-4 for unit in np.eye(len(x))], axis=1)
+        square, slope = jacobian.T @ jacobian, jacobian.T @ left
+        scale = np.diag(square) + 1e-12 * max(1.0, np.trace(square))
+        while weight < 1e12:
+            step = np.clip(np.linalg.solve(square + weight * np.diag(scale), -slope), -1.0, 1.0)
+            tried = residual(np.clip(x + step, -18.0, 18.0))
+            if float(tried @ tried) < cost:
+                break
+            weight *= HARDER
+        else:
+            break
+        better = 1.0 - float(tried @ tried) / max(cost, 1e-300)
+        x, left, cost, weight = np.clip(x + step, -18.0, 18.0), tried, float(tried @ tried), weight * EASIER
+        if better < FINEST:
+            break
+    return cost / len(torque), drive(x)
+
+
+def _share_limited(drive: Drive, log: ActuatorLog, rows: np.ndarray) -> float:
+    """Return the share of samples in which the motor's line, not the effort limit, holds the torque down."""
+    free = replace(drive, stall_torque=np.inf, no_load_speed=np.inf)
+    return float(np.mean(np.abs(drive.predict(log)[rows] - free.predict(log)[rows]) > 1e-6))

@@ -1,0 +1,166 @@
+"""A network trained on a log of an actuator, which legged/mdp/actuator_network.py then runs."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from legged.errors import ConfigError
+from legged.fitting.log import ActuatorLog
+from legged.mdp.actuator_network import ActuatorNetwork, NetworkWeights
+
+LEARNING_RATE = {"mlp": 3e-3, "lstm": 1e-2}
+BATCH = 4096
+"""Samples of an update of an MLP."""
+CHUNK, BURN_IN, CHUNKS = 60, 15, 64
+"""Of an LSTM: samples of a sequence, those at its start that are not judged, and sequences of an update."""
+
+
+def train_network(
+    log: ActuatorLog, kind: str, hidden: Sequence[int], samples: int, spacing: int, updates: int, seed: int
+) -> NetworkWeights:
+    """Return a network (`mlp` or `lstm`) of `hidden` units a layer, trained on the samples of a log that are not held out. An
+    MLP sees `samples` of them, `spacing` apart.
+
+    Raises:
+        ConfigError: the runs are too short for it.
+    """
+    error = log.target - log.position
+    used = ~log.held_out
+    scales = np.array([1.0 / _spread(error[used]), 1.0 / _spread(log.velocity[used]), _spread(log.torque[used])], np.float32)
+    random = torch.Generator().manual_seed(seed)
+    state = torch.get_rng_state()
+    try:
+        torch.manual_seed(seed)  # of torch's initial weights
+        train = _train_mlp if kind == "mlp" else _train_lstm
+        layers = train(
+            log,
+            error * scales[0],
+            log.velocity * scales[1],
+            log.torque / scales[2],
+            hidden,
+            (samples, spacing),
+            updates,
+            random,
+        )
+    finally:
+        torch.set_rng_state(state)
+    dt, seen = (log.dt * spacing, samples) if kind == "mlp" else (log.dt, 1)
+    return NetworkWeights(kind, dt, seen, scales, layers)
+
+
+def predict(weights: NetworkWeights, log: ActuatorLog) -> np.ndarray:
+    """Return the torques (T, D) of a log as the network gives them in a task [N m]: step by step, each run from its start."""
+    joints = len(log.joint_names)
+    network = ActuatorNetwork(weights, 1, joints, log.dt, torch.device("cpu"))
+    error = torch.tensor(log.target - log.position, dtype=torch.float32)
+    velocity = torch.tensor(log.velocity, dtype=torch.float32)
+    begins = np.r_[True, np.diff(log.run) != 0]
+    everyone, found = torch.ones(1, dtype=torch.bool), torch.zeros(len(error), joints)
+    with torch.inference_mode():
+        for k in range(len(error)):
+            if begins[k]:
+                network.reset(everyone)
+            found[k] = network.torques(error[k : k + 1], velocity[k : k + 1])[0]
+    return found.numpy().astype(np.float64)
+
+
+def _spread(values: np.ndarray) -> float:
+    return max(float(np.std(values)), 1e-6)
+
+
+def _rows(log: ActuatorLog, past: int) -> np.ndarray:
+    """Return the samples that may be learned from with `past` samples before them in the same run, none of them held out.
+
+    Raises:
+        ConfigError: there are none.
+    """
+    usable = ~log.held_out
+    starts = np.r_[True, (np.diff(log.run) != 0) | (np.diff(usable.astype(int)) != 0)]
+    since = np.arange(len(usable)) - np.maximum.accumulate(np.where(starts, np.arange(len(usable)), 0))
+    rows = np.flatnonzero(usable & (since >= past))
+    if not len(rows):
+        raise ConfigError(f"log: no run has more than {past} samples in a row to learn from ({log.dt:g} s apart)")
+    return rows
+
+
+def _train_mlp(
+    log: ActuatorLog,
+    error: np.ndarray,
+    velocity: np.ndarray,
+    torque: np.ndarray,
+    hidden: Sequence[int],
+    history: tuple[int, int],
+    updates: int,
+    random: torch.Generator,
+) -> tuple[dict[str, np.ndarray], ...]:
+    """Return the layers of an MLP; arrays are (T, D), scaled."""
+    samples, spacing = history
+    rows = _rows(log, spacing * (samples - 1))
+    lags = spacing * np.arange(samples)
+    seen = [values[rows - lag].ravel() for values in (error, velocity) for lag in lags]
+    inputs = torch.tensor(np.stack(seen, axis=1), dtype=torch.float32)
+    outputs = torch.tensor(torque[rows].ravel(), dtype=torch.float32)
+    widths = [2 * samples, *hidden]
+    linear = [nn.Linear(a, b) for a, b in zip(widths, [*widths[1:], 1], strict=True)]
+    network = nn.Sequential(*[part for layer in linear[:-1] for part in (layer, nn.Softsign())], linear[-1])
+
+    def loss() -> Tensor:
+        picked = torch.randint(len(inputs), (min(BATCH, len(inputs)),), generator=random)
+        return nn.functional.mse_loss(network(inputs[picked])[:, 0], outputs[picked])
+
+    _minimise(network, loss, updates, LEARNING_RATE["mlp"])
+    return tuple({"weight": _array(layer.weight), "bias": _array(layer.bias)} for layer in linear)
+
+
+def _train_lstm(
+    log: ActuatorLog,
+    error: np.ndarray,
+    velocity: np.ndarray,
+    torque: np.ndarray,
+    hidden: Sequence[int],
+    _: tuple[int, int],
+    updates: int,
+    random: torch.Generator,
+) -> tuple[dict[str, np.ndarray], ...]:
+    """Return the layers of an LSTM, by backpropagation through sequences; arrays are (T, D), scaled."""
+    ends = torch.tensor(_rows(log, CHUNK - 1))
+    inputs = torch.tensor(np.stack([error, velocity], axis=2), dtype=torch.float32)
+    outputs = torch.tensor(torque, dtype=torch.float32)
+    cells = [nn.LSTM(a, b) for a, b in zip([2, *hidden], hidden, strict=False)]
+    last = nn.Linear(hidden[-1], 1)
+    back = torch.arange(CHUNK - 1, -1, -1).unsqueeze(1)
+
+    def loss() -> Tensor:
+        rows = ends[torch.randint(len(ends), (CHUNKS,), generator=random)] - back
+        joints = torch.randint(inputs.shape[1], (CHUNKS,), generator=random)
+        x = inputs[rows, joints]
+        for cell in cells:
+            x, _ = cell(x)
+        return nn.functional.mse_loss(last(x)[BURN_IN:, :, 0], outputs[rows, joints][BURN_IN:])
+
+    _minimise(nn.ModuleList([*cells, last]), loss, updates, LEARNING_RATE["lstm"])
+    layers = []
+    for cell in cells:
+        weights = dict(cell.named_parameters())
+        bias = _array(weights["bias_ih_l0"] + weights["bias_hh_l0"])
+        layers.append({"input": _array(weights["weight_ih_l0"]), "hidden": _array(weights["weight_hh_l0"]), "bias": bias})
+    return (*layers, {"weight": _array(last.weight), "bias": _array(last.bias)})
+
+
+def _minimise(network: nn.Module, loss: Callable[[], Tensor], updates: int, rate: float) -> None:
+    """Make so many updates by Adam, with steps that become smaller down to nothing."""
+    optimiser = torch.optim.Adam(network.parameters(), rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
+    for _ in range(updates):
+        optimiser.zero_grad()
+        found = loss()
+        found.backward()
+        nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimiser.step()
+        schedule.step()
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().numpy().astype(np.float32)

@@ -1,0 +1,166 @@
+"""A task that a configuration of legged_gym becomes: settings, what is said beside them, and what is lost."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from legged.config.checks import build, shown
+from legged.config.dotted import value_at
+from legged.config.loader import nest, to_dict
+from legged.config.origins import Origins
+from legged.config.schema import LeggedConfig
+from legged.errors import ConfigError
+from legged.migration.found import Found, Place, members
+from legged.migration.legged_gym_defaults import ENVIRONMENT, LEARNING
+
+DEFAULTS = to_dict(LeggedConfig())
+LARGEST_NUMBER = 1e12
+"""What nobody means who writes a larger one."""
+PI = 3.14
+"""What legged_gym writes for half a turn."""
+
+
+@dataclass(frozen=True)
+class Lost:
+    """A setting that has no place here, or another meaning."""
+
+    place: Place
+    setting: str
+    value: str
+    reason: str
+
+    def __str__(self) -> str:
+        value = f" = {self.value}" if self.value else ""
+        return f"{self.place}: {self.setting}{value}: {self.reason}"
+
+
+def flat(owner: type, prefix: str = "") -> dict[str, Found]:
+    """Return the settings of a configuration class and of the classes in it, by dotted path."""
+    found: dict[str, Found] = {}
+    for name, value in members(owner):
+        if isinstance(value, Found):
+            found[f"{prefix}{name}"] = value
+        else:
+            found |= flat(value, f"{prefix}{name}.")
+    return found
+
+
+@dataclass
+class Translation:
+    """The task that a configuration becomes."""
+
+    theirs: dict[str, Found]
+    """Settings of the environment, and of the learner."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    """Dotted path here -> value, where it differs from the default."""
+    comments: dict[str, str] = field(default_factory=dict)
+    """Dotted path here -> what is said beside it."""
+    lost: list[Lost] = field(default_factory=list)
+    done: set[str] = field(default_factory=set)
+    """Settings of theirs that were looked at."""
+
+    def get(self, path: str, default: Any = None) -> Any:
+        """Return one of their values, for what is made of several; `default` where it is not set or not known."""
+        self.done.add(path)
+        found = self.theirs.get(path)
+        if found is not None and found.why_unknown:
+            self.lose(path, found.why_unknown)
+        return default if found is None or found.why_unknown else found.value
+
+    def number(self, path: str, default: float) -> float:
+        """Return one of their values that must be a number."""
+        return self._of_kind(path, default, is_number, "a number")
+
+    def numbers(self, path: str, default: list[float]) -> list[float]:
+        """Return one of their values that must be a list of numbers."""
+        return list(self._of_kind(path, default, _are_numbers, "a list of numbers"))
+
+    def table(self, path: str) -> dict[str, float]:
+        """Return one of their values that must be a table of names and numbers."""
+        found = self._of_kind(path, {}, _is_table, "names and their numbers")
+        return {name: float(value) for name, value in found.items()}
+
+    def _of_kind(self, path: str, default: Any, is_of_kind: Callable[[Any], bool], kind: str) -> Any:
+        value = self.get(path, default)
+        if not is_of_kind(value):
+            self.lose(path, f"expected {kind}")
+            return default
+        return value
+
+    def given(self, path: str) -> bool:
+        """Return whether their files set it to something else than legged_gym does."""
+        found = self.theirs.get(path)
+        if found is None:
+            return False
+        known = value_at(ENVIRONMENT | LEARNING, path)
+        return bool(found.why_unknown) or plain(found.value) != plain(known)
+
+    def lose(self, path: str, reason: str) -> None:
+        """List a setting of theirs as lost."""
+        self.done.add(path)
+        found = self.theirs[path]
+        if any(entry.setting == path and entry.place == found.place and entry.reason == reason for entry in self.lost):
+            return
+        self.lost.append(Lost(found.place, path, "" if found.why_unknown else shown(found.value), reason))
+
+    def put(self, path: str, value: Any, theirs: str, comment: str = "") -> None:
+        """Set `path` here, unless it is the default; a value that the schema refuses is lost."""
+        self.done.add(theirs)
+        value = plain(value)
+        try:
+            build(LeggedConfig, nest(path, value), "", Origins(), "value")
+        except ConfigError as error:
+            reason = str(error).removeprefix(f"value: {path}: ")
+            self.lose(theirs, f"{path} takes no such value: {reason}") if theirs in self.theirs else None
+            return
+        default = value_at(DEFAULTS, path)
+        if _same(value, 1.0 if default is None and path.startswith("observations.scales.") else default):
+            self.settings.pop(path, None)  # what another name of theirs set before
+            return
+        self.settings[path] = value
+        if comment:
+            self.comments[path] = comment
+
+    def take(self, table: Mapping[str, str]) -> None:
+        """Take over the settings of a table that are set."""
+        for theirs, ours in table.items():
+            found = self.theirs.get(theirs)
+            if found is None:
+                continue
+            if found.why_unknown:
+                self.lose(theirs, found.why_unknown)
+            else:
+                self.put(ours, found.value, theirs)
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value is a finite number, and no bool."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST_NUMBER
+
+
+def _are_numbers(value: Any) -> bool:
+    return isinstance(value, list | tuple) and all(map(is_number, value))
+
+
+def _is_table(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(name, str) and is_number(item) for name, item in value.items())
+
+
+def plain(value: Any) -> Any:
+    """Return lists for tuples, and no negative zeros, so that values can be compared and written."""
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    return 0.0 if value == 0 and isinstance(value, float) else value
+
+
+def _same(value: Any, default: Any) -> bool:
+    """Return whether a value is the default, half a turn being 3.14 in legged_gym."""
+    if isinstance(value, list) and isinstance(default, list | tuple) and len(value) == len(default):
+        return all(_same(a, b) for a, b in zip(value, default, strict=True))
+    if isinstance(value, int | float) and isinstance(default, int | float) and not isinstance(value, bool):
+        half_turn = abs(value) == PI and abs(abs(default) - math.pi) < 1e-6 and value * default > 0
+        return value == default or half_turn
+    return bool(value == default)

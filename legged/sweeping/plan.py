@@ -1,0 +1,332 @@
+"""The YAML file of a sweep, checked against the task's configuration before a training begins."""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from legged.config import TaskConfig, override, to_dict
+from legged.config.bounds import FLOAT32_MAX, NAME, between, items
+from legged.config.checks import PLAIN, build, is_plain_name, shown
+from legged.config.dotted import value_at
+from legged.config.origins import Origins
+from legged.config.yaml_files import read_yaml
+from legged.envs.checks import evaluated_figures, lower_is_better
+from legged.errors import ConfigError, suggest
+from legged.process.paths import data_folder, exists, relative
+from legged.registry import YAML_ENDINGS, register_file, task_class, task_config, task_names
+
+OWN = ("task", "env.seed", "train.runner.run_name", "train.runner.experiment_name", "train.runner.stop_at")
+"""Settings that the sweep sets itself."""
+EVALUATIONS = 10
+"""Default number of evaluations of a trial."""
+DIGITS = 4
+"""Significant digits of drawn numbers."""
+NUMBER = between(-FLOAT32_MAX, FLOAT32_MAX)
+
+
+@dataclass(frozen=True)
+class ParameterConfig:
+    """The tried values of a setting: a range or a list of choices."""
+
+    low: float | None = field(default=None, metadata=NUMBER)
+    """Least value."""
+    high: float | None = field(default=None, metadata=NUMBER)
+    """Greatest value."""
+    log: bool = False
+    """Draw from the logarithm of the range."""
+    choices: tuple[Any, ...] = field(default=(), metadata={**items(1000), "may_be_empty": True})
+    """Values to try, in place of a range."""
+
+
+@dataclass(frozen=True)
+class ObjectiveConfig:
+    """The objective of a sweep."""
+
+    figure: str = ""
+    """Figure of the evaluations during training; the most important one when empty."""
+    take: Literal["last", "best", "time", "steps"] = "last"
+    """Value of a trial: the last or the best value of the figure, or the training time [s] or the steps of all robots until
+    it reaches `target`.
+    """
+    target: float | None = field(default=None, metadata=NUMBER)
+    """Value of the figure at which a trial ends."""
+
+
+@dataclass(frozen=True)
+class SweepConfig:
+    """The file of a sweep."""
+
+    task: str = ""
+    """Task to train: a name, or a YAML file relative to this one."""
+    name: str = field(default="", metadata=NAME)
+    """Folder under logs/; by default sweep_ and the name of the file."""
+    trials: int = field(default=20, metadata=between(1, 1_000_000))
+    """Trials in all, of all processes."""
+    seeds: tuple[int, ...] = field(default=(1,), metadata={**items(100, between(0, 2**62)), "unique": True})
+    """Seeds of each trial; its value is their mean."""
+    objective: ObjectiveConfig = ObjectiveConfig()
+    """The objective."""
+    pruner: Literal["median", "hyperband", "none"] = "median"
+    """Rule for ending trials early: below the median of earlier trials, by successive halving, or never."""
+    startup_trials: int = field(default=10, metadata=between(1, 1_000_000))
+    """Number of random trials before earlier results guide the search."""
+    seed: int = field(default=1, metadata=between(0, 2**31 - 1))
+    """Seed of the search."""
+    storage: str = ""
+    """Storage of the trials: a URL of a database, or journal:<file>; by default sweep.db in the sweep's folder."""
+    overrides: dict[str, Any] = field(default_factory=dict)
+    """Dotted path -> value, for all trials."""
+    parameters: dict[str, ParameterConfig] = field(default_factory=dict)
+    """Dotted path -> values to try."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A swept setting."""
+
+    path: str
+    kind: Literal["whole", "number", "choice"]
+    low: float = 0.0
+    high: float = 0.0
+    log: bool = False
+    choices: tuple[str, ...] = ()
+    """Values as JSON."""
+
+    def value(self, drawn: Any) -> Any:
+        """Return the value of the setting from a drawn number, rounded to a few digits, or from the text of a choice."""
+        if self.kind == "choice":
+            return json.loads(drawn)
+        if self.kind == "whole":
+            return int(drawn)
+        return min(max(float(f"{drawn:.{DIGITS}g}"), self.low), self.high)
+
+    def drawn(self, value: Any) -> Any:
+        """Return the drawn number or text for a value of the setting; None if the value is not among those to try."""
+        if self.kind == "choice":
+            return next((text for text in self.choices if json.loads(text) == value), None)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not self.low <= value <= self.high:
+            return None
+        return value if self.value(value) == value else None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A checked sweep."""
+
+    name: str
+    given: SweepConfig
+    cfg: TaskConfig
+    """Common configuration of all trials."""
+    figure: str
+    parameters: tuple[Parameter, ...]
+    task: str
+    """TASK of `legged train`: a name, or a YAML file."""
+
+    @property
+    def own(self) -> dict[str, Any]:
+        """Dotted path -> the task's own value of each swept setting."""
+        task = to_dict(self.cfg)
+        return {one.path: value_at(task, one.path) for one in self.parameters}
+
+    @property
+    def own_drawn(self) -> dict[str, Any]:
+        """Dotted path -> drawn form of the task's own value; None if it is not among the values to try."""
+        own = self.own
+        return {one.path: one.drawn(own[one.path]) for one in self.parameters}
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the sweep's files and of the run folders of its trials."""
+        return Path("logs") / self.name
+
+    @property
+    def until_target(self) -> bool:
+        """True if the value of a trial is the time or the number of steps to its target."""
+        return self.given.objective.take in ("time", "steps")
+
+    @property
+    def minimize(self) -> bool:
+        """True if smaller values are better."""
+        return self.until_target or lower_is_better(self.figure)
+
+    @property
+    def objective_text(self) -> str:
+        """Objective as text, with its unit."""
+        objective = self.given.objective
+        units = {"lin_vel_rmse": " [m/s]", "ang_vel_rmse": " [rad/s]"}
+        if self.until_target:
+            what = "time in iterations [s]" if objective.take == "time" else "steps of all robots"
+            return f"{what} until {self.figure} reaches {objective.target:g}"
+        return f"{objective.take} {self.figure}{units.get(self.figure, '')}"
+
+    @property
+    def identity(self) -> str:
+        """Text of all parts that must stay the same for trials to be comparable."""
+        given = to_dict(self.given)
+        return json.dumps(
+            {name: given[name] for name in ("task", "seeds", "objective", "overrides", "parameters")}, sort_keys=True
+        )
+
+    def with_trials(self, trials: int) -> "Plan":
+        """Return the plan with another number of trials."""
+        return replace(self, given=replace(self.given, trials=trials))
+
+    @property
+    def negated(self) -> bool:
+        """True if intermediate figures are negated when they are reported: the values of trials are times, where less is
+        better, but more of the figure is better.
+        """
+        return self.until_target and not lower_is_better(self.figure)
+
+    def arguments(self, values: Mapping[str, Any], number: int, seed: int) -> list[str]:
+        """Return the arguments of `legged train` for a trial of that number."""
+        target = self.given.objective.target
+        goal = {} if target is None else {f"train.runner.stop_at.{self.figure}": target}
+        settings = {**self._own_defaults(), **self.given.overrides, **values, **goal}
+        flags = [self.task, "--seed", str(seed), "--experiment-name", self.name]
+        flags += ["--run-name", f"trial{number:03d}_s{seed}", "--note", self.note(values, number)]
+        return [*flags, *(f"{path}={json.dumps(value)}" for path, value in settings.items())]
+
+    def note(self, values: Mapping[str, Any], number: int) -> str:
+        """Return the note for the runs of a trial: its drawn values."""
+        drawn = [f"{'.'.join(path.split('.')[-2:])} {json.dumps(value)}" for path, value in values.items()]
+        return f"trial {number} of {self.name}: {', '.join(drawn)}"
+
+    def _own_defaults(self) -> dict[str, Any]:
+        """Return default overrides of trials: evaluations that make them comparable, and neither report nor film, which would
+        take longer than many trials; `legged runs report` makes them later.
+        """
+        return {
+            "train.runner.report": False,
+            "train.runner.film": False,
+            "train.runner.evaluate_interval": self.cfg.train.runner.evaluate_interval,
+            "train.runner.evaluate_share": self.cfg.train.runner.evaluate_share,
+        }
+
+
+def sweep_file(text: str) -> Path:
+    """Return the file of a sweep: a path, or the name of one in cfg/sweeps of this package.
+
+    Raises:
+        ConfigError: there is no such file.
+    """
+    folder = data_folder("cfg") / "sweeps"
+    for path in (Path(text), folder / f"{text}.yaml"):
+        if exists(path) and path.is_file():
+            return path
+    names = [path.stem for path in folder.glob("*.yaml")]
+    raise ConfigError(f"sweep: there is no file {shown(text)}{suggest(text[:100], names, 'sweeps')}")
+
+
+def read_sweep(path: Path) -> SweepConfig:
+    """Read the file of a sweep.
+
+    Raises:
+        ConfigError: the file does not describe a sweep.
+    """
+    return build(SweepConfig, read_yaml(path), "", Origins(), str(path))
+
+
+def plan_sweep(given: SweepConfig, path: Path, on_cpu: bool) -> Plan:
+    """Check the file of a sweep against its task, and return the plan.
+
+    Raises:
+        ConfigError: a setting is unknown, a value is out of bounds, or the objective is not measured.
+    """
+    name = given.name or f"sweep_{path.stem}"
+    if not is_plain_name(name):
+        raise ConfigError(f"{path}: name: expected {PLAIN}; got {shown(name)}")
+    if not given.task:
+        raise ConfigError(f"{path}: task: a sweep says which task it trains{suggest('', task_names(), 'tasks')}")
+    if not given.parameters:
+        raise ConfigError(f"{path}: parameters: a sweep tries the values of at least one setting")
+    for section in ("overrides", "parameters"):
+        for key in getattr(given, section):
+            if key in OWN or key.startswith(f"{OWN[-1]}."):
+                raise ConfigError(f"{path}: {section}: {key}: is set by the sweep itself (seeds, name, objective)")
+    task, file = given.task, None
+    if task.endswith(YAML_ENDINGS):
+        file = relative(path.parent / task)
+        task = register_file(file, f"{path}: task")
+    with _said_in(path, "overrides"):
+        cfg = task_config(task, given.overrides.items(), on_cpu)
+    runner = cfg.train.runner
+    changes: list[tuple[str, Any]] = []
+    if not runner.evaluate_interval:
+        changes.append(("train.runner.evaluate_interval", max(1, runner.max_iterations // EVALUATIONS)))
+    if "train.runner.evaluate_share" not in given.overrides:
+        changes.append(("train.runner.evaluate_share", 1.0))  # trials are compared at the same iterations
+    cfg = override(cfg, changes)
+    parameters = tuple(_parameter(key, one, cfg, path) for key, one in given.parameters.items())
+    return Plan(name, given, cfg, _figure(given, cfg, path), parameters, file or task)
+
+
+def _figure(given: SweepConfig, cfg: TaskConfig, path: Path) -> str:
+    """Return the figure of the objective.
+
+    Raises:
+        ConfigError: evaluations do not measure it, or the target is missing.
+    """
+    figures, objective = evaluated_figures(task_class(cfg.task), cfg), given.objective
+    figure = objective.figure or figures[0]
+    if figure not in figures:
+        where = f"{path}: objective.figure"
+        raise ConfigError(
+            f"{where}: evaluations of '{cfg.task}' find no {shown(figure)}{suggest(figure, figures, 'they find')}"
+        )
+    if objective.take in ("time", "steps") and objective.target is None:
+        raise ConfigError(f"{path}: objective.target: the {objective.take} until what value of {figure}? Give a number")
+    return figure
+
+
+def _parameter(key: str, one: ParameterConfig, cfg: TaskConfig, path: Path) -> Parameter:
+    """Return the swept setting; the ends of its range and all its choices must be valid values.
+
+    Raises:
+        ConfigError: they do not.
+    """
+    where = f"{path}: parameters: {key}"
+    if one.choices:
+        if one.low is not None or one.high is not None or one.log:
+            raise ConfigError(f"{where}: choices take the place of low, high and log; give one or the other")
+        _tried(key, one.choices, cfg, path)
+        texts = tuple(json.dumps(value) for value in one.choices)
+        if len({*texts}) < len(texts):
+            raise ConfigError(f"{where}.choices: names one twice; each may come once")
+        return Parameter(key, "choice", choices=texts)
+    if one.low is None or one.high is None:
+        raise ConfigError(f"{where}: expected low and high of a range, or choices")
+    if not one.low < one.high:
+        raise ConfigError(f"{where}: low must be below high, got {one.low:g} and {one.high:g}")
+    if one.log and one.low <= 0.0:
+        raise ConfigError(f"{where}: with log, low must be above 0, got {one.low:g}")
+    whole = isinstance(value_at(to_dict(cfg), key), int) and not isinstance(value_at(to_dict(cfg), key), bool)
+    ends = (one.low, one.high)
+    if whole:
+        if any(end != int(end) for end in ends):
+            raise ConfigError(f"{where}: expected whole numbers for low and high, got {one.low:g} and {one.high:g}")
+        ends = (int(one.low), int(one.high))
+    _tried(key, ends, cfg, path)
+    return Parameter(key, "whole" if whole else "number", *ends, log=one.log)
+
+
+def _tried(key: str, values: Iterable[Any], cfg: TaskConfig, path: Path) -> None:
+    """Check the configuration with each value."""
+    with _said_in(path, "parameters"):
+        for value in values:
+            task_class(cfg.task).check(override(cfg, [(key, value)]))
+
+
+@contextmanager
+def _said_in(path: Path, section: str) -> Iterator[None]:
+    """Make errors about settings name the file of the sweep in place of 'command line' or 'TASK'."""
+    try:
+        yield
+    except ConfigError as error:
+        for said, key in (("command line: ", section), ("TASK: ", "task")):
+            if str(error).startswith(said):
+                raise ConfigError(f"{path}: {key}: {str(error).removeprefix(said)}") from error
+        raise

@@ -1,1 +1,0 @@
-"""Commands: `python -m legged.tools.<name>`, and nothing else."""

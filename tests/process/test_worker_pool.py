@@ -1,0 +1,82 @@
+"""Processes side by side: limits per kind, order of trainings, stops and reasons for failures."""
+
+import signal
+import sys
+
+from legged.process.startup import STAGES_FILE
+from legged.process.worker_pool import BUILT, Job, Kind, WorkerPool, why_failed
+
+
+def script(kind, name, log, built_after=0.0, lasts=0.3, code="", done=lambda job, code: []):
+    """Return a job that notes its begin and end, and reports its stage `BUILT` after some time."""
+    text = (
+        "import os, time\n"
+        f"note = lambda what: open({str(log)!r}, 'a').write(f'{name} {{what}}\\n')\n"
+        "note('begins')\n"
+        f"time.sleep({built_after})\n"
+        f"open(os.environ[{STAGES_FILE!r}], 'a').write('1.0 {BUILT}\\n')\n"
+        f"note('is built')\n{code}\n"
+        f"time.sleep({lasts})\n"
+        "note('ends')\n"
+    )
+    return Job(kind, [sys.executable, "-c", text], log.with_name(f"{name}.txt"), done)
+
+
+def ran(jobs, room, shared=()):
+    """Run jobs in a pool; return their notes in the order of time."""
+    log = jobs[0].output.with_name("log")
+    WorkerPool(room, shared).run(jobs)
+    return log.read_text().splitlines()
+
+
+def test_as_many_run_side_by_side_as_there_is_room_for(tmp_path):
+    jobs = [script(Kind.ON_CORES, name, tmp_path / "log") for name in "abc"]
+    noted = ran(jobs, {Kind.ON_CORES: 2})
+    assert noted.index("b begins") < noted.index("a ends")
+    assert noted.index("c begins") > min(noted.index("a ends"), noted.index("b ends"))
+
+
+def test_a_training_begins_when_the_one_before_it_is_built(tmp_path):
+    jobs = [script(Kind.TRAINING, name, tmp_path / "log", built_after=0.2, lasts=1.0) for name in "abc"]
+    noted = ran(jobs, {Kind.TRAINING: 2})
+    assert noted[:3] == ["a begins", "a is built", "b begins"]
+    assert noted.index("a ends") < noted.index("c begins")
+    assert not list(tmp_path.glob("*.stages"))
+
+
+def test_what_shares_the_device_waits_for_all_trainings_and_the_rest_does_not(tmp_path):
+    log = tmp_path / "log"
+    after = script(Kind.ON_GPU, "gpu", log)
+    first = script(Kind.TRAINING, "a", log, done=lambda job, code: [after, script(Kind.ON_CORES, "cores", log, lasts=0.1)])
+    second = script(Kind.TRAINING, "b", log, lasts=1.0)
+    noted = ran([first, second], dict.fromkeys(Kind, 1), (Kind.ON_GPU,))
+    assert noted.index("a ends") < noted.index("cores begins") < noted.index("b ends") < noted.index("gpu begins")
+
+
+def test_a_pool_that_is_stopped_starts_nothing_more_and_tells_those_that_run(tmp_path):
+    log = tmp_path / "log"
+    asked = "import signal\nsignal.signal(signal.SIGTERM, lambda *_: (note('was asked'), exit(3)))"
+    codes = []
+    jobs = [script(Kind.TRAINING, "a", log, lasts=60, code=asked, done=lambda job, code: codes.append(code) or [])]
+    jobs.append(script(Kind.TRAINING, "b", log))
+    pool = WorkerPool({Kind.TRAINING: 1}, ())
+    handler = signal.signal(signal.SIGALRM, lambda *_: pool.stop() if log.is_file() and "built" in log.read_text() else None)
+    signal.setitimer(signal.ITIMER_REAL, 0.1, 0.1)
+    try:
+        pool.run(jobs)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, handler)
+    assert log.read_text().splitlines() == ["a begins", "a is built", "a was asked"]
+    assert codes == [3]
+
+
+def test_why_a_process_failed(tmp_path):
+    job = Job(Kind.TRAINING, [], tmp_path / "out.txt", lambda job, code: [])
+    assert why_failed(job, 7) == "exit code 7"
+    job.output.write_text("hello\nValueError: no\n\n")
+    assert why_failed(job, 1) == "ValueError: no"
+    assert why_failed(job, -9) == "killed by SIGKILL, maybe for want of memory"
+    assert why_failed(job, -11) == "killed by SIGSEGV"
+    job.output.write_text("error: --task: there is no task\nbye\n")
+    assert why_failed(job, 2) == "--task: there is no task"
