@@ -129,12 +129,12 @@ def tracking_of(result: dict[str, Any]) -> dict[str, Any]:
 
 
 def changes_text(result: dict[str, Any]) -> str:
-    """Return the changed fields of an evaluation as text, 'sim.dt=0.002, terrain.scan=own'; empty if there are none."""
+    """Return the changed fields of an evaluation as text, 'sim.dt=0.002, terrain.scan=own'; empty without changes."""
     return ", ".join(f"{field}={value}" for field, value in sorted(result.get("changes", {}).items()))
 
 
 def grid_text(result: dict[str, Any]) -> str:
-    """Return the grid of an evaluation as text, 'vx -1 to 1, vy 0, yaw 0 (5 commands)'; empty if there is none."""
+    """Return the grid of an evaluation as text, 'vx -1 to 1, vy 0, yaw 0 (5 commands)'; empty without a grid."""
     grid = tracking_of(result).get("grid", {})
     ends = {axis: sorted({min(values), max(values)}) for axis, values in grid.items()}
     parts = [f"{axis} {' to '.join(f'{value:g}' for value in values)}" for axis, values in ends.items()]
