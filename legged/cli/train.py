@@ -297,7 +297,7 @@ def _report(folder: Path, cfg: TaskConfig, args: argparse.Namespace | None) -> N
     """Write the report on a training that has ended, unless it asks for none; with a film, if that can be told its task."""
     if not cfg.train.runner.report:
         return
-    from legged.evaluation.reports.at_end import report_at_end  # a start does without what it imports
+    from legged.evaluation.reports.run_report import report_at_end  # a start does without what it imports
 
     film_with = None
     if args is not None and cfg.train.runner.film:

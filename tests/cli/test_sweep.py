@@ -253,7 +253,7 @@ def test_a_target_that_is_not_reached_gives_no_value():
     of = Worker(plan_of(objective={"figure": "return", "take": "time", "target": 5.0}), SimpleNamespace(), [])
     with pytest.raises(NoValue, match="did not reach 5; the last was 3"):
         of._taken(history(1.0, 3.0))
-    with pytest.raises(NoValue, match="is no number"):
+    with pytest.raises(NoValue, match="return is not finite"):
         of._taken(history(math.nan))
 
 

@@ -311,19 +311,6 @@
   });
 
   // ---- the page --------------------------------------------------------------------------------------------------------
-  document.querySelector("h1").textContent = data.title;
-  document.getElementById("summary").textContent = data.summary;
-  const facts = document.getElementById("facts");
-  if (film.why) make("p", facts, "There is no film, but a stick figure: " + film.why, "hint");
-  make("p", facts, "Hover over a plot or drag in it to move the cursor; arrow keys step, with Shift by ten; the space bar plays.", "hint");
-  for (const table of data.tables) {
-    const made = make("table", facts);
-    for (const [name, value] of table.rows) {
-      const line = make("tr", made);
-      make("td", line, name);
-      make("td", line, value, table.numbers ? "number" : undefined);
-    }
-  }
   for (const part of data.sections) {
     const section = make(part.open ? "section" : "details", document.getElementById("plots"));
     make(part.open ? "h2" : "summary", section, part.title);
@@ -336,7 +323,7 @@
   new ResizeObserver(redraw).observe(document.getElementById("plots"));
   redraw();
 
-  // What a test, or somebody at the console, may ask and do.
+  // For tests and for the console of a browser.
   window.episode = {
     show: (k) => { pause(); show(k); },
     state: () => ({ row, time: (row + 1) * dt, picture: drawn, playing, clock: clock.textContent,

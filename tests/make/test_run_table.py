@@ -5,12 +5,12 @@ import shutil
 from dataclasses import replace
 
 import pytest
+from evaluated_run import EvaluatedRun, find_runs, read_run
 from helpers import POLICY, POLICY_ITERATION, small_config
+from run_table import markdown, stairs_height, summary
 
 from legged.config import override
 from legged.errors import ConfigError
-from legged.evaluation.judged_run import JudgedRun, find_runs, read_run
-from legged.evaluation.run_table import markdown, stairs_height, summary
 from legged.learning.timing import Timing
 from legged.robots.robot import load_robot
 
@@ -34,7 +34,7 @@ def rough(up, down, **figures):
 
 
 def run(seed, results=None, timing=None, **other):
-    return JudgedRun(FLAT, seed, None, timing, results or {}, **other)
+    return EvaluatedRun(FLAT, seed, None, timing, results or {}, **other)
 
 
 def cells_of(text):

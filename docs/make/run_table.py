@@ -6,16 +6,18 @@ from dataclasses import asdict
 from statistics import mean
 from typing import Any
 
+from evaluated_run import EvaluatedRun
+
 from legged.errors import ConfigError
 from legged.evaluation.engines import ENGINES, engine_of
-from legged.evaluation.judged_run import JudgedRun
 from legged.evaluation.result_file import tracking_of
+from legged.evaluation.tables import markdown_table
 from legged.process.paths import relative
 from legged.robots.robot import load_robot
 
 UP, DOWN = "stairs_up", "stairs_down"
 NONE = "-"
-"""What a cell says of which nothing is known."""
+"""Text of a cell whose value is not known."""
 LEGEND = (
     "Errors: root mean square over time, mean of the cells of the command grid (worst cell). Falls: share of the robots on"
     " the grid. Stairs: share of the robots that get up, and down, steps of the height in the column before; h is the height"
@@ -27,13 +29,13 @@ COMPILED = " Start-up times with a * hold the compilation of kernels."
 Row = dict[str, Any]
 
 
-def summary(runs: Sequence[JudgedRun]) -> list[Row]:
-    """Return plain numbers of each task, in the order of the first run of each: a row a seed, and their mean."""
+def summary(runs: Sequence[EvaluatedRun]) -> list[Row]:
+    """Return plain numbers of each task, in the order of its first run: a row a seed, and the mean over seeds."""
     tasks = dict.fromkeys(run.cfg.task for run in runs)
     return [_task(task, [run for run in runs if run.cfg.task == task]) for task in tasks]
 
 
-def _task(task: str, runs: Sequence[JudgedRun]) -> Row:
+def _task(task: str, runs: Sequence[EvaluatedRun]) -> Row:
     robot, height = _robot(runs[0].cfg.robot)
     step = stairs_height(runs)
     stairs = None if step is None else {"size": step, "share_of_height": step / height if height else None}
@@ -51,7 +53,9 @@ def _task(task: str, runs: Sequence[JudgedRun]) -> Row:
 
 @functools.cache
 def _robot(given: str) -> tuple[str, float | None]:
-    """Return name and standing height [m] of the robot that a configuration names; no height if it is not there any more."""
+    """Return name and standing height [m] of the robot that a configuration names; None for the height if the robot is not
+    found.
+    """
     try:
         robot = load_robot(given)
     except ConfigError:
@@ -59,10 +63,10 @@ def _robot(given: str) -> tuple[str, float | None]:
     return robot.name, robot.height
 
 
-def stairs_height(runs: Sequence[JudgedRun]) -> float | None:
-    """Return the height of the steps whose success is stated [m]: the smallest that was measured up and down, wherever
-    stairs were, and is at least the share of the height that the configuration of the first run asks for; None if there is
-    none.
+def stairs_height(runs: Sequence[EvaluatedRun]) -> float | None:
+    """Return the height of the steps whose success is stated [m]: the smallest height that every evaluation with stairs
+    measured up and down, and that is at least the share of the base height which the first run's configuration asks for.
+    Return None if there is no such height.
     """
     cfg = runs[0].cfg
     least = cfg.evaluation.stairs * cfg.rewards.base_height_target - 1e-9
@@ -78,7 +82,7 @@ def _shares(result: Row, terrain: str) -> dict[float, float]:
     return {point["size"]: point["share"] for point in entry["points"]}
 
 
-def _row(run: JudgedRun, step: float | None) -> Row:
+def _row(run: EvaluatedRun, step: float | None) -> Row:
     timing = {} if run.timing is None else asdict(run.timing) | {"steps_per_s": run.timing.steps_per_s}
     engines = {}
     for name, result in run.results.items():
@@ -102,7 +106,7 @@ def _row(run: JudgedRun, step: float | None) -> Row:
 
 
 def means(rows: Sequence[Row]) -> Row:
-    """Return the means of some seeds, each over those that have the number, and the largest of their worst cells."""
+    """Return the means over seeds, each over the seeds that have the number, and the largest of their worst cells."""
     engines = {}
     for name in ENGINES:
         found = [row["engines"][name] for row in rows if name in row["engines"]]
@@ -122,7 +126,7 @@ def means(rows: Sequence[Row]) -> Row:
 
 
 def _of(values: Sequence[float | None], of: Callable[..., float]) -> float | None:
-    """Return a function of those values that there are; every robot may have fallen before it was measured."""
+    """Return a function of the values that are not None; a value is None if every robot fell early."""
     there = [value for value in values if value is not None]
     return of(there) if there else None
 
@@ -131,7 +135,7 @@ def _of(values: Sequence[float | None], of: Callable[..., float]) -> float | Non
 
 
 def markdown(tasks: Sequence[Row]) -> str:
-    """Return a summary as a table of Markdown: of each task its seeds, and before them their mean if there are several."""
+    """Return a summary as a table of Markdown: for each task its seeds, after their mean if there are several."""
     rows = [row for task in tasks for row in (*([task["mean"]] if task["mean"] else []), *task["seeds"])]
     engines = [name for name in ENGINES if any(name in row["engines"] for row in rows)]
     stairs = any(task["stairs"] for task in tasks)
@@ -141,11 +145,12 @@ def markdown(tasks: Sequence[Row]) -> str:
         head += [f"{measure}, {label}" for label in labels]
     if stairs:
         head += ["stairs [m]", *(f"up, down [%], {label}" for label in labels)]
-    lines = [head, ["---"] * len(head)]
-    for task in tasks:
-        for row in (*([task["mean"]] if task["mean"] else []), *task["seeds"]):
-            lines.append(_cells(task, row, engines, stairs))
-    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    lines = [
+        _cells(task, row, engines, stairs)
+        for task in tasks
+        for row in (*([task["mean"]] if task["mean"] else []), *task["seeds"])
+    ]
+    table = markdown_table(head, lines, left=range(len(head)))
     marks = {SIDE_BY_SIDE: "beside", COMPILED: "kernels_compiled"}
     legend = "".join([_devices(rows), LEGEND, *(text for text, key in marks.items() if any(row[key] for row in rows))])
     return "\n\n".join([table, legend, *_notes(tasks)]) + "\n"
@@ -184,13 +189,13 @@ def _stairs(stairs: Row) -> str:
 
 
 def _devices(rows: Sequence[Row]) -> str:
-    """Say what the trainings ran on, as far as they say it."""
+    """Return a sentence on the devices of the trainings, as far as they are known."""
     names = dict.fromkeys(str(row["device"]) for row in rows if row.get("device"))
     return f"Trained on {', '.join('a CPU' if name == 'cpu' else name for name in names)}. " if names else ""
 
 
 def _notes(tasks: Sequence[Row]) -> list[str]:
-    """Return a list of what went wrong, if anything did."""
+    """Return a list of failures and notes, if there are any."""
     said = []
     for task in tasks:
         for row in task["seeds"]:

@@ -1,12 +1,14 @@
-"""Drawings of reports: where lines are, what is said of them, and that they are whole documents."""
+"""Drawings of reports: the places of lines, their names and values, and that they are whole documents."""
 
 import re
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from PIL import Image
 
-from legged.evaluation.reports.svg import (
+from legged.evaluation.reports.charts import (
     BOTTOM,
     HEIGHT,
     LEFT,
@@ -14,9 +16,11 @@ from legged.evaluation.reports.svg import (
     RIGHT,
     TOP,
     WIDTH,
-    Axes,
+    Chart,
     Line,
     curves,
+    draw_charts,
+    draw_panel,
     heat_map,
     shade,
     sheet,
@@ -43,7 +47,7 @@ def texts(drawing: str) -> list[str]:
 
 def test_a_line_goes_from_corner_to_corner():
     """y from 0 to 100 on axes from 0 to 106: so much room is left above."""
-    drawing = curves(Axes("speed [m/s]", "iteration"), [Line("", np.array([1.0, 2.0, 5.0]), np.array([0.0, 50.0, 100.0]))])
+    drawing = curves(Chart("speed [m/s]", "iteration", [Line("", np.array([1.0, 2.0, 5.0]), np.array([0.0, 50.0, 100.0]))]))
     (line,) = parsed(drawing).iter(f"{NS}polyline")
     inside, tall = WIDTH - LEFT - RIGHT, HEIGHT - BOTTOM - TOP
     wanted = [
@@ -60,7 +64,7 @@ def test_a_line_goes_from_corner_to_corner():
 
 def test_lines_differ_by_colour_and_by_dashes_and_names_stand_beside_them():
     x = np.arange(4.0)
-    drawing = curves(Axes("level", "iteration"), [Line(f"type {i}", x, x + i) for i in range(6)])
+    drawing = curves(Chart("level", "iteration", [Line(f"type {i}", x, x + i) for i in range(6)]))
     lines = list(parsed(drawing).iter(f"{NS}polyline"))
     assert [line.get("stroke") for line in lines] == list(COLORS[:6])
     assert len({line.get("stroke-dasharray") for line in lines}) == 6
@@ -70,7 +74,7 @@ def test_lines_differ_by_colour_and_by_dashes_and_names_stand_beside_them():
 def test_no_name_leaves_the_drawing():
     """A long legend takes another row."""
     names = [f"a rather long name {i}" for i in range(5)]
-    drawing = parsed(curves(Axes("x", "iteration"), [Line(name, np.arange(3.0), np.ones(3)) for name in names]))
+    drawing = parsed(curves(Chart("x", "iteration", [Line(name, np.arange(3.0), np.ones(3)) for name in names])))
     at = [(float(e.get("x")), float(e.get("y"))) for e in drawing.iter(f"{NS}text") if e.text in names]
     assert len(at) == 5
     assert len({y for _, y in at}) == 3
@@ -81,19 +85,20 @@ def test_no_name_leaves_the_drawing():
 
 def test_values_that_are_no_numbers_are_left_out():
     y = np.array([np.nan, 1.0, np.inf, 2.0])
-    (line,) = parsed(curves(Axes("x", "iteration"), [Line("", np.arange(4.0), y)])).iter(f"{NS}polyline")
+    (line,) = parsed(curves(Chart("x", "iteration", [Line("", np.arange(4.0), y)]))).iter(f"{NS}polyline")
     assert line.get("data-x").split() == ["1", "3"]
-    (line,) = parsed(curves(Axes("x", "i", log=True), [Line("", np.arange(3.0), np.array([0.0, 0.1, 1.0]))])).iter(
+    (line,) = parsed(curves(Chart("x", "i", [Line("", np.arange(3.0), np.array([0.0, 0.1, 1.0]))], log=True))).iter(
         f"{NS}polyline"
     )
     assert line.get("data-x").split() == ["1", "2"]
     assert (
-        list(parsed(curves(Axes("nothing", "iteration"), [Line("", np.array([]), np.array([]))])).iter(f"{NS}polyline")) == []
+        list(parsed(curves(Chart("nothing", "iteration", [Line("", np.array([]), np.array([]))]))).iter(f"{NS}polyline"))
+        == []
     )
 
 
 def test_powers_of_ten_are_equally_far_on_a_logarithmic_axis():
-    drawing = curves(Axes("rate", "i", log=True), [Line("", np.arange(3.0), np.array([1e-4, 1e-3, 1e-2]))])
+    drawing = curves(Chart("rate", "i", [Line("", np.arange(3.0), np.array([1e-4, 1e-3, 1e-2]))], log=True))
     (line,) = parsed(drawing).iter(f"{NS}polyline")
     heights = points(line)[:, 1]
     assert heights[0] - heights[1] == pytest.approx(heights[1] - heights[2], abs=0.11)
@@ -103,7 +108,7 @@ def test_powers_of_ten_are_equally_far_on_a_logarithmic_axis():
 def test_a_long_line_keeps_its_ends_and_its_mean():
     x = np.arange(10_001.0)
     y = 3.0 + np.sin(x)
-    (line,) = parsed(curves(Axes("x", "iteration"), [Line("", x, y)])).iter(f"{NS}polyline")
+    (line,) = parsed(curves(Chart("x", "iteration", [Line("", x, y)]))).iter(f"{NS}polyline")
     at = [float(text) for text in line.get("data-x").split()]
     values = [float(text) for text in line.get("data-v").split()]
     assert len(at) == len(values) == MOST_POINTS
@@ -114,7 +119,7 @@ def test_a_long_line_keeps_its_ends_and_its_mean():
 def test_parts_are_stacked_by_their_sign_and_sum_up():
     """2 and 3 upwards, -1 downwards: areas meet at 2, end at 5 and -1, and the sum is 4."""
     parts = {"a": np.full(3, 2.0), "b": np.full(3, -1.0), "c": np.full(3, 3.0)}
-    drawing = parsed(stacked(Axes("parts", "iteration"), np.arange(3.0), parts))
+    drawing = parsed(stacked(Chart("parts", "iteration"), np.arange(3.0), parts))
     areas = [points(element)[:, 1] for element in drawing.iter(f"{NS}polygon")]
     a, b, c = ((float(area.min()), float(area.max())) for area in areas)
     unit = a[1] - a[0]  # of 2
@@ -155,7 +160,7 @@ def test_large_numbers_are_short():
 
 
 def test_a_sheet_has_all_drawings_side_by_side():
-    one = curves(Axes("first", "iteration"), [Line("", np.arange(3.0), np.ones(3))])
+    one = curves(Chart("first", "iteration", [Line("", np.arange(3.0), np.ones(3))]))
     whole = parsed(sheet([one.replace("first", name) for name in ("a1", "b2", "c3")], columns=2))
     places = [(float(e.get("x")), float(e.get("y"))) for e in whole.iter(f"{NS}svg") if e.get("x")]
     assert places == [(0.0, 0.0), (WIDTH + 12, 0.0), (0.0, HEIGHT + 12)]
@@ -164,6 +169,33 @@ def test_a_sheet_has_all_drawings_side_by_side():
 
 def test_what_is_written_is_not_read_as_a_drawing():
     name = '<script>"&'
-    drawing = curves(Axes(name, name, unit=name), [Line(name, np.arange(2.0), np.ones(2))])
+    drawing = curves(Chart(name, name, [Line(name, np.arange(2.0), np.ones(2))], unit=name))
     assert name in texts(drawing)
     assert not re.search("<script", drawing)
+
+
+def drawn(*charts: Chart, path, **how) -> np.ndarray:
+    """The pixels of charts in a PNG file."""
+    draw_charts(charts, path, **how)
+    with Image.open(path) as picture:
+        return np.asarray(picture.convert("RGB"))
+
+
+def has(pixels: np.ndarray, color: str) -> bool:
+    return bool((pixels == [int(color[i : i + 2], 16) for i in (1, 3, 5)]).all(axis=2).any())
+
+
+def test_a_chart_is_a_panel_of_a_picture(tmp_path):
+    """Three panels take two rows; each line has its colour, and a single point is a marker with its interval."""
+    point = Line("point", np.array([0.2]), np.array([0.5]), (np.array([0.4]), np.array([0.7])), markers=True)
+    lines = [Line("a", np.arange(3.0), np.ones(3)), Line("b", np.arange(3.0), np.array([0.0, np.nan, 2.0]))]
+    one, two = Chart("x", "iteration", lines), Chart("y", "size", [point], high=1.0, percent=True, walls=(("end", 0.3),))
+    low = drawn(one, two, path=tmp_path / "low.png")
+    high = drawn(one, two, one, path=tmp_path / "high.png", iteration_s=2.0)
+    assert high.shape[0] > 1.8 * low.shape[0]
+    assert has(low, COLORS[0])
+    assert has(low, COLORS[1])
+    axis = Figure().subplots()
+    draw_panel(axis, two)
+    (interval, *_) = axis.collections
+    assert interval.get_segments()[0].tolist() == [[0.2, 0.4], [0.2, 0.7]]

@@ -1,4 +1,4 @@
-"""A training and what its policy was found to be worth, read from its run folder or from the folder of a shipped policy."""
+"""A training and the evaluations of its policy, read from a run folder or from the folder of a shipped policy."""
 
 import re
 import sys
@@ -10,41 +10,39 @@ from typing import Any
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.evaluation.engines import ENGINES
+from legged.evaluation.reports.record import folders_in
 from legged.evaluation.result_file import changes_text, file_name, grid_text, read_results, tracking_of
 from legged.evaluation.velocity_grid import axes_of
-from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL, checkpoints, of_another_policy, run_config
+from legged.learning.run_folder import SHIPPED_MODEL, checkpoints, of_another_policy, run_config
 from legged.learning.timing import Timing, read_timing
 from legged.process.paths import relative
 
-DEEPEST = 3
-"""Folders inside each other in which runs are looked for: logs, tasks, runs."""
 SEED_FOLDER = re.compile(r"seed_(\d+)", re.ASCII)
-"""What the folders of other seeds are called beside a shipped policy."""
+"""Names of the folders of other seeds, next to a shipped policy."""
 
 
 @dataclass(frozen=True)
-class JudgedRun:
-    """One training. Where it failed, there may be neither folder nor times nor results."""
+class EvaluatedRun:
+    """A training and its evaluations. A failed one may have no folder, times or results."""
 
     cfg: LeggedConfig
     seed: int
     folder: Path | None = None
     timing: Timing | None = None
     results: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Engine -> what `evaluate` has written, of the engines that we know."""
+    """Engine -> result of its evaluation."""
     failure: str = ""
-    """Why there is no finished policy; empty where there is one."""
+    """Reason why there is no finished policy; empty if there is one."""
     notes: tuple[str, ...] = ()
-    """What else went wrong."""
+    """Other remarks, such as evaluations that were left out."""
 
 
-def read_run(folder: Path) -> JudgedRun:
-    """Read a run folder, or that of a shipped policy. An evaluation of another checkpoint than the last says nothing of the
-    policy that is in the table and is shipped, and one with changed fields is not comparable; they are left out, and a note
-    says so. So it does of one on another grid of commands than the task's.
+def read_run(folder: Path) -> EvaluatedRun:
+    """Read a run folder, or that of a shipped policy. Evaluations of another checkpoint than the last and those with changed
+    fields are left out, with a note. A note also marks evaluations on another grid of commands than the task's.
 
     Raises:
-        ConfigError: it is none, its task follows no commands, or a file in it is damaged.
+        ConfigError: the folder is no run folder, its task follows no commands, or a file in it is damaged.
     """
     cfg = run_config(folder)
     if not isinstance(cfg, LeggedConfig):
@@ -60,7 +58,7 @@ def read_run(folder: Path) -> JudgedRun:
             notes.append(f"its evaluation in {name} was made with {changes_text(known.pop(name))}, and is left out")
         elif tracking_of(one).get("grid") not in (None, axes_of(cfg)):
             notes.append(f"its evaluation in {name} is not on its task's grid of commands, but on {grid_text(one)}")
-    return JudgedRun(cfg, cfg.env.seed, folder, timing, known, why_unfinished(folder, cfg, timing), tuple(notes))
+    return EvaluatedRun(cfg, cfg.env.seed, folder, timing, known, why_unfinished(folder, cfg, timing), tuple(notes))
 
 
 def results_in(folder: Path) -> dict[str, dict[str, Any]]:
@@ -80,7 +78,7 @@ def results_in(folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def why_unfinished(folder: Path, cfg: LeggedConfig, timing: Timing | None) -> str:
-    """Say why a folder holds no policy that was trained to the end; nothing if it does."""
+    """Return the reason why a folder holds no policy that was trained to the end; an empty text if it holds one."""
     there = checkpoints(folder)
     if not there:
         return "it left no checkpoint"
@@ -90,21 +88,23 @@ def why_unfinished(folder: Path, cfg: LeggedConfig, timing: Timing | None) -> st
     return f"stopped after {last} of {wanted} iterations"
 
 
-def find_runs(paths: Iterable[Path]) -> list[JudgedRun]:
-    """Read the runs in some folders: a run folder itself, what lies in logs/ or logs/<task>/, or the folder of a shipped
-    policy with those of its other seeds; each once, however often it is named. Where others lie beside them, runs of tasks
-    that follow no commands and runs of a configuration that this version can't read are left out, and said to be.
+def find_runs(paths: Iterable[Path]) -> list[EvaluatedRun]:
+    """Read the runs in some folders: run folders, folders that hold them (logs/ or logs/<task>/), or the folder of a shipped
+    policy with its other seeds. Each run is read once. Runs whose task follows no commands or whose configuration can't be
+    read are left out, and a printed line names them.
 
     Raises:
-        ConfigError: a folder holds no run, none that the table is of, or something in one is damaged.
+        ConfigError: a folder holds no run with commands, or a file is damaged.
     """
-    found: list[JudgedRun] = []
+    found: list[EvaluatedRun] = []
     seen: set[Path] = set()
     left_out: dict[str, list[str]] = {}
     for path in paths:
         folders = folders_in(path)
         reasons = {folder: why_not(folder) for folder in folders if folder != path}
-        kept = [folder for folder in folders if not reasons.get(folder)] or folders[:1]  # if none is left, the first says why
+        kept = [folder for folder in folders if not reasons.get(folder)] or folders[
+            :1
+        ]  # without others, reading the first one raises the reason
         for folder in kept:
             if folder.resolve() not in seen:
                 found += [read_run(folder), *_other_seeds(folder)]
@@ -118,7 +118,7 @@ def find_runs(paths: Iterable[Path]) -> list[JudgedRun]:
 
 
 def why_not(folder: Path) -> str:
-    """Say why the table is not of a run; nothing if it may be."""
+    """Return the reason why a run is not in the table; an empty text if it is."""
     try:
         cfg = run_config(folder)
     except ConfigError as error:
@@ -126,22 +126,9 @@ def why_not(folder: Path) -> str:
     return "" if isinstance(cfg, LeggedConfig) else "for their tasks follow no commands"
 
 
-def folders_in(path: Path) -> list[Path]:
-    """Return the run folders in a folder: itself, or what lies in logs/ or logs/<task>/.
-
-    Raises:
-        ConfigError: there is none.
-    """
-    levels = [sorted(path.glob("/".join(["*"] * depth + [CONFIG_FILE]))) for depth in range(DEEPEST)]
-    folders = [file.parent for level in levels for file in level]
-    if not folders:
-        raise ConfigError(f"{path}: holds no run folder (there is no {CONFIG_FILE} in it)")
-    return folders
-
-
-def _other_seeds(folder: Path) -> list[JudgedRun]:
-    """Read what is kept of the other seeds of a shipped policy: evaluations and times."""
+def _other_seeds(folder: Path) -> list[EvaluatedRun]:
+    """Read the evaluations and times of the other seeds of a shipped policy."""
     cfg = run_config(folder)
     assert isinstance(cfg, LeggedConfig), "its own seed was read before"
     numbers = {int(match[1]): path for path in folder.iterdir() if (match := SEED_FOLDER.fullmatch(path.name))}
-    return [JudgedRun(cfg, seed, path, read_timing(path), results_in(path)) for seed, path in sorted(numbers.items())]
+    return [EvaluatedRun(cfg, seed, path, read_timing(path), results_in(path)) for seed, path in sorted(numbers.items())]
