@@ -157,10 +157,7 @@ class Driver:
         """
         if self._camera is None:
             self._camera = camera_of(self.task, 1, width, height)
-        if isinstance(self._camera, RobotsCamera):
-            self._camera.turn_to(env)
-        else:
-            self._camera.followed = env
+        self._camera.turn_to(env)
         return self._camera.picture()
 
     def close(self) -> None:

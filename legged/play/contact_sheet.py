@@ -17,7 +17,7 @@ from legged.policies.actor import Actor
 from legged.policies.restore import TrainedPolicy, restore, undisturbed
 from legged.process.paths import make_folder, relative, replacing
 from legged.rendering import RobotsCamera
-from legged.rendering.text import INK
+from legged.rendering.camera import INK
 
 FPS = 12.5
 """Pictures a second: a GIF counts time in hundredths of one."""

@@ -10,9 +10,8 @@ from typing import Any
 
 from legged.errors import ConfigError
 from legged.learning.run_folder import BEST
-from legged.play.live.drawing import Drawing
 from legged.play.live.history import AXES, UNITS
-from legged.play.live.plots import gait_figure, reward_figure, velocity_figures
+from legged.play.live.plots import LivePlots
 from legged.play.live.session import FASTEST, HARDEST_PUSH, SLOWEST, Session
 from legged.play.live.source import NEWEST
 
@@ -52,6 +51,8 @@ class Page:
     def __init__(self, session: Session, host: str, port: int) -> None:
         """Serve at an address; see `legged.play.live.address` for one that is free."""
         viser = load_viser()
+        from legged.play.live.drawing import Drawing  # imports trimesh, which comes with viser
+
         self.session = session
         self._asked: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         with contextlib.redirect_stdout(io.StringIO()):  # it announces itself at length
@@ -200,9 +201,7 @@ class Page:
         gui = self.server.gui
         panel = gui.add_panel()
         with panel.add_tab("Live"):
-            self._velocities = gui.add_html("")
-            self._gait = gui.add_html("") if self.session.history.feet else None
-            self._rewards = gui.add_html("")
+            self.plots = LivePlots(self.server, self.session.history, self.session.has_commands)
         panel.dock_right()
         panel.set_width(360)
         gui.main_panel.dock_left()
@@ -210,7 +209,7 @@ class Page:
 
     def refresh(self) -> None:
         """Bring words and plots up to date."""
-        session, history = self.session, self.session.history
+        session = self.session
         lines = [f"**{session.title()}**"]
         place = session.place()
         state = f"{session.time:.1f}\u00a0s" if session.running else f"paused at {session.time:.1f}\u00a0s"
@@ -223,10 +222,7 @@ class Page:
             self.status.content = text
         if self.choice.visible != session.follower.has_best:
             self.choice.visible = session.follower.has_best
-        self._velocities.content = velocity_figures(history, session.has_commands)
-        self._rewards.content = reward_figure(history)
-        if self._gait is not None:
-            self._gait.content = gait_figure(history)
+        self.plots.update(session.history)
 
     def do_what_was_asked(self) -> None:
         """Do what visitors have asked for since the last call."""

@@ -6,8 +6,8 @@ import numpy as np
 
 from legged.play.video import write_mp4
 from legged.rendering import Camera, display_model, size_of
-from legged.rendering.follower import Follower
-from legged.rendering.text import caption
+from legged.rendering.camera import caption
+from legged.rendering.framing import Follower
 from legged.robots.robot import Robot
 from legged.terrain import Terrain
 
