@@ -1,5 +1,8 @@
 """Meshes for the browser: closed bodies seen from outside, and a terrain that is the height map."""
 
+import json
+import struct
+
 import mujoco
 import numpy as np
 import pytest
@@ -27,6 +30,22 @@ MODEL = """
   </worldbody>
 </mujoco>
 """
+
+
+def attributes_of(mesh) -> dict[str, dict]:
+    """Accessors of the vertex attributes in the file that the browser gets, by name."""
+    data = mesh.export(file_type="glb")
+    scene = json.loads(data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])
+    return {name: scene["accessors"][i] for name, i in scene["meshes"][0]["primitives"][0]["attributes"].items()}
+
+
+def test_files_have_normals_and_colours():
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    for mesh in (*body_meshes(model).values(), plane_mesh()):
+        found = attributes_of(mesh)
+        assert {"POSITION", "NORMAL"} < set(found)
+        assert found["NORMAL"]["count"] == found["POSITION"]["count"] == len(mesh.vertices)
+    assert attributes_of(body_meshes(model)[1])["COLOR_0"]["max"] == [255, 0, 55, 255]
 
 
 def colors_of(mesh) -> np.ndarray:

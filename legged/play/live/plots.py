@@ -116,8 +116,8 @@ def gait_diagram(history: History) -> str:
         )
         # One unit of the drawing's width is a second, so the bars line up with the time axes of the charts.
         rows.append(
-            f'<div style="display:flex"><span style="width:{LEFT}px;margin:0 6px 0 4px;text-align:right">{escape(name)}</span>'
-            f'<svg viewBox="{-KEPT_S:g} 0 {KEPT_S:g} 1" preserveAspectRatio="none" style="flex:1;'
+            f'<div style="display:flex"><span style="width:{LEFT}px;margin:0 6px 0 4px;text-align:right">{escape(name)}'
+            f'</span><svg viewBox="{-KEPT_S:g} 0 {KEPT_S:g} 1" preserveAspectRatio="none" style="flex:1;'
             f'height:11px;margin:3px {RIGHT + FRAME}px 2px 0;outline:1px solid #8884">{bars}</svg></div>'
         )
     return f'<div style="font-size:11px"><b style="margin-left:{LEFT + FRAME}px">feet on the ground</b>{"".join(rows)}</div>'

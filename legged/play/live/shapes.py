@@ -1,5 +1,7 @@
 """Triangle meshes of a model's bodies and of a terrain, with a normal and a colour per vertex, for viser's scene."""
 
+from typing import Any
+
 import mujoco
 import numpy as np
 import trimesh
@@ -35,7 +37,8 @@ def body_meshes(model: mujoco.MjModel) -> dict[int, trimesh.Trimesh]:
         if mesh is not None:
             meshes.setdefault(body, []).append(mesh)
             colors.setdefault(body, []).append(np.tile(rgba[:3], (len(mesh.vertices), 1)))
-    return {body: _painted(trimesh.util.concatenate(parts), np.concatenate(colors[body])) for body, parts in meshes.items()}
+    joined: dict[int, Any] = {body: trimesh.util.concatenate(parts) for body, parts in meshes.items()}
+    return {body: _coloured(mesh.vertices, mesh.faces, np.concatenate(colors[body])) for body, mesh in joined.items()}
 
 
 def rgba_of(model: mujoco.MjModel, geom: int) -> np.ndarray:
@@ -67,7 +70,7 @@ def geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
             return None
     pose = trimesh.transformations.quaternion_matrix(model.geom_quat[geom])
     pose[:3, 3] = model.geom_pos[geom]
-    return _shaded(mesh, edges).apply_transform(pose)
+    return _split(mesh, edges).apply_transform(pose)
 
 
 def _mesh_asset(model: mujoco.MjModel, mesh: int) -> trimesh.Trimesh:
@@ -77,31 +80,31 @@ def _mesh_asset(model: mujoco.MjModel, mesh: int) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
-def _shaded(mesh: trimesh.Trimesh, edges: np.ndarray) -> trimesh.Trimesh:
-    """Return a mesh with normals and with sharp edges: faces share a vertex only where their normals, in `edges` (3,) steps
-    per unit length, round to the same numbers. With zeros all faces share their vertices, so the surface is smooth.
+def _split(mesh: trimesh.Trimesh, edges: np.ndarray) -> trimesh.Trimesh:
+    """Return a mesh with sharp edges: faces share a vertex only where their normals, in `edges` (3,) steps per unit length,
+    round to the same numbers. With zeros all faces share their vertices, so the surface is smooth.
     """
     keys = np.column_stack([mesh.faces.reshape(-1), np.repeat(np.round(mesh.face_normals * edges), 3, axis=0)])
     kept, which = np.unique(keys, axis=0, return_inverse=True)
-    return _with_normals(mesh.vertices[kept[:, 0].astype(int)], which.reshape(-1, 3))
+    return trimesh.Trimesh(mesh.vertices[kept[:, 0].astype(int)], which.reshape(-1, 3), process=False)
 
 
-def _with_normals(vertices: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh:
+def _with_visual(vertices: np.ndarray, faces: np.ndarray, visual: TextureVisuals) -> trimesh.Trimesh:
     """Return a mesh whose normal at a vertex is the mean of the normals of its faces, weighted by their area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    sides, normals = np.cross(b - a, c - a), np.zeros_like(vertices)  # trimesh does this without scipy in a slow loop
+    sides, normals = np.cross(b - a, c - a), np.zeros(vertices.shape)  # without scipy trimesh needs a slow loop
     for corner in range(3):
         np.add.at(normals, faces[:, corner], sides)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    return trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False)
+    return trimesh.Trimesh(vertices, faces, vertex_normals=normals, visual=visual, process=False)
 
 
-def _painted(mesh: trimesh.Trimesh, colors: np.ndarray) -> trimesh.Trimesh:
-    """Give a mesh sRGB colours (V, 3), 0 to 1, which glTF files hold as linear intensities, and return it."""
+def _coloured(vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> trimesh.Trimesh:
+    """Return a mesh with sRGB colours (V, 3), 0 to 1; files hold them as linear intensities, as glTF wants."""
+    visual = TextureVisuals(material=PBRMaterial(**MATT))
     light = np.column_stack([srgb_to_linear(colors), np.ones(len(colors))])
-    mesh.visual = TextureVisuals(material=PBRMaterial(**MATT))
-    mesh.visual.vertex_attributes["color"] = np.round(255.0 * light).astype(np.uint8)
-    return mesh
+    visual.vertex_attributes["color"] = np.round(255.0 * light).astype(np.uint8)
+    return _with_visual(vertices, faces, visual)
 
 
 def terrain_mesh(terrain: Terrain) -> trimesh.Trimesh:
@@ -121,13 +124,13 @@ def terrain_mesh(terrain: Terrain) -> trimesh.Trimesh:
     colors = [(model.geom_rgba[boxes, None, :3] * brightness[:, None]).reshape(-1, 3)]
     start = len(vertices[0])
     for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD):
-        points, triangles = _surface(model, geom)
+        points, triangles = _surface(model, int(geom))
         texture = model.mat_texid[model.geom_matid[geom], mujoco.mjtTextureRole.mjTEXROLE_RGB]
         vertices.append(points)
         faces.append(triangles + start)
         colors.append(model.tex_data[model.tex_adr[texture] :][: 3 * len(points)].reshape(-1, 3) / 255.0)
         start += len(points)
-    return _painted(_with_normals(np.concatenate(vertices), np.concatenate(faces)), np.concatenate(colors))
+    return _coloured(np.concatenate(vertices), np.concatenate(faces), np.concatenate(colors))
 
 
 def _surface(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
@@ -151,7 +154,6 @@ def plane_mesh() -> trimesh.Trimesh:
     light = np.array([209.0, 214.0, 219.0])
     squares = np.kron([[1.0, 0.94], [0.94, 1.0]], np.ones((128, 128)))[:, :, None] * light
     corners = HALF_PLANE * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
-    mesh = _with_normals(corners, np.array([[0, 1, 2], [0, 2, 3]]))
     material = PBRMaterial(baseColorTexture=Image.fromarray(squares.astype(np.uint8)), **MATT)
-    mesh.visual = TextureVisuals(uv=corners[:, :2] / PERIOD, material=material)
-    return mesh
+    visual = TextureVisuals(uv=corners[:, :2] / PERIOD, material=material)
+    return _with_visual(corners, np.array([[0, 1, 2], [0, 2, 3]]), visual)
