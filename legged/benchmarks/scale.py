@@ -1,4 +1,4 @@
-"""Speed and memory by number of robots: the benchmark once for each, in a process of its own, so that memory is its own."""
+"""Speed and memory by number of robots, each measured in a new process so that sizes do not share memory."""
 
 import argparse
 import json
@@ -17,9 +17,9 @@ from legged.errors import ConfigError
 from legged.process.paths import make_folder, write_text
 
 KILLED = -9
-"""What a process ends with that Linux ends for want of memory."""
+"""Exit code of a process that Linux ended because memory ran out."""
 NO_ROOM = "out of memory"
-"""What is said of a size that does not fit."""
+"""Result of a size that does not fit into memory."""
 COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], str]], ...] = (
     ("robots", 12, lambda row: f"{row['num_envs']:,}"),
     ("control step", 14, lambda row: f"{row['control_step_ms']:.2f} ms"),
@@ -28,16 +28,16 @@ COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], str]], ...] = (
     ("training steps/s", 18, lambda row: f"{row['robot_steps_per_s']:,.0f}" if "robot_steps_per_s" in row else "-"),
     ("GPU memory", 12, lambda row: f"{row['gpu_memory_gib']:.1f} GiB" if "gpu_memory_gib" in row else "-"),
 )
-"""Of the table: heading, width, text."""
+"""Columns of the table: heading, width, text."""
 
 
 def scale(args: argparse.Namespace, given: Sequence[str], cfg: TaskConfig, device: torch.device) -> int:
-    """Print a row for each number of robots in `args.scale`, write all to `args.json`; returns the exit code. `given` is the
-    command line that `args` were read from: each size is measured as it says. A size that
-    needs more memory than there is has a row that says so; one that fails for another reason too, and makes the code 1.
+    """Print a row for each number of robots in `args.scale`, write all rows to `args.json`, and return the exit code. Each
+    size is measured with the other arguments of the command line `given`. Sizes that fail have a row with the reason; the
+    exit code is 1 if one fails for another reason than memory.
 
     Raises:
-        ConfigError: the numbers are none, or another option asks for one number or compares something else.
+        ConfigError: the numbers are invalid, or another option fixes the number of robots or makes another comparison.
     """
     sizes = numbers(args.scale)
     for flag, value in (("--num_envs", args.num_envs), ("--grounds", args.grounds)):
@@ -49,7 +49,7 @@ def scale(args: argparse.Namespace, given: Sequence[str], cfg: TaskConfig, devic
     print("".join(f"{name:>{width}}" for name, width, _ in COLUMNS), flush=True)
     rows = []
     for size in sizes:
-        rows.append(measure_apart(others(given), size, loop))
+        rows.append(measure_apart(without(given, "--scale", "--json", "--num_envs", "--runner"), size, loop))
         print(line(rows[-1]), flush=True)
     if args.json:
         make_folder(args.json.parent)
@@ -70,10 +70,10 @@ def numbers(text: str) -> list[int]:
 
 
 def measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, Any]:
-    """Return the benchmark's numbers under these arguments with `size` robots, or why there are none as `failed`.
+    """Return the benchmark's results for `size` robots with these arguments; `failed` has the reason if there are none.
 
     Raises:
-        ConfigError: the configuration does not allow that many.
+        ConfigError: the configuration does not allow so many robots.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "result.json"
@@ -94,16 +94,16 @@ def measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, A
     return {**result, **iterations}
 
 
-def others(given: Sequence[str]) -> list[str]:
-    """Return a command line without what is different for each size, abbreviated or not."""
+def without(given: Sequence[str], *flags: str) -> list[str]:
+    """Return a command line without some flags, abbreviated or not, and their values; --startup has none."""
     own = argparse.ArgumentParser(add_help=False)
-    for flag in ("--scale", "--json", "--num_envs", "--runner"):
-        own.add_argument(flag)
+    for flag in flags:
+        own.add_argument(flag, **({"action": "store_true"} if flag == "--startup" else {}))  # type: ignore[arg-type]
     return own.parse_known_args(list(given))[1]
 
 
 def line(row: dict[str, Any]) -> str:
-    """Return a row of the table."""
+    """Return a row of the table as text."""
     if "failed" in row:
         _, width, robots = COLUMNS[0]
         return f"{robots(row):>{width}}  {row['failed']}"

@@ -25,7 +25,7 @@ from legged.deploy.policy import Policy
 from legged.deploy.program import Program
 from legged.deploy.safety import Limits
 from legged.deploy.states import Event
-from legged.deploy.telling import Telling
+from legged.deploy.status_messages import StatusMessages
 from legged.deploy.udp import UdpRobot
 from legged.deploy.unitree import SdkWire, UnitreeRobot
 from legged.deploy.unitree_messages import KINDS
@@ -88,7 +88,7 @@ def _main(argv: list[str] | None) -> int:
     if args.robot in KINDS:  # what does not fit must be refused before a robot is asked to leave its own controller
         policy.contract.check_fits(KINDS[args.robot].facts)
     operator = Interruptible(make_operator(args))
-    tell = Telling()
+    tell = StatusMessages()
     hurries = take_priority()  # before any thread of a robot's SDK begins: threads inherit it
     try:
         robot = _connect(args)

@@ -22,10 +22,9 @@ import torch
 
 from legged.benchmarks.iteration_times import LOOPS, loops_of, time_iterations
 from legged.benchmarks.kernel_times import kernel_times, table
-from legged.benchmarks.report import report
 from legged.benchmarks.scale import scale
 from legged.benchmarks.start_times import start_report, time_start
-from legged.benchmarks.step_times import synchronize, time_steps
+from legged.benchmarks.step_times import report, synchronize, time_steps
 from legged.commandline.arguments import add_task_arguments, overrides, pick_device, register_given, settle_on
 from legged.commandline.command import run_main
 from legged.commandline.parser import CommandParser

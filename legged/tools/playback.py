@@ -20,8 +20,7 @@ from legged.commandline.parser import CommandParser
 from legged.errors import ConfigError
 from legged.evaluation.playback import SETTLING_S, Played, follow, play
 from legged.evaluation.velocity_grid import AXES, AXIS, Grid, axis_values, check_size
-from legged.policies.foreign import ForeignPolicy, Layout, read_layout
-from legged.policies.own_layout import was_trained_with_other_motors
+from legged.policies.foreign import ForeignPolicy, Layout, read_layout, was_trained_with_other_motors
 from legged.process.paths import exists, ready_to_write_file, relative, write_text
 from legged.robots.robot import Robot, load_robot
 

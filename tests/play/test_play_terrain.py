@@ -14,7 +14,7 @@ from legged.config import TaskConfig, override
 from legged.envs import LeggedRobot
 from legged.math import yaw_of
 from legged.play import outing, video
-from legged.play.errors import TrackingErrors
+from legged.play.demonstrations import TrackingErrors
 from legged.play.playground import ROWS_NEEDED, SETTING, Playground, label
 from legged.process.paths import data_folder
 from legged.registry import make_task, task_config

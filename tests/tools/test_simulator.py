@@ -24,9 +24,8 @@ from legged.robots.robot import load_robot
 from legged.terrain import Terrain, TileSpec
 from legged.tools import deploy, fit_actuator, simulate_robot
 from legged.tools.simulator.film import make_film
-from legged.tools.simulator.link import Link
 from legged.tools.simulator.robot import SimulatedRobot
-from legged.tools.simulator.server import Server
+from legged.tools.simulator.server import Link, Server
 
 POLICIES = Path(__file__).resolve().parents[2] / "resources" / "policies"
 SMALL_TERRAIN = [
