@@ -69,7 +69,7 @@ class Driver:
         return list(config.items())
 
     def _tried(self) -> dict[str, Any]:
-        """Return the initial state, complete with buffers that terms create at their first call; makes a step and undoes it."""
+        """Return the initial state with the buffers that terms create at their first call; makes a step and undoes it."""
         before = self.task.state_dict()
         self.task.step(torch.zeros_like(self.task.actions))
         beginning = {part: {**state, **before[part]} for part, state in self.task.state_dict().items()}
@@ -98,7 +98,7 @@ class Driver:
 
     def reset(self, seed: int | None, options: dict[str, Any] | None, chosen: np.random.Generator) -> Any:
         """Start an episode in every environment and return the observations. A seed restores the initial state, curricula
-        included, and seeds the random numbers. Without a seed they continue; `chosen` draws the first seed.
+        included, and seeds the random numbers. Without one they continue; `chosen` draws the first seed.
 
         Raises:
             ConfigError: `options` are given.

@@ -11,7 +11,7 @@ from legged.gymnasium_envs.driver import RENDER_MODES, Driver, Seen, as_numpy, c
 
 
 class TaskEnv(gymnasium.Env):
-    """One environment of a task. At the end of an episode `step` returns its last observation; `reset` starts the next one."""
+    """One environment of a task. At the end of an episode `step` returns its last observation; `reset` starts the next."""
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES}  # type: ignore[misc]
 

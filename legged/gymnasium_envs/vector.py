@@ -69,8 +69,8 @@ class TaskVectorEnv(VectorEnv):
         that ended in a failure and of those whose time ran out, and infos.
 
         Infos have the reward terms, `reward_<name>` (N,). For environments whose episode ended, these are in `final_info` and
-        the last observations in `final_obs`. With NumPy `final_obs` is an array of N objects, None where no episode ended, and
-        is absent if no episode ended; with tensors it is (N, width), valid where the mask `_final_obs` is true.
+        the last observations in `final_obs`. With NumPy `final_obs` is an array of N objects, None where no episode ended,
+        and is absent if none ended; with tensors it is (N, width), valid where the mask `_final_obs` is true.
 
         Raises:
             ValueError: the actions have another shape, or are not real numbers.

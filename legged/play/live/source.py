@@ -1,4 +1,4 @@
-"""Which policy is on show: a run folder, of which the newest checkpoint counts, or the best, also while it is trained."""
+"""The watched policy: a run folder, also of a running training, and which of its checkpoints is shown."""
 
 import argparse
 import time
@@ -25,27 +25,27 @@ from legged.process.paths import data_folder, exists, relative
 from legged.registry import task_config
 
 NEWEST = "newest"
-"""The checkpoint that is followed, unless it is the BEST, which a training keeps where it evaluates its policy."""
+"""Choice of the newest checkpoint. The alternative, BEST, exists if the training evaluates its policy."""
 
 
 @dataclass(frozen=True)
 class Watched:
-    """A run, or a policy that comes with this package."""
+    """A run folder or a shipped policy."""
 
     cfg: TaskConfig
     folder: Path
     checkpoint: int | None = None
-    """The iteration that is shown whatever comes after it; none to follow the training."""
+    """Iteration that is shown; None follows the training."""
     choice: str = NEWEST
-    """Which checkpoint of the training is followed at first: NEWEST or BEST."""
+    """Checkpoint that is followed at first: NEWEST or BEST."""
 
 
 def find_watched(args: argparse.Namespace) -> Watched:
-    """Find what --task, --load_run and --checkpoint name: the newest run of all, or of the task, or else the policy that is
-    shipped for the task. The run may be so young that it has no checkpoint yet.
+    """Return the policy of --task, --load_run and --checkpoint; by default the newest run, of the task if one is given, or
+    else the policy that is shipped for the task. The run may not have a checkpoint yet.
 
     Raises:
-        ConfigError: there is none, it is of another task, or it has no such checkpoint.
+        ConfigError: there is no such run, it has another task, or it has no such checkpoint.
     """
     flags = [(key, value) for key, value in overrides(args) if key == "train.runner.experiment_name"]
     task = None if args.task is None else task_config(args.task, flags)
@@ -63,7 +63,7 @@ def find_watched(args: argparse.Namespace) -> Watched:
 
 
 def _newest(task: TaskConfig | None, experiment: Path | None) -> Path:
-    """Return the run folder that was begun or written to last, or else what is shipped for the task."""
+    """Return the run folder that was created or written to last, or else the shipped policy of the task."""
     where = LOGS.glob("*/*") if experiment is None else experiment.glob("*")
     runs = [folder for folder in where if exists(folder / CONFIG_FILE)]
     if runs:
@@ -79,7 +79,7 @@ def _newest(task: TaskConfig | None, experiment: Path | None) -> Path:
 
 
 def _named(name: str, experiment: Path | None) -> Path:
-    """Return the run folder of that name: a path, a name in the experiment or in any, or a policy that is shipped."""
+    """Return the run folder of a name: a path, a name in the experiment or in any other, or a shipped policy."""
     shipped = data_folder("resources") / "policies"
     parents = [*([experiment] if experiment is not None else []), Path(), LOGS, shipped.parent.parent, shipped]
     with suppress(OSError, ValueError):  # no name of a folder
@@ -95,35 +95,35 @@ def _named(name: str, experiment: Path | None) -> Path:
 
 
 def _last_written(folder: Path) -> float:
-    """Return when a run was begun, or its latest checkpoint written [s since 1970]."""
+    """Return the time at which a run was created or its latest checkpoint written [s since 1970]."""
     return max(_stamps([folder / CONFIG_FILE, *checkpoints(folder).values()]), default=0.0)
 
 
 def _stamps(paths: Iterable[Path]) -> list[float]:
     found = []
     for path in paths:
-        with suppress(OSError):  # it has gone in between
+        with suppress(OSError):  # removed in between
             found.append(path.stat().st_mtime)
     return found
 
 
 class CheckpointFollower:
-    """Looks into a run folder for the checkpoint to be shown, and says when it is another one."""
+    """Finder of the checkpoint to show in a run folder, which notices when it changes."""
 
     def __init__(self, watched: Watched) -> None:
-        """Follow the checkpoint that is asked for; nothing has been shown yet."""
+        """Follow the checkpoint of `watched`; nothing has been shown yet."""
         self.watched = watched
         self.choice = watched.choice
-        """NEWEST or BEST; of no account where one checkpoint was asked for."""
+        """NEWEST or BEST; without effect if `watched` names a checkpoint."""
         self._shown: tuple[Path, int, int] | None = None
 
     @property
     def has_best(self) -> bool:
-        """Whether there is a best checkpoint to choose."""
+        """Return whether BEST can be chosen."""
         return self.watched.checkpoint is None and (self.watched.folder / BEST_MODEL).is_file()
 
     def wanted(self) -> Path | None:
-        """Return the checkpoint that is to be shown now; None as long as there is none."""
+        """Return the checkpoint to show; None if there is none yet."""
         found = checkpoints(self.watched.folder)
         if self.watched.checkpoint is not None:
             return found.get(self.watched.checkpoint)
@@ -132,13 +132,13 @@ class CheckpointFollower:
         return found[max(found)] if found else None
 
     def changed(self) -> Path | None:
-        """Return the checkpoint to be shown if it is another file than at the last call, or was written anew."""
+        """Return the checkpoint to show if it is another file than at the last call or was rewritten, else None."""
         path = self.wanted()
         if path is None:
             return None
         try:
             stat = path.stat()
-        except OSError:  # a newer one has taken its place
+        except OSError:  # replaced by a newer one
             return None
         mark = (path, stat.st_mtime_ns, stat.st_size)
         if mark == self._shown:
@@ -147,11 +147,11 @@ class CheckpointFollower:
         return path
 
     def forget(self) -> None:
-        """Let the next call of `changed` return the checkpoint again, for a task that was built anew."""
+        """Make the next call of `changed` return the checkpoint again, for a new task."""
         self._shown = None
 
 
 def age(path: Path) -> float | None:
-    """Return how long ago a file was written [s]; None if it has gone."""
+    """Return the age of a file [s]; None if it does not exist."""
     stamps = _stamps([path])
     return max(0.0, time.time() - stamps[0]) if stamps else None
