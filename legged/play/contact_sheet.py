@@ -1,4 +1,4 @@
-"""Many robots in one picture, each walking in a tile of its own with its name below."""
+"""Contact sheets: pictures of many robots, each in its own named tile."""
 
 from collections.abc import Iterator, Sequence
 from math import ceil, sqrt
@@ -20,35 +20,35 @@ from legged.rendering import RobotsCamera
 from legged.rendering.camera import INK
 
 FPS = 12.5
-"""Pictures a second: a GIF counts time in hundredths of one."""
+"""Picture rate; GIFs count time in hundredths of a second [1/s]."""
 FILM_S, WARM_UP_S = 4.0, 2.0
-"""Length of the film, and how long a robot walks before it [s]."""
+"""Length of the film, and of the walk before it [s]."""
 SPEED = 0.6
-"""Velocity asked for, as a share of the fastest that was trained, straight ahead."""
+"""Commanded forward velocity, as a share of the fastest one of the training."""
 FILL, GLIDE = 0.82, 0.5
-"""Share of a tile that a robot fills in its default pose, and of the way to it that the camera makes up in a picture."""
+"""Share of a tile that a robot fills in its default pose, and share of the distance that the camera covers per picture."""
 SHARP = 2
-"""Pictures are drawn so many times larger than they are shown: there is no other smoothing of edges."""
+"""Factor by which pictures are rendered larger than shown, to smooth edges."""
 MOST_BYTES = 2_000_000
-"""Of a GIF, which has fewer colours and is smaller the more tiles there are."""
+"""Largest GIF; colours and size are reduced to reach it [bytes]."""
 SMALLER: tuple[tuple[int, float], ...] = (
     *((96, 1.0), (64, 1.0), (48, 1.0), (48, 0.92), (48, 0.84), (48, 0.76)),
     *((40, 0.7), (40, 0.6), (32, 0.5), (24, 0.4), (16, 0.3)),
 )
-"""Colours and size of what is tried, one after the other."""
+"""Colours and scales that are tried, in this order."""
 PAPER = (255, 255, 255)
 
 Tile = list[np.ndarray]
-"""Pictures of a robot, (height, width, 3) uint8 each."""
+"""Pictures (height, width, 3) uint8 of a robot."""
 
 
 def film(policy: TrainedPolicy, side: int) -> Tile:
-    """Let a robot walk straight ahead, on the type of ground that it saw most of in training, in C MuJoCo on the CPU; return
-    pictures of `side` x `side` pixels.
+    """Return pictures of `side` x `side` pixels of a robot that walks straight ahead, on the most frequent ground of its
+    training, in C MuJoCo on the CPU.
 
     Raises:
         ConfigError: the policy follows no commands, or does not fit its task.
-        RunError: nothing can be rendered.
+        RunError: this machine cannot render.
     """
     cfg = walker(policy)
     task, act, playground = _on_ground(policy, cfg)
@@ -61,10 +61,10 @@ def film(policy: TrainedPolicy, side: int) -> Tile:
 
 
 def walker(policy: TrainedPolicy, where: str = "") -> LeggedConfig:
-    """Return the configuration of a policy that can be asked to walk; `where` is how an error begins.
+    """Return the configuration of a policy that follows commands; `where` begins the error message.
 
     Raises:
-        ConfigError: it follows no commands.
+        ConfigError: the policy follows no commands.
     """
     if not isinstance(policy.cfg, LeggedConfig):
         raise ConfigError(f"{where}'{policy.cfg.task}' follows no commands: there is no way to ask it to walk")
@@ -93,7 +93,7 @@ def _on_ground(policy: TrainedPolicy, cfg: LeggedConfig) -> tuple[LeggedRobot, A
 
 @torch.inference_mode()
 def _walk(task: LeggedRobot, act: Actor, playground: Playground | None, camera: RobotsCamera) -> Iterator[np.ndarray]:
-    """Give the pictures of the film."""
+    """Yield the pictures of the film."""
     if playground is not None:
         playground.place(task)
     task.reset()
@@ -112,8 +112,8 @@ def _shown(picture: np.ndarray, side: int) -> np.ndarray:
 
 
 def sheet(tiles: Sequence[Tile], names: Sequence[str], columns: int | None = None) -> Tile:
-    """Put films side by side, each with its name below; return the pictures of all. Without `columns` the sheet is about
-    twice as wide as it is high.
+    """Return the pictures of films side by side, each with its name below. By default the sheet is about twice as wide as
+    high.
     """
     columns = min(len(tiles), columns or ceil(sqrt(2 * len(tiles))))
     rows = ceil(len(tiles) / columns)
@@ -133,11 +133,11 @@ def sheet(tiles: Sequence[Tile], names: Sequence[str], columns: int | None = Non
 
 
 def write_sheet(pictures: Tile, path: Path) -> str:
-    """Write a film as a GIF of at most MOST_BYTES, or the picture in its middle as a PNG, whichever the name ends with; say
-    in a line what it is.
+    """Write a film as a GIF of at most MOST_BYTES, or its middle picture as a PNG, by the suffix of `path`; return a line
+    about the file.
 
     Raises:
-        RunError: it can't be written, or would be larger however small it is drawn.
+        RunError: the file cannot be written, or exceeds MOST_BYTES at every scale.
     """
     make_folder(path.parent)
     if path.suffix == ".png":
@@ -155,7 +155,7 @@ def write_sheet(pictures: Tile, path: Path) -> str:
 
 
 def _write_gif(pictures: Tile, path: Path, colors: int, scale: float) -> tuple[int, int, int]:
-    """Write pictures in that many colours, which all of them share, and at that scale; return bytes, width and height."""
+    """Write pictures with a shared palette of some colours, scaled; return the size in bytes, the width and the height."""
     height, width = (round(scale * length) for length in pictures[0].shape[:2])
     small = [Image.fromarray(picture).resize((width, height), Image.Resampling.LANCZOS) for picture in pictures]
     palette = _palette(np.concatenate([np.asarray(picture) for picture in small[:: max(1, len(small) // 6)]]), colors)
@@ -165,8 +165,8 @@ def _write_gif(pictures: Tile, path: Path, colors: int, scale: float) -> tuple[i
 
 
 def _palette(pixels: np.ndarray, colors: int) -> Image.Image:
-    """Return a palette for pixels (..., 3) uint8. A colour counts with the root of how often it is there, else the floor has
-    all of them and a small robot is grey.
+    """Return a palette for pixels (..., 3) uint8. The weight of a colour is the square root of its frequency, so that the
+    floor does not take all colours.
     """
     fine = (pixels.reshape(-1, 3) >> 2).astype(np.int64)
     found, counts = np.unique(fine @ np.array([1 << 12, 1 << 6, 1]), return_counts=True)

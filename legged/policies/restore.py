@@ -21,28 +21,28 @@ from legged.terrain import Terrain
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """A checkpoint and the configuration it was trained with."""
+    """A checkpoint and the configuration of its training."""
 
     cfg: TaskConfig
     checkpoint: Path
 
     @property
     def folder(self) -> Path:
-        """The run folder, or the shipped policy's."""
+        """Return the run folder, or the folder of the shipped policy."""
         return self.checkpoint.parent
 
     def output(self, what: str) -> Path:
-        """Return where files about it go by default: the run folder; logs/<what>/<task> for a policy that is shipped, whose
-        folder belongs to the package and may not be writable.
+        """Return the default folder for output about the policy: the run folder, or logs/<what>/<task> for a shipped policy,
+        whose folder belongs to the package and may not be writable.
         """
         return Path("logs") / what / self.folder.name if self.folder.parent.name == "policies" else self.folder
 
 
 def find_policy(args: argparse.Namespace) -> TrainedPolicy:
-    """Find what --task, --load_run and --checkpoint name: the newest run of the task, else the policy that is shipped.
+    """Return the policy of --task, --load_run and --checkpoint; by default the newest run of the task, or the shipped policy.
 
     Raises:
-        ConfigError: there is none, or it is of another task.
+        ConfigError: there is no such policy, or it has another task.
     """
     flags = [(key, value) for key, value in overrides(args) if key == "train.runner.experiment_name"]
     task = task_config(args.task, flags)
@@ -54,11 +54,11 @@ def find_policy(args: argparse.Namespace) -> TrainedPolicy:
 
 
 def policy_of(name: str, where: str = "--task") -> TrainedPolicy:
-    """Return the policy in the run folder `name`, or that of a shipped policy; else of the task of that name, or in that YAML
-    file: of its newest run, or the one that is shipped. `where` is how an error about the name begins.
+    """Return the policy of a run folder, of a shipped policy's folder, or of a task, named or in a YAML file; a task stands
+    for its newest run or else its shipped policy. `where` begins errors about the name.
 
     Raises:
-        ConfigError: there is none, or it is of a task that nobody has named the file or the module of.
+        ConfigError: there is no such policy, or its task is user-defined and not registered.
     """
     folder = Path(name)
     if not exists(folder / CONFIG_FILE):
@@ -73,7 +73,7 @@ def policy_of(name: str, where: str = "--task") -> TrainedPolicy:
                 f"'{name}': there is neither a run nor a shipped policy of this task; train one first"
             ) from error
     cfg = run_config(folder)
-    if cfg.task not in task_names():  # a run does not say where the file of its task lies, nor of what class it is
+    if cfg.task not in task_names():  # a run does not record the file or the class of its task
         raise ConfigError(
             f"{where}: {relative(folder)} was trained on a task of your own, '{cfg.task}': name the YAML file of the task,"
             " whose newest run is taken, or import the module that registers it"
@@ -82,10 +82,10 @@ def policy_of(name: str, where: str = "--task") -> TrainedPolicy:
 
 
 def _newest(task: TaskConfig) -> Path:
-    """Return the folder of a task's newest run, or else of the policy that is shipped for it.
+    """Return the folder of a task's newest run, or else of its shipped policy.
 
     Raises:
-        ConfigError: there is neither.
+        ConfigError: the task has neither.
     """
     try:
         return find_run(task, None)
@@ -97,7 +97,7 @@ def _newest(task: TaskConfig) -> Path:
 
 
 def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:
-    """Return overrides for measuring: no noise, pushes or curriculum, friction 1, nominal mass, episodes that don't end."""
+    """Return overrides for measuring: no noise, pushes or curriculum, friction 1, nominal mass, and long episodes."""
     return [
         ("env.num_envs", num_envs),
         ("env.episode_length_s", seconds + 10.0),
@@ -110,10 +110,10 @@ def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:
 
 
 def nominal(cfg: TaskConfig, changes: Iterable[tuple[str, Any]]) -> TaskConfig:
-    """Return a configuration for measuring and showing the nominal model, with nothing drawn but what `changes` ask for.
+    """Return a configuration for measurements with the nominal model, randomised only by `changes`.
 
     Raises:
-        ConfigError: the changes do not fit it.
+        ConfigError: the changes do not fit the configuration.
     """
     few_robots_do = ("train.algorithm.num_mini_batches", 1)  # nothing is trained
     cfg = override(cfg.trained(), [*changes, few_robots_do])
@@ -129,8 +129,8 @@ def restore(
     terrain: Terrain | None = None,
     make: Callable[..., Any] = make_task,
 ) -> tuple[Any, Actor]:
-    """Build the task with some settings changed, on its own terrain or on the one given, and the policy that acts in it;
-    nothing is written. `make` builds a task of a configuration, as `make_task` does.
+    """Return the policy's task with changed settings, on its own terrain or the given one, and the policy. Writes no files.
+    `make` builds a task from a configuration, as `make_task` does.
 
     Raises:
         ConfigError: the checkpoint does not fit the task.
