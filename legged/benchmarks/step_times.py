@@ -1,4 +1,4 @@
-"""How long a control step takes, and the physics in it."""
+"""Duration of a control step, and of its physics alone."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -13,7 +13,7 @@ from legged.envs import BaseTask
 from legged.graph.step_graph import StepGraph
 
 Turn = tuple[Callable[[], object], Callable[[], object]]
-"""What is done before something is timed, and what is timed."""
+"""Untimed preparation, and the timed function."""
 
 
 class Driver:
