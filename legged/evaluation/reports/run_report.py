@@ -218,8 +218,8 @@ def report_at_end(folder: Path, film_with: Sequence[str] | None) -> None:
     itself is complete.
 
     `film_with` holds the options by which another process finds the run's task. That process films the policy and writes the
-    report again with the film. Nothing waits for it: it outlives this process, and LOG in the run folder keeps its output. It is
-    another process because a driver that fails while it draws may end it, or never return.
+    report again with the film. Nothing waits for it: it outlives this process, and LOG in the run folder keeps its output. It
+    is another process because a driver that fails while it draws may end it, or never return.
     """
     start = time.perf_counter()
     try:
