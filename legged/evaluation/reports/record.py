@@ -15,7 +15,7 @@ from legged.config.dotted import value_at
 from legged.errors import ConfigError
 from legged.evaluation.learning_curves import Scalars, read_config, read_scalars
 from legged.evaluation.result_file import file_name, read_results
-from legged.learning.given import Given, read_given
+from legged.learning.invocation import Invocation, read_invocation
 from legged.learning.run_folder import CODE_FILE, CONFIG_FILE, NOTE_FILE, checkpoints, of_another_policy, run_config
 from legged.learning.timing import Timing, read_timing
 
@@ -72,7 +72,7 @@ class Record:
     """Iterations behind its last policy or log, those before it was resumed too."""
     problems: tuple[str, ...]
     """What could not be read."""
-    given: Given | None = None
+    given: Invocation | None = None
     """What its command line said; None of runs that do not say so."""
 
     def at(self, path: str) -> Any:
@@ -140,7 +140,7 @@ def read_record(folder: Path) -> Record:
     with _noting(problems):
         timing = read_timing(folder)
     with _noting(problems):
-        given = read_given(folder)
+        given = read_invocation(folder)
     if any(folder.glob("events.out.tfevents.*")):
         with _noting(problems):
             scalars = read_scalars(folder)
