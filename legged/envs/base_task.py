@@ -22,14 +22,14 @@ from legged.envs.marks import concurrent
 from legged.envs.observing import ObservingTask
 from legged.envs.privileged_terms import PrivilegedTerms
 from legged.envs.saved import SavedTask
-from legged.envs.step_watchers import StepWatcher
+from legged.envs.final_observation import StepWatcher
 from legged.errors import ConfigError
 from legged.graph.step_graph import Branch, StepGraph
 from legged.math import masked_set_
-from legged.mdp.faults import LARGEST_STATE, Faults
+from legged.mdp.nan_guard import LARGEST_STATE, NanGuard
 from legged.mdp.mirror_images import MirrorImages
 from legged.mdp.observations import ObservationGroup, ObservationTerms
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.random_pool import RandomPool
 from legged.physics import Scene
 from legged.process.ranks import Ranks
 
@@ -45,7 +45,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
     """Arrays of MuJoCo's data, beside qpos and qvel, that its terms read by `self.physics.quantity(name)`."""
     OWN_HELPERS: ClassVar[tuple[str, ...]] = ()
     """Methods of a subclass that are named like a hook of another framework, which nothing here calls, but which the subclass
-    calls itself. Without this they are an error (legged/envs/overrides.py)."""
+    calls itself. Without this they are an error (legged/envs/class_checks.py)."""
 
     def __init__(self, cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True) -> None:
         """Build physics and terms on `device`; with `graph`, the step is captured on a GPU.
@@ -133,11 +133,11 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         self._action_input = torch.zeros_like(self.actions)
         self._clipped_actions = torch.zeros_like(self.actions)
         self._in_bounds = torch.ones_like(self.valid)
-        self._beside, self._aside = Branch(device), Branch(device)  # type: ignore[arg-type]
-        self.numbers = UniformNumbers(n, device)  # type: ignore[arg-type]
+        self._stream_1, self._stream_2 = Branch(device), Branch(device)  # type: ignore[arg-type]
+        self.numbers = RandomPool(n, device)  # type: ignore[arg-type]
         """What a step draws at random; subclasses ask it for theirs in `_init_buffers`."""
         self.step_watcher: StepWatcher | None = None
-        """What looks at a step before episodes begin anew, where somebody asked for it (`step_watchers.watch_steps`)."""
+        """What looks at a step before episodes begin anew, where somebody asked for it (`final_observation.watch_steps`)."""
         self._steps_since_log = 0
         self._has_buffers = False
 
@@ -153,9 +153,9 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         # Those of the largest group first, so that it finds them side by side.
         in_order = [name for group in sorted(groups.values(), key=lambda g: -len(g.terms)) for name in group.terms]
         self.observation_terms = ObservationTerms(self._methods("_obs_", dict.fromkeys(in_order)))
-        self.observation_terms.sensors = self.make_sensors()
+        self.observation_terms.errors = self.make_observation_errors()
         self.observation_groups: dict[str, ObservationGroup] = {name: self._group(name) for name in groups}
-        self.faults = Faults(self.rewards.names, self.observation_terms, self.num_envs, self.device)  # type: ignore[arg-type]
+        self.nan_guard = NanGuard(self.rewards.names, self.observation_terms, self.num_envs, self.device)  # type: ignore[arg-type]
 
     def _methods(self, prefix: str, names: Any) -> dict[str, Callable[[], Tensor]]:
         """Return the methods `<prefix><name>` by name."""
@@ -184,7 +184,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         for _ in range(self.cfg.control.decimation):
             self.apply_control()
             self.physics.step()
-        with self._beside.fork():
+        with self._stream_1.fork():
             self.draw()
         self.sense()
         self.advance()
@@ -192,27 +192,27 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         self.check_termination()
         if type(self).check_termination is not BaseTask.check_termination:
             self._settle_endings()
-        with self._aside.fork():
+        with self._stream_2.fork():
             self.measure()
         self.compute_reward()
-        self._beside.join()
-        self._aside.join()
+        self._stream_1.join()
+        self._stream_2.join()
         if self.step_watcher is not None:
             self.step_watcher.take()
-        with self._beside.fork():
+        with self._stream_1.fork():
             self._record()
-        with self._aside.fork():
+        with self._stream_2.fork():
             self._look_for_faults()
         self.update_curricula()
-        self._beside.join()
+        self._stream_1.join()
         self.reset_idx(self.reset_buf)
         self.disturb(~self.reset_buf)
-        self._aside.join()
+        self._stream_2.join()
         self.sense()
         self.ask()
         self.observe()
         self.remember()
-        self._beside.join()
+        self._stream_1.join()
 
     def take_actions(self) -> None:
         """Clip the actions; one that is no number counts as 0."""
@@ -254,7 +254,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         state = torch.cat([self.physics.qpos, self.physics.qvel, self._clipped_actions], dim=1)
         largest = torch.linalg.vector_norm(state, torch.inf, dim=1)
         torch.lt(largest, LARGEST_STATE, out=self._in_bounds)  # so is NaN not
-        torch.logical_and(self._in_bounds, self.faults.sound, out=self.valid)
+        torch.logical_and(self._in_bounds, self.nan_guard.sound, out=self.valid)
         self._concurrent_terminations.join()
         self.terminations.evaluate(self.valid, self.episode_length_buf >= self.max_episode_length)
 
@@ -291,8 +291,8 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
     def observe(self) -> None:
         """Write the observation groups; what is no number in them is looked for beside what follows."""
         self.observation_terms.evaluate(self.reset_buf)
-        with self._beside.fork():
-            self.faults.check_observations(self.reset_buf)
+        with self._stream_1.fork():
+            self.nan_guard.check_observations(self.reset_buf)
         for group in self.observation_groups.values():
             group.advance()
             group.compute()
@@ -328,7 +328,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
             self.ask()
             self.observe()
             self.remember()
-            self._beside.join()
+            self._stream_1.join()
             self.metrics.flush()
             self._steps_since_log = 0
         return self.get_observations()
@@ -375,7 +375,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
 
     def log_rollout(self) -> dict[str, Tensor]:
         """Return what is logged of a rollout: fresh 0-dimensional tensors by their name in TensorBoard."""
-        return {**self.metrics.flush(), **self.faults.flush()}
+        return {**self.metrics.flush(), **self.nan_guard.flush()}
 
     def reset_curricula(self) -> None:
         """Go back to where training starts."""

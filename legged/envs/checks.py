@@ -6,7 +6,7 @@ from typing import get_args
 
 from legged.config.networks import check_networks, learns_from_teacher
 from legged.config.schema import LeggedConfig, TaskConfig
-from legged.envs.overrides import check_overrides, check_terms
+from legged.envs.class_checks import check_overrides, check_terms
 from legged.envs.randomization_checks import check_observed, check_randomization
 from legged.errors import ConfigError, suggest
 from legged.mdp.mirror_images import MirrorKind

@@ -9,7 +9,7 @@ from torch import Tensor
 from legged.config.schema import TaskConfig
 from legged.envs.concurrent_terms import ConcurrentTerms
 from legged.envs.marks import concurrent, is_concurrent
-from legged.mdp.faults import Faults
+from legged.mdp.nan_guard import NanGuard
 from legged.mdp.metrics import Metrics
 from legged.mdp.rewards import Rewards
 from legged.mdp.terminations import Terminations
@@ -37,7 +37,7 @@ class JudgingTask:
     time_out_buf: Tensor
     reset_buf: Tensor
     episode_length_buf: Tensor
-    faults: Faults
+    nan_guard: NanGuard
     check_termination: Callable[[], None]
     active_terminations: Callable[[], tuple[list[str], list[str]]]
     terms: Callable[[str], set[str]]
@@ -100,5 +100,5 @@ class JudgingTask:
 
     def _look_for_faults(self) -> None:
         """Find out which states, actions and rewards are no numbers. Runs beside all that comes before `observe`."""
-        self.faults.check_state(self._in_bounds, self._clipped_actions)
-        self.faults.check_rewards(self.rewards.fine, self.valid)
+        self.nan_guard.check_state(self._in_bounds, self._clipped_actions)
+        self.nan_guard.check_rewards(self.rewards.fine, self.valid)

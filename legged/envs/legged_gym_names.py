@@ -93,7 +93,7 @@ def _obs_scales(task: Any) -> SimpleNamespace:
 
 
 def _noise_scale_vec(task: Any) -> Tensor:
-    sensors, noisy = task.observation_terms.sensors, task.cfg.observations.groups["actor"].noise
+    sensors, noisy = task.observation_terms.errors, task.cfg.observations.groups["actor"].noise
     measured = sensors.noise if sensors is not None and noisy else {}  # sensors add the noise of what they measure
     return torch.cat([term.scale * measured.get(term.name, term.noise) for term in task.observation_groups["actor"].terms])
 

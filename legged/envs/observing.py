@@ -6,8 +6,8 @@ from legged.config.networks import groups_in
 from legged.config.schema import TaskConfig
 from legged.mdp.height_map_errors import HeightMapErrors
 from legged.mdp.observations import ObservationGroup, ObservationTerms
-from legged.mdp.sensors import HEIGHTS, Sensors
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.observation_errors import HEIGHTS, ObservationErrors
+from legged.mdp.random_pool import RandomPool
 
 
 class ObservingTask:
@@ -15,7 +15,7 @@ class ObservingTask:
 
     cfg: TaskConfig  # type: ignore[assignment]
     observation_terms: ObservationTerms
-    numbers: UniformNumbers
+    numbers: RandomPool
 
     def observation_scales(self) -> dict[str, Any]:
         """Return the factor on each term, a number or one for each of its columns; 1 for those that are missing."""
@@ -25,7 +25,7 @@ class ObservingTask:
         """Return the map that the term `heights` is measured with, if it has errors."""
         return None
 
-    def make_sensors(self) -> Sensors | None:
+    def make_observation_errors(self) -> ObservationErrors | None:
         """Return what measures the terms with bias, delay, lost packets or a map; None if there are none in a group with
         noise.
         """
@@ -38,7 +38,7 @@ class ObservingTask:
         if not measured:
             return None
         errors = (cfg.bias, cfg.delay, cfg.dropped)
-        return Sensors(self.observation_terms, sorted(measured), *errors, noise, self.numbers, height_map)
+        return ObservationErrors(self.observation_terms, sorted(measured), *errors, noise, self.numbers, height_map)
 
     def _noise(self) -> dict[str, float]:
         """Return the half width of each term's noise, in the term's unit."""

@@ -23,8 +23,8 @@ class RandomizedTask:
     physics: Physics
     randomization: Randomization
     QUANTITIES: ClassVar[tuple[str, ...]]
-    _beside: Branch
-    _aside: Branch
+    _stream_1: Branch
+    _stream_2: Branch
     field_rows: dict[str, int]
     """Field that can be randomised -> how many joints, bodies or shapes have it."""
 
@@ -62,16 +62,16 @@ class RandomizedTask:
         if not self.randomization.redrawn:
             yield
             return
-        with self._beside.fork():
+        with self._stream_1.fork():
             self.redraw(mask)
         yield
-        self._beside.join()
-        self._aside.join()
+        self._stream_1.join()
+        self._stream_2.join()
 
     def redraw(self, mask: Tensor) -> None:
         """Draw again what is randomised and due, where episodes begin in the environments of `mask` (N,); only called where
         something is drawn more than once. Runs beside `forget`.
         """
         self.randomization.redraw(mask)
-        with self._aside.fork():
+        with self._stream_2.fork():
             self.randomization.rewrite(self.physics)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from legged.envs.randomized import RandomizedTask
-from legged.mdp.faults import Faults
+from legged.mdp.nan_guard import NanGuard
 from legged.mdp.observations import ObservationGroup, ObservationTerms
 from legged.mdp.rewards import Rewards
 from legged.state import load_state, state_of, take
@@ -16,7 +16,7 @@ class SavedTask(RandomizedTask):
     """The half of a task that takes and gives its state."""
 
     rewards: Rewards
-    faults: Faults
+    nan_guard: NanGuard
     observation_groups: dict[str, ObservationGroup]
     observation_terms: ObservationTerms
 
@@ -32,11 +32,11 @@ class SavedTask(RandomizedTask):
     def parts(self) -> dict[str, Any]:
         """Return what has a state of its own (`STATE`), by name. A subclass adds its own."""
         return {
-            "faults": self.faults,
+            "faults": self.nan_guard,
             "randomization": self.randomization,
             "rewards": self.rewards,
             **{f"observations_{name}": group for name, group in self.observation_groups.items()},
-            **(sensors.parts() if (sensors := self.observation_terms.sensors) is not None else {}),
+            **(sensors.parts() if (sensors := self.observation_terms.errors) is not None else {}),
         }
 
     def state_dict(self) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from legged.config.schema import ActuatorConfig, LeggedControlConfig
 from legged.errors import ConfigError
 from legged.math import masked_set_
 from legged.mdp.actuator_network import ActuatorNetwork, NetworkWeights
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.random_pool import RandomPool
 from legged.robots.patterns import match_names
 from legged.robots.robot import Robot
 
@@ -100,7 +100,7 @@ class Actuator:
         middle: Tensor,
         shape: tuple[int, int],
         sim_dt: float,
-        numbers: UniformNumbers,
+        numbers: RandomPool,
         kernels: "TaskKernels | None" = None,
     ) -> None:
         """Build for `shape` (N, D) on the device of `middle`, the target of action 0 (D,) or (). Delays come from `numbers`.

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from legged.config.schema import CommandsConfig
 from legged.math import masked_set_, wrap_to_pi, yaw_of
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.random_pool import RandomPool
 
 if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
@@ -32,7 +32,7 @@ class Commands:
         dt: float,
         device: torch.device,
         kernels: "TaskKernels | None" = None,
-        numbers: UniformNumbers | None = None,
+        numbers: RandomPool | None = None,
     ) -> None:
         """Start all commands at zero, due to be sampled at the first update; `dt` is the control step [s]."""
         self.cfg, self.dt, self._kernels = cfg, dt, kernels
@@ -54,7 +54,7 @@ class Commands:
         """(N,) robots that are asked to stand still, also in heading mode."""
         self._sample = torch.zeros(num_envs, 4, device=device)
         self._sample_standing = torch.zeros_like(self.standing)
-        self.numbers = numbers or UniformNumbers(num_envs, device)
+        self.numbers = numbers or RandomPool(num_envs, device)
         self._velocity = self.numbers.between(0.0, 1.0, 3)
         self._heading = self.numbers.between(*cfg.ranges.heading, 1)
         self._chance = self.numbers.between(0.0, 1.0, 1)

@@ -12,7 +12,7 @@ from legged.config.schema import LeggedControlConfig
 from legged.errors import ConfigError
 from legged.math import masked_set_
 from legged.mdp.actuator import Actuator, is_ideal
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.random_pool import RandomPool
 from legged.robots.patterns import match_names, match_values
 from legged.robots.robot import Robot
 
@@ -39,7 +39,7 @@ class Control:
         torques: Tensor,
         sim_dt: float,
         kernels: "TaskKernels | None" = None,
-        numbers: UniformNumbers | None = None,
+        numbers: RandomPool | None = None,
     ) -> None:
         """Write torques to `torques` (N, D), the physics' own tensor, which takes their device along. Gains come
         from `cfg` if it names any, else from the robot. Delays of targets are drawn from `numbers`.
@@ -79,7 +79,7 @@ class Control:
         """What motors do that are not ideal."""
         if not is_ideal(cfg.actuator):
             middle = self.default_dof_pos if cfg.control_type == "P" else self._zero
-            drawn = numbers or UniformNumbers(len(torques), torques.device)
+            drawn = numbers or RandomPool(len(torques), torques.device)
             self.actuator = Actuator(robot, cfg, middle, (len(torques), robot.num_dof), sim_dt, drawn, kernels)
             self._target = self.actuator.newest
 

@@ -5,8 +5,8 @@ from torch import Tensor
 
 from legged.config.schema import DrawConfig, ForceConfig, KickConfig, LeggedDomainRandConfig
 from legged.math import masked_set_, uniform
-from legged.mdp.draws import Draws
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.distributions import Distributions
+from legged.mdp.random_pool import RandomPool
 from legged.physics import Physics
 
 AXES = ("x", "y", "z")
@@ -94,7 +94,7 @@ class Disturbances:
         physics: Physics,
         dt: float,
         steps_per_iteration: int,
-        numbers: UniformNumbers,
+        numbers: RandomPool,
     ) -> None:
         """Make those that `cfg` names; `dt` is the control step [s]. Numbers that they draw are of `numbers`."""
         self._dt, self._kernels = dt, physics.kernels
@@ -129,7 +129,7 @@ class Disturbances:
                 self.STATE = (*self.STATE, f"{name}_{k}")
         columns = [column for part in self._all for column in part.columns]
         start = [value for part in self._all for value in part.start]
-        self._draws = Draws(columns, start, device, steps_per_iteration, within=False)
+        self._draws = Distributions(columns, start, device, steps_per_iteration, within=False)
         self._even = self._draws.ask(numbers)
         self._drawn = torch.zeros(num_envs, len(columns), device=device)
         for part, drawn in zip(self._all, self._drawn.split([part.WIDTH for part in self._all], dim=1), strict=True):

@@ -9,7 +9,7 @@ from torch import Tensor
 from legged.config.schema import HeightMapConfig
 from legged.math import masked_set_
 from legged.mdp.height_scan import HeightScan
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.random_pool import RandomPool
 
 if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
@@ -32,7 +32,7 @@ class HeightMapErrors:
         pose: tuple[Tensor, Tensor],
         seen: Callable[[Tensor], Tensor],
         dt: float,
-        numbers: UniformNumbers,
+        numbers: RandomPool,
         kernels: "TaskKernels | None" = None,
     ) -> None:
         """Read heights around the `pose` of bases, positions (N, 3) and orientations (N, 4) in the world. Where the map may

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from legged.graph.step_graph import calling
 from legged.math import masked_set_
-from legged.mdp.sensors import Sensors
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.observation_errors import ObservationErrors
+from legged.mdp.random_pool import RandomPool
 
 
 class ObservationTerms:
@@ -35,7 +35,7 @@ class ObservationTerms:
         """(N, width) the terms as groups read them, with 0 for what is no number."""
         self.raw = self.values
         """(N, width) the terms as they gave them, numbers or not."""
-        self.sensors: Sensors | None = None
+        self.sensors: ObservationErrors | None = None
         """What measures some of the terms, for groups with noise; None if sensors are ideal but for their noise."""
 
     def evaluate(self, begun: Tensor | None = None, again: bool = False) -> None:
@@ -75,13 +75,13 @@ class ObservationGroup:
 
     def __init__(
         self,
-        source: ObservationTerms | Sensors,
+        source: ObservationTerms | ObservationErrors,
         names: Sequence[str],
         scales: Mapping[str, Sequence[float] | float],
         noise: Mapping[str, float],
         clip: float,
         history: int = 1,
-        numbers: UniformNumbers | None = None,
+        numbers: RandomPool | None = None,
     ) -> None:
         """Make the group of the terms `names` of `source`, in that order. No noise where none is named."""
         self.clip, self.history = clip, history
@@ -107,7 +107,7 @@ class ObservationGroup:
         self._scale = torch.cat([term.scale for term in self.terms])
         half = torch.cat([torch.full_like(term.scale, term.noise) for term in self.terms])
         width = half * self._scale
-        self.numbers = numbers or UniformNumbers(num_envs, device)
+        self.numbers = numbers or RandomPool(num_envs, device)
         self._noise = self.numbers.between(-width, width, start) if bool(half.any()) else None
 
     def advance(self) -> None:

@@ -10,8 +10,8 @@ from torch import Tensor
 from legged.config.randomization import DrawConfig, Range, draw_of
 from legged.config.schema import LeggedDomainRandConfig
 from legged.math import masked_set_, uniform
-from legged.mdp.draws import Draws
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.distributions import Distributions
+from legged.mdp.random_pool import RandomPool
 from legged.physics import FIELDS, MODEL_FIELDS, Physics
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ they are drawn, which is not done within a step."""
 
 
 class Randomization:
-    """Draws properties of the model and of the control law, a number per world and field, or one for each row of it."""
+    """Distributions properties of the model and of the control law, a number per world and field, or one for each row of it."""
 
     STATE: tuple[str, ...] = ("drawn",)
 
@@ -50,11 +50,11 @@ class Randomization:
             """Control steps since training began, by which ranges grow."""
             self.STATE = ("drawn", "steps")
 
-    def _draws(self, names: Collection[str], widths: Mapping[str, int] | None = None, pace: int = 1) -> Draws:
+    def _draws(self, names: Collection[str], widths: Mapping[str, int] | None = None, pace: int = 1) -> Distributions:
         """Return what draws the columns of some fields."""
         wide = [name for name in names for _ in range((widths or {}).get(name, 1))]
         neutral = [FIELDS[name].neutral for name in wide]
-        return Draws([self.draws[name] for name in wide], neutral, self.drawn.device, pace)
+        return Distributions([self.draws[name] for name in wide], neutral, self.drawn.device, pace)
 
     def widen(self, rows: Mapping[str, int]) -> None:
         """Draw numbers for each row of the fields that ask for it, now that it is known how many `rows` they have."""
@@ -104,7 +104,7 @@ class Randomization:
                 self._given = self.variants.clone()
             physics.choose_variants(torch.ones_like(self.chosen, dtype=torch.bool), self.chosen)
 
-    def prepare(self, physics: Physics, numbers: UniformNumbers, dt: float, steps_per_iteration: int) -> None:
+    def prepare(self, physics: Physics, numbers: RandomPool, dt: float, steps_per_iteration: int) -> None:
         """Prepare for draws within steps of `dt` [s], from `numbers`; nothing is done where there are none."""
         if not self.redrawn:
             return
@@ -245,13 +245,13 @@ class Pushes:
         dt: float,
         device: torch.device,
         kernels: "TaskKernels | None" = None,
-        numbers: UniformNumbers | None = None,
+        numbers: RandomPool | None = None,
     ) -> None:
         """Spread the first pushes over a whole interval; `dt` is the control step [s]."""
         self.cfg, self.dt, self._kernels = cfg, dt, kernels
         self.push_time_left = uniform(0.0, cfg.push_interval_s, (num_envs,), device)
         """(N,) time until the next push [s]."""
-        self.numbers = numbers or UniformNumbers(num_envs, device)
+        self.numbers = numbers or RandomPool(num_envs, device)
         self._velocity = self.numbers.between(-cfg.max_push_vel_xy, cfg.max_push_vel_xy, 2)
         self._due = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._delta = torch.zeros(num_envs, 2, device=device)

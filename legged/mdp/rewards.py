@@ -8,7 +8,7 @@ from torch import Tensor
 
 from legged.graph.step_graph import calling
 from legged.math import masked_set_
-from legged.mdp.faults import LARGEST
+from legged.mdp.nan_guard import LARGEST
 
 if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels

@@ -16,7 +16,7 @@ from legged.learning.ppo import DevicePPO
 from legged.learning.runner import Runner
 from legged.learning.step_guard import StepGuard
 from legged.learning.watch import PATIENCE, FaultWatch
-from legged.mdp.faults import LARGEST, LARGEST_STATE
+from legged.mdp.nan_guard import LARGEST, LARGEST_STATE
 from legged.registry import _REGISTERED, make_task, register, task_config
 from legged.tools import train
 

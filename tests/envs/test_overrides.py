@@ -8,7 +8,7 @@ import pytest
 from helpers import call, small_config
 
 from legged.envs import LeggedRobot
-from legged.envs.overrides import EXTENDED, HOOKS
+from legged.envs.class_checks import EXTENDED, HOOKS
 from legged.errors import ConfigError
 from legged.tools import train
 

@@ -8,7 +8,7 @@ from torch import Tensor
 Bounds = Tensor | Sequence[float] | float
 
 
-class Drawn:
+class Slice:
     """Some of the numbers: those that one part of a task has asked for."""
 
     values: Tensor
@@ -19,17 +19,17 @@ class Drawn:
         self.low, self.high = low, high
 
 
-class UniformNumbers:
+class RandomPool:
     """Random numbers of N environments, spread evenly between bounds: two launches for all of them, where each part by
     itself would take as many. Parts ask for theirs while the task is built.
     """
 
     def __init__(self, num_envs: int, device: torch.device) -> None:
         self.num_envs, self.device = num_envs, device
-        self._asked: list[Drawn] = []
+        self._asked: list[Slice] = []
         self._values: Tensor | None = None
 
-    def between(self, low: Bounds, high: Bounds, width: int) -> Drawn:
+    def between(self, low: Bounds, high: Bounds, width: int) -> Slice:
         """Return where `width` numbers of each environment will be found; bounds are one for all or one for each.
 
         Raises:
@@ -38,7 +38,7 @@ class UniformNumbers:
         if self._values is not None:
             raise RuntimeError("random numbers must be asked for before the first are drawn: in _init_buffers")
         bounds = (torch.as_tensor(bound, dtype=torch.float32, device=self.device).expand(width) for bound in (low, high))
-        self._asked.append(Drawn(*bounds))
+        self._asked.append(Slice(*bounds))
         return self._asked[-1]
 
     def allocate(self) -> None:

@@ -17,7 +17,7 @@ LARGEST_STATE = 1e4
 """Positions [m], velocities [m/s], angles [rad] and rates [rad/s] beyond this are no robot's: its physics has diverged."""
 
 
-class Faults:
+class NanGuard:
     """Which of N robots had a number that is none since the last `flush`, and what it was a number of."""
 
     STATE = ("sound",)

@@ -55,7 +55,7 @@ HOOKS = {
     "update_feet_state": "self.feet_pos and self.feet_vel (N, F, 3) are current after every step",
     "compute_self_observations": _OBSERVE,
     "compute_termination_observations": "a task whose episodes end keeps what they ended with where somebody asks for it"
-    " (legged/envs/step_watchers.py)",
+    " (legged/envs/final_observation.py)",
     "_disturbance_robots": "domain_rand.forces and kicks push; others override disturb(mask), with self.physics.push",
     "_step_contact_targets": "override advance(), call super().advance() and write your own tensors in place",
     "_call_train_eval": _STEP,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from legged.config.schema import DrawConfig
-from legged.mdp.uniform_numbers import Drawn, UniformNumbers
+from legged.mdp.random_pool import Slice, RandomPool
 
 if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
@@ -21,7 +21,7 @@ def standard_deviation(draw: DrawConfig) -> float:
     return draw.std or 0.25 * (draw.range[1] - draw.range[0])
 
 
-class Draws:
+class Distributions:
     """V columns of numbers, some of which are drawn evenly, some evenly in their logarithm, some normally."""
 
     def __init__(
@@ -77,7 +77,7 @@ class Draws:
         pace, first = self._pace or (torch.zeros_like(kind), torch.ones_like(kind))
         return torch.stack([kind, middle, spread, self._least, self._most, pace, first, self._neutral], dim=1), source
 
-    def ask(self, numbers: UniformNumbers) -> Drawn:
+    def ask(self, numbers: RandomPool) -> Slice:
         """Ask for the even numbers that `values` is made of."""
         return numbers.between(self.low, self.high, len(self.low))
 

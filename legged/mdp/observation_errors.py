@@ -1,4 +1,4 @@
-"""Sensors that are not ideal: numbers that are off by the same amount all episode long, late, or lost on the way.
+"""ObservationErrors that are not ideal: numbers that are off by the same amount all episode long, late, or lost on the way.
 
 What a term says goes through here once a control step, for all groups that have noise: they see the same sensor.
 """
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from legged.math import masked_set_
 from legged.mdp.height_map_errors import HeightMapErrors
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.random_pool import RandomPool
 
 if TYPE_CHECKING:
     from legged.mdp.observations import ObservationTerms
@@ -20,7 +20,7 @@ HEIGHTS = "heights"
 """The term that is read from a map."""
 
 
-class Sensors:
+class ObservationErrors:
     """Some terms as N robots measure them: bias and noise are added, then numbers are delayed, then lost.
 
     `values` and `columns` are as those of `ObservationTerms`; terms that are measured ideally are copied.
@@ -36,7 +36,7 @@ class Sensors:
         delay: Mapping[str, tuple[int, int]],
         dropped: Mapping[str, float],
         noise: Mapping[str, float],
-        numbers: UniformNumbers,
+        numbers: RandomPool,
         height_map: HeightMapErrors | None = None,
     ) -> None:
         """Measure the terms `names` of `source`: with a `bias` and `noise` up to these half widths, in the term's unit, a
@@ -127,7 +127,7 @@ class Sensors:
         parts += ["map with errors"] if self._map is not None and name == HEIGHTS else []
         return ", ".join(parts)
 
-    def parts(self) -> dict[str, "Sensors | HeightMapErrors"]:
+    def parts(self) -> dict[str, "ObservationErrors | HeightMapErrors"]:
         """Return what has a state, by name."""
         return {"sensors": self, **({"height_map": self._map} if self._map is not None else {})}
 
