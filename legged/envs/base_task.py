@@ -17,17 +17,17 @@ from legged.config.networks import groups_in
 from legged.config.schema import TaskConfig
 from legged.envs.actions import as_actions, ordinary_tensors
 from legged.envs.checks import check_task
+from legged.envs.final_observation import StepWatcher
 from legged.envs.judging import JudgingTask
 from legged.envs.marks import concurrent
 from legged.envs.observing import ObservingTask
 from legged.envs.privileged_terms import PrivilegedTerms
 from legged.envs.saved import SavedTask
-from legged.envs.final_observation import StepWatcher
 from legged.errors import ConfigError
 from legged.graph.step_graph import Branch, StepGraph
 from legged.math import masked_set_
-from legged.mdp.nan_guard import LARGEST_STATE, NanGuard
 from legged.mdp.mirror_images import MirrorImages
+from legged.mdp.nan_guard import LARGEST_STATE, NanGuard
 from legged.mdp.observations import ObservationGroup, ObservationTerms
 from legged.mdp.random_pool import RandomPool
 from legged.physics import Scene
@@ -254,7 +254,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         state = torch.cat([self.physics.qpos, self.physics.qvel, self._clipped_actions], dim=1)
         largest = torch.linalg.vector_norm(state, torch.inf, dim=1)
         torch.lt(largest, LARGEST_STATE, out=self._in_bounds)  # so is NaN not
-        torch.logical_and(self._in_bounds, self.nan_guard.sound, out=self.valid)
+        torch.logical_and(self._in_bounds, self.nan_guard.outputs_finite, out=self.valid)
         self._concurrent_terminations.join()
         self.terminations.evaluate(self.valid, self.episode_length_buf >= self.max_episode_length)
 

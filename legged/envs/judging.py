@@ -9,8 +9,8 @@ from torch import Tensor
 from legged.config.schema import TaskConfig
 from legged.envs.concurrent_terms import ConcurrentTerms
 from legged.envs.marks import concurrent, is_concurrent
-from legged.mdp.nan_guard import NanGuard
 from legged.mdp.metrics import Metrics
+from legged.mdp.nan_guard import NanGuard
 from legged.mdp.rewards import Rewards
 from legged.mdp.terminations import Terminations
 from legged.physics import Physics
@@ -101,4 +101,4 @@ class JudgingTask:
     def _look_for_faults(self) -> None:
         """Find out which states, actions and rewards are no numbers. Runs beside all that comes before `observe`."""
         self.nan_guard.check_state(self._in_bounds, self._clipped_actions)
-        self.nan_guard.check_rewards(self.rewards.fine, self.valid)
+        self.nan_guard.check_rewards(self.rewards.terms_finite, self.valid)

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from legged.config.schema import LeggedConfig, TaskConfig
 from legged.envs.base_task import BaseTask
+from legged.envs.class_checks import check_overrides
 from legged.envs.legged_checks import check_legged
 from legged.envs.legged_gym_names import LeggedGymNames
-from legged.envs.class_checks import check_overrides
 from legged.envs.terms import Terms
 from legged.math import evenly_spaced, quat_rotate
 from legged.mdp.actuator import with_rotors

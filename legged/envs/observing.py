@@ -5,8 +5,8 @@ from typing import Any
 from legged.config.networks import groups_in
 from legged.config.schema import TaskConfig
 from legged.mdp.height_map_errors import HeightMapErrors
-from legged.mdp.observations import ObservationGroup, ObservationTerms
 from legged.mdp.observation_errors import HEIGHTS, ObservationErrors
+from legged.mdp.observations import ObservationGroup, ObservationTerms
 from legged.mdp.random_pool import RandomPool
 
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 from helpers import CALM, ENGINE, TASK, TINY_TRAINING, call, checkpoints, run_folders, small_task, tiny_run
 from learners import SAMPLES, fill, learner
+from legged.tools import train
 from rsl_rl.algorithms import PPO
 
 from legged.envs import LeggedRobot
@@ -18,7 +19,6 @@ from legged.learning.step_guard import StepGuard
 from legged.learning.watch import PATIENCE, FaultWatch
 from legged.mdp.nan_guard import LARGEST, LARGEST_STATE
 from legged.registry import _REGISTERED, make_task, register, task_config
-from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 NAN, INF = float("nan"), float("inf")

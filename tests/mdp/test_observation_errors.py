@@ -1,12 +1,12 @@
-"""ObservationErrors that are not ideal, by numbers worked by hand: bias, delay, lost packets, and the map of heights."""
+"""Errors of observations, by numbers worked by hand: bias, delay, lost packets, and the map of heights."""
 
 import pytest
 import torch
 from helpers import assert_goes_on_alike, small_task
 
 from legged.errors import ConfigError
-from legged.mdp.observations import ObservationTerms
 from legged.mdp.observation_errors import ObservationErrors
+from legged.mdp.observations import ObservationTerms
 from legged.mdp.random_pool import RandomPool
 
 N = 6

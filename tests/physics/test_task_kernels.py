@@ -20,14 +20,14 @@ from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
-from legged.mdp.disturbances import Disturbances
 from legged.mdp.distributions import Distributions
+from legged.mdp.disturbances import Disturbances
 from legged.mdp.height_map_errors import HeightMapErrors
 from legged.mdp.height_scan import HeightScan
+from legged.mdp.random_pool import RandomPool
 from legged.mdp.randomization import Pushes, Randomization
 from legged.mdp.rewards import Rewards
 from legged.mdp.terrain_curriculum import TerrainCurriculum
-from legged.mdp.random_pool import RandomPool
 from legged.physics.warp.task_kernels import TaskKernels
 from legged.robots.robot import load_robot
 from legged.state import state_of
@@ -189,10 +189,10 @@ def test_rewards_are_added_alike(only_positive):
         for part in parts:
             part.compute(valid)
         assert_same(parts)
-        assert parts[0].fine.equal(parts[1].fine)
+        assert parts[0].terms_finite.equal(parts[1].terms_finite)
         assert parts[0].last.equal(parts[1].last)
         torch.testing.assert_close(parts[0].total, parts[1].total, rtol=1e-6, atol=1e-6)
-    assert not parts[0].fine[3, :4].any()
+    assert not parts[0].terms_finite[3, :4].any()
 
 
 def varying(*names, when="interval"):
