@@ -42,8 +42,8 @@ class MotorCurve:
     """Torque-speed lines of the motors of D joints, which limit the torque at a velocity."""
 
     def __init__(self, stall_torque: Tensor, no_load_speed: Tensor) -> None:
-        """Set the torque at rest [N m] and the speed at which the torque is zero [rad/s], (D,) each. A motor is ideal if both are
-        infinite: only the effort limit of its joint limits its torque.
+        """Set the torque at rest [N m] and the speed at which the torque is zero [rad/s], (D,) each. A motor is ideal if both
+        are infinite: only the effort limit of its joint limits its torque.
         """
         self.stall_torque, self.no_load_speed = stall_torque, no_load_speed
         """(D,) each. No-load speeds become (N, D) at the first call of `vary`."""
@@ -59,8 +59,8 @@ class MotorCurve:
         torch.mul(self.nominal_speed, factor, out=self.no_load_speed)
 
     def limits(self, dof_vel: Tensor, effort: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the lowest and the highest torque (N, D) [N m] at velocities (N, D) [rad/s], within the effort limits `effort`,
-        (D,) or (N, D) [N m].
+        """Return the lowest and the highest torque (N, D) [N m] at velocities (N, D) [rad/s], within the effort limits
+        `effort`, (D,) or (N, D) [N m].
         """
         share = dof_vel / self.no_load_speed
         high = torch.minimum(torch.maximum(self.stall_torque * (1.0 - share), -effort), effort)
@@ -107,8 +107,8 @@ class Actuator:
         numbers: RandomPool,
         kernels: "TaskKernels | None" = None,
     ) -> None:
-        """Build actuators of `shape` (N, D) on the device of `middle`, the target of action 0, (D,) or (). Delays are drawn from
-        the pool `numbers`.
+        """Build actuators of `shape` (N, D) on the device of `middle`, the target of action 0, (D,) or (). Delays are drawn
+        from the pool `numbers`.
 
         Raises:
             ConfigError: as for `check_actuator`.
@@ -195,7 +195,8 @@ class Actuator:
         effort: Tensor,
         out: Tensor,
     ) -> None:
-        """Write to `out` the torques (N, D) [N m] of one physics step, at joint angles [rad] and velocities [rad/s], (N, D) each.
+        """Write to `out` the torques (N, D) [N m] of one physics step, at joint angles [rad] and velocities [rad/s], (N, D)
+        each.
 
         `law` computes the commanded torques (N, D) from targets (N, D). For the P law, `gains` are its stiffness and damping.
         `effort` are the effort limits of the joints [N m]. Gains and limits are (D,) or (N, D).
@@ -229,7 +230,9 @@ class Actuator:
         torch.clamp(asked, -effort, effort, out=out)
 
     def reset(self, mask: Tensor) -> None:
-        """Reset the state of the robots in `mask` (N,), and draw their delay. With delay_varies, draw the delay of all robots."""
+        """Reset the state of the robots in `mask` (N,), and draw their delay. With delay_varies, draw the delay of all
+        robots.
+        """
         if self._drawn is not None:
             drawn = self._drawn.values[:, 0].clamp(max=float(self.longest)).int()
             if self._varies:  # a target that arrived by the last physics step stays in force, however late the next one is
@@ -244,8 +247,8 @@ class Actuator:
 
 
 def modelled_joints(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str) -> tuple[int, ...]:
-    """Return the indices of the joints that have the motor model, and the network if there is one. `where` turns a dotted path
-    into the beginning of an error message.
+    """Return the indices of the joints that have the motor model, and the network if there is one. `where` turns a dotted
+    path into the beginning of an error message.
 
     Raises:
         ConfigError: a pattern matches no joint.
@@ -272,8 +275,8 @@ def motor_numbers(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str]
 
 
 def with_rotors(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str) -> Robot:
-    """Return the robot with the rotor inertias of the configuration (control.actuator.armature), or the same robot if there are
-    none. `where` is as for `modelled_joints`.
+    """Return the robot with the rotor inertias of the configuration (control.actuator.armature), or the same robot if there
+    are none. `where` is as for `modelled_joints`.
 
     Raises:
         ConfigError: a pattern matches no joint.
@@ -286,8 +289,8 @@ def with_rotors(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] =
 def friction_numbers(
     robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Coulomb and breakaway friction [N m] and viscous friction [N m s/rad] of all joints, (D,) each. `where` is as for
-    `modelled_joints`.
+    """Return Coulomb and breakaway friction [N m] and viscous friction [N m s/rad] of all joints, (D,) each. `where` is as
+    for `modelled_joints`.
 
     Raises:
         ConfigError: a pattern matches no joint, or breakaway friction is below Coulomb friction.
@@ -323,8 +326,8 @@ def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where:
     `modelled_joints`.
 
     Raises:
-        ConfigError: a pattern matches no joint, a speed is missing, a motor is too strong for the physics step, or the network
-            file is missing or invalid, or needs the P law or another physics step.
+        ConfigError: a pattern matches no joint, a speed is missing, a motor is too strong for the physics step, or the
+            network file is missing or invalid, or needs the P law or another physics step.
     """
     actuator = cfg.actuator
     _check_line(with_rotors(robot, actuator, where), *motor_numbers(robot, actuator, where), sim_dt, where)
@@ -337,12 +340,12 @@ def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where:
 
 
 def check_motor_model(actuator: ActuatorConfig, origins: Origins) -> None:
-    """Check that ideal motors are given no torque-speed line by mistake. A setting `ideal` is allowed over the numbers of a file,
-    so that the same motors can be tried without their line.
+    """Check that ideal motors are given no torque-speed line by mistake. A setting `ideal` is allowed over the numbers of a
+    file, so that the same motors can be tried without their line.
 
     Raises:
-        ConfigError: numbers of a line are given and the motor model is not set, or the command line gives the numbers and does
-            not set the model to `ideal` as well.
+        ConfigError: numbers of a line are given and the motor model is not set, or the command line gives the numbers and
+            does not set the model to `ideal` as well.
     """
     path, told = "control.actuator.model", origins.of("control.actuator.model")
     for name in ("stall_torque", "no_load_speed"):
@@ -359,8 +362,8 @@ def check_motor_model(actuator: ActuatorConfig, origins: Origins) -> None:
 def check_slowest(
     robot: Robot, cfg: LeggedControlConfig, sim_dt: float, lowest: float, where: Callable[[str], str] = str
 ) -> None:
-    """Check that torque-speed lines fit the physics step if no-load speeds are randomised, at the `lowest` factor on them. `where`
-    is as for `modelled_joints`.
+    """Check that torque-speed lines fit the physics step if no-load speeds are randomised, at the `lowest` factor on them.
+    `where` is as for `modelled_joints`.
 
     Raises:
         ConfigError: at that factor a motor is too strong for the physics step, as for `check_actuator`.
@@ -377,8 +380,8 @@ def check_slowest(
 
 
 def _line_gains(robot: Robot, stall: np.ndarray, speed: np.ndarray, sim_dt: float) -> np.ndarray:
-    """Return the gain of each torque-speed line, (D,): the change of speed of a joint in the air within a physics step, divided
-    by the distance of its speed from the line. It is 0 for ideal motors, whose no-load speed is infinite.
+    """Return the gain of each torque-speed line, (D,): the change of speed of a joint in the air within a physics step,
+    divided by the distance of its speed from the line. It is 0 for ideal motors, whose no-load speed is infinite.
     """
     return sim_dt * stall / (robot.inertia * speed)
 
@@ -386,8 +389,8 @@ def _line_gains(robot: Robot, stall: np.ndarray, speed: np.ndarray, sim_dt: floa
 def _check_line(robot: Robot, stall: np.ndarray, speed: np.ndarray, sim_dt: float, where: Callable[[str], str]) -> None:
     """Check that no torque-speed line is too steep for the physics step.
 
-    On a line with a gain above LARGEST_GAIN a joint in the air changes its speed, within a physics step, by more than twice its
-    distance from the line. Such a motor pushes and brakes in turn.
+    On a line with a gain above LARGEST_GAIN a joint in the air changes its speed, within a physics step, by more than twice
+    its distance from the line. Such a motor pushes and brakes in turn.
 
     Raises:
         ConfigError: a line is too steep.

@@ -2,7 +2,8 @@
 samples; an LSTM remembers all samples.
 
 The MLP is that of Hwangbo et al., "Learning agile and dynamic motor skills for legged robots", Science Robotics 4 (2019),
-eaau5872: position error and velocity of now and of two earlier samples, small layers with softsign. All joints share a network.
+eaau5872: position error and velocity of now and of two earlier samples, small layers with softsign. All joints share a
+network.
 """
 
 from dataclasses import dataclass, field
@@ -41,8 +42,9 @@ class NetworkWeights:
     scales: np.ndarray
     """(3,) factors on position errors [1/rad], on velocities [s/rad] and on the output [N m]."""
     layers: tuple[dict[str, np.ndarray], ...]
-    """Weights by layer. A linear layer has `weight` (out, in) and `bias` (out,). The cells of an LSTM come first, with `input`
-    (4 H, in), `hidden` (4 H, H) and `bias` (4 H,), for the gates i, f, g, o in torch's order."""
+    """Weights by layer. A linear layer has `weight` (out, in) and `bias` (out,). The cells of an LSTM come first, with
+    `input` (4 H, in), `hidden` (4 H, H) and `bias` (4 H,), for the gates i, f, g, o in torch's order.
+    """
     facts: dict[str, float] = field(default_factory=dict)
     """Figures of the fit, such as its error on held-out data."""
 
@@ -162,7 +164,8 @@ class ActuatorNetwork:
         else:
             shape = (2 * len(self._hidden), max(self._hidden, default=1), joints)
         self.state = torch.zeros(num_envs, *shape, device=device)
-        """State of the network. MLP: (N, steps, 2, D) scaled errors and velocities of the last physics steps, newest first. LSTM:
+        """State of the network. MLP: (N, steps, 2, D) scaled errors and velocities of the last physics steps, newest first.
+        LSTM:
         (N, 2 * cells, H, D), for each cell its hidden state, then its cell state.
         """
         if kernels is not None:

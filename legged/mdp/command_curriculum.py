@@ -49,8 +49,8 @@ class CommandCurriculum:
         torch.mul(self.full_ranges, self.share.unsqueeze(1), out=ranges)
 
     def update(self, commands: Tensor, lin_vel: Tensor, ang_vel: Tensor, valid: Tensor) -> None:
-        """Add a control step: `commands` (N, 3) as vx, vy, yaw rate, and velocities (N, 3) in the base frame [m/s, rad/s]. Only
-        robots of `valid` (N,) count. At the end of a window, widen the ranges of the axes that were followed.
+        """Add a control step: `commands` (N, 3) as vx, vy, yaw rate, and velocities (N, 3) in the base frame [m/s, rad/s].
+        Only robots of `valid` (N,) count. At the end of a window, widen the ranges of the axes that were followed.
         """
         if not self.cfg.enabled:
             return

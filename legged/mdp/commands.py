@@ -79,8 +79,8 @@ class Commands:
         torch.eq(kind, STANDING, out=self._sample_standing)
 
     def update(self, reset: Tensor, base_quat: Tensor) -> None:
-        """Update commands by a control step: give the sampled command to robots whose episode begins (`reset` (N,)) or whose time
-        is up, then steer towards the headings. `base_quat` (N, 4) are the orientations of the bases.
+        """Update commands by a control step: give the sampled command to robots whose episode begins (`reset` (N,)) or whose
+        time is up, then steer towards the headings. `base_quat` (N, 4) are the orientations of the bases.
         """
         if self._kernels is not None:
             self._update_in_one_launch(reset, base_quat)
@@ -107,8 +107,8 @@ class Commands:
         self._kernels.renew_commands(*masks, *drawn, base_quat, *times, *steering, MOVING, *written)
 
     def hold(self, commands: Tensor, heading: Tensor | None = None) -> None:
-        """Set fixed commands of all robots, (N, 3) or one (3,) for all; they are not sampled any more. With `heading` (N,) [rad]
-        and in heading mode, the yaw rate keeps steering towards it.
+        """Set fixed commands of all robots, (N, 3) or one (3,) for all; they are not sampled any more. With `heading` (N,)
+        [rad] and in heading mode, the yaw rate keeps steering towards it.
         """
         self.commands[:, :3].copy_(commands)
         self.held.fill_(True)

@@ -41,8 +41,8 @@ class Control:
         kernels: "TaskKernels | None" = None,
         numbers: RandomPool | None = None,
     ) -> None:
-        """Build the control law on the device of `torques` (N, D), the physics' own tensor, which the law writes. Gains come from
-        `cfg` if it names any, else from the robot. Delays of targets are drawn from the pool `numbers`.
+        """Build the control law on the device of `torques` (N, D), the physics' own tensor, which the law writes. Gains come
+        from `cfg` if it names any, else from the robot. Delays of targets are drawn from the pool `numbers`.
 
         Raises:
             ConfigError: a pattern matches no joint, a joint has no gain or scale, or joints are held without P.
@@ -59,8 +59,9 @@ class Control:
         """Scale of all actions, or (A,) of each."""
         stiffness, damping = control_gains(robot, cfg)
         self.stiffness, self.damping = tensor(stiffness), tensor(damping)
-        """(D,) gains [N m/rad] and [N m s/rad]. They and `torque_limits` [N m] become (N, D) once `vary` has been given values
-        that differ from robot to robot."""
+        """(D,) gains [N m/rad] and [N m s/rad]. They and `torque_limits` [N m] become (N, D) once `vary` has been given
+        values that differ from robot to robot.
+        """
         self.default_dof_pos = tensor(robot.default_dof_pos)
         self.torque_limits = tensor(robot.torque_limits)
         self._lowest_torques = -self.torque_limits
@@ -84,9 +85,9 @@ class Control:
             self._target = self.actuator.newest
 
     def vary(self, drawn: Mapping[str, Tensor]) -> None:
-        """Apply randomised properties, (N,) or (N, D) each: factors on gains and torque limits, and `joint_offset`, the error of
-        the encoders [rad]. Other fields of `physics.FIELDS` in `drawn` are ignored. The first call allocates for the fields
-        that it is given; later calls write in place.
+        """Apply randomised properties, (N,) or (N, D) each: factors on gains and torque limits, and `joint_offset`, the error
+        of the encoders [rad]. Other fields of `physics.FIELDS` in `drawn` are ignored. The first call allocates for the
+        fields that it is given; later calls write in place.
         """
         each = {
             name: values.view(len(values), -1) for name, values in drawn.items() if name in (*self.nominal, "joint_offset")

@@ -101,8 +101,8 @@ class Distributions:
             kernels.make_draws(even, self.source, self.table, steps.view(1), out)
 
     def values(self, even: Tensor, steps: Tensor) -> Tensor:
-        """Return (N, V) random numbers made from the uniform numbers `even` (N, V), which lie between `low` and `high`. Ranges
-        have grown for `steps` () of training.
+        """Return (N, V) random numbers made from the uniform numbers `even` (N, V), which lie between `low` and `high`.
+        Ranges have grown for `steps` () of training.
         """
         parts = list(even.split(self._counts, dim=1))
         if self._counts[1]:

@@ -41,7 +41,9 @@ class Kicks:
         time_left.copy_(uniform(0.0, cfg.interval_s[1], (len(time_left),), time_left.device))
 
     def take(self, drawn: Tensor) -> None:
-        """Set the tensor `drawn` (N, 7) that holds each robot's next kick: its velocity [m/s, rad/s] and the interval after it [s]."""
+        """Set the tensor `drawn` (N, 7) that holds each robot's next kick: its velocity [m/s, rad/s] and the interval after
+        it [s].
+        """
         self.velocity, self._next = drawn[:, :6], drawn[:, 6]
 
     def act(self, physics: Physics, mask: Tensor) -> None:
@@ -60,8 +62,8 @@ class Forces:
     """Random columns of a push: 3 for the force, 1 for the interval, 1 for the duration."""
 
     def __init__(self, cfg: ForceConfig, body: int, dt: float, left: Tensor, force: Tensor) -> None:
-        """Push the body with index `body` in the model. The first pushes are spread over a whole interval. `dt` is the control
-        step [s]; `left` (N, 2) and `force` (N, 3) are written in place.
+        """Push the body with index `body` in the model. The first pushes are spread over a whole interval. `dt` is the
+        control step [s]; `left` (N, 2) and `force` (N, 3) are written in place.
         """
         self.columns, self.start = _columns(cfg, AXES, ("interval_s", "duration_s"))
         """Distribution of each random column, and the value that its range grows from."""
@@ -98,8 +100,8 @@ class Disturbances:
         steps_per_iteration: int,
         numbers: RandomPool,
     ) -> None:
-        """Build the kicks and forces that `cfg` names. `dt` is the control step [s]; `steps_per_iteration` are the control steps
-        of a training iteration, by which ranges grow. Random numbers come from the pool `numbers`.
+        """Build the kicks and forces that `cfg` names. `dt` is the control step [s]; `steps_per_iteration` are the control
+        steps of a training iteration, by which ranges grow. Random numbers come from the pool `numbers`.
         """
         self._dt, self._kernels = dt, physics.kernels
         num_envs, device = numbers.num_envs, numbers.device

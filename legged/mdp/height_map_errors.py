@@ -21,8 +21,8 @@ def is_exact(cfg: HeightMapConfig) -> bool:
 
 
 class HeightMapErrors:
-    """Height maps of N robots with errors: the map is displaced from the ground, the displacement drifts, and some of P points
-    are unknown.
+    """Height maps of N robots with errors: the map is displaced from the ground, the displacement drifts, and some of P
+    points are unknown.
     """
 
     STATE = ("error", "rate", "holes")

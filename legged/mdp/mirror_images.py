@@ -129,7 +129,8 @@ class MirrorImages:
 
 
 def mirror_of_actions(mirror: Mirror, acted: Sequence[int]) -> tuple[list[int], list[float]] | None:
-    """Return, for each action of the joints `acted`, the index of the action whose place it takes in the mirror, and its sign.
+    """Return, for each action of the joints `acted`, the index of the action whose place it takes in the mirror, and its
+    sign.
 
     Return None if a joint has an action and its partner on the other side has none.
     """

@@ -89,8 +89,8 @@ class ObservationErrors:
         """(N, C) numbers that arrived last; (N, 0) without loss."""
 
     def update(self, begun: Tensor, again: bool = False) -> None:
-        """Update `values` for a new control step. Robots of `begun` (N,) have new episodes: they get a new bias and delay, and
-        their first measurement fills their past. With `again`, repeat the measurement of the same step.
+        """Update `values` for a new control step. Robots of `begun` (N,) have new episodes: they get a new bias and delay,
+        and their first measurement fills their past. With `again`, repeat the measurement of the same step.
         """
         if not again:
             self._draw(begun)

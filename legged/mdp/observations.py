@@ -77,8 +77,8 @@ class ObservationTerm:
 
 
 class ObservationGroup:
-    """Input of a network, (N, history * width): the concatenated terms of the last `history` steps, oldest first. The buffer is
-    rewritten in place.
+    """Input of a network, (N, history * width): the concatenated terms of the last `history` steps, oldest first. The buffer
+    is rewritten in place.
     """
 
     STATE = ("_steps",)
@@ -95,8 +95,9 @@ class ObservationGroup:
     ) -> None:
         """Build the group of the terms `names` of `source`, in that order.
 
-        `scales` and `noise` (half widths in the term's unit, before scaling) have entries by term; without one, the scale is 1
-        and there is no noise. The scaled values are clipped to plus and minus `clip`. Noise is drawn from the pool `numbers`.
+        `scales` and `noise` (half widths in the term's unit, before scaling) have entries by term; without one, the scale is
+        1 and there is no noise. The scaled values are clipped to plus and minus `clip`. Noise is drawn from the pool
+        `numbers`.
         """
         self.clip, self.history = clip, history
         self.terms: list[ObservationTerm] = []
@@ -134,8 +135,8 @@ class ObservationGroup:
         self._write(self._now)
 
     def preview(self, out: Tensor) -> None:
-        """Write into `out` (N, history * width) the buffer that `advance` and `compute` would give now. The group itself stays as
-        it is.
+        """Write into `out` (N, history * width) the buffer that `advance` and `compute` would give now. The group itself
+        stays as it is.
         """
         steps = out.view_as(self._steps)
         if self.history > 1:

@@ -30,8 +30,8 @@ class RandomPool:
         self._values: Tensor | None = None
 
     def between(self, low: Bounds, high: Bounds, width: int) -> Slice:
-        """Reserve `width` columns with bounds `low` and `high`, and return them. A bound is one number for all columns, or one
-        for each.
+        """Reserve `width` columns with bounds `low` and `high`, and return them. A bound is one number for all columns, or
+        one for each.
 
         Raises:
             RuntimeError: the pool has been allocated already.

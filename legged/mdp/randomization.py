@@ -28,8 +28,8 @@ class Randomization:
     STATE: tuple[str, ...] = ("drawn",)
 
     def __init__(self, ranges: Mapping[str, Range | DrawConfig], num_envs: int, device: torch.device) -> None:
-        """Draw one number per world and field. `ranges` maps a field of `physics.FIELDS` to its lowest and highest value, or to
-        its distribution.
+        """Draw one number per world and field. `ranges` maps a field of `physics.FIELDS` to its lowest and highest value, or
+        to its distribution.
         """
         self.draws = {name: draw_of(entry) for name, entry in ranges.items()}
         """Field -> its distribution and the moments of its draws."""
@@ -53,8 +53,8 @@ class Randomization:
             self.STATE = ("drawn", "steps")
 
     def _draws(self, names: Collection[str], widths: Mapping[str, int] | None = None, pace: int = 1) -> Distributions:
-        """Return the distributions of the fields `names`, with `widths` columns each (else 1). `pace` is the number of control
-        steps in a training iteration.
+        """Return the distributions of the fields `names`, with `widths` columns each (else 1). `pace` is the number of
+        control steps in a training iteration.
         """
         wide = [name for name in names for _ in range((widths or {}).get(name, 1))]
         neutral = [FIELDS[name].neutral for name in wide]
@@ -111,8 +111,8 @@ class Randomization:
             physics.choose_variants(torch.ones_like(self.chosen, dtype=torch.bool), self.chosen)
 
     def prepare(self, physics: Physics, numbers: RandomPool, dt: float, steps_per_iteration: int) -> None:
-        """Allocate buffers for draws within control steps of `dt` [s], from the pool `numbers`. Does nothing if no field changes
-        within steps.
+        """Allocate buffers for draws within control steps of `dt` [s], from the pool `numbers`. Does nothing if no field
+        changes within steps.
         """
         if not self.redrawn:
             return
@@ -224,8 +224,8 @@ class RobotRandomization(Randomization):
         num_envs: int,
         device: torch.device,
     ) -> None:
-        """Draw friction from `friction_buckets` values and the mass added to the base, even if they are switched off; then draw
-        from `cfg.ranges`, which replace both.
+        """Draw friction from `friction_buckets` values and the mass added to the base, even if they are switched off; then
+        draw from `cfg.ranges`, which replace both.
         """
         low, high = cfg.friction_range
         buckets = uniform(low, high, (cfg.friction_buckets,), device)

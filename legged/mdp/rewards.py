@@ -28,8 +28,8 @@ class Rewards:
         total: Tensor,
         kernels: "TaskKernels | None" = None,
     ) -> None:
-        """Build the sum of the terms in `functions`, with their `scales` by name. `dt` is the control step [s], or 1 for scales
-        that are not per second. Sums are written to `total` (N,); with `only_positive` they are clipped at zero.
+        """Build the sum of the terms in `functions`, with their `scales` by name. `dt` is the control step [s], or 1 for
+        scales that are not per second. Sums are written to `total` (N,); with `only_positive` they are clipped at zero.
         """
         num_envs, device = len(total), total.device
         self._kernels = kernels
@@ -55,8 +55,8 @@ class Rewards:
         """The rows of `sums` by name."""
 
     def compute(self, valid: Tensor) -> Tensor:
-        """Evaluate all terms, and return `total`. Robots outside `valid` (N,), whose physics has diverged, get zero. A term that
-        is not finite counts as zero.
+        """Evaluate all terms, and return `total`. Robots outside `valid` (N,), whose physics has diverged, get zero. A term
+        that is not finite counts as zero.
 
         Raises:
             TermError: a term fails, or returns something else than (N,) or one number.

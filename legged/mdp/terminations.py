@@ -10,7 +10,9 @@ from legged.graph.step_graph import calling
 
 
 class Terminations:
-    """Termination terms of two kinds: failures, after which no reward is expected, and time-outs, whose value is bootstrapped."""
+    """Termination terms of two kinds: failures, after which no reward is expected, and time-outs, whose value is
+    bootstrapped.
+    """
 
     def __init__(
         self,
@@ -30,8 +32,8 @@ class Terminations:
         """For each term a mask (N,) of the robots whose episodes it ended at the last step."""
 
     def evaluate(self, valid: Tensor, over: Tensor) -> None:
-        """Evaluate all terms. Whatever the terms return, robots outside `valid` (N,) have failed, and robots of `over` (N,) are
-        timed out. A failed robot is never also timed out.
+        """Evaluate all terms. Whatever the terms return, robots outside `valid` (N,) have failed, and robots of `over` (N,)
+        are timed out. A failed robot is never also timed out.
 
         Raises:
             TermError: a term fails, or does not return (N,) bool.

@@ -62,8 +62,8 @@ class TerrainCurriculum:
         self._random.random_(0, self.rows)
 
     def update(self, mask: Tensor, base_pos: Tensor, asked: Tensor) -> None:
-        """Move the robots of `mask` (N,), whose episodes end, to their next levels. `base_pos` (N, 3) is their final position [m];
-        `asked` (N,) is the distance that their command asks for in an episode [m].
+        """Move the robots of `mask` (N,), whose episodes end, to their next levels. `base_pos` (N, 3) is their final position
+        [m]; `asked` (N,) is the distance that their command asks for in an episode [m].
         """
         if not self.enabled:
             return
@@ -92,8 +92,8 @@ class TerrainCurriculum:
         torch.index_select(self._tiles, 0, self.levels * self._count + self.columns, out=self.origins)
 
     def metrics(self) -> dict[str, Tensor]:
-        """Return fresh 0-dimensional tensors by name in TensorBoard: the mean level, and for each terrain type the mean level and
-        the shares of ended episodes that moved up and down. Shares are averaged over about the last ten calls, since one
+        """Return fresh 0-dimensional tensors by name in TensorBoard: the mean level, and for each terrain type the mean level
+        and the shares of ended episodes that moved up and down. Shares are averaged over about the last ten calls, since one
         rollout ends few episodes of each type.
         """
         if not self.enabled:
