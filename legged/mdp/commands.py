@@ -60,8 +60,8 @@ class Commands:
         self._velocity = self.numbers.between(0.0, 1.0, 3)
         self._heading = self.numbers.between(*cfg.ranges.heading, 1)
         self._chance = self.numbers.between(0.0, 1.0, 1)
-        # Kinds of commands: only vx, only vy, only yaw rate, all axes, none. Independent sampling of three axes hardly ever gives
-        # a command along one axis only.
+        # Kinds of commands: only vx, only vy, only yaw rate, all axes, none. Independent sampling of three axes hardly ever
+        # gives a command along one axis only.
         single, standing = cfg.single_axis_share * (1.0 - cfg.standing_share) / 3.0, cfg.standing_share
         self._up_to = torch.tensor([single, 2.0 * single, 3.0 * single, 1.0 - standing], device=device)
         kept = torch.cat([torch.eye(3), torch.ones(1, 3), torch.zeros(1, 3)])

@@ -32,7 +32,9 @@ class Kicks:
     """Random columns of a kick: 6 for the change of velocity, 1 for the time until the next kick."""
 
     def __init__(self, cfg: KickConfig, dt: float, time_left: Tensor) -> None:
-        """Spread the first kicks over a whole interval. `dt` is the control step [s]; `time_left` (N,) is written in place."""
+        """Spread the first kicks over a whole interval. `dt` is the control step [s]; `time_left` (N,) is written in
+        place.
+        """
         self.columns, self.start = _columns(cfg, (*AXES, *TURNS), ("interval_s",))
         """Distribution of each random column, and the value that its range grows from."""
         self._dt = dt
@@ -69,7 +71,7 @@ class Forces:
         """Distribution of each random column, and the value that its range grows from."""
         self._dt, self.body = dt, body
         self.left, self.force = left, force
-        """(N, 2) time until the current push ends and until the next one begins [s]; (N, 3) current force, world frame [N]."""
+        """(N, 2) time until the current push ends and until the next one begins [s]; (N, 3) force now, world frame [N]."""
         left[:, 1] = uniform(0.0, cfg.interval_s[1], (len(left),), left.device)
 
     def take(self, drawn: Tensor) -> None:

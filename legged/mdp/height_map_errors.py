@@ -62,7 +62,9 @@ class HeightMapErrors:
         """(N, P) True at unknown points; (N, 0) if the map has no holes."""
 
     def advance(self, begun: Tensor) -> None:
-        """Advance the drift by one control step, and draw new errors for the robots of `begun` (N,), whose episodes are new."""
+        """Advance the drift by one control step, and draw new errors for the robots of `begun` (N,), whose episodes are
+        new.
+        """
         if self._kernels is not None:
             chances = self._holes_drawn.values if self._holes_drawn is not None else self._drawn.values[:, :0]
             drawn = (begun, self._drawn.values, chances, self._share, self._lost)

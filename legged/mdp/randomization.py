@@ -23,7 +23,9 @@ these fields. That cannot be done within a step, so variants are drawn at the st
 
 
 class Randomization:
-    """Random properties of the model and of the control law: a number per world and field, or one for each row of the field."""
+    """Random properties of the model and of the control law: a number per world and field, or one for each row of the
+    field.
+    """
 
     STATE: tuple[str, ...] = ("drawn",)
 
@@ -139,7 +141,9 @@ class Randomization:
         self._kernels = physics.kernels
         self._interval = torch.tensor([float(max(1, round(each / dt))) for each in intervals], device=device)
         self.steps_left = torch.floor(torch.rand(worlds, len(intervals), device=device) * self._interval) + 1.0
-        """(N, I) control steps until the next draw of each of I intervals. The first draws are spread over a whole interval."""
+        """(N, I) control steps until the next draw of each of I intervals. The first draws are spread over a whole
+        interval.
+        """
         self.STATE = (*self.STATE, "steps_left")
         self._chosen, self._chosen_at = self._new_chosen, 0
         if self.chosen_fields:

@@ -70,9 +70,7 @@ class Once(argparse.Action):
 
 def add_import_argument(parser: argparse.ArgumentParser) -> None:
     """Add --import, which names user-defined tasks; `args.module` holds it."""
-    parser.add_argument(
-        "--import", dest="module", action=Once, help="module, .py or YAML file with user-defined tasks; several with commas"
-    )
+    parser.add_argument("--import", dest="module", action=Once, help="module, .py or YAML file with user-defined tasks; several with commas")
 
 
 class Paragraphs(argparse.HelpFormatter):

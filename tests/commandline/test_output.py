@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 from helpers import TASK, TINY_TRAINING, checkpoints, run_folders
-from legged.tools import train
 
 from legged.commandline.command import run_main
 from legged.commandline.output import Output, forgiving_output, when_output_is_lost
 from legged.errors import ConfigError, RunError
+from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

@@ -3,11 +3,11 @@
 import pytest
 import yaml
 from helpers import TASK, call, small_config
-from legged.tools import train
 
 from legged.commandline.show import summary
 from legged.config import from_dict, to_yaml
 from legged.registry import task_config
+from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

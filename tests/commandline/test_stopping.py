@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 from helpers import TASK, TINY_TRAINING, checkpoints, run_folders, wait_for
-from legged.tools import train
 
 from legged.commandline.stopping import SIGNALS, quiet_writers, stopping_on_signals
 from legged.process import startup
+from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 from helpers import TASK, call, forget_modules_of, tiny_run
-from legged.tools import episodes, evaluate, train
 
 from legged import LeggedRobot, registry, user_modules
 from legged.config import from_dict
 from legged.config.loader import read_yaml
 from legged.errors import ConfigError
 from legged.robots.robot import load_robot
+from legged.tools import episodes, evaluate, train
 
 pytestmark = pytest.mark.usefixtures("workplace", "own_registry")
 

@@ -5,11 +5,11 @@ import json
 import pytest
 import torch
 from helpers import TASK, call, run_folders, tiny_run
-from legged.tools import evaluate
 
 from legged.evaluation import all_checkpoints
 from legged.evaluation.all_checkpoints import walks
 from legged.learning.checkpoint import read_checkpoint, write_checkpoint
+from legged.tools import evaluate
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

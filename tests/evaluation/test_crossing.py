@@ -5,11 +5,11 @@ from typing import get_args
 
 import pytest
 from helpers import TASK, call, kept_global_state, tiny_run
-from legged.tools import evaluate
 from rich.console import Console
 
 from legged.config.schema import NewtonSolver
 from legged.evaluation import crossing
+from legged.tools import evaluate
 
 GRID = ["--vx=0:0.5:0.5", "--vy=0", "--yaw=0", "--robots", "1"]
 ENGINES = ["mujoco_warp", "mujoco", *(f"newton_{name}" for name in get_args(NewtonSolver))]

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import POLICY, TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
-from legged.tools import evaluate, play
 
 from legged import make_task
 from legged.config import override
@@ -20,6 +19,7 @@ from legged.evaluation.velocity_tracking import measure_tracking
 from legged.play import schedule
 from legged.policies.restore import TrainedPolicy, undisturbed
 from legged.registry import task_config
+from legged.tools import evaluate, play
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

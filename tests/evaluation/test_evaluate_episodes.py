@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 from helpers import call, kept_global_state, run_folders, tiny_run
-from legged.tools import benchmark, compare, evaluate, play, plot, show_terrain
 
 from legged.errors import ConfigError
 from legged.evaluation.gymnasium_episodes import run_exported
+from legged.tools import benchmark, compare, evaluate, play, plot, show_terrain
 
 pytestmark = pytest.mark.usefixtures("workplace")
 TASK = "half_cheetah"

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from helpers import POLICY, TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
-from legged.tools import evaluate
 
 from legged import make_task
 from legged.config import override
@@ -31,6 +30,7 @@ from legged.learning.run_folder import find_checkpoint, run_config
 from legged.policies.restore import TrainedPolicy, undisturbed
 from legged.registry import task_config
 from legged.terrain import Terrain, TileSpec, check_terrain
+from legged.tools import evaluate
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

@@ -11,7 +11,6 @@ import pytest
 import torch
 from devices import CUDA
 from helpers import CALM, TASK, checkpoints, run_folders
-from legged.tools import train
 from tensordict import TensorDict
 
 from legged.envs import LeggedRobot
@@ -24,6 +23,7 @@ from legged.learning.run_folder import run_config
 from legged.policies.export import export
 from legged.policies.restore import TrainedPolicy, restore
 from legged.registry import task_config
+from legged.tools import train
 
 pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("workplace", "full_precision")]
 

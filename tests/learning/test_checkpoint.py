@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import TASK, call, checkpoints, kept_global_state, tiny_run
-from legged.tools import evaluate, play, train
 
 from legged.errors import ConfigError
 from legged.learning.checkpoint import FORMAT, read_checkpoint
 from legged.learning.run_folder import shipped_policy
+from legged.tools import evaluate, play, train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 COMMANDS = {

@@ -4,7 +4,6 @@ import pytest
 import torch
 from helpers import TASK, TINY_TRAINING, call, tiny_run
 from learners import fill, learner
-from legged.tools import train
 from test_resume import content, same
 
 from legged.envs import BaseTask
@@ -14,6 +13,7 @@ from legged.learning.critic_warmup import CriticWarmup
 from legged.learning.ppo import DevicePPO
 from legged.learning.run_folder import run_config
 from legged.registry import make_task
+from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

@@ -10,7 +10,6 @@ import pytest
 import torch
 from helpers import TASK, TINY_TRAINING, call, run_folders, small_config, small_task, tiny_run
 from learners import LEARNING, ROBOTS, STEPS
-from legged.tools import train
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
@@ -28,6 +27,7 @@ from legged.learning.rollout import Rollout
 from legged.learning.runner import Runner
 from legged.mdp.observations import ObservationGroup, ObservationTerms
 from legged.policies.export import export
+from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

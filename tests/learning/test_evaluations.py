@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, small_config, tiny_run
-from legged.tools import evaluate, train
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 
@@ -16,6 +15,7 @@ from legged.evaluation.during_training import TrainingEvaluation
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.evaluations import Evaluations
 from legged.learning.timing import read_timing
+from legged.tools import evaluate, train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

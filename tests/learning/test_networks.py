@@ -8,7 +8,6 @@ import onnxruntime
 import pytest
 import torch
 from helpers import TASK, TINY_TRAINING, call, checkpoints, small_config, small_task, tiny_run
-from legged.tools import evaluate, play, train
 from tensordict import TensorDict
 
 from legged.errors import ConfigError
@@ -18,6 +17,7 @@ from legged.learning.networks import action_std, build_actor
 from legged.learning.run_folder import run_config
 from legged.learning.runner import Runner
 from legged.policies.restore import TrainedPolicy, restore
+from legged.tools import evaluate, play, train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, small_task
-from legged.tools import train
 
 from legged.commandline.arguments import pick_device
 from legged.errors import ConfigError
 from legged.process.ranks import Ranks
 from legged.registry import make_task, task_config
+from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

@@ -8,7 +8,6 @@ import onnxruntime
 import pytest
 import torch
 from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, small_config, small_task, tiny_run
-from legged.tools import play, train
 
 import legged.policies.export as export_module
 from legged.errors import ConfigError
@@ -20,6 +19,7 @@ from legged.policies.actor import Actor
 from legged.policies.export import ExportError, export
 from legged.policies.restore import find_policy, restore
 from legged.registry import task_config
+from legged.tools import play, train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

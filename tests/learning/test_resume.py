@@ -5,11 +5,11 @@ import shutil
 import pytest
 import torch
 from helpers import TASK, call, run_folders, tiny_run
-from legged.tools import train
 
 from legged.envs import LeggedRobot
 from legged.learning.run_folder import run_config
 from legged.policies.restore import find_policy  # noqa: F401  (imports every loader of checkpoints)
+from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import POLICY, POLICY_ITERATION, TASK, TINY_TRAINING, call, checkpoints, tiny_run
-from legged.tools import play, train
 from test_resume import EVENTFUL, content, same
 
 from legged.config import to_dict
@@ -18,6 +17,7 @@ from legged.learning.student_rollout import StudentRollout
 from legged.learning.student_runner import StudentRunner
 from legged.learning.teacher import find_teacher, teacher_in, with_teacher
 from legged.registry import make_task, task_config
+from legged.tools import play, train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

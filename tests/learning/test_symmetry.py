@@ -6,7 +6,6 @@ import mujoco
 import pytest
 import torch
 from helpers import call, small_config, small_task, tiny_run
-from legged.tools import train
 from reference import States, random_states
 from tensordict import TensorDict
 
@@ -18,6 +17,7 @@ from legged.learning.symmetry import augment
 from legged.mdp.mirror_images import MirrorImages
 from legged.registry import make_task, task_config
 from legged.robots.mirror import Mirror
+from legged.tools import train
 
 SYMMETRIC = ("train.algorithm.symmetry", True)
 ONE_CORE = ("sim.physics", "mujoco"), ("sim.threads", 1)

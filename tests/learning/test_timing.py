@@ -4,11 +4,11 @@ import json
 
 import pytest
 from helpers import TASK, TINY_TRAINING, run_folders, small_task, tiny_run
-from legged.tools import train
 
 from legged.errors import ConfigError
 from legged.learning.timing import TIMING_FILE, Timing, read_timing, write_timing
 from legged.physics.warp import mujoco_warp
+from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

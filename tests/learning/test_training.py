@@ -13,7 +13,6 @@ import pytest
 import torch
 import yaml
 from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, tiny_run, wait_for
-from legged.tools import train
 
 from legged.commandline.arguments import overrides
 from legged.config import from_dict
@@ -22,6 +21,7 @@ from legged.learning.run_folder import find_run, run_config
 from legged.learning.runner import Runner
 from legged.policies.restore import find_policy
 from legged.registry import make_task, task_config
+from legged.tools import train
 
 REPOSITORY = Path(train.__file__).parents[2]
 UPDATES = 20  # optimiser steps per iteration: 5 epochs of 4 mini-batches

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import POLICY, POLICY_ITERATION, TASK, TINY_TRAINING, call, checkpoints, run_folders, tiny_run
-from legged.tools import play, train
 
 import legged
 from legged.learning.captured import CapturedRunner
@@ -16,6 +15,7 @@ from legged.learning.run_folder import run_config
 from legged.learning.runner import Runner
 from legged.learning.transfer import first_difference
 from legged.registry import make_task, task_config
+from legged.tools import play, train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

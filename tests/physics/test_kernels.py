@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 import warp as wp
-from legged.tools import warmup
 
 from legged.physics.warp.compile import Build, Line, compile_ahead, launched
+from legged.tools import warmup
 
 # Two modules with a kernel each, one of them launched with two block sizes, and a third that nothing launches.
 MODELS = """

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import POLICY, TASK, call, small_config, small_task, stand
-from legged.tools import play
 
 import legged.policies.restore
 from legged.envs import LeggedRobot
@@ -16,6 +15,7 @@ from legged.play import schedule, video
 from legged.policies.actor import Actor
 from legged.policies.export import export
 from legged.process.paths import DISK_FULL
+from legged.tools import play
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

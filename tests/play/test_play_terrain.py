@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from helpers import CALM, ENGINE, call, kept_global_state, tiny_run
-from legged.tools import play
 
 from legged.config import TaskConfig, override
 from legged.envs import LeggedRobot
@@ -20,6 +19,7 @@ from legged.play.playground import ROWS_NEEDED, SETTING, Playground, label
 from legged.process.paths import data_folder
 from legged.registry import make_task, task_config
 from legged.terrain import TERRAIN_TYPES
+from legged.tools import play
 
 TYPES = [
     "slope_up",

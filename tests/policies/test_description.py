@@ -7,7 +7,6 @@ import onnxruntime
 import pytest
 import torch
 from helpers import CALM, ENGINE, TASK, call, small_config, small_task, tiny_run
-from legged.tools import export as export_tool
 
 from legged import unit
 from legged.config.schema import ObservationGroupConfig
@@ -17,6 +16,7 @@ from legged.physics import FIELDS
 from legged.policies.description import describe
 from legged.policies.export import export
 from legged.registry import make_task, task_config
+from legged.tools import export as export_tool
 
 SMALL_TERRAIN = [
     ("terrain.num_rows", 3),

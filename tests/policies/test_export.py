@@ -8,12 +8,12 @@ import onnxruntime
 import pytest
 import torch
 from helpers import TINY_TRAINING, call, run_folders, small_task
-from legged.tools import export as export_tool
-from legged.tools import train
 
 import legged.policies.export as export_module
 from legged.learning.runner import Runner
 from legged.policies.export import ExportError, export
+from legged.tools import export as export_tool
+from legged.tools import train
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["plain", "normalised"])

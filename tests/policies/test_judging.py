@@ -8,7 +8,6 @@ import onnx
 import pytest
 import torch
 from helpers import call, small_task, tiny_run
-from legged.tools import export, playback
 from onnx import TensorProto, helper, numpy_helper
 
 from legged.errors import ConfigError
@@ -17,6 +16,7 @@ from legged.evaluation.velocity_grid import Grid
 from legged.policies.description import describe
 from legged.policies.foreign import ForeignPolicy, Layout, read_layout
 from legged.robots.robot import load_robot
+from legged.tools import export, playback
 
 
 def write_policy(path, matrix, bias, **metadata):

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 import yaml
 from helpers import TASK, TINY_TRAINING, checkpoints, run_folders, tiny_run, wait_for
-from legged.tools import train
 
 from legged.config import to_dict
 from legged.config.dotted import MISSING
@@ -21,6 +20,7 @@ from legged.evaluation.reports.record import is_running, read_code, read_record
 from legged.learning.captured import CapturedRunner
 from legged.learning.timing import TIMING_FILE, Timing, read_timing, write_timing
 from legged.registry import task_config
+from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from helpers import ENGINE, POLICY, TASK, call, kept_global_state, tiny_run
-from legged.tools import evaluate
 
 from legged.evaluation import success
 from legged.evaluation.stress import measuring
@@ -14,6 +13,7 @@ from legged.evaluation.stress.measuring import GROUND, STAIRS, Bench, Wish
 from legged.evaluation.stress.table import ALONE, Disturbance
 from legged.evaluation.success import FELL, REACHED, STUCK, Scores
 from legged.policies.restore import policy_of
+from legged.tools import evaluate
 
 make = measuring._make
 pytestmark = pytest.mark.usefixtures("workplace")
