@@ -6,10 +6,11 @@ import re
 
 import pytest
 from helpers import call, small_config
+from legged.tools import train
 
 from legged.cli import train
 from legged.envs import LeggedRobot
-from legged.envs.overrides import EXTENDED, HOOKS
+from legged.envs.class_checks import EXTENDED, HOOKS
 from legged.errors import ConfigError
 
 pytestmark = pytest.mark.usefixtures("workplace")
