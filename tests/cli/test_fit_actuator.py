@@ -8,7 +8,6 @@ import pytest
 import torch
 import yaml
 from helpers import call, small_task
-from legged.tools import fit_actuator
 from simulated_motor import TRUTH, simulated_log
 
 from legged.cli import fit_actuator
@@ -305,7 +304,7 @@ def test_a_wrong_flag_is_one_line(tmp_path, flags, said, capsys):
         ({"kind": "gru"}, "unknown kind 'gru'"),
         ({"layer1.weight": np.zeros((3, 3))}, "layer 1 does not fit"),
         ({"layer1.bias": None}, "'bias' is missing"),
-        ({"layer0.weight": np.full((4, 6), np.nan)}, "layer 0 has weights that are no numbers"),
+        ({"layer0.weight": np.full((4, 6), np.nan)}, "layer 0 has weights that are NaN"),
         ({"dt": 0.007}, "sim.dt must be 0.007 or a whole part of it"),
     ],
 )

@@ -7,10 +7,10 @@ import re
 import pytest
 from helpers import call, small_config
 
+from legged.cli import train
 from legged.envs import LeggedRobot
-from legged.envs.overrides import EXTENDED, HOOKS
+from legged.envs.class_checks import EXTENDED, HOOKS
 from legged.errors import ConfigError
-from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

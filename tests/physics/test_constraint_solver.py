@@ -10,9 +10,9 @@ import torch
 import warp as wp
 from devices import on_gpu
 from helpers import call
-from legged.tools.train import main
 from reference import heaps, random_states, roll
 
+from legged.cli.train import main
 from legged.errors import ConfigError
 from legged.physics.fused.constraint_solver import ConstraintSolver
 

@@ -17,13 +17,14 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import warp as wp
+from filelock import lock_descriptor, unlock_descriptor
 
 POLL_S = 0.1
 PLAIN_LINES_EVERY_S = 5.0
@@ -181,20 +182,16 @@ class _Lock:
         return self
 
     def __exit__(self, *_: object) -> None:
-        import fcntl
-
-        fcntl.flock(self._file, fcntl.LOCK_UN)  # closing is not enough while a child process has the file open
+        with suppress(OSError):
+            unlock_descriptor(self._file.fileno())  # closing is not enough while a child has it open
         self._file.close()
 
     def acquire(self) -> bool:
-        """Return True if this process holds the lock now. Does not wait."""
-        import fcntl
-
+        """Return whether this process has it; do not wait for it."""
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            return False
-        return True
+            return lock_descriptor(self._file.fileno(), blocking=False)
+        except OSError:  # a file system without locks; compiling twice does no harm
+            return True
 
 
 class Line:
