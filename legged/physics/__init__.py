@@ -92,7 +92,7 @@ def check_engine(
     others = "sim.physics=mujoco_warp or mujoco"
     if not isinstance(scene, RobotScene):
         raise ConfigError(
-            f"{where('sim.physics')}: newton simulates robots with a floating base, not {scene.name}; {others} simulate any model"
+            f"{where('sim.physics')}: newton simulates robots with a floating base, not {scene.name}; {others} do"
         )
     if scene.robot.passive is not None:
         raise ConfigError(

@@ -79,7 +79,7 @@ def contact_features(model: mujoco.MjModel, shapes: Iterable[int]) -> Iterator[C
         else:
             raise ConfigError(
                 f"terrain: shape '{model.geom(i).name}' is of type {kind_of(model, i)}; sim.terrain_collider=cells"
-                " supports spheres, capsules, cylinders and boxes. Use those, sim.terrain_collider=convex, or sim.physics=mujoco"
+                " supports spheres, capsules, cylinders, boxes; use them, sim.terrain_collider=convex or sim.physics=mujoco"
             )
 
 

@@ -63,7 +63,7 @@ def ignored(model: mujoco.MjModel) -> str:
     ):
         for i in np.flatnonzero(limited & (span < 2.0 * margin)):
             return (
-                f"{kind} '{getattr(model, kind)(i).name}' can be within the margin ({margin[i]:g}) of both of its limits, which"
+                f"{kind} '{getattr(model, kind)(i).name}' can be within the margin ({margin[i]:g}) of both its limits, which"
                 f" are {span[i]:g} apart, and only the nearer limit would exert force"
             )
     return ""
