@@ -30,7 +30,8 @@ OUTSIDE = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md"}
 """Files of the repository's root -> the pages that they become."""
 NOTEBOOK = "notebooks/first_walk.ipynb"
 LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
-PICTURES = (".png", ".gif", ".jpg", ".svg")
+COPIED = (".png", ".gif", ".jpg", ".svg", ".cff")
+"""Endings of files outside docs/ that are copied to the site if a page links to them: pictures, and the citation."""
 LONGEST_DEFAULT = 60
 """Characters of a default that stand in the table; longer ones follow the meaning."""
 API = {
@@ -46,7 +47,7 @@ log = logging.getLogger("mkdocs.hooks.site")  # under strict, a warning ends the
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that are made here, and the pictures that pages show from other folders."""
+    """Add the pages that are made here, and the files that pages show from other folders."""
     for name, page in OUTSIDE.items():
         files.append(File.generated(config, page, abs_src_path=str(ROOT / name)))
     made = {
@@ -58,17 +59,17 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     made |= {f"reference/{name}.md": api_page(*what) for name, what in API.items()}
     for page, text in made.items():
         files.append(File.generated(config, page, content=text))
-    shown = {target for path in (*DOCS.glob("*.md"), *(ROOT / name for name in OUTSIDE)) for target in _pictures(path)}
+    shown = {target for path in (*DOCS.glob("*.md"), *(ROOT / name for name in OUTSIDE)) for target in _copied(path)}
     for target in sorted(shown):
         files.append(File.generated(config, target, abs_src_path=str(ROOT / target)))
     return files
 
 
-def _pictures(path: Path) -> Iterator[str]:
-    """Yield the pictures outside docs/ that a page shows, relative to the repository."""
+def _copied(path: Path) -> Iterator[str]:
+    """Yield the files outside docs/ that a page shows and the site copies, relative to the repository."""
     for match in LINK.finditer(path.read_text(encoding="utf-8")):
         target = posixpath.normpath(posixpath.join(path.parent.relative_to(ROOT).as_posix(), match[2]))
-        if target.endswith(PICTURES) and not target.startswith("docs/") and "://" not in match[2]:
+        if target.endswith(COPIED) and not target.startswith("docs/") and "://" not in match[2]:
             yield target
 
 

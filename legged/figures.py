@@ -1,5 +1,7 @@
 """Figures: how one is drawn into a file, and the colours that all of them share."""
 
+import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +24,22 @@ DPI = 110
 """Pixels an inch."""
 
 
+def import_matplotlib() -> None:
+    """Import matplotlib, which takes a while, also under an MPLBACKEND that it does not know: figures are files here."""
+    if "matplotlib" in sys.modules:
+        return
+    backend = os.environ.pop("MPLBACKEND", None)
+    import matplotlib
+
+    if backend:
+        os.environ["MPLBACKEND"] = backend
+        try:
+            matplotlib.rcParams["backend"] = backend
+        except ValueError:
+            said = f"warning: MPLBACKEND: matplotlib knows no backend '{backend}'; figures are drawn without it"
+            print(said, file=sys.stderr, flush=True)
+
+
 @contextmanager
 def figure(
     path: Path, size: tuple[float, float], rows: int = 1, columns: int = 1, share_y: bool = False, **saving: Any
@@ -35,7 +53,8 @@ def figure(
     Raises:
         RunError: the file can't be written.
     """
-    from matplotlib import rc_context  # takes a while; commands that fail early do without
+    import_matplotlib()
+    from matplotlib import rc_context
     from matplotlib.figure import Figure
     from matplotlib.rcsetup import cycler
 

@@ -19,6 +19,8 @@ from legged.config import TaskConfig
 from legged.envs import LeggedRobot
 from legged.registry import make_task, task_config
 
+HANG_S = 900.0
+"""What takes longer hangs, on the busiest machine too: no test is decided by how fast it is [s]."""
 TASK = "anymal_c_flat"
 JOINTS = 12
 POLICY = Path(__file__).resolve().parents[1] / "resources" / "policies" / TASK
@@ -114,7 +116,15 @@ def kept_global_state() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def wait_for(condition: Callable[[], object], process: subprocess.Popen, seconds: float = 60.0) -> None:
+def until(condition: Callable[[], object]) -> None:
+    """Wait until something holds."""
+    end = time.monotonic() + HANG_S
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def wait_for(condition: Callable[[], object], process: subprocess.Popen, seconds: float = HANG_S) -> None:
     """Wait until something holds while a process runs whose output goes to out.txt, and maybe to err.txt."""
     end = time.monotonic() + seconds
     while not condition():

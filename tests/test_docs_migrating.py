@@ -54,6 +54,7 @@ def test_the_class_that_was_ported_trains():
     arguments = command.removeprefix("python train.py ").split()
     settings = [f"{key}={value}" for key, value in ENGINE]
     tiny = ["--num-envs", "8", "--max-iterations", "1", "--sim-device", "cpu", "train.runner.num_steps_per_env=4"]
+    tiny.append("train.runner.report=false")
     assert call(train.main, [*arguments, *tiny, *settings]) == 0
 
 

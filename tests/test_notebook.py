@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from helpers import TINY_TRAINING
+from helpers import HANG_S, TINY_TRAINING
 
 SEARCH = {
     "trials": 2,
@@ -60,7 +60,7 @@ def test_the_notebook_runs(task, tmp_path, monkeypatch):
     nbformat.validate(notebook)
     (parameters,) = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", ())]
     parameters.source = SMALL[task]
-    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    NotebookClient(notebook, timeout=int(HANG_S), resources={"metadata": {"path": str(tmp_path)}}).execute()
 
     shown = [output for cell in notebook.cells for output in cell.get("outputs", ())]
     pictures = [output.data["image/png"] for output in shown if "image/png" in output.get("data", {})]

@@ -165,7 +165,8 @@ def test_every_command_that_is_shown_exists(page):
 
 def test_commands_are_found_on_pages():
     assert sum(len(shown_commands(text)) for text in PAGES.values()) > 100
-    page = "Run `legged\ntrain TASK` or:\n\n```\n$ legged play anymal_c \\\n  --gif  # films\nlegged 1.2\n```\n\n`legged`, `legged.cli`"
+    block = "```\n$ legged play anymal_c \\\n  --gif  # films\nlegged 1.2\n```"
+    page = f"Run `legged\ntrain TASK` or:\n\n{block}\n\n`legged`, `legged.cli`"
     assert shown_commands(page) == [
         Shown(1, "legged train TASK", False),
         Shown(6, "legged play anymal_c  --gif  # films", True),

@@ -22,7 +22,8 @@ from legged.process.paths import data_folder
 from legged.registry import CLASSES
 from legged.terrain import TERRAIN_TYPES
 
-COMPLETED = {"task": "names", "policy": "names", "task_option": "names", "runs": "names", "overrides": "keys"}
+NAMES = ("task", "policy", "other", "task_option", "runs", "load_run", "transfer", "teacher")
+COMPLETED = {**dict.fromkeys(NAMES, "names"), "overrides": "keys"}
 """Argument -> the shell function that lists its values: names of tasks and runs, or keys of the configuration."""
 SCRIPT = """
 _legged_names() {{ (cd {cfg} && printf '%s\\n' *.yaml | sed 's/[.]yaml$//'); ls -d logs/*/* 2>/dev/null | sed 's/^logs.//'; }}
@@ -36,7 +37,18 @@ _legged_next_keys() {{ _legged_keys | sed -n "s/^\\\\($1[^.]*[.]\\\\{{0,1\\\\}}\
 """
 IN_BASH = """
 _legged_complete_names() { compgen -W "$(_legged_names)" -- "$1"; }
-_legged_complete_keys() { compopt -o nospace; _legged_next_keys "$1"; }
+_legged_complete_keys() { _legged_next_keys "$1"; }
+"""
+LAST_IN_BASH = """
+# `legged evaluate` takes a policy in the place of a sub-command. No blank comes after a key, which goes on or gets a value.
+_legged_complete() {
+  _shtab_legged "$@"
+  if [[ ${COMP_WORDS[1]} == evaluate && $COMP_CWORD == 2 && $2 != -* ]]; then
+    COMPREPLY+=($(_legged_complete_names "$2"))
+  fi
+  if [[ "${COMPREPLY[0]-}" == *[.=] ]]; then compopt -o nospace; fi
+}
+complete -o bashdefault -F _legged_complete legged
 """
 IN_ZSH = """
 _legged_complete_names() { compadd -- ${(f)"$(_legged_names)"} }
@@ -66,6 +78,8 @@ def _main(argv: list[str] | None) -> int:
     kinds = [getattr(import_module(module), name) for name, module in CLASSES.items()]
     lists = SCRIPT.format(cfg=shlex.quote(str(data_folder("cfg"))), keys="\n".join(keys_of(kinds)))
     print(shtab.complete(whole_parser(), shell, preamble=lists + (IN_BASH if shell == "bash" else IN_ZSH)))
+    if shell == "bash":
+        print(LAST_IN_BASH)
     return 0
 
 
@@ -77,7 +91,7 @@ def whole_parser() -> argparse.ArgumentParser:
     for name, (module, summary) in COMMANDS.items():
         group, _, inside = name.partition(" ")
         parser = import_module(module).build_parser()
-        for action in parser._actions:
+        for action in parser._actions if name != "migrate" else ():  # its tasks are those of legged_gym
             if action.dest in COMPLETED:
                 function = f"_legged_complete_{COMPLETED[action.dest]}"
                 action.complete = {"bash": function, "zsh": function}

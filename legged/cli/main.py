@@ -3,8 +3,10 @@
 Nothing heavy is imported here: `legged --help` answers before torch would be loaded.
 """
 
+import difflib
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 
 from legged.commandline.light import answer, print_rows
@@ -84,6 +86,28 @@ def split(words: list[str]) -> tuple[str | None, list[str]]:
     return None, words
 
 
+@contextmanager
+def hint_at_sub_command(group: str, words: Sequence[str]) -> Iterator[None]:
+    """Add the nearest sub-command of `group` to an error about one of `words`, which may be a sub-command misspelt.
+
+    Raises:
+        ConfigError: the error, with the hint.
+    """
+    try:
+        yield
+    except ConfigError as error:
+        for word in words:
+            near = difflib.get_close_matches(word, sub_commands(group), n=1)
+            if near and word in str(error):
+                raise ConfigError(f"{error}; did you mean the sub-command `legged {group} {near[0]}`?") from error
+        raise
+
+
+def sub_commands(group: str) -> list[str]:
+    """Return the second words of a group's commands."""
+    return [name.partition(" ")[2] for name in COMMANDS if name.startswith(f"{group} ")]
+
+
 def _print_help(words: list[str]) -> None:
     """Print the commands, or those of a group.
 
@@ -104,12 +128,10 @@ def _print_help(words: list[str]) -> None:
     if asked[0] not in groups:
         known = {name.partition(" ")[0] for name in COMMANDS}
         raise ConfigError(f"legged: there is no command '{asked[0]}'{suggest(asked[0], known, 'commands')}")
-    inside = {name: said for name, (_, said) in COMMANDS.items() if name.startswith(f"{asked[0]} ")}
     if len(asked) > 1:
-        names = [name.partition(" ")[2] for name in inside]
-        raise ConfigError(
-            f"legged {asked[0]}: there is no sub-command '{asked[1]}'{suggest(asked[1], names, 'sub-commands')}"
-        )
+        near = suggest(asked[1], sub_commands(asked[0]), "sub-commands")
+        raise ConfigError(f"legged {asked[0]}: there is no sub-command '{asked[1]}'{near}")
+    inside = {name: said for name, (_, said) in COMMANDS.items() if name.startswith(f"{asked[0]} ")}
     print_rows(f"commands of `legged {asked[0]}`, each with --help", inside)
 
 

@@ -12,6 +12,7 @@ from legged.commandline.arguments import (
     POLICY_HELP,
     add_build_arguments,
     add_checkpoint_argument,
+    override_is_no_name,
     pick_device,
     policy_overrides,
     register_given,
@@ -58,9 +59,7 @@ def build_parser() -> CommandParser:
 
 def _main(argv: list[str] | None) -> int:
     args = build_parser().parse_intermixed_args(argv)
-    if args.policy is not None and "=" in args.policy:
-        args.overrides.insert(0, args.policy)
-        args.policy = None
+    override_is_no_name(args, "policy")
     register_given(args, "policy")
     port = free_port(args.host, None if args.port is None else check_port(args.port))
     count = ROBOTS if args.num_envs is None else args.num_envs

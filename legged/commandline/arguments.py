@@ -1,6 +1,7 @@
 """Command-line arguments that several commands share, and the configuration that they make."""
 
 import argparse
+import re
 import shlex
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from legged.process.startup import program
 from legged.registry import YAML_ENDINGS, import_tasks, register_file
 
 TASK_HELP = "a task, e.g. anymal_c_flat, or its YAML file"
+OVERRIDE = re.compile(r"[\w.]+=")
+"""The beginning of a `key=value`; what has a slash before the equals sign is a path."""
 POLICY_HELP = "a task (its newest run, else the shipped policy), its YAML file, a run, or a run's folder"
 
 
@@ -68,10 +71,8 @@ def settle_name(args: argparse.Namespace, name: str) -> None:
     Raises:
         ConfigError: neither or both name something.
     """
+    override_is_no_name(args, name)
     given = getattr(args, name)
-    if given is not None and "=" in given and args.task_option is not None:
-        args.overrides.insert(0, given)
-        given = None
     if given is not None and args.task_option not in (None, given):
         raise ConfigError(f"--task: '{args.task_option}' is given beside {name.upper()} '{given}'; leave one of them out")
     found = given if given is not None else args.task_option
@@ -80,6 +81,14 @@ def settle_name(args: argparse.Namespace, name: str) -> None:
             f"{name.upper()}: is missing; name {'a task' if name == 'task' else 'a task or a run'}, e.g. anymal_c"
         )
     setattr(args, name, found)
+
+
+def override_is_no_name(args: argparse.Namespace, name: str) -> None:
+    """Move a `key=value` in the place of the positional argument `name`, which may be left out, to the overrides."""
+    given = getattr(args, name)
+    if given is not None and OVERRIDE.match(given):
+        args.overrides.insert(0, given)
+        setattr(args, name, None)
 
 
 def _iteration(text: str) -> int | str:

@@ -1,10 +1,10 @@
-"""MuJoCo's viewer with a robot that follows the keyboard."""
+"""MuJoCo's viewer with keyboard commands."""
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 import mujoco
-import mujoco.viewer
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -26,20 +26,20 @@ PANELS = {"show_left_ui": False, "show_right_ui": False}
 
 
 class Keyboard:
-    """Key presses -> a command (vx, vy, yaw rate), kept inside the ranges of the task."""
+    """Key presses -> a command (vx, vy, yaw rate) within the ranges of the task."""
 
     MOVES = {UP: (0, 1), DOWN: (0, -1), COMMA: (1, 1), PERIOD: (1, -1), LEFT: (2, 1), RIGHT: (2, -1)}
 
     def __init__(self, low: list[float], high: list[float]) -> None:
-        """Begin at rest; `low` and `high` are the least and the greatest command of each axis."""
+        """Start with the command zero; `low` and `high` are the limits of each axis."""
         self.low, self.high = low, high
         self.command = [0.0, 0.0, 0.0]
         self.restart = False
         self.tile = 0
-        """How many times the next tile was asked for."""
+        """Number of requests for the next tile."""
 
     def press(self, key: int) -> None:
-        """Take one key, by GLFW's code; others mean nothing."""
+        """Process a key by its GLFW code; other keys have no effect."""
         if key in self.MOVES:
             axis, sign = self.MOVES[key]
             moved = round(self.command[axis] + sign * STEP[axis], 3)
@@ -66,7 +66,7 @@ def view(task: LeggedRobot, act: Callable[[TensorDict], Tensor], playground: Pla
     if playground:
         print(HELP_ON_TERRAIN)
     begin_anew(task, playground, keyboard)
-    with mujoco.viewer.launch_passive(model, data, key_callback=keyboard.press, **PANELS) as window:
+    with _window(model, data, keyboard.press) as window:
         window.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
         window.cam.trackbodyid = model.body(f"0/{task.robot.file.base}").id
         window.cam.distance, window.cam.azimuth, window.cam.elevation = (
@@ -100,7 +100,7 @@ def watch(task: BaseTask, act: Callable[[TensorDict], Tensor]) -> None:
         if key == BACKSPACE:
             restart.append(key)
 
-    with mujoco.viewer.launch_passive(model, data, key_callback=press, **PANELS) as window:
+    with _window(model, data, press) as window:
         follow_root(window.cam, model)
         while window.is_running():
             begin = time.perf_counter()
@@ -115,8 +115,15 @@ def watch(task: BaseTask, act: Callable[[TensorDict], Tensor]) -> None:
             time.sleep(max(0.0, task.dt - (time.perf_counter() - begin)))
 
 
+def _window(model: mujoco.MjModel, data: mujoco.MjData, press: Callable[[int], None]) -> Any:
+    """Open MuJoCo's viewer, whose library for windows a machine without a display may lack."""
+    import mujoco.viewer
+
+    return mujoco.viewer.launch_passive(model, data, key_callback=press, **PANELS)
+
+
 def begin_anew(task: LeggedRobot, playground: Playground | None, keyboard: Keyboard) -> None:
-    """Put the robots back to their start, on terrain on the tile that the keyboard asks for, and name it."""
+    """Reset the robots, on terrain on the tile that the keyboard selects, and print its name."""
     if playground and task.terrain:
         playground.place(task, keyboard.tile)
     task.reset()

@@ -7,6 +7,7 @@ that, a module stands in its place which notes these marks; then the real one is
 """
 
 import importlib
+import importlib.metadata
 import importlib.util
 import sys
 from collections.abc import Sequence
@@ -16,6 +17,8 @@ from types import ModuleType
 from typing import Any
 
 NAME = "torch._dynamo"
+KNOWN = ("2.13.",)
+"""Versions of torch whose use of its compiler the stand-in knows; under any other the real one is imported, as ever."""
 
 
 class DeferredCompiler(ModuleType):
@@ -113,10 +116,20 @@ class _Imported:
 
 
 def defer_compiler() -> None:
-    """Put the stand-in where the compiler would be, unless it, or torch, has been imported, or is not installed."""
+    """Put the stand-in where the compiler would be, unless it or torch has been imported, or torch is missing or of a version
+    that is not known.
+    """
     torch = importlib.util.find_spec("torch") if "torch" not in sys.modules else None
-    if torch is None or torch.origin is None or NAME in sys.modules:
+    if torch is None or torch.origin is None or NAME in sys.modules or not _version().startswith(KNOWN):
         return
     stand_in = DeferredCompiler(Path(torch.origin).parent / "_dynamo")
     sys.modules[NAME] = stand_in
     sys.meta_path.insert(0, _Submodules(stand_in))  # type: ignore[arg-type]
+
+
+def _version() -> str:
+    """Return the version of torch that is installed, without importing it; nothing if its package does not say."""
+    try:
+        return importlib.metadata.version("torch")
+    except importlib.metadata.PackageNotFoundError:
+        return ""

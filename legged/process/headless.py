@@ -11,11 +11,15 @@ from importlib import import_module
 from legged.errors import ConfigError, suggest
 from legged.process.startup import command_of_ours
 
+NO_PICTURES = ""
+"""Why nothing can be drawn in this process, once MuJoCo was found not to draw by the library that MUJOCO_GL names."""
 ANSWER_S = 0.5
 """A display that does not answer for so long is taken for gone [s]."""
 OFF = ("disable", "disabled", "off", "false", "0")
 ALLOWED = ("egl", "osmesa", "glfw", "glx") if sys.platform == "linux" else ("cgl", "glfw", "wgl")
 """Values of MUJOCO_GL; `OFF` and words for on are allowed too."""
+CONTEXT = "mujoco.rendering.classic.gl_context"
+"""MuJoCo's module that imports the library for drawing."""
 ON = ("", "enable", "enabled", "on", "true", "1")
 
 
@@ -77,11 +81,13 @@ def off_screen_library() -> str | None:
 
 
 def choose() -> None:
-    """Set MUJOCO_GL where there is no display, if the user has not; check it, if he has.
+    """Set MUJOCO_GL where there is no display, if the user has not; check it, if the user has. MuJoCo cannot be imported
+    under a library that is missing: then pictures are off, and a line says so, because most commands draw nothing.
 
     Raises:
-        ConfigError: MuJoCo could not be imported under the value that MUJOCO_GL has.
+        ConfigError: MUJOCO_GL has a value that MuJoCo does not know.
     """
+    global NO_PICTURES
     given = os.environ.get("MUJOCO_GL")
     if given is None:
         found = off_screen_library() if HEADLESS else None
@@ -92,15 +98,22 @@ def choose() -> None:
     if value not in (*ALLOWED, *ON, *OFF):
         raise ConfigError(f"MUJOCO_GL: unknown value '{given}'{suggest(value, (*ALLOWED, 'off'))}")
     try:
-        import_module("mujoco.rendering.classic.gl_context")
-    except ModuleNotFoundError as error:
-        if error.name != "mujoco":
-            raise
-        return  # a robot's computer, which draws nothing
-    except (ImportError, AttributeError, RuntimeError, OSError) as error:
-        works = off_screen_library()
-        instead = f"{works} would" if works else "none of them is here; leave it out, and play with --no-video"
-        raise ConfigError(f"MUJOCO_GL: '{given}' does not work on this machine ({error}); {instead}") from error
+        context = import_module(CONTEXT)
+        if value not in OFF and context.GLContext.__module__ == CONTEXT:
+            context.GLContext()  # MuJoCo's placeholder for a library that is missing: it says which
+    except Exception as error:  # each library fails in its own way
+        if isinstance(error, ModuleNotFoundError) and error.name == "mujoco":
+            return  # a robot's computer, which draws nothing
+        NO_PICTURES = _does_not_work(given, error)
+        os.environ["MUJOCO_GL"] = OFF[0]
+        print(f"warning: {NO_PICTURES}; going on without pictures", file=sys.stderr, flush=True)
+
+
+def _does_not_work(given: str, error: Exception) -> str:
+    """Say that MuJoCo does not draw by the library that was asked for, why, and which one is there."""
+    works = off_screen_library()
+    instead = f"{works} may" if works and works != given.lower().strip() else "no other library for drawing was found"
+    return f"MUJOCO_GL: '{given}' does not work on this machine ({' '.join(str(error).split())}); {instead}"
 
 
 HEADLESS = not display_answers()

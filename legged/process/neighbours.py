@@ -1,16 +1,19 @@
-"""Trainings that share a device: each holds a lock where the others see it, so that whoever reads its times knows of them."""
+"""Trainings that share a device: each holds a lock that the others see, so that its times can say how many there were."""
 
 import contextlib
-import fcntl
 import os
 import tempfile
 import time
 from pathlib import Path
 from typing import IO
 
+from filelock import lock_descriptor
+
 FOLDER = "legged-trainings"
 """Folder in the machine's one for temporary files: in it one for each device, in that a file for each training."""
 ENDING = ".training"
+TURN = "looking"
+"""File that a process locks while it looks: the locks that it tries then would be taken for those of trainings."""
 PAUSE_S = 1.0
 """How much time lies between two looks during a training [s]."""
 
@@ -48,11 +51,13 @@ class Neighbours:
             with contextlib.suppress(FileExistsError):
                 folder.mkdir()
                 folder.chmod(0o1777)  # for every user, as the folder around it is
+        if not (self._folder / TURN).exists():
+            (self._folder / TURN).touch(0o644)
         descriptor, name = tempfile.mkstemp(prefix=f"{os.getpid()}.", dir=self._folder)
         self._lock = os.fdopen(descriptor, "wb")
-        os.fchmod(descriptor, 0o644)
-        _locked(self._lock, fcntl.LOCK_EX)
-        self._path = Path(name).rename(f"{name}{ENDING}")  # locked before anybody takes it for one of a dead process
+        os.chmod(name, 0o644)
+        lock_descriptor(descriptor, blocking=False)
+        self._path = Path(name).rename(f"{name}{ENDING}")  # locked before another process looks at it
 
     def glance(self) -> None:
         """Look, unless that was done a moment ago."""
@@ -60,24 +65,20 @@ class Neighbours:
             self.look()
 
     def look(self) -> None:
-        """Count the others, and remove what trainings that were killed have left."""
+        """Count the others, and remove what trainings that were killed have left; not while another process does so."""
         self._looked_s = time.monotonic()
-        others = 0
-        for path in self._folder.glob(f"*{ENDING}"):
-            if path == self._path:
-                continue
-            with contextlib.suppress(OSError), path.open("rb") as file:
-                if _locked(file, fcntl.LOCK_SH):  # shared: who looks at the same time is not taken for its owner
-                    path.unlink()
-                else:
-                    others += 1
-        self.most = max(self.most, others)
+        with contextlib.suppress(OSError), (self._folder / TURN).open("rb") as turn:
+            if lock_descriptor(turn.fileno(), blocking=False):
+                self.most = max(self.most, sum(map(_is_of_a_training, self._others())))
+
+    def _others(self) -> list[Path]:
+        return [path for path in self._folder.glob(f"*{ENDING}") if path != self._path]
 
 
-def _locked(file: IO[bytes], kind: int) -> bool:
-    """Whether a lock of that kind on `file` is ours now. Does not wait."""
-    try:
-        fcntl.flock(file, kind | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
+def _is_of_a_training(path: Path) -> bool:
+    """Return whether a process holds a file's lock; remove the file if no process does."""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        if not lock_descriptor(file.fileno(), blocking=False):
+            return True
+        path.unlink()
+    return False

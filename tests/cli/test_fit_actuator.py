@@ -8,7 +8,6 @@ import pytest
 import torch
 import yaml
 from helpers import call, small_task
-from legged.tools import fit_actuator
 from simulated_motor import TRUTH, simulated_log
 
 from legged.cli import fit_actuator

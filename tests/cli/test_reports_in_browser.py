@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from helpers import POLICY, TASK, kept_global_state, tiny_run
+from helpers import HANG_S, POLICY, TASK, kept_global_state, tiny_run
 
 from legged.cli.runs import compare, table
 from legged.evaluation.reports.run_report import write_report
@@ -54,6 +54,7 @@ def open_page(browser, logs):
     def opened(name: str, width: int):
         (path,) = logs.glob(name)
         page = browser.new_page(viewport={"width": width, "height": 900})
+        page.set_default_timeout(1000.0 * HANG_S)
         pages.append(page)
         heard: list[str] = []
 

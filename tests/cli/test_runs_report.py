@@ -22,11 +22,11 @@ from legged.cli.evaluate import grid
 from legged.cli.runs import report, table
 from legged.errors import RunError
 from legged.evaluation.learning_curves import read_scalars, smooth
-from legged.evaluation.reports import at_end
+from legged.evaluation.reports import run_report
 from legged.evaluation.reports.record import read_record
 from legged.evaluation.reports.run_report import over_training, write_report
 from legged.learning.captured import CapturedRunner
-from legged.learning.given import GIVEN_FILE
+from legged.learning.invocation import INVOCATION_FILE
 from legged.learning.timing import TIMING_FILE
 
 pytestmark = pytest.mark.usefixtures("workplace")
@@ -35,9 +35,9 @@ REPORTED = ["train.runner.report=true", "train.runner.film=false", "env.episode_
 FLAGS = ["--task", TASK, "--sim_device", "cpu", "--num_envs", "8", *TINY_TRAINING]
 
 
-def instead_of_processes(run) -> SimpleNamespace:
-    """What stands for the module subprocess, with another `run`."""
-    return SimpleNamespace(run=run, DEVNULL=subprocess.DEVNULL, TimeoutExpired=subprocess.TimeoutExpired)
+def instead_of_processes(start) -> SimpleNamespace:
+    """What stands for the module subprocess, with another `Popen`."""
+    return SimpleNamespace(Popen=start, DEVNULL=subprocess.DEVNULL)
 
 
 def read(folder: Path, name: str = "report.html") -> str:
@@ -144,7 +144,7 @@ def test_a_report_that_fails_spoils_no_run(monkeypatch, capsys):
     def fail(folder):
         raise ValueError("two\nlines")
 
-    monkeypatch.setattr(at_end, "write_report", fail)
+    monkeypatch.setattr(run_report, "write_report", fail)
     arguments = [*FLAGS, *REPORTED, "--max_iterations", "1"]
     assert train.main(arguments) == 0
     (folder,) = run_folders()
@@ -154,7 +154,7 @@ def test_a_report_that_fails_spoils_no_run(monkeypatch, capsys):
     def interrupt(folder):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(at_end, "write_report", interrupt)
+    monkeypatch.setattr(run_report, "write_report", interrupt)
     assert train.main(arguments) == 0
     assert "interrupted before its report was written" in capsys.readouterr().err
 
@@ -203,44 +203,72 @@ def test_an_evaluation_that_lacks_its_cells_is_left_out_of_the_maps():
 # ---- film ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_film_is_made_by_another_process_and_shown(monkeypatch):
-    """What it is asked, and that its film is in the page."""
-    asked = []
+class Started:
+    """A process that has not ended: waiting for it would fail."""
 
-    def run(command, **options):
-        asked.append((command[1:], options["env"]["CUDA_VISIBLE_DEVICES"], "RANK" in options["env"]))
-        (folder,) = run_folders()
-        shutil.copyfile(POLICY.with_name("anymal_c") / "play.gif", folder / "film.gif")
-        return subprocess.CompletedProcess(command, 0, "written: film.gif\n", "")
+    pid = 0
 
+    def __init__(self, command, **options):
+        self.command, self.options = command, options
+
+    def poll(self):
+        return None
+
+
+def test_a_film_is_asked_of_another_process_and_the_report_is_there_before(monkeypatch, capsys):
     monkeypatch.setenv("RANK", "0")
-    monkeypatch.setattr(at_end, "subprocess", instead_of_processes(run))
+    monkeypatch.setattr(run_report, "subprocess", instead_of_processes(Started))
+    monkeypatch.setattr(run_report.os, "setpriority", lambda *given: niceness.append(given))
+    monkeypatch.setattr(run_report, "FILMING", [])
+    niceness = []
+    assert train.main([*FLAGS, "--max_iterations", "1", "train.runner.report=true"]) == 0
+    (folder,) = run_folders()
+    (asked,) = run_report.FILMING
+    assert asked.command[1:] == ["-m", "legged", "runs", "report", str(folder), "--film"]
+    assert (asked.options["env"]["CUDA_VISIBLE_DEVICES"], "RANK" in asked.options["env"]) == ("", False)
+    assert asked.options["start_new_session"]  # Ctrl-C and a terminal that closes are none of its business
+    assert niceness == [(os.PRIO_PROCESS, 0, run_report.NICENESS)]
+    assert "Run" in read(folder)
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert re.fullmatch(rf"report {folder}/report.html \(\d+\.\d s; a film follows, or film.log says why not\)", last)
+
+
+def test_the_other_process_writes_why_there_is_no_film_and_leaves_the_report_whole(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "disable")
     folder = tiny_run("train.runner.report=true", iterations=1)
-    assert asked == [(["-m", "legged", "runs", "report", str(folder), "--film"], "", False)]
-    assert '<img class="film" src="data:image/gif;base64,' in read(folder)
-    assert "](film.gif)" in read(folder, "report.md")
+    process = run_report.FILMING[-1]
+    assert process.wait() == 0
+    assert read(folder, run_report.LOG).startswith("no film: cannot render here")
+    assert read(folder).rstrip().endswith("</html>")
+    assert not list(folder.glob(".*"))
+
+
+def test_a_run_that_is_deleted_before_it_is_filmed_stays_deleted(monkeypatch, capsys):
+    def film(policy, side):
+        shutil.rmtree(folder)
+        return [np.zeros((32, 32, 3), dtype=np.uint8)]
+
+    folder = tiny_run(iterations=1)
+    monkeypatch.setattr(report, "film", film)
+    assert report.main([str(folder), "--film"]) == 2
+    assert str(folder) in capsys.readouterr().err
+    assert not folder.exists()
 
 
 @pytest.mark.parametrize(
-    ("outcome", "words"),
-    [
-        (subprocess.CompletedProcess([], 0, "no film: nothing can be rendered\nwritten: x\n", ""), "nothing can be rendered"),
-        (subprocess.CompletedProcess([], -11, "", ""), "exit code -11"),
-        (subprocess.CompletedProcess([], 2, "", "a\nerror: RUN: there is no run\n"), "error: RUN: there is no run"),
-        (subprocess.TimeoutExpired([], 60), "it took longer than 60 s"),
-    ],
+    ("why", "words"),
+    [("MUJOCO_GL: 'egl' does not work", "no film: nothing can be drawn"), ("", "no film: no such program")],
 )
-def test_without_a_film_there_is_a_report_and_a_line(outcome, words, monkeypatch, capsys):
-    def run(*_, **__):
-        if isinstance(outcome, Exception):
-            raise outcome
-        return outcome
+def test_without_a_film_there_is_a_report_and_a_line(why, words, monkeypatch, capsys):
+    def fail(*_, **__):
+        raise OSError("no such program")
 
-    monkeypatch.setattr(at_end, "subprocess", instead_of_processes(run))
+    monkeypatch.setattr(run_report.headless, "NO_PICTURES", why)
+    monkeypatch.setattr(run_report, "subprocess", instead_of_processes(fail))
     arguments = [*FLAGS, "--max_iterations", "1", "train.runner.report=true"]
     assert train.main(arguments) == 0
     last = capsys.readouterr().out.splitlines()[-1]
-    assert re.fullmatch(rf"report logs/{TASK}/[-\d_]+/report.html \(\d+\.\d s; no film: {re.escape(words)}\)", last)
+    assert re.fullmatch(rf"report logs/{TASK}/[-\d_]+/report.html \(\d+\.\d s; {words}\)", last)
 
 
 def test_the_command_films(monkeypatch, capsys):
@@ -322,9 +350,9 @@ def test_a_resumed_run_keeps_what_was_set_before():
     again = tiny_run("--resume", "env.episode_length_s=0.2", iterations=2)
     changes = read_record(again).given.changes
     assert (changes["rewards.scales.torques"], changes["env.episode_length_s"]) == (-3e-4, 0.2)
-    (first / GIVEN_FILE).write_text('{"task": 3}')
+    (first / INVOCATION_FILE).write_text('{"task": 3}')
     assert read_record(first).given is None
-    assert any(GIVEN_FILE in text for text in read_record(first).problems)
+    assert any(INVOCATION_FILE in text for text in read_record(first).problems)
 
 
 def test_a_task_without_commands_is_told_the_command_that_films_it(forgotten, capsys):

@@ -12,8 +12,7 @@ import imageio.v3 as iio
 import mujoco
 import numpy as np
 import pytest
-from helpers import CALM, ENGINE, call
-from legged.tools import fit_actuator
+from helpers import CALM, ENGINE, HANG_S, call
 
 from legged.cli import fit_actuator
 from legged.cli.deploy import robot as simulated_robot
@@ -26,9 +25,8 @@ from legged.process.headless import off_screen_library
 from legged.registry import make_task, task_config
 from legged.robots.robot import load_robot
 from legged.simulated_robot.film import make_film
-from legged.simulated_robot.link import Link
 from legged.simulated_robot.robot import SimulatedRobot
-from legged.simulated_robot.server import Server
+from legged.simulated_robot.server import Link, Server
 from legged.terrain import Terrain, TileSpec
 
 POLICIES = Path(__file__).resolve().parents[2] / "resources" / "policies"
@@ -266,7 +264,7 @@ def test_the_program_walks_up_stairs_in_another_process(tmp_path):
     command += ["--commands", "walk.txt", "--terrain", "stairs_up", "--size", "0.1", "--loss", "0.01", "--out", "out"]
     command += ["--max-missed", "50", "--max-age", "0.5", "--stand-seconds", "1.9"]
     command += ["control.actuator.coulomb_friction={HAA: 1.5}", "control.actuator.delay=[2, 2]"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=HANG_S, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert not report["fell"]

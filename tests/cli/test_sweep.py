@@ -13,11 +13,11 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
-from helpers import call, wait_for
-from legged.tools import sweep
+from helpers import HANG_S, call, wait_for
 
 from legged.cli.sweep import report as reporting
 from legged.cli.sweep import run as sweep
+from legged.cli.sweep.worker import NoValue, Worker
 from legged.errors import ConfigError
 from legged.evaluation.reports.record import read_note
 from legged.learning.evaluations import Evaluated
@@ -29,7 +29,6 @@ from legged.sweeping import study, worker
 from legged.sweeping.plan import Parameter, plan_sweep, read_sweep
 from legged.sweeping.report import importances, ranking, settings
 from legged.sweeping.study import Trials, is_dead, me
-from legged.sweeping.worker import NoValue, Worker
 
 pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
 pytestmark = pytest.mark.usefixtures("workplace")
@@ -254,7 +253,7 @@ def test_a_target_that_is_not_reached_gives_no_value():
     of = Worker(plan_of(objective={"figure": "return", "take": "time", "target": 5.0}), SimpleNamespace(), [])
     with pytest.raises(NoValue, match="did not reach 5; the last was 3"):
         of._taken(history(1.0, 3.0))
-    with pytest.raises(NoValue, match="is no number"):
+    with pytest.raises(NoValue, match="return is not finite"):
         of._taken(history(math.nan))
 
 
@@ -384,7 +383,7 @@ def test_a_signal_ends_the_trial_with_a_checkpoint_and_it_is_tried_again():
         output = Path("logs/sweep_mine/output/trial000.txt")
         wait_for(lambda: output.is_file() and "\nit " in output.read_text(), process)
         process.terminate()
-        assert process.wait(timeout=60) == 128 + signal.SIGTERM
+        assert process.wait(timeout=HANG_S) == 128 + signal.SIGTERM
     assert "stopped; it will be tried again  [0 of 3]" in Path("out.txt").read_text()
     trials = Trials(plan_of(overrides=overrides))
     assert states(trials) == ["FAIL", "WAITING"]

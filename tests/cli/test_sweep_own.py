@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 import yaml
 from helpers import call
-from legged.tools import sweep
 
 from legged.cli.sweep import run as sweep
 from legged.sweeping.plan import plan_sweep, read_sweep

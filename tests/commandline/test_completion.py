@@ -1,52 +1,26 @@
-"""Completion in bash and zsh: what the shells' own functions offer after the beginning of a command line."""
+"""Completion: what bash offers after the beginning of a command line, with the script that `legged completion` prints."""
 
-import argparse
 import contextlib
 import io
 import shutil
 import subprocess
 
 import pytest
-from legged.commandline.completion import words_of
-from legged.commandline.listing import robots, tasks
-from legged.tools import completion
+
+from legged.cli import completion
+from legged.cli.listing import tasks
+from legged.cli.main import COMMANDS, sub_commands
 
 BASH = """
+compopt() { echo "$*" >> compopts; }
 source "$1"
-COMP_WORDBREAKS=$' \\t\\n"\\'><=;|&(:'
-COMP_LINE=$2 COMP_POINT=${#2}
-_legged
+shift
+COMP_WORDS=("$@") COMP_CWORD=$(($# - 1)) COMPREPLY=()
+function=$(complete -p legged)
+function=${function##*-F } function=${function%% *}
+$function legged "${COMP_WORDS[COMP_CWORD]}" "${COMP_WORDS[COMP_CWORD-1]}"
 printf '%s\\n' "${COMPREPLY[@]}"
 """
-ZSH = """
-compdef() { }
-compadd() { while [[ $1 != -- ]]; do shift; done; shift; print -rl -- "$@" }
-_files() { }
-source "$1"
-words=("${(@s: :)2}") CURRENT=$#words
-_legged
-"""
-
-
-@pytest.fixture(scope="module", params=["bash", "zsh"])
-def complete(request, tmp_path_factory):
-    """Return what a shell offers for the last word of a line; of bash only what follows the last '='."""
-    if shutil.which(request.param) is None:
-        pytest.skip(f"{request.param} is not installed")
-    file = tmp_path_factory.mktemp("completion") / "script"
-    with file.open("w") as out:
-        out.write(written(request.param))
-    flags = {"bash": ["--norc", "-c", BASH], "zsh": ["-f", "-c", ZSH]}[request.param]
-
-    def offered(line: str) -> set[str]:
-        command = [request.param, *flags, "test", str(file), line]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        assert done.stderr == ""
-        kept = line.rpartition(" ")[2].rpartition("=")
-        front = "".join(kept[:2]) if request.param == "bash" else ""
-        return {front + word for word in done.stdout.split()}
-
-    return offered
 
 
 def written(shell: str) -> str:
@@ -55,75 +29,98 @@ def written(shell: str) -> str:
     return out.getvalue()
 
 
-def test_tasks_are_those_of_the_installation(complete):
-    assert complete("python train.py --task ") == set(tasks())
-    assert complete("python train.py --task=h1") == {"--task=h1", "--task=h1_flat"}
-    assert complete("python -m legged.tools.report --task anymal_c_fl") == {"anymal_c_flat"}
-    assert complete("python -m legged.tools.migrate --task anymal_c_fl") == set()  # that is a name of legged_gym's
+@pytest.fixture(scope="module")
+def script(tmp_path_factory):
+    file = tmp_path_factory.mktemp("completion") / "script"
+    file.write_text(written("bash"))
+    return file
 
 
-def test_flags_are_those_of_the_tool(complete):
-    assert complete("python play.py --task anymal_c --terr") == {"--terrain"}
-    assert complete("legged-train --max") == {"--max_iterations"}
-    assert complete("python3 -m legged.tools.evaluate --gym") == {"--gymnasium"}
-    assert complete("python -m legged.tools.plot --") == {"--help", "--out"}
-    assert complete("python -m legged.deploy --rob") == {"--robot"}
+@pytest.fixture
+def complete(script, tmp_path):
+    """Return what bash offers for the last word of a line."""
+
+    def offered(line: str) -> set[str]:
+        command = ["bash", "--norc", "-c", BASH, "test", str(script), *line.split(" ")]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
+        assert done.stderr == ""
+        return set(done.stdout.split())
+
+    return offered
 
 
-def test_keys_are_offered_section_by_section(complete):
-    assert complete("./train.py --task anymal_c trai") == {"train."}
+def test_commands_and_sub_commands(complete):
+    assert complete("legged ") == {name.partition(" ")[0] for name in COMMANDS}
+    assert complete("legged fit") == {"fit-actuator"}
+    for group in ("episodes", "deploy", "benchmark"):
+        assert complete(f"legged {group} ") == set(sub_commands(group))
+
+
+def test_tasks_and_runs_are_offered_where_one_is_named(complete, tmp_path):
+    assert complete("legged train ") == set(tasks())
+    assert complete("legged train --task h1") == {name for name in tasks() if name.startswith("h1")}
+    (tmp_path / "logs" / "anymal_c_flat" / "2026-01-02_run").mkdir(parents=True)
+    assert complete("legged evaluate grid anymal_c_flat/") == {"anymal_c_flat/2026-01-02_run"}
+    assert complete("legged runs report anymal_c_fl") == {"anymal_c_flat", "anymal_c_flat/2026-01-02_run"}
+    assert complete("legged migrate --task anymal_c_fl") == set()  # that is a name of legged_gym's
+
+
+def test_a_group_that_is_a_command_too_offers_both(complete):
+    assert complete("legged evaluate ") == {*sub_commands("evaluate"), *tasks()}
+    assert complete("legged evaluate go2_fl") == {"go2_flat"}
+    assert complete("legged runs ") == set(sub_commands("runs"))
+
+
+def test_options_are_those_of_the_command(complete):
+    assert complete("legged play anymal_c --terr") == {"--terrain"}
+    assert complete("legged train --max") == {"--max-iterations"}
+    assert complete("legged runs curves --") == {"--help", "--out", "--import"}
+    assert complete("legged deploy robot --ru") == set()
+
+
+def test_choices_of_an_option(complete):
+    assert complete("legged train --runner ") == {"stock", "captured"}
+    assert complete("legged completion z") == {"zsh"}
+
+
+def test_keys_are_offered_section_by_section(complete, tmp_path):
+    assert complete("legged train anymal_c trai") == {"train."}
     sections = {"train.policy.", "train.algorithm.", "train.distillation.", "train.runner."}
-    assert complete("python train.py train.") == sections
-    assert complete("python train.py train.runner.max") == {"train.runner.max_iterations="}
-    assert complete("python train.py rewards.scales.tracking_") == {
+    assert complete("legged train anymal_c train.") == sections
+    assert (tmp_path / "compopts").read_text().splitlines()[-1] == "-o nospace"  # what was begun goes on
+    assert complete("legged train anymal_c train.runner.max") == {"train.runner.max_iterations="}
+    assert complete("legged export anymal_c rewards.scales.tracking_") == {
         "rewards.scales.tracking_lin_vel=",
         "rewards.scales.tracking_ang_vel=",
     }
-    assert complete("python train.py observations.groups.actor.") == {
+    assert complete("legged play anymal_c observations.groups.actor.") == {
         f"observations.groups.actor.{name}=" for name in ("terms", "history", "noise")
     }
-
-
-def test_values_are_those_that_a_field_may_have(complete):
-    assert complete("python train.py sim.cone=") == {"sim.cone=pyramidal", "sim.cone=elliptic"}
-    assert complete("python train.py train.algorithm.symmetry=t") == {"train.algorithm.symmetry=true"}
-    assert complete("python train.py --runner ") == {"stock", "captured"}
-    assert complete("python train.py robot=go") == {f"robot={name}" for name in robots() if name.startswith("go")}
-
-
-def test_modules_are_offered_to_python_and_nothing_to_other_programs(complete):
-    assert complete("python -m legged.tools.ev") == {"legged.tools.evaluate"}
-    assert complete("python -m legged.de") == {"legged.deploy"}
-    assert complete("python other.py --ta") == set()
-    assert complete("python other.py train.py --ta") == set()
 
 
 def test_a_task_that_has_come_later_is_offered(tmp_path, monkeypatch):
     folder = tmp_path / "a folder"
     folder.mkdir()
-    monkeypatch.setattr("legged.commandline.completion.data_folder", lambda _: folder)
+    monkeypatch.setattr(completion, "data_folder", lambda _: folder)
     (tmp_path / "script").write_text(written("bash"))
-    command = ["bash", "--norc", "-c", BASH, "test", str(tmp_path / "script"), "python train.py --task "]
+    command = ["bash", "--norc", "-c", BASH, "test", str(tmp_path / "script"), "legged", "train", ""]
     for names in (["early"], ["early", "zz_later"]):
         for name in names:
             (folder / f"{name}.yaml").touch()
-        assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.split() == names
+        done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
+        assert done.stdout.split() == names
 
 
-def test_words_of_a_parser():
-    parser = argparse.ArgumentParser()
-    parser.add_argument("names", nargs="*", metavar="TASK | key=value")
-    parser.add_argument("--task")
-    parser.add_argument("-s", "--side", choices=[1, 2], type=int)
-    parser.add_argument("--again", action="store_true")
-    parser.add_argument("--worker", help=argparse.SUPPRESS)  # for the command's own use
-    words = words_of(parser, {"sim.physics": (), "sim.solver": ()})
-    assert words.flags == ("--help", "--task", "--side", "--again")
-    assert words.values == {"--task": ("@tasks",), "--side": ("1", "2")}
-    assert (words.tasks, words.keys) == (True, True)
+def test_the_script_for_zsh_names_commands_and_keys():
+    text = written("zsh")
+    assert "#compdef legged" in text
+    for words in ("fit-actuator", "--max-iterations", "train.runner.max_iterations="):
+        assert words in text
+    if shutil.which("zsh"):
+        assert subprocess.run(["zsh", "-n"], input=text, text=True, check=False).returncode == 0
 
 
-def test_another_shell_is_a_wrong_flag(capsys):
+def test_another_shell_is_a_wrong_argument(capsys):
     with pytest.raises(SystemExit) as stop:
         completion.main(["fish"])
     assert stop.value.code == 2

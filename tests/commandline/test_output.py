@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from helpers import TASK, TINY_TRAINING, checkpoints, run_folders
 
+from legged.cli import train
 from legged.commandline.command import run_main
 from legged.commandline.output import Output, forgiving_output, when_output_is_lost
 from legged.errors import ConfigError, RunError
-from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -102,12 +102,12 @@ def test_a_command_goes_on_to_its_end_and_then_says_so(monkeypatch, capsys):
         (KeyboardInterrupt(), 130, "interrupted"),
         (OSError(errno.ENOSPC, "No space left on device", "x.png"), 1, "error: x.png: no space left on the disk"),
         (PermissionError(errno.EACCES, "Permission denied", "x.png"), 1, "error: x.png: Permission denied"),
-        (MemoryError(), 1, "error: out of memory; fewer robots (--num_envs) need less"),
+        (MemoryError(), 1, "error: out of memory; fewer robots (--num-envs) need less"),
         (
             RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried 99 bytes\nmore"),
             1,
             "error: out of memory ([enforce fail] DefaultCPUAllocator: can't allocate memory: you tried 99 bytes);"
-            " fewer robots (--num_envs) need less",
+            " fewer robots (--num-envs) need less",
         ),
     ],
 )
@@ -163,7 +163,7 @@ def test_a_training_whose_output_goes_away_stops_with_a_checkpoint(monkeypatch, 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
 def test_a_full_disk_behind_the_output_leaves_no_traceback_at_exit():
     with open("/dev/full", "w") as full:
-        command = [sys.executable, "-m", "legged.tools.train", *ARGUMENTS, "--show"]
+        command = [sys.executable, "-m", "legged", "train", *ARGUMENTS, "--show"]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 1
     assert done.stderr == "error: the output can't be written: no space left on the disk\n"

@@ -1,42 +1,31 @@
-"""Help of every command: its paragraphs, and examples that its own parser reads."""
-
-from importlib import import_module
+"""The parser of a command: paragraphs and examples of its help, numbers below zero, and legged_gym's underscores."""
 
 import pytest
-from legged.commandline.listing import module_of, tasks, tools
 
-from legged.commandline.arguments import overrides
 from legged.process.command_parser import CommandParser
-from legged.registry import task_config
-
-INSTALLED = {"legged.tools.train": "python train.py ", "legged.tools.play": "python play.py "}
 
 
-def parser_of(tool: str) -> CommandParser:
-    return import_module(module_of(tool)).build_parser()
+def test_arguments_of_an_example_are_what_follows_the_program():
+    parser = CommandParser("legged runs table", "Do.", "legged runs table a", "legged runs table b")
+    assert parser.arguments_of("legged runs table --out 'x y' > a.txt") == ["--out", "x y"]
 
 
-@pytest.mark.parametrize("tool", tools())
-def test_help_of_a_command_shows_two_examples_that_it_can_read(tool, capsys):
-    parser = parser_of(tool)
-    assert len(parser.examples) >= 2
-    with pytest.raises(SystemExit) as stop:
-        import_module(module_of(tool)).main(["--help"])
-    assert stop.value.code == 0
-    shown = capsys.readouterr().out.partition("\nexamples:\n")[2].splitlines()
-    assert shown == [f"  {example}" for example in parser.examples]
-    for example in parser.examples:
-        assert f"{example} ".startswith(INSTALLED.get(tool, f"python -m {tool} "))
-        args = parser.parse_intermixed_args(CommandParser.arguments_of(example))
-        task = getattr(args, "task", None)
-        assert task is None or task in tasks() or tool == "legged.tools.migrate"  # its tasks are those of legged_gym
-        if task is not None and hasattr(args, "overrides"):
-            task_config(task, overrides(args))  # its settings are ones of that task
+@pytest.mark.parametrize("given", ["--num_envs", "--num-envs"])
+@pytest.mark.parametrize("form", ["{}=3", "{} 3"])
+def test_options_of_legged_gym_are_read_with_underscores_too(given, form):
+    parser = CommandParser("x", "Do.", "x a", "x b")
+    parser.add_argument("--num-envs", type=int)
+    parser.add_argument("rest", nargs="*")
+    args = parser.parse_args(["a_b=num_envs", *form.format(given).split()])
+    assert (args.num_envs, args.rest) == (3, ["a_b=num_envs"])
 
 
-@pytest.mark.parametrize("program", ["python train.py", "python -m legged.tools.train", "legged-train"])
-def test_arguments_of_an_example_are_what_follows_the_program(program):
-    assert CommandParser.arguments_of(f"{program} --task 'x y' > a.txt") == ["--task", "x y"]
+def test_other_options_have_hyphens_alone(capsys):
+    parser = CommandParser("x", "Do.", "x a", "x b")
+    parser.add_argument("--robots-per-point", type=int)
+    with pytest.raises(SystemExit):
+        parser.parse_args(["--robots_per_point", "3"])
+    assert "did you mean '--robots-per-point'?" in capsys.readouterr().err
 
 
 def test_a_command_with_one_example_is_not_built():

@@ -4,10 +4,10 @@ import pytest
 import yaml
 from helpers import TASK, call, small_config
 
+from legged.cli import train
 from legged.commandline.show import summary
 from legged.config import from_dict, to_yaml
 from legged.registry import task_config
-from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -89,8 +89,8 @@ def test_rewards_terminations_actions_and_joints_of_a_legged_robot():
     [
         (
             "go2_flat",
-            "# robot: go2, 15.02 kg, 0.324 m high; numbers written for anymal_c are carried: masses x 0.288, lengths x 0.589,"
-            " times x 0.768",
+            "# robot: go2, 15.02 kg, 0.324 m high; numbers written for anymal_c are rescaled: masses x 0.288,"
+            " lengths x 0.589, times x 0.768",
         ),
         ("anymal_c", "# robot: anymal_c, 52.13 kg, 0.549 m high; numbers are written for it"),
     ],

@@ -9,11 +9,11 @@ import threading
 from pathlib import Path
 
 import pytest
-from helpers import TASK, TINY_TRAINING, checkpoints, run_folders, wait_for
+from helpers import HANG_S, TASK, TINY_TRAINING, checkpoints, run_folders, wait_for
 
+from legged.cli import train
 from legged.commandline.stopping import SIGNALS, quiet_writers, stopping_on_signals
 from legged.process import startup
-from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -86,7 +86,7 @@ def test_a_terminal_that_is_closed_stops_a_training_with_a_checkpoint():
     with running(*TRAIN, *TINY_TRAINING) as process:
         wait_for(lambda: "\nit 1/" in Path("out.txt").read_text(), process)
         process.send_signal(signal.SIGHUP)
-        assert process.wait(timeout=30) == 128 + signal.SIGHUP
+        assert process.wait(timeout=HANG_S) == 128 + signal.SIGHUP
     (folder,) = run_folders()
     done = max(checkpoints(folder))
     assert f"stopped after {done + 1} iterations" in Path("out.txt").read_text()
@@ -99,17 +99,17 @@ def test_a_second_signal_ends_a_training_at_once_in_one_line():
         process.send_signal(signal.SIGTERM)
         wait_for(lambda: "stopping" in Path("err.txt").read_text(), process)
         process.send_signal(signal.SIGTERM)
-        assert process.wait(timeout=30) == 128 + signal.SIGTERM
+        assert process.wait(timeout=HANG_S) == 128 + signal.SIGTERM
     assert Path("err.txt").read_text().splitlines()[1:] == ["interrupted"]
     assert not Path("logs").exists()  # there was no checkpoint to keep
 
 
-@pytest.mark.parametrize("module", ["legged.tools.play", "legged.tools.evaluate"])
-def test_an_interrupt_during_imports_is_one_line(module):
-    with running("-X", "importtime", "-m", module, "--task", TASK) as process:  # says on stderr what is imported
+@pytest.mark.parametrize("command", [["legged.cli.play"], ["legged", "evaluate"]])
+def test_an_interrupt_during_imports_is_one_line(command):
+    with running("-X", "importtime", "-m", *command, TASK) as process:  # says on stderr what is imported
         wait_for(lambda: "legged.process.startup" in Path("err.txt").read_text(), process)
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=30) == 130
+        assert process.wait(timeout=HANG_S) == 130
     said = [line for line in Path("err.txt").read_text().splitlines() if not line.startswith("import time:")]
     assert said == ["interrupted"]
 

@@ -5,14 +5,16 @@ import shutil
 import sys
 from pathlib import Path
 
-import legged.tools.train
 import pytest
 import torch
 from helpers import TASK, call, kept_global_state, run_folders, tiny_run
-from legged.tools import benchmark, evaluate, play, train
 
+import legged.cli.train
 import legged.policies.restore
 import legged.registry
+from legged.cli import play, train
+from legged.cli.benchmark import common, step
+from legged.cli.evaluate import grid
 
 SMALLER = (
     'observations.groups.actor.terms=["base_ang_vel", "projected_gravity", "commands", "dof_pos", "dof_vel"]'  # 33 numbers
@@ -47,9 +49,9 @@ def fails(monkeypatch, capsys):
         pytest.fail("the task was built before the mistake was found")
 
     monkeypatch.setattr(legged.registry, "make_task", built)
-    monkeypatch.setattr(legged.tools.train, "make_task", built)
+    monkeypatch.setattr(legged.cli.train, "make_task", built)
     monkeypatch.setattr(legged.policies.restore, "make_task", built)
-    monkeypatch.setattr(benchmark, "make_task", built)
+    monkeypatch.setattr(common, "make_task", built)
 
     def fails(main, arguments, *words):
         before = run_folders() if Path("logs").is_dir() else []
@@ -66,21 +68,24 @@ def fails(monkeypatch, capsys):
 
 
 def task(*arguments: str) -> list[str]:
-    return ["--task", TASK, "--sim_device", "cpu", *arguments]
+    return [TASK, "--sim_device", "cpu", *arguments]
 
 
 # ---- tasks and their settings ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("main", [train.main, play.main, evaluate.main, benchmark.main])
-def test_an_unknown_task(fails, main):
-    err = fails(main, ["--task", "anymal_c_flatt"], "anymal_c_flatt", f"did you mean '{TASK}'?")
-    assert err.startswith("error: --task")
+NAMES = [(train.main, "TASK"), (play.main, "POLICY"), (grid.main, "POLICY"), (step.main, "TASK")]
 
 
-@pytest.mark.parametrize("main", [train.main, play.main, evaluate.main, benchmark.main])
-def test_a_missing_task_and_an_unknown_flag(fails, main):
-    fails(main, [], "--task")
+@pytest.mark.parametrize(("main", "name"), NAMES)
+def test_an_unknown_task(fails, main, name):
+    err = fails(main, ["anymal_c_flatt"], "anymal_c_flatt", f"did you mean '{TASK}'?")
+    assert err.startswith(f"error: {name}: ")
+
+
+@pytest.mark.parametrize(("main", "name"), NAMES)
+def test_a_missing_task_and_an_unknown_flag(fails, main, name):
+    fails(main, [], name)
     fails(main, task("--nonsense"), "--nonsense")
 
 
@@ -133,10 +138,10 @@ def test_a_mistake_in_an_override(fails, argument, words):
 def test_a_mistake_in_a_file_of_a_user_s_task(fails, tmp_path):
     (tmp_path / "mine.yaml").write_text(f"extends: {TASK}\nrewards:\n  scales: {{walk_nicely: 1}}\n")
     (tmp_path / "my_tasks.py").write_text("import legged\nlegged.register('mine', 'mine.yaml')\n")
-    fails(train.main, ["--import", "my_tasks.py", "--task", "mine"], "mine.yaml: rewards.scales.walk_nicely", "has no reward")
+    fails(train.main, ["--import", "my_tasks.py", "mine"], "mine.yaml: rewards.scales.walk_nicely", "has no reward")
 
 
-@pytest.mark.parametrize("main", [train.main, play.main, evaluate.main, benchmark.main])
+@pytest.mark.parametrize("main", [train.main, play.main, grid.main, step.main])
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -161,15 +166,15 @@ def test_a_module_that_is_not_there(fails, module):
     fails(train.main, task("--import", module), "--import", module)
 
 
-@pytest.mark.parametrize("main", [train.main, play.main, evaluate.main, benchmark.main])
+@pytest.mark.parametrize("main", [train.main, play.main, grid.main, step.main])
 @pytest.mark.parametrize("number", ["0", "-3", "some"])
 def test_a_number_of_robots_that_cannot_be(fails, run, main, number):
-    fails(main, task("--num_envs", number), "num_envs")
+    fails(main, task("--num_envs", number), "num_envs" if number != "some" and main != grid.main else "--num-envs")
 
 
 def test_a_number_of_robots_is_not_evaluate_s_to_choose(fails, run):
     """The grid says how many robots there are; another number cannot be obeyed and must not crash."""
-    fails(evaluate.main, task("--num_envs", "5"), "num_envs")
+    fails(grid.main, task("--num_envs", "5"), "--num-envs")
 
 
 def test_a_number_of_iterations_that_cannot_be(fails):
@@ -193,38 +198,45 @@ def test_an_odd_name_is_still_one_line(fails, name):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-@pytest.mark.parametrize("flag", ["--sim_device", "--rl_device"])
+@pytest.mark.parametrize("flag", ["--sim-device", "--rl-device"])
 @pytest.mark.parametrize("name", ["cuda", "cuda:0", "cuda:7"])
 def test_a_gpu_where_there_is_none(fails, flag, name):
-    fails(train.main, ["--task", TASK, flag, name], flag, f"'{name}'", "no GPU")
+    fails(train.main, [TASK, flag, name], flag, f"'{name}'", "no GPU")
 
 
-@pytest.mark.parametrize("main", [train.main, play.main, evaluate.main, benchmark.main])
+@pytest.mark.parametrize("main", [train.main, play.main, grid.main, step.main])
 @pytest.mark.parametrize("name", ["nonsense", "gpu", "cuda:x", "meta", "mps"])
 def test_a_device_that_is_none(fails, main, name):
-    fails(main, ["--task", TASK, "--sim_device", name], "--sim_device", f"'{name}'", "allowed: cpu, cuda")
+    fails(main, [TASK, "--sim_device", name], "--sim-device", f"'{name}'", "allowed: cpu, cuda")
 
 
 # ---- runs and checkpoints --------------------------------------------------------------------------------------------
 
 HIDDEN = ["train.policy.actor_hidden_dims=[8]", "train.policy.critic_hidden_dims=[8]"]
-LOADING = [(train.main, "--resume"), (play.main, "--no-video"), (evaluate.main, "--vx=0")]
+LOADING = [(train.main, "--resume"), (play.main, "--no-video"), (grid.main, "--vx=0")]
 
 
-@pytest.mark.parametrize(("main", "flag"), LOADING)
-def test_no_run_at_all(fails, monkeypatch, main, flag):
-    monkeypatch.setattr(legged.policies.restore, "shipped_policy", lambda task: None)
-    fails(main, task(flag), f"'{TASK}': there is no run with a checkpoint", f"logs/{TASK}; train one first")
+def test_no_run_to_resume(fails):
+    fails(train.main, task("--resume"), f"'{TASK}': there is no run with a checkpoint", f"logs/{TASK}; train one first")
 
 
-def test_no_run_of_a_task_without_a_shipped_policy(fails):
+@pytest.mark.parametrize(("main", "flag"), LOADING[1:])
+def test_no_run_of_a_task_without_a_shipped_policy(fails, main, flag):
     Path("never_trained.yaml").write_text("extends: anymal_c_flat\n")
-    fails(play.main, ["--task", "never_trained.yaml", "--no-video"], "logs/never_trained, and the package has no policy")
+    words = "POLICY: 'never_trained' has neither a run in logs/never_trained nor a shipped policy; train it first"
+    fails(main, ["never_trained.yaml", flag], words)
 
 
-@pytest.mark.parametrize(("main", "flag"), LOADING)
+@pytest.mark.parametrize(("main", "flag"), LOADING[:2])
+def test_a_run_of_the_task_that_is_not_there_names_those_that_are(fails, run, main, flag):
+    name = run.name[:-1] + "x"
+    fails(main, task(flag, "--load_run", name), "--load-run", f"'{name}'", f"did you mean '{run.name}'?")
+
+
+@pytest.mark.parametrize(("main", "flag"), LOADING[1:])
 def test_a_run_that_is_not_there_names_those_that_are(fails, run, main, flag):
-    fails(main, task(flag, "--load_run", run.name[:-1] + "x"), "--load_run", f"did you mean '{run.name}'?")
+    name = f"{TASK}/{run.name[:-1]}x"
+    fails(main, [name, flag], "POLICY", f"'{name}'", f"did you mean '{TASK}/{run.name}'?")
 
 
 @pytest.mark.parametrize(("main", "flag"), LOADING)
@@ -236,13 +248,17 @@ def test_a_checkpoint_that_is_not_there_names_those_that_are(fails, run, main, f
 def test_a_folder_without_checkpoint(fails, run, main, flag):
     (run.parent / "empty").mkdir()
     shutil.copy(run / "config.yaml", run.parent / "empty")
-    fails(main, task(flag, "--load_run", "empty"), "holds no checkpoint")
+    named = task("--load_run", "empty") if main == train.main else [f"{TASK}/empty"]
+    fails(main, [*named, flag], f"logs/{TASK}/empty: holds no checkpoint")
 
 
-@pytest.mark.parametrize(("main", "flag"), LOADING[1:])
+@pytest.mark.parametrize(("main", "flag"), LOADING)
 def test_a_folder_that_is_no_run(fails, tmp_path, main, flag):
     (tmp_path / "other").mkdir()
-    fails(main, task(flag, "--load_run", "other"), "--load_run", "other is no run folder")
+    if main != grid.main:
+        fails(main, task(flag, "--load_run", "other"), "--load-run", "other is not a run folder")
+    if main != train.main:
+        fails(main, ["other", flag], "POLICY: 'other' holds no run: it has no config.yaml")
 
 
 FOREIGN = {
@@ -291,8 +307,10 @@ def test_a_checkpoint_of_another_network_names_both_shapes(fails, run, network):
 def test_a_run_of_another_task(fails, run):
     config = run / "config.yaml"
     config.write_text(config.read_text().replace(f"task: {TASK}", "task: climbing"))
-    for main, flag in LOADING[1:]:
+    for main, flag in LOADING[:2]:
         fails(main, task(flag, "--load_run", str(run)), "climbing", TASK)
+    for main, flag in LOADING[1:]:
+        fails(main, [str(run), flag], "POLICY", str(run), "'climbing'", "--import")
 
 
 def test_a_configuration_of_a_run_that_someone_broke(fails, run):
@@ -303,7 +321,7 @@ def test_a_configuration_of_a_run_that_someone_broke(fails, run):
 
 def test_a_training_that_is_finished_already(fails, run):
     err = fails(train.main, task("--resume", "--max_iterations", "1", *HIDDEN), "model_0.pt", "finished 1 iterations of 1")
-    assert "--max_iterations" in err
+    assert "--max-iterations" in err
 
 
 # ---- files and grids -------------------------------------------------------------------------------------------------
@@ -317,11 +335,11 @@ def test_a_file_where_the_log_folder_should_be(fails, tmp_path):
 
 @pytest.mark.parametrize("spec", ["a:b:c", "1:0:0.1", "0:1", "0:1:0", "0:1:-1", "", "0:1:2:3", "nan", "0:inf:1", "0:1:nan"])
 def test_a_grid_that_is_none(fails, run, spec):
-    fails(evaluate.main, task(f"--vx={spec}"), "--vx", f"'{spec}'", "low:high:step")
+    fails(grid.main, task(f"--vx={spec}"), "--vx", f"'{spec}'", "low:high:step")
 
 
 def test_a_number_of_robots_a_cell_that_cannot_be(fails, run):
-    fails(evaluate.main, task("--robots", "0"), "--robots", "at least 1")
+    fails(grid.main, task("--robots", "0"), "--robots", "at least 1")
 
 
 # ---- a user's own code -----------------------------------------------------------------------------------------------
@@ -372,7 +390,7 @@ def test_a_mistake_in_a_user_s_class_is_one_line_with_file_and_line(capsys, tmp_
         f"    {method}\n"
         f"register('mine', {{'extends': '{TASK}', 'rewards': {{'scales': {scales}}}}}, Mine)\n"
     )
-    code = call(train.main, ["--import", "mine.py", "--task", "mine", "--sim_device", "cpu", "--num_envs", "4"])
+    code = call(train.main, ["mine", "--import", "mine.py", "--sim_device", "cpu", "--num_envs", "4"])
     err = capsys.readouterr().err
     assert (code, err.count("\n")) == (2, 1), err
     assert err.startswith(f"error: {words}")
@@ -382,4 +400,4 @@ def test_a_mistake_in_a_user_s_class_is_one_line_with_file_and_line(capsys, tmp_
 
 def test_a_second_import_does_not_take_the_place_of_the_first(fails):
     words = ("--import: is given twice, slip.py and feel.py", "let one of them import the other")
-    fails(train.main, ["--task", TASK, "--import", "slip.py", "--import", "feel.py"], *words)
+    fails(train.main, [TASK, "--import", "slip.py", "--import", "feel.py"], *words)

@@ -3,11 +3,11 @@
 import ctypes
 import struct
 import threading
-import time
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers import until
 
 from legged.deploy import unitree
 from legged.deploy.unitree import UnitreeRobot
@@ -146,7 +146,7 @@ class StandIn:
         data = packed(command, self.structure)
         words = struct.unpack(f"<{len(data) // 4}I", data)
         assert crc_bit_by_bit(words[:-1]) == words[-1]
-        self.sent.append((time.perf_counter(), self.structure.from_buffer_copy(data)))
+        self.sent.append(self.structure.from_buffer_copy(data))
 
     def close(self):
         self.closed = True
@@ -226,7 +226,7 @@ def test_every_field_of_a_command(robot):
     count = len(robot.kind.motors)
     targets, kp, kd = 0.01 * np.arange(count), 20.0 + np.arange(count), 0.5 + 0.01 * np.arange(count)
     robot.write(targets, kp, kd)
-    _, command = wire.sent[0]
+    command = wire.sent[0]
     for joint, motor in enumerate(robot.kind.motors):
         found = command.motor_cmd[motor]
         assert found.mode == 1
@@ -253,22 +253,20 @@ def test_every_field_of_a_command(robot):
 
 def test_a_command_is_repeated_and_joints_are_braked_when_the_program_is_silent(robot, monkeypatch):
     robot, wire = robot
-    monkeypatch.setattr(unitree, "HOLD_S", 0.15)
+    now = [100.0]
+    monkeypatch.setattr(unitree, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     count = len(robot.kind.motors)
     robot.write(np.ones(count), np.full(count, 20.0), np.full(count, 0.5))
-    start = time.perf_counter()
-    while time.perf_counter() - start < 0.5:
-        time.sleep(0.01)
     motor = robot.kind.motors[0]
-    sent = [(at - start, command.motor_cmd[motor]) for at, command in list(wire.sent)]
-    early = [found for at, found in sent if at < 0.1]
-    late = [found for at, found in sent if at > 0.3]
-    assert len(early) > 3, "one command each control step is too few for motors"
-    assert all((found.q, found.kp) == (1.0, 20.0) for found in early)
-    assert late
-    assert all((found.kp, found.kd) == (0.0, unitree.BRAKING) for found in late)
+    until(lambda: len(wire.sent) > 3)  # one command each control step is too few for motors
+    assert all((command.motor_cmd[motor].q, command.motor_cmd[motor].kp) == (1.0, 20.0) for command in list(wire.sent))
+    now[0] += 1.01 * unitree.HOLD_S
+    until(lambda: wire.sent[-1].motor_cmd[motor].kp == 0.0)
+    braked = len(wire.sent)
+    until(lambda: len(wire.sent) > braked + 3)
+    assert all(command.motor_cmd[motor].kd == unitree.BRAKING for command in wire.sent[braked:])
     robot.write(np.ones(count), np.full(count, 20.0), np.full(count, 0.5))
-    assert wire.sent[-1][1].motor_cmd[motor].kp == 20.0
+    assert wire.sent[-1].motor_cmd[motor].kp == 20.0
 
 
 def test_a_message_that_cannot_be_sent_does_not_end_what_watches_over_the_program(robot, monkeypatch):
@@ -276,19 +274,20 @@ def test_a_message_that_cannot_be_sent_does_not_end_what_watches_over_the_progra
     count = len(robot.kind.motors)
     send = wire.send
 
+    failed = []
+
     def fail(_):
+        if threading.current_thread() is not threading.main_thread():
+            failed.append(True)
         raise OSError("no buffer space")
 
     robot.write(np.ones(count), np.full(count, 20.0), np.full(count, 0.5))
     monkeypatch.setattr(wire, "send", fail)
     with pytest.raises(OSError, match="no buffer space"):
         robot.write(np.ones(count), np.full(count, 20.0), np.full(count, 0.5))
-    time.sleep(0.02)
+    until(lambda: failed)  # the thread that repeats the command has met it, too
     monkeypatch.setattr(wire, "send", send)
-    before = len(wire.sent)
-    time.sleep(unitree.HOLD_S + 0.2)
-    assert len(wire.sent) > before
-    assert wire.sent[-1][1].motor_cmd[robot.kind.motors[0]].kd == unitree.BRAKING
+    until(lambda: wire.sent and wire.sent[-1].motor_cmd[robot.kind.motors[0]].kd == unitree.BRAKING)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import pytest
 from helpers import call, small_config
 from legged.tools import train
 
+from legged.cli import train
 from legged.envs import LeggedRobot
 from legged.envs.class_checks import EXTENDED, HOOKS
 from legged.errors import ConfigError

@@ -8,11 +8,13 @@ import pytest
 from helpers import TASK, call, forget_modules_of, tiny_run
 
 from legged import LeggedRobot, registry, user_modules
+from legged.cli import train
+from legged.cli.episodes import compare
+from legged.cli.evaluate import grid as evaluate_grid
 from legged.config import from_dict
 from legged.config.loader import read_yaml
 from legged.errors import ConfigError
 from legged.robots.robot import load_robot
-from legged.tools import episodes, evaluate, train
 
 pytestmark = pytest.mark.usefixtures("workplace", "own_registry")
 
@@ -90,8 +92,8 @@ def test_a_yaml_file_trains_and_its_run_lies_under_its_name():
 def test_a_policy_of_a_yaml_file_is_played_and_judged(capsys):
     written("mine.yaml", f"extends: {TASK}\n")
     tiny_run("--task", "mine.yaml")
-    arguments = ["--task", "mine.yaml", "--sim_device", "cpu", "sim.threads=1"]
-    assert call(evaluate.main, [*arguments, "--vx=0", "--vy=0", "--yaw=0", "--robots", "1"]) == 0
+    arguments = ["mine.yaml", "--sim-device", "cpu", "sim.threads=1"]
+    assert call(evaluate_grid.main, [*arguments, "--vx=0", "--vy=0", "--yaw=0", "--robots", "1"]) == 0
     assert "logs/mine/" in capsys.readouterr().out
 
 
@@ -103,8 +105,8 @@ def test_a_command_that_names_no_task_is_told_of_a_yaml_file_by_import(show, err
     registry._REGISTERED.clear()
     folder = tiny_run("--task", "mine.yaml")
     registry._REGISTERED.clear()
-    flags = ["--import", "mine.yaml", "--compare", str(folder), str(folder), "--episodes", "1", "--physics", "mujoco"]
-    assert call(episodes.main, flags) == 2, "episodes of 0.4 s are too short for statistics"
+    flags = ["--import", "mine.yaml", str(folder), str(folder), "--episodes", "1", "--physics", "mujoco"]
+    assert call(compare.main, flags) == 2, "episodes of 0.4 s are too short for statistics"
     assert "no episode of 'mine' is longer than 1 s" in capsys.readouterr().err
 
 
@@ -133,7 +135,7 @@ def test_what_is_no_task_is_refused(error, name, words):
     written(f"{TASK}.yaml", f"extends: {TASK}\n")
     written(".hidden.yaml", f"extends: {TASK}\n")
     text = error("--task", name)
-    assert text.startswith("error: --task: ")
+    assert text.startswith("error: TASK: ")
     assert words in text
     assert len(text) < 1000
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from handmade import DT, made_by_hand
+from helpers import HANG_S
 from PIL import Image
 
 from legged.episodes.page import write_page
@@ -61,6 +62,7 @@ def opened(browser, tmp_path):
         episodes["reward_parts"][episodes.rows(1)] = [0.02, -0.01]
         path = write_page(tmp_path, episodes, figures_of(episodes), 1, film)
         page = browser.new_page(viewport={"width": width, "height": 900})
+        page.set_default_timeout(1000.0 * HANG_S)
         page.on("console", lambda message: said.append(message.text))
         page.on("pageerror", lambda error: said.append(str(error)))
         page.on("request", lambda request: asked.append(request.url))
@@ -73,7 +75,7 @@ def opened(browser, tmp_path):
     assert [url for url in asked if not url.startswith(("file:", "data:"))] == []
 
 
-def wait(page, condition: str, seconds: float = 20.0) -> None:
+def wait(page, condition: str, seconds: float = HANG_S) -> None:
     """Wait until something holds: the page's own rules forbid what playwright would wait with."""
     end = time.monotonic() + seconds
     while not page.evaluate(condition):

@@ -6,14 +6,14 @@ import pytest
 import torch
 from helpers import TASK, call, run_folders, tiny_run
 
+from legged.cli.evaluate import checkpoints
 from legged.evaluation import all_checkpoints
 from legged.evaluation.all_checkpoints import walks
 from legged.learning.checkpoint import read_checkpoint, write_checkpoint
-from legged.tools import evaluate
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
-HERE = ["--task", TASK, "--sim_device", "cpu", "--robots", "1", "sim.threads=1", "--all-checkpoints"]
+HERE = [TASK, "--sim-device", "cpu", "--robots", "1", "sim.threads=1"]
 AXIS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 
@@ -33,7 +33,7 @@ def test_checkpoints_are_judged_in_order_and_the_first_good_one_is_named(capsys)
                 saved["actor_state_dict"][name] = torch.zeros_like(tensor)
         write_checkpoint(path, saved)
     stands = sum((x * x + y * y) ** 0.5 for x in AXIS for y in AXIS) / 25
-    assert evaluate.main([*HERE, "--rmse", "0.1"]) == 0
+    assert checkpoints.main([*HERE, "--rmse", "0.1"]) == 0
     assert "never" in capsys.readouterr().out
     result = json.loads((folder / "time_to_walk.json").read_text())
     assert result["first"] is None
@@ -41,7 +41,7 @@ def test_checkpoints_are_judged_in_order_and_the_first_good_one_is_named(capsys)
     assert result["checkpoints"][1]["rmse_lin"] == pytest.approx(stands, abs=0.05)
     assert [row["wall_s"] for row in result["checkpoints"]] == [4.0, 5.0, 6.5]
     limit = result["checkpoints"][1]["rmse_lin"] + 0.02  # resets are random
-    assert evaluate.main([*HERE, "--rmse", str(limit), "--falls", "0.5"]) == 0
+    assert checkpoints.main([*HERE, "--rmse", str(limit), "--falls", "0.5"]) == 0
     first = json.loads((folder / "time_to_walk.json").read_text())["first"]
     wanted = 4.0 if result["checkpoints"][0]["rmse_lin"] < limit else 5.0
     assert first["wall_s"] == wanted
@@ -53,7 +53,7 @@ def test_the_file_says_under_what_conditions_checkpoints_were_judged_and_lost_co
     (folder,) = run_folders()
     figures = {"rmse_lin": {"mean": 0.1}, "rmse_ang": {"mean": 0.1}, "falls": 0.0, "contact_overflows": 3}
     monkeypatch.setattr(all_checkpoints, "measure_tracking", lambda *_: figures)
-    assert evaluate.main([*HERE, "--vx=0.5", "--vy=0", "--yaw=0", "sim.iterations=30"]) == 0
+    assert checkpoints.main([*HERE, "--vx=0.5", "--vy=0", "--yaw=0", "sim.iterations=30"]) == 0
     result = json.loads((folder / "changed" / "time_to_walk.json").read_text())
     assert result["changes"] == {"sim.iterations": 30}
     assert (result["grid"], result["robots_per_cell"]) == ({"vx": [0.5], "vy": [0.0], "yaw": [0.0]}, 1)
@@ -69,20 +69,19 @@ def test_a_robot_that_always_falls_does_not_walk():
 
 
 def test_wrong_limits_are_refused(capsys):
-    assert call(evaluate.main, [*HERE, "--rmse", "-1"]) == 2
+    assert call(checkpoints.main, [*HERE, "--rmse", "-1"]) == 2
     assert "--rmse: must be above 0" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([*HERE, "--checkpoint", "3"], "--checkpoint: --all-checkpoints tracks commands with every checkpoint"),
-        ([*HERE, "--types", "pit"], "--types: --all-checkpoints tracks commands"),
-        ([*HERE, "--physics", "all"], "--all-checkpoints: looks at one engine"),
-        ([*HERE[:-1], "--rmse", "0.1"], "--rmse: is a limit of --all-checkpoints; add it"),
-        ([*HERE[:-1], "--falls", "0.1"], "--falls: is a limit of --all-checkpoints; add it"),
+        ([*HERE, "--checkpoint", "3"], "--checkpoint: all checkpoints of the run are measured"),
+        ([*HERE, "--types", "pit"], "unrecognized arguments: --types"),
+        ([*HERE, "--physics", "all"], "command line: sim.physics: unknown value 'all'"),
+        (["half_cheetah"], "POLICY: 'half_cheetah' has no velocity commands"),
     ],
 )
-def test_flags_that_contradict_each_other_are_refused(arguments, words, capsys):
-    assert call(evaluate.main, arguments) == 2
+def test_arguments_that_do_not_fit_are_refused(arguments, words, capsys):
+    assert call(checkpoints.main, arguments) == 2
     assert words in capsys.readouterr().err

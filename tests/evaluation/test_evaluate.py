@@ -10,16 +10,18 @@ import torch
 from helpers import POLICY, TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
 
 from legged import make_task
+from legged.cli import play
+from legged.cli.evaluate import grid as evaluate_grid
+from legged.cli.evaluate import terrain as evaluate_terrain
 from legged.config import override
 from legged.errors import RunError
 from legged.evaluation import crossing, following, velocity_tracking
 from legged.evaluation.tracking_report import draw_tracking, print_tracking
 from legged.evaluation.velocity_grid import Grid, axes_of, axis_values
 from legged.evaluation.velocity_tracking import measure_tracking
-from legged.play import schedule
+from legged.play import demonstrations
 from legged.policies.restore import TrainedPolicy, undisturbed
 from legged.registry import task_config
-from legged.tools import evaluate, play
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -164,8 +166,8 @@ def run(trained, monkeypatch) -> Path:
 
 
 def test_evaluate_writes_json_and_picture_beside_the_checkpoint(run, capsys):
-    arguments = ["--task", TASK, "--physics", "mujoco", "--vx=0:0.5:0.5", "--vy=0", "--yaw=-0.5:0.5:1", "--robots", "2"]
-    assert call(evaluate.main, [*arguments, "sim.threads=1"]) == 0
+    arguments = [TASK, "--physics", "mujoco", "--vx=0:0.5:0.5", "--vy=0", "--yaw=-0.5:0.5:1", "--robots", "2"]
+    assert call(evaluate_grid.main, [*arguments, "sim.threads=1"]) == 0
     out = capsys.readouterr().out
     result = json.loads((run / "evaluation_mujoco.json").read_text())
     assert result["grid"] == {"vx": [0.0, 0.5], "vy": [0.0], "yaw": [-0.5, 0.5]}
@@ -184,8 +186,8 @@ def test_evaluate_writes_json_and_picture_beside_the_checkpoint(run, capsys):
 
 def test_the_grid_is_that_of_the_task_where_no_flag_says_otherwise(run, tmp_path):
     judged = ["evaluation.vx=[-0.5,1,1.5]", "evaluation.vy=[0.3,0.3,1]", "evaluation.yaw=[0,0,1]"]
-    arguments = ["--task", TASK, "--physics", "mujoco", "--robots", "1", "--yaw=-0.2", "--out", str(tmp_path)]
-    assert call(evaluate.main, [*arguments, *judged, "sim.threads=1"]) == 0
+    arguments = [TASK, "--physics", "mujoco", "--robots", "1", "--yaw=-0.2", "--out", str(tmp_path)]
+    assert call(evaluate_grid.main, [*arguments, *judged, "sim.threads=1"]) == 0
     result = json.loads((tmp_path / "evaluation_mujoco.json").read_text())
     assert result["grid"] == {"vx": [-0.5, 1.0], "vy": [0.3], "yaw": [-0.2]}
 
@@ -193,7 +195,7 @@ def test_the_grid_is_that_of_the_task_where_no_flag_says_otherwise(run, tmp_path
 def test_a_grid_is_no_changed_field_however_it_is_asked_for(run):
     """The zoo judges again what was trained with another grid, and looks for the result beside the checkpoint."""
     judged = ["evaluation.vx=[0.5,0.5,1]", "evaluation.vy=[0,0,1]", "evaluation.yaw=[0,0,1]", "evaluation.stairs=0.3"]
-    assert call(evaluate.main, ["--task", TASK, "--physics", "mujoco", "--robots", "1", *judged, "sim.threads=1"]) == 0
+    assert call(evaluate_grid.main, [TASK, "--physics", "mujoco", "--robots", "1", *judged, "sim.threads=1"]) == 0
     result = json.loads((run / "evaluation_mujoco.json").read_text())
     assert result["grid"] == {"vx": [0.5], "vy": [0.0], "yaw": [0.0]}
     assert "changes" not in result
@@ -215,20 +217,8 @@ def test_grids_of_quadrupeds_and_bipeds(task, axes):
 
 def test_evaluate_writes_elsewhere_if_asked(run, tmp_path):
     before = sorted(run.iterdir())
-    arguments = [
-        "--task",
-        TASK,
-        "--physics",
-        "mujoco",
-        "--vx=0",
-        "--vy=0",
-        "--yaw=0",
-        "--robots",
-        "1",
-        "--out",
-        str(tmp_path / "o"),
-    ]
-    assert call(evaluate.main, [*arguments, "sim.threads=1"]) == 0
+    arguments = [TASK, "--physics", "mujoco", "--vx=0", "--vy=0", "--yaw=0", "--robots", "1", "--out", str(tmp_path / "o")]
+    assert call(evaluate_grid.main, [*arguments, "sim.threads=1"]) == 0
     assert {path.name for path in (tmp_path / "o").iterdir()} == {"evaluation_mujoco.json", "evaluation_mujoco.png"}
     assert sorted(run.iterdir()) == before
 
@@ -237,7 +227,7 @@ SHORT = ((1.1, (0.5, 0.0, 0.0)), (1.1, (9.0, 0.0, 0.0)))  # the second is outsid
 
 
 def test_play_without_video_exports_and_prints_a_table(run, capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(schedule, "SCHEDULE", SHORT)
+    monkeypatch.setattr(demonstrations, "SCHEDULE", SHORT)
     arguments = [
         "--task",
         TASK,
@@ -273,7 +263,7 @@ def test_play_records_a_short_video_where_something_can_be_drawn(run, capsys, mo
         mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
     except Exception as error:
         pytest.skip(f"nothing can be rendered here: {error}")
-    monkeypatch.setattr(schedule, "SCHEDULE", SHORT[:1])
+    monkeypatch.setattr(demonstrations, "SCHEDULE", SHORT[:1])
     arguments = [
         "--task",
         TASK,
@@ -308,21 +298,25 @@ def test_evaluations_of_a_shipped_policy_do_not_touch_the_package(tmp_path):
         (["--vx=-1:1:1e-9"], "--vx: '-1:1:1e-9' makes 2,000,000,001 cells"),
         (["--vx=1e30"], "--vx: '1e30' asks for more than 20"),
         (["--robots", "100000000"], "125 cells x 100,000,000 robots are 12,500,000,000 robots"),
-        (["--robots-per-point", "99999999"], "--robots-per-point: must be at most 65,536, got 99,999,999"),
     ],
 )
 def test_grids_that_no_machine_holds_are_refused_with_their_size(options, words, capsys):
-    assert call(evaluate.main, ["--task", TASK, "--sim_device", "cpu", *options]) == 2
+    assert call(evaluate_grid.main, [TASK, "--sim-device", "cpu", *options]) == 2
     assert words in capsys.readouterr().err
+
+
+def test_more_robots_a_size_than_any_machine_holds_are_refused(capsys):
+    assert call(evaluate_terrain.main, [TASK, "--sim-device", "cpu", "--robots-per-point", "99999999"]) == 2
+    assert "--robots-per-point: must be at most 65,536, got 99,999,999" in capsys.readouterr().err
 
 
 def test_a_folder_that_cannot_be_written_is_found_before_anything_is_measured(tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("mine")
     for module in (following, crossing):
         monkeypatch.setattr(module, "ready_to_track", lambda *_, **__: pytest.fail("measured"))
-    arguments = ["--task", TASK, "--sim_device", "cpu", "--load_run", str(POLICY), "--out", str(tmp_path / "file")]
+    arguments = [str(POLICY), "--sim_device", "cpu", "--out", str(tmp_path / "file")]
     for physics in ("mujoco", "all"):
-        assert call(evaluate.main, [*arguments, "--physics", physics]) == 2
+        assert call(evaluate_grid.main, [*arguments, "--physics", physics]) == 2
         assert "file: cannot make the folder" in capsys.readouterr().err
 
 
@@ -332,8 +326,8 @@ def test_a_disk_that_fills_up_meanwhile_costs_the_files_and_not_the_table(tmp_pa
 
     monkeypatch.setattr(following, "write_text", full)
     grid = ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1", "--physics", "mujoco", "sim.threads=1"]
-    arguments = ["--task", TASK, "--load_run", str(POLICY), "--out", str(tmp_path), *grid]
-    assert call(evaluate.main, arguments) == 1
+    arguments = [str(POLICY), "--out", str(tmp_path), *grid]
+    assert call(evaluate_grid.main, arguments) == 1
     out, err = capsys.readouterr()
     assert "velocity RMSE, mean" in out
     assert err == "error: evaluation_mujoco.json: no space left on the disk\n"
@@ -344,10 +338,10 @@ def test_an_evaluation_with_changed_fields_says_so_and_does_not_take_the_place_o
     shutil.copytree(POLICY, run)
     own = (run / "evaluation_mujoco.json").read_bytes()
     grid = ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1", "--physics", "mujoco", "sim.threads=1"]
-    arguments = ["--task", TASK, "--load_run", str(run), *grid]
-    assert evaluate.main([*arguments, "domain_rand.ranges.added_base_mass=[40,40]"]) == 0
+    arguments = [str(run), *grid]
+    assert evaluate_grid.main([*arguments, "domain_rand.ranges.added_base_mass=[40,40]"]) == 0
     assert (run / "evaluation_mujoco.json").read_bytes() == own
     changed = json.loads((run / "changed" / "evaluation_mujoco.json").read_text())
     assert changed["changes"] == {"domain_rand.ranges.added_base_mass": [40, 40]}
-    assert evaluate.main(arguments) == 0
+    assert evaluate_grid.main(arguments) == 0
     assert "changes" not in json.loads((run / "evaluation_mujoco.json").read_text())

@@ -9,13 +9,17 @@ import pytest
 import torch
 from helpers import call, kept_global_state, run_folders, tiny_run
 
+from legged.cli import play, terrain
+from legged.cli.benchmark import ground, step
+from legged.cli.evaluate import checkpoints, episodes, grid, policy
+from legged.cli.evaluate import gymnasium as in_gymnasium
+from legged.cli.runs import curves, evaluations
 from legged.errors import ConfigError
 from legged.evaluation.gymnasium_episodes import run_exported
-from legged.tools import benchmark, compare, evaluate, play, plot, show_terrain
 
 pytestmark = pytest.mark.usefixtures("workplace")
 TASK = "half_cheetah"
-SHORT = ["--task", TASK, "sim.threads=1", "env.episode_length_s=1"]
+SHORT = [TASK, "sim.threads=1", "env.episode_length_s=1"]
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +40,7 @@ def run(trained, monkeypatch) -> Path:
 
 
 def test_episodes_are_measured_and_written(run, capsys):
-    assert call(evaluate.main, [*SHORT, "--physics", "mujoco", "--episodes", "3"]) == 0
+    assert call(episodes.main, [*SHORT, "--physics", "mujoco", "--episodes", "3"]) == 0
     out = capsys.readouterr().out
     result = json.loads((run / "changed" / "evaluation_mujoco.json").read_text())  # its episodes are shorter than the task's
     assert (result["task"], result["checkpoint"], result["physics"], result["device"]) == (
@@ -45,16 +49,16 @@ def test_episodes_are_measured_and_written(run, capsys):
         "mujoco",
         "cpu",
     )
-    episodes = result["episodes"]
-    assert (episodes["count"], episodes["failures"], episodes["length"]["mean"]) == (3, 0.0, 20.0)
-    assert sum(episodes["terms"].values()) == pytest.approx(episodes["return"]["mean"], rel=1e-4)
-    assert episodes["metrics"].keys() == {"x_velocity"}
-    for words in ("3 episodes", f"{episodes['return']['mean']:.1f}", "evaluation_mujoco.json"):
+    found = result["episodes"]
+    assert (found["count"], found["failures"], found["length"]["mean"]) == (3, 0.0, 20.0)
+    assert sum(found["terms"].values()) == pytest.approx(found["return"]["mean"], rel=1e-4)
+    assert found["metrics"].keys() == {"x_velocity"}
+    for words in ("3 episodes", f"{found['return']['mean']:.1f}", "evaluation_mujoco.json"):
         assert words in out
 
 
 def test_seeds_and_engines_are_compared(run, tmp_path, capsys):
-    assert call(evaluate.main, [*SHORT, "--physics", "mujoco", "--episodes", "2", "--out", str(tmp_path / "1")]) == 0
+    assert call(episodes.main, [*SHORT, "--physics", "mujoco", "--episodes", "2", "--out", str(tmp_path / "1")]) == 0
     result = json.loads((tmp_path / "1" / "evaluation_mujoco.json").read_text())
     for name, value in (("1", 10.0), ("2", 20.0)):
         result["episodes"]["return"]["mean"] = value
@@ -63,7 +67,7 @@ def test_seeds_and_engines_are_compared(run, tmp_path, capsys):
     other = {**result, "physics": "gymnasium", "episodes": {**result["episodes"], "metrics": {}}}
     (tmp_path / "2" / "evaluation_gymnasium.json").write_text(json.dumps(other))
     capsys.readouterr()
-    assert call(compare.main, [str(tmp_path / "1"), str(tmp_path / "2")]) == 0
+    assert call(evaluations.main, [str(tmp_path / "1"), str(tmp_path / "2")]) == 0
     out = capsys.readouterr().out
     rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in out.split("\n") if "│" in line]
     lines = {row[0]: row[1:] for row in rows}
@@ -71,13 +75,13 @@ def test_seeds_and_engines_are_compared(run, tmp_path, capsys):
     assert lines["x_velocity"][1] == ""  # Gymnasium tells nothing of it
     del result["episodes"]["return"]["std"]
     (tmp_path / "1" / "evaluation_mujoco.json").write_text(json.dumps(result))
-    assert call(compare.main, [str(tmp_path / "1")]) == 2
+    assert call(evaluations.main, [str(tmp_path / "1")]) == 2
     assert "episodes.return.std: expected a number, got nothing" in capsys.readouterr().err
 
 
 def test_an_exported_policy_is_scored_by_gymnasium(run, tmp_path, capsys):
     """By Gymnasium's own count, beside the same loop written out here."""
-    assert call(evaluate.main, ["--task", TASK, "--gymnasium", "--episodes", "2", "--out", str(tmp_path)]) == 0
+    assert call(in_gymnasium.main, [TASK, "--episodes", "2", "--out", str(tmp_path)]) == 0
     assert "HalfCheetah-v5: 2 episodes" in capsys.readouterr().out
     result = json.loads((tmp_path / "evaluation_gymnasium.json").read_text())
     assert (result["physics"], result["environment"]) == ("gymnasium", "HalfCheetah-v5")
@@ -90,11 +94,11 @@ def test_an_exported_policy_is_scored_by_gymnasium(run, tmp_path, capsys):
             action = policy(torch.tensor(np.float32(seen))[None])[0].detach().numpy().clip(-1, 1)
             seen, reward, _, _, _ = environment.step(action)
             returns[-1] += reward
-    episodes = result["episodes"]
-    assert episodes["return"]["mean"] == pytest.approx(np.mean(returns), rel=1e-6)
-    assert episodes["return"]["std"] == pytest.approx(np.std(returns), rel=1e-6)
-    assert (episodes["length"]["mean"], episodes["failures"]) == (1000.0, 0.0)
-    assert episodes["terms"].keys() == {"forward", "ctrl"}
+    found = result["episodes"]
+    assert found["return"]["mean"] == pytest.approx(np.mean(returns), rel=1e-6)
+    assert found["return"]["std"] == pytest.approx(np.std(returns), rel=1e-6)
+    assert (found["length"]["mean"], found["failures"]) == (1000.0, 0.0)
+    assert found["terms"].keys() == {"forward", "ctrl"}
 
 
 class Always(torch.nn.Module):
@@ -160,25 +164,33 @@ def test_a_policy_for_something_else_is_refused(changes, name, words, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("command", "arguments", "words"),
     [
-        (["--task", TASK, "--vx=0"], f"--vx: '{TASK}' follows no commands; --episodes says"),
-        (["--task", TASK, "--all-checkpoints"], f"--all-checkpoints: '{TASK}' follows no commands"),
-        (["--task", TASK, "--num_envs", "3"], "--num_envs: every episode has a robot of its own"),
-        (["--task", TASK, "--episodes", "0"], "--episodes: must be at least 1, got 0"),
-        (["--task", TASK, "--episodes", "100000"], "--episodes: must be at most 65,536, got 100,000"),
-        (["--task", TASK, "--physics", "all"], "--physics: 'all' is for tasks that follow commands"),
-        (["--task", TASK, "--gymnasium", "--physics", "mujoco"], "--physics: Gymnasium simulates by itself"),
-        (["--task", "humanoid", "--gymnasium"], "--gymnasium: 'humanoid' is no task of Gymnasium's"),
-        (["--task", "anymal_c_flat", "--episodes", "3"], "--episodes: 'anymal_c_flat' follows commands"),
-        (["--task", "anymal_c_flat", "--gymnasium"], "--gymnasium: 'anymal_c_flat' follows commands"),
+        (grid, [TASK, "--vx=0"], f"POLICY: '{TASK}' has no velocity commands; legged evaluate episodes"),
+        (checkpoints, [TASK], f"POLICY: '{TASK}' has no velocity commands; legged evaluate episodes"),
+        (episodes, [TASK, "--num-envs", "3"], "--num-envs: the evaluation itself says how many robots"),
+        (episodes, [TASK, "--episodes", "0"], "--episodes: must be at least 1, got 0"),
+        (in_gymnasium, [TASK, "--episodes", "100000"], "--episodes: must be at most 65,536, got 100,000"),
+        (episodes, [TASK, "--physics", "all"], "sim.physics: unknown value 'all'"),
+        (in_gymnasium, [TASK, "--physics", "mujoco"], "--physics: Gymnasium simulates by itself"),
+        (in_gymnasium, [TASK, "--sim-device", "cpu"], "--sim-device: Gymnasium simulates by itself"),
+        (in_gymnasium, ["humanoid"], "'humanoid'"),
+        (episodes, ["anymal_c_flat"], "POLICY: 'anymal_c_flat' follows velocity commands; legged evaluate grid"),
+        (in_gymnasium, ["anymal_c_flat"], "'anymal_c_flat'"),
     ],
 )
-def test_flags_of_the_other_kind_of_task_are_refused(arguments, words, capsys):
-    assert call(evaluate.main, arguments) == 2
+def test_a_policy_of_the_other_kind_of_task_is_refused(run, command, arguments, words, capsys):
+    assert call(command.main, arguments) == 2
     err = capsys.readouterr().err
     assert words in err
     assert err.count("\n") == 1
+
+
+def test_evaluate_measures_what_fits_the_task(run, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(policy, "ENVIRONMENTS", 3)
+    assert call(policy.main, [*SHORT, "--physics", "mujoco", "--out", str(tmp_path)]) == 0
+    assert "half_cheetah" in capsys.readouterr().out
+    assert json.loads((tmp_path / "evaluation_mujoco.json").read_text())["episodes"]["count"] == 3
 
 
 def test_play_exports_and_prints_a_table(run, tmp_path, capsys):
@@ -203,19 +215,18 @@ def test_a_model_with_a_floor_of_its_own_has_no_tiles(run, flag, capsys):
 
 
 def test_there_is_no_terrain_to_show_or_to_compare_colliders_on(capsys):
-    assert call(show_terrain.main, ["--task", TASK]) == 2
+    assert call(terrain.main, [TASK]) == 2
     assert "'half_cheetah' has no terrain to show" in capsys.readouterr().err
-    grounds = ["--grounds", "--sim_device", "cpu", "sim.physics=mujoco_warp"]
-    assert call(benchmark.main, ["--task", TASK, *grounds]) == 2
-    assert "--grounds: the task 'half_cheetah' has no terrain" in capsys.readouterr().err
+    assert call(ground.main, [TASK, "--sim-device", "cpu", "sim.physics=mujoco_warp"]) == 2
+    assert "TASK: 'half_cheetah' has no terrain" in capsys.readouterr().err
 
 
 def test_a_step_is_timed(capsys):
     few = ["--num_envs", "4", "--steps", "2", "--repeats", "1", "--iterations", "0", "sim.physics=mujoco", "sim.threads=1"]
-    assert call(benchmark.main, ["--task", TASK, "--sim_device", "cpu", *few]) == 0
+    assert call(step.main, [TASK, "--sim-device", "cpu", *few]) == 0
     assert "half_cheetah, 4 robots, CPU" in capsys.readouterr().out
 
 
 def test_a_run_is_drawn(run, tmp_path):
-    assert call(plot.main, [str(run), "--out", str(tmp_path / "curves.png")]) == 0
+    assert call(curves.main, [str(run), "--out", str(tmp_path)]) == 0
     assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")

@@ -9,9 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import POLICY, TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
+from helpers import POLICY, call, kept_global_state, run_folders, small_config, stand, tiny_run
 
 from legged import make_task
+from legged.cli.evaluate import grid as evaluate_grid
+from legged.cli.evaluate import policy as evaluate
+from legged.cli.evaluate import terrain as evaluate_terrain
 from legged.config import override
 from legged.errors import ConfigError
 from legged.evaluation import success
@@ -22,7 +25,7 @@ from legged.evaluation.success import (
     sizes_of,
     trained_to,
 )
-from legged.evaluation.success_report import _draw_panel, is_beyond, panels_of, with_other_engines
+from legged.evaluation.success_report import is_beyond, panels_of, with_other_engines
 from legged.evaluation.tiles import cell_for, dividing_cell, on_terrain, rough_ground, rough_side, tiles_of_sizes
 from legged.evaluation.velocity_grid import Grid
 from legged.evaluation.velocity_tracking import measure_tracking, place_to_track
@@ -30,7 +33,6 @@ from legged.learning.run_folder import find_checkpoint, run_config
 from legged.policies.restore import TrainedPolicy, undisturbed
 from legged.registry import task_config
 from legged.terrain import Terrain, TileSpec, check_terrain
-from legged.tools import evaluate
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -198,7 +200,8 @@ def test_lost_contacts_are_counted_over_all_rollouts(monkeypatch):
 
 # ---- the command -----------------------------------------------------------------------------------------------------
 
-CELL = ["--physics", "mujoco", "--vx=0", "--vy=0", "--yaw=0", "--robots", "1", "sim.threads=1"]
+HERE = ["--physics", "mujoco", "sim.threads=1"]
+CELL = ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1"]
 
 
 @pytest.fixture(scope="module")
@@ -221,9 +224,35 @@ def run(trained, monkeypatch) -> Path:
     return folder
 
 
+def test_terrain_and_grid_write_their_parts_into_one_file(run, tmp_path, capsys):
+    """Each keeps the other's part, as long as both are of the same policy, engine and settings."""
+    out = ["--out", str(tmp_path / "o")]
+    points = ["--types", "stairs_up,slope_down", "--robots-per-point", "2"]
+    assert call(evaluate_terrain.main, ["anymal_c", *HERE, *points, *out]) == 0
+    path = tmp_path / "o" / "evaluation_mujoco.json"
+    alone = json.loads(path.read_text())
+    assert "success" in alone
+    assert "rough" not in alone
+    assert call(evaluate_grid.main, ["anymal_c", *HERE, *CELL, *out]) == 0
+    both = json.loads(path.read_text())
+    assert both["success"] == alone["success"]
+    assert call(evaluate_terrain.main, ["anymal_c", *HERE, "--types", "slope_down", "--robots-per-point", "1", *out]) == 0
+    again = json.loads(path.read_text())
+    assert again["rough"] == both["rough"]
+    assert list(again["success"]["types"]) == ["slope_down"]
+    changed = [*HERE, "sim.iterations=30"]
+    assert call(evaluate_grid.main, ["anymal_c", *changed, *CELL, *out]) == 0
+    assert "success" not in json.loads(path.read_text())
+    path.write_text(json.dumps({**again, "checkpoint": "model_7.pt"}))
+    assert call(evaluate_grid.main, ["anymal_c", *HERE, *CELL, *out]) == 0
+    assert "success" not in json.loads(path.read_text())
+
+
 def test_evaluate_measures_success_and_tracking_on_rough_ground(run, tmp_path, capsys):
-    arguments = ["--task", "anymal_c", *CELL, "--types", "stairs_up,slope_down", "--robots-per-point", "2"]
-    assert call(evaluate.main, [*arguments, "--out", str(tmp_path / "o")]) == 0
+    """Each by its own command, into the same folder; `legged evaluate` does both."""
+    here = ["anymal_c", *HERE, "--out", str(tmp_path / "o")]
+    assert call(evaluate_grid.main, [*here, *CELL]) == 0
+    assert call(evaluate_terrain.main, [*here, "--types", "stairs_up,slope_down", "--robots-per-point", "2"]) == 0
     out = capsys.readouterr().out
     files = {path.name for path in (tmp_path / "o").iterdir()}
     assert files == {"evaluation_mujoco.json", "evaluation_mujoco.png", "success_mujoco.png"}
@@ -263,7 +292,8 @@ def test_the_other_engine_is_drawn_too_if_it_is_of_the_same_checkpoint(tmp_path)
 
 def test_a_plane_task_is_evaluated_as_ever_and_crosses_terrain_only_if_asked(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(success, "TIME_S", 0.1)
-    arguments = ["--task", TASK, "--load_run", str(POLICY), *CELL, "--robots-per-point", "1"]
+    monkeypatch.setattr("legged.cli.evaluate.common.ROBOTS", 1)
+    arguments = [str(POLICY), *HERE, *(f"evaluation.{axis}=[0,0,1]" for axis in ("vx", "vy", "yaw"))]
     shipped = json.loads((POLICY / "evaluation_mujoco.json").read_text())
     assert call(evaluate.main, [*arguments, "--out", str(tmp_path / "plane")]) == 0
     plane = json.loads((tmp_path / "plane" / "evaluation_mujoco.json").read_text())
@@ -271,7 +301,9 @@ def test_a_plane_task_is_evaluated_as_ever_and_crosses_terrain_only_if_asked(tmp
     assert plane["cells"][0].keys() == shipped["cells"][0].keys()
     assert not (tmp_path / "plane" / "success_mujoco.png").exists()
     assert "success" not in capsys.readouterr().out
-    assert call(evaluate.main, [*arguments, "--out", str(tmp_path / "both"), "--types", "waves"]) == 0
+    assert call(evaluate.main, [*arguments, "--out", str(tmp_path / "both")]) == 0
+    crossed = ["--types", "waves", "--robots-per-point", "1", "--out", str(tmp_path / "both")]
+    assert call(evaluate_terrain.main, [str(POLICY), *HERE, *crossed]) == 0
     both = json.loads((tmp_path / "both" / "evaluation_mujoco.json").read_text())
     assert both.keys() == shipped.keys() | {"success"}
     assert both["success"]["types"]["waves"]["trained_to"] is None
@@ -295,24 +327,7 @@ def test_lost_contacts_are_warned_of(capsys):
     ],
 )
 def test_wrong_input(arguments, words, capsys):
-    assert call(evaluate.main, ["--task", TASK, "--load_run", str(POLICY), *CELL, *arguments]) == 2
+    assert call(evaluate_terrain.main, [str(POLICY), *HERE, *arguments]) == 2
     error = capsys.readouterr().err
     for word in words:
         assert word in error
-
-
-def test_a_single_size_is_drawn_with_its_interval():
-    """A band has no width there."""
-    from matplotlib import pyplot as plt
-
-    axis = plt.figure().subplots()
-    entry = {
-        "unit": "m",
-        "what": "height",
-        "trained_to": None,
-        "points": [{"size": 0.2, "share": 0.5, "low": 0.4, "high": 0.7}],
-    }
-    _draw_panel(axis, [{"physics": "mujoco", "success": {"types": {"kerbs": entry}}}], ("kerbs",))
-    (bars,) = axis.collections
-    assert bars.get_segments()[0].tolist() == [[0.2, 0.4], [0.2, 0.7]]
-    plt.close()

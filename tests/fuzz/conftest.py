@@ -14,7 +14,7 @@ CASES = int(os.environ.get("FUZZ_CASES", "25"))
 settings.register_profile(
     "fuzz",
     max_examples=CASES,
-    deadline=20_000,  # milliseconds: what takes longer hangs
+    deadline=None,  # how fast a case is decides nothing: the machine may be busy
     derandomize="FUZZ_CASES" not in os.environ,  # the same cases for everybody in the ordinary run
     database=None,
     print_blob=True,

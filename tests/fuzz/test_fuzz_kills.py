@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import TASK, TINY_TRAINING, checkpoints, run_folders
+from helpers import HANG_S, TASK, TINY_TRAINING, checkpoints, run_folders
 
 from legged.learning.captured import CapturedRunner
 from legged.learning.run_folder import run_config
@@ -36,7 +36,7 @@ def end_a_training(number: signal.Signals, after_s: float) -> tuple[int, str]:
         time.sleep(after_s)
         process.send_signal(number)
         try:
-            code = process.wait(timeout=60)
+            code = process.wait(timeout=HANG_S)
         finally:
             process.kill()
     return code, Path("out.txt").read_text()

@@ -13,6 +13,7 @@ from devices import CUDA
 from helpers import CALM, TASK, checkpoints, run_folders
 from tensordict import TensorDict
 
+from legged.cli import train
 from legged.envs import LeggedRobot
 from legged.evaluation.learning_curves import read_scalars
 from legged.graph.step_graph import StepGraph
@@ -23,7 +24,6 @@ from legged.learning.run_folder import run_config
 from legged.policies.export import export
 from legged.policies.restore import TrainedPolicy, restore
 from legged.registry import task_config
-from legged.tools import train
 
 pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("workplace", "full_precision")]
 

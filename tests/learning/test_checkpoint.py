@@ -8,17 +8,19 @@ import pytest
 import torch
 from helpers import TASK, call, checkpoints, kept_global_state, tiny_run
 
+from legged.cli import play, train
+from legged.cli.evaluate import checkpoints as evaluate_checkpoints
+from legged.cli.evaluate import grid as evaluate_grid
 from legged.errors import ConfigError
 from legged.learning.checkpoint import FORMAT, read_checkpoint
 from legged.learning.run_folder import shipped_policy
-from legged.tools import evaluate, play, train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 COMMANDS = {
     "resume": (train.main, ["--resume", "--max_iterations", "9"]),
     "play": (play.main, ["--no-video"]),
-    "evaluate": (evaluate.main, ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1"]),
-    "evaluate --all-checkpoints": (evaluate.main, ["--all-checkpoints", "--robots", "1"]),
+    "evaluate grid": (evaluate_grid.main, ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1"]),
+    "evaluate checkpoints": (evaluate_checkpoints.main, ["--robots", "1"]),
 }
 
 
@@ -83,7 +85,7 @@ CODE = [in_infos, as_the_whole_file, as_a_bare_pickle, as_an_old_torch_file]
 def test_a_checkpoint_runs_no_code(model, capsys, place, command):
     place(model)
     main, arguments = COMMANDS[command]
-    assert call(main, ["--task", TASK, "--sim_device", "cpu", *arguments]) == 2
+    assert call(main, [TASK, "--sim_device", "cpu", *arguments]) == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1
     assert "model_0.pt: not a checkpoint" in err
@@ -105,7 +107,7 @@ WRONG = {
     "iter": ("three", "its iter is str, not int"),
     "infos": ([1, 2], "its infos is list, not dict"),
     "actor_state_dict": ([], "its actor_state_dict is list, not dict"),
-    "critic_state_dict": ({"mlp.0.weight": 3}, "its critic is damaged ('mlp.0.weight' is no tensor)"),
+    "critic_state_dict": ({"mlp.0.weight": 3}, "its critic is damaged ('mlp.0.weight' is not a tensor)"),
     "optimizer_state_dict": (7, "its optimizer_state_dict is int, not dict"),
 }
 
@@ -155,10 +157,10 @@ def test_weights_that_are_no_numbers_are_refused(model, value):
 def test_progress_of_curricula_that_is_damaged_is_said(model, capsys, command):
     infos = torch.load(model, weights_only=True)["infos"]
     change(model, infos={**infos, "task_state": {"command_curriculum": {"share": torch.ones(7)}}})
-    if command == "evaluate":  # it switches the curriculum off, and reads nothing of it
+    if command == "evaluate grid":  # it switches the curriculum off, and reads nothing of it
         return
     main, arguments = COMMANDS[command]
-    code = call(main, ["--task", TASK, "--sim_device", "cpu", *arguments, "commands.curriculum.enabled=true"])
+    code = call(main, [TASK, "--sim_device", "cpu", *arguments, "commands.curriculum.enabled=true"])
     assert (code, capsys.readouterr().err.count("curricula is damaged")) == (2, 1)
 
 
@@ -215,9 +217,9 @@ def test_a_policy_with_normalised_observations_is_played_evaluated_and_resumed(c
     """The normaliser's moments are matrices too, and no layers."""
     normalise = ["train.policy.obs_normalization=true"]
     folder = tiny_run(*normalise, "train.policy.actor_hidden_dims=[16, 8]", num_envs=4)
-    base = ["--task", TASK, "--sim_device", "cpu"]
+    base = [TASK, "--sim-device", "cpu"]
     assert play.main([*base, "--no-video", "--num_envs", "1"]) == 0
-    assert evaluate.main([*base, *COMMANDS["evaluate"][1]]) == 0
+    assert evaluate_grid.main([*base, *COMMANDS["evaluate grid"][1]]) == 0
     assert train.main([*base, "--resume", "--max_iterations", "3"]) == 0
     (resumed,) = [run for run in folder.parent.iterdir() if run != folder]
     assert checkpoints(resumed) == [2]

@@ -6,6 +6,7 @@ from helpers import TASK, TINY_TRAINING, call, tiny_run
 from learners import fill, learner
 from test_resume import content, same
 
+from legged.cli import train
 from legged.envs import BaseTask
 from legged.learning.captured import CapturedRunner
 from legged.learning.checkpoint import read_checkpoint
@@ -13,7 +14,6 @@ from legged.learning.critic_warmup import CriticWarmup
 from legged.learning.ppo import DevicePPO
 from legged.learning.run_folder import run_config
 from legged.registry import make_task
-from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -100,13 +100,13 @@ def test_a_transfer_with_warmup_takes_the_policy_alone(loop, capsys):
     taken = saved["actor_state_dict"]
     warmup = ["--runner", loop, "train.algorithm.critic_warmup_iterations=1", "train.policy.init_noise_std=0.1"]
     for checkpoint in ("1", "2"):
-        flags = ["--transfer", "--load_run", str(source), "--checkpoint", checkpoint, *warmup]
+        flags = ["--transfer", str(source), "--checkpoint", checkpoint, *warmup]
         begun = content(tiny_run(*flags, iterations=1), 0)["actor_state_dict"]
         std = begun.pop("distribution.std_param")
         assert torch.equal(std, torch.full_like(std, 0.1))
         assert same(begun, {name: tensor for name, tensor in taken.items() if name != "distribution.std_param"})
     capsys.readouterr()
-    refused = ["--task", TASK, "--transfer", "--load_run", str(source), "--checkpoint", "2", "--sim_device", "cpu"]
+    refused = ["--task", TASK, "--transfer", str(source), "--checkpoint", "2", "--sim_device", "cpu"]
     assert call(train.main, [*refused, *TINY_TRAINING]) == 2
     assert "train.algorithm.critic_warmup_iterations=50 would train a new value function" in capsys.readouterr().err
 

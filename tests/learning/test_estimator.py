@@ -15,6 +15,7 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from test_resume import content, same
 
+from legged.cli import train
 from legged.errors import ConfigError
 from legged.evaluation.estimation import EstimateMeter
 from legged.evaluation.learning_curves import read_scalars
@@ -27,7 +28,6 @@ from legged.learning.rollout import Rollout
 from legged.learning.runner import Runner
 from legged.mdp.observations import ObservationGroup, ObservationTerms
 from legged.policies.export import export
-from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

@@ -10,12 +10,13 @@ from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, small_c
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 
+from legged.cli import train
+from legged.cli.evaluate import grid as evaluate_grid
 from legged.config.schema import RunnerConfig
 from legged.evaluation.during_training import TrainingEvaluation
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.evaluations import Evaluations
 from legged.learning.timing import read_timing
-from legged.tools import evaluate, train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -150,15 +151,15 @@ def test_the_best_policy_can_be_played_and_trained_on(capsys):
     best = read_checkpoint(folder / "model_best.pt")
     again = tiny_run("--resume", "--checkpoint", "best", iterations=5)
     assert max(checkpoints(again)) == 4
-    flags = ["--task", TASK, "--sim_device", "cpu", "--load_run", str(folder), "--checkpoint"]
+    flags = [str(folder), "--sim-device", "cpu", "--checkpoint"]
     one = ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1", "--physics", "mujoco"]
-    assert call(evaluate.main, [*flags, "best", *one]) == 0
+    assert call(evaluate_grid.main, [*flags, "best", *one]) == 0
     assert json.loads((folder / "evaluation_mujoco.json").read_text())["checkpoint"] == "model_best.pt"
     plain = tiny_run(iterations=1)
-    flags[5] = str(plain)
-    assert call(evaluate.main, [*flags, "best"]) == 2
+    flags[0] = str(plain)
+    assert call(evaluate_grid.main, [*flags, "best"]) == 2
     assert f"{plain.name} has no model_best.pt; with train.runner.evaluate_interval" in capsys.readouterr().err
-    assert call(evaluate.main, [*flags, "bset"]) == 2
+    assert call(evaluate_grid.main, [*flags, "bset"]) == 2
     assert "'bset' (an iteration, or best)" in capsys.readouterr().err
     assert best["iter"] in range(3)
 

@@ -10,6 +10,8 @@ import torch
 from helpers import TASK, TINY_TRAINING, call, checkpoints, small_config, small_task, tiny_run
 from tensordict import TensorDict
 
+from legged.cli import play, train
+from legged.cli.evaluate import grid as evaluate_grid
 from legged.errors import ConfigError
 from legged.learning.captured import CapturedRunner
 from legged.learning.checkpoint import check_fits, read_checkpoint
@@ -17,7 +19,6 @@ from legged.learning.networks import action_std, build_actor
 from legged.learning.run_folder import run_config
 from legged.learning.runner import Runner
 from legged.policies.restore import TrainedPolicy, restore
-from legged.tools import evaluate, play, train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -95,7 +96,7 @@ def test_every_kind_of_network_is_trained_resumed_played_evaluated_and_exported(
     assert run_config(resumed).train.policy == run_config(folder).train.policy
     assert call(play.main, [*BASE, "--load_run", str(folder), "--num_envs", "3", "--no-video"]) == 0
     one_cell = ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1"]
-    assert call(evaluate.main, [*BASE, "--load_run", str(folder), *one_cell]) == 0
+    assert call(evaluate_grid.main, [str(folder), "--sim-device", "cpu", *one_cell]) == 0
 
     policy = TrainedPolicy(run_config(folder), folder / "model_1.pt")
     task, act = restore(policy, [("env.num_envs", 3)], torch.device("cpu"))

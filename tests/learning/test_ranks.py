@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, small_task
+from helpers import HANG_S, TASK, TINY_TRAINING, call, checkpoints, run_folders, small_task
 
+from legged.cli import train
 from legged.commandline.arguments import pick_device
 from legged.errors import ConfigError
 from legged.process.ranks import Ranks
 from legged.registry import make_task, task_config
-from legged.tools import train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -31,7 +31,7 @@ TRAIN = ["--task", TASK, "--sim_device", "cpu", "--num_envs", "8", *TINY_TRAININ
 SPY = """
 import sys, torch
 from legged.process.ranks import Ranks
-from legged.tools import train
+from legged.cli import train
 from legged.learning.runner import Runner
 learn = Runner.train
 
@@ -74,7 +74,7 @@ def torchrun(output: str, *arguments: str, **environment: str):
 
 def ended(process, code: int) -> str:
     """What two processes have said, once they have ended."""
-    assert process.wait(timeout=90) == code, Path("out.txt").read_text()
+    assert process.wait(timeout=HANG_S) == code, Path("out.txt").read_text()
     return Path("out.txt").read_text()
 
 
@@ -84,7 +84,7 @@ def children(process) -> list[int]:
 
 
 def wait_for_iterations(process) -> None:
-    end = time.monotonic() + 90
+    end = time.monotonic() + HANG_S
     while "\nit 1/" not in Path("out.txt").read_text():
         assert process.poll() is None, Path("out.txt").read_text()
         assert time.monotonic() < end
@@ -171,7 +171,7 @@ def test_two_machines_learn_one_policy_into_one_run_folder():
         torchrun("other.txt", *command, GLOO_SOCKET_IFNAME="lo") as other,
     ):
         said = ended(one, 0)
-        assert other.wait(timeout=30) == 0, Path("other.txt").read_text()
+        assert other.wait(timeout=HANG_S) == 0, Path("other.txt").read_text()
     said += Path("other.txt").read_text()
     first, second = (torch.load(f"rank{r}.pt", weights_only=True) for r in (0, 1))
     for network in ("actor", "critic"):
@@ -278,7 +278,7 @@ def test_each_process_has_the_gpu_of_its_number(monkeypatch):
 def test_a_mistake_names_the_process(monkeypatch, capsys):
     as_rank(monkeypatch, 1, 2)
     assert call(train.main, ["--task", "anymal_z"]) == 2
-    assert capsys.readouterr().err.startswith("rank 1: error: --task: there is no task 'anymal_z'")
+    assert capsys.readouterr().err.startswith("rank 1: error: TASK: there is no task 'anymal_z'")
 
 
 @pytest.mark.parametrize("name", ["RANK", "LOCAL_RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE"])

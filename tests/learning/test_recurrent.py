@@ -10,6 +10,7 @@ import torch
 from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, small_config, small_task, tiny_run
 
 import legged.policies.export as export_module
+from legged.cli import play, train
 from legged.errors import ConfigError
 from legged.learning.checkpoint import check_fits, read_checkpoint
 from legged.learning.recurrent import rnn_of
@@ -17,9 +18,8 @@ from legged.learning.run_folder import run_config
 from legged.learning.runner import Runner
 from legged.policies.actor import Actor
 from legged.policies.export import ExportError, export
-from legged.policies.restore import find_policy, restore
+from legged.policies.restore import policy_of, restore
 from legged.registry import task_config
-from legged.tools import play, train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -183,9 +183,7 @@ def test_who_begins_an_episode_acts_as_if_nothing_had_been(kind, inference):
 
 def test_a_restored_policy_forgets(tmp_path):
     folder = tiny_run(*flags("lstm"))
-    args = type("Args", (), {"task": TASK, "load_run": str(folder), "checkpoint": None, "overrides": [], "solver": None})()
-    policy = find_policy(args)
-    task, act = restore(policy, [("env.num_envs", 3)], torch.device("cpu"))
+    task, act = restore(policy_of(str(folder)), [("env.num_envs", 3)], torch.device("cpu"))
     observations = task.reset()
     with torch.inference_mode():
         before = act(observations)

@@ -5,13 +5,13 @@ import subprocess
 import threading
 from pathlib import Path
 
-import legged.tools.train
 import numpy as np
 import pytest
 import torch
 from helpers import TASK, TINY_TRAINING, call, run_folders, small_config, tiny_run
-from legged.tools import train
 
+import legged.cli.train
+from legged.cli import train
 from legged.errors import ConfigError, RunError
 from legged.learning import run_folder as runs
 from legged.learning.run_folder import checkpoints, code_state, create_run, discard_run, find_checkpoint, run_config
@@ -47,7 +47,7 @@ def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(monkeypatc
     ],
 )
 def test_names_that_are_paths_are_refused_before_anything_is_built(override, words, monkeypatch, capsys):
-    monkeypatch.setattr(legged.tools.train, "make_task", lambda *_, **__: pytest.fail("built"))
+    monkeypatch.setattr(legged.cli.train, "make_task", lambda *_, **__: pytest.fail("built"))
     assert call(train.main, [*ARGUMENTS, override]) == 2
     err = capsys.readouterr().err
     assert words in err
@@ -60,7 +60,7 @@ def test_a_failed_start_leaves_no_folder(monkeypatch):
         assert not Path("logs").exists()
         raise KeyError("while building")
 
-    monkeypatch.setattr(legged.tools.train, "make_task", fail)
+    monkeypatch.setattr(legged.cli.train, "make_task", fail)
     with pytest.raises(KeyError):
         train.main(ARGUMENTS)
     assert not Path("logs").exists()
@@ -68,9 +68,7 @@ def test_a_failed_start_leaves_no_folder(monkeypatch):
 
 def test_a_first_iteration_that_fails_leaves_no_folder_and_a_later_one_its_checkpoints(monkeypatch):
     runner = (
-        legged.tools.train.CapturedRunner
-        if "captured" in str(small_config().train.runner.loop)
-        else legged.tools.train.Runner
+        legged.cli.train.CapturedRunner if "captured" in str(small_config().train.runner.loop) else legged.cli.train.Runner
     )
     save, saved = runner.save, []
 
@@ -115,7 +113,7 @@ def test_a_folder_with_something_else_in_it_is_not_discarded():
 @pytest.mark.parametrize("room", [0, 2**20])
 def test_a_full_disk_is_seen_before_anything_is_built(room, monkeypatch, capsys):
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(2**30, 2**30 - room, room))
-    monkeypatch.setattr(legged.tools.train, "make_task", lambda *_, **__: pytest.fail("built"))
+    monkeypatch.setattr(legged.cli.train, "make_task", lambda *_, **__: pytest.fail("built"))
     assert train.main(ARGUMENTS) == 1
     assert capsys.readouterr().err == f"error: logs/{TASK}: cannot write there: no space left on the disk\n"
 
@@ -146,7 +144,7 @@ def test_folders_and_links_that_lead_nowhere_are_no_checkpoints():
     (folder / "model_5.pt").mkdir(parents=True)
     (folder / "model_7.pt").symlink_to("gone.pt")
     assert checkpoints(folder) == {}
-    with pytest.raises(ConfigError, match="run holds no checkpoint"):
+    with pytest.raises(ConfigError, match="run: holds no checkpoint"):
         find_checkpoint(folder, None)
     (folder / "model_3.pt").write_bytes(b"")
     assert list(checkpoints(folder)) == [3]
@@ -165,16 +163,17 @@ def test_the_hint_names_everything_that_play_needs(capsys):
     Path("my tasks.py").write_text(f"import legged\nlegged.register('mine', {{'extends': '{TASK}'}})\n")
     arguments = ["--task", "mine", "--import", "my tasks.py", "--experiment_name", "second try", "--run_name", "[x]"]
     assert train.main([*ARGUMENTS[2:], *arguments]) == 0
-    expected = "python play.py --task mine --import 'my tasks.py' --experiment_name 'second try'"
+    (folder,) = run_folders()
+    expected = f"legged play --import 'my tasks.py' '{folder}'"
     assert hint(capsys.readouterr().out) == expected
 
 
 def test_the_hint_names_the_run_where_it_is_not_the_newest(monkeypatch, capsys):
     other = tiny_run("--run_name", "other", iterations=1)
-    monkeypatch.setattr(legged.tools.train, "find_run", lambda *_: other)
+    monkeypatch.setattr(legged.cli.train, "find_run", lambda *_: other)
     assert train.main([*ARGUMENTS, "--run_name", "this"]) == 0
     (this,) = [folder for folder in run_folders() if folder.name.endswith("_this")]
-    assert hint(capsys.readouterr().out) == f"python play.py --task {TASK} --load_run {this.name}"
+    assert hint(capsys.readouterr().out) == f"legged play {this}"
 
 
 # ---- the state of the code -------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import torch
 from helpers import POLICY, POLICY_ITERATION, TASK, TINY_TRAINING, call, checkpoints, tiny_run
 from test_resume import EVENTFUL, content, same
 
+from legged.cli import play, train
 from legged.config import to_dict
 from legged.envs.checks import check_lengths
 from legged.errors import ConfigError
@@ -17,7 +18,6 @@ from legged.learning.student_rollout import StudentRollout
 from legged.learning.student_runner import StudentRunner
 from legged.learning.teacher import find_teacher, teacher_in, with_teacher
 from legged.registry import make_task, task_config
-from legged.tools import play, train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -186,7 +186,7 @@ def test_evaluations_during_training_are_of_the_student():
 def test_the_sequel_goes_on_from_rewards(capsys):
     """PPO begins with what the student has learned, a new value function that learns alone at first, and a std of its own."""
     source = student(num_envs=24)
-    sequel = ["--task", "anymal_c_student_ppo", "terrain.mesh_type=plane", "--transfer", "--load_run", str(source)]
+    sequel = ["--task", "anymal_c_student_ppo", "terrain.mesh_type=plane", "--transfer", str(source)]
     folder = tiny_run(*sequel, "train.algorithm.critic_warmup_iterations=1", "train.runner.save_interval=1", iterations=2)
     learned, begun, now = (content(f, i)["actor_state_dict"] for f, i in ((source, 1), (folder, 0), (folder, 1)))
     assert torch.equal(begun.pop("distribution.std_param"), torch.full((12,), 0.2))
@@ -210,7 +210,7 @@ UNFIT = {
     "step": (["control.decimation=5"], "the control step 0.02 there, 0.025 here"),
     "clip": (["observations.clip=5.0"], "observations.clip 100 there, 5 here"),
     "robot": (["robot=go2"], "made for another robot: 'anymal_c' with 12 joints"),
-    "nobody": (["--teacher", "anymal_x"], "there is no run 'anymal_x'"),
+    "nobody": (["--teacher", "anymal_x"], "there is no task and no run 'anymal_x'"),
     "divisor": (["train.distillation.gradient_length=3"], "must divide train.runner.num_steps_per_env=4"),
     "estimator": (["train.policy.estimator.targets=[base_lin_vel]"], "a student learns no estimator"),
     "std": (["train.policy.state_dependent_std=true"], "a student learns the mean of the actions alone"),
@@ -266,7 +266,7 @@ def test_what_a_teacher_knows_of_the_randomisation_must_be_on_its_scale(capsys):
 def test_a_policy_with_an_estimator_is_no_teacher(capsys):
     folder = tiny_run("--task", TASK, "train.policy.estimator.targets=[base_lin_vel]", iterations=1)
     assert call(train.main, [*STUDENT, "--teacher", str(folder), *TINY_TRAINING, "--sim_device", "cpu"]) == 2
-    assert "has an estimator, and no teacher can have one" in capsys.readouterr().err
+    assert "has an estimator, which a teacher can't have" in capsys.readouterr().err
 
 
 def test_observations_that_a_students_task_has_not_are_named(capsys):
@@ -279,14 +279,14 @@ def test_flags_that_do_not_go_together_are_refused(capsys):
     small = [*TINY_TRAINING, "--sim_device", "cpu"]
     assert call(train.main, ["--task", TASK, "--teacher", TASK, *small]) == 2
     assert f"--teacher: '{TASK}' learns from rewards" in capsys.readouterr().err
-    assert call(train.main, [*STUDENT, "--transfer", "--load_run", TASK, *small]) == 2
+    assert call(train.main, [*STUDENT, "--transfer", TASK, *small]) == 2
     assert "--transfer: 'anymal_c_student' learns from a teacher, and begins anew" in capsys.readouterr().err
     assert call(train.main, [*STUDENT, "--teacher", "", *small]) == 2
-    assert "error: --teacher: 'anymal_c_student' learns from a teacher, and none is named" in capsys.readouterr().err
+    assert "error: --teacher: 'anymal_c_student' learns from a teacher; name one" in capsys.readouterr().err
     folder = student()
     resume = [*STUDENT[:2], "--resume", "--load_run", str(folder), "--max_iterations", "9", *small]
     assert call(train.main, [*resume, "--teacher", "anymal_c"]) == 2
-    assert f"{TEACHER}: a resumed training keeps its own, '{TASK}'; got 'anymal_c'" in capsys.readouterr().err
+    assert f"{TEACHER}: a resumed training can't change '{TASK}'; got 'anymal_c'" in capsys.readouterr().err
 
 
 def test_a_checkpoint_without_its_teacher_is_not_resumed(capsys):
@@ -296,13 +296,13 @@ def test_a_checkpoint_without_its_teacher_is_not_resumed(capsys):
     torch.save(saved, folder / "model_1.pt")
     resume = [*STUDENT[:2], "--resume", "--load_run", str(folder), "--max_iterations", "9", "--sim_device", "cpu"]
     assert call(train.main, resume) == 2
-    assert "holds no teacher to go on learning from" in capsys.readouterr().err
+    assert "holds no teacher to continue with" in capsys.readouterr().err
 
 
 def test_a_group_of_the_students_own_keeps_its_name():
     group = {"terms": ["dof_pos"]}
     cfg = task_config("anymal_c_student", [*SMALL, ("observations.groups.teacher_actor", group)], on_cpu=True)
-    with pytest.raises(ConfigError, match=r"observations\.groups\.teacher_actor: this is what the teacher's group is called"):
+    with pytest.raises(ConfigError, match=r"observations\.groups\.teacher_actor: the teacher's group has this name"):
         find_teacher(cfg)
 
 

@@ -9,6 +9,7 @@ from helpers import call, small_config, small_task, tiny_run
 from reference import States, random_states
 from tensordict import TensorDict
 
+from legged.cli import train
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
 from legged.learning.captured import CapturedRunner
@@ -17,7 +18,6 @@ from legged.learning.symmetry import augment
 from legged.mdp.mirror_images import MirrorImages
 from legged.registry import make_task, task_config
 from legged.robots.mirror import Mirror
-from legged.tools import train
 
 SYMMETRIC = ("train.algorithm.symmetry", True)
 ONE_CORE = ("sim.physics", "mujoco"), ("sim.threads", 1)
@@ -238,7 +238,7 @@ class Sideless(LeggedRobot):
 
 def test_a_task_without_mirror_images_learns_without_symmetry_only():
     task = Sideless(small_config(SYMMETRIC))
-    with pytest.raises(ConfigError, match=r"train\.algorithm\.symmetry: Sideless has no mirror images; false learns without"):
+    with pytest.raises(ConfigError, match=r"train\.algorithm\.symmetry: Sideless has no mirror images; must be false"):
         Runner(task)
     Runner(Sideless(small_config(("train.algorithm.symmetry", False))))
 

@@ -5,13 +5,13 @@ import sys
 import types
 from pathlib import Path
 
-import legged.tools.train
 import pytest
-from helpers import TASK, TINY_TRAINING, call, run_folders, tiny_run
-from legged.tools import train
+from helpers import HANG_S, TASK, TINY_TRAINING, call, run_folders, tiny_run
 from rsl_rl.utils import wandb_log_writer
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import legged.cli.train
+from legged.cli import train
 from legged.learning.checkpoint import read_checkpoint
 
 pytestmark = pytest.mark.usefixtures("workplace")
@@ -86,7 +86,7 @@ def scalars(folder: Path) -> dict[str, list[int]]:
 def test_weights_and_biases_get_what_tensorboard_gets_and_the_files_of_the_run(monkeypatch):
     fake = FakeWandb()
     monkeypatch.setattr(wandb_log_writer, "wandb", fake)
-    write_timing = legged.tools.train.write_timing
+    write_timing = legged.cli.train.write_timing
 
     def with_report(folder, timing):
         """A report and a video, written at the end of a run."""
@@ -94,7 +94,7 @@ def test_weights_and_biases_get_what_tensorboard_gets_and_the_files_of_the_run(m
         (folder / "walk.mp4").write_bytes(b"")
         write_timing(folder, timing)
 
-    monkeypatch.setattr(legged.tools.train, "write_timing", with_report)
+    monkeypatch.setattr(legged.cli.train, "write_timing", with_report)
     folder = tiny_run("train.runner.logger=wandb", "train.runner.logger_project=dogs", iterations=2)
     assert fake.of("init") == [
         ({"project": "dogs", "entity": None, "name": folder.name, "config": {"log_dir": str(folder)}},)
@@ -153,7 +153,7 @@ def test_a_training_learns_the_same_with_a_tracker_and_without():
 def test_a_tracker_that_is_not_there_is_one_line_before_anything_is_built(logger, words, monkeypatch, capsys):
     own_tracker()
     monkeypatch.setattr(wandb_log_writer, "wandb", None)
-    monkeypatch.setattr(legged.tools.train, "make_task", lambda *_, **__: pytest.fail("built"))
+    monkeypatch.setattr(legged.cli.train, "make_task", lambda *_, **__: pytest.fail("built"))
     assert call(train.main, [*ARGUMENTS, f"train.runner.logger={logger}"]) == 2
     err = capsys.readouterr().err
     assert words in err
@@ -165,7 +165,7 @@ def test_a_writer_beside_the_user_is_found_by_a_program_that_lies_elsewhere():
     Path("my_lines.py").write_text("Nothing = 3")
     program = Path(legged.__file__).parents[1] / "train.py"
     arguments = [sys.executable, str(program), *ARGUMENTS, "train.runner.logger=my_lines:Nothing"]
-    done = subprocess.run(arguments, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=HANG_S, check=False)
     assert done.returncode == 2
     assert "'my_lines:Nothing' does not extend rsl_rl.utils.log_writer.LogWriter" in done.stderr
 

@@ -1,5 +1,6 @@
 """Training from the command line: what a run leaves behind, how it goes on, and how it stops."""
 
+import argparse
 import contextlib
 import os
 import re
@@ -12,16 +13,16 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, tiny_run, wait_for
+from helpers import HANG_S, TASK, TINY_TRAINING, call, checkpoints, run_folders, tiny_run, wait_for
 
-from legged.commandline.arguments import overrides
+from legged.cli import train
+from legged.commandline.arguments import add_policy_arguments, policy_overrides
 from legged.config import from_dict
 from legged.config.loader import read_yaml
 from legged.learning.run_folder import find_run, run_config
 from legged.learning.runner import Runner
-from legged.policies.restore import find_policy
+from legged.policies.restore import policy_of
 from legged.registry import make_task, task_config
-from legged.tools import train
 
 REPOSITORY = Path(train.__file__).parents[2]
 UPDATES = 20  # optimiser steps per iteration: 5 epochs of 4 mini-batches
@@ -87,7 +88,7 @@ def test_lines_are_plain_where_there_is_no_terminal(capsys):
         for pattern in (r"[\d,]+ steps/s", r"error \d\.\d{3} m/s \d\.\d{3} rad/s", r"reward ", r"std 0\.\d\d"):
             assert re.search(pattern, line), line
     assert "finished after 2 iterations: 64 steps" in out
-    assert f"python play.py --task {TASK}" in out
+    assert f"legged play {TASK}" in out
 
 
 def test_a_fixed_seed_trains_to_the_same_network():
@@ -197,7 +198,7 @@ def test_a_run_without_a_name_is_no_new_training(capsys):
     """As a script has it whose variable is empty."""
     arguments = ["--task", TASK, "--sim_device", "cpu", "--load_run", "", "--max_iterations", "1", *SIZES]
     assert call(train.main, arguments) == 2
-    assert capsys.readouterr().err.startswith("error: --load_run: there is no run ''")
+    assert capsys.readouterr().err.startswith("error: --load-run: there is no run ''")
     assert run_folders() == []
 
 
@@ -210,18 +211,14 @@ def test_the_newest_run_is_the_one_trained_last_not_the_one_looked_at_last():
     assert find_run(task_config(TASK), None) == new
 
 
-def test_find_policy_takes_the_flags_that_play_and_evaluate_have():
-    import argparse
-
-    from legged.commandline.arguments import add_run_arguments, add_task_arguments
-
+@pytest.mark.parametrize("name", ["walking", "walking/{run}", "logs/walking/{run}"])
+def test_a_policy_is_found_by_the_arguments_that_commands_share(name):
     folder = tiny_run("--experiment_name", "walking", "train.runner.save_interval=1")
     parser = argparse.ArgumentParser()
-    add_task_arguments(parser)
-    add_run_arguments(parser)
-    args = parser.parse_intermixed_args(["--task", TASK, "--experiment_name", "walking", "--checkpoint", "0", "env.seed=3"])
-    assert ("env.seed", 3) in overrides(args)
-    policy = find_policy(args)
+    add_policy_arguments(parser)
+    args = parser.parse_intermixed_args([name.format(run=folder.name), "--checkpoint", "0", "env.seed=3"])
+    assert policy_overrides(args) == [("env.seed", 3)]
+    policy = policy_of(args.policy, args.checkpoint)
     assert policy.checkpoint == folder / "model_0.pt"
     assert policy.cfg == from_dict(read_yaml(folder / "config.yaml"))
 
@@ -256,7 +253,7 @@ def test_a_signal_stops_after_the_iteration_with_a_checkpoint_of_it(number):
     with training("train.runner.save_interval=100000") as process:
         wait_for(lambda: "\nit 1/" in Path("out.txt").read_text(), process)
         process.send_signal(number)
-        assert process.wait(timeout=30) == 128 + number
+        assert process.wait(timeout=HANG_S) == 128 + number
     out = Path("out.txt").read_text()
     assert "Traceback" not in out
     assert "stopping after this iteration" in out

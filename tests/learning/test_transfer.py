@@ -9,13 +9,13 @@ import torch
 from helpers import POLICY, POLICY_ITERATION, TASK, TINY_TRAINING, call, checkpoints, run_folders, tiny_run
 
 import legged
+from legged.cli import play, train
 from legged.learning.captured import CapturedRunner
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.run_folder import run_config
 from legged.learning.runner import Runner
 from legged.learning.transfer import first_difference
 from legged.registry import make_task, task_config
-from legged.tools import play, train
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -38,7 +38,7 @@ def another_task():
 
 
 def transfer(*arguments: str, iterations: int = 2) -> Path:
-    return tiny_run("--transfer", "--task", OTHER, *arguments, iterations=iterations)
+    return tiny_run("--task", OTHER, "--transfer", *arguments, iterations=iterations)
 
 
 def content(folder: Path, iteration: int) -> dict:
@@ -92,7 +92,7 @@ def settings_of(folder: Path) -> list[tuple[str, object]]:
 
 def test_a_transferred_run_counts_from_0_says_where_it_comes_from_and_is_resumed(capsys):
     source = tiny_run(iterations=3)
-    folder = transfer("--load_run", f"{TASK}/{source.name}")
+    folder = transfer(f"{TASK}/{source.name}")
     assert folder.parent == Path("logs") / OTHER
     assert checkpoints(folder) == [0, 1]
     assert run_config(folder).task == OTHER
@@ -109,7 +109,7 @@ def test_a_transferred_run_counts_from_0_says_where_it_comes_from_and_is_resumed
     resumed = tiny_run("--resume", "--task", OTHER, "--load_run", str(folder), iterations=4)
     assert content(resumed, 3)["infos"]["transferred_from"] == origin
     assert "transferred_from" not in content(source, 2)["infos"]
-    again = transfer("--load_run", str(resumed))
+    again = transfer(str(resumed))
     assert content(again, 1)["infos"]["transferred_from"] == {"file": f"{resumed}/model_3.pt", "task": OTHER, "iteration": 3}
 
 
@@ -125,7 +125,7 @@ def test_what_was_taken_is_said(capsys):
     rate = content(source, 1)["infos"]["learning_rate"]
     std = content(source, 1)["actor_state_dict"]["distribution.std_param"]
     sizes = ["train.policy.obs_normalization=true", "train.policy.critic_hidden_dims=[16, 8]"]
-    out = said(capsys, "--load_run", str(source), *sizes)
+    out = said(capsys, str(source), *sizes)
     assert (
         f"took from {source} ({TASK}, iteration 1): actor (8) and critic (16, 8), observation normaliser, Adam's state,"
         f" learning rate {rate:.2g}, std {float(std.min()):.2f} to {float(std.max()):.2f}\n"
@@ -136,7 +136,7 @@ def test_what_was_taken_is_said(capsys):
 
 def test_a_fixed_learning_rate_is_the_configurations(capsys):
     source = tiny_run()
-    out = said(capsys, "--load_run", str(source), "train.algorithm.schedule=fixed", "train.algorithm.learning_rate=3e-4")
+    out = said(capsys, str(source), "train.algorithm.schedule=fixed", "train.algorithm.learning_rate=3e-4")
     assert "learning rate 0.0003 (fixed, the configuration's)" in out
     (folder,) = Path("logs", OTHER).iterdir()
     (group,) = content(folder, 0)["optimizer_state_dict"]["param_groups"]
@@ -145,11 +145,11 @@ def test_a_fixed_learning_rate_is_the_configurations(capsys):
 
 def test_an_optimiser_of_another_kind_begins_anew(capsys):
     source = tiny_run("train.algorithm.optimizer=rmsprop")
-    assert "no state of Adam (it trained with RMSprop)" in said(capsys, "--load_run", str(source))
+    assert "no state of Adam (it trained with RMSprop)" in said(capsys, str(source))
     saved = content(source, 1)
     del saved["optimizer_state_dict"]
     torch.save(saved, source / "model_1.pt")
-    out = said(capsys, "--load_run", str(source), "train.algorithm.optimizer=rmsprop")
+    out = said(capsys, str(source), "train.algorithm.optimizer=rmsprop")
     assert "no state of RMSprop (it holds none)" in out
 
 
@@ -159,15 +159,15 @@ def test_an_optimiser_of_another_kind_begins_anew(capsys):
 @pytest.mark.parametrize("name", [TASK, f"resources/policies/{TASK}", str(POLICY)])
 def test_a_shipped_policy_is_named_by_its_task_or_its_path(capsys, name):
     sizes = [f"train.policy.{network}_hidden_dims=[128, 64, 32]" for network in ("actor", "critic")]
-    out = said(capsys, "--load_run", name, *sizes)
+    out = said(capsys, name, *sizes)
     assert f"policies/{TASK} ({TASK}, iteration {POLICY_ITERATION}): actor and critic (128, 64, 32)" in out
 
 
 def test_the_newest_run_of_another_tasks_folder_is_taken(capsys):
     tiny_run()
     source = tiny_run(iterations=3)
-    assert f"took from {source} ({TASK}, iteration 2)" in said(capsys, "--load_run", TASK)
-    assert f"took from {source} ({TASK}, iteration 0)" in said(capsys, "--load_run", str(source), "--checkpoint", "0")
+    assert f"took from {source} ({TASK}, iteration 2)" in said(capsys, TASK)
+    assert f"took from {source} ({TASK}, iteration 0)" in said(capsys, str(source), "--checkpoint", "0")
 
 
 def refused(capsys, *arguments: str) -> str:
@@ -184,12 +184,12 @@ def refused(capsys, *arguments: str) -> str:
 
 def test_flags_that_do_not_go_together(capsys):
     source = tiny_run()
-    assert "--transfer: needs --load_run" in refused(capsys, "--transfer")
-    error = refused(capsys, "--transfer", "--resume", "--load_run", str(source))
-    assert re.search(r"--transfer: .*--resume", error)
-    error = refused(capsys, "--transfer", "--load_run", f"{TASK}/{source.name}x")
-    assert f"--load_run: there is no run '{TASK}/{source.name}x'; did you mean '{TASK}/{source.name}'?" in error
-    assert "no checkpoint 7" in refused(capsys, "--transfer", "--load_run", str(source), "--checkpoint", "7")
+    for option in (["--resume"], ["--load-run", str(source)]):
+        error = refused(capsys, "--transfer", str(source), *option)
+        assert re.search(rf"{option[0]}: .*--transfer", error)
+    error = refused(capsys, "--transfer", f"{TASK}/{source.name}x")
+    assert f"--transfer: there is no task and no run '{TASK}/{source.name}x'; did you mean '{TASK}/{source.name}'?" in error
+    assert "no checkpoint 7" in refused(capsys, "--transfer", str(source), "--checkpoint", "7")
 
 
 # ---- what does not fit -----------------------------------------------------------------------------------------------
@@ -221,14 +221,14 @@ def test_what_differs_is_named_before_anything_is_built(capsys, monkeypatch, cha
     source = tiny_run()
     monkeypatch.setattr(train, "make_task", lambda *_, **__: pytest.fail("built"))
     override, text = DIFFERENT[change]
-    error = refused(capsys, "--transfer", "--load_run", str(source), override)
+    error = refused(capsys, "--transfer", str(source), override)
     assert re.search(rf"{source}/model_1\.pt: .*{text}", error), error
 
 
 def test_every_group_that_differs_is_named(capsys):
     source = tiny_run()
     fewer = [f"observations.{group}=[{TERMS}]" for group in ("actor", "critic")]
-    error = refused(capsys, "--transfer", "--load_run", str(source), *fewer)
+    error = refused(capsys, "--transfer", str(source), *fewer)
     assert f"made for other observations than '{OTHER}': actor: term 7" in error
     assert "; critic: term 7" in error
 
@@ -239,7 +239,7 @@ def test_terms_of_another_width_are_named_when_the_task_is_built(capsys):
     heights = f"observations.critic=[{TERMS}, heights]"
     source = tiny_run(heights, *points)
     wider = ["terrain.measured_points_x=[0.0, 0.5, 1.0]", points[1]]
-    error = refused(capsys, "--transfer", "--load_run", str(source), heights, *wider)
+    error = refused(capsys, "--transfer", str(source), heights, *wider)
     assert "critic: term 7 is 'heights' (6) here, 'heights' (4) there" in error
 
 
@@ -248,7 +248,7 @@ def test_another_robots_joints_are_refused(capsys):
     saved = content(source, 1)
     saved["infos"]["robot"]["joints"] = ["hip", "knee"]
     torch.save(saved, source / "model_1.pt")
-    error = refused(capsys, "--transfer", "--load_run", str(source))
+    error = refused(capsys, "--transfer", str(source))
     assert "made for another robot: 'anymal_c' with 2 joints" in error
 
 
@@ -257,12 +257,12 @@ def test_a_checkpoint_that_says_nothing_of_itself_is_compared_by_its_runs_config
     saved = content(source, 1)
     saved["infos"] = {"learning_rate": saved["infos"]["learning_rate"]}
     torch.save(saved, source / "model_1.pt")
-    assert "(no task named, iteration 1): actor and critic (8)" in said(capsys, "--load_run", str(source))
-    error = refused(capsys, "--transfer", "--load_run", str(source), f"observations.actor=[{TERMS}]")
+    assert "(no task named, iteration 1): actor and critic (8)" in said(capsys, str(source))
+    error = refused(capsys, "--transfer", str(source), f"observations.actor=[{TERMS}]")
     assert "actor: term 7 is none here, 'actions' there" in error
     Path("elsewhere").mkdir()
     shutil.copy(source / "model_1.pt", "elsewhere")
-    assert "elsewhere is no run folder" in refused(capsys, "--transfer", "--load_run", "elsewhere")
+    assert "--transfer: 'elsewhere' holds no run" in refused(capsys, "--transfer", "elsewhere")
 
 
 def test_a_checkpoint_with_other_actions_is_refused(capsys):
@@ -273,7 +273,7 @@ def test_a_checkpoint_with_other_actions_is_refused(capsys):
     for name in ("mlp.2.weight", "mlp.2.bias", "distribution.std_param"):
         state[name] = state[name][:6]
     torch.save(saved, source / "model_1.pt")
-    error = refused(capsys, "--transfer", "--load_run", str(source))
+    error = refused(capsys, "--transfer", str(source))
     assert f"its policy gives 6 actions, '{OTHER}' takes 12" in error
 
 
@@ -309,9 +309,9 @@ def test_a_policy_alone_is_played_but_not_trained_on(capsys):
         call(play.main, ["--task", TASK, "--load_run", str(folder), "--sim_device", "cpu", "--headless", "--no-video"]) == 0
     )
     assert "largest difference to the policy" in capsys.readouterr().out
-    refused = ["--task", OTHER, "--transfer", "--load_run", str(folder), *TINY_TRAINING, "--sim_device", "cpu"]
+    refused = ["--task", OTHER, "--transfer", str(folder), *TINY_TRAINING, "--sim_device", "cpu"]
     assert call(train.main, refused) == 2
     assert "holds a policy alone, without a value function; it can be played, not trained on" in capsys.readouterr().err
     resume = ["--task", TASK, "--resume", "--load_run", str(folder), *TINY_TRAINING, "--max_iterations", "9"]
     assert call(train.main, [*resume, "--sim_device", "cpu"]) == 2
-    assert "holds no optimiser; it can be played, not trained on" in capsys.readouterr().err
+    assert "holds no optimiser, so its training can't be resumed" in capsys.readouterr().err

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 import torch
 import zoo
+from evaluated_run import find_runs
 from helpers import TASK, TINY_TRAINING, call, run_folders, tiny_run, wait_for
 from shipping import LARGEST, ship
 
 from legged.errors import ConfigError
-from legged.evaluation.judged_run import find_runs
 from legged.learning.timing import read_timing
 
 pytestmark = pytest.mark.usefixtures("workplace")
@@ -111,7 +111,7 @@ def test_evaluations_are_asked_for_as_the_arguments_say():
 # ---- the command -----------------------------------------------------------------------------------------------------
 
 
-def test_tasks_are_trained_judged_tabulated_and_shipped_and_nothing_is_done_twice(tmp_path, capfd):
+def test_tasks_are_trained_judged_tabulated_and_shipped_and_nothing_is_done_twice(tmp_path, capfd, monkeypatch):
     (tmp_path / "bad.py").write_text(
         "import os, signal\n"
         "from legged import LeggedRobot, register\n"

@@ -10,9 +10,9 @@ import torch
 import warp as wp
 from devices import on_gpu
 from helpers import call
-from legged.tools.train import main
 from reference import heaps, random_states, roll
 
+from legged.cli.train import main
 from legged.errors import ConfigError
 from legged.physics.fused.constraint_solver import ConstraintSolver
 
@@ -157,7 +157,7 @@ def test_a_world_that_is_no_number_ends_and_harms_no_neighbour(robot, make_physi
 
 @pytest.mark.parametrize(
     ("sim", "reason"),
-    [({"njmax": 1000}, "1000 constraint rows .* are more than 512")],
+    [({"njmax": 1000}, "1000 constraint rows .* exceed 512")],
 )
 def test_what_it_does_not_know_is_refused(make_physics, sim, reason):
     with pytest.raises(ConfigError, match=f"sim.step=fused: .*{reason}"):

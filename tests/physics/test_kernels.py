@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 import warp as wp
+from helpers import HANG_S
 
+from legged.cli import warmup
 from legged.physics.warp.compile import Build, Line, compile_ahead, launched
-from legged.tools import warmup
 
 # Two modules with a kernel each, one of them launched with two block sizes, and a third that nothing launches.
 MODELS = """
@@ -64,7 +65,7 @@ def start(folder: Path, cache: Path) -> subprocess.Popen:
 
 
 def finish(process: subprocess.Popen) -> str:
-    out, _ = process.communicate(timeout=120)
+    out, _ = process.communicate(timeout=HANG_S)
     assert process.returncode == 0
     assert "untouched [1.0, 1.0, 1.0, 1.0]" in out
     assert "scaled [6.0, 6.0, 6.0, 6.0]" in out
@@ -88,7 +89,7 @@ def test_missing_modules_are_compiled_once_though_two_processes_start_together(t
 def test_a_dry_run_of_a_step_names_the_modules_that_a_step_loads(make_physics, monkeypatch):
     physics = make_physics("mujoco_warp", step="library")
     device = wp.get_device("cpu")
-    functions = (physics._step, physics._exchange.kinematics, physics._exchange.contact_forces)
+    functions = (physics._step, physics._state_io.kinematics, physics._state_io.contact_forces)
     before = physics.robot_state.base_pos.clone()
     noted = {build.module for build in launched(device, functions)}
     assert physics.robot_state.base_pos.equal(before)
@@ -116,7 +117,7 @@ def test_warp_is_itself_again_after_a_dry_run():
 
 def test_warmup_leaves_nothing_to_compile(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    arguments = ["--task", "anymal_c_flat", "--num_envs", "2", "--sim_device", "cpu", "sim.physics=mujoco_warp"]
+    arguments = ["anymal_c_flat", "--num-envs", "2", "--sim_device", "cpu", "sim.physics=mujoco_warp"]
     assert warmup.main(arguments) == 0
     out = capsys.readouterr().out
     assert "anymal_c_flat: ready in" in out
@@ -127,7 +128,7 @@ def test_warmup_leaves_nothing_to_compile(tmp_path, monkeypatch, capsys):
 
 
 def test_warmup_has_nothing_to_do_for_the_c_engine(capsys):
-    assert warmup.main(["--task", "anymal_c_flat", "--sim_device", "cpu", "sim.physics=mujoco"]) == 0
+    assert warmup.main(["anymal_c_flat", "--sim-device", "cpu", "sim.physics=mujoco"]) == 0
     assert "nothing to do" in capsys.readouterr().out
 
 

@@ -263,11 +263,11 @@ def test_chosen_tiles_come_with_the_border_on_their_side():
 def test_training_grid_builds_in_bounded_time():
     """200 tiles of 80 x 80 cells, 0.5 s alone on one core."""
     terrain = Terrain.build(TerrainConfig(mesh_type="height_map", proportions=TRAINING), seed=1)
-    start = time.perf_counter()
+    start = time.process_time()  # of this process alone: others may have the core
     spec = mujoco.MjSpec()
     geoms = add_terrain(spec, terrain)
     model = spec.compile()
-    assert time.perf_counter() - start < 8.0
+    assert time.process_time() - start < 8.0
     assert model.ngeom == len(geoms) < 7000
     model, data = seen(terrain)
     _, _, x, y = points_in_cells(terrain.height_map, 300)

@@ -8,12 +8,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import ENGINE, POLICY, POLICY_ITERATION, TASK, wait_for
+from helpers import ENGINE, HANG_S, POLICY, POLICY_ITERATION, TASK, until, wait_for
 from PIL import Image
 
 from legged.learning.run_folder import run_config
@@ -28,8 +28,6 @@ pytest.importorskip("viser", reason="the extra `watch` is not installed")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 """WebGL without a GPU."""
-PATIENCE_S = 90.0
-"""Pictures take long without a GPU, on a machine that does other things too [s]."""
 
 
 def page_of(task: str, robots: int = 1) -> Page:
@@ -57,18 +55,10 @@ def running(page: Page) -> Iterator[Page]:
         yield page
     finally:
         ended.set()
-        thread.join(timeout=PATIENCE_S)
+        thread.join(timeout=HANG_S)
         page.close()
     assert not failures, failures[0]
     assert not thread.is_alive()
-
-
-def until(condition: Callable[[], object]) -> None:
-    """Wait until something holds."""
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
 
 
 def labels(page: Page) -> list[str]:
@@ -141,7 +131,7 @@ def test_a_browser_draws_the_robot_and_moves_it():
     with running(page_of(TASK)) as shown, api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=FLAGS)
         window = browser.new_page(viewport={"width": 900, "height": 420})
-        window.set_default_timeout(1000.0 * PATIENCE_S)
+        window.set_default_timeout(1000.0 * HANG_S)
         wrong: list[str] = []
         window.on("pageerror", lambda error: wrong.append(str(error)))
         window.goto(url(HOST, shown.port))
@@ -151,7 +141,7 @@ def test_a_browser_draws_the_robot_and_moves_it():
         window.keyboard.press("End")
         until(lambda: shown.session.command == [1.1, 0.0, 0.0])
         until(lambda: float(shown.session.task.commands[0, 0]) == pytest.approx(1.1))
-        assert window.locator("text=reward parts [1/s]").count() == 1
+        assert window.locator("text=reward terms [1/s]").count() == 1
         slider.blur()
         window.keyboard.press("p")  # a picture that stands still is drawn sooner
         until(lambda: not shown.session.running)
@@ -171,13 +161,13 @@ def test_a_browser_draws_the_robot_and_moves_it():
 
 def test_ctrl_c_ends_it_as_it_ends_other_tools(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
-    command = [sys.executable, "-m", "legged.tools.watch", "--task", TASK, "--num_envs", "1", "--port", "0"]
+    command = [sys.executable, "-m", "legged", "watch", TASK, "--num-envs", "1", "--port", "0"]
     with Path("out.txt").open("w") as out, Path("err.txt").open("w") as err:
         process = subprocess.Popen(command, stdout=out, stderr=err)
         try:
             wait_for(lambda: "watch it at http://127.0.0.1:" in Path("out.txt").read_text(), process)
             process.send_signal(signal.SIGINT)
-            assert process.wait(timeout=30) == 130
+            assert process.wait(timeout=HANG_S) == 130
         finally:
             process.kill()
     assert Path("err.txt").read_text() == "interrupted\n"

@@ -1,6 +1,5 @@
 """Which run a live view shows, and which checkpoint of it."""
 
-import argparse
 import os
 import shutil
 from pathlib import Path
@@ -14,14 +13,6 @@ from legged.learning.run_folder import BEST, BEST_MODEL, CONFIG_FILE, SHIPPED_MO
 from legged.play.live.source import CheckpointFollower, Watched, find_watched
 
 pytestmark = pytest.mark.usefixtures("workplace")
-
-
-def asked(
-    task: str | None = None, load_run: str | None = None, checkpoint: int | str | None = None, experiment: str | None = None
-):
-    """What a command line asks for."""
-    flags = {"task": task, "load_run": load_run, "checkpoint": checkpoint, "experiment_name": experiment}
-    return find_watched(argparse.Namespace(**flags, overrides=[], solver=None))
 
 
 def begin(name: str, *checkpoints: int, when: float) -> Path:
@@ -38,58 +29,56 @@ def begin(name: str, *checkpoints: int, when: float) -> Path:
 
 
 def test_the_newest_run_of_all_is_shown_also_while_it_has_no_checkpoint():
-    with pytest.raises(ConfigError, match=r"--load_run: there is no run in logs; train one first, or name a task"):
-        asked()
+    with pytest.raises(ConfigError, match=r"POLICY: there is no run in logs/; train one first, or name a task"):
+        find_watched(None, None)
     older = begin(f"{TASK}/older", 0, 50, when=1000.0)
-    assert asked().folder == older
+    assert find_watched(None, None).folder == older
     other = begin("other/middle", 10, when=500.0)
     young = begin(f"{TASK}/young", when=100.0)
-    assert asked().folder == young
-    assert asked(experiment="other").folder == other
-    assert asked(task=TASK, experiment="other").folder == other
+    assert find_watched(None, None).folder == young
+    assert find_watched("other", None).folder == other
     os.utime(older / "model_50.pt")  # it goes on
-    assert asked().folder == older
+    assert find_watched(None, None).folder == older
 
 
 def test_a_task_without_a_run_shows_its_shipped_policy(monkeypatch):
-    assert asked(task=TASK).folder == POLICY
+    assert find_watched(TASK, None).folder == POLICY
     run = begin(f"{TASK}/run", 50, when=1.0)
-    assert asked(task=TASK).folder == run
+    assert find_watched(TASK, None).folder == run
     monkeypatch.setattr(registry, "_REGISTERED", {})
     registry.register("untrained", {"extends": TASK})
-    with pytest.raises(ConfigError, match="there is no run in logs/untrained; train one first"):
-        asked(task="untrained")
+    with pytest.raises(
+        ConfigError, match="POLICY: 'untrained' has neither a run in logs/untrained nor a shipped policy; train it first"
+    ):
+        find_watched("untrained", None)
 
 
-@pytest.mark.parametrize("name", ["logs/{0}/run", "{0}/run", "run"])
+@pytest.mark.parametrize("name", ["logs/{0}/run", "{0}/run", "./logs/{0}/run/"])
 def test_a_run_is_named_by_its_path_or_its_name(name):
     run = begin(f"{TASK}/run", 50, when=1.0)
     begin(f"{TASK}/newer", 50, when=0.0)
-    assert asked(load_run=name.format(TASK)).folder.resolve() == run.resolve()
-    assert asked(load_run=name.format(TASK)).cfg.task == TASK
+    assert find_watched(name.format(TASK), None).folder.resolve() == run.resolve()
+    assert find_watched(name.format(TASK), None).cfg.task == TASK
 
 
 def test_a_shipped_policy_is_named_by_its_task():
-    begin(f"{TASK}/run", 50, when=1.0)
     for name in (TASK, f"resources/policies/{TASK}", str(POLICY)):
-        assert asked(load_run=name).folder.resolve() == POLICY
+        assert find_watched(name, None).folder.resolve() == POLICY
 
 
 def test_wrong_names_are_said_with_the_nearest_one():
     begin(f"{TASK}/2026-01-01_run", 50, when=1.0)
-    with pytest.raises(ConfigError, match=rf"there is no run '2026-01-02_run'.*{TASK}/2026-01-01_run"):
-        asked(load_run="2026-01-02_run")
-    with pytest.raises(ConfigError, match=f"was trained on '{TASK}', not on 'go2_flat'"):
-        asked(task="go2_flat", load_run=f"logs/{TASK}/2026-01-01_run")
+    with pytest.raises(ConfigError, match=rf"no run '{TASK}/2026-01-02_run'; did you mean '{TASK}/2026-01-01_run'"):
+        find_watched(f"{TASK}/2026-01-02_run", None)
     with pytest.raises(ConfigError, match=r"has no checkpoint 7 \(it has: 50\)"):
-        asked(load_run="2026-01-01_run", checkpoint=7)
-    assert asked(load_run="2026-01-01_run", checkpoint=50).checkpoint == 50
-    assert asked(load_run="2026-01-01_run", checkpoint=-1).checkpoint is None
+        find_watched(f"{TASK}/2026-01-01_run", 7)
+    assert find_watched(f"{TASK}/2026-01-01_run", 50).checkpoint == 50
+    assert find_watched(f"{TASK}/2026-01-01_run", -1).checkpoint is None
 
 
 def test_a_checkpoint_is_given_once_and_again_when_it_was_written_anew():
     run = begin(f"{TASK}/run", 50, when=100.0)
-    follower = CheckpointFollower(Watched(asked().cfg, run))
+    follower = CheckpointFollower(Watched(find_watched(None, None).cfg, run))
     assert follower.changed() == run / "model_50.pt"
     assert follower.changed() is None
     follower.forget()
@@ -111,9 +100,9 @@ def test_a_checkpoint_is_given_once_and_again_when_it_was_written_anew():
 def test_the_best_checkpoint_can_be_asked_for_and_is_followed():
     run = begin(f"{TASK}/run", 50, when=100.0)
     with pytest.raises(ConfigError, match=r"has no model_best\.pt"):
-        asked(checkpoint="best")
+        find_watched(None, "best")
     shutil.copy(POLICY / SHIPPED_MODEL, run / BEST_MODEL)
-    follower = CheckpointFollower(asked(checkpoint="best"))
+    follower = CheckpointFollower(find_watched(None, "best"))
     assert follower.changed() == run / BEST_MODEL
     os.utime(run / BEST_MODEL, (1.0, 1.0))  # the training has found a better one
     assert follower.changed() == run / BEST_MODEL

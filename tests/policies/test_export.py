@@ -10,10 +10,10 @@ import torch
 from helpers import TINY_TRAINING, call, run_folders, small_task
 
 import legged.policies.export as export_module
+from legged.cli import export as export_tool
+from legged.cli import train
 from legged.learning.runner import Runner
 from legged.policies.export import ExportError, export
-from legged.tools import export as export_tool
-from legged.tools import train
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["plain", "normalised"])
@@ -158,7 +158,7 @@ def test_all_checkpoints_of_a_task_without_commands_are_exported():
     """It has neither pushes nor a base to draw a mass for, so there is nothing to switch off."""
     flags = ["--task", "half_cheetah", "--num_envs", "4", "--max_iterations", "2", "train.runner.save_interval=1"]
     assert call(train.main, [*flags, *TINY_TRAINING, "--sim_device", "cpu", "train.algorithm.num_mini_batches=1"]) == 0
-    assert call(export_tool.main, ["--task", "half_cheetah"]) == 0
+    assert call(export_tool.main, ["half_cheetah"]) == 0
     (folder,) = run_folders()
     for name in ("00001", "00002"):
         policy = torch.jit.load(str(folder / "exported" / name / "policy.pt"))

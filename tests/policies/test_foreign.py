@@ -7,9 +7,9 @@ import numpy as np
 import onnx
 import pytest
 from helpers import call
-from legged.tools.playback import main
 from onnx import TensorProto, helper, numpy_helper
 
+from legged.cli.evaluate.onnx import main
 from legged.errors import ConfigError
 from legged.evaluation.playback import play
 from legged.policies.foreign import ForeignPolicy, Layout, read_layout
@@ -129,32 +129,43 @@ def test_a_policy_that_does_nothing_stands_or_topples(policy_file):
 
 def test_the_command(policy_file, capsys):
     path = policy_file(np.zeros((WIDTH, 12)), np.zeros(12))
-    arguments = ["anymal_c", str(path), "--layout", "holosoma", "--seconds", "2.5", "--command", "0.5", "0", "0"]
+    arguments = [str(path), "--robot", "anymal_c", "--layout", "holosoma", "--seconds", "2.5", "--command", "0.5,0,0"]
     assert call(main, arguments) == 0
     text = capsys.readouterr().out
     assert "0.50   0.00   0.00" in text
     assert "1.00   0.00   0.00" not in text
 
 
+HERE = ["{policy}", "--robot", "anymal_c"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["anymal_cc", "p", "--layout", "holosoma"], "policy: there is no file p"),
-        (["anymal_cc", "{policy}", "--layout", "holosoma"], "robot: there is no robot 'anymal_cc'; did you mean 'anymal_c'?"),
-        (["g1", "{policy}", "--layout", "holosoma"], "takes 49 numbers, the layout's observation has 100"),
-        (["anymal_c", "{policy}", "--layout", "holosomo"], "--layout: there is no layout 'holosomo'"),
-        (["anymal_c", "{policy}", "--layout", "{other}"], "observation: there is no term 'base_linvel'; did you mean"),
-        (["anymal_c", "{other}", "--layout", "holosoma"], "onnxruntime cannot read it"),
-        (["anymal_c", "{policy}", "--layout", "holosoma", "--seconds", "1"], "--seconds: must be above 2"),
-        (["anymal_c", "{policy}", "--layout", "holosoma", "--friction", "-1"], "--friction: must be from 0 to 10"),
-        (["anymal_c", "{policy}", "--layout", "holosoma", "--command", "nan", "0", "0"], "--command: velocities must be"),
+        (["p", "--layout", "holosoma"], "POLICY: there is no ONNX file 'p'"),
+        (
+            ["{policy}", "--robot", "anymal_cc", "--layout", "holosoma"],
+            "--robot: there is no robot 'anymal_cc'; did you mean 'anymal_c'?",
+        ),
+        (["{policy}", "--layout", "holosoma"], "--robot: is missing; the layout 'holosoma' names none"),
+        (["{policy}", "--robot", "anymal_c"], "policy.json lies beside it; --layout says"),
+        (["{policy}", "--robot", "g1", "--layout", "holosoma"], "takes 49 numbers, the layout's observation has 100"),
+        ([*HERE, "--layout", "holosomo"], "--layout: there is no layout 'holosomo'"),
+        ([*HERE, "--layout", "{other}"], "observation: there is no term 'base_linvel'; did you mean"),
+        (["{broken}", "--robot", "anymal_c", "--layout", "holosoma"], "onnxruntime cannot read it"),
+        ([*HERE, "--layout", "holosoma", "--seconds", "1"], "--seconds: must be above 2"),
+        ([*HERE, "--layout", "holosoma", "--friction", "-1"], "--friction: must be from 0 to 10"),
+        ([*HERE, "--layout", "holosoma", "--command", "nan,0,0"], "--command: expected three numbers"),
+        ([*HERE, "--layout", "holosoma", "--command", "0.5,0"], "got '0.5,0'"),
     ],
 )
 def test_wrong_input_ends_with_one_line(policy_file, tmp_path, capsys, arguments, message):
     other = tmp_path / "layout.yaml"
     other.write_text("observation: {base_linvel: 1.0}\n")
+    broken = tmp_path / "broken.onnx"
+    broken.write_text("not a network")
     path = policy_file(np.zeros((WIDTH, 12)), np.zeros(12))
-    assert call(main, [text.format(policy=path, other=other) for text in arguments]) == 2
+    assert call(main, [text.format(policy=path, other=other, broken=broken) for text in arguments]) == 2
     error = capsys.readouterr().err.strip()
     assert error.startswith("error: ")
     assert message in error

@@ -10,13 +10,15 @@ import torch
 from helpers import call, small_task, tiny_run
 from onnx import TensorProto, helper, numpy_helper
 
+from legged.cli import export
+from legged.cli.evaluate import onnx as evaluate_onnx
+from legged.cli.evaluate import policy as evaluate
 from legged.errors import ConfigError
 from legged.evaluation.playback import Stage, follow
 from legged.evaluation.velocity_grid import Grid
 from legged.policies.description import describe
 from legged.policies.foreign import ForeignPolicy, Layout, read_layout
 from legged.robots.robot import load_robot
-from legged.tools import export, playback
 
 
 def write_policy(path, matrix, bias, **metadata):
@@ -111,7 +113,7 @@ def test_our_own_checkpoints_are_judged_as_the_task_sees_them(tmp_path, monkeypa
     """A run's checkpoints, exported, act in playback as in their own task: observation and targets of the same state."""
     monkeypatch.chdir(tmp_path)
     folder = tiny_run("train.runner.save_interval=1")
-    assert call(export.main, ["--task", "anymal_c_flat", "--load_run", folder.name]) == 0
+    assert call(export.main, [f"anymal_c_flat/{folder.name}"]) == 0
     exported = sorted((folder / "exported").glob("*/policy.onnx"))
     assert [path.parent.name for path in exported] == ["00001", "00002"]
     description = json.loads((exported[0].parent / "policy.json").read_text())
@@ -133,16 +135,21 @@ def test_our_own_checkpoints_are_judged_as_the_task_sees_them(tmp_path, monkeypa
     targets = policy.act(command[:3], *rest)
     np.testing.assert_allclose(targets, policy.default + task.control.action_scale * policy._actions, atol=1e-6)
     np.testing.assert_allclose(policy.stiffness, task.control.stiffness.numpy(), rtol=1e-6)
-    out = tmp_path / "judged.json"
-    arguments = ["anymal_c", *map(str, reversed(exported)), "--layout", str(exported[0].parent / "policy.json")]
-    axes = ["--vx=0:0.5:0.5", "--vy=0", "--yaw=0", "--seconds", "1.2", "--rmse", "50", "--json", str(out)]
+    out = tmp_path / "judged"
+    arguments = list(map(str, reversed(exported)))
+    axes = ["--vx=0:0.5:0.5", "--vy=0", "--yaw=0", "--seconds", "1.2", "--rmse", "50", "--out", str(out)]
     capsys.readouterr()
-    assert call(playback.main, [*arguments, *axes]) == 0
-    result = json.loads(out.read_text())
+    assert call(evaluate_onnx.main, [*arguments, *axes]) == 0
+    result = json.loads((out / "onnx.json").read_text())
     assert [row["iterations"] for row in result["policies"]] == [1.0, 2.0], "the earliest comes first"
     assert result["grid"] == {"vx": [0.0, 0.5], "vy": [0.0], "yaw": [0.0]}
     first = next((row for row in result["policies"] if row["falls"] == 0.0), None)
     assert (result["first"] or {}).get("file") == (first or {}).get("file")
+    for name in (exported[0], exported[0].parent):  # `legged evaluate` does the same with a file and with its folder
+        capsys.readouterr()
+        assert call(evaluate.main, [str(name), "--out", str(tmp_path / "again")]) == 0
+        assert "policy.onnx: velocities" in capsys.readouterr().out
+        assert json.loads((tmp_path / "again" / "onnx.json").read_text())["robot"] == "anymal_c"
 
 
 @pytest.mark.parametrize(
@@ -158,8 +165,8 @@ def test_motors_that_are_not_simulated_are_told(changes, warns, tmp_path, capsys
     task = small_task(*changes, num_envs=1)
     (tmp_path / "policy.json").write_text(json.dumps(describe(task)))
     policy = write_policy(tmp_path / "policy.onnx", np.zeros((48, 12)), np.zeros(12))
-    command = ["--command", "0", "0", "0", "--seconds", "2.1"]
-    assert call(playback.main, ["anymal_c", str(policy), "--layout", str(tmp_path / "policy.json"), *command]) == 0
+    command = ["--command", "0,0,0", "--seconds", "2.1"]
+    assert call(evaluate_onnx.main, [str(policy), *command]) == 0
     said = capsys.readouterr().err
     assert ("policy.json: the policy was trained with motors that are not ideal" in said) == warns
 
@@ -168,10 +175,11 @@ def test_the_first_that_follows(standing, tmp_path, capsys):
     later = write_policy(tmp_path / "later.onnx", np.zeros((12, 12)), np.zeros(12), wall_s=40.0)
     layout = tmp_path / "layout.yaml"
     layout.write_text("observation: {dof_pos: 1.0}\n")
-    arguments = ["anymal_c", str(later), str(standing), "--layout", str(layout), "--vy=0", "--yaw=0", "--seconds", "1.1"]
-    assert call(playback.main, [*arguments, "--vx=0.1", "--rmse", "0.2"]) == 0
+    arguments = [str(later), str(standing), "--robot", "anymal_c", "--layout", str(layout)]
+    arguments += ["--vy=0", "--yaw=0", "--seconds", "1.1"]
+    assert call(evaluate_onnx.main, [*arguments, "--vx=0.1", "--rmse", "0.2"]) == 0
     assert "standing.onnx after 20.5 s of training" in " ".join(capsys.readouterr().out.split())
-    assert call(playback.main, [*arguments, "--vx=0.3", "--rmse", "0.2"]) == 0
+    assert call(evaluate_onnx.main, [*arguments, "--vx=0.3", "--rmse", "0.2"]) == 0
     assert "without a fall: none" in capsys.readouterr().out
 
 
@@ -180,17 +188,19 @@ def test_the_first_that_follows(standing, tmp_path, capsys):
     [
         (["--rmse", "0.2"], "--rmse: is a limit of a grid"),
         (["--vx=0", "--rmse", "-1"], "--rmse: must be above 0"),
-        (["--vx=0", "--command", "0", "0", "0"], "--command: is no part of a grid"),
+        (["--vx=0", "--command", "0,0,0"], "--command: is no part of a grid"),
         (["--vx=1:0:0.5"], "--vx: '1:0:0.5' is not of the form"),
         (["--vx=0", "--seconds", "1"], "--seconds: must be above 1"),
         (["--vx=-1:1:0.01", "--vy=-1:1:0.01"], "commands; at most 10,000"),
-        (["--json", "."], "--json: . is a folder"),
+        (["--out", "{file}"], "a_file: cannot make the folder"),
     ],
 )
 def test_wrong_grids_end_with_one_line(standing, tmp_path, capsys, arguments, message):
     layout = tmp_path / "layout.yaml"
     layout.write_text("observation: {dof_pos: 1.0}\n")
-    assert call(playback.main, ["anymal_c", str(standing), "--layout", str(layout), *arguments]) == 2
+    (tmp_path / "a_file").write_text("mine")
+    here = [str(standing), "--robot", "anymal_c", "--layout", str(layout)]
+    assert call(evaluate_onnx.main, [*here, *(text.format(file=tmp_path / "a_file") for text in arguments)]) == 2
     error = capsys.readouterr().err.strip()
     assert error.startswith("error: ")
     assert message in error

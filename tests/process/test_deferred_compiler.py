@@ -4,6 +4,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+from helpers import HANG_S
+
 import legged
 
 TRAIN = str(Path(legged.__file__).parents[1] / "train.py")
@@ -19,9 +22,10 @@ def run(code: str, *arguments: str, cwd: Path | None = None) -> str:
 
 def test_a_training_does_without_the_compiler(tmp_path):
     settings = ["--task", "anymal_c_flat", "--sim_device", "cpu", "--num_envs", "2", "--max_iterations", "1", "sim.threads=1"]
+    settings.append("train.runner.film=false")
     code = (
         f"{AS_A_COMMAND}sys.argv += {settings!r}\n"
-        "from legged.tools.train import main\n"
+        "from legged.cli.train import main\n"
         "assert main() == 0\n"
         "print([name for name in ('torch._dynamo.utils', 'torch._inductor', 'sympy') if name in sys.modules])\n"
     )
@@ -48,6 +52,34 @@ assert all(id(function) in trace_rules._allowed_callable_ids for function in mar
 assert not any("__dynamo_disable" in vars(function) for function in stand_in._not_disabled)
 optimizer.zero_grad()
 assert torch.optim.Optimizer.zero_grad.__wrapped__.__dynamo_disable is not torch.optim.Optimizer.zero_grad.__wrapped__
+"""
+    run(code)
+
+
+@pytest.mark.parametrize(
+    ("version", "deferred"), [("2.13.1+cu130", True), ("2.12.1", False), ("2.130.0", False), ("3.0", False)]
+)
+def test_under_a_version_that_is_not_known_the_real_one_is_imported(version, deferred):
+    code = f"""{AS_A_COMMAND}
+import importlib.metadata
+version = importlib.metadata.version
+importlib.metadata.version = lambda name: {version!r} if name == "torch" else version(name)
+import legged
+assert ("torch._dynamo" in sys.modules) == {deferred}
+"""
+    run(code)
+
+
+def test_a_torch_that_does_not_say_its_version_has_the_real_one():
+    code = f"""{AS_A_COMMAND}
+import importlib.metadata
+
+def missing(name):
+    raise importlib.metadata.PackageNotFoundError(name)
+
+importlib.metadata.version = missing
+import legged
+assert "torch._dynamo" not in sys.modules
 """
     run(code)
 
@@ -87,6 +119,6 @@ def test_a_process_that_a_command_starts_collects_garbage_and_has_the_real_one(t
         "told = context.Queue()\n"
         "process = context.Process(target=worker.work, args=(told,))\n"
         "process.start()\n"
-        "print(told.get(timeout=100))\n"
+        f"print(told.get(timeout={HANG_S}))\n"
     )
     assert run(code) == "(True, True)\n"

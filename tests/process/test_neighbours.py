@@ -1,6 +1,5 @@
 """Trainings that share a device know of each other, whoever started them and however they end."""
 
-import fcntl
 import os
 import signal
 import subprocess
@@ -9,11 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from filelock import lock_descriptor
 from helpers import tiny_run
 
 from legged.learning.timing import read_timing
 from legged.process import neighbours
-from legged.process.neighbours import ENDING, Neighbours
+from legged.process.neighbours import ENDING, TURN, Neighbours
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -62,17 +62,20 @@ def test_a_training_that_is_killed_is_a_neighbour_no_longer():
         assert len(list(folder.glob(f"*{ENDING}"))) == 2  # nobody has removed what it left
         with Neighbours("gpu-a") as second:
             assert second.most == 1
-        assert len(list(folder.iterdir())) == 1
-    assert not list(folder.iterdir())
+        assert len(list(folder.glob(f"*{ENDING}"))) == 1
+    assert [path.name for path in folder.iterdir()] == [TURN]
 
 
-def test_who_looks_at_what_a_killed_training_has_left_is_no_training():
+def test_a_process_that_looks_is_not_taken_for_a_training():
     with Neighbours("gpu-a") as first:
         left = Path(neighbours.FOLDER, "gpu-a", f"1.left{ENDING}")
         left.touch()
-        with left.open("rb") as other:
-            fcntl.flock(other, fcntl.LOCK_SH)  # as another training does while it looks
+        with left.with_name(TURN).open("rb") as turn, left.open("rb") as other:  # as another training does while it looks
+            assert lock_descriptor(turn.fileno(), blocking=False)
+            assert lock_descriptor(other.fileno(), blocking=False)
             first.look()
+            assert first.most == 0
+        first.look()
         assert first.most == 0
         assert not left.exists()
 

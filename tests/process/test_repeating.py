@@ -3,6 +3,7 @@
 import threading
 
 import pytest
+from helpers import HANG_S
 
 from legged.process.repeating import repeating
 
@@ -17,7 +18,7 @@ def test_calls_come_while_the_block_runs_and_end_with_it(at_end):
             third.set()
 
     with repeating(call, 0.001, at_end):
-        assert third.wait(10.0)
+        assert third.wait(HANG_S)
     assert threading.current_thread() not in calls
     assert not calls[0].is_alive()
 

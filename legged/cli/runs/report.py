@@ -5,6 +5,7 @@ report.md and its pictures lie beside it. A training writes its report when it e
 evaluation or for a run that was killed. `--film` films the policy first; `--note` keeps a sentence about the run.
 """
 
+import faulthandler
 import sys
 from pathlib import Path
 
@@ -16,15 +17,17 @@ from legged.config import LeggedConfig
 from legged.errors import ConfigError, RunError
 from legged.evaluation.reports.record import FILMS, read_record
 from legged.evaluation.reports.run_report import command_on, write_report
-from legged.learning.run_folder import NOTE_FILE, find_checkpoint, own_run, run_config
+from legged.learning.run_folder import CONFIG_FILE, NOTE_FILE, find_checkpoint, own_run, run_config
 from legged.play.walking_film import film, write_film
 from legged.policies.restore import TrainedPolicy
 from legged.process.command_parser import CommandParser, add_import_argument
-from legged.process.paths import ready_to_write, relative, write_text
+from legged.process.paths import exists, ready_to_write, relative, write_text
 from legged.registry import import_tasks
 
 SIDE = 320
 """Width and height of the film [pixels]."""
+LONGEST_FILM_S = 900.0
+"""Filming that takes longer hangs, and ends the process [s]."""
 LONGEST_NOTE = 1000
 
 
@@ -34,7 +37,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def build_parser() -> CommandParser:
-    """Return what reads the command line."""
+    """Return the parser of the command line."""
     parser = CommandParser(
         "legged runs report",
         __doc__,
@@ -61,7 +64,10 @@ def _main(argv: list[str] | None) -> int:
     for folder in folders:
         ready_to_write(folder, 4.0)
         if args.film:
+            if argv is None:  # a library that draws may hang where no exception reaches it
+                faulthandler.dump_traceback_later(LONGEST_FILM_S, exit=True, file=2)
             why = _film(folder, args.checkpoint)
+            faulthandler.cancel_dump_traceback_later()
             print(f"no film: {why}" if why else f"written: {relative(folder / FILMS[0])}", flush=True)
         print(f"written: {relative(write_report(folder))}", flush=True)
     return 0
@@ -89,7 +95,10 @@ def _film(folder: Path, checkpoint: int | str | None) -> str:
             return f"'{cfg.task}' has no velocity commands; {command} --gif makes one"
         torch.set_num_threads(1)
         policy = TrainedPolicy(cfg, find_checkpoint(folder, checkpoint))
-        write_film(film(policy, SIDE), folder / FILMS[0])
+        pictures = film(policy, SIDE)
+        if not exists(folder / CONFIG_FILE):
+            return "the run folder was removed"
+        write_film(pictures, folder / FILMS[0])
     except (ConfigError, RunError) as error:
         return " ".join(str(error).split())
     return ""

@@ -7,11 +7,11 @@ click on a column sorts and a field filters. `--seeds-share` makes one row of th
 import sys
 from pathlib import Path
 
+from legged.cli.main import hint_at_sub_command
 from legged.commandline.command import run_main
-from legged.evaluation.judged_run import folders_in
 from legged.evaluation.reports.document import to_html, to_markdown
 from legged.evaluation.reports.experiments import TITLE, experiments_parts
-from legged.evaluation.reports.record import read_record
+from legged.evaluation.reports.record import folders_in, read_record
 from legged.learning.run_folder import LOGS
 from legged.process.command_parser import CommandParser, add_import_argument
 from legged.process.paths import exists, make_folder, ready_to_write, relative, write_text
@@ -44,7 +44,8 @@ def _main(argv: list[str] | None) -> int:
     folder: Path = args.out or (args.folders[0] if args.folders else LOGS)
     if exists(folder) or args.out is not None:  # `folders_in` reports a missing folder of runs
         ready_to_write(folder, 4.0)
-    found = {run.resolve(): run for given in args.folders or [LOGS] for run in folders_in(given)}
+    with hint_at_sub_command("runs", list(map(str, args.folders))):
+        found = {run.resolve(): run for given in args.folders or [LOGS] for run in folders_in(given)}
     records = [read_record(run) for run in found.values()]
     make_folder(folder)
     parts = {ending: experiments_parts(records, folder, ending, args.seeds_share) for ending in ("md", "html")}

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import torch
 
+from legged.cli.sweep.worker import Worker
 from legged.commandline.arguments import pick_device
 from legged.commandline.command import EXIT_FAILED, run_main
 from legged.commandline.stopping import stopping_on_signals
@@ -28,7 +29,6 @@ from legged.registry import import_tasks
 from legged.sweeping.plan import Plan, plan_sweep, read_sweep, sweep_file
 from legged.sweeping.report import write_report
 from legged.sweeping.study import WHY, Trials, check_installed, finished
-from legged.sweeping.worker import Worker
 
 TELL_S = 1.0
 """What other processes have done is looked at so often [s]."""

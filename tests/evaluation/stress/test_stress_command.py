@@ -1,23 +1,23 @@
-"""`evaluate --stress`: its files, where its robots are, and its errors."""
+"""`legged evaluate stress`: its files, where its robots are, and its errors."""
 
 import json
 
 import numpy as np
 import pytest
 import torch
-from helpers import ENGINE, POLICY, TASK, call, kept_global_state, tiny_run
+from helpers import ENGINE, POLICY, call, kept_global_state, tiny_run
 
+from legged.cli.evaluate import stress
 from legged.evaluation import success
 from legged.evaluation.stress import measuring
 from legged.evaluation.stress.measuring import GROUND, STAIRS, Bench, Wish
 from legged.evaluation.stress.table import ALONE, Disturbance
 from legged.evaluation.success import FELL, REACHED, STUCK, Scores
 from legged.policies.restore import policy_of
-from legged.tools import evaluate
 
 make = measuring._make
 pytestmark = pytest.mark.usefixtures("workplace")
-FLAGS = ["--physics", "mujoco", "--stress", "sim.threads=1"]
+FLAGS = ["--physics", "mujoco", "sim.threads=1"]
 LINES = 1 + len(ALONE) + 2
 
 
@@ -40,8 +40,8 @@ def short(monkeypatch):
 
 
 def test_the_stress_test_writes_a_table_and_a_picture(trained, short, tmp_path, capsys):
-    arguments = ["--task", "anymal_c", "--load_run", str(trained), "--robots-per-point", "2", "--out", str(tmp_path / "o")]
-    assert call(evaluate.main, [*arguments, *FLAGS, "--riser", "0.12"]) == 0
+    arguments = [str(trained), "--robots-per-point", "2", "--out", str(tmp_path / "o")]
+    assert call(stress.main, [*arguments, *FLAGS, "--riser", "0.12"]) == 0
     assert {path.name for path in (tmp_path / "o").iterdir()} == {"stress_mujoco.json", "stress_mujoco.png"}
     assert (tmp_path / "o" / "stress_mujoco.png").read_bytes().startswith(b"\x89PNG")
     result = json.loads((tmp_path / "o" / "stress_mujoco.json").read_text())
@@ -76,9 +76,9 @@ def test_some_lines_are_measured_alone_at_solver_settings_of_one_s_own(trained, 
     """Both the lines and, with --full, the other solvers; those are others than the one that was asked for."""
     steps = []
     monkeypatch.setattr(measuring, "_make", lambda *given: steps.append(given[1].sim.dt) or make(*given))
-    arguments = ["--task", "anymal_c", "--load_run", str(trained), "--robots-per-point", "2", "--lines", "nominal, together"]
+    arguments = [str(trained), "--robots-per-point", "2", "--lines", "nominal, together"]
     own = ["sim.dt=0.004", "control.decimation=5", "sim.cone=elliptic"]
-    assert call(evaluate.main, [*arguments, *FLAGS, *own, "--out", str(tmp_path / "a")]) == 0
+    assert call(stress.main, [*arguments, *FLAGS, *own, "--out", str(tmp_path / "a")]) == 0
     result = json.loads((tmp_path / "a" / "stress_mujoco.json").read_text())
     assert [line["name"] for line in result["lines"]] == ["nominal", "together"]
     assert (result["ground"], result["settings"], result["score"]) == ({}, {}, None)
@@ -86,15 +86,15 @@ def test_some_lines_are_measured_alone_at_solver_settings_of_one_s_own(trained, 
     assert "stairs of 0.17 x 0.28 m" in capsys.readouterr().out
     assert steps == [0.004] * 2
     steps.clear()
-    assert call(evaluate.main, [*arguments, *FLAGS, *own, "--full", "--out", str(tmp_path / "b")]) == 0
+    assert call(stress.main, [*arguments, *FLAGS, *own, "--full", "--out", str(tmp_path / "b")]) == 0
     result = json.loads((tmp_path / "b" / "stress_mujoco.json").read_text())
     assert list(result["settings"]) == ["half the time step", "elliptic cones", "impratio 100"]
     assert steps == [0.004] * 2 + [0.002] * 2 + [0.004] * 4
 
 
 def test_a_policy_of_a_plane_is_stressed_on_the_flat_only(short, tmp_path):
-    arguments = ["--task", TASK, "--load_run", str(POLICY), "--robots-per-point", "1", "--out", str(tmp_path)]
-    assert call(evaluate.main, [*arguments, *FLAGS]) == 0
+    arguments = [str(POLICY), "--robots-per-point", "1", "--out", str(tmp_path)]
+    assert call(stress.main, [*arguments, *FLAGS]) == 0
     result = json.loads((tmp_path / "stress_mujoco.json").read_text())
     assert len(result["lines"]) == LINES
     assert not any("stairs" in line for line in result["lines"])
@@ -181,26 +181,21 @@ def test_robots_take_turns_at_commands_within_the_tasks_grid(trained, monkeypatc
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--stress", "--types", "pit"], ["--types", "--stress has a table of its own"]),
-        (["--stress", "--vx=0"], ["--vx", "leave it out"]),
-        (["--stress", "--all-checkpoints"], ["--all-checkpoints", "leave it out"]),
-        (["--stress", "--physics", "all"], ["--stress: looks at one engine"]),
-        (["--stress", "--tread", "0"], ["--tread: must be between 0.05 and 2 m, got 0"]),
-        (["--stress", "--riser", "nan"], ["--riser: must be between 0 and 1 m, got nan"]),
-        (["--stress", "--payload", "-1"], ["--payload: must be between 0 and 1000 kg, got -1"]),
-        (["--stress", "--lines", "nominal,paylaod"], ["--lines: there is no line 'paylaod'; did you mean 'payload'?"]),
-        (["--lines", "nominal"], ["--lines", "is of --stress; add it"]),
-        (["--riser", "0.1"], ["--riser", "is of --stress; add it"]),
+        (["--physics", "all"], ["sim.physics", "'all'"]),
+        (["--tread", "0"], ["--tread: must be between 0.05 and 2 m, got 0"]),
+        (["--riser", "nan"], ["--riser: must be between 0 and 1 m, got nan"]),
+        (["--payload", "-1"], ["--payload: must be between 0 and 1000 kg, got -1"]),
+        (["--lines", "nominal,paylaod"], ["--lines: there is no line 'paylaod'; did you mean 'payload'?"]),
         (
-            ["--stress", "domain_rand.ranges.friction=[0.5,0.6]"],
+            ["domain_rand.ranges.friction=[0.5,0.6]"],
             ["domain_rand.ranges.friction: --stress gives", "leave it out"],
         ),
-        (["--stress", "domain_rand.ranges={joint_offset: [0,0.1]}"], ["domain_rand.ranges.joint_offset: --stress gives"]),
-        (["--stress", "--robots-per-point", "0"], ["--robots-per-point", "at least 1, got 0"]),
+        (["domain_rand.ranges={joint_offset: [0,0.1]}"], ["domain_rand.ranges.joint_offset: --stress gives"]),
+        (["--robots-per-point", "0"], ["--robots-per-point", "at least 1, got 0"]),
     ],
 )
 def test_wrong_flags(arguments, words, capsys):
-    assert call(evaluate.main, ["--task", TASK, "--load_run", str(POLICY), *arguments]) == 2
+    assert call(stress.main, [str(POLICY), *arguments]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     for word in words:
@@ -208,5 +203,5 @@ def test_wrong_flags(arguments, words, capsys):
 
 
 def test_a_task_without_commands_is_not_stressed(capsys):
-    assert call(evaluate.main, ["--task", "half_cheetah", "--stress"]) == 2
-    assert "--stress: 'half_cheetah' follows no commands" in capsys.readouterr().err
+    assert call(stress.main, ["half_cheetah"]) == 2
+    assert "POLICY: 'half_cheetah' has no velocity commands" in capsys.readouterr().err
