@@ -6,7 +6,6 @@ import re
 
 import pytest
 from helpers import call, small_config
-from legged.tools import train
 
 from legged.cli import train
 from legged.envs import LeggedRobot
