@@ -74,7 +74,7 @@ def check_evaluation(cls: type, cfg: TaskConfig) -> None:
     """Check the settings of evaluations during training.
 
     Raises:
-        ConfigError: a named figure does not exist, a stop needs evaluations and there are none, or an evaluation is shorter
+        ConfigError: a named figure does not exist, stop_at is set without evaluations, or an evaluation is shorter
             than a control step.
     """
     runner, figures = cfg.train.runner, evaluated_figures(cls, cfg)
