@@ -14,16 +14,16 @@ from torch import Tensor
 from legged.config.networks import ESTIMATED
 from legged.envs import BaseTask
 from legged.graph.step_graph import StepGraph
+from legged.learning.async_readback import AsyncReadback
 from legged.learning.display import Display
+from legged.learning.divergence import Diverged
 from legged.learning.estimator import EstimatingModel, EstimationErrors
 from legged.learning.evaluations import Ended
 from legged.learning.logger import Interrupted
 from legged.learning.ppo import DevicePPO
-from legged.learning.reading import Reading
 from legged.learning.rollout import Rollout, Steps
 from legged.learning.runner import Runner
 from legged.learning.update_threads import UpdateThreads
-from legged.learning.watch import Diverged
 from legged.process.cores import available_cores
 from legged.process.ranks import Ranks
 from legged.process.startup import stage_ended
@@ -152,11 +152,11 @@ class CapturedRunner(Runner):
     def _episodes(self) -> dict[str, Tensor]:
         return super()._episodes() if self._rollout is None else self._rollout.episodes
 
-    def _read(self, rollout: Steps) -> Reading:
+    def _read(self, rollout: Steps) -> AsyncReadback:
         """Ask for what is logged of the iteration that was just launched."""
         logged = self.env.log_rollout() if self.logger.writer is not None else {}
         named = {LOGGED + name: value for name, value in logged.items()}
-        return Reading({"ended": rollout.ended, **self.alg.outcome(), **named})
+        return AsyncReadback({"ended": rollout.ended, **self.alg.outcome(), **named})
 
     def _log_before(self, made: "Made", following: "Made") -> None:
         """Log an iteration while the device computes the `following` one; if training ends here, log that one too, because
@@ -178,7 +178,7 @@ class CapturedRunner(Runner):
 
     def _log(self, made: "Made") -> None:
         """Log an iteration; waits for it to end."""
-        logger, numbers = self.logger, made.reading.numbers()
+        logger, numbers = self.logger, made.readback.numbers()
         ended, returns, lengths, squares = numbers.pop("ended")
         if ended:
             logger.return_std = math.sqrt(squares / ended)
@@ -249,6 +249,6 @@ class Made:
     """The training's first iteration."""
     total: int
     """Iterations there will be in the end, with those of the run that this one goes on from."""
-    reading: Reading
+    readback: AsyncReadback
     clock: Clock
     """Of its rollout and its update."""

@@ -14,11 +14,11 @@ from torch.utils.tensorboard import SummaryWriter
 
 from legged.learning.display import Display, Progress
 from legged.learning.distributed import any_rank
-from legged.learning.divergence_meter import DivergenceMeter
+from legged.learning.divergence import FAULT, MINI_BATCHES, Diverged, DivergenceDetector
 from legged.learning.estimator import SECTION as ESTIMATES
 from legged.learning.evaluations import SECTION, Ended
+from legged.learning.kl_meter import KLMeter
 from legged.learning.trackers import Tracker, open_writer
-from legged.learning.watch import FAULT, MINI_BATCHES, Diverged, FaultWatch
 from legged.process.neighbours import Neighbours
 
 
@@ -35,7 +35,7 @@ class QuietLogger(Logger):
         """`left_out` gives the share of the last update's mini-batches that changed nothing."""
         super().__init__(*args, **kwargs)
         self.display, self._left_out = display, left_out
-        self.watch = FaultWatch(self.cfg["num_steps_per_env"] * self.num_envs)
+        self.divergence = DivergenceDetector(self.cfg["num_steps_per_env"] * self.num_envs)
         self.stop_requested = False
         self.evaluate: Callable[[int, int], dict[str, float]] = lambda _iterations, _total: {}
         """Evaluates the policy after so many iterations of a total, where that is due, and gives what it finds."""
@@ -49,7 +49,7 @@ class QuietLogger(Logger):
         """Standard deviation of the returns of the episodes that ended in the last rollout in which any did; of those in the
         buffer of returns where the training loop does not say.
         """
-        self.divergence: DivergenceMeter | None = None
+        self.kl_meter: KLMeter | None = None
         """What hears of the divergence where rsl-rl's own update computes it."""
         self.latest: dict[str, float] = {}
         """The last value of everything the task logs, NaN while it had none: an iteration in which no episode ended has no
@@ -104,7 +104,7 @@ class QuietLogger(Logger):
         if left_out > 0.0:
             values[MINI_BATCHES] = left_out
         self.ep_extras[:] = [dict(values)] if values else []  # a copy: rsl-rl puts tensors in
-        kl = self.divergence.flush() if self.divergence else None
+        kl = self.kl_meter.flush() if self.kl_meter else None
         losses = {name: loss for name, loss in given.items() if name not in estimated} | ({} if kl is None else {"kl": kl})
         losses = {name: loss for name, loss in losses.items() if math.isfinite(loss)}
         self._log_return_std(it)
@@ -115,7 +115,7 @@ class QuietLogger(Logger):
         finally:
             self.device = device
         self.ep_extras.clear()  # rsl-rl leaves them where nothing is written, as in all processes but the first
-        self.watch.judge(values, left_out)
+        self.divergence.update(values, left_out)
         self.latest = names | {name: value for name, value in self.latest.items() if not name.startswith(FAULT)} | values
         self.loop_s += collect_time + learn_time
         if self.neighbours is not None:
@@ -136,8 +136,8 @@ class QuietLogger(Logger):
                     behavior=losses.get("behavior"),
                 )
             )
-        if any_rank(bool(self.watch.why_stop), torch.device(self.device)):
-            raise Diverged(self.watch.why_stop or "numbers of another process were NaN or infinite")
+        if any_rank(bool(self.divergence.why_stop), torch.device(self.device)):
+            raise Diverged(self.divergence.why_stop or "numbers of another process were NaN or infinite")
         if self.why_end is not None and any_rank(bool(self.why_end()), torch.device(self.device)) and it + 1 < total_it:
             raise Ended
         if any_rank(self.stop_requested, torch.device(self.device)) and it + 1 < total_it:

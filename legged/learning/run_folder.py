@@ -17,7 +17,7 @@ from legged.config.checks import shown
 from legged.config.legged import LeggedConfig
 from legged.config.loader import actuator_path, read_yaml
 from legged.errors import ConfigError, suggest
-from legged.learning.given import GIVEN_FILE
+from legged.learning.invocation import INVOCATION_FILE
 from legged.process.paths import data_folder, exists, make_folder, not_made, relative, write_bytes, write_text
 from legged.registry import YAML_ENDINGS, register_file, task_config, task_names, task_schema
 
@@ -77,7 +77,7 @@ def discard_run(folder: Path) -> None:
     """
     if checkpoints(folder) or (folder / BEST_MODEL).is_file():
         return
-    ours = [folder / name for name in (CONFIG_FILE, CODE_FILE, GIVEN_FILE, NOTE_FILE, MOTORS)]
+    ours = [folder / name for name in (CONFIG_FILE, CODE_FILE, INVOCATION_FILE, NOTE_FILE, MOTORS)]
     ours += [*folder.glob("events.out.tfevents.*"), *folder.glob("state_*.pt")]
     with suppress(OSError):
         for path in ours:

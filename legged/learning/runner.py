@@ -26,8 +26,10 @@ from legged.learning.checkpoint import (
 )
 from legged.learning.display import Display
 from legged.learning.distributed import RankLost, join, leave
-from legged.learning.divergence_meter import DivergenceMeter
+from legged.learning.divergence import Diverged
 from legged.learning.evaluations import Ended, Evaluations
+from legged.learning.gradient_guard import GradientGuard
+from legged.learning.kl_meter import KLMeter
 from legged.learning.logger import Interrupted, QuietLogger
 from legged.learning.networks import begin_std, keep_std_in_bounds, network_settings, use_matmul
 from legged.learning.recurrent import hidden_states, keep_shape_of_one_robot
@@ -40,10 +42,8 @@ from legged.learning.run_state import (
     set_generators,
     write_run_state,
 )
-from legged.learning.step_guard import StepGuard
 from legged.learning.symmetry import augment, images_of
 from legged.learning.transfer import check_built, tell_taken, what_is_taken
-from legged.learning.watch import Diverged
 from legged.process.paths import relative
 from legged.process.ranks import Ranks
 from legged.process.startup import STARTED_S
@@ -111,7 +111,7 @@ class Runner(OnPolicyRunner):
         keep_std_in_bounds(self.alg.get_policy(), self.alg.optimizer)
         if self.alg.get_policy().is_recurrent:
             keep_shape_of_one_robot(self.alg.get_policy())
-        self._guard = None if hasattr(self.alg.optimizer, "found_inf") else StepGuard(self.alg.optimizer)
+        self._guard = None if hasattr(self.alg.optimizer, "found_inf") else GradientGuard(self.alg.optimizer)
         self.logger = QuietLogger(
             log_dir=str(log_dir) if log_dir else None,
             cfg=self.cfg,
@@ -124,7 +124,7 @@ class Runner(OnPolicyRunner):
             display=display,
             left_out=self._left_out,
         )
-        self.logger.divergence = DivergenceMeter(self.alg.actor)
+        self.logger.kl_meter = KLMeter(self.alg.actor)
 
     def _configuration(self, env: BaseTask) -> dict[str, Any]:
         """Return the dictionary rsl-rl wants for a task."""

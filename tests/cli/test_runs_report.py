@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import POLICY, TASK, TINY_TRAINING, call, run_folders, tiny_run
+from legged.tools import evaluate, experiments, report, train
 from torch.utils.tensorboard import SummaryWriter
 
 from legged import registry
@@ -26,7 +27,7 @@ from legged.evaluation.reports import run_report
 from legged.evaluation.reports.record import read_record
 from legged.evaluation.reports.run_report import over_training, write_report
 from legged.learning.captured import CapturedRunner
-from legged.learning.given import GIVEN_FILE
+from legged.learning.invocation import INVOCATION_FILE
 from legged.learning.timing import TIMING_FILE
 
 pytestmark = pytest.mark.usefixtures("workplace")
@@ -350,9 +351,9 @@ def test_a_resumed_run_keeps_what_was_set_before():
     again = tiny_run("--resume", "env.episode_length_s=0.2", iterations=2)
     changes = read_record(again).given.changes
     assert (changes["rewards.scales.torques"], changes["env.episode_length_s"]) == (-3e-4, 0.2)
-    (first / GIVEN_FILE).write_text('{"task": 3}')
+    (first / INVOCATION_FILE).write_text('{"task": 3}')
     assert read_record(first).given is None
-    assert any(GIVEN_FILE in text for text in read_record(first).problems)
+    assert any(INVOCATION_FILE in text for text in read_record(first).problems)
 
 
 def test_a_task_without_commands_is_told_the_command_that_films_it(forgotten, capsys):

@@ -16,10 +16,10 @@ import torch
 from legged.cli.train import train_as_asked
 from legged.commandline.stopping import stopping_on_signals
 from legged.errors import ConfigError
+from legged.learning.divergence import Diverged
 from legged.learning.evaluations import Evaluated, reaches
 from legged.learning.run_folder import NOTE_FILE
 from legged.learning.runner import Runner
-from legged.learning.watch import Diverged
 from legged.process.paths import make_folder, relative, write_text
 from legged.sweeping.plan import Plan
 from legged.sweeping.study import RUNS, WHY, Trials

@@ -16,7 +16,7 @@ from legged.config.yaml_files import dump
 from legged.errors import ConfigError
 from legged.evaluation.learning_curves import Log, Scalars, read_config, read_scalars
 from legged.evaluation.result_file import file_name, read_results
-from legged.learning.given import Given, read_given
+from legged.learning.invocation import Invocation, read_invocation
 from legged.learning.run_folder import CODE_FILE, CONFIG_FILE, NOTE_FILE, checkpoints, of_another_policy, run_config
 from legged.learning.timing import Timing, read_timing
 from legged.registry import task_config
@@ -81,7 +81,7 @@ class Record:
     """Iterations of the last policy or log, with those before a resumption."""
     problems: tuple[str, ...]
     """Reasons why parts could not be read."""
-    given: Given | None = None
+    given: Invocation | None = None
     """Contents of the command line; None for runs that did not store it."""
 
     def at(self, path: str) -> Any:
@@ -161,7 +161,7 @@ def read_record(folder: Path) -> Record:
     with _noting(problems):
         timing = read_timing(folder)
     with _noting(problems):
-        given = read_given(folder)
+        given = read_invocation(folder)
     if any(folder.glob("events.out.tfevents.*")):
         with _noting(problems):
             scalars = read_scalars(folder)

@@ -27,7 +27,7 @@ from legged.evaluation.reports.document import (
 )
 from legged.evaluation.reports.evaluation_part import evaluation_parts, number
 from legged.evaluation.reports.record import Record, from_task_file, read_record, words
-from legged.learning.given import Given
+from legged.learning.invocation import Invocation
 from legged.learning.run_folder import BEST_MODEL, CODE_FILE, checkpoints
 from legged.process import headless
 from legged.process.paths import relative
@@ -102,7 +102,7 @@ def report_parts(record: Record) -> list[Part]:
 
 def command_on(record: Record, command: str) -> str:
     """Return a command on a run, quoted for a shell, with the option that names its user-defined task."""
-    given = Given(record.task) if record.given is None else record.given
+    given = Invocation(record.task) if record.given is None else record.given
     return shlex.join(["legged", *command.split(), *given.flags, relative(record.folder)])
 
 

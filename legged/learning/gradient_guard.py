@@ -5,7 +5,7 @@ from typing import Any
 import torch
 
 
-class StepGuard:
+class GradientGuard:
     """Leaves out the steps of an optimiser in which a gradient is NaN or infinite; reads on the host."""
 
     def __init__(self, optimizer: torch.optim.Optimizer) -> None:

@@ -21,7 +21,7 @@ class Diverged(RunError):
     """Training went on being non-finite; the text says how."""
 
 
-class FaultWatch:
+class DivergenceDetector:
     """Reads what an iteration has logged: warns once of every fault, and gives up on a training that does not recover."""
 
     def __init__(self, steps_per_iteration: int) -> None:
@@ -32,7 +32,7 @@ class FaultWatch:
         self.why_stop = ""
         """Why training can't go on; empty while it can."""
 
-    def judge(self, values: Mapping[str, float], left_out: float) -> None:
+    def update(self, values: Mapping[str, float], left_out: float) -> None:
         """Take in an iteration: what it logged by name, and the share of mini-batches that were left out."""
         found = {name.removeprefix(FAULT): count for name, count in values.items() if name.startswith(FAULT)}
         for name, count in found.items():

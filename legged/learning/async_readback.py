@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 
-class Reading:
+class AsyncReadback:
     """The numbers that some tensors of a device have now: at this place in the order of its work, whatever follows."""
 
     @torch.no_grad()

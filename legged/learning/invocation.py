@@ -16,11 +16,11 @@ from legged.errors import ConfigError
 from legged.process.paths import relative, write_text
 from legged.registry import YAML_ENDINGS
 
-GIVEN_FILE = "given.json"
+INVOCATION_FILE = "given.json"
 
 
 @dataclass(frozen=True)
-class Given:
+class Invocation:
     """A task as it was named, and what was set."""
 
     task: str
@@ -37,7 +37,7 @@ class Given:
         return ["--import", ",".join(files)] if files else []
 
 
-def write_given(folder: Path, given: Given, before: Path | None = None) -> None:
+def write_invocation(folder: Path, invocation: Invocation, before: Path | None = None) -> None:
     """Write what a training was told into its run folder; `before` is the folder that it goes on from, if it does.
 
     Raises:
@@ -46,18 +46,18 @@ def write_given(folder: Path, given: Given, before: Path | None = None) -> None:
     earlier: Mapping[str, Any] = {}
     if before is not None:
         with suppress(ConfigError):  # a report on that run names what is damaged
-            earlier = (read_given(before) or given).changes
-    said = {"task": given.task, "import": given.module, "changes": {**earlier, **given.changes}}
-    write_text(folder / GIVEN_FILE, json.dumps(said, indent=1, default=str) + "\n")
+            earlier = (read_invocation(before) or invocation).changes
+    said = {"task": invocation.task, "import": invocation.module, "changes": {**earlier, **invocation.changes}}
+    write_text(folder / INVOCATION_FILE, json.dumps(said, indent=1, default=str) + "\n")
 
 
-def read_given(folder: Path) -> Given | None:
+def read_invocation(folder: Path) -> Invocation | None:
     """Read what the training of a run folder was told; None where it does not say that, as older ones do not.
 
     Raises:
         ConfigError: the file is none that was written here.
     """
-    path = folder / GIVEN_FILE
+    path = folder / INVOCATION_FILE
     if not path.is_file():
         return None
     try:
@@ -65,6 +65,6 @@ def read_given(folder: Path) -> Given | None:
         for name, kind in (("task", str), ("import", str | None), ("changes", dict)):
             if not isinstance(said[name], kind):
                 raise TypeError(f"{name}: got {shown(said[name])}")
-        return Given(said["task"], said["import"], said["changes"])
+        return Invocation(said["task"], said["import"], said["changes"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ConfigError(f"{relative(path)}: does not say what a training was told ({error})") from error

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 
-class DivergenceMeter:
+class KLMeter:
     """Listens to a policy's `get_kl_divergence`; whoever calls it gets what it gave before."""
 
     def __init__(self, policy: Any) -> None:
