@@ -1,4 +1,4 @@
-"""Numbers on their way from a device to the host, in one transfer for which nothing waits until they are needed."""
+"""Asynchronous transfer of numbers from a device to the host."""
 
 from collections.abc import Mapping
 
@@ -7,13 +7,15 @@ from torch import Tensor
 
 
 class AsyncReadback:
-    """The numbers that some tensors of a device have now: at this place in the order of its work, whatever follows."""
+    """Values of some tensors at the moment of the call, copied to the host in one transfer. Work launched later does not
+    change them.
+    """
 
     @torch.no_grad()
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
-        """Ask for the numbers of `tensors`, by name; on a GPU the host goes on at once."""
+        """Start the transfer of `tensors`, by name. On a GPU this returns at once."""
         self._sizes = {name: tensor.numel() for name, tensor in tensors.items()}
-        self._numbers = torch.cat([tensor.reshape(-1) for tensor in tensors.values()])  # a copy: they may change
+        self._numbers = torch.cat([tensor.reshape(-1) for tensor in tensors.values()])  # a copy: the tensors may change
         self._arrival: torch.cuda.Event | None = None
         if self._numbers.is_cuda:
             of_device = self._numbers
@@ -23,7 +25,7 @@ class AsyncReadback:
             self._arrival.record()
 
     def numbers(self) -> dict[str, list[float]]:
-        """Return the numbers of each tensor; waits until they are there."""
+        """Wait for the transfer and return the values of each tensor."""
         if self._arrival is not None:
             self._arrival.synchronize()
         pieces = self._numbers.split(list(self._sizes.values()))

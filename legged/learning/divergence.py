@@ -1,4 +1,6 @@
-"""What is said and done about a training whose numbers are none: warnings by term, and an end to what does not mend."""
+"""Detector for trainings whose numbers become NaN or infinite. It warns of each term, and ends a training that does not
+recover.
+"""
 
 import sys
 from collections.abc import Mapping
@@ -7,33 +9,34 @@ from math import isnan
 from legged.errors import RunError
 
 PATIENCE = 10
-"""Iterations in a row that may go wrong."""
+"""Number of consecutive bad iterations after which training ends."""
 SHARE_OF_ROBOTS, SHARE_OF_BATCHES = 0.2, 0.5
-"""An iteration has gone wrong if robots were reset for it in this share of their steps, or with this share of mini-batches
-left out.
-"""
+"""Thresholds of a bad iteration: the share of robot steps that ended in a reset for NaN, and the share of skipped
+mini-batches."""
 FAULT = "Faults/"
 MINI_BATCHES = "Faults/mini_batches"
-"""Logged: the share of mini-batches that were left out, if any was."""
+"""Name in the log for the share of skipped mini-batches; logged if it is above 0."""
 
 
 class Diverged(RunError):
-    """Training went on being non-finite; the text says how."""
+    """Error raised when training has diverged; the text gives the cause."""
 
 
 class DivergenceDetector:
-    """Reads what an iteration has logged: warns once of every fault, and gives up on a training that does not recover."""
+    """Detector that reads the log of each iteration. It warns once of every fault, and decides when a training can't
+    recover.
+    """
 
     def __init__(self, steps_per_iteration: int) -> None:
-        """`steps_per_iteration` are the control steps of all robots of this process."""
+        """Take the control steps per iteration of all robots of this process."""
         self._steps = steps_per_iteration
         self._said: set[str] = set()
         self._in_a_row = 0
         self.why_stop = ""
-        """Why training can't go on; empty while it can."""
+        """Reason why training can't go on; empty if it can."""
 
     def update(self, values: Mapping[str, float], left_out: float) -> None:
-        """Take in an iteration: what it logged by name, and the share of mini-batches that were left out."""
+        """Process the log `values` of an iteration, by name, and the share `left_out` of skipped mini-batches."""
         found = {name.removeprefix(FAULT): count for name, count in values.items() if name.startswith(FAULT)}
         for name, count in found.items():
             if name not in self._said and not isnan(count):
@@ -55,11 +58,11 @@ class DivergenceDetector:
 
 
 MEANING = {"physics": "left all bounds, and they were reset", "action": "was NaN, and they were reset"}
-"""Fault -> what happened, where it is not that a term was no number."""
+"""Fault -> description, for the faults that are not simply a NaN or infinite term."""
 
 
 def term(name: str) -> str:
-    """'reward_torques' -> '_reward_torques', the name of the method; 'the physics', 'the action'."""
+    """Return the method name of a term, 'reward_torques' -> '_reward_torques', or 'the physics', 'the action'."""
     return f"the {name}" if name in MEANING else f"_{name}"
 
 

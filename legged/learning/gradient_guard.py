@@ -1,4 +1,4 @@
-"""Keeps NaN out of networks that an optimiser of torch steps by itself, as in rsl-rl's own update."""
+"""Protection against NaN for the networks of rsl-rl's own update, which calls torch's optimiser itself."""
 
 from typing import Any
 
@@ -6,10 +6,12 @@ import torch
 
 
 class GradientGuard:
-    """Leaves out the steps of an optimiser in which a gradient is NaN or infinite; reads on the host."""
+    """Hook that skips the steps of an optimiser in which a gradient is NaN or infinite. It reads from the device at every
+    step.
+    """
 
     def __init__(self, optimizer: torch.optim.Optimizer) -> None:
-        """Every later step of `optimizer` is looked at."""
+        """Register the hook for all later steps of `optimizer`."""
         self._steps, self._left_out = 0, 0
         optimizer.register_step_pre_hook(self._look)
 
@@ -18,10 +20,10 @@ class GradientGuard:
         self._steps += 1
         if gradients and not bool(torch.nn.utils.get_total_norm(gradients) < torch.inf):
             self._left_out += 1
-            optimizer.zero_grad(set_to_none=True)  # a parameter without a gradient is passed over
+            optimizer.zero_grad(set_to_none=True)  # the optimiser skips parameters without a gradient
 
     def flush(self) -> float:
-        """Return the share of steps that were left out since the last flush."""
+        """Return the share of skipped steps since the last flush."""
         share = self._left_out / max(self._steps, 1)
         self._steps, self._left_out = 0, 0
         return share

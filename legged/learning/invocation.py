@@ -1,7 +1,7 @@
-"""What a training was told on its command line: given.json in its run folder.
+"""The task and settings on a training's command line, stored in its run folder as given.json.
 
-A task of a user's own is known by its name to nobody who has not been told where it is. A report therefore names it as it was
-named, and where it can't be looked up says what the command line set.
+The name of a user-defined task is not enough to find it: its module or file must be known too. A report therefore names the
+task as the command line did. If it can't load the task, it shows the settings of the command line.
 """
 
 import json
@@ -21,14 +21,14 @@ INVOCATION_FILE = "given.json"
 
 @dataclass(frozen=True)
 class Invocation:
-    """A task as it was named, and what was set."""
+    """Task and settings of a command line."""
 
     task: str
-    """Its name, or its YAML file."""
+    """Name of the task, or its YAML file."""
     module: str | None = None
-    """What --import named."""
+    """Value of --import."""
     changes: Mapping[str, Any] = field(default_factory=dict)
-    """Dotted path -> value; of a resumed training also those of the command lines before."""
+    """Dotted path -> value; for a resumed training, with those of earlier command lines."""
 
     @property
     def flags(self) -> list[str]:
@@ -38,24 +38,24 @@ class Invocation:
 
 
 def write_invocation(folder: Path, invocation: Invocation, before: Path | None = None) -> None:
-    """Write what a training was told into its run folder; `before` is the folder that it goes on from, if it does.
+    """Write the invocation into a run folder. `before` is the folder of the run that is resumed, if there is one.
 
     Raises:
         RunError: it can't be written.
     """
     earlier: Mapping[str, Any] = {}
     if before is not None:
-        with suppress(ConfigError):  # a report on that run names what is damaged
+        with suppress(ConfigError):  # a report on that run names the damage
             earlier = (read_invocation(before) or invocation).changes
     said = {"task": invocation.task, "import": invocation.module, "changes": {**earlier, **invocation.changes}}
     write_text(folder / INVOCATION_FILE, json.dumps(said, indent=1, default=str) + "\n")
 
 
 def read_invocation(folder: Path) -> Invocation | None:
-    """Read what the training of a run folder was told; None where it does not say that, as older ones do not.
+    """Read the invocation from a run folder. Return None for runs of old versions, which lack it.
 
     Raises:
-        ConfigError: the file is none that was written here.
+        ConfigError: the file is damaged.
     """
     path = folder / INVOCATION_FILE
     if not path.is_file():

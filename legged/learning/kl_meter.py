@@ -1,4 +1,4 @@
-"""The divergence that rsl-rl's own update computes, to set the learning rate by, and does not log."""
+"""Recorder of the KL divergence that rsl-rl's own update computes for its learning rate but does not log."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 class KLMeter:
-    """Listens to a policy's `get_kl_divergence`; whoever calls it gets what it gave before."""
+    """Wrapper around a policy's `get_kl_divergence` that records the results. Callers get the same results as before."""
 
     def __init__(self, policy: Any) -> None:
         self._means: list[Tensor] = []
@@ -22,6 +22,6 @@ class KLMeter:
 
     @torch.inference_mode()
     def flush(self) -> float | None:
-        """Return the mean over the calls since the last flush; None if there were none, as with a fixed learning rate."""
+        """Return the mean over the calls since the last flush, or None without calls, as with a fixed learning rate."""
         means, self._means = self._means, []
         return float(torch.stack(means).mean()) if means else None
