@@ -12,10 +12,10 @@ from typing import Any
 import torch
 
 from legged.config import TaskConfig, load_config
-from legged.config.carry import carry
 from legged.config.checks import PLAIN, is_plain_name, shown
-from legged.config.loader import Carry, Registered, class_hints
+from legged.config.loader import Registered, Rescale, class_hints
 from legged.config.networks import groups_in
+from legged.config.rescale import rescale
 from legged.envs import BaseTask, LeggedRobot
 from legged.envs.marks import unit_of
 from legged.errors import ConfigError, suggest
@@ -192,14 +192,14 @@ def task_config(name: str, overrides: Iterable[tuple[str, Any]] = (), on_cpu: bo
     """
     kind = task_class(name)
     schema = _schema_of(kind)
-    cfg = load_config(_entry(name), name, overrides, on_cpu, _REGISTERED, schema, _carrier(kind, schema))
+    cfg = load_config(_entry(name), name, overrides, on_cpu, _REGISTERED, schema, _rescaler(kind, schema))
     kind.check(cfg)
     _check_units(kind, cfg)
     return cfg
 
 
 def _check_units(kind: type[BaseTask], cfg: TaskConfig) -> None:
-    """Look for terms whose numbers were carried from another robot, and which do not declare their unit.
+    """Look for terms whose numbers were rescaled from another robot, and which do not declare their unit.
 
     Raises:
         ConfigError: there is one that runs, and whose number is not 0.
@@ -213,21 +213,21 @@ def _check_units(kind: type[BaseTask], cfg: TaskConfig) -> None:
             prefix, _ = field.metadata.get("unit_of", ("", 1))
             for name, number in getattr(getattr(cfg, section), field.name).items() if prefix in running else ():
                 path = f"{section}.{field.name}.{name}"
-                if not number or name not in running[prefix] or cfg.origins.of(path) not in cfg.origins.carried:
+                if not number or name not in running[prefix] or cfg.origins.of(path) not in cfg.origins.rescaled:
                     continue
                 if unit_of(getattr(kind, prefix + name)) is None:
                     parents = (unit_of(getattr(part, prefix + name, None)) for part in kind.__mro__)
                     example = next((unit for unit in parents if unit is not None), "m^2/s^2")
                     raise ConfigError(
-                        f"{cfg.origins.where(path)}: the number is carried from another robot, and"
+                        f"{cfg.origins.where(path)}: the number is rescaled from another robot, and"
                         f" {kind.__name__}.{prefix}{name}"
-                        f' declares no unit to carry it by: write @unit("{example}") above the method (from legged import'
+                        f' declares no unit for that: write @unit("{example}") above the method (from legged import'
                         ' unit), with the unit of what it returns; a plain number has @unit("1"). A docstring does not count'
                     )
 
 
-def _carrier(kind: type[BaseTask], schema: type[TaskConfig]) -> Carry:
-    """Return what carries the numbers of a configuration from the robot that they are written for to another one."""
+def _rescaler(kind: type[BaseTask], schema: type[TaskConfig]) -> Rescale:
+    """Return the function that rescales the numbers of a configuration from its reference robot to another one."""
 
     def unit_at(name: str) -> str:
         section, _, entry = name.rpartition(".")
@@ -235,23 +235,23 @@ def _carrier(kind: type[BaseTask], schema: type[TaskConfig]) -> Carry:
             return TERRAIN_TYPES[entry].unit if entry in TERRAIN_TYPES else "1"
         if section == "domain_rand.ranges":
             return FIELDS[entry].unit.partition(" or ")[0] if entry in FIELDS else "1"
-        return unit_of(getattr(kind, name, None)) or "1"  # `_check_units` refuses terms without
+        return unit_of(getattr(kind, name, None)) or "1"  # `_check_units` refuses terms without one
 
-    def carry_layer(data: Mapping[str, Any], written_for: str, robot: str, where: str) -> Mapping[str, Any]:
+    def rescale_layer(data: Mapping[str, Any], reference_robot: str, robot: str, where: str) -> Mapping[str, Any]:
         if not issubclass(kind, LeggedRobot):
-            raise ConfigError(f"{where}: a task of {kind.__name__} has no robot to which numbers could be carried")
-        reference = size_of(written_for, where)
-        if not robot or robot == written_for:
+            raise ConfigError(f"{where}: a task of {kind.__name__} has no robot to which numbers could be rescaled")
+        reference = size_of(reference_robot, where)
+        if not robot or robot == reference_robot:
             return data
         try:
             size = size_of(robot)
         except ConfigError:
             return data  # `check` says what is wrong with it, and who named it
-        factor = partial(grown, written_for=reference, robot=size)
-        carried = carry({key: value for key, value in data.items() if key != "cpu"}, schema, factor, unit_at)
-        return carried | ({"cpu": carry(data["cpu"], schema, factor, unit_at)} if "cpu" in data else {})
+        factor = partial(grown, reference=reference, robot=size)
+        rescaled = rescale({key: value for key, value in data.items() if key != "cpu"}, schema, factor, unit_at)
+        return rescaled | ({"cpu": rescale(data["cpu"], schema, factor, unit_at)} if "cpu" in data else {})
 
-    return carry_layer
+    return rescale_layer
 
 
 def make_task(cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None) -> Any:

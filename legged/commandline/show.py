@@ -56,18 +56,18 @@ def _number(value: float) -> str:
 
 
 def _robot(task: BaseTask) -> Iterator[str]:
-    """Yield how large a legged robot is, and by what numbers have been carried to it from those they were written for."""
+    """Yield the size of a legged robot, and the factors by which numbers were rescaled from their reference robot."""
     if not isinstance(task, LeggedRobot):
         return
     size = Size(task.robot.mass, task.robot.height)
     line = f"robot: {task.robot.name}, {size.mass:.4g} kg, {size.height:.3g} m high"
-    for name in task.cfg.origins.written_for:
+    for name in task.cfg.origins.reference_robots:
         by = growth(size_of(name), size)
         if set(by.values()) == {1.0}:
             line += "; numbers are written for it"
             continue
         factors = f"masses x {by['kg']:.3g}, lengths x {by['m']:.3g}, times x {by['s']:.3g}"
-        line += f"; numbers written for {Path(name).name} are carried: {factors}"
+        line += f"; numbers written for {Path(name).name} are rescaled: {factors}"
     yield ""
     yield line
 

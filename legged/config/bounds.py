@@ -37,17 +37,17 @@ def quantity(unit: str, bounds: Bounds) -> Bounds:
     return {**bounds, "unit": unit}
 
 
-def carried(unit: str, bounds: Bounds) -> Bounds:
-    """Return metadata: a quantity of `unit` that grows with the robot (carry.py), within `bounds`."""
-    return {**quantity(unit, bounds), "carried": unit}
+def rescaled(unit: str, bounds: Bounds) -> Bounds:
+    """Return metadata: a quantity of `unit` that grows with the robot (rescale.py), within `bounds`."""
+    return {**quantity(unit, bounds), "rescaled": unit}
 
 
-def carried_by_term(prefix: str, power: int, bounds: Bounds) -> Bounds:
+def rescaled_by_term(prefix: str, power: int, bounds: Bounds) -> Bounds:
     """Return metadata: for each term a number that grows with that power of what the method `<prefix><term>` returns."""
     return {**bounds, "unit_of": (prefix, power)}
 
 
-def carried_by_entry(path: str, bounds: Bounds) -> Bounds:
+def rescaled_by_entry(path: str, bounds: Bounds) -> Bounds:
     """Return metadata: for each entry of the map at the dotted `path` numbers that grow with the entry's unit."""
     return {**bounds, "unit_of": (f"{path}.", 1)}
 

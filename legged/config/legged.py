@@ -13,12 +13,12 @@ from legged.config.bounds import (
     TERMS,
     UNIT,
     between,
-    carried,
-    carried_by_entry,
-    carried_by_term,
     items,
     positive,
     quantity,
+    rescaled,
+    rescaled_by_entry,
+    rescaled_by_term,
 )
 from legged.config.mdp import (
     ControlConfig,
@@ -35,7 +35,7 @@ from legged.config.task import TaskConfig
 
 MOTION = between(-100, 100)
 """Bounds of velocities [m/s] or [rad/s], of angles [rad] and of factors on them."""
-MEASURED = carried("m", items(500, between(-100, 100)))
+MEASURED = rescaled("m", items(500, between(-100, 100)))
 FASTEST = 20.0
 """A command that is judged, at most [m/s, rad/s]: the ground that fast robots need grows with the square of it."""
 Axis = tuple[float, float, float]
@@ -51,30 +51,30 @@ class TerrainConfig:
     """An infinite horizontal plane, or a height map of num_rows x num_cols tiles."""
     curriculum: bool = True
     """Robots move to harder rows while they succeed; otherwise all rows are hard, and robots stay where they are."""
-    scale: float = field(default=1.0, metadata={**positive(100, low=0.01), "carried": "m"})
+    scale: float = field(default=1.0, metadata={**positive(100, low=0.01), "rescaled": "m"})
     """Factor on all lengths that the types are made of, treads and sizes alike; 1 suits a robot half a metre high."""
     proportions: dict[str, float] = field(default_factory=dict, metadata=UNIT)
     """Terrain type -> share of the columns; sums to 1. Types: legged/terrain/generators.py, TERRAIN_TYPES."""
-    sizes: dict[str, float | Range] = field(default_factory=dict, metadata=carried_by_entry("terrain.sizes", positive(100)))
+    sizes: dict[str, float | Range] = field(default_factory=dict, metadata=rescaled_by_entry("terrain.sizes", positive(100)))
     """Terrain type -> size of all its tiles, in its unit, or the lowest and highest size: evenly from the easier one in the
     first row to the harder one at difficulty 1. In place of the type's own."""
     num_rows: int = field(default=10, metadata=between(1, 1000))
     """Levels of difficulty: row / num_rows."""
     num_cols: int = field(default=20, metadata=between(1, 1000))
     """Columns, each of one type."""
-    terrain_length: float = field(default=8.0, metadata=carried("m", positive(1000, low=0.01)))
+    terrain_length: float = field(default=8.0, metadata=rescaled("m", positive(1000, low=0.01)))
     """Extent of a tile along x [m]."""
-    terrain_width: float = field(default=8.0, metadata=carried("m", positive(1000, low=0.01)))
+    terrain_width: float = field(default=8.0, metadata=rescaled("m", positive(1000, low=0.01)))
     """Extent of a tile along y [m]."""
-    border_size: float = field(default=25.0, metadata=carried("m", between(0, 1000)))
+    border_size: float = field(default=25.0, metadata=rescaled("m", between(0, 1000)))
     """Width of the level ground around all tiles [m]."""
-    horizontal_scale: float = field(default=0.1, metadata=carried("m", positive(10, low=1e-3)))
+    horizontal_scale: float = field(default=0.1, metadata=rescaled("m", positive(10, low=1e-3)))
     """Edge of a cell of the height map [m]."""
     slope_threshold: float = field(default=0.2, metadata=between(0, 1000))
     """On types made of steps, a difference between cells steeper than this (rise over run) is a vertical face."""
     max_init_terrain_level: int = field(default=5, metadata=between(0, 999))
     """Highest row in which robots start training."""
-    spawn_range: float = field(default=1.0, metadata=carried("m", between(0, 1000)))
+    spawn_range: float = field(default=1.0, metadata=rescaled("m", between(0, 1000)))
     """Robots start at most this far from the middle of their tile, in x and in y [m]."""
     measured_points_x: tuple[float, ...] = field(default=tuple(round(0.1 * i - 0.8, 1) for i in range(17)), metadata=MEASURED)
     """Where heights are measured, forward of the base [m]."""
@@ -143,7 +143,7 @@ class InitStateConfig:
     """Joint angles are the default ones times a number drawn from this range, per joint."""
     yaw: Range = field(default=(0.0, 0.0), metadata=quantity("rad", MOTION))
     """Heading of the base [rad]."""
-    base_velocity: Range = field(default=(-0.5, 0.5), metadata=carried("m/s", MOTION))
+    base_velocity: Range = field(default=(-0.5, 0.5), metadata=rescaled("m/s", MOTION))
     """Range of each component of the base's linear [m/s] and angular [rad/s] velocity."""
 
 
@@ -174,7 +174,7 @@ class LeggedTerminationsConfig(TerminationsConfig):
     100 N; `base_height` and `tilt` have their limits below."""
     time_outs: tuple[str, ...] = field(default=("left_terrain",), metadata=TERMS)
     """`left_terrain`: a robot that walked off the map is not judged for it."""
-    min_base_height: float = field(default=0.0, metadata=carried("m", between(0, 100)))
+    min_base_height: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
     """Lowest height of the base above the ground [m]; 0 switches `base_height` off."""
     max_tilt: float = field(default=0.0, metadata=quantity("rad", between(0, 10)))
     """Largest angle between the base's up axis and the vertical [rad]; 0 switches `tilt` off."""
@@ -192,13 +192,13 @@ class LeggedDomainRandConfig(DomainRandConfig):
     """Friction is drawn from this many values."""
     randomize_base_mass: bool = False
     """Add a mass to each robot's base."""
-    added_mass_range: Range = field(default=(-5.0, 5.0), metadata=carried("kg", between(-10_000, 10_000)))
+    added_mass_range: Range = field(default=(-5.0, 5.0), metadata=rescaled("kg", between(-10_000, 10_000)))
     """Mass added to the base [kg]."""
     push_robots: bool = True
     """Set the base's horizontal velocity now and then, each robot at its own moment."""
     push_interval_s: float = field(default=15.0, metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Time between two pushes of a robot [s]."""
-    max_push_vel_xy: float = field(default=1.0, metadata=carried("m/s", between(0, 100)))
+    max_push_vel_xy: float = field(default=1.0, metadata=rescaled("m/s", between(0, 100)))
     """Range of a push's velocity, per world axis [m/s]."""
     kicks: dict[str, KickConfig] = field(default_factory=dict)
     """Any name -> sudden changes of the base's velocity, which they add to where push_robots sets it."""
@@ -237,20 +237,20 @@ class LeggedRewardsConfig(RewardsConfig):
             "collision": -1.0,
             "action_rate": -0.01,
         },
-        metadata=carried_by_term("_reward_", -1, between(-LARGEST, LARGEST)),
+        metadata=rescaled_by_term("_reward_", -1, between(-LARGEST, LARGEST)),
     )
     """Term -> scale; multiplied by the control step. A scale of 0 switches the term off."""
     only_positive_rewards: bool = True
     """Clip the sum at zero (before `termination`) against early learning to fall."""
     tracking_sigma: float = field(default=0.25, metadata=positive(LARGEST, low=1e-6))
     """Tracking reward = exp(-error^2 / sigma)."""
-    air_time_target_s: float = field(default=0.5, metadata=carried("s", between(0, 100)))
+    air_time_target_s: float = field(default=0.5, metadata=rescaled("s", between(0, 100)))
     """Swings longer than this are rewarded by feet_air_time, shorter ones punished; single_stance pays them most [s]."""
-    feet_clearance_target: float = field(default=0.1, metadata=carried("m", between(0, 100)))
+    feet_clearance_target: float = field(default=0.1, metadata=rescaled("m", between(0, 100)))
     """Height of a swinging foot above the lowest foot that feet_clearance wants [m]."""
-    base_height_target: float = field(default=0.5, metadata=carried("m", positive(100)))
+    base_height_target: float = field(default=0.5, metadata=rescaled("m", positive(100)))
     """Base height wanted by base_height [m]."""
-    max_contact_force: float = field(default=500.0, metadata=carried("N", positive(LARGEST)))
+    max_contact_force: float = field(default=500.0, metadata=rescaled("N", positive(LARGEST)))
     """Foot forces above this are penalised by feet_contact_forces [N]."""
     soft_dof_pos_limit: float = field(default=1.0, metadata=positive(10))
     """Share of a joint's range outside which dof_pos_limits counts."""
@@ -276,7 +276,7 @@ class LeggedObservationsConfig(ObservationsConfig):
     """`actor`: what the policy sees, with noise; `critic`: what the value function sees, without."""
     scales: dict[str, float] = field(
         default_factory=lambda: {"base_lin_vel": 2.0, "base_ang_vel": 0.25, "dof_vel": 0.05, "heights": 5.0},
-        metadata=carried_by_term("_obs_", -1, between(-LARGEST, LARGEST)),
+        metadata=rescaled_by_term("_obs_", -1, between(-LARGEST, LARGEST)),
     )
     """Term -> factor; 1 where not named. `commands` are scaled like the velocities they ask for."""
     noise: dict[str, float] = field(
@@ -288,14 +288,14 @@ class LeggedObservationsConfig(ObservationsConfig):
             "dof_vel": 1.5,
             "heights": 0.1,
         },
-        metadata=carried_by_term("_obs_", 1, between(0, LARGEST)),
+        metadata=rescaled_by_term("_obs_", 1, between(0, LARGEST)),
     )
     """Term -> half width of its uniform noise, in the term's unit before scaling."""
-    heights_offset: float = field(default=0.5, metadata=carried("m", between(-100, 100)))
+    heights_offset: float = field(default=0.5, metadata=rescaled("m", between(-100, 100)))
     """Observed heights are relative to this far below the base [m]."""
-    heights_limit: float = field(default=1.0, metadata=carried("m", positive(100)))
+    heights_limit: float = field(default=1.0, metadata=rescaled("m", positive(100)))
     """Observed heights are at most this large, up or down [m]."""
-    depth_limit: float = field(default=0.0, metadata=carried("m", between(0, 100)))
+    depth_limit: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
     """Low ground is observed at most this deep, if heights_limit is more; 0: heights_limit alone [m]."""
     once_trained: HeightLimitsConfig = field(default_factory=HeightLimitsConfig)
     """What a policy is told of heights in play, evaluation and export, if that is less than in training."""

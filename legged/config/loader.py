@@ -32,7 +32,7 @@ class Registered:
 
 
 Source = Path | Mapping[str, Any] | Registered
-Carry = Callable[[Mapping[str, Any], str, str, str], Mapping[str, Any]]
+Rescale = Callable[[Mapping[str, Any], str, str, str], Mapping[str, Any]]
 """Data of a layer, the robot it is written for, the robot of the task, and how errors begin -> data for the task's robot."""
 
 
@@ -70,7 +70,7 @@ class _Layer:
     """The name of the registered task that it is; None for a file."""
     kind: Any
     """What it names as the class of the task; None if it names none."""
-    written_for: Any
+    reference_robot: Any
     """The robot for which its numbers are meant; None if they are meant for any."""
 
 
@@ -94,10 +94,10 @@ def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> 
         data = renamed(read_yaml(given) if isinstance(given, Path) else given, name)
         if isinstance(data.get("cpu"), Mapping):
             data["cpu"] = renamed(data["cpu"], f"{name}: cpu")
-        parent, kind, written_for = (data.pop(key, None) for key in ("extends", "class", "written_for"))
+        parent, kind, reference_robot = (data.pop(key, None) for key in ("extends", "class", "written_for"))
         beside = given.parent if isinstance(given, Path) else None
         folder = beside or (found.folder if isinstance(found, Registered) else Path.cwd())
-        layers.append(_Layer(data, name, folder, task if isinstance(found, Registered) else None, kind, written_for))
+        layers.append(_Layer(data, name, folder, task if isinstance(found, Registered) else None, kind, reference_robot))
         if parent is None:
             return layers
         others = {key: entry for key, entry in registered.items() if _mark(entry) not in seen}
@@ -147,7 +147,7 @@ def class_hints(source: Source, task: str, registered: Mapping[str, Registered])
 
 
 def _merged(
-    layers: Iterable[_Layer], schema: type[TaskConfig], carry: Carry | None, robot: str | None, on_cpu: bool
+    layers: Iterable[_Layer], schema: type[TaskConfig], rescale: Rescale | None, robot: str | None, on_cpu: bool
 ) -> tuple[dict[str, Any], Origins]:
     """Return layers laid over those after them, each under its own `cpu:` section (if asked), so that the nearest file has
     the last word. Each is checked by itself: what another one sets over it must not hide a mistake. Numbers that a layer
@@ -172,18 +172,18 @@ def _merged(
     origins = Origins()
     for layer, data in parts:
         name = layer.name
-        if layer.written_for is not None:
+        if layer.reference_robot is not None:
             where = f"{name}: written_for"
-            if not isinstance(layer.written_for, str):
-                raise ConfigError(f"{where}: expected the name of a robot, got {shown(layer.written_for)}")
-            carried: Mapping[str, Any] = data
-            if carry is not None and isinstance(robot, str):  # what is no name is found where the command line is checked
-                reference = robot_path(layer.written_for, layer.folder)
-                carried = carry(data, reference, robot, where)
-                origins.written_for = tuple(dict.fromkeys([*origins.written_for, reference]))
-            if carried is not data:
-                data, name = dict(carried), f"{name} (written for {Path(layer.written_for).name})"
-                origins.carried |= {name, f"{name}: cpu"}
+            if not isinstance(layer.reference_robot, str):
+                raise ConfigError(f"{where}: expected the name of a robot, got {shown(layer.reference_robot)}")
+            rescaled: Mapping[str, Any] = data
+            if rescale is not None and isinstance(robot, str):  # what is no name is found where the command line is checked
+                reference = robot_path(layer.reference_robot, layer.folder)
+                rescaled = rescale(data, reference, robot, where)
+                origins.reference_robots = tuple(dict.fromkeys([*origins.reference_robots, reference]))
+            if rescaled is not data:
+                data, name = dict(rescaled), f"{name} (written for {Path(layer.reference_robot).name})"
+                origins.rescaled |= {name, f"{name}: cpu"}
         cpu = data.pop("cpu", {})
         merge(merged, data, name, origins)
         if on_cpu:
@@ -268,7 +268,7 @@ def load_config(
     on_cpu: bool = False,
     registered: Mapping[str, Registered] | None = None,
     schema: type[TaskConfig] = LeggedConfig,
-    carry: Carry | None = None,
+    rescale: Rescale | None = None,
 ) -> TaskConfig:
     """Load the task file or mapping `source`, over what it extends (a file, or one of the tasks in `registered`), each
     under its `cpu:` section (if asked), and under overrides, as an instance of `schema`. What of it is written for another
@@ -281,7 +281,7 @@ def load_config(
     overrides = list(overrides)
     named = [robot_path(value, Path.cwd()) for key, value in overrides if key == "robot"]
     robot = named[-1] if named else None
-    data, origins = _merged(_layers(source, task, registered or {}), schema, carry, robot, on_cpu)
+    data, origins = _merged(_layers(source, task, registered or {}), schema, rescale, robot, on_cpu)
     data["task"] = task
     where = Origins(origins)
     _merge_overrides(data, overrides, where, schema)
@@ -317,7 +317,7 @@ def from_dict(
         merge({}, data, source, origins)
     cfg = build(schema, data, "", origins, source)
     cfg.origins.update(origins)
-    cfg.origins.written_for, cfg.origins.carried = origins.written_for, origins.carried
+    cfg.origins.reference_robots, cfg.origins.rescaled = origins.reference_robots, origins.rescaled
     return cfg
 
 

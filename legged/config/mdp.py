@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 from legged.config.actuator import LONGEST_DELAY, Steps
-from legged.config.bounds import LARGEST, NAMES, TERMS, UNIT, between, carried_by_entry, carried_by_term, positive
+from legged.config.bounds import LARGEST, NAMES, TERMS, UNIT, between, positive, rescaled_by_entry, rescaled_by_term
 from legged.config.randomization import DrawConfig, Range
 
 
@@ -33,12 +33,12 @@ class DomainRandConfig:
     """What differs from robot to robot."""
 
     ranges: dict[str, Range | DrawConfig] = field(
-        default_factory=dict, metadata=carried_by_entry("domain_rand.ranges", between(-LARGEST, LARGEST))
+        default_factory=dict, metadata=rescaled_by_entry("domain_rand.ranges", between(-LARGEST, LARGEST))
     )
     """Property -> range from which each robot's is drawn evenly at the start; or a mapping, which has the range as `range`,
     and beside it how and when. Properties: legged/physics/fields.py."""
     observed_ranges: dict[str, Range | DrawConfig] = field(
-        default_factory=dict, metadata=carried_by_entry("domain_rand.ranges", between(-LARGEST, LARGEST))
+        default_factory=dict, metadata=rescaled_by_entry("domain_rand.ranges", between(-LARGEST, LARGEST))
     )
     """Property -> the same for properties that are observed (`_obs_rand_<property>`) and not drawn, or not by that range:
     play and evaluation put here what was drawn in training."""
@@ -86,7 +86,7 @@ class ObservationsConfig:
     """Factor on all noise."""
     noise: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
     """Term -> half width of its uniform noise, in the term's unit before scaling."""
-    bias: dict[str, float] = field(default_factory=dict, metadata=carried_by_term("_obs_", 1, between(0, LARGEST)))
+    bias: dict[str, float] = field(default_factory=dict, metadata=rescaled_by_term("_obs_", 1, between(0, LARGEST)))
     """Term -> half width of the error of each of its numbers that stays for an episode, in the term's unit before scaling.
     Bias, delay and lost packets are seen by the groups that have noise, and only while `add_noise` is on."""
     delay: dict[str, Steps] = field(default_factory=dict, metadata=between(0, LONGEST_DELAY))

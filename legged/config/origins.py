@@ -9,10 +9,10 @@ class Origins(dict[str, str]):
     def __init__(self, other: Mapping[str, str] | None = None) -> None:
         """Copy another one, or begin with nothing."""
         super().__init__(other or {})
-        self.written_for: tuple[str, ...] = other.written_for if isinstance(other, Origins) else ()
+        self.reference_robots: tuple[str, ...] = other.reference_robots if isinstance(other, Origins) else ()
         """Robots for which files say that their numbers are written, each once."""
-        self.carried: frozenset[str] = other.carried if isinstance(other, Origins) else frozenset()
-        """Sources whose numbers were carried from another robot (carry.py)."""
+        self.rescaled: frozenset[str] = other.rescaled if isinstance(other, Origins) else frozenset()
+        """Sources whose numbers were carried from another robot (rescale.py)."""
 
     def note(self, path: str, source: str) -> None:
         """Note that `source` set `path`, and forget what it replaces, above and below."""

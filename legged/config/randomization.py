@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from legged.config.bounds import LARGEST, LONGEST_S, between, carried, positive, quantity
+from legged.config.bounds import LARGEST, LONGEST_S, between, positive, quantity, rescaled
 
 Range = tuple[float, float]
 ITERATIONS = between(0, 10_000_000)
@@ -39,17 +39,17 @@ class KickConfig:
 
     interval_s: Range = field(default=(5.0, 10.0), metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Range of the time between two kicks of a robot, drawn anew after each [s]."""
-    x: Range = field(default=(0.0, 0.0), metadata=carried("m/s", KICK))
+    x: Range = field(default=(0.0, 0.0), metadata=rescaled("m/s", KICK))
     """What is added to the base's velocity along x, world frame [m/s]."""
-    y: Range = field(default=(0.0, 0.0), metadata=carried("m/s", KICK))
+    y: Range = field(default=(0.0, 0.0), metadata=rescaled("m/s", KICK))
     """Along y, world frame [m/s]."""
-    z: Range = field(default=(0.0, 0.0), metadata=carried("m/s", KICK))
+    z: Range = field(default=(0.0, 0.0), metadata=rescaled("m/s", KICK))
     """Along z, world frame [m/s]."""
-    roll: Range = field(default=(0.0, 0.0), metadata=carried("rad/s", KICK))
+    roll: Range = field(default=(0.0, 0.0), metadata=rescaled("rad/s", KICK))
     """What is added to the base's angular velocity about its x axis, base frame [rad/s]."""
-    pitch: Range = field(default=(0.0, 0.0), metadata=carried("rad/s", KICK))
+    pitch: Range = field(default=(0.0, 0.0), metadata=rescaled("rad/s", KICK))
     """About its y axis, base frame [rad/s]."""
-    yaw: Range = field(default=(0.0, 0.0), metadata=carried("rad/s", KICK))
+    yaw: Range = field(default=(0.0, 0.0), metadata=rescaled("rad/s", KICK))
     """About its z axis, base frame [rad/s]."""
     grow: Range = field(default=(0.0, 0.0), metadata=ITERATIONS)
     """Iterations between which kicks grow from nothing to their full ranges; [0, 0] has them full at once."""
@@ -65,11 +65,11 @@ class ForceConfig:
     """Range of the time from the end of one push of a robot to the next, drawn anew after each [s]."""
     duration_s: Range = field(default=(0.1, 0.5), metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Range of the time that it lasts, in whole control steps and at least one [s]."""
-    x: Range = field(default=(0.0, 0.0), metadata=carried("N", between(-LARGEST, LARGEST)))
+    x: Range = field(default=(0.0, 0.0), metadata=rescaled("N", between(-LARGEST, LARGEST)))
     """Force along x at the body's centre of mass, world frame [N]."""
-    y: Range = field(default=(0.0, 0.0), metadata=carried("N", between(-LARGEST, LARGEST)))
+    y: Range = field(default=(0.0, 0.0), metadata=rescaled("N", between(-LARGEST, LARGEST)))
     """Along y, world frame [N]."""
-    z: Range = field(default=(0.0, 0.0), metadata=carried("N", between(-LARGEST, LARGEST)))
+    z: Range = field(default=(0.0, 0.0), metadata=rescaled("N", between(-LARGEST, LARGEST)))
     """Along z, world frame [N]."""
     grow: Range = field(default=(0.0, 0.0), metadata=ITERATIONS)
     """Iterations between which forces grow from nothing to their full ranges; [0, 0] has them full at once."""

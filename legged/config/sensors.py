@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from legged.config.bounds import between, carried
+from legged.config.bounds import between, rescaled
 
 
 @dataclass(frozen=True)
@@ -11,13 +11,13 @@ class HeightMapConfig:
     term. The groups with `noise: true` see it.
     """
 
-    offset: float = field(default=0.0, metadata=carried("m", between(0, 100)))
+    offset: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
     """Half width of the error of all heights alike, drawn for each episode [m]."""
-    shift: float = field(default=0.0, metadata=carried("m", between(0, 100)))
+    shift: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
     """Half width of the map's displacement along each horizontal axis of the world, drawn for each episode [m]."""
-    drift: float = field(default=0.0, metadata=carried("m/s", between(0, 100)))
+    drift: float = field(default=0.0, metadata=rescaled("m/s", between(0, 100)))
     """Half width of the speed at which `offset` grows, drawn for each episode [m/s]."""
-    shift_drift: float = field(default=0.0, metadata=carried("m/s", between(0, 100)))
+    shift_drift: float = field(default=0.0, metadata=rescaled("m/s", between(0, 100)))
     """Half width of the speed at which `shift` grows along each axis, drawn for each episode [m/s]."""
     holes: float = field(default=0.0, metadata=between(0, 1))
     """Share of the points, drawn for each episode, of which the map knows nothing: they read 0, as level ground does
@@ -31,7 +31,7 @@ class HeightMapConfig:
 class HeightLimitsConfig:
     """Limits of the term `heights` for a policy that is trained; 0: as in training. Training does not use them."""
 
-    heights_limit: float = field(default=0.0, metadata=carried("m", between(0, 100)))
+    heights_limit: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
     """In place of observations.heights_limit [m]."""
-    depth_limit: float = field(default=0.0, metadata=carried("m", between(0, 100)))
+    depth_limit: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
     """In place of observations.depth_limit [m]."""

@@ -14,7 +14,7 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 
 def unit(text: str) -> Callable[[Method], Method]:
     """Declare the unit of what a term returns, such as "m^2/s^2"; "1" for a plain number. Columns of several units have
-    them separated by commas; the first counts where numbers are carried to another robot (docs/scaling.md).
+    them separated by commas; the first counts where numbers are rescaled for another robot (docs/scaling.md).
 
     Raises:
         ConfigError: the text is not a unit.

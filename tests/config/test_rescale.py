@@ -1,10 +1,10 @@
-"""Numbers that are written for one robot, carried to another: units, fields, terms, and what is never carried."""
+"""Numbers written for one robot and rescaled for another: units, fields, terms, and numbers that are never rescaled."""
 
 import pytest
 import yaml
 
-from legged.config.carry import carry
 from legged.config.legged import LeggedConfig
+from legged.config.rescale import rescale
 from legged.config.units import exponents, factor, is_unit
 from legged.envs.half_cheetah import HalfCheetah
 from legged.envs.humanoid import Humanoid
@@ -66,7 +66,7 @@ def test_fields_grow_by_their_unit_and_scales_of_terms_against_it():
         "observations": {"scales": {"heights": 5.0}, "noise": {"heights": 0.1}},
     }
     units = {"_reward_torques": "N^2 m^2", "_reward_collision": "1", "_obs_heights": "m"}
-    grown = carry(data, LeggedConfig, lambda unit: factor(unit, {"kg": 0.5, "m": 0.25, "s": 0.5}), units.__getitem__)
+    grown = rescale(data, LeggedConfig, lambda unit: factor(unit, {"kg": 0.5, "m": 0.25, "s": 0.5}), units.__getitem__)
     assert grown == {
         "rewards": {"base_height_target": 0.125, "tracking_sigma": 0.25, "scales": {"torques": -0.00064, "collision": -1.0}},
         "domain_rand": {"added_mass_range": [-2.5, 2.5]},
@@ -83,7 +83,7 @@ def test_every_reward_and_observation_declares_its_unit(kind):
 
 
 def test_rewards_whose_unit_is_one():
-    """A reward that measures something physical must be carried, and these do not."""
+    """A reward that measures something physical must have its number rescaled, and these do not."""
     counted = {name for name in LeggedRobot.terms("_reward_") if unit_of(getattr(LeggedRobot, f"_reward_{name}")) == "1"}
     tracking = {"tracking_lin_vel", "tracking_ang_vel"}
     assert counted == tracking | {"orientation", "action_rate", "collision", "termination", "stumble", "no_fly"}
@@ -135,10 +135,10 @@ class Overridden(LeggedRobot):
         return self.torques.abs().sum(dim=1)
 
 
-def test_a_user_defined_reward_is_carried_by_its_mark():
-    register("carry_marked", {**FOR_GO2, **SLIP}, Marked)
+def test_a_user_defined_reward_is_rescaled_by_its_mark():
+    register("rescale_marked", {**FOR_GO2, **SLIP}, Marked)
     speed = 0.3235036 / 0.5488202  # squared
-    assert task_config("carry_marked").rewards.scales["slip"] == pytest.approx(-0.1 / speed, rel=1e-4)
+    assert task_config("rescale_marked").rewards.scales["slip"] == pytest.approx(-0.1 / speed, rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -152,11 +152,11 @@ def test_a_user_defined_reward_is_carried_by_its_mark():
         ),
     ],
 )
-def test_a_carried_term_without_a_unit_is_refused(kind, config, message):
+def test_a_rescaled_term_without_a_unit_is_refused(kind, config, message):
     """With a unit in its docstring, too, for that is not read; and where it overrides a term with a unit."""
-    register("carry_bare", config, kind)
+    register("rescale_bare", config, kind)
     with pytest.raises(ConfigError, match=message):
-        task_config("carry_bare")
+        task_config("rescale_bare")
 
 
 @pytest.mark.parametrize(
@@ -170,10 +170,10 @@ def test_a_carried_term_without_a_unit_is_refused(kind, config, message):
         (Overridden, {"extends": "anymal_c_flat"}),
     ],
 )
-def test_a_term_whose_number_is_not_carried_needs_no_unit(kind, config):
-    register("carry_none", config, kind)
+def test_a_term_whose_number_is_not_rescaled_needs_no_unit(kind, config):
+    register("rescale_none", config, kind)
     scales = config.get("rewards", {}).get("scales", {"torques": -1e-5})
-    assert scales.items() <= task_config("carry_none").rewards.scales.items()
+    assert scales.items() <= task_config("rescale_none").rewards.scales.items()
 
 
 @pytest.fixture
@@ -188,28 +188,28 @@ def tasks(tmp_path):
 
 
 def test_the_robot_it_was_written_for_has_the_numbers_as_they_are(tasks):
-    tasks("carry_same", {"written_for": "anymal_c", "robot": "anymal_c", "rewards": {"base_height_target": 0.123456789}})
-    assert task_config("carry_same").rewards.base_height_target == 0.123456789
+    tasks("rescale_same", {"written_for": "anymal_c", "robot": "anymal_c", "rewards": {"base_height_target": 0.123456789}})
+    assert task_config("rescale_same").rewards.base_height_target == 0.123456789
 
 
 def test_what_is_set_over_it_is_taken_as_it_stands(tasks):
     """By a file that extends it, by another one of its own kind, and by the command line."""
     parent = {"written_for": "anymal_c", "rewards": {"base_height_target": 0.5, "max_contact_force": 350.0}}
-    tasks("carry_parent", {**parent, "domain_rand": {"max_push_vel_xy": 1.0}, "cpu": {"terrain": {"spawn_range": 2.0}}})
-    tasks("carry_child", {"extends": "carry_parent", "robot": "go2", "rewards": {"max_contact_force": 99.0}})
-    cfg = task_config("carry_child", [("domain_rand.max_push_vel_xy", 0.25)], on_cpu=True)
+    tasks("rescale_parent", {**parent, "domain_rand": {"max_push_vel_xy": 1.0}, "cpu": {"terrain": {"spawn_range": 2.0}}})
+    tasks("rescale_child", {"extends": "rescale_parent", "robot": "go2", "rewards": {"max_contact_force": 99.0}})
+    cfg = task_config("rescale_child", [("domain_rand.max_push_vel_xy", 0.25)], on_cpu=True)
     height = 0.3235036 / 0.5488202  # of the two bases above their feet, in their default poses
     assert cfg.rewards.base_height_target == pytest.approx(0.5 * height, rel=1e-5)
     assert cfg.terrain.spawn_range == pytest.approx(2.0 * height, rel=1e-5)
     assert cfg.rewards.max_contact_force == 99.0
     assert cfg.domain_rand.max_push_vel_xy == 0.25
-    assert "carry_parent.yaml (written for anymal_c)" in cfg.origins.of("rewards.base_height_target")
-    assert "carry_child.yaml" in cfg.origins.of("rewards.max_contact_force")
+    assert "rescale_parent.yaml (written for anymal_c)" in cfg.origins.of("rewards.base_height_target")
+    assert "rescale_child.yaml" in cfg.origins.of("rewards.max_contact_force")
 
 
 def test_the_robot_of_the_command_line_counts(tasks):
-    tasks("carry_robot", {"written_for": "anymal_c", "robot": "anymal_c", "rewards": {"max_contact_force": 350.0}})
-    cfg = task_config("carry_robot", [("robot", "go2")])
+    tasks("rescale_robot", {"written_for": "anymal_c", "robot": "anymal_c", "rewards": {"max_contact_force": 350.0}})
+    cfg = task_config("rescale_robot", [("robot", "go2")])
     assert cfg.rewards.max_contact_force == pytest.approx(350.0 * 15.019 / 52.13485, rel=1e-4)
 
 
@@ -217,9 +217,9 @@ def test_sizes_of_tiles_and_ranges_of_properties_grow_by_the_unit_of_each(tasks)
     """Heights of steps and added masses do, angles of slopes and factors do not."""
     ranges = {"added_base_mass": [-1.0, 2.0], "link_mass": [0.9, 1.1], "joint_friction": [0.0, 0.5]}
     sizes = {"step": 0.15, "stairs_up": [0.1, 0.2], "slope_up": 20.0}
-    tasks("carry_entries", {"written_for": "anymal_c", "domain_rand": {"ranges": ranges}, "terrain": {"sizes": sizes}})
-    tasks("carry_entries_go2", {"extends": "carry_entries", "robot": "go2"})
-    cfg = task_config("carry_entries_go2")
+    tasks("rescale_entries", {"written_for": "anymal_c", "domain_rand": {"ranges": ranges}, "terrain": {"sizes": sizes}})
+    tasks("rescale_entries_go2", {"extends": "rescale_entries", "robot": "go2"})
+    cfg = task_config("rescale_entries_go2")
     mass, height = 15.019 / 52.13485, 0.3235036 / 0.5488202
     stairs = pytest.approx((0.1 * height, 0.2 * height), rel=1e-4)
     assert cfg.terrain.sizes == {"step": pytest.approx(0.15 * height, rel=1e-4), "stairs_up": stairs, "slope_up": 20.0}
@@ -242,22 +242,22 @@ def test_a_robot_of_the_command_line_that_is_no_name(robot):
     ],
 )
 def test_a_robot_that_is_none(tasks, written_for, message):
-    tasks("carry_wrong", {"written_for": written_for, "robot": "go2"})
+    tasks("rescale_wrong", {"written_for": written_for, "robot": "go2"})
     with pytest.raises(ConfigError) as error:
-        task_config("carry_wrong")
+        task_config("rescale_wrong")
     assert message in str(error.value)
-    assert "carry_wrong.yaml" in str(error.value)
+    assert "rescale_wrong.yaml" in str(error.value)
 
 
 @pytest.mark.parametrize("wrong", ["writen_for", "extend", "clas", "cpus"])
 def test_a_key_of_files_that_is_misspelt_has_its_nearest_name(tasks, wrong):
     right = {"writen_for": "written_for", "extend": "extends", "clas": "class", "cpus": "cpu"}[wrong]
-    tasks("carry_misspelt", {"robot": "go2", wrong: "anymal_c"})
-    with pytest.raises(ConfigError, match=f"carry_misspelt.yaml: {wrong}: unknown key '{wrong}'; did you mean '{right}'"):
-        task_config("carry_misspelt")
+    tasks("rescale_misspelt", {"robot": "go2", wrong: "anymal_c"})
+    with pytest.raises(ConfigError, match=f"rescale_misspelt.yaml: {wrong}: unknown key '{wrong}'; did you mean '{right}'"):
+        task_config("rescale_misspelt")
 
 
-def test_a_task_without_a_robot_has_nobody_to_carry_to(tasks):
-    tasks("carry_nobody", {"extends": "half_cheetah", "written_for": "anymal_c"})
+def test_a_task_without_a_robot_has_no_robot_to_rescale_for(tasks):
+    tasks("rescale_none", {"extends": "half_cheetah", "written_for": "anymal_c"})
     with pytest.raises(ConfigError, match="written_for: a task of HalfCheetah has no robot"):
-        task_config("carry_nobody")
+        task_config("rescale_none")

@@ -21,28 +21,28 @@ DIGITS = 6
 """Significant digits of a carried number: a configuration is there to be read."""
 
 
-def carry(data: Mapping[str, Any], schema: type, factor: Factor, unit_of: UnitOf) -> dict[str, Any]:
+def rescale(data: Mapping[str, Any], schema: type, factor: Factor, unit_of: UnitOf) -> dict[str, Any]:
     """Return the nested values `data`, which fit `schema`, with all numbers carried that have a unit to be carried by."""
     fields = {f.name: f for f in dataclasses.fields(schema)}
     hints = hints_of(schema)
-    carried: dict[str, Any] = {}
+    rescaled: dict[str, Any] = {}
     for key, value in data.items():
         meta = fields[key].metadata
         if dataclasses.is_dataclass(hints[key]):
-            carried[key] = carry(value, hints[key], factor, unit_of)  # type: ignore[arg-type]
-        elif "carried" in meta:
-            carried[key] = times(value, factor(meta["carried"]))
+            rescaled[key] = rescale(value, hints[key], factor, unit_of)  # type: ignore[arg-type]
+        elif "rescaled" in meta:
+            rescaled[key] = times(value, factor(meta["rescaled"]))
         elif "unit_of" in meta:
             prefix, power = meta["unit_of"]
-            carried[key] = {
+            rescaled[key] = {
                 term: _times_entry(number, factor(unit_of(prefix + term)) ** power) for term, number in value.items()
             }
         elif _of_sections(hints[key]):
             kind = typing.get_args(hints[key])[1]
-            carried[key] = {name: carry(section, kind, factor, unit_of) for name, section in value.items()}
+            rescaled[key] = {name: rescale(section, kind, factor, unit_of) for name, section in value.items()}
         else:
-            carried[key] = value
-    return carried
+            rescaled[key] = value
+    return rescaled
 
 
 def _of_sections(hint: Any) -> bool:
