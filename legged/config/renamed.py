@@ -1,4 +1,4 @@
-"""Names that settings used to have: files written before they were renamed still load."""
+"""Old names of settings. Files written before a renaming still load."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,19 +11,19 @@ RENAMED = {
     "observations.actor_history": "observations.groups.actor.history",
     "observations.critic": "observations.groups.critic.terms",
 }
-"""Dotted path as it was -> as it is."""
+"""Old dotted path -> new dotted path."""
 REPLACED: dict[str, tuple[str, dict[str, str | None]]] = {
     "sim.constraint_solver": ("sim.step", {"auto": None, "fused": "fused", "rounds": "library"}),
     "sim.smooth_dynamics": ("sim.step", {"auto": None, "fused": "fused", "stages": "library"}),
 }
-"""Dotted path as it was -> what took its place, and what its values mean there; None where nothing need be set."""
+"""Old dotted path -> setting that replaces it, with old value -> new value; None if the setting need not be set."""
 
 
 def renamed(data: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Return `data` with its old names replaced; it is not changed.
+    """Return a copy of `data` with old names replaced.
 
     Raises:
-        ConfigError: a setting is there by its old and by its new name; begins with `source`.
+        ConfigError: a setting has both its old and its new name; the text begins with `source`.
     """
     result = _replaced(data, source)
     for old, new in RENAMED.items():
@@ -38,7 +38,7 @@ def renamed(data: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def _replaced(data: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Return a copy of `data` in which settings that others took the place of are expressed by those."""
+    """Return a copy of `data` with replaced settings expressed by their new ones."""
     result = dict(data)
     for old, (new, meanings) in REPLACED.items():
         section, _, key = old.rpartition(".")
@@ -57,7 +57,7 @@ def _replaced(data: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def _put(data: dict[str, Any], path: list[str], value: Any, conflict: str) -> None:
-    """Put a value at a path of keys, copying the maps on the way."""
+    """Set the value at a path of keys. Maps on the way are copied."""
     key, *rest = path
     if not rest:
         if key in data:

@@ -1,8 +1,8 @@
-"""Numbers of a configuration that was written for one robot -> those that mean the same to another, by dynamic similarity.
+"""Rescaling of a configuration's numbers from its reference robot to another robot, by dynamic similarity.
 
-Which numbers these are is said by their fields: `carried` (bounds.py) gives a field the unit in which it grows with the
-robot; scales and noise of terms grow by the unit that `@unit` declares for the term; sizes of terrain types, and
-ranges of what is randomised, by the unit of each.
+The fields define the unit of each number. `rescaled` (bounds.py) gives a field its unit. Scales and noise of a term follow
+from the unit that `@unit` declares for it. Sizes of terrain types and ranges of randomised properties follow from the unit of
+each entry.
 """
 
 import dataclasses
@@ -13,16 +13,16 @@ from typing import Any
 from legged.config.checks import hints_of
 
 Factor = Callable[[str], float]
-"""Unit -> by what a quantity of it grows from the one robot to the other."""
+"""Function: unit -> factor by which a quantity of that unit grows from one robot to the other."""
 UnitOf = Callable[[str], str]
-"""Name of a term's method, such as "_reward_torques" -> unit of what it returns; dotted path of an entry, such as
-"terrain.sizes.step" -> its unit."""
+"""Function: name of a term's method, such as "_reward_torques", or dotted path of an entry, such as "terrain.sizes.step" ->
+its unit."""
 DIGITS = 6
-"""Significant digits of a carried number: a configuration is there to be read."""
+"""Significant digits of a rescaled number, few enough to read."""
 
 
 def rescale(data: Mapping[str, Any], schema: type, factor: Factor, unit_of: UnitOf) -> dict[str, Any]:
-    """Return the nested values `data`, which fit `schema`, with all numbers carried that have a unit to be carried by."""
+    """Return the nested values `data`, which fit `schema`, with all numbers that have a unit rescaled."""
     fields = {f.name: f for f in dataclasses.fields(schema)}
     hints = hints_of(schema)
     rescaled: dict[str, Any] = {}
@@ -46,19 +46,19 @@ def rescale(data: Mapping[str, Any], schema: type, factor: Factor, unit_of: Unit
 
 
 def _of_sections(hint: Any) -> bool:
-    """Return whether a field is a map of sections."""
+    """Return True if a field is a map of sections."""
     return typing.get_origin(hint) is dict and dataclasses.is_dataclass(typing.get_args(hint)[1])
 
 
 def _times_entry(value: Any, by: float) -> Any:
-    """Return an entry of a map, times a factor; of one that says more than a range what has the entry's unit."""
+    """Return an entry of a map times a factor. In an entry that is a section, only the values in the entry's unit change."""
     if not isinstance(value, Mapping):
         return times(value, by)
     return {key: times(item, by) if key in ("range", "std") else item for key, item in value.items()}
 
 
 def times(value: Any, by: float) -> Any:
-    """Return a number, or all in a list or map, times a factor; a factor of 1 leaves them as they were written."""
+    """Return a number, or all numbers in a list or map, times a factor. A factor of 1 keeps them exactly as written."""
     if by == 1.0:
         return value
     if isinstance(value, Mapping):
