@@ -107,7 +107,7 @@ WORDS = {
     float: "a number",
     tuple: "[low, high]",
     dict: "a mapping from names to numbers",
-    Mapping: "a mapping that has it as range",
+    Mapping: "a mapping with the key range",
 }
 """Kind of value -> its description in an error."""
 
@@ -201,7 +201,7 @@ def _number(value: float, fail: Any) -> float:
 def _check_free(value: Any, fail: Any, depth: int = 0) -> Any:
     """Check a value in the free part of a configuration: anything that YAML can write and read, but finite numbers only."""
     if depth > DEEPEST:
-        raise fail(f"at most {DEEPEST} maps and lists inside each other")
+        raise fail(f"at most {DEEPEST} nested maps and lists")
     if isinstance(value, Mapping):
         for key in value:
             if not isinstance(key, str | int):
@@ -252,4 +252,4 @@ def _check_length(value: Sequence[Any], bounds: Mapping[str, Any], where: str) -
     if bounds.get("unique"):
         twice = next((item for i, item in enumerate(value) if item in value[:i]), None)
         if twice is not None:
-            raise ConfigError(f"{where}: {shown(twice)} is named twice; each may come once")
+            raise ConfigError(f"{where}: {shown(twice)} is named twice")

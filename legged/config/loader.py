@@ -43,7 +43,7 @@ def merge(base: dict[str, Any], top: Mapping[str, Any], source: str, origins: Or
         ConfigError: the maps are nested too deeply.
     """
     if prefix.count(".") > DEEPEST:
-        raise ConfigError(f"{source}: {shown(prefix)}: more than {DEEPEST} sections inside each other")
+        raise ConfigError(f"{source}: {shown(prefix)}: more than {DEEPEST} nested sections")
     for key, value in top.items():
         path = f"{prefix}{plain_path(key)}"
         if isinstance(value, Mapping):
@@ -118,7 +118,7 @@ def _parent(
     or a task of this package.
     """
     if not isinstance(parent, str) or not parent:
-        raise ConfigError(f"{name}: extends: expected the name of a task or of a file beside this one, got {shown(parent)}")
+        raise ConfigError(f"{name}: extends: expected the name of a task or of a file next to this one, got {shown(parent)}")
     file = parent if parent.endswith((".yaml", ".yml")) else f"{parent}.yaml"
     if beside is not None and exists(beside / file):
         return beside / file, parent
@@ -304,7 +304,7 @@ def _merge_overrides(
         if key == "task":
             raise ConfigError("command line: task: can't be overridden; name the task first")
         if key.count(".") > DEEPEST:
-            raise ConfigError(f"command line: {shown(key)}: more than {DEEPEST} sections inside each other")
+            raise ConfigError(f"command line: {shown(key)}: more than {DEEPEST} nested sections")
         layer = nest(key, robot_path(value, Path.cwd()) if key == "robot" else copy.deepcopy(value))
         layer = renamed(layer, "command line")
         build(schema, layer, "", Origins(), "command line")

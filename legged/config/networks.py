@@ -57,7 +57,7 @@ def check_networks(cfg: TaskConfig) -> None:
         return
     if algorithm.mirror_loss_coeff > 0.0 and not algorithm.symmetry:
         where = origins.where("train.algorithm.mirror_loss_coeff")
-        raise ConfigError(f"{where}: must be 0 without mirror images; train.algorithm.symmetry=true")
+        raise ConfigError(f"{where}: must be 0 without mirror images; train.algorithm.symmetry=true adds them")
     _check_estimator(cfg)
     if policy.rnn_type != "none":
         _check_recurrent(cfg)
@@ -129,5 +129,5 @@ def _check_recurrent(cfg: TaskConfig) -> None:
     if algorithm.num_mini_batches > cfg.env.num_envs:
         where, given = origins.where("train.algorithm.num_mini_batches"), algorithm.num_mini_batches
         raise ConfigError(
-            f"{where}: {recurrent} learns from whole robots: must be at most env.num_envs={cfg.env.num_envs}, got {given}"
+            f"{where}: {recurrent} splits mini-batches by robot: must be at most env.num_envs={cfg.env.num_envs}, got {given}"
         )

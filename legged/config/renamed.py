@@ -33,7 +33,7 @@ def renamed(data: Mapping[str, Any], source: str) -> dict[str, Any]:
             continue
         value = found[key]
         result[section] = {name: item for name, item in found.items() if name != key}
-        _put(result, new.split("."), value, f"{source}: {old}: {shown(value)}: this is {new} now, which is set too")
+        _put(result, new.split("."), value, f"{source}: {old}: {shown(value)}: renamed {new}, which is set too")
     return result
 
 
@@ -48,10 +48,10 @@ def _replaced(data: Mapping[str, Any], source: str) -> dict[str, Any]:
         value, name = found[key], new.rpartition(".")[2]
         rest = {other: item for other, item in found.items() if other != key}
         if not isinstance(value, str) or value not in meanings:
-            raise ConfigError(f"{source}: {old}: {new} has taken its place: auto, fused or library; got {shown(value)}")
+            raise ConfigError(f"{source}: {old}: replaced by {new}: auto, fused or library; got {shown(value)}")
         meaning = meanings[value]
         if meaning is not None and rest.get(name, meaning) != meaning:
-            raise ConfigError(f"{source}: {old}: {shown(value)} means {new}={meaning} now, and {new} is {shown(rest[name])}")
+            raise ConfigError(f"{source}: {old}: {shown(value)} now means {new}={meaning}, but {new} is {shown(rest[name])}")
         result[section] = rest if meaning is None else {**rest, name: meaning}
     return result
 

@@ -36,7 +36,7 @@ class _Loader(yaml.SafeLoader):
         """Compose a node as the parser does. Refuse deep nesting, through which the parser would recurse without limit."""
         self._depth = getattr(self, "_depth", 0) + 1
         if self._depth > DEEPEST:
-            raise yaml.MarkedYAMLError(problem=f"more than {DEEPEST} blocks inside each other", problem_mark=self.get_mark())
+            raise yaml.MarkedYAMLError(problem=f"more than {DEEPEST} nested blocks", problem_mark=self.get_mark())
         try:
             return super().compose_node(parent, index)  # type: ignore[no-any-return]
         finally:
@@ -56,7 +56,7 @@ class _Loader(yaml.SafeLoader):
         parts = [self._measure(part) for part in inner]
         size, depth = 1 + sum(part[0] for part in parts), 1 + max((part[1] for part in parts), default=0)
         if size > MOST_VALUES or depth > DEEPEST:
-            self._refuse(f"aliases stand for more than {MOST_VALUES} values, or {DEEPEST} blocks inside each other", node)
+            self._refuse(f"aliases stand for more than {MOST_VALUES} values, or {DEEPEST} nested blocks", node)
         self._sizes[id(node)] = size, depth
         if isinstance(node, yaml.MappingNode):
             self._refuse_key_given_twice(node)
@@ -80,7 +80,7 @@ class _Loader(yaml.SafeLoader):
         number: int = super().construct_yaml_int(node)
         digits = node.value.replace("_", "")
         if ":" in digits or (re.fullmatch(r"[-+]?0\d+", digits) and int(digits) != number):
-            raise ValueError("it is one number in YAML 1.1 and another, or text, in 1.2")
+            raise ValueError("YAML 1.1 and 1.2 read it differently")
         return number
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
@@ -121,7 +121,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
     if len(content) > MOST_BYTES:
-        raise ConfigError(f"{path}: is no configuration: it is larger than {MOST_BYTES:,} bytes")
+        raise ConfigError(f"{path}: not a configuration: it is larger than {MOST_BYTES:,} bytes")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -24,7 +24,7 @@ from legged.graph.python_state import attributes, random_states, shown
 __all__ = ["ForbidHostReads", "ForbidReads", "HostReadError", "calling"]
 
 aten = torch.ops.aten
-ON_THE_DEVICE = "say device=self.device"
+ON_THE_DEVICE = "pass device=self.device"
 NEXT_TO = ("torch", "numpy", "warp", "contextlib")
 """Modules that `caller` skips, because they only pass calls on."""
 

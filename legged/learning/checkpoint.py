@@ -148,7 +148,7 @@ def check_weights(state: dict[str, Any], where: str) -> None:
     """Raise ConfigError, with a text that begins with `where`, if a network's state is not made of finite tensors."""
     for name, tensor in state.items():
         if not isinstance(name, str) or not isinstance(tensor, Tensor):
-            raise ConfigError(f"{where} is damaged ({name!r} is no tensor)")
+            raise ConfigError(f"{where} is damaged ({name!r} is not a tensor)")
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             raise ConfigError(f"{where} is damaged ({name} holds NaN or infinite numbers)")
 

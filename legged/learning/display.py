@@ -42,7 +42,7 @@ STYLES = {
 ON_THE_LINE = len(STYLES)
 """Number of metrics on the line. A task that lacks some of `STYLES` shows others in their place."""
 WARNINGS = {
-    "non_finite_worlds": "{:.0f} robots reset after numbers that are none (docs/training.md)",
+    "non_finite_worlds": "{:.0f} robots reset for NaN or infinite numbers (docs/training.md)",
     "contact_overflows": "contacts lost in {:.0f} robot steps: raise sim.nconmax, sim.njmax",
 }
 """Metrics of faults, shown if they are above 0."""

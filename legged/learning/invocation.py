@@ -67,4 +67,4 @@ def read_invocation(folder: Path) -> Invocation | None:
                 raise TypeError(f"{name}: got {shown(said[name])}")
         return Invocation(said["task"], said["import"], said["changes"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ConfigError(f"{relative(path)}: does not say what a training was told ({error})") from error
+        raise ConfigError(f"{relative(path)}: is not the invocation of a training ({error})") from error

@@ -45,13 +45,13 @@ def resumed(
     for key in KEPT:
         old, new = (value_at(to_dict(one), key) for one in (before, cfg))
         if old != new:
-            raise ConfigError(f"{cfg.origins.where(key)}: a resumed training keeps its own, '{old}'; got '{new}'")
+            raise ConfigError(f"{cfg.origins.where(key)}: a resumed training can't change '{old}'; got '{new}'")
     task_class(cfg.task).check(cfg)
     path = find_checkpoint(folder, iteration)
     saved = read_checkpoint(path)
     check_fits(path, saved, cfg)
     if "optimizer_state_dict" not in saved:
-        raise ConfigError(f"{relative(path)}: holds no optimiser; it can be played, not trained on")
+        raise ConfigError(f"{relative(path)}: holds no optimiser, so its training can't be resumed; it can only be played")
     check_optimizer(path, saved, cfg)
     done, until = saved["iter"] + 1, cfg.train.runner.max_iterations
     if done >= until:

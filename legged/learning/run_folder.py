@@ -109,11 +109,11 @@ def code_state() -> str:
         difference = _git(package.parent, "diff", "--no-ext-diff", "--no-color", "HEAD") if changed else ""
         return f"{version}commit {commit}\n{status}\n{difference}"
     except FileNotFoundError:
-        return f"{version}git is not on the PATH: the commit is not known\n"
+        return f"{version}git is not on the PATH, so the commit is unknown\n"
     except subprocess.CalledProcessError:
         return f"{version}not in a git repository of its own\n"
     except (OSError, subprocess.TimeoutExpired, ValueError) as error:
-        return f"{version}git could not be asked: {error}\n"
+        return f"{version}git failed: {error}\n"
 
 
 def _git(folder: Path, *args: str) -> str:
@@ -192,7 +192,7 @@ def run_named(name: str, where: str, begun: bool = False) -> Path:
                 return max(runs, key=_last_saved)
     known = [f"{run.parent.name}/{run.name}" for run in LOGS.glob("*/*") if is_run(run)]
     if exists(Path(name)) and Path(name).is_dir():
-        raise ConfigError(f"{where}: {shown(name)} holds no run: it has no {CONFIG_FILE}, nor has a folder in it")
+        raise ConfigError(f"{where}: {shown(name)} holds no run: there is no {CONFIG_FILE} in it or in its folders")
     raise ConfigError(f"{where}: there is no task and no run {shown(name)}{suggest(name[:100], [*task_names(), *known])}")
 
 

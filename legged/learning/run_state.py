@@ -64,7 +64,7 @@ def read_run_state(checkpoint: Path, checkpoint_id: str) -> dict[str, Any]:
     """
     path = state_path(checkpoint)
     if not path.is_file():
-        raise StateError(f"there is no {path.name} beside it")
+        raise StateError(f"there is no {path.name} next to it")
     try:
         state = load_plain(path)
     except ConfigError as error:

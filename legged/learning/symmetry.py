@@ -18,7 +18,7 @@ def images_of(task: BaseTask) -> MirrorImages:
     images = task.mirror_images()
     if images is None:
         where = task.cfg.origins.where("train.algorithm.symmetry")
-        raise ConfigError(f"{where}: {type(task).__name__} has no mirror images; false learns without")
+        raise ConfigError(f"{where}: {type(task).__name__} has no mirror images; must be false")
     return images
 
 

@@ -69,14 +69,14 @@ def find_teacher(cfg: TaskConfig) -> Teacher:
     """
     name, where = cfg.train.distillation.teacher, cfg.origins.where(FIELD)
     if not name:
-        raise ConfigError(f"--teacher: '{cfg.task}' learns from a teacher, and none is named; --teacher RUN does")
+        raise ConfigError(f"--teacher: '{cfg.task}' learns from a teacher; name one with --teacher POLICY")
     file = Path(name) if name.endswith(".pt") and exists(Path(name)) else None
     path = file or find_checkpoint(run_named(name, where), None)
     there, saved = run_config(path.parent), read_checkpoint(path)
     check_joints(f"{where}: {relative(path)}", made_for(path, saved), cfg)
     check_networks_fit(relative(path), {name: part for name, part in saved.items() if name != "critic_state_dict"}, there)
     if there.train.policy.estimator.targets:
-        raise ConfigError(f"{where}: {relative(path)} has an estimator, and no teacher can have one")
+        raise ConfigError(f"{where}: {relative(path)} has an estimator, which a teacher can't have")
     read = groups_of(there, "actor")
     groups = {PREFIX + group: replace(there.observations.groups[group], noise=False) for group in read}
     terms = dict.fromkeys(term for group in groups.values() for term in group.terms)
@@ -84,10 +84,10 @@ def find_teacher(cfg: TaskConfig) -> Teacher:
     if missing:
         known = suggest(missing[0], task_class(cfg.task).terms("_obs_"), "observations")
         unknown = ", ".join(f"'{term}'" for term in missing)
-        raise ConfigError(f"{where}: {relative(path)} observes {unknown}, which '{cfg.task}' has not{known}")
+        raise ConfigError(f"{where}: {relative(path)} observes {unknown}, which '{cfg.task}' does not have{known}")
     found = differences(cfg, there, terms)
     if found:
-        raise ConfigError(f"{where}: {relative(path)} was made for other numbers than '{cfg.task}': {'; '.join(found)}")
+        raise ConfigError(f"{where}: {relative(path)} was trained with other settings than '{cfg.task}': {'; '.join(found)}")
     network = {**networks(there)["actor"], "observations": list(groups)}
     origin: dict[str, str | int] = {"file": relative(path), "task": there.task, "iteration": saved["iter"]}
     teacher = Teacher(origin, groups, network, saved["actor_state_dict"])
@@ -158,7 +158,7 @@ def with_teacher(cfg: TaskConfig, teacher: Teacher) -> TaskConfig:
     for name, group in teacher.groups.items():
         if groups.get(name, group) != group:
             where = cfg.origins.where(f"observations.groups.{name}")
-            raise ConfigError(f"{where}: this is what the teacher's group is called; give the student's another name")
+            raise ConfigError(f"{where}: the teacher's group has this name; rename the student's group")
     # A student has no value function and does not learn from mirror images. The teacher's observations therefore need none.
     algorithm = replace(cfg.train.algorithm, symmetry=False, critic_warmup_iterations=0)
     return replace(
@@ -182,6 +182,6 @@ def teacher_in(path: Path, saved: Saved) -> Teacher:
         teacher = Teacher({"file": name, "task": "", "iteration": 0, **infos["teacher"]}, groups, network, weights)
         teacher.policy  # noqa: B018 (it is complete)
     except (KeyError, TypeError) as error:
-        raise ConfigError(f"{name}: holds no teacher to go on learning from ({error})") from error
+        raise ConfigError(f"{name}: holds no teacher to continue with ({error})") from error
     check_weights(saved["teacher_state_dict"], f"{name}: its teacher")
     return teacher

@@ -83,4 +83,4 @@ def read_timing(folder: Path) -> Timing | None:
                 raise TypeError(f"{field.name}: expected {kind.__name__}, got {shown(said.get(field.name))}")
         return Timing(**given)
     except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
-        raise ConfigError(f"{relative(path)}: does not say how long a training took ({error})") from error
+        raise ConfigError(f"{relative(path)}: does not hold the times of a training ({error})") from error

@@ -33,7 +33,7 @@ def data_folder(name: str) -> Path:
     for folder in (package / name, package.parent / name):
         if folder.is_dir():
             return folder
-    raise FileNotFoundError(f"legged: the folder '{name}' is missing beside {package}; install the package again")
+    raise FileNotFoundError(f"legged: the folder '{name}' is missing next to {package}; install the package again")
 
 
 def relative(path: Path) -> str:
@@ -171,9 +171,9 @@ def ready_to_write_file(flag: str, path: Path, megabytes: float = 1.0, endings: 
         RunError: it can't be written there.
     """
     if "\0" in path.name or len(os.fsencode(path.name)) > LONGEST_NAME:
-        raise ConfigError(f"{flag}: no file can be called {path.name}")
+        raise ConfigError(f"{flag}: not a valid file name: {path.name}")
     if path.is_dir() or not path.name:
-        raise ConfigError(f"{flag}: {path} is a folder; the name of a file is wanted")
+        raise ConfigError(f"{flag}: {path} is a folder; expected a file")
     if endings and path.suffix not in endings:
         raise ConfigError(f"{flag}: must end in {' or '.join(endings)}, got '{path.name}'")
     ready_to_write(path.parent, megabytes)

@@ -52,5 +52,5 @@ def _whole(name: str, default: int, least: int) -> int:
     if not text:
         return default
     if not (text.isdecimal() and int(text) >= least):
-        raise ConfigError(f"{name}: the environment says '{text}'; a whole number of at least {least} is allowed, or nothing")
+        raise ConfigError(f"{name}: the environment says '{text}'; expected a whole number of at least {least}, or nothing")
     return int(text)

@@ -149,5 +149,5 @@ def why_failed(job: Job, code: int) -> str:
         return errors[-1]
     if code < 0:
         named = {number.value: number.name for number in signal.Signals}
-        return f"killed by {named.get(-code, f'signal {-code}')}" + (", maybe for want of memory" if code == -9 else "")
+        return f"killed by {named.get(-code, f'signal {-code}')}" + (", maybe out of memory" if code == -9 else "")
     return lines[-1].strip() if lines else f"exit code {code}"

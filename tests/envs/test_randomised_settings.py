@@ -108,7 +108,7 @@ def test_privileged_observations_have_mirror_images():
             {"range": [0.5, 1.0], "when": "resets"},
             r"friction\.when: unknown value 'resets'; did you mean 'reset'",
         ),
-        ("friction", "much", r"ranges\.friction: expected \[low, high\], or a mapping that has it as range, got 'much'"),
+        ("friction", "much", r"ranges\.friction: expected \[low, high\], or a mapping with the key range, got 'much'"),
         ("friction", {"range": [0.0, 1.0], "distribution": "log_uniform"}, r"friction\.distribution: log_uniform draws from"),
         ("friction", {"range": [0.2, 1.0], "std": 0.1}, r"friction\.std: only gaussian has a standard deviation"),
         ("friction", {"range": [0.2, 1.0], "when": "interval"}, r"friction\.when: interval needs an interval_s above 0"),
