@@ -45,7 +45,7 @@ def transferred(
     """
     cfg = task_config(task, overrides, on_cpu)
     if learns_from_teacher(cfg):
-        raise ConfigError(f"--transfer: '{cfg.task}' learns from a teacher and can't start from other networks; --teacher names the teacher")
+        raise ConfigError(f"--transfer: '{cfg.task}' learns from a teacher, and begins anew; --teacher names the teacher")
     path = find_checkpoint(run_named(source, "--transfer"), iteration)
     check_source(path, read_checkpoint(path), cfg)
     return cfg, path
