@@ -50,7 +50,8 @@ class TerrainConfig:
     mesh_type: Literal["plane", "height_map"] = "plane"
     """Shape of the ground: an infinite horizontal plane, or a height map of num_rows x num_cols tiles."""
     curriculum: bool = True
-    """Move robots to harder rows while they succeed. Otherwise all rows are equally hard, and robots stay in theirs."""
+    """Move robots to harder rows while they succeed. Otherwise every row has a random high difficulty, and robots stay in
+    theirs."""
     scale: float = field(default=1.0, metadata={**positive(100, low=0.01), "rescaled": "m"})
     """Factor on all lengths of the terrain types; 1 suits a robot half a metre high."""
     proportions: dict[str, float] = field(default_factory=dict, metadata=UNIT)

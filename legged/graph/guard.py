@@ -198,19 +198,19 @@ class ForbidHostReads:
 
 
 class ForbidReads(TorchDispatchMode):
-    """Refuses, in its block, operators that read some tensors, or a part of them."""
+    """Dispatch mode that refuses, in its block, operators that read certain tensors or parts of them."""
 
     def __init__(self, tensors: Mapping[str, Tensor], reason: str) -> None:
-        """Refuse to read `tensors`, by the names that errors call them, for a `reason` that follows the name."""
+        """Refuse reads of `tensors`, a map from their names in errors. An error gives the `reason` after the name."""
         super().__init__()
         self._names = {memory_of(tensor): name for name, tensor in tensors.items()}
         self._reason = reason
 
     def judge(self, value: Any) -> None:
-        """Refuse a value that holds one of the tensors.
+        """Check that a value holds none of the tensors.
 
         Raises:
-            HostReadError: it does.
+            HostReadError: it holds one.
         """
         for part in tree_leaves(value):
             memory = memory_of(part)
@@ -302,7 +302,7 @@ class _Operators(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        with self:  # in inference mode, composite operators (item, one-argument where) arrive undivided
+        with self:  # in inference mode, composite operators (item, one-argument where) arrive whole: take them apart
             result = func.decompose(*args, **kwargs)
         if result is not NotImplemented:
             return result
