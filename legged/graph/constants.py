@@ -65,7 +65,7 @@ class Constants:
                 before, after = parts[:place], parts[place:]
                 from_behind = any(other is Ellipsis for other in before)
                 dim = tensor.dim() - sum(map(_dimensions, after)) if from_behind else sum(map(_dimensions, before))
-                tensor = tensor[(*[slice(None)] * dim, part.view(1).long())]  # torch allows only int64 here
+                tensor = tensor[(*[slice(None)] * dim, part.view(1).long())]  # torch refuses short integers here
                 parts = (*before, 0, *after[1:])
         return tensor, parts if isinstance(index, tuple) else parts[0]
 

@@ -155,7 +155,7 @@ def check_weights(state: dict[str, Any], where: str) -> None:
 
 def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str, waiting: int = 0) -> dict[str, Any]:
     """Return an optimiser's state from a checkpoint, with checked moments. Every setting but the learning rate is that of
-    `optimizer`. The first `waiting` parameters may lack moments, if all of them do.
+    `optimizer`. The first `waiting` parameters may lack moments, if none of these has any.
 
     Raises:
         ConfigError: the state does not fit these parameters; the text begins with `where`.
