@@ -14,7 +14,7 @@ MISSING = _Missing()
 
 
 def value_at(values: Any, path: str) -> Any:
-    """Return the value at a dotted path of nested mappings, or None if there is none."""
+    """Return the value at a dotted path of nested mappings, or None without one."""
     for key in path.split("."):
         values = values.get(key) if isinstance(values, dict) else None
     return values

@@ -29,7 +29,7 @@ class FieldText:
     unit: str
     """Unit in the metadata (`quantity` and `rescaled` in bounds.py); empty without one, or if each entry has its own."""
     bounds: str
-    """Bounds of its numbers; empty if there are none."""
+    """Bounds of its numbers; empty without any."""
     meaning: str
     """Its docstring, on one line."""
     choices: tuple[str, ...] = ()

@@ -99,7 +99,7 @@ class DevicePPO(CriticWarmup):
         return [*models, *moments, self._rate]
 
     def _why_stock(self) -> str:
-        """Return the first feature that only rsl-rl's own update supports; empty if there is none. A configuration can ask
+        """Return the first feature that only rsl-rl's own update supports; empty without one. A configuration can ask
         for each of them.
         """
         if self.symmetry and self.symmetry.use_mirror_loss:

@@ -149,7 +149,7 @@ def _check_observations(
 
 
 def first_difference(here: Terms, there: Terms) -> str:
-    """Return the first difference between the terms of two groups, in name, place or width; empty if there is none."""
+    """Return the first difference between the terms of two groups, in name, place or width; empty if they are equal."""
     for number, (mine, theirs) in enumerate(zip_longest(here.items(), there.items()), 1):
         if mine is None or theirs is None or mine[0] != theirs[0] or (None not in (mine[1], theirs[1]) and mine != theirs):
             return f"term {number} is {_shown(mine)} here, {_shown(theirs)} there"
