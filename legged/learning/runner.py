@@ -88,7 +88,7 @@ def loop_settings(runner: RunnerConfig) -> dict[str, Any]:
 
 
 class Runner(OnPolicyRunner):
-    """Trains a task with rsl-rl's PPO."""
+    """Runner that trains a task with rsl-rl's PPO."""
 
     env: BaseTask
     ALGORITHM = "PPO"
