@@ -14,7 +14,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import POLICY, TASK, TINY_TRAINING, call, run_folders, tiny_run
-from legged.tools import evaluate, experiments, report, train
 from torch.utils.tensorboard import SummaryWriter
 
 from legged import registry

@@ -7,7 +7,6 @@ import pytest
 import torch
 from helpers import CALM, ENGINE, TASK, TINY_TRAINING, call, checkpoints, run_folders, small_task, tiny_run
 from learners import SAMPLES, fill, learner
-from legged.tools import train
 from rsl_rl.algorithms import PPO
 
 from legged.cli import train
