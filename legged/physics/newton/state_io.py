@@ -1,7 +1,8 @@
-"""Between Newton's arrays and those of the task: conventions, and contact forces by shape.
+"""Conversion between Newton's arrays and those of the task: conventions of states, and contact forces by shape.
 
-Newton: quaternions (x, y, z, w); velocity of a body's centre of mass, world frame; angular velocity, world frame. The
-task's arrays are in MuJoCo's layout: (w, x, y, z); velocity of the base's origin, world frame; angular, base frame.
+Newton uses quaternions (x, y, z, w), the velocity of a body's centre of mass, world frame, and angular velocity, world frame.
+The task's arrays are in MuJoCo's layout: (w, x, y, z), the velocity of the base's origin, world frame, and angular velocity,
+base frame.
 """
 
 from typing import Any
@@ -14,13 +15,13 @@ import warp as wp
 from legged.physics.newton.fields import SolverFields
 from legged.physics.newton.simulation import Simulation
 from legged.physics.robot_state import RobotState
-from legged.physics.warp.exchange import EngineArrays, RobotExchange, rotate, rotate_inverse
+from legged.physics.warp.state_io import EngineArrays, RobotStateIO, rotate, rotate_inverse
 from legged.robots.robot import Robot
 
 
 @wp.kernel
 def write_torques(torques: wp.array2d[float], dof_qd: wp.array[int], joint_f: wp.array2d[float]):
-    """One thread a joint."""
+    """Copy the task's torques to Newton's joint forces. One thread per joint."""
     world, dof = wp.tid()
     joint_f[world, dof_qd[dof]] = torques[world, dof]
 
@@ -33,7 +34,9 @@ def write_varied_torques(
     dof_qd: wp.array[int],
     joint_f: wp.array2d[float],
 ):
-    """One thread a joint: what a motor makes of the torque that it is asked for, as MuJoCo's actuators do."""
+    """Compute Newton's joint forces from the task's torques with gains and limits, as MuJoCo's actuators do. One thread per
+    joint.
+    """
     world, dof = wp.tid()
     given = gains[world, dof, 0] * torques[world, dof]
     joint_f[world, dof_qd[dof]] = wp.clamp(given, limits[world, dof, 0], limits[world, dof, 1])
@@ -51,7 +54,7 @@ def read_states(
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
 ):
-    """One thread a world: Newton -> task."""
+    """Convert Newton's state to the task's. One thread per world."""
     world = wp.tid()
     quat = wp.vec4(
         joint_q[world, root_q + 6], joint_q[world, root_q + 3], joint_q[world, root_q + 4], joint_q[world, root_q + 5]
@@ -84,7 +87,7 @@ def put_states(
     joint_q: wp.array2d[float],
     joint_qd: wp.array2d[float],
 ):
-    """One thread a world of `mask`: task -> Newton."""
+    """Convert the task's state to Newton's in the worlds of `mask`. One thread per world."""
     world = wp.tid()
     if not mask[world]:
         return
@@ -112,7 +115,9 @@ def add_shape_forces(
     world_of_shape: wp.array[int],
     contact_forces: wp.array2d[wp.vec3],
 ):
-    """One thread a contact: its force on the first shape, and the reaction on the second, world frame [N]."""
+    """Add the force of each contact to its first shape, and the reaction to its second, world frame [N]. One thread per
+    contact.
+    """
     i = wp.tid()
     if i >= count[0]:
         return
@@ -126,22 +131,24 @@ def add_shape_forces(
 
 @wp.kernel
 def flag_lost_contacts(count: wp.array[int], capacity: int, overflow: wp.array[int]):
-    """One thread a world. The pool is everybody's, so where it overflows, every world may have lost contacts."""
+    """Set every world's flag if the pool of contacts has overflowed: all worlds share it, so each may have lost contacts. One
+    thread per world.
+    """
     if count[0] > capacity:
         overflow[wp.tid()] = 1
 
 
 @wp.kernel
 def take_flags(flags: wp.array[Any], lost: int, overflow: wp.array[int]):
-    """One thread a world: the solver's flags, which it may clear at its next step, or never."""
+    """Move the solver's flags to `overflow`: the solver clears them at its next step, or never. One thread per world."""
     world = wp.tid()
     if (int(flags[world]) & lost) != 0:
         overflow[world] = 1
     flags[world] = flags.dtype(0)
 
 
-class NewtonExchange(RobotExchange):
-    """Launches the kernels above on fixed arrays: those of a simulation, and the task's."""
+class NewtonStateIO(RobotStateIO):
+    """Launches of the kernels above on the fixed arrays of a simulation and of the task."""
 
     def __init__(
         self,
@@ -152,8 +159,8 @@ class NewtonExchange(RobotExchange):
         robot: Robot,
         state: RobotState,
     ) -> None:
-        """`task` is qpos, qvel and ctrl, which with all after it is the task's side. Call with the device as Warp's current
-        one.
+        """Prepare the launches. `task` holds the task's qpos, qvel and ctrl; the arguments after it belong to the task too.
+        Warp's current device must be that of the arrays.
         """
         self._qpos, self._qvel, self._torques = task
         count, layout = len(overflowed), simulation.layout
@@ -169,9 +176,9 @@ class NewtonExchange(RobotExchange):
         base_com = simulation.model.body_com.numpy().reshape(count, layout.bodies, 3)[:, layout.base]
         of_base = wp.array(base_com, dtype=wp.vec3)
         self.base_com = wp.to_torch(of_base)
-        """(N, 3) centre of mass of the base, in its frame [m]."""
+        """(N, 3) centre of mass of the base, base frame [m]."""
         self.motors: SolverFields | None = None
-        """What makes other torques of those that are asked for, if something does."""
+        """Gains and limits that convert requested torques; None if torques are applied as requested."""
         self._convention = [
             of_base,
             layout.root_q,
@@ -185,7 +192,7 @@ class NewtonExchange(RobotExchange):
         self._tracked = wp.array(tracked, dtype=int)
 
     def apply_torques(self) -> None:
-        """Task -> generalised forces of the joints."""
+        """Write the generalised forces of the joints from the task's controls."""
         if self.motors is not None and self.motors.motors:
             varied = [wp.from_torch(self.motors.gains), wp.from_torch(self.motors.limits)]
             inputs = [self._torques, *varied, self._dof_qd]
@@ -194,18 +201,18 @@ class NewtonExchange(RobotExchange):
         wp.launch(write_torques, dim=self._torques.shape, inputs=[self._torques, self._dof_qd], outputs=[self._joint_f])
 
     def read(self) -> None:
-        """Newton's joint coordinates -> task."""
+        """Convert Newton's joint coordinates to the task's."""
         inputs = [self._joint_q, self._joint_qd, *self._convention]
         wp.launch(read_states, dim=len(self._qpos), inputs=inputs, outputs=[self._qpos, self._qvel])
 
     def put(self, mask: wp.array) -> None:
-        """Task -> Newton's joint coordinates, for the worlds of `mask`; bodies must follow."""
+        """Convert the task's coordinates to Newton's for the worlds of `mask`. Newton's bodies must be updated afterwards."""
         inputs = [mask, self._qpos, self._qvel, *self._convention]
         wp.launch(put_states, dim=len(self._qpos), inputs=inputs, outputs=[self._joint_q, self._joint_qd])
 
     def note_lost_contacts(self) -> None:
-        """Keep until the next refresh what was lost in this step: in the pool of contacts, or by the solver's flags, which
-        are cleared.
+        """Record until the next refresh that contacts were lost in this step, in the pool of contacts or according to the
+        solver's flags, which this clears.
         """
         simulation, contacts = self._simulation, self._simulation.contacts
         inputs = [contacts.rigid_contact_count, contacts.rigid_contact_max]

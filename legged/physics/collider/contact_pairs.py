@@ -1,4 +1,4 @@
-"""Which shapes of a model may touch, and what their contacts are made of, as MuJoCo mixes it: tables on the host."""
+"""Pairs of shapes that may touch, and the contact parameters that MuJoCo computes for them: tables on the host."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -9,51 +9,52 @@ import numpy as np
 
 KINDS = mujoco.mjtGeom
 ROUND = (int(KINDS.mjGEOM_SPHERE), int(KINDS.mjGEOM_CAPSULE))
-"""Shapes that meet each other as a segment, or a point, with a radius."""
+"""Types of shapes that collide with each other as a segment, or a point, with a radius."""
 ON_PLANES = (*ROUND, int(KINDS.mjGEOM_ELLIPSOID), int(KINDS.mjGEOM_CYLINDER), int(KINDS.mjGEOM_BOX))
-"""Shapes that meet a plane in a few points."""
+"""Types of shapes that touch a plane in a few points."""
 POINT, END, CORNER, RIM, ELLIPSOID = range(5)
-"""How a point of a shape that may touch a plane is found: where it is said, with a radius; the same at an end of a capsule,
-along whose axis friction is; a corner of a box, if it is below the box's centre; the `radius`-th point of a cylinder; the
-lowest point of an ellipsoid."""
+"""Kinds of points of a shape that may touch a plane. POINT: at `place`, with a radius. END: the same at an end of a capsule,
+with friction along the capsule's axis. CORNER: corner of a box, which counts only if it is below the box's centre. RIM: the
+`radius`-th rest point of a cylinder. ELLIPSOID: the lowest point of an ellipsoid."""
 SPRING = 7
-"""Numbers that say how a constraint holds: stiffness [1/s^2], damping [1/s], least and greatest impedance, the depth at which
-it is greatest [m or rad], and middle and power of the way there."""
+"""Number of parameters of a constraint's spring: stiffness [1/s^2], damping [1/s], least and greatest impedance, the depth at
+which the impedance is greatest [m or rad], and midpoint and power of the curve between."""
 DEFAULT_SOLREF = np.array([0.02, 1.0])
-"""MuJoCo's: time constant [s] and damping ratio."""
+"""MuJoCo's default solref: time constant [s] and damping ratio."""
 LEAST_FRICTION, LEAST, GREATEST, TINY = mujoco.mjMINMU, mujoco.mjMINIMP, mujoco.mjMAXIMP, mujoco.mjMINVAL
 
 
 @dataclass(frozen=True)
-class Touch:
-    """Two shapes that may touch."""
+class ContactPair:
+    """Contact parameters of two shapes that may touch."""
 
     geoms: tuple[int, int]
-    """The first is of the lower type, as in MuJoCo: normals point from it to the second."""
+    """Ids of the geoms, ordered by type as in MuJoCo; normals point from the first to the second."""
     margin: float
-    """Distance from which on the contact pushes [m]."""
+    """Distance below which the contact exerts force [m]."""
     dim: int
-    """Directions in which it pushes: 1, 3, 4 or 6."""
+    """Number of directions in which the contact exerts force: 1, 3, 4 or 6."""
     rough: tuple[int, int]
-    """Shapes of which the larger friction counts; (-1, -1) where `friction` does."""
+    """Geoms whose larger friction counts; (-1, -1) if `friction` counts instead."""
     friction: np.ndarray
-    """(5,) along two tangents, about the normal, and about two tangents."""
+    """(5,) coefficients: sliding along two tangents, torsion about the normal, rolling about two tangents."""
     solref: np.ndarray
     solreffriction: np.ndarray
     solimp: np.ndarray
 
 
-def touch_of(model: mujoco.MjModel, first: int, second: int, pair: int = -1) -> Touch:
-    """Return how two geoms touch, as MuJoCo mixes their contacts, or as one of its explicit `pair`s says.
+def contact_pair(model: mujoco.MjModel, first: int, second: int, pair: int = -1) -> ContactPair:
+    """Return the contact parameters of two geoms, as MuJoCo combines them, or those of the explicit contact pair with index
+    `pair`.
 
-    Source: MuJoCo documentation, "Computation", contact parameters. (mujoco-warp takes the smaller solref of two shapes of
-    different priority too, if one is a stiffness.)
+    Source: MuJoCo documentation, "Computation", contact parameters. mujoco-warp differs for shapes of different priority: it
+    takes the smaller solref if one of them is a stiffness.
     """
     if pair >= 0:
         friction = np.maximum(model.pair_friction[pair], LEAST_FRICTION)
         own = (model.pair_solref[pair], model.pair_solreffriction[pair], model.pair_solimp[pair])
         margin = float(model.pair_margin[pair])
-        return Touch((first, second), margin, int(model.pair_dim[pair]), (-1, -1), friction, *own)
+        return ContactPair((first, second), margin, int(model.pair_dim[pair]), (-1, -1), friction, *own)
     both = [first, second]
     priority, mixes = model.geom_priority[both], model.geom_solmix[both]
     dim = int(model.geom_condim[both].max())
@@ -65,17 +66,20 @@ def touch_of(model: mujoco.MjModel, first: int, second: int, pair: int = -1) -> 
         share = float(mixes[0] / mixes.sum()) if mixes.min() >= TINY else float(mixes[0] >= TINY)
     weights = np.array([share, 1.0 - share])
     solref = model.geom_solref[both]
-    alike = priority[0] != priority[1] or (solref[:, 0] > 0.0).all()  # one alone counts, or both are time constants
+    alike = priority[0] != priority[1] or (solref[:, 0] > 0.0).all()  # only one shape counts, or both have time constants
     mixed = weights @ solref if alike else solref.min(axis=0)
     margin = float(model.geom_margin[both].sum())
-    return Touch((first, second), margin, dim, rough, np.zeros(5), mixed, np.zeros(2), weights @ model.geom_solimp[both])
+    return ContactPair(
+        (first, second), margin, dim, rough, np.zeros(5), mixed, np.zeros(2), weights @ model.geom_solimp[both]
+    )
 
 
 def spring_of(solref: np.ndarray, solimp: np.ndarray, timestep: float, safe: bool) -> np.ndarray:
-    """Return the SPRING numbers of a constraint with MuJoCo's parameters; `safe` keeps its time constant above two steps.
+    """Return the SPRING numbers of a constraint with MuJoCo's `solref` and `solimp`. With `safe`, its time constant is at
+    least two time steps.
 
-    Source: MuJoCo documentation, "Modeling", solver parameters. (mujoco-warp makes a stiffness without end of a solref
-    that `is_mixed`.)
+    Source: MuJoCo documentation, "Modeling", solver parameters. For a solref that `is_mixed`, mujoco-warp computes an
+    infinite stiffness.
     """
     if is_mixed(solref):
         solref = DEFAULT_SOLREF
@@ -92,13 +96,15 @@ def spring_of(solref: np.ndarray, solimp: np.ndarray, timestep: float, safe: boo
 
 
 def is_mixed(solref: np.ndarray) -> np.ndarray:
-    """Return of solrefs (..., 2) which are half a time constant and half a stiffness: C MuJoCo takes its default instead."""
+    """Return a mask of the solrefs (..., 2) that mix a time constant with a damping, or a stiffness with a damping ratio. C
+    MuJoCo replaces these by its default.
+    """
     return np.asarray((solref[..., 0] > 0.0) != (solref[..., 1] > 0.0))
 
 
 def alike_springs(model: mujoco.MjModel, pairs: Sequence[tuple[int, int, int]]) -> bool:
-    """Whether the contacts of each of the pairs have the spring of one shape, even if worlds differ in it: of the one with
-    priority, or of two that have the same.
+    """Return True if the contacts of each pair use the spring of one shape, even in worlds that differ in it: that of the
+    shape with priority, or that of two shapes with the same solref.
     """
     for first, second, pair in pairs:
         solref, priority = model.geom_solref[[first, second]], model.geom_priority[[first, second]]
@@ -108,28 +114,28 @@ def alike_springs(model: mujoco.MjModel, pairs: Sequence[tuple[int, int, int]]) 
 
 
 def is_safe(model: mujoco.MjModel) -> bool:
-    """Whether the time constants of the model's constraints are kept above two steps."""
+    """Return True if the model keeps the time constants of its constraints above two time steps."""
     return not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE
 
 
 def pairs_of(m: Any) -> list[tuple[int, int, int]]:
-    """Return the pairs of shapes that mujoco-warp would test, of its model: two geoms, and the explicit pair or -1."""
+    """Return the pairs of shapes that mujoco-warp tests for collision: two geoms, and the index of an explicit pair or -1."""
     geoms, pairs = m.nxn_geom_pair_filtered.numpy(), m.nxn_pairid_filtered.numpy()
     kinds = m.geom_type.numpy()
     found = []
     for (first, second), (pair, _) in zip(geoms.tolist(), pairs.tolist(), strict=True):
-        if pair > -2:  # else a sensor alone asks
+        if pair > -2:  # otherwise only a sensor uses the pair
             found.append((first, second, pair) if kinds[first] <= kinds[second] else (second, first, pair))
     return found
 
 
 def kind_of(model: mujoco.MjModel, geom: int) -> str:
-    """Return what a geom is, in a word."""
+    """Return the name of a geom's type."""
     return KINDS(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
 
 
 def why_not(model: mujoco.MjModel, pairs: Sequence[tuple[int, int, int]]) -> str:
-    """Return which of the pairs is of shapes whose contacts are not computed here; empty if none."""
+    """Return the reason why the contacts of a pair are not supported here; empty if all pairs are supported."""
     for first, second, _ in pairs:
         kinds = [int(model.geom_type[g]) for g in (first, second)]
         on_plane = kinds[0] == KINDS.mjGEOM_PLANE and kinds[1] in ON_PLANES
@@ -141,18 +147,18 @@ def why_not(model: mujoco.MjModel, pairs: Sequence[tuple[int, int, int]]) -> str
 
 @dataclass(frozen=True)
 class PlanePoint:
-    """A point of a shape that may touch a plane."""
+    """Point of a shape that may touch a plane."""
 
     touch: int
     kind: int
     place: np.ndarray
-    """(3,) in the shape's frame; for RIM radius and half length, for ELLIPSOID the half axes [m]."""
+    """(3,) position in the shape's frame; for RIM, radius and half length; for ELLIPSOID, the half axes [m]."""
     radius: float
-    """Of the sphere around it [m]; for RIM the point's number."""
+    """Radius of the sphere around the point [m]; for RIM, the point's number."""
 
 
 def plane_points(model: mujoco.MjModel, touch: int, geom: int) -> Iterable[PlanePoint]:
-    """Yield the points of a geom that may touch the plane of the `touch`-th pair, in the order in which MuJoCo has them."""
+    """Yield the points of a geom that may touch the plane of the pair with index `touch`, in MuJoCo's order."""
     kind, size = model.geom_type[geom], model.geom_size[geom]
     if kind == KINDS.mjGEOM_SPHERE:
         yield PlanePoint(touch, POINT, np.zeros(3), size[0])

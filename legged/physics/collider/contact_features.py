@@ -1,8 +1,9 @@
-"""Shapes as probes of a height map: points with a radius, what lies between the ends of a capsule, discs.
+"""Contact features of shapes, which are tested against a height map: points with a radius, segments of capsules, rim points
+and end discs of cylinders.
 
-A sphere is one point, a capsule its ends and what is between them, a box its corners. A cylinder touches a surface in points
-of its rims, those in which it would rest on a plane as steep as the ground under its centre; vertical faces and their rims
-meet its discs at both ends, and what is between these is that of a capsule.
+A sphere has one point. A capsule has its two ends and the segment between them. A box has its corners. A cylinder touches a
+surface in points of its rims: those in which it would rest on a plane with the slope of the ground under its centre. Vertical
+faces and their rims meet the discs at its two ends, and the segment between the ends, as for a capsule.
 """
 
 from collections.abc import Iterable, Iterator
@@ -14,75 +15,77 @@ import numpy as np
 import warp as wp
 
 from legged.errors import ConfigError
+from legged.physics.collider.contact_pairs import kind_of
 from legged.physics.collider.ground import NOTHING, Ground, Hits, around_point, between_ends, cell_of, surface
 from legged.physics.collider.shapes import rim_point
-from legged.physics.collider.touches import kind_of
 
 AT, BETWEEN, RIM, DISC = (wp.constant(k) for k in range(4))
-"""A sphere at `start`; what lies between `start` and `end`; the `end[0]`-th point of the rims of a cylinder of radius
-`start[0]` and half length `start[1]`; a disc at `start`, of radius `end[0]`, across the shape's z axis."""
+"""Kinds of features. AT: a sphere at `start`. BETWEEN: the segment between `start` and `end`, without its ends. RIM: the
+`end[0]`-th rim point of a cylinder of radius `start[0]` and half length `start[1]`. DISC: a disc at `start` of radius
+`end[0]`, perpendicular to the shape's z axis."""
 
 LENGTHWISE = wp.constant(0.1)
-"""Cosine between a rim and a cylinder's axis from which on the rim may pass through a disc at the cylinder's end."""
+"""Smallest cosine between a rim of the terrain and a cylinder's axis at which the rim may pass through an end disc of the
+cylinder."""
 
 
 @dataclass(frozen=True)
-class Probe:
-    """What of a geom looks at the ground, in the geom's frame [m]."""
+class ContactFeature:
+    """Part of a geom that is tested against the height map, in the geom's frame [m]."""
 
     geom: int
     kind: int
     start: np.ndarray
     end: np.ndarray
     radius: float
-    """Around what is found; 0 for corners, rims and discs."""
+    """Radius around the feature; 0 for corners, rim points and discs."""
 
     @property
     def reach(self) -> float:
-        """How far from its middle the ground may be that it touches [m]."""
+        """Largest distance from the feature's centre to ground that it can touch [m]."""
         return float(self.end[0]) if self.kind == DISC else self.radius
 
     @property
     def length(self) -> float:
-        """Distance between its ends [m]."""
+        """Distance between the ends [m]; 0 for points and discs."""
         return float(np.linalg.norm(self.end - self.start)) if self.kind == BETWEEN else 0.0
 
 
-def probes_of(model: mujoco.MjModel, shapes: Iterable[int]) -> Iterator[Probe]:
-    """Yield the probes of those geoms.
+def contact_features(model: mujoco.MjModel, shapes: Iterable[int]) -> Iterator[ContactFeature]:
+    """Yield the contact features of the geoms `shapes`.
 
     Raises:
-        ConfigError: a shape that has none.
+        ConfigError: a shape is of a type without contact features.
     """
     kinds = mujoco.mjtGeom
     for i in shapes:
         kind, size = model.geom_type[i], model.geom_size[i]
         centre, end = np.zeros(3), np.array([0.0, 0.0, size[1]])
         if kind == kinds.mjGEOM_SPHERE:
-            yield Probe(i, AT, centre, centre, size[0])
+            yield ContactFeature(i, AT, centre, centre, size[0])
         elif kind == kinds.mjGEOM_CAPSULE:
-            yield Probe(i, AT, -end, -end, size[0])
-            yield Probe(i, AT, end, end, size[0])
-            yield Probe(i, BETWEEN, -end, end, size[0])
+            yield ContactFeature(i, AT, -end, -end, size[0])
+            yield ContactFeature(i, AT, end, end, size[0])
+            yield ContactFeature(i, BETWEEN, -end, end, size[0])
         elif kind == kinds.mjGEOM_BOX:
             for signs in product((-1.0, 1.0), repeat=3):
-                yield Probe(i, AT, size * signs, size * signs, 0.0)
+                yield ContactFeature(i, AT, size * signs, size * signs, 0.0)
         elif kind == kinds.mjGEOM_CYLINDER:
             for k in range(4):
-                yield Probe(i, RIM, np.array([size[0], size[1], 0.0]), np.array([float(k), 0.0, 0.0]), 0.0)
+                yield ContactFeature(i, RIM, np.array([size[0], size[1], 0.0]), np.array([float(k), 0.0, 0.0]), 0.0)
             for centre in (-end, end):
-                yield Probe(i, DISC, centre, np.array([size[0], 0.0, 0.0]), 0.0)
-            yield Probe(i, BETWEEN, -end, end, size[0])
+                yield ContactFeature(i, DISC, centre, np.array([size[0], 0.0, 0.0]), 0.0)
+            yield ContactFeature(i, BETWEEN, -end, end, size[0])
         else:
             raise ConfigError(
-                f"terrain: shape '{model.geom(i).name}' is of type {kind_of(model, i)}; sim.terrain_collider=cells knows"
-                " spheres, capsules, cylinders and boxes. Use those, sim.terrain_collider=convex, or sim.physics=mujoco"
+                f"terrain: shape '{model.geom(i).name}' is of type {kind_of(model, i)}; sim.terrain_collider=cells"
+                " supports spheres, capsules, cylinders, boxes; use them, sim.terrain_collider=convex or sim.physics=mujoco"
             )
 
 
 @wp.func
 def around_disc(ground: Ground, centre: wp.vec3, axis: wp.vec3, radius: float, margin: float, hits: Hits, row: int) -> int:
-    """Find vertical faces and their rims that a thin disc touches; returns how many hits are in the row."""
+    """Find the hits of a thin disc with vertical faces and their rims. Return the number of hits in the row."""
     found = around_point(ground, centre, radius + margin, True, hits, row)
     count = wp.int32(0)
     for k in range(found):
@@ -94,7 +97,7 @@ def around_disc(ground: Ground, centre: wp.vec3, axis: wp.vec3, radius: float, m
             point = centre - across * (radius / wide)
         dist = hits.dist[row, k] - radius * wide
         if normal[2] > 0.0 and (normal[0] == 0.0 or normal[1] == 0.0):
-            # A rim along x or y: where it passes through the disc's plane.
+            # A rim along x or y: find the point where it passes through the disc's plane.
             along = wp.where(normal[0] == 0.0, axis[0], axis[1])
             to = -normal * hits.dist[row, k]
             shift = -wp.dot(to, axis) / along
@@ -104,7 +107,8 @@ def around_disc(ground: Ground, centre: wp.vec3, axis: wp.vec3, radius: float, m
                 to[1] = to[1] + shift
             away = wp.length(to)
             dist = NOTHING
-            if wp.abs(along) > LENGTHWISE and away > 1e-6:  # a rim across the axis is between the ends, or in no disc
+            # a rim across the axis meets the cylinder between its ends, or no disc
+            if wp.abs(along) > LENGTHWISE and away > 1e-6:
                 normal = -to / away
                 point = centre - normal * radius
                 dist = away - radius
@@ -117,7 +121,7 @@ def around_disc(ground: Ground, centre: wp.vec3, axis: wp.vec3, radius: float, m
 
 
 @wp.func
-def look(
+def find_hits(
     ground: Ground,
     kind: int,
     position: wp.vec3,
@@ -128,8 +132,8 @@ def look(
     hits: Hits,
     row: int,
 ) -> int:
-    """Find what a probe of a geom touches, within `near` (its radius and the margin of contacts); returns how many hits are
-    in the row. A hit's distance is that of its point, not yet less the probe's radius.
+    """Find the hits of a geom's feature within `near` [m], the sum of its radius and the contact margin. Return the number of
+    hits in the row. A hit's distance is that of its point, before the radius is subtracted.
     """
     if kind == BETWEEN:
         return between_ends(ground, position + turn * start, position + turn * end, near, hits, row)

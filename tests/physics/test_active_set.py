@@ -1,4 +1,4 @@
-"""The sides of rows that the constraint solver begins with: they save rounds, and change nothing else."""
+"""Active set of the last step, from which the constraint solver starts: it saves iterations, and changes nothing else."""
 
 from unittest import mock
 
@@ -11,7 +11,7 @@ from mechanisms import EVERY_ROW, FusedWorlds, relative_error
 from reference import heaps
 
 from legged.physics.fused import constraint_solver
-from legged.physics.fused.row_sides import HOLDING, IDLE, SLIPPING, SLIPPING_BACK, UNKNOWN
+from legged.physics.fused.active_set import HOLDING, IDLE, SLIPPING, SLIPPING_BACK, UNKNOWN
 
 COUNT = 19
 HERE = [pytest.param("cpu", "wide", id="blocks"), pytest.param("cpu", "lanes", id="lanes")]
@@ -52,13 +52,13 @@ def test_beginning_with_them_halves_the_rounds_and_leads_to_the_same_forces(devi
 
 
 @pytest.mark.parametrize(("device", "source"), SOURCES)
-def test_sides_are_kept_in_the_order_of_their_keys_as_where_the_rows_ended(device, source):
+def test_final_states_of_rows_are_kept_in_the_order_of_their_keys(device, source):
     """A row pushes or not, by its force; one of dry friction (0.8 N m) is at its greatest force or below."""
     worlds = crawlers(device, source)
     for _ in range(40):
         worlds.step()
-    sides, force = worlds.sides, worlds.d.efc.force.numpy()
-    keys, last = sides.key.numpy(), sides.last.numpy()
+    active_set, force = worlds.active_set, worlds.d.efc.force.numpy()
+    keys, last = active_set.key.numpy(), active_set.last.numpy()
     ne, nf, nefc = (worlds.read(name) for name in ("ne", "nf", "nefc"))
     of_friction, of_others = set(), set()
     for world in range(COUNT):
@@ -82,18 +82,18 @@ def test_sides_are_kept_in_the_order_of_their_keys_as_where_the_rows_ended(devic
 
 
 @pytest.mark.parametrize(("device", "source"), SOURCES)
-def test_wrong_sides_cost_rounds_only(device, source):
+def test_wrong_states_cost_iterations_only(device, source):
     """Every row is said to be where it is not, or by a key that no row has."""
     right, wrong = crawlers(device, source), crawlers(device, source)
     for _ in range(30):
         right.step()
     for name in ("qpos", "qvel", "qacc_warmstart"):
         getattr(wrong.d, name).assign(getattr(right.d, name).numpy())
-    last = right.sides.last.numpy()
+    last = right.active_set.last.numpy()
     keys, side = last[:, 1:] >> 2, (last[:, 1:] & 3) - 2
     other = np.where(keys < right.model.nv, np.where(side == HOLDING, SLIPPING, HOLDING), IDLE + HOLDING - side)
     keys[::3] += 1000
-    wrong.sides.last.assign(np.hstack([last[:, :1], keys << 2 | other + 2]))
+    wrong.active_set.last.assign(np.hstack([last[:, :1], keys << 2 | other + 2]))
     for worlds in (right, wrong):
         worlds.step()
     assert relative_error(wrong.read("qacc"), right.read("qacc")) < 1e-3

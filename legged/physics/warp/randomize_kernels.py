@@ -1,4 +1,6 @@
-"""What was drawn again into the arrays of mujoco-warp's model, within a step: a launch for all arrays, and no host read."""
+"""Kernels that copy random values into a model's arrays within a step: one launch for all arrays, without reading on the
+host.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,17 +17,17 @@ HOW = {"set": 0, "add": 1, "scale": 2}
 BOUNCE = {"": 0, "ratio": 1, "inverse": 2}
 ADD, SCALE, INVERSE = wp.constant(HOW["add"]), wp.constant(HOW["scale"]), wp.constant(BOUNCE["inverse"])
 THREADS = 128
-"""Threads of a GPU that share the numbers of a world. Few worlds take any in a step; a thread for each number of all would
-keep it busy with nothing, and a warp would wait some ten times for what it needs to know of a number."""
+"""Number of GPU threads that share the numbers of one world. In a step, few worlds take new values. One thread per number of
+all worlds would mostly be idle, and a single warp per world would wait about ten times for the data of a number."""
 MOST_ARRAYS = 14
-"""Arrays that one launch writes, at most: those of all fields are fewer."""
+"""Largest number of arrays that one launch writes. All fields together need fewer."""
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
 class Arrays:
-    """Where worlds have what they differ in: rows of numbers, (N, L) each."""
+    """Model arrays with one row per world, (N, L) each."""
 
     a0: wp.array2d[float]
     a1: wp.array2d[float]
@@ -45,7 +47,7 @@ class Arrays:
 
 @wp.func
 def put(to: Arrays, array: int, world: int, at: int, number: float) -> None:
-    """Write a number at its place in a world's row of one of the arrays."""
+    """Write a number at position `at` of a world's row in one of the arrays."""
     if array == 0:
         to.a0[world, at] = number
     elif array == 1:
@@ -89,8 +91,9 @@ def write_drawn(
     ratios: wp.array[float],
     to: Arrays,
 ):
-    """So many threads a world, which share the numbers that change: the model's own, changed by one field after the other.
-    `place` has its array and its place there, `entry` the column of a value, how it changes the number, and whether it is a
+    """Compute the randomised numbers of the worlds in `mask`: each starts from the model's own number, which the fields
+    change one after the other. `threads` threads per world share the numbers. `place` holds the array of each number and its
+    position there. `entry` holds, for each change, the column of the value, the operation, and the conversion from
     restitution.
     """
     world, thread = wp.tid()
@@ -127,7 +130,9 @@ def copy_variants(
     place: wp.array2d[int],
     to: Arrays,
 ):
-    """So many threads a world, which share the numbers of a variant; `place` has the number's array and its place there."""
+    """Copy the chosen variant into the worlds of `mask`. `threads` threads per world share the numbers of the variant.
+    `place` holds the array of each number and its position there.
+    """
     world, thread = wp.tid()
     if not mask[world]:
         return
@@ -137,12 +142,12 @@ def copy_variants(
 
 
 def _threads() -> int:
-    """Return how many threads share a world on Warp's current device."""
+    """Return the number of threads per world on Warp's current device."""
     return 1 if wp.get_device().is_cpu else THREADS
 
 
 def _arrays(arrays: Sequence[Tensor]) -> Any:
-    """Return where numbers are written, of arrays (N, ...)."""
+    """Return the struct of arrays (N, ...) that a kernel writes."""
     assert len(arrays) <= MOST_ARRAYS
     to = Arrays()
     nothing = wp.zeros((1, 1), dtype=float)
@@ -153,13 +158,13 @@ def _arrays(arrays: Sequence[Tensor]) -> Any:
 
 
 class Redraws:
-    """A launch that writes what is in `drawn` into arrays of the model."""
+    """Launch that applies the random values in `drawn` to arrays of the model."""
 
     def __init__(
         self, of: RandomizedModel, drawn: Tensor, columns: Mapping[str, slice], arrays: Mapping[str, Tensor]
     ) -> None:
-        """Write into `arrays`, (N, ...) each, from `drawn` (N, V), where `columns` says which are those of each field. Call
-        with their device as Warp's current one.
+        """Prepare to write `arrays`, (N, ...) each, from `drawn` (N, V), whose `columns` of each field are given. Warp's
+        current device must be that of the tensors.
         """
         changes: dict[tuple[int, int], list[tuple[int, int, int, float]]] = {}
         own = []
@@ -195,16 +200,16 @@ class Redraws:
         self._dim = (len(drawn), _threads())
 
     def launch(self, mask: Tensor) -> None:
-        """Write the rows of the worlds of `mask` (N,)."""
+        """Write the rows of the worlds in `mask` (N,)."""
         wp.launch(write_drawn, dim=self._dim, inputs=[self._dim[1], wp.from_torch(mask), *self._inputs])
 
 
 class Variants:
-    """Arrays of models with constants derived, of which worlds take one's."""
+    """Model variants with derived constants, one of which each world takes."""
 
     def __init__(self, arrays: Mapping[str, tuple[Tensor, Tensor]]) -> None:
-        """Keep of each array the variants (K, ...), and where the worlds have it, (N, ...). Call with their device as Warp's
-        current one.
+        """Keep, for each array, the variants (K, ...) and the worlds' array (N, ...). Warp's current device must be that of
+        the tensors.
         """
         self._variants = self._side_by_side({name: made for name, (made, _) in arrays.items()})
         widths = [made[0].numel() for made, _ in arrays.values()]
@@ -215,14 +220,14 @@ class Variants:
 
     @staticmethod
     def _side_by_side(made: Mapping[str, Tensor]) -> Tensor:
-        """Return variants of all arrays as rows, (K, L)."""
+        """Return the variants of all arrays as concatenated rows, (K, L)."""
         return torch.cat([array.reshape(len(array), -1) for array in made.values()], dim=1).contiguous()
 
     def replace(self, made: Mapping[str, Tensor]) -> None:
-        """Take other variants, as many, at the same address."""
+        """Replace the variants in place by as many others."""
         self._variants.copy_(self._side_by_side(made))
 
     def launch(self, mask: Tensor, chosen: Tensor) -> None:
-        """Copy those `chosen` (N,) into the worlds of `mask` (N,)."""
+        """Copy the variants `chosen` (N,) into the worlds of `mask` (N,)."""
         inputs = [self._dim[1], wp.from_torch(mask), wp.from_torch(chosen), *self._inputs]
         wp.launch(copy_variants, dim=self._dim, inputs=inputs)

@@ -1,6 +1,8 @@
-"""Between an engine's arrays and the task: one Warp launch to write states, one to read kinematics, one or three for forces.
+"""Kernels between an engine's arrays and those of the task: one launch writes states, one reads kinematics, one to three read
+contact forces.
 
-The same formulas in torch (mujoco.py, feet.py) take some 140 launches a control step, a third of its time at 4096 robots.
+The same formulas in torch (mujoco.py, feet.py) take about 140 launches per control step, a third of its time with 4096
+robots.
 """
 
 from abc import ABC, abstractmethod
@@ -18,13 +20,13 @@ from legged.physics.robot_state import RobotState
 from legged.physics.warp.contact_forces import add_contact_forces, sum_contact_forces
 from legged.robots.robot import Robot
 
-# Contacts or constraint rows were dropped; the other bits (iteration caps) are no loss.
+# Flags of dropped contacts or constraint rows. The other bits (iteration limits) do not mean a loss.
 LOST = int(mjw.OverflowType.NEFC | mjw.OverflowType.NJMAX_NNZ | mjw.OverflowType.BROADPHASE | mjw.OverflowType.NARROWPHASE)
 
 
 @wp.func
 def rotate(quat: wp.vec4, vec: wp.vec3) -> wp.vec3:
-    """Body -> world for a quaternion (w, x, y, z); Warp's own quaternions are (x, y, z, w)."""
+    """Rotate a vector from body to world frame by a quaternion (w, x, y, z). Warp's own quaternions are (x, y, z, w)."""
     xyz = wp.vec3(quat[1], quat[2], quat[3])
     t = 2.0 * wp.cross(xyz, vec)
     return vec + quat[0] * t + wp.cross(xyz, t)
@@ -32,7 +34,7 @@ def rotate(quat: wp.vec4, vec: wp.vec3) -> wp.vec3:
 
 @wp.func
 def rotate_inverse(quat: wp.vec4, vec: wp.vec3) -> wp.vec3:
-    """World -> body."""
+    """Rotate a vector from world to body frame by a quaternion (w, x, y, z)."""
     xyz = wp.vec3(quat[1], quat[2], quat[3])
     t = 2.0 * wp.cross(xyz, vec)
     return vec - quat[0] * t + wp.cross(xyz, t)
@@ -40,7 +42,7 @@ def rotate_inverse(quat: wp.vec4, vec: wp.vec3) -> wp.vec3:
 
 @wp.func
 def turn(vec: wp.vec3, axis: wp.vec3, angle: float) -> wp.vec3:
-    """Rodrigues' formula."""
+    """Rotate a vector about an axis by Rodrigues' formula."""
     c = wp.cos(angle)
     return c * vec + wp.sin(angle) * wp.cross(axis, vec) + (1.0 - c) * wp.dot(axis, vec) * axis
 
@@ -64,7 +66,9 @@ def read_kinematics(
     feet_vel: wp.array2d[wp.vec3],
     overflowed: wp.array[wp.bool],
 ):
-    """One thread a world and foot. Tables are (levels, feet), from the foot's body up to the base's child."""
+    """Compute the base's velocity and gravity in its frame, the feet and the overflow flags. One thread per world and foot.
+    Tables are (levels, feet), from the foot's body up to the base's child.
+    """
     world, foot = wp.tid()
     base = wp.vec3(qpos[world, 0], qpos[world, 1], qpos[world, 2])
     quat = wp.vec4(qpos[world, 3], qpos[world, 4], qpos[world, 5], qpos[world, 6])
@@ -92,7 +96,7 @@ def read_kinematics(
 
 @wp.kernel
 def read_flags(overflow: wp.array[int], lost: int, overflowed: wp.array[wp.bool]):
-    """One thread a world, where no robot is read."""
+    """Read and clear the overflow flags of a model without a robot. One thread per world."""
     world = wp.tid()
     overflowed[world] = (overflow[world] & lost) != 0
     overflow[world] = 0
@@ -111,7 +115,9 @@ def write_states(
     warmstart: wp.array2d[float],
     contact_forces: wp.array2d[wp.vec3],
 ):
-    """So many threads a world. Clears what would carry over a step: controls, activations and the solver's warm start."""
+    """Write the states of the worlds in `mask`, and clear the solver's and the actuators' memory: controls, activations, warm
+    start and contact forces. `lanes` threads per world.
+    """
     world, lane = wp.tid()
     if not mask[world]:
         return
@@ -131,7 +137,7 @@ def write_states(
 
 @wp.kernel
 def add_velocities(mask: wp.array[wp.bool], delta: wp.array2d[float], qvel: wp.array2d[float]):
-    """One thread a world and degree of freedom."""
+    """Add `delta` to velocities in the worlds of `mask`. One thread per world and degree of freedom."""
     world, i = wp.tid()
     if mask[world]:
         qvel[world, i] = qvel[world, i] + delta[world, i]
@@ -139,36 +145,36 @@ def add_velocities(mask: wp.array[wp.bool], delta: wp.array2d[float], qvel: wp.a
 
 @dataclass(frozen=True)
 class EngineArrays:
-    """What of an engine a write changes and a read takes, (N, ...) each; `qpos` and `qvel` in MuJoCo's layout."""
+    """Arrays of an engine that the kernels write or read, (N, ...) each; `qpos` and `qvel` are in MuJoCo's layout."""
 
     qpos: wp.array
     qvel: wp.array
     ctrl: wp.array
     act: wp.array
-    """Activations of actuators that have a state; (N, 0) without."""
+    """Activations of actuators with a state; (N, 0) without such actuators."""
     warmstart: wp.array
-    """The solver's; (N, 0) where the engine clears it itself."""
+    """Warm start of the solver; (N, 0) if the engine clears it itself."""
     overflow: wp.array
-    """(N,) flags of what found no room, which reading clears."""
+    """(N,) overflow flags, which reading clears."""
     lost: int
-    """Those bits of `overflow` that mean that contacts were dropped."""
+    """Bits of `overflow` that mean that contacts or constraint rows were dropped."""
 
 
-class StateExchange:
-    """Launches the kernels that write states and read kinematics on fixed arrays, so that a capture can hold them."""
+class StateIO:
+    """Launches of the kernels that write states and read kinematics, on fixed arrays, so that a graph can capture them."""
 
     def __init__(self, arrays: EngineArrays, overflowed: torch.Tensor) -> None:
-        """For a model without a robot: nothing is read but `overflowed` (N,). Call with the arrays' device as Warp's current
-        one.
+        """Prepare for a model without a robot, from which only `overflowed` (N,) is read. Warp's current device must be that
+        of the arrays.
         """
         self._arrays = arrays
         self._overflowed = wp.from_torch(overflowed)
         self._contact_forces = wp.zeros((len(overflowed), 0), dtype=wp.vec3)
 
     def write(self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
-        """Write the state of the worlds of `mask` (N,): `qpos` (N, nq) and `qvel` (N, nv).
+        """Write the state of the worlds in `mask` (N,): `qpos` (N, nq) and `qvel` (N, nv).
 
-        mujoco-warp's own reset_data would drop the contacts of all worlds.
+        mujoco-warp's reset_data is not used, since it drops the contacts of all worlds.
         """
         own = self._arrays
         lanes = lanes_of(wp.get_device())
@@ -177,26 +183,28 @@ class StateExchange:
         wp.launch(write_states, dim=(len(mask), lanes), inputs=inputs, outputs=outputs)
 
     def push(self, mask: torch.Tensor, delta: torch.Tensor, qvel: torch.Tensor) -> None:
-        """Add `delta` (N, K) to the first K of `qvel` in the worlds of `mask` (N,)."""
+        """Add `delta` (N, K) to the first K columns of `qvel` in the worlds of `mask` (N,)."""
         inputs = [wp.from_torch(mask), wp.from_torch(delta), wp.from_torch(qvel)]
         wp.launch(add_velocities, dim=tuple(delta.shape), inputs=inputs)
 
     def kinematics(self) -> None:
-        """Read everything but forces; clears the overflow flags."""
+        """Read all outputs except forces, and clear the overflow flags."""
         inputs = [self._arrays.overflow, self._arrays.lost]
         wp.launch(read_flags, dim=len(self._overflowed), inputs=inputs, outputs=[self._overflowed])
 
     def contact_forces(self) -> None:
-        """Read the contact forces of tracked shapes, as the last step's solver left them; nothing without a robot."""
+        """Read the contact forces of tracked shapes from the last step. Does nothing without a robot."""
 
 
-class RobotExchange(StateExchange, ABC):
-    """The same for a robot with a floating base and feet."""
+class RobotStateIO(StateIO, ABC):
+    """Launches for a robot with a floating base and feet."""
 
     def __init__(
         self, arrays: EngineArrays, overflowed: torch.Tensor, model: mujoco.MjModel, robot: Robot, state: RobotState
     ) -> None:
-        """Fill those fields of `state` that are no views. Call with the arrays' device as Warp's current one."""
+        """Prepare to write the fields of `state` that are not views of `qpos` and `qvel`. Warp's current device must be that
+        of the arrays.
+        """
         super().__init__(arrays, overflowed)
         chains = FootChains.of(model, robot)
         self._contact_forces = wp.from_torch(state.contact_forces, dtype=wp.vec3)
@@ -218,15 +226,15 @@ class RobotExchange(StateExchange, ABC):
         self._outputs = [*(wp.from_torch(t, dtype=wp.vec3) for t in vectors), self._overflowed]
 
     def kinematics(self) -> None:
-        """Read base_lin_vel, projected_gravity, feet_pos, feet_vel, overflowed; clears the overflow flags."""
+        """Read base_lin_vel, projected_gravity, feet_pos, feet_vel and overflowed, and clear the overflow flags."""
         wp.launch(read_kinematics, dim=self._dim, inputs=self._inputs, outputs=self._outputs)
 
     @abstractmethod
     def contact_forces(self) -> None: ...
 
 
-class MujocoWarpExchange(RobotExchange):
-    """The same with the contact forces of mujoco-warp."""
+class MujocoWarpStateIO(RobotStateIO):
+    """Launches for a robot in mujoco-warp, with its contact forces."""
 
     def __init__(
         self,
@@ -238,8 +246,8 @@ class MujocoWarpExchange(RobotExchange):
         state: RobotState,
         slots: int = 0,
     ) -> None:
-        """`m`, `d` are mujoco-warp's model and data, in which each world has so many `slots` of its own for contacts
-        (`ContactStage`), or none where all share a pool. Call with their device as Warp's current one.
+        """Prepare for mujoco-warp's model `m` and data `d`. `slots` is the number of contacts that each world has for itself
+        (`ContactStage`), or 0 if all worlds share a pool. Warp's current device must be that of `m` and `d`.
         """
         super().__init__(arrays_of(d), overflowed, model, robot, state)
         self._m, self._d = m, d
@@ -272,5 +280,5 @@ class MujocoWarpExchange(RobotExchange):
 
 
 def arrays_of(d: Any) -> EngineArrays:
-    """Return what of mujoco-warp's data is written and read."""
+    """Return the arrays of mujoco-warp's data that are written and read."""
     return EngineArrays(d.qpos, d.qvel, d.ctrl, d.act, d.qacc_warmstart, d.overflow, LOST)
