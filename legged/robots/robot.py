@@ -13,7 +13,7 @@ from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, exists
 from legged.robots.gains import VELOCITY_LIMIT, gains, inertia_in_air
-from legged.robots.importing.adapted import adaptations
+from legged.robots.importing.convert import adaptations
 from legged.robots.mirror import Mirror
 from legged.robots.passive_joints import PassiveJoints, default_qpos
 from legged.robots.patterns import match_values

@@ -10,12 +10,10 @@ import numpy as np
 
 from legged.errors import ConfigError, suggest
 from legged.process.paths import exists
+from legged.robots.importing.convert import robot_spec_of
 from legged.robots.patterns import match_names
+from legged.robots.reserved_names import RESERVED
 
-FLOOR = "floor"
-"""Name of the ground's geom, where it is a plane or stands for a height map; no geom of a robot may have it."""
-TAKEN = {"geom": r"floor|terrain_\d+", "sensor": "contact_.*"}
-"""Kind of element -> names that the scene gives to its own."""
 GROUPS = 31
 """Groups of actuators that a model may disable, from 0."""
 LARGEST_NUMBER = 1e12
@@ -30,8 +28,6 @@ def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
     Raises:
         ConfigError: there is no such file, MuJoCo refuses it, or it holds numbers that are not finite.
     """
-    from legged.robots.importing.adapted import robot_spec_of  # which needs the names above
-
     path = folder / file
     if not exists(path) or not path.is_file():
         raise ConfigError(f"{where}: model: there is no file '{file}' in {folder}")
@@ -103,7 +99,7 @@ def check_model(model: mujoco.MjModel, base: str, where: str, passive: Sequence[
             raise ConfigError(f"{where}: model: every collision geom needs a name; one of body '{body.name}' has none")
     for kind, count in (("geom", model.ngeom), ("sensor", model.nsensor)):
         for name in (getattr(model, kind)(i).name for i in range(count)):
-            if re.fullmatch(TAKEN[kind], name):
+            if re.fullmatch(RESERVED[kind], name):
                 raise ConfigError(f"{where}: model: {kind} '{name}': the scene has one of that name; choose another")
     if base_mass(model, base) <= 0.0:
         raise ConfigError(f"{where}: base: body '{base}' has no mass")

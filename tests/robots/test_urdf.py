@@ -7,12 +7,12 @@ from importing_fixtures import LEG_MASS, LEGS, TRUNK, urdf
 
 from legged.errors import ConfigError
 from legged.robots.gains import standing_torques
-from legged.robots.importing.guess import make_ready, read_robot
+from legged.robots.importing.infer import make_ready, read_robot
 from legged.robots.importing.legs import Poser
-from legged.robots.importing.mend import mend
+from legged.robots.importing.repair import mend
 from legged.robots.importing.mjcf import read_mjcf
 from legged.robots.importing.shapes import fit_meshes, name_shapes
-from legged.robots.importing.text import mjcf_of
+from legged.robots.importing.mjcf_writer import mjcf_of
 from legged.robots.importing.tree import Tree
 from legged.robots.importing.urdf import read_urdf
 

@@ -16,9 +16,9 @@ from legged.process.command_parser import CommandParser
 from legged.process.paths import data_folder, exists, make_folder, ready_to_write, relative, write_text
 from legged.registry import register_file, task_config
 from legged.robots.importing.folder import Guesses, called, task_yaml, write_folder
-from legged.robots.importing.guess import make_ready, read_robot
+from legged.robots.importing.infer import make_ready, read_robot
 from legged.robots.importing.menagerie import PREFIX, menagerie_model
-from legged.robots.importing.mend import plain
+from legged.robots.importing.repair import plain
 from legged.robots.importing.tree import Tree
 from legged.robots.robot import load_robot
 

@@ -12,7 +12,7 @@ from legged.physics.newton.solvers import SolverSetup
 from legged.physics.scene.robot_scene import robot_source
 from legged.physics.scene.terrain_geoms import DEPTH, lattice_heights
 from legged.robots.robot import Robot
-from legged.robots.robot_model import FLOOR
+from legged.robots.reserved_names import FLOOR
 from legged.terrain import Terrain
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 from legged.config.yaml_files import dump
 from legged.process.paths import make_folder, write_text
 from legged.robots.importing import meshes
-from legged.robots.importing.mend import plain
+from legged.robots.importing.repair import plain
 from legged.robots.importing.shapes import free_name
-from legged.robots.importing.text import mjcf_of
+from legged.robots.importing.mjcf_writer import mjcf_of
 from legged.robots.importing.tree import Mesh, Tree
 
 

@@ -7,9 +7,9 @@ import mujoco
 import numpy as np
 
 from legged.errors import ConfigError
-from legged.robots.importing.mend import half_lengths
+from legged.robots.importing.repair import half_lengths
 from legged.robots.importing.meshes import refitted, rounded
-from legged.robots.importing.text import model_of
+from legged.robots.importing.mjcf_writer import model_of
 from legged.robots.importing.tree import IDENTITY, Shape, Tree, Vector, matrix, quat_about, rotate
 
 FOOT = re.compile(r"foot|feet|toe|sole|heel|ankle|shank|calf|tarsus|lower_?leg|wheel", re.IGNORECASE)
