@@ -7,9 +7,9 @@ from helpers import call
 
 from legged.cli.robot import add
 from legged.robots.importing.convert import robot_spec_of
-from legged.robots.importing.repair import mend
 from legged.robots.importing.mjcf import read_mjcf
 from legged.robots.importing.mjcf_writer import mjcf_of
+from legged.robots.importing.repair import mend
 from legged.robots.robot import load_robot
 
 ARMS = """

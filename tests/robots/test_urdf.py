@@ -9,10 +9,10 @@ from legged.errors import ConfigError
 from legged.robots.gains import standing_torques
 from legged.robots.importing.infer import make_ready, read_robot
 from legged.robots.importing.legs import Poser
-from legged.robots.importing.repair import mend
 from legged.robots.importing.mjcf import read_mjcf
-from legged.robots.importing.shapes import fit_meshes, name_shapes
 from legged.robots.importing.mjcf_writer import mjcf_of
+from legged.robots.importing.repair import mend
+from legged.robots.importing.shapes import fit_meshes, name_shapes
 from legged.robots.importing.tree import Tree
 from legged.robots.importing.urdf import read_urdf
 

@@ -9,10 +9,10 @@ import mujoco
 
 from legged.errors import ConfigError
 from legged.robots.importing.infer import read_robot
-from legged.robots.importing.repair import repair
 from legged.robots.importing.mjcf import drop_visual_meshes
-from legged.robots.importing.shapes import fit_meshes, name_shapes
 from legged.robots.importing.mjcf_writer import mjcf_of
+from legged.robots.importing.repair import repair
+from legged.robots.importing.shapes import fit_meshes, name_shapes
 
 URDF = ".urdf"
 
@@ -52,8 +52,7 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 @lru_cache(maxsize=16)
 def _adapted(path: Path, _stamp: tuple[int, int], drawn: bool) -> tuple[str, tuple[str, ...]]:
-    """Return the MJCF of an adapted file, and one line for each change. `_stamp` makes the cache read a changed file again.
-    """
+    """Return the MJCF of an adapted file, and one line for each change. `_stamp` makes the cache read a changed file again."""
     tree = read_robot(path, drawn=drawn)
     bare = not tree.shapes
     if bare and not drawn:  # the visual shapes will collide

@@ -14,10 +14,10 @@ from legged.robots.importing.actuation import guess_efforts, speed_limits, take_
 from legged.robots.importing.folder import Guesses, called
 from legged.robots.importing.inverse_kinematics import GOOD, standing_angles
 from legged.robots.importing.legs import Leg, Poser, face_forward, find_legs
-from legged.robots.importing.repair import repair
 from legged.robots.importing.mjcf import read_mjcf
-from legged.robots.importing.shapes import fit_meshes, free_name, give_trunk, name_shapes
 from legged.robots.importing.mjcf_writer import model_of
+from legged.robots.importing.repair import repair
+from legged.robots.importing.shapes import fit_meshes, free_name, give_trunk, name_shapes
 from legged.robots.importing.tree import Shape, Tree
 from legged.robots.importing.urdf import read_urdf
 from legged.robots.stance import standing_height
@@ -98,8 +98,7 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
 
 
 def _name_feet(tree: Tree, legs: list[Leg]) -> None:
-    """Rename the feet so that no name of a foot is part of another shape's name: patterns of robot.yaml are parts of names.
-    """
+    """Rename the feet so that no name of a foot is part of another shape's name: patterns of robot.yaml are parts of names."""
     for leg in legs:
         for shape in leg.feet:
             others = {other.name for other in tree.shapes if other is not shape}
@@ -176,8 +175,7 @@ def _roles(tree: Tree, legs: list[Leg], feet: Sequence[str]) -> tuple[list[str],
 
 
 def _trunk(tree: Tree, legs: list[Leg]) -> list[int]:
-    """Return the links of the trunk: the base, and the links in the middle that belong to no leg and carry arms and a head.
-    """
+    """Return the links of the trunk: the base, and the links in the middle that belong to no leg and carry arms and a head."""
     poser = Poser(tree)
     poser.pose({})
     of_legs = {i for leg in legs for i in leg.links}

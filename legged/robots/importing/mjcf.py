@@ -240,7 +240,7 @@ def _read_hinges(model: mujoco.MjModel, body: int, link: Link, tree: Tree) -> No
 
 
 def _smaller(limits: np.ndarray) -> float | None:
-    """Return half the width of a range that is limited on both sides, as the smaller of its ends, or None."""
+    """Return the end of a range that is nearer to 0, or the other one if that is 0; None if it is no finite limit."""
     size = float(min(abs(limits[0]), abs(limits[1])) or max(abs(limits[0]), abs(limits[1])))
     return size if 0.0 < size < 1e5 else None
 
