@@ -1,4 +1,4 @@
-"""Torque limits and gains from a robot's file, with a check that the gains are stable in the explicit control law used here."""
+"""Torque limits and gains from a robot's file, with a check that the gains are stable in the explicit control law."""
 
 from collections.abc import Sequence
 

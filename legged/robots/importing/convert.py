@@ -52,7 +52,7 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 @lru_cache(maxsize=16)
 def _adapted(path: Path, _stamp: tuple[int, int], drawn: bool) -> tuple[str, tuple[str, ...]]:
-    """Return the MJCF of an adapted file, and one line for each change. `_stamp` makes the cache read a changed file again."""
+    """Return the MJCF of an adapted file, and one line for each change. `_stamp` renews the cache entry of a changed file."""
     tree = read_robot(path, drawn=drawn)
     bare = not tree.shapes
     if bare and not drawn:  # the visual shapes will collide

@@ -98,7 +98,7 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
 
 
 def _name_feet(tree: Tree, legs: list[Leg]) -> None:
-    """Rename the feet so that no name of a foot is part of another shape's name: patterns of robot.yaml are parts of names."""
+    """Rename the feet so that no foot's name is part of another shape's name: patterns of robot.yaml are parts of names."""
     for leg in legs:
         for shape in leg.feet:
             others = {other.name for other in tree.shapes if other is not shape}
@@ -175,7 +175,7 @@ def _roles(tree: Tree, legs: list[Leg], feet: Sequence[str]) -> tuple[list[str],
 
 
 def _trunk(tree: Tree, legs: list[Leg]) -> list[int]:
-    """Return the links of the trunk: the base, and the links in the middle that belong to no leg and carry arms and a head."""
+    """Return the links of the trunk: the base, and the links in the middle that carry arms and a head and are not in a leg."""
     poser = Poser(tree)
     poser.pose({})
     of_legs = {i for leg in legs for i in leg.links}

@@ -95,7 +95,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoc
     if missing:
         tree.say(f"{len(missing)} meshes are not beside the file and left out: {', '.join(sorted(missing))[:200]}")
     if not drawn:
-        drop_what_is_drawn(spec, path)
+        drop_visual_meshes(spec, path)
     used = {geom.meshname for geom in spec.geoms if geom.meshname}
     for mesh in list(spec.meshes):
         if mesh_name(mesh) in missing or mesh_name(mesh) not in used:

@@ -63,9 +63,7 @@ def _check_numbers(tree: Tree) -> None:
         sizes = [np.hstack([shape.size, shape.pos, shape.quat]) for shape in link.shapes]
         numbers = np.abs(np.hstack([values, *sizes]))
         if not (numbers <= LARGEST).all():
-            raise ConfigError(
-                f"{tree.source}: link '{link.name}': masses, inertias, lengths and positions must be finite and at most {LARGEST:g}"
-            )
+            raise ConfigError(f"{tree.source}: link '{link.name}': its numbers must be finite and at most {LARGEST:g}")
 
 
 def _hold(tree: Tree, hold: Sequence[str]) -> None:

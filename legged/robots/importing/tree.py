@@ -45,7 +45,7 @@ class Shape:
     """Other primitives that fit the mesh: kind -> size, position and orientation."""
 
     def move(self, pos: Vector, quat: Vector) -> None:
-        """Move the shape into another frame, in which the shape's present frame is at `pos` (3,) [m], turned by `quat` (4,)."""
+        """Move the shape into another frame, in which its present frame is at `pos` (3,) [m], turned by `quat` (4,)."""
         self.pos, self.quat = pos + rotate(quat, self.pos), quat_product(quat, self.quat)
         self.fits = {
             kind: (size, pos + rotate(quat, at), quat_product(quat, turned)) for kind, (size, at, turned) in self.fits.items()
