@@ -71,7 +71,7 @@ def numbers(text: str) -> list[int]:
 
 
 def measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, Any]:
-    """Return the benchmark's results for `size` robots with these arguments; `failed` has the reason if there are none.
+    """Return the benchmark's results for `size` robots with these arguments; `failed` has the reason if they are missing.
 
     Raises:
         ConfigError: the configuration does not allow so many robots.

@@ -1,4 +1,4 @@
-"""Evaluator of Python expressions in files that are not run: literals, arithmetic, numbers of math and numpy, earlier names."""
+"""Evaluator of Python expressions in files that are not run: literals, arithmetic, members of math and numpy, known names."""
 
 import ast
 import math

@@ -117,7 +117,7 @@ def _does_not_work(given: str, error: Exception) -> str:
 
 
 HEADLESS = not display_answers()
-"""Whether no window can be opened."""
+"""True if no window can be opened."""
 
 try:
     choose()

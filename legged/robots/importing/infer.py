@@ -175,7 +175,7 @@ def _roles(tree: Tree, legs: list[Leg], feet: Sequence[str]) -> tuple[list[str],
 
 
 def _trunk(tree: Tree, legs: list[Leg]) -> list[int]:
-    """Return the links of the trunk: the base, and the links in the middle that carry arms and a head and are not in a leg."""
+    """Return the links of the trunk: the base, and the links in the middle that are in no leg and carry arms and a head."""
     poser = Poser(tree)
     poser.pose({})
     of_legs = {i for leg in legs for i in leg.links}
