@@ -1,4 +1,4 @@
-"""Task names -> task class and configuration. Every `cfg/*.yaml` is a task; outside code adds its own."""
+"""Registry of tasks: names, task classes and configurations. Every `cfg/*.yaml` is a task; users register their own."""
 
 import dataclasses
 import sys
@@ -44,27 +44,28 @@ CLASSES = {
     "HalfCheetah": "legged.envs.half_cheetah",
     "Humanoid": "legged.envs.humanoid",
 }
-"""Task classes of this package that `class:` in a task's YAML can name -> the module of each."""
+"""Task class of this package that `class:` in a task's YAML can name -> its module."""
 
 
 @dataclass(frozen=True)
 class _Entry(Registered):
     task_class: type[BaseTask] | None
-    """None takes that of the task it extends."""
+    """Task class; None takes the class of the configuration, or of the task that it extends."""
 
 
 _REGISTERED: dict[str, _Entry] = {}
 
 
 def register(name: str, config: Path | str | Mapping[str, Any], task_class: type[BaseTask] | None = None) -> None:
-    """Make `name` a task: a YAML file, or a mapping with the same keys, and a subclass of LeggedRobot or BaseTask; without
-    one, the class that the configuration names (`class:`), or what it extends has, else LeggedRobot.
+    """Register the task `name`. `config` is a YAML file, or a mapping with the same keys. `task_class` is a subclass of
+    LeggedRobot or BaseTask; by default it is the class that the configuration names (`class:`), or that of the task it
+    extends, else LeggedRobot.
 
-    `extends: anymal_c_flat` in it builds on a task of this package or on a registered one. The path of the file, and paths
-    in a mapping, are relative to the folder of the module that calls this, else to the working directory.
+    In a configuration, `extends: anymal_c_flat` builds on a task of this package or on a registered one. The path of the
+    file, and paths in a mapping, are relative to the folder of the calling module, else to the working directory.
 
     Raises:
-        ConfigError: the name is none, or the class or the configuration is of the wrong type.
+        ConfigError: the name is invalid, or the class or the configuration has a wrong type.
     """
     if not isinstance(name, str) or not is_plain_name(name):
         raise ConfigError(f"register: the name of a task must be {PLAIN}; got {shown(name)}")
@@ -82,11 +83,11 @@ def register(name: str, config: Path | str | Mapping[str, Any], task_class: type
 
 
 def import_tasks(name: str) -> None:
-    """Register user-defined tasks: run the module of that name or path, or make the YAML file at that path a task. `name` may
-    be several, separated by commas, such as the module of a class and a YAML file that uses it.
+    """Register user-defined tasks: run the module with that name or path, or register the YAML file at that path. `name` may
+    hold several, separated by commas, such as the module of a class and a YAML file that uses it.
 
     Raises:
-        ConfigError: one can't be found, or fails.
+        ConfigError: a module or a file can't be found, or fails.
     """
     for one in name.split(","):
         if one.endswith(YAML_ENDINGS):
@@ -96,11 +97,11 @@ def import_tasks(name: str) -> None:
 
 
 def register_file(path: str, flag: str = "TASK") -> str:
-    """Make the YAML file at `path` a task, which is called by the file's name without ending; returns that name. `flag` is
-    the option or argument that names the file.
+    """Register the YAML file at `path` as a task, and return its name: the file's name without ending. `flag` is the option
+    or argument that named the file, for errors.
 
     Raises:
-        ConfigError: there is no such file, or another task is called so.
+        ConfigError: there is no such file, its name is invalid, or another task has that name.
     """
     file = Path(path).absolute()
     if not exists(file) or file.is_dir():
@@ -121,7 +122,7 @@ def register_file(path: str, flag: str = "TASK") -> str:
 
 
 def task_names() -> list[str]:
-    """All tasks there are."""
+    """Return the names of all tasks, sorted."""
     return sorted({path.stem for path in data_folder("cfg").glob("*.yaml")} | set(_REGISTERED))
 
 
@@ -152,7 +153,7 @@ def task_class(name: str) -> type[BaseTask]:
 def _class_named(kind: Any, where: str) -> type[BaseTask]:
     """Return the task class of that name: one of ours, or one that a registered task has."""
     registered = {entry.task_class.__name__: entry.task_class for entry in _REGISTERED.values() if entry.task_class}
-    if isinstance(kind, str) and kind in registered and kind not in CLASSES:  # a name of ours means our class
+    if isinstance(kind, str) and kind in registered and kind not in CLASSES:  # the names of our classes cannot be redefined
         return registered[kind]
     if not isinstance(kind, str) or kind not in CLASSES:
         raise ConfigError(f"{where}: there is no task class {shown(kind)}{suggest(str(kind)[:100], {*CLASSES, *registered})}")
@@ -160,13 +161,13 @@ def _class_named(kind: Any, where: str) -> type[BaseTask]:
 
 
 def _schema_of(kind: type[BaseTask]) -> type[TaskConfig]:
-    """Return the schema that a task class has.
+    """Return the configuration schema of a task class.
 
     Raises:
-        ConfigError: it is none, or lacks what the class that is extended here reads.
+        ConfigError: `Config` is not a frozen dataclass that extends the schema of LeggedRobot or BaseTask.
     """
     base, schema = (LeggedRobot if issubclass(kind, LeggedRobot) else BaseTask).Config, kind.Config
-    # Fields of a class that is not decorated itself would be left out without a word.
+    # The fields of an undecorated class would be ignored silently.
     decorated = isinstance(schema, type) and "__dataclass_fields__" in vars(schema)
     if not decorated or not issubclass(schema, base):
         raise ConfigError(
@@ -177,7 +178,7 @@ def _schema_of(kind: type[BaseTask]) -> type[TaskConfig]:
 
 
 def task_schema(name: str) -> type[TaskConfig]:
-    """Return the schema of a task's configuration, or that of a legged robot for a task which is not there any more."""
+    """Return the schema of a task's configuration; that of a legged robot for a task that does not exist any more."""
     try:
         return _schema_of(task_class(name))
     except ConfigError:
@@ -185,10 +186,11 @@ def task_schema(name: str) -> type[TaskConfig]:
 
 
 def task_config(name: str, overrides: Iterable[tuple[str, Any]] = (), on_cpu: bool = False) -> TaskConfig:
-    """Return the configuration of a task, checked down to its reward names and gains, but with nothing built.
+    """Return the configuration of a task, checked completely, without building anything. `overrides` are pairs of a dotted
+    path and a value; `on_cpu` applies the section `cpu` of the configuration.
 
     Raises:
-        ConfigError: no such task, or a mistake in its configuration.
+        ConfigError: there is no such task, or its configuration is invalid.
     """
     kind = task_class(name)
     schema = _schema_of(kind)
@@ -199,10 +201,10 @@ def task_config(name: str, overrides: Iterable[tuple[str, Any]] = (), on_cpu: bo
 
 
 def _check_units(kind: type[BaseTask], cfg: TaskConfig) -> None:
-    """Look for terms whose numbers were rescaled from another robot, and which do not declare their unit.
+    """Check that every term whose number was rescaled from another robot declares its unit.
 
     Raises:
-        ConfigError: there is one that runs, and whose number is not 0.
+        ConfigError: a term that runs, with a number other than 0, has no unit.
     """
     running = {
         "_reward_": set(cfg.rewards.scales),
@@ -246,7 +248,7 @@ def _rescaler(kind: type[BaseTask], schema: type[TaskConfig]) -> Rescale:
         try:
             size = size_of(robot)
         except ConfigError:
-            return data  # `check` says what is wrong with it, and who named it
+            return data  # `check` reports the error, with the place that names the robot
         factor = partial(grown, reference=reference, robot=size)
         rescaled = rescale({key: value for key, value in data.items() if key != "cpu"}, schema, factor, unit_at)
         return rescaled | ({"cpu": rescale(data["cpu"], schema, factor, unit_at)} if "cpu" in data else {})
@@ -255,7 +257,12 @@ def _rescaler(kind: type[BaseTask], schema: type[TaskConfig]) -> Rescale:
 
 
 def make_task(cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None) -> Any:
-    """Build the task that a configuration describes, on its own terrain or on the one given: an instance of `task_class`."""
+    """Return the task of a configuration, an instance of `task_class`, built on its own terrain or on the given one.
+
+    Raises:
+        ConfigError: the configuration does not fit the engine, or the class does not call super().__init__.
+        TermError: a term fails or cannot be captured.
+    """
     other_ground = {} if terrain is None else {"terrain": terrain}  # a user's constructor may not know the argument
     kind: Any = task_class(cfg.task)
     with importing():

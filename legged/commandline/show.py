@@ -12,7 +12,7 @@ from legged.config.networks import groups_in
 from legged.config.schema import DrawConfig, LeggedDomainRandConfig
 from legged.envs import BaseTask, LeggedRobot
 from legged.mdp.control import action_scales
-from legged.mdp.draws import standard_deviation
+from legged.mdp.distributions import standard_deviation
 from legged.physics import FIELDS
 from legged.registry import make_task
 from legged.robots.similarity import Size, growth, size_of
@@ -80,7 +80,7 @@ def _observations(task: BaseTask) -> Iterator[str]:
             scales = term.scale.tolist()
             scales = scales[:1] if len(set(scales)) == 1 else scales
             noise = f"+-{_number(term.noise)}" if term.noise else "-"
-            sensors = task.observation_terms.sensors if groups_in(task.cfg)[name].noise else None
+            sensors = task.observation_terms.errors if groups_in(task.cfg)[name].noise else None
             if sensors is not None and term.name in sensors.names:
                 noise = sensors.describe(term.name)
             columns = f"{term.columns.start}:{term.columns.stop}"

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.envs import BaseTask, LeggedRobot
-from legged.envs.step_watchers import watch_steps
+from legged.envs.final_observation import watch_steps
 from legged.episodes.quantities import FLAGS, quantities_of
 from legged.episodes.stored import Episodes
 from legged.evaluation.overflows import Overflows

@@ -11,7 +11,7 @@ from torch import Tensor
 from legged.commandline.arguments import pick_device
 from legged.config.checks import shown
 from legged.config.networks import groups_of
-from legged.envs.step_watchers import keep_final_step
+from legged.envs.final_observation import keep_final_step
 from legged.errors import ConfigError, suggest
 from legged.gymnasium_envs.random_stream import RandomStream
 from legged.registry import make_task, task_config

@@ -17,7 +17,7 @@ from legged.learning.divergence import PATIENCE, DivergenceDetector
 from legged.learning.gradient_guard import GradientGuard
 from legged.learning.ppo import DevicePPO
 from legged.learning.runner import Runner
-from legged.mdp.faults import LARGEST, LARGEST_STATE
+from legged.mdp.nan_guard import LARGEST, LARGEST_STATE
 from legged.registry import _REGISTERED, make_task, register, task_config
 
 pytestmark = pytest.mark.usefixtures("workplace")

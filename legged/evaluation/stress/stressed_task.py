@@ -12,7 +12,7 @@ from legged.evaluation.stress.table import PUSH_INTERVAL, Disturbance
 from legged.math import quat_rotate
 from legged.mdp.height_map_errors import HeightMapErrors, is_exact
 from legged.mdp.height_scan import HeightScan
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.random_pool import RandomPool
 from legged.physics import FIELDS, MODEL_FIELDS, Scene
 from legged.registry import task_class
 from legged.terrain import Terrain
@@ -146,7 +146,7 @@ class StressedTask(LeggedRobot):
         scan = self.height_scan
         if cfg.shift:
             scan = HeightScan(self.cfg.terrain, self.terrain, n, torch.device(self.device), self.physics.kernels)
-        pose, numbers = (self.base_pos, self.base_quat), UniformNumbers(n, torch.device(self.device))
+        pose, numbers = (self.base_pos, self.base_quat), RandomPool(n, torch.device(self.device))
         found = GivenMap(cfg, scan, pose, self.heights_seen, self.dt, numbers)
         found.given = self._map_error, self._map_holes
         return found

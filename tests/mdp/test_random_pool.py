@@ -3,14 +3,14 @@
 import pytest
 import torch
 
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.random_pool import RandomPool
 
 MANY, CPU = 20_000, torch.device("cpu")
 
 
 def test_everyone_gets_numbers_between_the_bounds_asked_for():
     torch.manual_seed(0)
-    numbers = UniformNumbers(MANY, CPU)
+    numbers = RandomPool(MANY, CPU)
     one, other = numbers.between(-1.0, 3.0, 2), numbers.between([5.0, 2.0, 0.0], torch.tensor([6.0, -2.0, 0.0]), 3)
     numbers.draw()
     for drawn in (one, other):
@@ -24,7 +24,7 @@ def test_everyone_gets_numbers_between_the_bounds_asked_for():
 
 
 def test_they_are_new_at_every_draw_and_stay_where_they_are():
-    numbers = UniformNumbers(3, CPU)
+    numbers = RandomPool(3, CPU)
     drawn = numbers.between(0.0, 1.0, 2)
     numbers.draw()
     first, address = drawn.values.clone(), drawn.values.data_ptr()
@@ -34,7 +34,7 @@ def test_they_are_new_at_every_draw_and_stay_where_they_are():
 
 
 def test_who_asks_too_late_is_told_when_to_ask():
-    numbers = UniformNumbers(3, CPU)
+    numbers = RandomPool(3, CPU)
     numbers.draw()
     with pytest.raises(RuntimeError, match="_init_buffers"):
         numbers.between(0.0, 1.0, 2)

@@ -1,13 +1,13 @@
-"""Sensors that are not ideal, by numbers worked by hand: bias, delay, lost packets, and the map of heights."""
+"""Errors of observations, by numbers worked by hand: bias, delay, lost packets, and the map of heights."""
 
 import pytest
 import torch
 from helpers import assert_goes_on_alike, small_task
 
 from legged.errors import ConfigError
+from legged.mdp.observation_errors import ObservationErrors
 from legged.mdp.observations import ObservationTerms
-from legged.mdp.sensors import Sensors
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.random_pool import RandomPool
 
 N = 6
 NOBODY, EVERYBODY = torch.zeros(N, dtype=torch.bool), torch.ones(N, dtype=torch.bool)
@@ -29,8 +29,8 @@ class Bench:
     def __init__(self, names=("a",), bias=None, delay=None, dropped=None, noise=None):
         self.clock = torch.zeros(())
         self.terms = ObservationTerms({"a": self.a, "b": self.b})
-        self.numbers = UniformNumbers(N, torch.device("cpu"))
-        self.sensors = Sensors(self.terms, names, bias or {}, delay or {}, dropped or {}, noise or {}, self.numbers)
+        self.numbers = RandomPool(N, torch.device("cpu"))
+        self.sensors = ObservationErrors(self.terms, names, bias or {}, delay or {}, dropped or {}, noise or {}, self.numbers)
         self.terms.sensors = self.sensors
         self.numbers.allocate()
 
@@ -139,10 +139,10 @@ def test_the_actor_is_misled_and_the_critic_is_not():
         actor, critic = obs["actor"], obs["critic"]
         speeds.append(critic[:, 24:36])
         off = actor[:, 12:24] - critic[:, 12:24]
-        torch.testing.assert_close(off, task.observation_terms.sensors.bias[:, :12])
+        torch.testing.assert_close(off, task.observation_terms.errors.bias[:, :12])
         torch.testing.assert_close(actor[:, :12], critic[:, :12], rtol=0.0, atol=0.0)
     torch.testing.assert_close(actor[:, 24:36], speeds[1])
-    assert small_task(*settings[1:]).observation_terms.sensors is None  # add_noise is off: nothing misleads
+    assert small_task(*settings[1:]).observation_terms.errors is None  # add_noise is off: nothing misleads
 
 
 def test_two_groups_have_the_same_sensor():
@@ -177,7 +177,7 @@ def heights_task(**height_map):
 
 def test_a_map_that_is_too_high_shows_lower_bases():
     task = heights_task(offset=0.05, drift=0.5)
-    errors = task.observation_terms.sensors._map
+    errors = task.observation_terms.errors._map
     for _ in range(5):
         before = errors.error.clone()
         obs, *_ = task.step(torch.zeros(4, 12))
@@ -192,7 +192,7 @@ def test_a_map_that_is_too_high_shows_lower_bases():
 
 def test_a_shifted_map_has_the_ground_of_another_place():
     task = heights_task(shift=0.3)
-    errors, scan = task.observation_terms.sensors._map, task.height_scan
+    errors, scan = task.observation_terms.errors._map, task.height_scan
     obs, *_ = task.step(torch.zeros(4, 12))
     there = task.base_pos.clone() - errors.error
     at_home = scan.heights.clone()
@@ -204,7 +204,7 @@ def test_a_shifted_map_has_the_ground_of_another_place():
 
 def test_holes_read_0_and_stay_for_the_episode():
     task = heights_task(holes=0.25)
-    holes = task.observation_terms.sensors._map.holes.clone()
+    holes = task.observation_terms.errors._map.holes.clone()
     assert holes.float().mean().item() == pytest.approx(0.25, abs=0.08)
     for _ in range(3):
         obs, *_ = task.step(torch.zeros(4, 12))
@@ -219,7 +219,7 @@ def test_a_lost_map_reads_0_everywhere_and_the_others_are_whole():
     for _ in range(10):
         task.reset()
         obs, *_ = task.step(torch.zeros(4, 12))
-        holes = task.observation_terms.sensors._map.holes
+        holes = task.observation_terms.errors._map.holes
         lost = holes.any(dim=1)
         assert (lost == holes.all(dim=1)).all()
         seen = (task.base_pos[:, 2:] - 0.5 - task.measured_heights).masked_fill(lost.unsqueeze(1), 0.0)
@@ -254,6 +254,6 @@ def test_errors_of_0_are_none():
     rollouts = []
     for settings in ([], [*zero, ("control.actuator.delay", [0, 0])]):
         task = small_task(ON, *settings)
-        assert task.observation_terms.sensors is None
+        assert task.observation_terms.errors is None
         rollouts.append(torch.stack([task.step(torch.full((4, 12), 0.1 * k))[0]["actor"] for k in range(5)]))
     assert torch.equal(*rollouts)

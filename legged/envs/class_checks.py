@@ -1,4 +1,6 @@
-"""Methods of a user's class that nothing here would call: hooks of other frameworks, and terms that are none."""
+"""Checks of user-defined task classes: methods that are never called, overrides without super(), and terms that are not
+methods.
+"""
 
 import inspect
 from pathlib import Path
@@ -14,13 +16,13 @@ from legged.process.paths import relative
 _OBSERVE = "write a method _obs_<name> for each part and list the names in observations.groups.actor.terms and .critic.terms"
 _STEP = "override one of the hooks that _step() calls, and call super()'s in it: advance, compute_reward, remember, ..."
 _START = (
-    "init_state.dof_pos_factor, init_state.yaw and init_state.base_velocity say how an episode begins; for more, override"
+    "init_state.dof_pos_factor, init_state.yaw and init_state.base_velocity set the initial states; for more, override"
     " reset_idx(mask) and call self.physics.write(mask, qpos, qvel) after super().reset_idx(mask)"
 )
 _BUILD = "the robot is its MJCF (robot: in the task's YAML), the ground is terrain: or what make_terrain() returns"
 _DRAWING = "nothing is drawn while training; play.py makes pictures (legged/rendering)"
-_TORQUES = "control.control_type, control.stiffness and control.damping choose the law; others go into legged/mdp/control.py"
-_RANDOM = "domain_rand.ranges names what is drawn for each robot (docs/randomisation.md)"
+_TORQUES = "control.control_type, control.stiffness and control.damping set the law; other laws go into legged/mdp/control.py"
+_RANDOM = "domain_rand.ranges names the properties that are randomised (docs/randomisation.md)"
 
 HOOKS = {
     # legged_gym and its forks
@@ -31,19 +33,19 @@ HOOKS = {
     "compute_observations": _OBSERVE,
     "get_privileged_observations": "observations.groups.critic.terms lists the _obs_<name> methods that the critic sees",
     "_get_noise_scale_vec": "observations.noise in the YAML gives each term's noise; observations.add_noise, noise_level",
-    "_resample_commands": "commands.ranges, commands.resampling_time_s, standing_share and single_axis_share say what is"
-    " sampled; another way of sampling goes into legged/mdp/commands.py",
+    "_resample_commands": "commands.ranges, commands.resampling_time_s, standing_share and single_axis_share set the"
+    " sampling; another way of sampling goes into legged/mdp/commands.py",
     "_compute_torques": _TORQUES,
     "_reset_dofs": _START,
     "_reset_root_states": _START,
-    "_push_robots": "domain_rand.push_robots, push_interval_s and max_push_vel_xy say how robots are pushed",
+    "_push_robots": "domain_rand.push_robots, push_interval_s and max_push_vel_xy set the pushes",
     "_update_terrain_curriculum": "terrain.curriculum switches it; another one goes into legged/mdp/terrain_curriculum.py",
     "update_command_curriculum": "commands.curriculum sets it; another one goes into legged/mdp/command_curriculum.py",
-    "_get_heights": "self.measured_heights (N, P) has them after every step; terrain.measured_points_x and _y say where",
-    "_init_height_points": "terrain.measured_points_x and terrain.measured_points_y say where heights are measured",
-    "_process_rigid_shape_props": "domain_rand.randomize_friction and friction_range randomise; the MJCF says the rest",
+    "_get_heights": "self.measured_heights (N, P) has them after every step; terrain.measured_points_x and _y set the points",
+    "_init_height_points": "terrain.measured_points_x and terrain.measured_points_y set the points of the height scan",
+    "_process_rigid_shape_props": "domain_rand.randomize_friction and friction_range randomise; the MJCF has the rest",
     "_process_dof_props": "joint limits and efforts are the MJCF's, velocity limits robot.yaml's; rewards.soft_* shrink them",
-    "_process_rigid_body_props": "domain_rand.randomize_base_mass and added_mass_range randomise; the MJCF says the rest",
+    "_process_rigid_body_props": "domain_rand.randomize_base_mass and added_mass_range randomise; the MJCF has the rest",
     "_create_envs": _BUILD,
     "_create_ground_plane": _BUILD,
     "_create_heightfield": _BUILD,
@@ -51,12 +53,13 @@ HOOKS = {
     "_get_env_origins": "self.env_origins (N, 3) are the terrain's; terrain.spawn_range scatters robots around them",
     "create_sim": _BUILD,
     "_reset_buffers": _STEP,
-    "_init_foot": "self.feet_pos and self.feet_vel (N, F, 3) are there; buffers of your own are made in _init_buffers()",
+    "_init_foot": "self.feet_pos and self.feet_vel (N, F, 3) exist already; allocate your own buffers in _init_buffers()",
     "update_feet_state": "self.feet_pos and self.feet_vel (N, F, 3) are current after every step",
     "compute_self_observations": _OBSERVE,
-    "compute_termination_observations": "a task whose episodes end keeps what they ended with where somebody asks for it"
-    " (legged/envs/step_watchers.py)",
-    "_disturbance_robots": "domain_rand.forces and kicks push; others override disturb(mask), with self.physics.push",
+    "compute_termination_observations": "keep_final_step(task) keeps the final observations of episodes"
+    " (legged/envs/final_observation.py)",
+    "_disturbance_robots": "domain_rand.forces and kicks push robots; for other disturbances override disturb(mask), with"
+    " self.physics.push",
     "_step_contact_targets": "override advance(), call super().advance() and write your own tensors in place",
     "_call_train_eval": _STEP,
     "_randomize_dof_props": _RANDOM,
@@ -73,35 +76,34 @@ HOOKS = {
     "_get_observations": _OBSERVE,
     "_get_rewards": "write a method _reward_<name> for each part and name its scale in rewards.scales",
     "_get_dones": "write a method _terminate_<name> and list the name in terminations.failures or terminations.time_outs",
-    "_reset_idx": "override reset_idx(mask), with a bool a robot",
+    "_reset_idx": "override reset_idx(mask), with one bool per robot",
 }
-"""Hook of another framework -> what takes its place here."""
+"""Hook of another framework -> its replacement here."""
 OUTSIDE = {
     "step": "training runs _step() as a CUDA graph, without it; override the hooks of _step(), and call super()'s in them",
     "get_observations": "training reads the groups' buffers, without it; " + _OBSERVE,
 }
-"""Method of a task that only play and evaluation call -> what is overridden in its place."""
+"""Method of a task that only play and evaluation call -> methods to override instead."""
 
 EXTENDED = {
-    "advance": "time would stand still: episode_length_buf and self.contacts",
-    "check_termination": "falls would not be counted, nor robots put back whose physics blew up; what ends an episode is a"
-    " method _terminate_<name>, listed in terminations.failures or terminations.time_outs",
-    "compute_reward": "every step would be worth nothing, and so every episode; a reward is a method _reward_<name>, with its"
-    " scale in rewards.scales",
-    "draw": "all episodes would begin alike, under the same commands",
-    "remember": "last_actions and last_dof_vel would be those of the start",
-    "reset_idx": "no episode would begin anew",
+    "advance": "otherwise episode_length_buf and self.contacts would stand still",
+    "check_termination": "otherwise falls would not be counted, and robots whose physics has diverged would not be reset;"
+    " write a method _terminate_<name> and list it in terminations.failures or terminations.time_outs",
+    "compute_reward": "otherwise every reward would be 0; write a method _reward_<name>, with its scale in rewards.scales",
+    "draw": "otherwise all episodes would begin in the same state, under the same commands",
+    "remember": "otherwise last_actions and last_dof_vel would keep their initial values",
+    "reset_idx": "otherwise no episode would begin",
 }
-"""Hook that a class extends and does not replace -> what would be missing."""
+"""Hook that must call super()'s -> effect of a missing call."""
 
 
 def check_overrides(cls: type) -> None:
-    """Look for hooks that `cls`, or a class between it and the class of this package that it extends, defines in vain or
-    without what they do here, and whether it can be made as tasks are made here.
+    """Check the methods of a task class, and those of its parents up to a class of this package.
 
     Raises:
-        ConfigError: there is a hook which that class does not have, or which training does not call, and no OWN_HELPERS
-            names; one that does not call super()'s; or a constructor that wants other arguments.
+        ConfigError: a method has the name of another framework's hook, or of a method that training does not call, and
+            OWN_HELPERS does not list it; an override does not call super()'s method; or a constructor takes other arguments
+            than (self, cfg, device, graph).
     """
     base = next(part for part in cls.__mro__ if part.__module__.startswith("legged."))
     between = [part for part in cls.__mro__ if part not in base.__mro__]
@@ -129,16 +131,16 @@ def check_overrides(cls: type) -> None:
 
 
 def _names_in(code: CodeType) -> set[str]:
-    """Return the attributes and globals that a function, or one within it, names."""
+    """Return the attributes and globals that a function, or a function within it, names."""
     within = [constant for constant in code.co_consts if isinstance(constant, CodeType)]
     return set(code.co_names).union(*(_names_in(constant) for constant in within))
 
 
 def _check_constructor(part: type) -> None:
-    """Look whether a class can be made with what the registry gives it.
+    """Check that the constructor of a class takes the arguments that the registry passes.
 
     Raises:
-        ConfigError: it can't.
+        ConfigError: it does not.
     """
     constructor = vars(part)["__init__"]
     try:
@@ -146,14 +148,14 @@ def _check_constructor(part: type) -> None:
     except TypeError as error:
         raise ConfigError(
             f"{place(part, constructor)}: {part.__name__}.__init__ must take (self, cfg, device, graph), as tasks here do"
-            f" ({error}); Isaac Gym's arguments mean nothing here, and buffers are made in _init_buffers()"
+            f" ({error}); there are no arguments of Isaac Gym, and buffers are allocated in _init_buffers()"
         ) from error
-    except ValueError:  # of something without a signature
+    except ValueError:  # the constructor has no signature
         return
 
 
 KINDS = {"_reward_": "reward", "_obs_": "observation", "_terminate_": "termination"}
-"""Prefix of a term's method -> what errors call it."""
+"""Prefix of a term's method -> word for it in errors."""
 
 
 def named_terms(cfg: TaskConfig) -> list[tuple[str, str, str]]:
@@ -169,10 +171,10 @@ def named_terms(cfg: TaskConfig) -> list[tuple[str, str, str]]:
 
 
 def check_terms(cls: Any, cfg: TaskConfig) -> None:
-    """Look whether the terms that a configuration names are there and can be called.
+    """Check that the terms that a configuration names exist and can be called.
 
     Raises:
-        ConfigError: one is missing, is no method, or wants arguments; or there are no observations.
+        ConfigError: a term is missing, is not a method, or takes arguments; or a group has no observations.
     """
     groups = cfg.observations.groups
     for group in groups or ("actor",):
@@ -188,12 +190,16 @@ def check_terms(cls: Any, cfg: TaskConfig) -> None:
 
 
 def _check_term(cls: type, name: str, path: str, origins: Origins) -> None:
-    """One term that the setting at `path` asks for."""
+    """Check the method `name` of a term that the setting at `path` names.
+
+    Raises:
+        ConfigError: it is not a method, or takes arguments.
+    """
     found = inspect.getattr_static(cls, name)
     where = f"{origins.where(path)}: {cls.__name__}.{name}"
     if isinstance(found, property) or not callable(getattr(cls, name)):
-        raise ConfigError(f"{where} is no method but a {type(found).__name__}; a term is a method without arguments")
-    # A method of the class has `self` still to come, one bound to it (classmethod, staticmethod) has not.
+        raise ConfigError(f"{where} is not a method but a {type(found).__name__}; a term is a method without arguments")
+    # Python passes `self` to a plain method, and nothing to a static method; the class of a classmethod is bound already.
     bound = isinstance(found, classmethod | staticmethod)
     parameters = list(inspect.signature(getattr(cls, name)).parameters.values())
     needed = [p.name for p in parameters if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
@@ -202,11 +208,11 @@ def _check_term(cls: type, name: str, path: str, origins: Origins) -> None:
         raise ConfigError(f"{where} takes no self; a term is a method without other arguments")
     if needed[0 if bound else 1 :]:
         listed = ", ".join(needed[0 if bound else 1 :])
-        raise ConfigError(f"{where} takes arguments ({listed}); a term has none but self, and reads the task's tensors")
+        raise ConfigError(f"{where} takes arguments ({listed}); a term takes only self, and reads the task's tensors")
 
 
 def place(cls: type, attribute: Any) -> str:
-    """File and line of something a class defines, as far as Python knows them."""
+    """Return file and line of an attribute of a class; only the file, or the module, if Python knows no more."""
     function = inspect.unwrap(getattr(attribute, "fget", None) or getattr(attribute, "__func__", attribute))
     code = getattr(function, "__code__", None)
     if code is not None:

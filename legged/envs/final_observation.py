@@ -1,6 +1,4 @@
-"""What looks at a step before episodes that end in it begin anew, and one that does: it keeps the last step of an episode for
-those who learn from it.
-"""
+"""Final observations of episodes: watchers copy the end of each step before episodes are reset."""
 
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
@@ -14,32 +12,32 @@ if TYPE_CHECKING:
 
 
 class StepWatcher(Protocol):
-    """Looks at every environment in each step when its reward has been judged, before any is reset, pushed or given a new
-    command.
+    """Watcher of a task, which is called in each step when rewards are computed, before any environment is reset, pushed or
+    given a new command.
     """
 
     def take(self) -> None:
-        """Copy what is wanted of it: within the captured step, so without host reads or new addresses."""
+        """Copy tensors of the task. Runs within the captured step, so without reads by the host or new addresses."""
 
 
 Watcher = TypeVar("Watcher", bound=StepWatcher)
 
 
 class FinalStep:
-    """What every environment was like in the last step when its reward was judged, before any was reset, pushed or given a
-    new command.
+    """Observations and state of every environment at the end of the last step, when rewards were computed, before any
+    environment was reset, pushed or given a new command.
     """
 
     def __init__(self, terms: ObservationTerms, groups: dict[str, ObservationGroup], physics: Physics) -> None:
-        """For the observation groups of a task and its physics."""
+        """Allocate copies for the observation groups of a task and its physics."""
         self._terms, self._groups, self._physics = terms, groups, physics
         self.observations = {name: torch.zeros_like(group.buffer) for name, group in groups.items()}
-        """By group what it would have shown, (N, history * width)."""
+        """Group -> final observation, (N, history * width)."""
         self.qpos, self.qvel = torch.zeros_like(physics.qpos), torch.zeros_like(physics.qvel)
         """(N, nq) and (N, nv) generalised positions and velocities."""
 
     def take(self) -> None:
-        """Observe the environments as they are now, in the middle of a step: terms are evaluated once more."""
+        """Copy observations and state now, in the middle of a step. The terms are evaluated once more for it."""
         self._terms.evaluate()
         for name, group in self._groups.items():
             group.preview(self.observations[name])
@@ -48,13 +46,13 @@ class FinalStep:
 
 
 def keep_final_step(task: "BaseTask", graph: bool = True) -> FinalStep:
-    """Let a task keep the last step of its episodes from now on, and return where it does. Otherwise as `watch_steps`."""
+    """Attach a `FinalStep` to a task and return it. Everything else is as for `watch_steps`."""
     return watch_steps(task, FinalStep(task.observation_terms, task.observation_groups, task.physics), graph)
 
 
 def watch_steps(task: "BaseTask", watcher: Watcher, graph: bool = True) -> Watcher:
-    """Let `watcher` look at every step of a task from now on, and return it. All episodes begin anew. With `graph` the step
-    is captured (again, if the task was built with a graph), or checked on the CPU, as at its start.
+    """Attach `watcher` to a task and return it. It is called in every step from now on. All episodes and curricula are reset.
+    With `graph` the step is captured on a GPU (again, if the task was built with a graph), or checked on the CPU.
 
     Raises:
         TermError: the step cannot be captured.

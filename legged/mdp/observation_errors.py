@@ -1,6 +1,6 @@
-"""Sensors that are not ideal: numbers that are off by the same amount all episode long, late, or lost on the way.
+"""Errors of observations: a constant bias within an episode, noise, delay, and loss.
 
-What a term says goes through here once a control step, for all groups that have noise: they see the same sensor.
+Errors are applied to terms once a control step, so that all groups with noise see the same errors.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from legged.math import masked_set_
 from legged.mdp.height_map_errors import HeightMapErrors
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.random_pool import RandomPool
 
 if TYPE_CHECKING:
     from legged.mdp.observations import ObservationTerms
@@ -20,10 +20,10 @@ HEIGHTS = "heights"
 """The term that is read from a map."""
 
 
-class Sensors:
-    """Some terms as N robots measure them: bias and noise are added, then numbers are delayed, then lost.
+class ObservationErrors:
+    """Observation terms of N robots with errors: bias and noise are added, then numbers are delayed, then some are lost.
 
-    `values` and `columns` are as those of `ObservationTerms`; terms that are measured ideally are copied.
+    `values` and `columns` have the layout of `ObservationTerms`. Terms without errors are copied.
     """
 
     STATE: tuple[str, ...] = ("bias", "delay", "past", "held")
@@ -36,16 +36,18 @@ class Sensors:
         delay: Mapping[str, tuple[int, int]],
         dropped: Mapping[str, float],
         noise: Mapping[str, float],
-        numbers: UniformNumbers,
+        numbers: RandomPool,
         height_map: HeightMapErrors | None = None,
     ) -> None:
-        """Measure the terms `names` of `source`: with a `bias` and `noise` up to these half widths, in the term's unit, a
-        `delay` of fewest to most control steps, and a share of the control steps `dropped`; none where a term is not named.
-        What is drawn comes from `numbers`. The heights are read from `height_map`.
+        """Apply errors to the terms `names` of `source`. Each table has entries by term; a missing entry means no such error.
+
+        `bias` and `noise` are half widths of uniform distributions, in the term's unit. `delay` is the fewest and the most
+        control steps. `dropped` is the share of control steps at which a term is lost. Random numbers come from the pool
+        `numbers`. With `height_map`, the heights are read from it.
         """
         self.columns, self.names = source.columns, tuple(sorted(names, key=lambda name: source.columns[name].start))
         self.noise = {name: noise.get(name, 0.0) for name in self.names}
-        """Term -> half width of the noise that is added here, in the term's unit."""
+        """Term -> half width of its noise, in the term's unit."""
         self._source, self._map = source, height_map
         self._shares, self._delays = (bias, dropped), delay
         num_envs, device = source.values.shape[0], source.values.device
@@ -53,7 +55,7 @@ class Sensors:
         widths = [source.columns[name].stop - source.columns[name].start for name in self.names]
         term_of = [i for i, width in enumerate(widths) for _ in range(width)]
         self.values = torch.zeros_like(source.values)
-        """(N, width) the terms as groups with noise read them."""
+        """(N, width) terms with errors, which groups with noise read."""
         together = columns == list(range(columns[0], columns[0] + len(columns)))
         self._slice = slice(columns[0], columns[0] + len(columns)) if together else None
         self._columns = torch.tensor(columns, device=device)
@@ -70,25 +72,25 @@ class Sensors:
         half, width = by_column(bias), by_column(noise)
         self._bias_drawn = numbers.between(-half, half, len(columns)) if half.any() else None
         self.bias = torch.zeros(num_envs, len(columns) if self._bias_drawn else 0, device=device)
-        """(N, C) error of each of the C measured columns in this episode, if there is any."""
+        """(N, C) bias of each of the C columns with errors in this episode; (N, 0) without bias."""
         self._noise = numbers.between(-width, width, len(columns)) if width.any() else None
         low, high = (torch.tensor([delay.get(name, (0, 0))[k] for name in self.names], device=device) for k in (0, 1))
         self._longest = int(high.max())
         self._most = high
         self._delay_drawn = numbers.between(low.float(), high.float() + 1.0, len(high)) if self._longest else None
         self.delay = high.expand(num_envs, -1).clone()
-        """(N, T) delay of each of the T measured terms in this episode, in control steps."""
+        """(N, T) delay of each of the T terms with errors in this episode, in control steps."""
         self.past = torch.zeros(num_envs, self._longest + 1 if self._longest else 0, len(columns), device=device)
-        """(N, steps, C) what was measured, the newest first, if anything is delayed."""
+        """(N, steps, C) measurements of the last steps, newest first; (N, 0, C) without delay."""
         lost = torch.tensor([float(dropped.get(name, 0.0)) for name in self.names], device=device)
         self._dropped = lost if lost.any() else None
         self._lost_drawn = numbers.between(0.0, 1.0, len(lost)) if lost.any() else None
         self.held = torch.zeros(num_envs, len(columns) if self._lost_drawn else 0, device=device)
-        """(N, C) what arrived last, if anything can be lost."""
+        """(N, C) numbers that arrived last; (N, 0) without loss."""
 
     def update(self, begun: Tensor, again: bool = False) -> None:
-        """Measure in a new control step, in which the episodes of `begun` (N,) are new: with errors of their own, and what
-        they measure first for their past. With `again` the step is the same one, and only its measurement is repeated.
+        """Update `values` for a new control step. Robots of `begun` (N,) have new episodes: they get a new bias and delay,
+        and their first measurement fills their past. With `again`, repeat the measurement of the same step.
         """
         if not again:
             self._draw(begun)
@@ -106,18 +108,18 @@ class Sensors:
         self._show(now)
 
     def preview(self) -> None:
-        """Show in `values` what would be measured if a control step ended now; nothing else changes."""
+        """Write into `values` the measurement that a control step ending now would give. Nothing else changes."""
         now = self._measured()
         if self._longest:
             before = self._late(self.past, (self.delay - 1).clamp_(min=0))
-            prompt = (self.delay == 0).index_select(1, self._term_of)
-            now = torch.where(prompt, now, before)
+            undelayed = (self.delay == 0).index_select(1, self._term_of)
+            now = torch.where(undelayed, now, before)
         if self._lost_drawn is not None:
             now = torch.where(self._lost(), self.held, now)
         self._show(now)
 
     def describe(self, name: str) -> str:
-        """Return what is wrong with a measured term, in a few words."""
+        """Return the errors of a term in a few words."""
         bias, lost = (table.get(name, 0.0) for table in self._shares)
         low, high = self._delays.get(name, (0, 0))
         parts = [f"+-{self.noise[name]:.6g}"] if self.noise[name] else []
@@ -127,12 +129,12 @@ class Sensors:
         parts += ["map with errors"] if self._map is not None and name == HEIGHTS else []
         return ", ".join(parts)
 
-    def parts(self) -> dict[str, "Sensors | HeightMapErrors"]:
-        """Return what has a state, by name."""
+    def parts(self) -> dict[str, "ObservationErrors | HeightMapErrors"]:
+        """Return the parts that have a `STATE`, by their names in saved states."""
         return {"sensors": self, **({"height_map": self._map} if self._map is not None else {})}
 
     def _draw(self, begun: Tensor) -> None:
-        """Draw the errors of new episodes, and let those of the map grow."""
+        """Draw bias and delay of new episodes, and advance the errors of the map."""
         if self._bias_drawn is not None:
             masked_set_(self.bias, begun, self._bias_drawn.values)
         if self._delay_drawn is not None:
@@ -141,10 +143,10 @@ class Sensors:
             self._map.advance(begun)
 
     def _measured(self) -> Tensor:
-        """Return the terms of now (N, C), with bias and noise."""
+        """Return the current values of the terms (N, C), with bias and noise."""
         source = self._source.values
         if self._map is not None and self.names == (HEIGHTS,):
-            now = self._map.read()  # all that is measured
+            now = self._map.read()  # the heights are the only term with errors
         elif self._map is not None and self._of_map is not None:
             now = source.index_select(1, self._columns)
             now[:, self._of_map].copy_(self._map.read())
@@ -159,18 +161,18 @@ class Sensors:
         return now
 
     def _late(self, past: Tensor, delay: Tensor) -> Tensor:
-        """Return what of the past (N, steps, C) is seen with delays (N, T), (N, C)."""
+        """Return the entries (N, C) of `past` (N, steps, C) at the age `delay` (N, T)."""
         age = delay.index_select(1, self._term_of).unsqueeze(1)
         return past.gather(1, age)[:, 0]
 
     def _lost(self) -> Tensor:
-        """Return which numbers (N, C) do not arrive in this step."""
+        """Return a mask (N, C) of the numbers that are lost in this step."""
         assert self._lost_drawn is not None
         assert self._dropped is not None
         return (self._lost_drawn.values < self._dropped).index_select(1, self._term_of)
 
     def _show(self, seen: Tensor) -> None:
-        """Write the measured terms into `values`, beside the others."""
+        """Write the measured terms `seen` (N, C) into `values`, and copy all other terms."""
         self.values.copy_(self._source.values)
         if self._slice is not None:
             self.values[:, self._slice].copy_(seen)

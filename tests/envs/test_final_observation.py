@@ -4,7 +4,7 @@ import pytest
 import torch
 from helpers import small_task, zero_actions
 
-from legged.envs.step_watchers import keep_final_step
+from legged.envs.final_observation import keep_final_step
 from legged.registry import make_task, task_config
 
 

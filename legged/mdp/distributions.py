@@ -1,4 +1,4 @@
-"""Numbers in one range after another, each with a distribution of its own, from even ones."""
+"""Random columns with a range and a distribution each (uniform, log-uniform or gaussian), made from uniform numbers."""
 
 import math
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from legged.config.schema import DrawConfig
-from legged.mdp.uniform_numbers import Drawn, UniformNumbers
+from legged.mdp.random_pool import RandomPool, Slice
 
 if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
@@ -17,12 +17,14 @@ KINDS = ("uniform", "log_uniform", "gaussian")
 
 
 def standard_deviation(draw: DrawConfig) -> float:
-    """Return that of a normal distribution before it is cut off: as told, or a quarter of the range's width."""
+    """Return the standard deviation of a normal distribution before it is cut off at its range: `std` of the draw, or a
+    quarter of the range's width.
+    """
     return draw.std or 0.25 * (draw.range[1] - draw.range[0])
 
 
-class Draws:
-    """V columns of numbers, some of which are drawn evenly, some evenly in their logarithm, some normally."""
+class Distributions:
+    """V random columns: uniform, uniform in their logarithm, or normal within a range."""
 
     def __init__(
         self,
@@ -32,8 +34,9 @@ class Draws:
         steps_per_iteration: int = 1,
         within: bool = True,
     ) -> None:
-        """Say how each of V columns is drawn, and from what `neutral` value on it grows over iterations of so many steps:
-        from the end of its range that is nearest to it, or (not `within`) from that value itself.
+        """Configure the columns. A range with `grow` widens over training from the `neutral` value (V,) of its column: with
+        `within`, from the number in the range that is nearest to it; else from the value itself. `steps_per_iteration` are
+        the control steps of a training iteration.
         """
         self._order = sorted(range(len(columns)), key=lambda i: KINDS.index(columns[i].distribution))
         ordered = [columns[i] for i in self._order]
@@ -50,10 +53,11 @@ class Draws:
         self._spread = tensor([math.sqrt(2.0) * standard_deviation(draw) for draw in normal])
         ends = [_ends(draw) for draw in ordered]
         self.low, self.high = (tensor([end[k] for end in ends]) for k in range(2))
-        """(V,) bounds of the even numbers, in an order of their own."""
+        """(V,) bounds of the uniform numbers, sorted by distribution."""
         self._least, self._most = (tensor([draw.range[k] for draw in columns]) for k in range(2))
         self._pace: tuple[Tensor, Tensor] | None = None
-        """(V,) how much wider a range gets in a step, and how wide it is at the first one, as shares; None if none grows."""
+        """(V,) growth of each range in a step, and (V,) its width at the first step, as shares of the full width. None if no
+        range grows."""
         if any(draw.grow[1] > 0.0 for draw in columns):
             paces = [1.0 / (draw.grow[1] - draw.grow[0]) if draw.grow[1] > 0.0 else 0.0 for draw in columns]
             first = [-draw.grow[0] * pace if pace else 1.0 for draw, pace in zip(columns, paces, strict=True)]
@@ -62,11 +66,14 @@ class Draws:
         if within:
             self._neutral = torch.minimum(torch.maximum(self._neutral, self._least), self._most)
         self.table, self.source = self._table(columns)
-        """(V, 8) all of it, and (V,) of which even number each column is made: what a launch is told."""
+        """(V, 8) parameters of each column and (V,) index of its uniform number, for the kernel."""
 
     def _table(self, columns: Sequence[DrawConfig]) -> tuple[Tensor, Tensor]:
-        """Return columns of the distribution's place in `KINDS`; middle and spread of normal ones; the range's ends; pace and
-        first share of those that grow, 0 and 1 of others; and the neutral value.
+        """Return the table of parameters (V, 8) and the index of each column's uniform number (V,).
+
+        A row holds: the distribution's index in `KINDS`; middle and spread of a normal distribution, else 0; both ends of
+        the range; the growth in a step and the share at the first step, or 0 and 1 for a range that does not grow; the
+        neutral value.
         """
         count, like = len(columns), self.low
         source = torch.tensor([self._order.index(i) for i in range(count)], device=like.device)
@@ -77,24 +84,26 @@ class Draws:
         pace, first = self._pace or (torch.zeros_like(kind), torch.ones_like(kind))
         return torch.stack([kind, middle, spread, self._least, self._most, pace, first, self._neutral], dim=1), source
 
-    def ask(self, numbers: UniformNumbers) -> Drawn:
-        """Ask for the even numbers that `values` is made of."""
+    def ask(self, numbers: RandomPool) -> Slice:
+        """Reserve in the pool `numbers` the uniform numbers that `values` takes."""
         return numbers.between(self.low, self.high, len(self.low))
 
     def at_once(self, count: int) -> Tensor:
-        """Draw (count, V) numbers, not within a step; those that grow have not yet."""
+        """Draw (count, V) numbers outside a step. Ranges that grow have their initial width."""
         even = self.low + torch.rand(count, len(self.low), device=self.low.device) * (self.high - self.low)
         return self.values(even, torch.zeros((), device=even.device))
 
     def write(self, even: Tensor, steps: Tensor, out: Tensor, kernels: "TaskKernels | None") -> None:
-        """Write `values` into `out` (N, V), by one launch where there are `kernels`."""
+        """Write `values` into `out` (N, V), by one launch if `kernels` are given."""
         if kernels is None:
             out.copy_(self.values(even, steps))
         else:
             kernels.make_draws(even, self.source, self.table, steps.view(1), out)
 
     def values(self, even: Tensor, steps: Tensor) -> Tensor:
-        """Return (N, V) numbers from even ones, (N, V) within `low` and `high`, after so many `steps` of training, ()."""
+        """Return (N, V) random numbers made from the uniform numbers `even` (N, V), which lie between `low` and `high`.
+        Ranges have grown for `steps` () of training.
+        """
         parts = list(even.split(self._counts, dim=1))
         if self._counts[1]:
             parts[1] = parts[1].exp()
@@ -112,11 +121,11 @@ class Draws:
 
 
 def _ends(draw: DrawConfig) -> tuple[float, float]:
-    """Return between what even numbers are drawn of which a column is made."""
+    """Return the bounds of the uniform numbers that a column is made from."""
     low, high = draw.range
     if draw.distribution == "log_uniform":
         return math.log(low), math.log(high)
-    if draw.distribution == "gaussian":  # of which torch.erfinv makes normal ones; at +-1 they would be infinite
+    if draw.distribution == "gaussian":  # torch.erfinv makes normal numbers of them; at +-1 they would be infinite
         reach = 0.5 * (high - low) / standard_deviation(draw) if high > low else 0.0
         end = min(math.erf(reach / math.sqrt(2.0)), 1.0 - 1e-6)
         return -end, end

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from legged.config.schema import DrawConfig
-from legged.mdp.draws import Draws
+from legged.mdp.distributions import Distributions
 
 CPU = torch.device("cpu")
 MANY = 40_000
@@ -14,7 +14,7 @@ MANY = 40_000
 
 def drawn(*columns: DrawConfig) -> torch.Tensor:
     torch.manual_seed(5)
-    return Draws(columns, [0.0] * len(columns), CPU).at_once(MANY)
+    return Distributions(columns, [0.0] * len(columns), CPU).at_once(MANY)
 
 
 def test_uniform_numbers_fill_their_range_evenly():
@@ -66,7 +66,7 @@ def test_columns_keep_their_order_whatever_their_distributions_are():
 
 def test_ranges_grow_from_the_neutral_value_over_their_iterations():
     """Iterations of 10 steps, from iteration 2 to 6: at step 40 half of the way has been made."""
-    draws = Draws([DrawConfig((0.5, 2.0), grow=(2.0, 6.0)), DrawConfig((0.5, 2.0))], [1.0, 1.0], CPU, 10)
+    draws = Distributions([DrawConfig((0.5, 2.0), grow=(2.0, 6.0)), DrawConfig((0.5, 2.0))], [1.0, 1.0], CPU, 10)
     ends = torch.stack([draws.low, draws.high])
     for step, low, high in ((0, 1.0, 1.0), (20, 1.0, 1.0), (40, 0.75, 1.5), (60, 0.5, 2.0), (500, 0.5, 2.0)):
         found = draws.values(ends, torch.tensor(float(step)))
@@ -74,5 +74,5 @@ def test_ranges_grow_from_the_neutral_value_over_their_iterations():
 
 
 def test_a_range_without_its_neutral_value_grows_from_its_nearer_end():
-    draws = Draws([DrawConfig((2.0, 3.0), grow=(0.0, 1.0))], [1.0], CPU)
+    draws = Distributions([DrawConfig((2.0, 3.0), grow=(0.0, 1.0))], [1.0], CPU)
     assert draws.values(draws.high.view(1, 1), torch.tensor(0.0)).item() == 2.0
