@@ -80,9 +80,9 @@ def _observations(task: BaseTask) -> Iterator[str]:
             scales = term.scale.tolist()
             scales = scales[:1] if len(set(scales)) == 1 else scales
             noise = f"+-{_number(term.noise)}" if term.noise else "-"
-            sensors = task.observation_terms.errors if groups_in(task.cfg)[name].noise else None
-            if sensors is not None and term.name in sensors.names:
-                noise = sensors.describe(term.name)
+            errors = task.observation_terms.errors if groups_in(task.cfg)[name].noise else None
+            if errors is not None and term.name in errors.names:
+                noise = errors.describe(term.name)
             columns = f"{term.columns.start}:{term.columns.stop}"
             rows.append((columns, term.name, ", ".join(map(_number, scales)), noise, _says(task, f"_obs_{term.name}")))
         steps = f" x {group.history} steps, oldest first" if group.history > 1 else ""
