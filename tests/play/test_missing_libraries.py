@@ -25,7 +25,7 @@ def ends(code: str, folder: Path, missing: tuple[str, ...], **environment: str) 
 
 
 def test_playing_without_a_film_needs_neither_encoder_nor_windows(tmp_path):
-    code = f"sys.argv = {[PLAY, '--no-video', *ARGUMENTS]!r}\nfrom legged.tools.play import main\nsys.exit(main())"
+    code = f"sys.argv = {[PLAY, '--no-video', *ARGUMENTS]!r}\nfrom legged.cli.play import main\nsys.exit(main())"
     done = ends(code, tmp_path, ("imageio_ffmpeg", "imageio", "glfw", "mujoco.viewer"))
     assert (done.returncode, done.stderr) == (0, "")
     assert "following commands" in done.stdout
@@ -43,7 +43,7 @@ def test_a_film_without_an_encoder_is_one_line_after_the_table_and_a_gif_is_ther
         "    def close(self): ...\n"
         "video.camera_of = Camera\n"
         "schedule.SCHEDULE = ((0.2, (0.5, 0.0, 0.0)),)\n"
-        "from legged.tools.play import main\n"
+        "from legged.cli.play import main\n"
         f"sys.exit(main({['--headless', '--gif', *ARGUMENTS]!r}))"
     )
     done = ends(code, tmp_path, ("imageio_ffmpeg",))
@@ -54,7 +54,7 @@ def test_a_film_without_an_encoder_is_one_line_after_the_table_and_a_gif_is_ther
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["exported", "play.gif"]
 
 
-@pytest.mark.parametrize("module", ["legged.tools.train", "legged.tools.play", "legged.tools.benchmark", "legged.deploy.udp"])
+@pytest.mark.parametrize("module", ["legged.cli.train", "legged.cli.play", "legged.cli.benchmark.step", "legged.deploy.udp"])
 def test_modules_of_one_system_alone_are_not_imported(module, tmp_path):
     """Windows has none of them; torch and Warp do without, too."""
     done = ends(f"import {module}", tmp_path, ("fcntl", "termios", "pwd", "grp", "resource"))
