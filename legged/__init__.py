@@ -1,10 +1,10 @@
 """Robots learn to walk and run: tasks on batched MuJoCo, trained by rsl-rl.
 
-What this package offers is imported when it is first asked for: a robot's computer runs `legged.deploy` out of this package,
-and has neither torch nor MuJoCo.
+The names of this package are imported at their first use, because a robot's computer runs `legged.deploy` without torch and
+MuJoCo.
 """
 
-from legged.process.startup import importing, only_lists  # first: it looks at the time
+from legged.process.startup import importing, only_lists  # first: it records the time
 
 import importlib
 from collections.abc import Iterable
@@ -41,11 +41,15 @@ _HOMES = {
     "task_config": "legged.registry",
     "unit": "legged.envs",
 }
-"""Name -> the module that it is imported from when somebody asks for it."""
+"""Name -> module that it is imported from at its first use."""
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for: a name of `__all__`, or a module of this package."""
+    """Import and return a name of `__all__`, or a module of this package.
+
+    Raises:
+        AttributeError: there is no such name and no such module.
+    """
     if name.startswith("_"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     with importing():
@@ -61,7 +65,7 @@ def __getattr__(name: str) -> Any:
 
 
 def _task_names() -> Iterable[str]:
-    """Return the names of the tasks there are."""
+    """Return the names of all tasks."""
     with importing():
         registry = importlib.import_module("legged.registry")
     return registry.task_names()

@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C8C00")
-"""Of curves, bars and areas, in this order: those of Okabe and Ito ("Color universal design", 2008), which readers of any
-colour vision tell apart. The last is their yellow, darkened to be seen on white.
+"""Colours of curves, bars and areas, in this order. They are those of Okabe and Ito ("Color universal design", 2008), which
+are distinct for any colour vision. The last is their yellow, darkened for a white background.
 """
 STYLES = ("-", "--", "-.", ":")
-"""Of curves that differ by more than their colours, in this order."""
+"""Line styles of curves that differ by more than their colours, in this order."""
 DPI = 110
 """Pixels an inch."""
 
@@ -44,11 +44,11 @@ def import_matplotlib() -> None:
 def figure(
     path: Path, size: tuple[float, float], rows: int = 1, columns: int = 1, share_y: bool = False, **saving: Any
 ) -> Iterator[tuple["Figure", np.ndarray]]:
-    """Give a figure of `size` (width, height) [inches] and its (rows, columns) axes to draw into; it is then written to
-    `path` as a PNG file that is whole or not there. Curves take the colours of all figures. With `share_y` all axes have one
-    scale of y; `saving` are options of matplotlib's savefig.
+    """Provide a figure of `size` (width, height) [inches] and its (rows, columns) axes in a `with` block, then write it to
+    `path` as a PNG file. The file is written completely or not at all. Curves have the colours `COLORS`. With `share_y` all
+    axes share one y scale. `saving` are options of matplotlib's savefig.
 
-    No window system is asked: matplotlib's choice of one (MPLBACKEND) has no say here.
+    No window system is needed, whatever matplotlib's backend is (MPLBACKEND).
 
     Raises:
         RunError: the file can't be written.

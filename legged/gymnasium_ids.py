@@ -1,5 +1,7 @@
-"""What Gymnasium calls our tasks: `legged/<task>`. Gymnasium is not imported here; it is told as soon as somebody else does,
-and finds our classes by their names when an environment is made.
+"""Gymnasium ids of our tasks: `legged/<task>`.
+
+Gymnasium is not imported here. The ids are registered as soon as other code imports it. Gymnasium imports our classes by name
+when it makes an environment.
 """
 
 import importlib.util
@@ -11,11 +13,11 @@ from types import ModuleType
 from typing import Any
 
 NAMESPACE = "legged"
-"""What stands before the slash."""
+"""Part of an id before the slash."""
 
 
 def announce(names: Callable[[], Iterable[str]]) -> None:
-    """Register the tasks that `names` lists: now, if Gymnasium is imported already, else when it is."""
+    """Register the tasks that `names` returns: now, if Gymnasium is imported already, else when it is imported."""
     if "gymnasium" in sys.modules:
         add_ids(names())
     else:
@@ -23,8 +25,10 @@ def announce(names: Callable[[], Iterable[str]]) -> None:
 
 
 def add_ids(names: Iterable[str]) -> None:
-    """Register these tasks, again if they are already; nothing happens while Gymnasium is not imported. It has no id for a
-    name with letters other than a-z, 0-9 and `_:.-`, nor for both of `x` and `x-v1`: such a task has none.
+    """Register these tasks, replacing earlier ids. Does nothing while Gymnasium is not imported.
+
+    Gymnasium refuses names with characters other than letters, digits and `_:.-`, and the names `x` and `x-v1` together. Such
+    a task gets no id.
     """
     gymnasium = sys.modules.get("gymnasium")
     if gymnasium is None:
@@ -43,7 +47,7 @@ def add_ids(names: Iterable[str]) -> None:
 
 
 class _AtImport(MetaPathFinder):
-    """Finds Gymnasium as it would be found anyway, and registers our tasks once it has been imported."""
+    """Finder that lets Python import Gymnasium as usual, and registers our tasks afterwards."""
 
     def __init__(self, names: Callable[[], Iterable[str]]) -> None:
         self.names = names
@@ -65,7 +69,7 @@ class _AtImport(MetaPathFinder):
 
 
 class _AndThen(Loader):
-    """Another loader, and what follows it."""
+    """Loader that runs another loader, then registers our tasks and removes the finder."""
 
     def __init__(self, loader: Any, finder: _AtImport) -> None:
         self._loader, self._finder = loader, finder

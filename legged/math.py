@@ -1,4 +1,4 @@
-"""Quaternions (w, x, y, z) and in-place helpers, batched over the first dimension and free of host synchronisation."""
+"""Quaternions (w, x, y, z) and in-place helpers, batched over the first dimension, without synchronisation with the host."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -9,21 +9,21 @@ from torch.nn.functional import mse_loss
 
 
 def quat_rotate(quat: Tensor, vec: Tensor) -> Tensor:
-    """Vectors (N, 3) in the body frame of `quat` (N, 4) -> world frame."""
+    """Return vectors (N, 3), given in the body frame of `quat` (N, 4), in the world frame."""
     w, xyz = quat[:, :1], quat[:, 1:]
     t = 2.0 * torch.linalg.cross(xyz, vec)
     return vec + w * t + torch.linalg.cross(xyz, t)
 
 
 def quat_rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
-    """Vectors (N, 3) in the world frame -> body frame of `quat` (N, 4)."""
+    """Return vectors (N, 3), given in the world frame, in the body frame of `quat` (N, 4)."""
     w, xyz = quat[:, :1], quat[:, 1:]
     t = 2.0 * torch.linalg.cross(xyz, vec)
     return vec - w * t + torch.linalg.cross(xyz, t)
 
 
 def quat_to_matrix(quat: Tensor) -> Tensor:
-    """Rotation matrices (N, 3, 3) from the body frame of `quat` (N, 4), w first, to the world frame."""
+    """Return the rotation matrices (N, 3, 3) from the body frame of `quat` (N, 4), w first, to the world frame."""
     w, x, y, z = quat.t().contiguous()
     rows = (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
@@ -34,15 +34,15 @@ def quat_to_matrix(quat: Tensor) -> Tensor:
 
 
 def yaw_of(quat: Tensor) -> Tensor:
-    """Heading angle of the body's x axis in the world [rad], (N,)."""
+    """Return the heading angle of the body's x axis in the world frame, (N,) [rad]."""
     w, x, y, z = quat.unbind(dim=1)
     return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def get_euler_xyz(quat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return roll, pitch and yaw [rad], (N,) each, of `quat` (N, 4), w first: the turns about the world's x, y and z axes,
-    in this order, that make up the rotation. Each lies in [-pi, pi]. Isaac Gym's lie in [0, 2 pi), and its quaternions have
-    w last.
+    """Return roll, pitch and yaw [rad], (N,) each, of `quat` (N, 4), w first. The rotation consists of these turns about the
+    world's x, y and z axes, in this order. Each angle lies in [-pi, pi]. In Isaac Gym angles lie in [0, 2 pi), and
+    quaternions have w last.
     """
     w, x, y, z = quat.unbind(dim=1)
     roll = torch.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
@@ -51,19 +51,19 @@ def get_euler_xyz(quat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def wrap_to_pi(angle: Tensor) -> Tensor:
-    """Return the same angle in [-pi, pi)."""
+    """Return the same angle in [-pi, pi) [rad]."""
     return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi
 
 
 def uniform(low: float, high: float, shape: tuple[int, ...], device: torch.device) -> Tensor:
-    """Independent numbers U(low, high)."""
+    """Return independent random numbers, uniform between `low` and `high`."""
     return low + (high - low) * torch.rand(shape, device=device)
 
 
 def masked_set_(target: Tensor, mask: Tensor, value: Tensor | float) -> None:
-    """target[mask] = value[mask] without an index list: rows of `target` (N, ...) where `mask` (N,) holds.
+    """Write `value` into the rows of `target` (N, ...) in which `mask` (N,) is True, without a list of indices.
 
-    Other rows keep their bits, NaN included; `value` is a number or a tensor shaped like `target`.
+    Other rows stay bit-identical, NaN included. `value` is a number or a tensor of the shape of `target`.
     """
     rows = mask.view(-1, *[1] * (target.dim() - 1))
     if isinstance(value, Tensor):
@@ -73,12 +73,14 @@ def masked_set_(target: Tensor, mask: Tensor, value: Tensor | float) -> None:
 
 
 def squared_difference(a: Tensor, b: Tensor) -> Tensor:
-    """(a - b)^2 of two tensors of one shape, in one launch."""
+    """Return (a - b)^2 of two tensors of the same shape, computed in one launch."""
     return mse_loss(a, b, reduction="none")
 
 
 def evenly_spaced(indices: Sequence[int]) -> slice | None:
-    """Return the slice that picks `indices`, if they rise in equal steps: a slice is a view and costs no launch."""
+    """Return the slice that selects `indices` if they rise in equal steps, else None. A slice is a view and costs no
+    launch.
+    """
     steps = {after - before for before, after in pairwise(indices)} or {1}
     step = min(steps)
     return slice(indices[0], indices[-1] + 1, step) if indices and len(steps) == 1 and step > 0 else None

@@ -1,4 +1,4 @@
-"""Task names -> task class and configuration. Every `cfg/*.yaml` is a task; outside code adds its own."""
+"""Registry of tasks: names, task classes and configurations. Every `cfg/*.yaml` is a task; users register their own."""
 
 import dataclasses
 import sys
@@ -12,10 +12,10 @@ from typing import Any
 import torch
 
 from legged.config import TaskConfig, load_config
-from legged.config.carry import carry
 from legged.config.checks import PLAIN, is_plain_name, shown
-from legged.config.loader import Carry, Registered, class_hints
+from legged.config.loader import Registered, Rescale, class_hints
 from legged.config.networks import groups_in
+from legged.config.rescale import rescale
 from legged.envs import BaseTask, LeggedRobot
 from legged.envs.marks import unit_of
 from legged.errors import ConfigError, suggest
@@ -44,27 +44,28 @@ CLASSES = {
     "HalfCheetah": "legged.envs.half_cheetah",
     "Humanoid": "legged.envs.humanoid",
 }
-"""Task classes of this package that `class:` in a task's YAML can name -> the module of each."""
+"""Task class of this package that `class:` in a task's YAML can name -> its module."""
 
 
 @dataclass(frozen=True)
 class _Entry(Registered):
     task_class: type[BaseTask] | None
-    """None takes that of the task it extends."""
+    """Task class; None takes the class of the configuration, or of the task that it extends."""
 
 
 _REGISTERED: dict[str, _Entry] = {}
 
 
 def register(name: str, config: Path | str | Mapping[str, Any], task_class: type[BaseTask] | None = None) -> None:
-    """Make `name` a task: a YAML file, or a mapping with the same keys, and a subclass of LeggedRobot or BaseTask; without
-    one, the class that the configuration names (`class:`), or what it extends has, else LeggedRobot.
+    """Register the task `name`. `config` is a YAML file, or a mapping with the same keys. `task_class` is a subclass of
+    LeggedRobot or BaseTask; by default it is the class that the configuration names (`class:`), or that of the task it
+    extends, else LeggedRobot.
 
-    `extends: anymal_c_flat` in it builds on a task of this package or on a registered one. The path of the file, and paths
-    in a mapping, are relative to the folder of the module that calls this, else to the working directory.
+    In a configuration, `extends: anymal_c_flat` builds on a task of this package or on a registered one. The path of the
+    file, and paths in a mapping, are relative to the folder of the calling module, else to the working directory.
 
     Raises:
-        ConfigError: the name is none, or the class or the configuration is of the wrong type.
+        ConfigError: the name is invalid, or the class or the configuration has a wrong type.
     """
     if not isinstance(name, str) or not is_plain_name(name):
         raise ConfigError(f"register: the name of a task must be {PLAIN}; got {shown(name)}")
@@ -82,11 +83,11 @@ def register(name: str, config: Path | str | Mapping[str, Any], task_class: type
 
 
 def import_tasks(name: str) -> None:
-    """Register user-defined tasks: run the module of that name or path, or make the YAML file at that path a task. `name` may
-    be several, separated by commas, such as the module of a class and a YAML file that uses it.
+    """Register user-defined tasks: run the module with that name or path, or register the YAML file at that path. `name` may
+    hold several, separated by commas, such as the module of a class and a YAML file that uses it.
 
     Raises:
-        ConfigError: one can't be found, or fails.
+        ConfigError: a module or a file can't be found, or fails.
     """
     for one in name.split(","):
         if one.endswith(YAML_ENDINGS):
@@ -96,11 +97,11 @@ def import_tasks(name: str) -> None:
 
 
 def register_file(path: str, flag: str = "TASK") -> str:
-    """Make the YAML file at `path` a task, which is called by the file's name without ending; returns that name. `flag` is
-    the option or argument that names the file.
+    """Register the YAML file at `path` as a task, and return its name: the file's name without ending. `flag` is the option
+    or argument that named the file, for errors.
 
     Raises:
-        ConfigError: there is no such file, or another task is called so.
+        ConfigError: there is no such file, its name is invalid, or another task has that name.
     """
     file = Path(path).absolute()
     if not exists(file) or file.is_dir():
@@ -121,7 +122,7 @@ def register_file(path: str, flag: str = "TASK") -> str:
 
 
 def task_names() -> list[str]:
-    """All tasks there are."""
+    """Return the names of all tasks, sorted."""
     return sorted({path.stem for path in data_folder("cfg").glob("*.yaml")} | set(_REGISTERED))
 
 
@@ -152,7 +153,7 @@ def task_class(name: str) -> type[BaseTask]:
 def _class_named(kind: Any, where: str) -> type[BaseTask]:
     """Return the task class of that name: one of ours, or one that a registered task has."""
     registered = {entry.task_class.__name__: entry.task_class for entry in _REGISTERED.values() if entry.task_class}
-    if isinstance(kind, str) and kind in registered and kind not in CLASSES:  # a name of ours means our class
+    if isinstance(kind, str) and kind in registered and kind not in CLASSES:  # the names of our classes cannot be redefined
         return registered[kind]
     if not isinstance(kind, str) or kind not in CLASSES:
         raise ConfigError(f"{where}: there is no task class {shown(kind)}{suggest(str(kind)[:100], {*CLASSES, *registered})}")
@@ -160,13 +161,13 @@ def _class_named(kind: Any, where: str) -> type[BaseTask]:
 
 
 def _schema_of(kind: type[BaseTask]) -> type[TaskConfig]:
-    """Return the schema that a task class has.
+    """Return the configuration schema of a task class.
 
     Raises:
-        ConfigError: it is none, or lacks what the class that is extended here reads.
+        ConfigError: `Config` is not a frozen dataclass that extends the schema of LeggedRobot or BaseTask.
     """
     base, schema = (LeggedRobot if issubclass(kind, LeggedRobot) else BaseTask).Config, kind.Config
-    # Fields of a class that is not decorated itself would be left out without a word.
+    # The fields of an undecorated class would be ignored silently.
     decorated = isinstance(schema, type) and "__dataclass_fields__" in vars(schema)
     if not decorated or not issubclass(schema, base):
         raise ConfigError(
@@ -177,7 +178,7 @@ def _schema_of(kind: type[BaseTask]) -> type[TaskConfig]:
 
 
 def task_schema(name: str) -> type[TaskConfig]:
-    """Return the schema of a task's configuration, or that of a legged robot for a task which is not there any more."""
+    """Return the schema of a task's configuration; that of a legged robot for a task that does not exist any more."""
     try:
         return _schema_of(task_class(name))
     except ConfigError:
@@ -185,24 +186,25 @@ def task_schema(name: str) -> type[TaskConfig]:
 
 
 def task_config(name: str, overrides: Iterable[tuple[str, Any]] = (), on_cpu: bool = False) -> TaskConfig:
-    """Return the configuration of a task, checked down to its reward names and gains, but with nothing built.
+    """Return the configuration of a task, checked completely, without building anything. `overrides` are pairs of a dotted
+    path and a value; `on_cpu` applies the section `cpu` of the configuration.
 
     Raises:
-        ConfigError: no such task, or a mistake in its configuration.
+        ConfigError: there is no such task, or its configuration is invalid.
     """
     kind = task_class(name)
     schema = _schema_of(kind)
-    cfg = load_config(_entry(name), name, overrides, on_cpu, _REGISTERED, schema, _carrier(kind, schema))
+    cfg = load_config(_entry(name), name, overrides, on_cpu, _REGISTERED, schema, _rescaler(kind, schema))
     kind.check(cfg)
     _check_units(kind, cfg)
     return cfg
 
 
 def _check_units(kind: type[BaseTask], cfg: TaskConfig) -> None:
-    """Look for terms whose numbers were carried from another robot, and which do not declare their unit.
+    """Check that every term whose number was rescaled from another robot declares its unit.
 
     Raises:
-        ConfigError: there is one that runs, and whose number is not 0.
+        ConfigError: a term that runs, with a number other than 0, has no unit.
     """
     running = {
         "_reward_": set(cfg.rewards.scales),
@@ -213,21 +215,21 @@ def _check_units(kind: type[BaseTask], cfg: TaskConfig) -> None:
             prefix, _ = field.metadata.get("unit_of", ("", 1))
             for name, number in getattr(getattr(cfg, section), field.name).items() if prefix in running else ():
                 path = f"{section}.{field.name}.{name}"
-                if not number or name not in running[prefix] or cfg.origins.of(path) not in cfg.origins.carried:
+                if not number or name not in running[prefix] or cfg.origins.of(path) not in cfg.origins.rescaled:
                     continue
                 if unit_of(getattr(kind, prefix + name)) is None:
                     parents = (unit_of(getattr(part, prefix + name, None)) for part in kind.__mro__)
                     example = next((unit for unit in parents if unit is not None), "m^2/s^2")
                     raise ConfigError(
-                        f"{cfg.origins.where(path)}: the number is carried from another robot, and"
+                        f"{cfg.origins.where(path)}: the number is rescaled from another robot, and"
                         f" {kind.__name__}.{prefix}{name}"
-                        f' declares no unit to carry it by: write @unit("{example}") above the method (from legged import'
+                        f' declares no unit for that: write @unit("{example}") above the method (from legged import'
                         ' unit), with the unit of what it returns; a plain number has @unit("1"). A docstring does not count'
                     )
 
 
-def _carrier(kind: type[BaseTask], schema: type[TaskConfig]) -> Carry:
-    """Return what carries the numbers of a configuration from the robot that they are written for to another one."""
+def _rescaler(kind: type[BaseTask], schema: type[TaskConfig]) -> Rescale:
+    """Return the function that rescales the numbers of a configuration from its reference robot to another one."""
 
     def unit_at(name: str) -> str:
         section, _, entry = name.rpartition(".")
@@ -235,27 +237,32 @@ def _carrier(kind: type[BaseTask], schema: type[TaskConfig]) -> Carry:
             return TERRAIN_TYPES[entry].unit if entry in TERRAIN_TYPES else "1"
         if section == "domain_rand.ranges":
             return FIELDS[entry].unit.partition(" or ")[0] if entry in FIELDS else "1"
-        return unit_of(getattr(kind, name, None)) or "1"  # `_check_units` refuses terms without
+        return unit_of(getattr(kind, name, None)) or "1"  # `_check_units` refuses terms without one
 
-    def carry_layer(data: Mapping[str, Any], written_for: str, robot: str, where: str) -> Mapping[str, Any]:
+    def rescale_layer(data: Mapping[str, Any], reference_robot: str, robot: str, where: str) -> Mapping[str, Any]:
         if not issubclass(kind, LeggedRobot):
-            raise ConfigError(f"{where}: a task of {kind.__name__} has no robot to which numbers could be carried")
-        reference = size_of(written_for, where)
-        if not robot or robot == written_for:
+            raise ConfigError(f"{where}: a task of {kind.__name__} has no robot to which numbers could be rescaled")
+        reference = size_of(reference_robot, where)
+        if not robot or robot == reference_robot:
             return data
         try:
             size = size_of(robot)
         except ConfigError:
-            return data  # `check` says what is wrong with it, and who named it
-        factor = partial(grown, written_for=reference, robot=size)
-        carried = carry({key: value for key, value in data.items() if key != "cpu"}, schema, factor, unit_at)
-        return carried | ({"cpu": carry(data["cpu"], schema, factor, unit_at)} if "cpu" in data else {})
+            return data  # `check` reports the error, with the place that names the robot
+        factor = partial(grown, reference=reference, robot=size)
+        rescaled = rescale({key: value for key, value in data.items() if key != "cpu"}, schema, factor, unit_at)
+        return rescaled | ({"cpu": rescale(data["cpu"], schema, factor, unit_at)} if "cpu" in data else {})
 
-    return carry_layer
+    return rescale_layer
 
 
 def make_task(cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None) -> Any:
-    """Build the task that a configuration describes, on its own terrain or on the one given: an instance of `task_class`."""
+    """Return the task of a configuration, an instance of `task_class`, built on its own terrain or on the given one.
+
+    Raises:
+        ConfigError: the configuration does not fit the engine, or the class does not call super().__init__.
+        TermError: a term fails or cannot be captured.
+    """
     other_ground = {} if terrain is None else {"terrain": terrain}  # a user's constructor may not know the argument
     kind: Any = task_class(cfg.task)
     with importing():

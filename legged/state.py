@@ -1,4 +1,4 @@
-"""What a resumed training needs of an object: the tensors that its class names in `STATE`, saved as copies."""
+"""Saving and loading of an object's state: the tensors that its class names in `STATE`."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 class StateError(ValueError):
-    """A saved state does not fit the object that is to take it."""
+    """A saved state does not fit the object that should load it."""
 
 
 def state_of(owner: Any) -> dict[str, Tensor]:
@@ -16,19 +16,19 @@ def state_of(owner: Any) -> dict[str, Tensor]:
 
 
 def load_state(owner: Any, state: Mapping[str, Any]) -> None:
-    """Give the tensors of `owner.STATE` the values saved by `state_of`, on whatever device.
+    """Copy the values saved by `state_of`, on any device, into the tensors of `owner.STATE`.
 
     Raises:
-        StateError: one is missing, or of another shape or type.
+        StateError: a tensor is missing, or has another shape or type.
     """
     take({name: getattr(owner, name) for name in owner.STATE}, state, type(owner).__name__)
 
 
 def take(tensors: Mapping[str, Tensor], saved: Mapping[str, Any], of: str) -> None:
-    """Copy `saved` values into `tensors` of the same names; `of` says whose they are.
+    """Copy `saved` values into `tensors` of the same names. `of` is the owner's name, for errors.
 
     Raises:
-        StateError: one is missing, or of another shape or type; nothing is copied then.
+        StateError: a tensor is missing, or has another shape or type; nothing is copied then.
     """
     for name, tensor in tensors.items():
         value = saved.get(name) if isinstance(saved, Mapping) else None

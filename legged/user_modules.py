@@ -1,4 +1,4 @@
-"""Modules of users, which register their tasks: how they are found and run, and how their mistakes are reported."""
+"""User-defined modules, which register tasks: import from a name or a file, and reports of their errors."""
 
 import importlib
 import importlib.util
@@ -13,15 +13,15 @@ from legged.process.paths import exists
 _IMPORTED: set[str] = set()
 """Names of the modules that were run from files."""
 _FOLDERS: set[str] = set()
-"""Folders that modules of users were found in."""
+"""Folders that such modules were found in."""
 
 
 def run_module(name: str) -> None:
-    """Run a user's module, 'my_tasks' or 'path/my_tasks.py', so that it registers its tasks. What lies beside it can be
-    imported from it.
+    """Import a user-defined module, 'my_tasks' or 'path/my_tasks.py', so that it registers its tasks. It can import other
+    modules of its folder.
 
     Raises:
-        ConfigError: it can't be found, or it fails.
+        ConfigError: the module can't be found, or fails.
     """
     path = Path(name)
     is_file = path.suffix == ".py"
@@ -34,7 +34,7 @@ def run_module(name: str) -> None:
     try:
         _run(path) if is_file else importlib.import_module(name)
     except (Exception, SystemExit) as error:
-        for module in set(sys.modules) - before:  # half of a module is none
+        for module in set(sys.modules) - before:  # remove modules whose import may be incomplete
             file = getattr(sys.modules[module], "__file__", None)
             if file and str(Path(file).parent) == folder:
                 del sys.modules[module]
@@ -42,21 +42,25 @@ def run_module(name: str) -> None:
 
 
 def find_modules_in(folder: str) -> None:
-    """Let modules of users be found in a folder. Python looks into the working directory by itself, but not for a program
-    that is called by its path.
+    """Add a folder to Python's search path, if it is missing. Python adds the working directory itself only if the program
+    was not called by its path.
     """
     if folder not in sys.path:
         sys.path.insert(0, folder)
 
 
 def is_of_a_module(file: str) -> bool:
-    """Whether a file of code lies beside a module that a user let run, or below."""
+    """Return whether a file of code lies in the folder of a module that was run, or below it."""
     path = Path(file)
     return any(path.is_relative_to(folder) for folder in _FOLDERS) and "site-packages" not in path.parts
 
 
 def _run(path: Path) -> None:
-    """Run a file as the module of its name."""
+    """Run a file as the module with its name.
+
+    Raises:
+        ConfigError: another module with that name is loaded.
+    """
     loaded = sys.modules.get(path.stem)
     if loaded is not None and path.stem not in _IMPORTED:
         file = getattr(loaded, "__file__", None) or "built in"
@@ -72,7 +76,7 @@ def _run(path: Path) -> None:
 
 
 def _described(name: str, is_file: bool, folder: str, error: BaseException) -> ConfigError:
-    """Return what went wrong in the module `name`, or that there is none."""
+    """Return the error of the module `name` as a ConfigError: the module does not exist, or it failed at a line."""
     if isinstance(error, ModuleNotFoundError) and not is_file and f"{name}.".startswith(f"{error.name}."):
         return ConfigError(f"--import: there is no module {shown(name)} (a module name, or a path that ends in .py)")
     text = " ".join(str(error.msg if isinstance(error, SyntaxError) else error).split())
@@ -81,7 +85,9 @@ def _described(name: str, is_file: bool, folder: str, error: BaseException) -> C
 
 
 def _line(error: BaseException, folder: str) -> str:
-    """' (file, line n)' of a mistake: where a file cannot be parsed, else the innermost line of a file in `folder`."""
+    """Return ' (file, line n)' of an error: the line that cannot be parsed, else the innermost line of a file in `folder`.
+    Return '' if there is no such line.
+    """
     if isinstance(error, SyntaxError) and error.filename:
         return f" ({error.filename}, line {error.lineno})"
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename != __file__]

@@ -211,8 +211,8 @@ class FusedWorlds:
             self.m.opt.disableflags |= absent_stages(model, drawn)
             own = not ContactStage.why_not(model, self.m, self.d, drawn)
             self._contacts = ContactStage(model, self.m, self.d, drawn) if own else None
-            self.sides = None if self._contacts is None or not known else self._contacts.sides
-            self._step = TorqueStep(model, self.m, self.d, drawn, self.sides)
+            self.active_set = None if self._contacts is None or not known else self._contacts.active_set
+            self._step = TorqueStep(model, self.m, self.d, drawn, self.active_set)
 
     def write(self, qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray) -> None:
         """Put the worlds into states, one row a world, with their controls."""

@@ -20,7 +20,7 @@ from legged.policies.restore import TrainedPolicy, policy_of
 from legged.process.command_parser import CommandParser, add_import_argument
 from legged.process.paths import ready_to_write_file
 from legged.registry import import_tasks
-from legged.rendering.text import INK
+from legged.rendering.camera import INK
 
 SIDE = 176
 """Width and height of a tile without --side [pixels]."""

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from evaluated_run import SEED_FOLDER, EvaluatedRun
 
 from legged.config.actuator import MOTORS
 from legged.errors import ConfigError, RunError
-from legged.evaluation.judged_run import SEED_FOLDER, JudgedRun
 from legged.evaluation.result_file import file_name, stress_name
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.run_folder import CONFIG_FILE, SHIPPED_MODEL, checkpoints, find_checkpoint, of_another_policy
@@ -26,7 +26,7 @@ MEASURED = (MOTORS, TIMING_FILE, "evaluation_*", "stress_*", "crossing.*", "time
 PICTURES = ("*.png", "*.gif", "*.mp4")
 
 
-def ship(runs: Sequence[JudgedRun], folder: Path) -> list[str]:
+def ship(runs: Sequence[EvaluatedRun], folder: Path) -> list[str]:
     """Write `folder`/<task>/ for each task, and return a line on each.
 
     The policy is that of the lowest seed that has finished; the last run of a seed counts. The times, evaluations and stress

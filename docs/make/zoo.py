@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from evaluated_run import EvaluatedRun, find_runs, results_in, why_unfinished
+from run_table import markdown, summary
 from shipping import ship
 
 from legged.cli.evaluate.common import ROBOTS, check_points
@@ -25,9 +27,7 @@ from legged.commandline.stopping import stopping_on_signals
 from legged.config import LeggedConfig, override, parse_override
 from legged.errors import ConfigError, suggest
 from legged.evaluation.engines import ENGINES
-from legged.evaluation.judged_run import JudgedRun, find_runs, results_in, why_unfinished
 from legged.evaluation.result_file import tracking_of
-from legged.evaluation.run_table import markdown, summary
 from legged.evaluation.success import TYPES_HELP, chosen_sizes
 from legged.evaluation.velocity_grid import AXES, axes_of
 from legged.learning.run_folder import CONFIG_FILE, checkpoints, experiment_folder, find_checkpoint, run_config
@@ -220,14 +220,14 @@ def _is_measured(result: dict[str, Any] | None, training: Training, args: argpar
     return there and success.get("robots_per_point") == args.robots_per_point
 
 
-def judged(training: Training, args: argparse.Namespace) -> JudgedRun:
+def judged(training: Training, args: argparse.Namespace) -> EvaluatedRun:
     """Return a training with its evaluations, as far as both have come."""
     notes = tuple(training.notes)
     if training.folder is None:
-        return JudgedRun(training.cfg, training.seed, failure=training.failure or "not trained yet", notes=notes)
+        return EvaluatedRun(training.cfg, training.seed, failure=training.failure or "not trained yet", notes=notes)
     known = {*args.engines} - {*missing_engines(training, args)}
     results = {name: result for name, result in results_in(training.run).items() if name in known}
-    return JudgedRun(training.cfg, training.seed, training.run, read_timing(training.run), results, notes=notes)
+    return EvaluatedRun(training.cfg, training.seed, training.run, read_timing(training.run), results, notes=notes)
 
 
 # ---- processes -------------------------------------------------------------------------------------------------------
@@ -350,7 +350,7 @@ class _Campaign:
 # ---- table -----------------------------------------------------------------------------------------------------------
 
 
-def _write_table(runs: Sequence[JudgedRun], out: Path) -> str:
+def _write_table(runs: Sequence[EvaluatedRun], out: Path) -> str:
     """Write table.md and table.json into a folder; return the Markdown."""
     tasks = summary(runs)
     text = markdown(tasks)
@@ -360,7 +360,7 @@ def _write_table(runs: Sequence[JudgedRun], out: Path) -> str:
     return text
 
 
-def _finish(runs: Sequence[JudgedRun], out: Path | None, shipped: Path | None) -> None:
+def _finish(runs: Sequence[EvaluatedRun], out: Path | None, shipped: Path | None) -> None:
     """Print the table, write it into `out`, and ship the policies to `shipped`, where these are given."""
     print(f"\n{markdown(summary(runs)) if out is None else _write_table(runs, out)}", end="", flush=True)
     if out is not None:

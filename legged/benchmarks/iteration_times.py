@@ -1,4 +1,4 @@
-"""How long an iteration of a training takes, in each training loop."""
+"""Duration of training iterations in each training loop."""
 
 import contextlib
 import io
@@ -18,12 +18,12 @@ from legged.learning.student_runner import StudentRunner
 from legged.learning.teacher import Teacher
 
 LOOPS: dict[str, Callable[..., Runner]] = {"stock": Runner, "captured": CapturedRunner}
-"""Training loops that are timed."""
+"""Training loops by name."""
 
 
 def loops_of(cfg: TaskConfig, teacher: Teacher | None, asked: str | None) -> dict[str, Callable[..., Runner]]:
-    """Return by name what trains a task in the loop that is `asked` for, else in each of them; a student of `teacher` and a
-    policy with an estimator in the configuration's own loop alone.
+    """Return the runners to time, by name of the loop: the loop `asked`, or else all. Students of a `teacher` and policies
+    with an estimator have only the loop of the configuration.
     """
     own = cfg.train.runner.loop
     if teacher is not None:
@@ -33,19 +33,19 @@ def loops_of(cfg: TaskConfig, teacher: Teacher | None, asked: str | None) -> dic
 
 
 class Recorder:
-    """A stand-in for the display of a training that keeps its times."""
+    """Replacement for the display of a training that keeps the times of iterations."""
 
     def __init__(self) -> None:
         self.progress: list[Progress] = []
 
     def show(self, progress: Progress) -> None:
-        """Keep an iteration."""
+        """Keep the progress of an iteration."""
         self.progress.append(progress)
 
 
 def time_iterations(kind: Callable[..., Runner], task: BaseTask, count: int) -> dict[str, Any]:
-    """Train for `count` iterations with a training loop, from new networks; return milliseconds of rollout, update and both
-    (medians, and the range of both), the first iteration left out.
+    """Return the medians of rollout, update and iteration times [ms] and the range of the latter, over `count` iterations of
+    a training with new networks, after a first iteration that is left out.
     """
     recorder = Recorder()
     with tempfile.TemporaryDirectory() as folder:

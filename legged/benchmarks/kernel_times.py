@@ -1,4 +1,4 @@
-"""Where the time of a control step goes on a GPU: its kernels, as the graph replays them."""
+"""GPU times of the kernels of a control step, as the graph replays them."""
 
 from dataclasses import dataclass
 
@@ -9,17 +9,17 @@ from legged.envs import BaseTask
 
 @dataclass(frozen=True)
 class KernelTime:
-    """A kernel in one control step."""
+    """Times of a kernel in one control step."""
 
     name: str
     launches: float
-    """Per control step; a solver's rounds differ from step to step."""
+    """Mean number of launches per control step; iterations of solvers vary."""
     total_us: float
-    """On the GPU, of all its launches in a control step [us]."""
+    """GPU time of all launches in a control step [us]."""
 
 
 def kernel_times(task: BaseTask, steps: int) -> list[KernelTime]:
-    """Return the kernels of a control step, longest first: means over `steps` steps under small random actions."""
+    """Return the kernels of a control step, slowest first; means over `steps` steps with small random actions."""
     actions = 0.3 * torch.randn(task.num_envs, task.num_actions, device=torch.device(task.device))
     task.step(actions)
     torch.cuda.synchronize()
@@ -33,7 +33,7 @@ def kernel_times(task: BaseTask, steps: int) -> list[KernelTime]:
 
 
 def table(times: list[KernelTime], longest: int) -> str:
-    """Return the `longest` kernels in lines, and the sum of all."""
+    """Return the `longest` slowest kernels and the sum of all as lines of text."""
     lines = [f"{'us':>9} {'launches':>9}  kernel"]
     lines += [f"{time.total_us:9.1f} {time.launches:9.1f}  {time.name[:90]}" for time in times[:longest]]
     launches, total = sum(time.launches for time in times), sum(time.total_us for time in times)

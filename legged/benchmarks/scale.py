@@ -1,4 +1,4 @@
-"""Speed and memory by number of robots: the benchmark once for each, in a process of its own, so that memory is its own."""
+"""Speed and memory by number of robots, each measured in a new process so that sizes do not share memory."""
 
 import argparse
 import json
@@ -17,9 +17,9 @@ from legged.config import TaskConfig
 from legged.errors import ConfigError
 
 KILLED = -9
-"""What a process ends with that Linux ends for want of memory."""
+"""Exit code of a process that Linux ended because memory ran out."""
 NO_ROOM = "out of memory"
-"""What is said of a size that does not fit."""
+"""Result of a size that does not fit into memory."""
 COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], str]], ...] = (
     ("robots", 12, lambda row: f"{row['num_envs']:,}"),
     ("control step", 14, lambda row: f"{row['control_step_ms']:.2f} ms"),
@@ -28,7 +28,7 @@ COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], str]], ...] = (
     ("training steps/s", 18, lambda row: f"{row['robot_steps_per_s']:,.0f}" if "robot_steps_per_s" in row else "-"),
     ("GPU memory", 12, lambda row: f"{row['gpu_memory_gib']:.1f} GiB" if "gpu_memory_gib" in row else "-"),
 )
-"""Of the table: heading, width, text."""
+"""Columns of the table: heading, width, text."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def scale(sizes: Sequence[int], loop: str, given: Sequence[str], cfg: TaskConfig
     print("".join(f"{name:>{width}}" for name, width, _ in COLUMNS), flush=True)
     rows = []
     for size in sizes:
-        rows.append(measure_apart(others(given), size, loop))
+        rows.append(measure_apart(without(given, "--robots", "--out", "--num-envs", "--runner"), size, loop))
         print(line(rows[-1]), flush=True)
     failed = any(row.get("failed", NO_ROOM) != NO_ROOM for row in rows)
     return Scale({"task": cfg.task, "device": where, "loop": loop, "sizes": rows}, int(failed))
@@ -71,10 +71,10 @@ def numbers(text: str) -> list[int]:
 
 
 def measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, Any]:
-    """Return the benchmark's numbers under these arguments with `size` robots, or why there are none as `failed`.
+    """Return the benchmark's results for `size` robots with these arguments; `failed` has the reason if there are none.
 
     Raises:
-        ConfigError: the configuration does not allow that many.
+        ConfigError: the configuration does not allow so many robots.
     """
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "legged", "benchmark", "step", *arguments]
@@ -94,16 +94,16 @@ def measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, A
     return {**result, **iterations}
 
 
-def others(given: Sequence[str]) -> list[str]:
-    """Return a command line without the options that differ from size to size."""
+def without(given: Sequence[str], *flags: str) -> list[str]:
+    """Return a command line without some options and their values."""
     own = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for flag in ("--robots", "--out", "--num-envs", "--runner"):
+    for flag in flags:
         own.add_argument(flag)
     return own.parse_known_args(list(given))[1]
 
 
 def line(row: dict[str, Any]) -> str:
-    """Return a row of the table."""
+    """Return a row of the table as text."""
     if "failed" in row:
         _, width, robots = COLUMNS[0]
         return f"{robots(row):>{width}}  {row['failed']}"

@@ -1,6 +1,5 @@
-"""How long a training takes to begin, beside what importing torch takes: both in fresh processes, one after the other."""
+"""Start-up time of a training, compared with the time to import torch; both are measured in new processes."""
 
-import argparse
 import os
 import statistics
 import subprocess
@@ -11,26 +10,27 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from legged.benchmarks.scale import without
 from legged.errors import RunError
 from legged.process.startup import STAGES_FILE
 
 ENDS = "first iteration"
 CAPTURES = ("step captured", "training captured")
-"""Stages that end with a CUDA graph captured; on the CPU with the step checked."""
+"""Stages that end when a CUDA graph is captured, or on the CPU when the step is checked."""
 
 
 def time_start(given: Sequence[str], repeats: int) -> dict[str, Any]:
-    """Return medians of `repeats` runs: `torch_s` of `import torch`; `stages` of a training under the arguments `given`, the
-    seconds since its process was started; `ratio` of the first iteration's end to `torch_s`, and `ratio_without_capture`. One
-    run of each before them fills caches.
+    """Return medians of `repeats` runs, after one run that fills caches: `torch_s`, the time of `import torch`; `stages`, the
+    end of each stage of a training with the arguments `given`, since the start of its process; `capture_s`; the `ratio` of
+    the end of the first iteration to `torch_s`; and `ratio_without_capture`. Times are in seconds.
 
     Raises:
-        RunError: a process fails, in its own words.
+        RunError: a process fails; the message is the last line of its error output.
     """
     torch_s, stages = [], []
     for _ in range(repeats + 1):
         torch_s.append(_run([sys.executable, "-c", "import torch"], {})["end"])
-        command = [sys.executable, "-m", "legged", "train", *without_own(given)]
+        command = [sys.executable, "-m", "legged", "train", *without(given, "--out", "--repeats")]
         command += ["--max-iterations", "1", "train.runner.film=false"]
         with tempfile.NamedTemporaryFile() as file:
             stages.append(_run(command, {STAGES_FILE: file.name}))
@@ -48,7 +48,7 @@ def time_start(given: Sequence[str], repeats: int) -> dict[str, Any]:
 
 
 def start_report(times: dict[str, Any]) -> str:
-    """Say them in lines."""
+    """Return the times as lines of text."""
     return "\n".join(
         [
             f"import torch: {times['torch_s']:.2f} s",
@@ -60,16 +60,8 @@ def start_report(times: dict[str, Any]) -> str:
     )
 
 
-def without_own(given: Sequence[str]) -> list[str]:
-    """Return a command line without the benchmark's own options."""
-    own = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for flag in ("--out", "--repeats"):
-        own.add_argument(flag)
-    return own.parse_known_args(list(given))[1]
-
-
 def _run(command: list[str], environment: dict[str, str]) -> dict[str, float]:
-    """Run a process in an empty folder; return when each stage ended, the process itself as `end` [s]."""
+    """Run a process in an empty folder; return the end of each stage, and of the process as `end` [s]."""
     # Where this package is not installed, the process finds it as this one did.
     path = os.pathsep.join(str(Path(entry or ".").resolve()) for entry in sys.path)
     with tempfile.TemporaryDirectory() as folder:

@@ -26,10 +26,8 @@ from legged.config import LeggedConfig, override
 from legged.envs import BaseTask, LeggedRobot
 from legged.errors import ConfigError, RunError
 from legged.learning.run_folder import find_run, run_config
-from legged.play.outing import EPISODE_S, walk_out
+from legged.play.demonstrations import EPISODE_S, follow_schedule, roll_out, schedule_s, walk_out
 from legged.play.playground import SETTING, Playground
-from legged.play.rollout import roll_out
-from legged.play.schedule import follow_schedule, schedule_s
 from legged.play.video import Video
 from legged.play.viewer import view, watch
 from legged.policies.actor import Actor

@@ -18,8 +18,7 @@ from legged.errors import ConfigError
 from legged.process.command_parser import CommandParser
 from legged.process.paths import make_folder, ready_to_write, relative, replacing
 from legged.registry import task_config
-from legged.rendering.terrain_map import draw_map
-from legged.rendering.terrain_picture import picture_of_types, tiles
+from legged.rendering.terrain_picture import draw_map, picture_of_types, tiles
 from legged.terrain import Terrain, check_terrain, terrain_types
 
 

@@ -36,7 +36,7 @@ from legged.learning.checkpoint import read_checkpoint
 from legged.learning.display import Display
 from legged.learning.distributed import RankLost, check_reachable
 from legged.learning.evaluations import Evaluations
-from legged.learning.given import Given, write_given
+from legged.learning.invocation import Invocation, write_invocation
 from legged.learning.resume import resumed
 from legged.learning.run_folder import NOTE_FILE, create_run, discard_run, experiment_folder, find_run
 from legged.learning.runner import Runner
@@ -260,8 +260,8 @@ def _learn(
     folder = create_run(cfg) if display else None
     if folder is None or display is None:
         return None, runner.train(cfg.train.runner.max_iterations)
-    given = Given(args.task_file or args.task, args.module, dict(overrides(args)))
-    write_given(folder, given, goes_on_from.parent if goes_on_from is not None else None)
+    given = Invocation(args.task_file or args.task, args.module, dict(overrides(args)))
+    write_invocation(folder, given, goes_on_from.parent if goes_on_from is not None else None)
     if args.note is not None:
         write_text(folder / NOTE_FILE, f"{args.note}\n")
     print(f"run folder {relative(folder)}\nwatch it: {watch_command(args, folder)}", flush=True)
@@ -297,7 +297,7 @@ def _report(folder: Path, cfg: TaskConfig, args: argparse.Namespace | None) -> N
     """Write the report on a training that has ended, unless it asks for none; with a film, if that can be told its task."""
     if not cfg.train.runner.report:
         return
-    from legged.evaluation.reports.at_end import report_at_end  # a start does without what it imports
+    from legged.evaluation.reports.run_report import report_at_end  # a start does without what it imports
 
     film_with = None
     if args is not None and cfg.train.runner.film:

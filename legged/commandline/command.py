@@ -12,7 +12,7 @@ import legged.errors
 from legged.commandline.output import forgiving_output
 from legged.errors import ConfigError, RunError, TermError
 from legged.graph.step_graph import HostReadError
-from legged.physics.engine_warnings import told_once
+from legged.physics.engine_warnings import each_warning_once
 from legged.process.paths import full_disk_in, reason
 from legged.process.ranks import Ranks
 from legged.process.startup import INTERRUPTED, is_a_command, leave_at_interrupts, raise_at_interrupts
@@ -34,7 +34,7 @@ def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = N
     if argv is None:
         is_a_command()
         raise_at_interrupts()
-    with forgiving_output() as output, told_once():
+    with forgiving_output() as output, each_warning_once():
         leaves = None
         try:
             code = _guarded(main, argv)

@@ -12,7 +12,7 @@ from legged.config.networks import groups_in
 from legged.config.schema import DrawConfig, LeggedDomainRandConfig
 from legged.envs import BaseTask, LeggedRobot
 from legged.mdp.control import action_scales
-from legged.mdp.draws import standard_deviation
+from legged.mdp.distributions import standard_deviation
 from legged.physics import FIELDS
 from legged.registry import make_task
 from legged.robots.similarity import Size, growth, size_of
@@ -56,18 +56,18 @@ def _number(value: float) -> str:
 
 
 def _robot(task: BaseTask) -> Iterator[str]:
-    """Yield how large a legged robot is, and by what numbers have been carried to it from those they were written for."""
+    """Yield the size of a legged robot, and the factors by which numbers were rescaled from their reference robot."""
     if not isinstance(task, LeggedRobot):
         return
     size = Size(task.robot.mass, task.robot.height)
     line = f"robot: {task.robot.name}, {size.mass:.4g} kg, {size.height:.3g} m high"
-    for name in task.cfg.origins.written_for:
+    for name in task.cfg.origins.reference_robots:
         by = growth(size_of(name), size)
         if set(by.values()) == {1.0}:
             line += "; numbers are written for it"
             continue
         factors = f"masses x {by['kg']:.3g}, lengths x {by['m']:.3g}, times x {by['s']:.3g}"
-        line += f"; numbers written for {Path(name).name} are carried: {factors}"
+        line += f"; numbers written for {Path(name).name} are rescaled: {factors}"
     yield ""
     yield line
 
@@ -80,7 +80,7 @@ def _observations(task: BaseTask) -> Iterator[str]:
             scales = term.scale.tolist()
             scales = scales[:1] if len(set(scales)) == 1 else scales
             noise = f"+-{_number(term.noise)}" if term.noise else "-"
-            sensors = task.observation_terms.sensors if groups_in(task.cfg)[name].noise else None
+            sensors = task.observation_terms.errors if groups_in(task.cfg)[name].noise else None
             if sensors is not None and term.name in sensors.names:
                 noise = sensors.describe(term.name)
             columns = f"{term.columns.start}:{term.columns.stop}"

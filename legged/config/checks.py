@@ -1,4 +1,6 @@
-"""Plain values -> an instance of a schema, field by field; every mistake is an error that names who set it and its path."""
+"""Conversion of plain values to an instance of a schema, field by field. Every error names the source of the value and its
+path.
+"""
 
 import dataclasses
 import functools
@@ -15,45 +17,45 @@ from legged.errors import ConfigError, suggest
 T = TypeVar("T")
 
 LONGEST_NAME = 100
-"""Letters of a name that becomes a folder."""
+"""Longest name of a folder, in characters."""
 DEEPEST = 30
-"""Sections and lists inside each other, in the free space of a configuration."""
+"""Deepest nesting of sections and lists in the free part of a configuration."""
 SHOWN = 80
-"""Letters of a value that an error shows."""
+"""Longest text of a value in an error, in characters."""
 PLAIN = "a plain name: no path separators, not '..', no leading '.', no control characters, at most 100 letters"
 
 
 @functools.cache
 def hints_of(schema: type) -> dict[str, Any]:
-    """Field -> type of a dataclass."""
+    """Return field -> type of a dataclass."""
     return typing.get_type_hints(schema)
 
 
 def shown(value: Any) -> str:
-    """Return a value as an error shows it: on one line, and not endless."""
+    """Return a value as text for an error, on one line and cut if it is long."""
     try:
         text = repr(value)
-    except ValueError:  # Python writes no integer of more than 4300 digits
+    except ValueError:  # Python refuses to write integers of more than 4300 digits
         return f"a whole number of {value.bit_length()} bits" if isinstance(value, int) else type(value).__name__
     text = " ".join(text.split())
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}... ({len(text)} letters)"
 
 
 def plain_path(key: Any) -> str:
-    """Return a key as part of a dotted path in an error: on one line, and not endless."""
+    """Return a key as part of a dotted path in an error, on one line and cut if it is long."""
     return key if isinstance(key, str) and key and key.isprintable() and len(key) <= SHOWN else shown(key)
 
 
 def is_plain_name(name: str) -> bool:
-    """Return whether `name` can be that of a folder inside another one, on every system."""
+    """Return True if `name` is a valid folder name on every system."""
     if not name or not name.isprintable() or name.startswith(".") or name != name.strip():
         return False
     return not any(mark in name for mark in "/\\") and len(name) <= LONGEST_NAME and len(name.encode()) <= 2 * LONGEST_NAME
 
 
 def build(schema: type[T], data: Any, path: str, origins: Origins, source: str, base: T | None = None) -> T:
-    """Make an instance of the dataclass `schema` from a mapping, checked field by field; what the mapping leaves out is that
-    of `base`, or else the schema's default.
+    """Build an instance of the dataclass `schema` from a mapping, with every field checked. Missing fields come from `base`,
+    or else from the schema's defaults.
 
     Raises:
         ConfigError: an unknown key, a wrong type, or a value beyond its bounds.
@@ -82,22 +84,22 @@ def build(schema: type[T], data: Any, path: str, origins: Origins, source: str, 
             checked = _check(hints[key], value, dotted, origins, source)
         if fields[key].metadata:
             _check_bounds(checked, fields[key].metadata, dotted, f"{_origin(dotted, origins, source)}: ")
-        values[key] = {**entries, **checked} if is_map else checked  # maps merge with the schema's default entries
+        values[key] = {**entries, **checked} if is_map else checked  # maps are merged with the schema's default entries
     return schema(**values) if base is None else dataclasses.replace(base, **values)  # type: ignore[type-var]
 
 
 def _build_entries(
     schema: Any, data: Any, path: str, origins: Origins, source: str, entries: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Build the instances of `schema` in a map of them; one that is there by default keeps what is left out."""
-    names = _check(dict[str, object], data, path, origins, source)  # of any values: they are looked at next
+    """Build the sections in a map. Fields that a section lacks come from the default entry of its name, if there is one."""
+    names = _check(dict[str, object], data, path, origins, source)  # `build` checks the values
     return {
         name: build(schema, data[name], f"{path}.{plain_path(name)}", origins, source, entries.get(name)) for name in names
     }
 
 
 def _origin(path: str, origins: Origins, source: str) -> str:
-    """Return who gave the value at `path`; `source` where nobody in particular did."""
+    """Return the source of the value at `path`, or `source` if it is not recorded."""
     return origins.of(path) if path and origins else source
 
 
@@ -105,25 +107,27 @@ WORDS = {
     float: "a number",
     tuple: "[low, high]",
     dict: "a mapping from names to numbers",
-    Mapping: "a mapping that has it as range",
+    Mapping: "a mapping with the key range",
 }
-"""What an alternative of a field takes, by its shape."""
+"""Kind of value -> its description in an error."""
 
 
 def _shape(kind: Any) -> Any:
-    """Return of which shape values of a type are, a key of WORDS: one number, a list, a map, or a section."""
+    """Return the kind of value that a type accepts, a key of WORDS: a number, a list, a map, or a section."""
     origin = typing.get_origin(kind)
     return Mapping if dataclasses.is_dataclass(kind) else origin if origin in (tuple, dict) else float
 
 
 def _has_shape(kind: Any, value: Any) -> bool:
-    """Return whether a value looks like one of a type."""
+    """Return True if a value is of the kind that a type accepts."""
     looks_like: dict[Any, Any] = {float: (int, float), tuple: (list, tuple), dict: Mapping, Mapping: Mapping}
     return isinstance(value, looks_like[_shape(kind)])
 
 
 def _check(kind: Any, value: Any, path: str, origins: Origins, source: str) -> Any:
-    """Return `value` as `kind`, or raise ConfigError. Integers count as floats, lists as tuples; nothing else changes."""
+    """Return `value` as `kind`, or raise ConfigError. Integers become floats and lists become tuples; nothing else is
+    converted.
+    """
     origin, args = typing.get_origin(kind), typing.get_args(kind)
 
     def fail(expected: str) -> ConfigError:
@@ -182,7 +186,7 @@ def _check(kind: Any, value: Any, path: str, origins: Origins, source: str) -> A
 
 
 def _number(value: float, fail: Any) -> float:
-    """Return a number that float32 holds."""
+    """Return a number that fits float32."""
     if value != value:
         raise fail("a number")
     try:
@@ -191,13 +195,13 @@ def _number(value: float, fail: Any) -> float:
         number = math.inf
     if math.isinf(number):
         raise fail(f"a finite number, at most {FLOAT32_MAX:g} in size")
-    return number  # the bounds of the field, which lie within float32, come next
+    return number  # the field's bounds are checked next
 
 
 def _check_free(value: Any, fail: Any, depth: int = 0) -> Any:
-    """Return a value of the free space: whatever YAML can write and read, but no infinite number."""
+    """Check a value in the free part of a configuration: anything that YAML can write and read, but finite numbers only."""
     if depth > DEEPEST:
-        raise fail(f"at most {DEEPEST} maps and lists inside each other")
+        raise fail(f"at most {DEEPEST} nested maps and lists")
     if isinstance(value, Mapping):
         for key in value:
             if not isinstance(key, str | int):
@@ -208,16 +212,16 @@ def _check_free(value: Any, fail: Any, depth: int = 0) -> Any:
     if isinstance(value, int | float) and not isinstance(value, bool):
         if value != value or not abs(value) <= FLOAT32_MAX:
             raise fail(f"finite numbers, at most {FLOAT32_MAX:g} in size")
-        return int(value) if isinstance(value, int) else float(value)  # NumPy's are not written as YAML
+        return int(value) if isinstance(value, int) else float(value)  # a NumPy number would not be written as YAML
     elif value is not None and not isinstance(value, bool | str):
         raise fail("numbers, texts, true, false, null, lists and maps of them")
     return value
 
 
 def _check_bounds(value: Any, bounds: Mapping[str, Any], path: str, origin: str) -> None:
-    """Hold a checked value, and all items in it, against the bounds of its field."""
+    """Check a value, and all items in it, against the bounds of its field."""
     if dataclasses.is_dataclass(value):
-        return  # its own fields have theirs
+        return  # a section's fields have their own bounds
     if isinstance(value, tuple):
         _check_length(value, bounds, f"{origin}{path}")
         for i, item in enumerate(value):
@@ -248,4 +252,4 @@ def _check_length(value: Sequence[Any], bounds: Mapping[str, Any], where: str) -
     if bounds.get("unique"):
         twice = next((item for i, item in enumerate(value) if item in value[:i]), None)
         if twice is not None:
-            raise ConfigError(f"{where}: {shown(twice)} is named twice; each may come once")
+            raise ConfigError(f"{where}: {shown(twice)} is named twice")

@@ -1,4 +1,4 @@
-"""Settings by their dotted paths, in nested mappings as YAML files have them: one of them, all, and those that differ."""
+"""Access to settings in nested mappings by dotted path: one setting, all settings, and differences."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,18 +10,18 @@ class _Missing:
 
 
 MISSING = _Missing()
-"""Stands where a configuration lacks a setting."""
+"""Value of a setting that a configuration lacks."""
 
 
 def value_at(values: Any, path: str) -> Any:
-    """Return what nested mappings have at a dotted path; None where there is nothing."""
+    """Return the value at a dotted path of nested mappings, or None without one."""
     for key in path.split("."):
         values = values.get(key) if isinstance(values, dict) else None
     return values
 
 
 def flat(config: Any, prefix: str = "") -> dict[str, Any]:
-    """Return dotted path -> value of all settings; a list is one value, and so is an empty mapping."""
+    """Return dotted path -> value for all settings. A list is one value, and so is an empty mapping."""
     if not isinstance(config, Mapping) or (not config and prefix):
         return {prefix: config}
     return {
@@ -30,8 +30,8 @@ def flat(config: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def differences(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Return dotted path -> its value in each configuration, of settings that are not the same in all; MISSING stands where
-    one lacks it. An empty mapping is told only where no configuration has anything in it.
+    """Return dotted path -> its value in each configuration, for all settings that differ. The value is MISSING where a
+    configuration lacks the setting. An empty mapping counts only if it is empty or missing in every configuration.
     """
     all_flat = [flat(config) for config in configs]
     paths = dict.fromkeys(path for one in all_flat for path in one)

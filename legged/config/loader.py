@@ -1,4 +1,4 @@
-"""YAML files and `key=value` overrides -> TaskConfig; every mistake is an error that names file and dotted path."""
+"""Loading of a TaskConfig from YAML files and `key=value` overrides. Every error names the file and the dotted path."""
 
 import copy
 import dataclasses
@@ -17,33 +17,33 @@ from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, exists
 
 LONGEST_CHAIN = 20
-"""Files that extend each other."""
+"""Largest number of files in a chain of `extends`."""
 OF_FILES = ("extends", "class", "written_for", "cpu")
-"""Keys of a file that are no fields of the schema."""
+"""Keys of a file that are not fields of the schema."""
 
 
 @dataclass(frozen=True)
 class Registered:
-    """A configuration that outside code gave to the registry: a file, or a mapping with the same keys."""
+    """Configuration that outside code registered: a file, or a mapping with the same keys."""
 
     config: Path | Mapping[str, Any]
     folder: Path
-    """What the paths in a mapping are relative to: the folder of the code."""
+    """Folder of that code, to which the paths in a mapping are relative."""
 
 
 Source = Path | Mapping[str, Any] | Registered
-Carry = Callable[[Mapping[str, Any], str, str, str], Mapping[str, Any]]
-"""Data of a layer, the robot it is written for, the robot of the task, and how errors begin -> data for the task's robot."""
+Rescale = Callable[[Mapping[str, Any], str, str, str], Mapping[str, Any]]
+"""Function: (data of a layer, its reference robot, the task's robot, beginning of errors) -> data for the task's robot."""
 
 
 def merge(base: dict[str, Any], top: Mapping[str, Any], source: str, origins: Origins, prefix: str = "") -> None:
-    """Lay `top` over `base` in place: maps merge, lists and scalars replace. Note in `origins` who set each path.
+    """Merge `top` into `base` in place: maps merge, lists and scalars replace. Record the source of each path in `origins`.
 
     Raises:
-        ConfigError: maps inside each other without end.
+        ConfigError: the maps are nested too deeply.
     """
     if prefix.count(".") > DEEPEST:
-        raise ConfigError(f"{source}: {shown(prefix)}: more than {DEEPEST} sections inside each other")
+        raise ConfigError(f"{source}: {shown(prefix)}: more than {DEEPEST} nested sections")
     for key, value in top.items():
         path = f"{prefix}{plain_path(key)}"
         if isinstance(value, Mapping):
@@ -58,27 +58,27 @@ def merge(base: dict[str, Any], top: Mapping[str, Any], source: str, origins: Or
 
 @dataclass(frozen=True)
 class _Layer:
-    """One of the configurations that are laid over each other."""
+    """One configuration in a chain of `extends`."""
 
     data: Mapping[str, Any]
-    """What it sets, without `extends`, `class` and `written_for`."""
+    """Settings, without `extends`, `class` and `written_for`."""
     name: str
-    """What errors call it."""
+    """Name in errors."""
     folder: Path
-    """What its paths are relative to."""
+    """Folder to which its paths are relative."""
     task: str | None
-    """The name of the registered task that it is; None for a file."""
+    """Name of the registered task; None for a file."""
     kind: Any
-    """What it names as the class of the task; None if it names none."""
-    written_for: Any
-    """The robot for which its numbers are meant; None if they are meant for any."""
+    """Class of the task that it names, or None."""
+    reference_robot: Any
+    """Robot for which its numbers are written, or None for any robot."""
 
 
 def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> list[_Layer]:
-    """Return the configuration of `task`, what it extends, what that extends, and so on.
+    """Return the configuration of `task` and the chain of configurations that it extends.
 
     Raises:
-        ConfigError: one of them cannot be read, is not there, or extends itself.
+        ConfigError: one of them is missing, can't be read, or extends itself.
     """
     layers: list[_Layer] = []
     seen: list[Any] = []
@@ -94,10 +94,10 @@ def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> 
         data = renamed(read_yaml(given) if isinstance(given, Path) else given, name)
         if isinstance(data.get("cpu"), Mapping):
             data["cpu"] = renamed(data["cpu"], f"{name}: cpu")
-        parent, kind, written_for = (data.pop(key, None) for key in ("extends", "class", "written_for"))
+        parent, kind, reference_robot = (data.pop(key, None) for key in ("extends", "class", "written_for"))
         beside = given.parent if isinstance(given, Path) else None
         folder = beside or (found.folder if isinstance(found, Registered) else Path.cwd())
-        layers.append(_Layer(data, name, folder, task if isinstance(found, Registered) else None, kind, written_for))
+        layers.append(_Layer(data, name, folder, task if isinstance(found, Registered) else None, kind, reference_robot))
         if parent is None:
             return layers
         others = {key: entry for key, entry in registered.items() if _mark(entry) not in seen}
@@ -106,7 +106,7 @@ def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> 
 
 
 def _mark(source: Source) -> Any:
-    """Return what tells configurations apart."""
+    """Return an identifier of a configuration."""
     given = source.config if isinstance(source, Registered) else source
     return given.resolve() if isinstance(given, Path) else id(given)
 
@@ -114,9 +114,11 @@ def _mark(source: Source) -> Any:
 def _parent(
     parent: Any, name: str, beside: Path | None, registered: Mapping[str, Registered]
 ) -> tuple[Path | Registered, str]:
-    """Return what `extends: parent` means: a file in the folder `beside`, a registered task, or one of ours; and its name."""
+    """Return the configuration that `extends: parent` means, and its name: a file in the folder `beside`, a registered task,
+    or a task of this package.
+    """
     if not isinstance(parent, str) or not parent:
-        raise ConfigError(f"{name}: extends: expected the name of a task or of a file beside this one, got {shown(parent)}")
+        raise ConfigError(f"{name}: extends: expected the name of a task or of a file next to this one, got {shown(parent)}")
     file = parent if parent.endswith((".yaml", ".yml")) else f"{parent}.yaml"
     if beside is not None and exists(beside / file):
         return beside / file, parent
@@ -131,27 +133,29 @@ def _parent(
 
 @dataclass(frozen=True)
 class ClassHint:
-    """What one configuration of a chain says about the class of the task."""
+    """Class of the task according to one configuration of a chain."""
 
     where: str
-    """How an error about it begins."""
+    """Beginning of errors about it."""
     task: str | None
-    """The registered task that the configuration is of, which may have a class; None for a file."""
+    """Name of the registered task, which may have a class; None for a file."""
     kind: Any
-    """What it has as `class:`, or None."""
+    """Value of `class:`, or None."""
 
 
 def class_hints(source: Source, task: str, registered: Mapping[str, Registered]) -> list[ClassHint]:
-    """Return what the configuration of `task` and those that it extends say about its class, the nearest first."""
+    """Return the class hints of the configuration of `task` and of those that it extends, the nearest first."""
     return [ClassHint(f"{layer.name}: class", layer.task, layer.kind) for layer in _layers(source, task, registered)]
 
 
 def _merged(
-    layers: Iterable[_Layer], schema: type[TaskConfig], carry: Carry | None, robot: str | None, on_cpu: bool
+    layers: Iterable[_Layer], schema: type[TaskConfig], rescale: Rescale | None, robot: str | None, on_cpu: bool
 ) -> tuple[dict[str, Any], Origins]:
-    """Return layers laid over those after them, each under its own `cpu:` section (if asked), so that the nearest file has
-    the last word. Each is checked by itself: what another one sets over it must not hide a mistake. Numbers that a layer
-    means for some robot are carried to `robot`, or if None, to that of the layers.
+    """Merge layers, so that the nearest file has the last word. On a CPU, the `cpu:` section of each layer is merged on top
+    of it.
+
+    Each layer is checked separately, so that a later one can't hide a mistake. Numbers of a layer with a reference robot are
+    rescaled for `robot`, or if None, for the robot that the layers name.
 
     Raises:
         ConfigError: a layer does not fit the schema.
@@ -172,18 +176,18 @@ def _merged(
     origins = Origins()
     for layer, data in parts:
         name = layer.name
-        if layer.written_for is not None:
+        if layer.reference_robot is not None:
             where = f"{name}: written_for"
-            if not isinstance(layer.written_for, str):
-                raise ConfigError(f"{where}: expected the name of a robot, got {shown(layer.written_for)}")
-            carried: Mapping[str, Any] = data
-            if carry is not None and isinstance(robot, str):  # what is no name is found where the command line is checked
-                reference = robot_path(layer.written_for, layer.folder)
-                carried = carry(data, reference, robot, where)
-                origins.written_for = tuple(dict.fromkeys([*origins.written_for, reference]))
-            if carried is not data:
-                data, name = dict(carried), f"{name} (written for {Path(layer.written_for).name})"
-                origins.carried |= {name, f"{name}: cpu"}
+            if not isinstance(layer.reference_robot, str):
+                raise ConfigError(f"{where}: expected the name of a robot, got {shown(layer.reference_robot)}")
+            rescaled: Mapping[str, Any] = data
+            if rescale is not None and isinstance(robot, str):  # other values are refused with the command line
+                reference = robot_path(layer.reference_robot, layer.folder)
+                rescaled = rescale(data, reference, robot, where)
+                origins.reference_robots = tuple(dict.fromkeys([*origins.reference_robots, reference]))
+            if rescaled is not data:
+                data, name = dict(rescaled), f"{name} (written for {Path(layer.reference_robot).name})"
+                origins.rescaled |= {name, f"{name}: cpu"}
         cpu = data.pop("cpu", {})
         merge(merged, data, name, origins)
         if on_cpu:
@@ -192,16 +196,16 @@ def _merged(
 
 
 def name_of(source: Source, task: str) -> str:
-    """Return what errors call the configuration of a task."""
+    """Return the name of a task's configuration in errors."""
     given = source.config if isinstance(source, Registered) else source
     return str(given) if isinstance(given, Path) else f"registered config of '{task}'"
 
 
 def _check_layer(data: Mapping[str, Any], name: str, schema: type[TaskConfig]) -> None:
-    """Check that what is set here, and in the `cpu:` section (found on a GPU machine too), fits the schema.
+    """Check that a layer and its `cpu:` section fit the schema. The section is checked on a GPU machine too.
 
     Raises:
-        ConfigError: it does not.
+        ConfigError: it does not fit.
     """
     known = {*OF_FILES, *(field.name for field in dataclasses.fields(schema) if field.compare)}
     for key in data:
@@ -219,9 +223,9 @@ def _check_layer(data: Mapping[str, Any], name: str, schema: type[TaskConfig]) -
 
 
 def robot_path(robot: Any, folder: Path) -> Any:
-    """Return a `robot` that was named by a file in `folder`, as an absolute path if it is one: a folder beside the file or in
-    the working directory, or what holds a slash or begins with a dot. Names of robots under resources/robots/ stay as they
-    are.
+    """Return the setting `robot` of a file in `folder`, as an absolute path if it is a path: a folder next to the file or in
+    the working directory, or a text with a slash or a leading dot. Names of robots under resources/robots/ are returned
+    unchanged.
     """
     if not isinstance(robot, str) or not robot or exists(data_folder("resources") / "robots" / robot / "robot.yaml"):
         return robot
@@ -232,8 +236,8 @@ def robot_path(robot: Any, folder: Path) -> Any:
 
 
 def actuator_path(section: Any, folder: Path) -> None:
-    """Make the file of a learned actuator, which a file in `folder` names in a section, an absolute path: it lies beside that
-    file, or else in the working directory.
+    """Make the path of a learned actuator absolute, in a section of a file in `folder`. The path is relative to that folder,
+    or else to the working directory.
     """
     for key in ("control", "actuator"):
         section = section.get(key) if isinstance(section, Mapping) else None
@@ -243,10 +247,10 @@ def actuator_path(section: Any, folder: Path) -> None:
 
 
 def parse_override(text: str) -> tuple[str, Any]:
-    """Turn `a.b=1e-3` into ("a.b", 0.001); the value is read as YAML.
+    """Return `a.b=1e-3` as ("a.b", 0.001). The value is read as YAML.
 
     Raises:
-        ConfigError: it is not of that form.
+        ConfigError: the text has another form.
     """
     key, equals, value = text.partition("=")
     if not equals or not key:
@@ -255,7 +259,7 @@ def parse_override(text: str) -> tuple[str, Any]:
 
 
 def nest(path: str, value: Any) -> dict[str, Any]:
-    """Turn ("a.b", 1) into {"a": {"b": 1}}."""
+    """Return ("a.b", 1) as {"a": {"b": 1}}."""
     for key in reversed(path.split(".")):
         value = {key: value}
     return value
@@ -268,20 +272,22 @@ def load_config(
     on_cpu: bool = False,
     registered: Mapping[str, Registered] | None = None,
     schema: type[TaskConfig] = LeggedConfig,
-    carry: Carry | None = None,
+    rescale: Rescale | None = None,
 ) -> TaskConfig:
-    """Load the task file or mapping `source`, over what it extends (a file, or one of the tasks in `registered`), each
-    under its `cpu:` section (if asked), and under overrides, as an instance of `schema`. What of it is written for another
-    robot is carried to that of the task by `carry`, if there is one; overrides never are.
+    """Load the configuration of a task as an instance of `schema`.
+
+    The file or mapping `source` is merged onto the configurations that it extends, which are files or tasks in `registered`.
+    On a CPU their `cpu:` sections count. Overrides come last. `rescale` rescales the numbers that are written for another
+    robot, except overrides.
 
     Raises:
-        ConfigError: unknown key, wrong type or value, with file and dotted path.
+        ConfigError: an unknown key, a wrong type or a wrong value; the text names file and dotted path.
     """
     name = name_of(source, task)
     overrides = list(overrides)
     named = [robot_path(value, Path.cwd()) for key, value in overrides if key == "robot"]
     robot = named[-1] if named else None
-    data, origins = _merged(_layers(source, task, registered or {}), schema, carry, robot, on_cpu)
+    data, origins = _merged(_layers(source, task, registered or {}), schema, rescale, robot, on_cpu)
     data["task"] = task
     where = Origins(origins)
     _merge_overrides(data, overrides, where, schema)
@@ -291,12 +297,14 @@ def load_config(
 def _merge_overrides(
     data: dict[str, Any], overrides: Iterable[tuple[str, Any]], origins: Origins, schema: type[TaskConfig]
 ) -> None:
-    """Lay overrides of the command line over `data`, each of them checked by itself: a later one must not hide it."""
+    """Merge overrides of the command line into `data`. Each is checked separately, so that a later one can't hide a
+    mistake.
+    """
     for key, value in overrides:
         if key == "task":
             raise ConfigError("command line: task: can't be overridden; name the task first")
         if key.count(".") > DEEPEST:
-            raise ConfigError(f"command line: {shown(key)}: more than {DEEPEST} sections inside each other")
+            raise ConfigError(f"command line: {shown(key)}: more than {DEEPEST} nested sections")
         layer = nest(key, robot_path(value, Path.cwd()) if key == "robot" else copy.deepcopy(value))
         layer = renamed(layer, "command line")
         build(schema, layer, "", Origins(), "command line")
@@ -310,19 +318,21 @@ def from_dict(
     source: str = "config",
     schema: type[TaskConfig] = LeggedConfig,
 ) -> TaskConfig:
-    """Make an instance of `schema` from nested plain values; `origins` says who set them, if not all are from `source`."""
+    """Build an instance of `schema` from nested plain values. `origins` has the sources of the values, if they are not all
+    from `source`.
+    """
     if origins is None:
         data = renamed(data, source)
         origins = Origins()
         merge({}, data, source, origins)
     cfg = build(schema, data, "", origins, source)
     cfg.origins.update(origins)
-    cfg.origins.written_for, cfg.origins.carried = origins.written_for, origins.carried
+    cfg.origins.reference_robots, cfg.origins.rescaled = origins.reference_robots, origins.rescaled
     return cfg
 
 
 def override(cfg: TaskConfig, overrides: Iterable[tuple[str, Any]]) -> TaskConfig:
-    """Return `cfg` with some dotted paths replaced, by the command line or by what it asks for, checked again."""
+    """Return a copy of `cfg` with the settings of some dotted paths replaced and checked."""
     data = to_dict(cfg)
     origins = Origins(cfg.origins)
     _merge_overrides(data, overrides, origins, type(cfg))
@@ -330,7 +340,7 @@ def override(cfg: TaskConfig, overrides: Iterable[tuple[str, Any]]) -> TaskConfi
 
 
 def to_dict(config: Any) -> Any:
-    """Return nested plain values of a configuration, as YAML can write them."""
+    """Return a configuration as nested plain values, which YAML can write."""
     if dataclasses.is_dataclass(config):
         return {f.name: to_dict(getattr(config, f.name)) for f in dataclasses.fields(config) if f.compare}
     if isinstance(config, Mapping):
@@ -341,5 +351,5 @@ def to_dict(config: Any) -> Any:
 
 
 def to_yaml(config: TaskConfig) -> str:
-    """Return the full configuration as YAML that `load_config` reads back."""
+    """Return the complete configuration as YAML, which `load_config` can read."""
     return dump(to_dict(config), sort_keys=False, default_flow_style=None, width=120)

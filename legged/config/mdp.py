@@ -1,50 +1,50 @@
-"""What every task has of a Markov decision process: control, observations, rewards, terminations, randomisation."""
+"""Sections of every task's Markov decision process: control, observations, rewards, terminations, randomisation."""
 
 from dataclasses import dataclass, field, replace
 from typing import Self
 
 from legged.config.actuator import LONGEST_DELAY, Steps
-from legged.config.bounds import LARGEST, NAMES, TERMS, UNIT, between, carried_by_entry, carried_by_term, positive
+from legged.config.bounds import LARGEST, NAMES, TERMS, UNIT, between, positive, rescaled_by_entry, rescaled_by_term
 from legged.config.randomization import DrawConfig, Range
 
 
 @dataclass(frozen=True)
 class ControlConfig:
-    """From actions to what moves the robot."""
+    """Conversion of actions to controls of the robot."""
 
     decimation: int = field(default=4, metadata=between(1, 1000))
-    """Physics steps per control step; a control law is computed anew at each."""
+    """Physics steps per control step. The control law is computed in each of them."""
     clip_actions: float = field(default=100.0, metadata=positive(LARGEST))
-    """Actions are clipped at plus and minus this."""
+    """Absolute value at which actions are clipped."""
 
 
 @dataclass(frozen=True)
 class TerminationsConfig:
-    """What ends an episode: `_terminate_<name>` terms, beside its length and numbers that are none."""
+    """Terms `_terminate_<name>` that end an episode, in addition to its length and NaN or infinite numbers."""
 
     failures: tuple[str, ...] = field(default=(), metadata=TERMS)
-    """Terms that end the episode in a failure: nothing is to be gained after it."""
+    """Terms that end an episode as a failure, with no value after it."""
     time_outs: tuple[str, ...] = field(default=(), metadata=TERMS)
-    """Terms that end it as time does: the learner bootstraps what would have come."""
+    """Terms that end an episode as a time-out. The learner bootstraps the value after it."""
 
 
 @dataclass(frozen=True)
 class DomainRandConfig:
-    """What differs from robot to robot."""
+    """Domain randomisation of the robots."""
 
     ranges: dict[str, Range | DrawConfig] = field(
-        default_factory=dict, metadata=carried_by_entry("domain_rand.ranges", between(-LARGEST, LARGEST))
+        default_factory=dict, metadata=rescaled_by_entry("domain_rand.ranges", between(-LARGEST, LARGEST))
     )
-    """Property -> range from which each robot's is drawn evenly at the start; or a mapping, which has the range as `range`,
-    and beside it how and when. Properties: legged/physics/fields.py."""
+    """Property -> range of a uniform distribution, from which each robot's value is drawn at the start. A mapping with the
+    range as `range` also sets distribution and time. Properties: legged/physics/fields.py."""
     observed_ranges: dict[str, Range | DrawConfig] = field(
-        default_factory=dict, metadata=carried_by_entry("domain_rand.ranges", between(-LARGEST, LARGEST))
+        default_factory=dict, metadata=rescaled_by_entry("domain_rand.ranges", between(-LARGEST, LARGEST))
     )
-    """Property -> the same for properties that are observed (`_obs_rand_<property>`) and not drawn, or not by that range:
-    play and evaluation put here what was drawn in training."""
+    """Property -> range of a property that is observed (`_obs_rand_<property>`) but not randomised, or not with this range.
+    Play and evaluation put the ranges of the training here."""
 
     def nominal(self) -> Self:
-        """Return the same with no property drawn, for showing and measuring; observations keep their scales."""
+        """Return a copy without randomisation, for play and evaluation. Observations keep their scales."""
         return replace(self, ranges={}, observed_ranges={**self.observed_ranges, **self.ranges})
 
 
@@ -57,45 +57,45 @@ class RewardsConfig:
     times_dt: bool = True
     """Multiply scales by the control step, so that sums over time do not depend on it."""
     only_positive_rewards: bool = False
-    """Clip the sum at zero (before `termination`) against early learning to fall."""
+    """Clip the sum of rewards (except `termination`) at zero, so that the policy does not learn early to fall."""
 
 
 @dataclass(frozen=True)
 class ObservationGroupConfig:
-    """What one network sees, or several."""
+    """Observation group, which one or several networks read."""
 
     terms: tuple[str, ...] = field(default=(), metadata=NAMES)
-    """`_obs_<name>` terms, side by side in this order."""
+    """Names of `_obs_<name>` terms, concatenated in this order."""
     history: int = field(default=1, metadata=between(1, 1000))
-    """Steps of the terms that are seen side by side, oldest first; a new episode repeats its first."""
+    """Number of steps that are concatenated, oldest first. A new episode repeats its first step."""
     noise: bool = False
     """Add uniform noise to the terms."""
 
 
 @dataclass(frozen=True)
 class ObservationsConfig:
-    """Observation groups, and how their terms are scaled."""
+    """Observation groups, and scales and errors of their terms."""
 
     groups: dict[str, ObservationGroupConfig] = field(default_factory=dict)
-    """Group -> what is in it. `actor` is what the policy sees; `train.policy` says which groups a network reads."""
+    """Group -> its content. The group `actor` is the policy's by default; `train.policy` sets the groups of each network."""
     scales: dict[str, float] = field(default_factory=dict, metadata=between(-LARGEST, LARGEST))
-    """Term -> factor; 1 where not named."""
+    """Term -> factor; 1 for other terms."""
     add_noise: bool = True
-    """Add noise to the groups that ask for it."""
+    """Add noise to the groups with `noise: true`."""
     noise_level: float = field(default=1.0, metadata=between(0, 1000))
     """Factor on all noise."""
     noise: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
     """Term -> half width of its uniform noise, in the term's unit before scaling."""
-    bias: dict[str, float] = field(default_factory=dict, metadata=carried_by_term("_obs_", 1, between(0, LARGEST)))
-    """Term -> half width of the error of each of its numbers that stays for an episode, in the term's unit before scaling.
-    Bias, delay and lost packets are seen by the groups that have noise, and only while `add_noise` is on."""
+    bias: dict[str, float] = field(default_factory=dict, metadata=rescaled_by_term("_obs_", 1, between(0, LARGEST)))
+    """Term -> half width of an error that is constant in an episode, for each of its numbers, in the term's unit before
+    scaling. Bias, delay and lost packets affect only groups with noise, and only while `add_noise` is on."""
     delay: dict[str, Steps] = field(default_factory=dict, metadata=between(0, LONGEST_DELAY))
-    """Term -> range from which each robot's delay is drawn for an episode, in control steps."""
+    """Term -> range of each robot's delay, drawn for an episode, in control steps."""
     dropped: dict[str, float] = field(default_factory=dict, metadata=UNIT)
-    """Term -> share of the control steps in which it does not arrive: the numbers of the step before are seen again."""
+    """Term -> share of the control steps in which its packet is lost. The values of the step before then stay."""
     clip: float = field(default=100.0, metadata=positive(LARGEST))
-    """Scaled observations are clipped at plus and minus this."""
+    """Absolute value at which scaled observations are clipped."""
 
     def trained(self) -> Self:
-        """Return what a policy observes once it is trained: in play, evaluation and export."""
+        """Return the observations of a trained policy, in play, evaluation and export."""
         return self

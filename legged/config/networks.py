@@ -1,11 +1,11 @@
-"""Which observations the networks read, and what they ask of the rest of a configuration."""
+"""Observation groups of the networks, and checks of the networks against the rest of a configuration."""
 
 from legged.config.schema import ObservationGroupConfig, TaskConfig
 from legged.errors import ConfigError, suggest
 
 NETWORKS = ("actor", "critic")
 ESTIMATED = "estimated"
-"""Observation group of what an estimator learns to estimate."""
+"""Name of the observation group with an estimator's targets."""
 
 
 def groups_of(cfg: TaskConfig, network: str) -> tuple[str, ...]:
@@ -20,23 +20,22 @@ def groups_in(cfg: TaskConfig) -> dict[str, ObservationGroupConfig]:
 
 
 def path_of_terms(cfg: TaskConfig, group: str) -> str:
-    """Return the dotted path of the setting that names the terms of an observation group."""
+    """Return the dotted path of the setting with the terms of an observation group."""
     is_targets = group == ESTIMATED and bool(cfg.train.policy.estimator.targets)
     return "train.policy.estimator.targets" if is_targets else f"observations.groups.{group}.terms"
 
 
 def learns_from_teacher(cfg: TaskConfig) -> bool:
-    """Return whether a policy is a student, which learns to act as a teacher would."""
+    """Return True if a policy is a student that learns from a teacher."""
     return cfg.train.algorithm.class_name == "Distillation"
 
 
 def check_networks(cfg: TaskConfig) -> None:
-    """Compare the networks with the observations, with each other's settings and with the learner.
+    """Check the networks against the observations, each other's settings and the learner.
 
     Raises:
-        ConfigError: they read a group that there is not, the bounds of the standard deviation leave out its start, a mirror
-            loss comes without symmetry, a recurrent policy or an estimator with what it can't learn from, or a student with
-            another one.
+        ConfigError: a network reads an unknown group; the initial standard deviation is out of bounds; a mirror loss lacks
+            symmetry; or a recurrent policy, an estimator or a student has settings that it can't learn with.
     """
     policy, algorithm, origins = cfg.train.policy, cfg.train.algorithm, cfg.origins
     known = cfg.observations.groups
@@ -58,18 +57,18 @@ def check_networks(cfg: TaskConfig) -> None:
         return
     if algorithm.mirror_loss_coeff > 0.0 and not algorithm.symmetry:
         where = origins.where("train.algorithm.mirror_loss_coeff")
-        raise ConfigError(f"{where}: must be 0 without mirror images; train.algorithm.symmetry=true")
+        raise ConfigError(f"{where}: must be 0 without mirror images; train.algorithm.symmetry=true adds them")
     _check_estimator(cfg)
     if policy.rnn_type != "none":
         _check_recurrent(cfg)
 
 
 def _check_estimator(cfg: TaskConfig) -> None:
-    """Compare an estimator with the other settings.
+    """Check an estimator against the other settings.
 
     Raises:
-        ConfigError: it has outputs and no targets, the name of its observation group is taken, or it has settings beside it
-            that only rsl-rl's own update learns with, which knows no estimator.
+        ConfigError: it has outputs but no targets, the name of its group is taken, or a setting needs rsl-rl's own update,
+            which has no estimator.
     """
     policy, algorithm, origins = cfg.train.policy, cfg.train.algorithm, cfg.origins
     path = "train.policy.estimator.targets"
@@ -96,10 +95,10 @@ def _check_estimator(cfg: TaskConfig) -> None:
 
 
 def _check_student(cfg: TaskConfig) -> None:
-    """Compare a student with the settings of distillation.
+    """Check a student against the settings of distillation.
 
     Raises:
-        ConfigError: its standard deviation or an estimator would have to be learned, or steps would be left over.
+        ConfigError: it has a learned standard deviation or an estimator, or gradients would leave steps over.
     """
     policy, origins = cfg.train.policy, cfg.origins
     if policy.state_dependent_std:
@@ -117,10 +116,10 @@ def _check_student(cfg: TaskConfig) -> None:
 
 
 def _check_recurrent(cfg: TaskConfig) -> None:
-    """Compare a recurrent policy with the learner's settings.
+    """Check a recurrent policy against the settings of the learner.
 
     Raises:
-        ConfigError: it can't learn from mirror images, nor from fewer robots than mini-batches.
+        ConfigError: it is to learn from mirror images, or has fewer robots than mini-batches.
     """
     kind, algorithm, origins = cfg.train.policy.rnn_type, cfg.train.algorithm, cfg.origins
     recurrent = f"a recurrent policy (train.policy.rnn_type={kind}, {origins.of('train.policy.rnn_type')})"
@@ -130,5 +129,5 @@ def _check_recurrent(cfg: TaskConfig) -> None:
     if algorithm.num_mini_batches > cfg.env.num_envs:
         where, given = origins.where("train.algorithm.num_mini_batches"), algorithm.num_mini_batches
         raise ConfigError(
-            f"{where}: {recurrent} learns from whole robots: must be at most env.num_envs={cfg.env.num_envs}, got {given}"
+            f"{where}: {recurrent} splits mini-batches by robot: must be at most env.num_envs={cfg.env.num_envs}, got {given}"
         )

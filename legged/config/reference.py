@@ -1,4 +1,4 @@
-"""The schema as text: every field with path, type, default, unit, bounds and meaning, for reference and completion."""
+"""Text of the schema: path, type, default, unit, bounds and meaning of every field, for the reference and for completion."""
 
 import ast
 import dataclasses
@@ -18,28 +18,28 @@ from legged.config.loader import to_dict
 
 @dataclass(frozen=True)
 class FieldText:
-    """What is to be known about a field of a configuration."""
+    """Description of one field of a configuration."""
 
     path: str
     """Dotted path, as on the command line; `<name>` stands for the entry of a map."""
     kind: str
-    """What it takes, such as "a number" or "one of P, V, T"."""
+    """Accepted values, such as "a number" or "one of P, V, T"."""
     default: Any
-    """Its default as plain values; None for a section, whose fields have their own."""
+    """Default as plain values; None for a section, whose fields have their own."""
     unit: str
-    """The unit in its metadata (`quantity` and `carried` in bounds.py); empty without one, or if each entry has its own."""
+    """Unit in the metadata (`quantity` and `rescaled` in bounds.py); empty without one, or if each entry has its own."""
     bounds: str
-    """What its numbers must be; empty where they may be any."""
+    """Bounds of its numbers; empty without any."""
     meaning: str
     """Its docstring, on one line."""
     choices: tuple[str, ...] = ()
-    """The values that it may have, where they can be counted."""
+    """All values that it can have, if they are few."""
     is_section: bool = False
-    """Whether it has fields of its own, which follow it."""
+    """True if it is a section, whose fields follow it."""
 
 
 def fields(schema: type, defaults: Any = None, prefix: str = "") -> Iterator[FieldText]:
-    """Yield all fields of a schema, each section before the fields in it; of a map of sections those of one entry."""
+    """Yield all fields of a schema, each section before its fields. A map of sections is described by one entry."""
     instance = schema() if defaults is None else defaults
     for field in dataclasses.fields(schema):  # type: ignore[arg-type]
         if not field.compare or field.name == "task":
@@ -64,7 +64,7 @@ def fields(schema: type, defaults: Any = None, prefix: str = "") -> Iterator[Fie
 
 @functools.cache
 def _meanings(schema: type) -> dict[str, str]:
-    """Return field -> docstring of the fields that a class itself declares."""
+    """Return field -> docstring for the fields that a class itself declares."""
     (tree,) = ast.parse(textwrap.dedent(inspect.getsource(schema))).body
     assert isinstance(tree, ast.ClassDef)
     found = {}
@@ -78,13 +78,13 @@ def _meanings(schema: type) -> dict[str, str]:
 
 
 def meaning_of(schema: type, name: str) -> str:
-    """Return the docstring of a field, of the nearest class that has one; empty if none has."""
+    """Return the docstring of a field from the nearest class that has one, or an empty text."""
     classes = [kind for kind in schema.__mro__ if dataclasses.is_dataclass(kind)]
     return next((_meanings(kind)[name] for kind in classes if name in _meanings(kind)), "")
 
 
 def kind_of(hint: Any) -> str:
-    """Say in words what a field of that type takes."""
+    """Return a text for the values that a field of this type accepts."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is Literal:
         return f"one of {', '.join(f'`{arg}`' for arg in args)}"
@@ -103,7 +103,7 @@ def kind_of(hint: Any) -> str:
 
 
 def bounds_of(metadata: Mapping[str, Any]) -> str:
-    """Say in words what the bounds of a field allow."""
+    """Return a text for the bounds of a field."""
     low, high = metadata.get("min"), metadata.get("max")
     parts = []
     if "above" in metadata and high is not None:
@@ -121,5 +121,5 @@ def bounds_of(metadata: Mapping[str, Any]) -> str:
 
 
 def _number(value: float) -> str:
-    """Return a bound as it is shortest to read; whole numbers of up to seven digits are exact."""
+    """Return a bound as short text. Whole numbers of up to seven digits are exact."""
     return f"{value:.7g}" if isinstance(value, int) else f"{value:g}"

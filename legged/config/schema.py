@@ -1,7 +1,7 @@
-"""The configuration schema: every field a task file can set, with its meaning, unit, default and bounds.
+"""Configuration schema: every setting of a task file, with meaning, unit, default and bounds.
 
-A file under `cfg/` states only what differs. The sections of every task are in world.py, mdp.py and learning.py, those of a
-legged robot that follows commands in legged.py.
+A file under `cfg/` states only the differences from the defaults. The sections of every task are in world.py, mdp.py and
+learning.py. Those of a legged robot with velocity commands are in legged.py.
 """
 
 from legged.config.actuator import ActuatorConfig

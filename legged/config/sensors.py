@@ -1,37 +1,37 @@
-"""How sensors differ from ideal ones: errors of terms beside their noise, and of the map of heights."""
+"""Settings of sensor errors: errors of terms in addition to noise, and errors of the height map."""
 
 from dataclasses import dataclass, field
 
-from legged.config.bounds import between, carried
+from legged.config.bounds import between, rescaled
 
 
 @dataclass(frozen=True)
 class HeightMapConfig:
-    """What is wrong with the map from which a robot reads the term `heights`, beside noise, delay and lost packets of the
-    term. The groups with `noise: true` see it.
+    """Errors of the map from which a robot reads the term `heights`, in addition to the term's noise, delay and lost packets.
+    Groups with `noise: true` see them.
     """
 
-    offset: float = field(default=0.0, metadata=carried("m", between(0, 100)))
-    """Half width of the error of all heights alike, drawn for each episode [m]."""
-    shift: float = field(default=0.0, metadata=carried("m", between(0, 100)))
-    """Half width of the map's displacement along each horizontal axis of the world, drawn for each episode [m]."""
-    drift: float = field(default=0.0, metadata=carried("m/s", between(0, 100)))
+    offset: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
+    """Half width of a common error of all heights, drawn for each episode [m]."""
+    shift: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
+    """Half width of the map's displacement along each horizontal world axis, drawn for each episode [m]."""
+    drift: float = field(default=0.0, metadata=rescaled("m/s", between(0, 100)))
     """Half width of the speed at which `offset` grows, drawn for each episode [m/s]."""
-    shift_drift: float = field(default=0.0, metadata=carried("m/s", between(0, 100)))
+    shift_drift: float = field(default=0.0, metadata=rescaled("m/s", between(0, 100)))
     """Half width of the speed at which `shift` grows along each axis, drawn for each episode [m/s]."""
     holes: float = field(default=0.0, metadata=between(0, 1))
-    """Share of the points, drawn for each episode, of which the map knows nothing: they read 0, as level ground does
-    under a robot that stands `heights_offset` high."""
+    """Share of the points that the map lacks, drawn for each episode. Such a point reads 0, like level ground under a robot
+    whose base is `heights_offset` high."""
     lost: float = field(default=0.0, metadata=between(0, 1))
-    """Share of the robots, drawn for each episode, whose map knows nothing at all, so that they have to walk as blind ones
-    do. Success on terrain is measured with robots that have a map."""
+    """Share of the robots without a map, drawn for each episode, which must walk blindly. Success on terrain is measured with
+    robots that have a map."""
 
 
 @dataclass(frozen=True)
 class HeightLimitsConfig:
-    """Limits of the term `heights` for a policy that is trained; 0: as in training. Training does not use them."""
+    """Limits of the term `heights` for a trained policy; 0 for the limits of the training. Training does not use them."""
 
-    heights_limit: float = field(default=0.0, metadata=carried("m", between(0, 100)))
-    """In place of observations.heights_limit [m]."""
-    depth_limit: float = field(default=0.0, metadata=carried("m", between(0, 100)))
-    """In place of observations.depth_limit [m]."""
+    heights_limit: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
+    """Limit that replaces observations.heights_limit [m]."""
+    depth_limit: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
+    """Limit that replaces observations.depth_limit [m]."""

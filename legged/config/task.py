@@ -1,4 +1,4 @@
-"""The configuration of a task of any kind. A task class with sections of its own has a subclass of it as `Config`."""
+"""Configuration of any kind of task. A task class with its own sections has a subclass as `Config`."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
@@ -12,34 +12,34 @@ from legged.config.world import EnvConfig, SimConfig
 
 @dataclass(frozen=True)
 class TaskConfig:
-    """A whole task: its world, its Markov decision process and how a policy is trained."""
+    """Configuration of a task: its world, its Markov decision process, and the training of its policy."""
 
     task: str = field(default="", metadata=NAME)
-    """Name of the task; set by the registry."""
+    """Name of the task, set by the registry."""
     env: EnvConfig = field(default_factory=EnvConfig)
     """Size and length of the simulated batch."""
     sim: SimConfig = field(default_factory=SimConfig)
     """Physics time step, engine and contact solver."""
     control: ControlConfig = field(default_factory=ControlConfig)
-    """From actions to what moves the robot."""
+    """Conversion of actions to controls of the robot."""
     terminations: TerminationsConfig = field(default_factory=TerminationsConfig)
-    """What ends an episode."""
+    """Terms that end an episode."""
     domain_rand: DomainRandConfig = field(default_factory=DomainRandConfig)
-    """What differs from robot to robot."""
+    """Domain randomisation of the robots."""
     rewards: RewardsConfig = field(default_factory=RewardsConfig)
     """Reward terms."""
     observations: ObservationsConfig = field(default_factory=ObservationsConfig)
-    """What networks see."""
+    """Observation groups of the networks."""
     train: TrainConfig = field(default_factory=TrainConfig)
-    """Everything the learner needs."""
+    """Settings of the learner."""
     custom: dict[str, Any] = field(default_factory=dict)
-    """Free space for a user's own terms: `self.cfg.custom["name"]`."""
+    """Free section for user-defined terms: `self.cfg.custom["name"]`."""
     origins: Origins = field(default_factory=Origins, repr=False, compare=False)
-    """Who set what; no setting itself (`compare` says so), so neither read from files nor written to them."""
+    """Sources of the settings. This is not itself a setting (`compare` is False), so files neither set nor store it."""
 
     def trained(self) -> Self:
-        """Return the configuration in which a trained policy is shown and measured: with nothing drawn, and with what it is
-        to observe otherwise than in training.
+        """Return the configuration for play and evaluation of a trained policy: without randomisation, and with the
+        observations of a trained policy.
         """
         return replace(self, domain_rand=self.domain_rand.nominal(), observations=self.observations.trained())
 

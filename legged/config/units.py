@@ -1,4 +1,4 @@
-"""Physical units, as texts: what a number of a configuration measures, and how it changes with the size of a robot."""
+"""Physical units as texts, and the growth of quantities with the size of a robot."""
 
 import re
 from collections.abc import Mapping
@@ -18,27 +18,27 @@ BASE = {
     "deg": (0, 0, 0),
     "1": (0, 0, 0),
 }
-"""Unit -> exponents of mass, length and time; an angle is a ratio of lengths."""
+"""Unit -> exponents of mass, length and time. An angle is a ratio of lengths."""
 Exponents = tuple[int, int, int]
 SPELLINGS = {"**": "^", "*": " ", "·": " ", "²": "^2", "³": "^3", "⁴": "^4", "⁻": "^-", "^-^": "^-", "¹": "1"}
-"""How else powers and products are written -> how they are read here."""
+"""Other spellings of powers and products -> the spelling used here."""
 TOKENS = re.compile(r"[A-Za-z]+|\^-?\d+|\S")
 
 
 def exponents(unit: str) -> Exponents:
-    """Return the exponents of mass, length and time of a unit such as "N^2 m^2", "rad/s^2" or "(m/s)^2"; of several,
-    separated by commas, those of the first. What is no unit has none: (0, 0, 0).
+    """Return the exponents of mass, length and time of a unit such as "N^2 m^2", "rad/s^2" or "(m/s)^2". Of several units,
+    separated by commas, the first counts. A text that is not a unit gives (0, 0, 0).
     """
     return _parsed(unit.partition(",")[0]) or (0, 0, 0)
 
 
 def is_unit(text: str) -> bool:
-    """Return whether a text is a unit, or several, separated by commas."""
+    """Return True if a text is a unit, or several units separated by commas."""
     return all(part.strip() and _parsed(part) is not None for part in text.split(","))
 
 
 def _parsed(text: str) -> Exponents | None:
-    """Return the exponents of mass, length and time of one unit; None for what is not a unit."""
+    """Return the exponents of mass, length and time of one unit; None for a text that is not a unit."""
     for theirs, ours in SPELLINGS.items():
         text = text.replace(theirs, ours)
     words = TOKENS.findall(text)
@@ -47,8 +47,8 @@ def _parsed(text: str) -> Exponents | None:
 
 
 def _product(words: list[str]) -> Exponents | None:
-    """Take a product off the front of `words`, up to a closing bracket, and return its exponents; None if it is none. What
-    follows a slash is all divided by.
+    """Take a product from the front of `words`, up to a closing bracket. Return its exponents, or None if it is not a unit.
+    Everything after a slash is in the denominator.
     """
     mass, length, time, sign = 0, 0, 0, 1
     while words and words[0] != ")":
@@ -67,6 +67,8 @@ def _product(words: list[str]) -> Exponents | None:
 
 
 def factor(unit: str, scale: Mapping[str, float]) -> float:
-    """Return by what a quantity of that unit grows where masses, lengths and times grow by scale["kg"], ["m"] and ["s"]."""
+    """Return the growth factor of a quantity of this unit if masses, lengths and times grow by scale["kg"], ["m"] and
+    ["s"].
+    """
     mass, length, time = exponents(unit)
     return float(scale["kg"] ** mass * scale["m"] ** length * scale["s"] ** time)

@@ -1,4 +1,4 @@
-"""YAML texts -> plain values, and back; whatever is wrong with a file is one line that names it, and the line in it."""
+"""Conversion between YAML texts and plain values. An error in a file is one line that names the file and the line in it."""
 
 import contextlib
 import re
@@ -12,16 +12,17 @@ from legged.config.checks import shown
 from legged.errors import ConfigError
 
 MOST_BYTES = 250_000
-"""Size of the largest file that is read; a whole configuration has 6000, and PyYAML takes seconds for this one."""
+"""Size of the largest file that is read [bytes]. A complete configuration has 6000, and PyYAML needs seconds for this
+limit."""
 DEEPEST = 40
-"""Maps and lists inside each other."""
+"""Deepest nesting of maps and lists."""
 MOST_VALUES = 100_000
-"""Values in a file once its aliases are written out; a few lines of aliases of aliases can stand for billions."""
+"""Largest number of values in a file after its aliases are expanded. A few lines of nested aliases can expand to billions."""
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that reads `1e-4` and `-.5` as numbers (YAML 1.1 wants more of them), knows merge keys `<<`, and refuses a
-    key given twice, numbers that are others in YAML 1.2, and what would take forever to read.
+    """SafeLoader with four changes. It reads `1e-4` and `-.5` as numbers, unlike YAML 1.1. It merges keys `<<`. It refuses
+    repeated keys, and numbers that YAML 1.2 reads differently. It refuses texts that would take forever to read.
     """
 
     def get_single_node(self) -> yaml.Node | None:
@@ -32,17 +33,17 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Compose a node as the parser does, which by itself would recurse as deep as the text says."""
+        """Compose a node as the parser does. Refuse deep nesting, through which the parser would recurse without limit."""
         self._depth = getattr(self, "_depth", 0) + 1
         if self._depth > DEEPEST:
-            raise yaml.MarkedYAMLError(problem=f"more than {DEEPEST} blocks inside each other", problem_mark=self.get_mark())
+            raise yaml.MarkedYAMLError(problem=f"more than {DEEPEST} nested blocks", problem_mark=self.get_mark())
         try:
             return super().compose_node(parent, index)  # type: ignore[no-any-return]
         finally:
             self._depth -= 1
 
     def _measure(self, node: yaml.Node) -> tuple[int, int]:
-        """Return how many values a node stands for, and how deep they lie, with aliases written out."""
+        """Return the number of values in a node and their depth, with aliases expanded."""
         if isinstance(node, yaml.ScalarNode):
             return 1, 1
         if id(node) in self._sizes:
@@ -55,14 +56,14 @@ class _Loader(yaml.SafeLoader):
         parts = [self._measure(part) for part in inner]
         size, depth = 1 + sum(part[0] for part in parts), 1 + max((part[1] for part in parts), default=0)
         if size > MOST_VALUES or depth > DEEPEST:
-            self._refuse(f"aliases stand for more than {MOST_VALUES} values, or {DEEPEST} blocks inside each other", node)
+            self._refuse(f"aliases stand for more than {MOST_VALUES} values, or {DEEPEST} nested blocks", node)
         self._sizes[id(node)] = size, depth
         if isinstance(node, yaml.MappingNode):
             self._refuse_key_given_twice(node)
         return size, depth
 
     def _refuse_key_given_twice(self, node: yaml.MappingNode) -> None:
-        """Refuse a key that is given twice, before merge keys are put in place, whose keys a block may give again."""
+        """Refuse a repeated key. This happens before merge keys are expanded, because a block may override those."""
         seen = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode):
@@ -75,15 +76,15 @@ class _Loader(yaml.SafeLoader):
         raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
-        """Construct a whole number; YAML 1.1 counts in eights after a leading 0, and in sixties at a colon."""
+        """Construct a whole number. Refuse one that YAML 1.1 reads as octal (leading 0) or base 60 (colon)."""
         number: int = super().construct_yaml_int(node)
         digits = node.value.replace("_", "")
         if ":" in digits or (re.fullmatch(r"[-+]?0\d+", digits) and int(digits) != number):
-            raise ValueError("it is one number in YAML 1.1 and another, or text, in 1.2")
+            raise ValueError("YAML 1.1 and 1.2 read it differently")
         return number
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        """Construct an object as the constructor does; numbers and dates that are none are an error with a line."""
+        """Construct an object as the constructor does. For an invalid number or date, raise an error with its line."""
         try:
             return super().construct_object(node, deep)
         except (ValueError, OverflowError) as error:
@@ -97,7 +98,7 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
 
 
 class _Dumper(yaml.SafeDumper):
-    """SafeDumper that puts text into quotes which the loader above would read as a number."""
+    """SafeDumper that quotes texts that the loader above would read as numbers."""
 
 
 for _kind in (_Loader, _Dumper):
@@ -112,7 +113,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """Return the mapping in a YAML file.
 
     Raises:
-        ConfigError: the file is missing, too large, malformed, or no mapping.
+        ConfigError: the file is missing, too large, malformed, or not a mapping.
     """
     try:
         with path.open("rb") as stream:
@@ -120,7 +121,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
     if len(content) > MOST_BYTES:
-        raise ConfigError(f"{path}: is no configuration: it is larger than {MOST_BYTES:,} bytes")
+        raise ConfigError(f"{path}: not a configuration: it is larger than {MOST_BYTES:,} bytes")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -135,10 +136,10 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse(text: str, source: str) -> Any:
-    """Return the value that a YAML text stands for; `source` says whose it is.
+    """Return the value of a YAML text from `source`.
 
     Raises:
-        ConfigError: it is malformed, refers to itself, or is too large once its aliases are written out.
+        ConfigError: the text is malformed, refers to itself, or is too large after its aliases are expanded.
     """
     with _as_one_line(source):
         loader = _Loader(text)
@@ -150,7 +151,7 @@ def parse(text: str, source: str) -> Any:
 
 
 def dump(value: Any, **style: Any) -> str:
-    """Return a YAML text of a plain value, which `parse` reads back as it was; `style` is that of yaml.dump."""
+    """Return a plain value as a YAML text, which `parse` can read. `style` has options of yaml.dump."""
     text: str = yaml.dump(value, Dumper=_Dumper, **style)
     return text
 

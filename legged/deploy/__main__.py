@@ -24,7 +24,7 @@ from legged.deploy.policy import Policy
 from legged.deploy.program import Program
 from legged.deploy.safety import Limits
 from legged.deploy.states import Event
-from legged.deploy.telling import Telling
+from legged.deploy.status_messages import StatusMessages
 from legged.deploy.udp import UdpRobot
 from legged.deploy.unitree import SdkWire, UnitreeRobot
 from legged.deploy.unitree_messages import KINDS
@@ -37,19 +37,19 @@ BOUNDS = {
     "max_age": (0.005, 0.5),
     "max_missed": (1, 50),
 }
-"""Flag -> its least and largest value, in seconds, radians and cycles: whoever thinks in degrees or milliseconds is told."""
+"""Flag -> its smallest and largest value, in seconds, radians and cycles; degrees or milliseconds are refused."""
 ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
-"""Signals that ask the program to end: Ctrl-C, kill, a closed terminal or a lost connection, Ctrl-\\ and Ctrl-Z. Most of them
-would by default leave a robot alone with its last command."""
+"""Signals that end the program after the robot was braked: Ctrl-C, kill, a closed terminal or a lost connection, Ctrl-\\ and
+Ctrl-Z. By default most of them would leave the robot with its last command."""
 SWITCH_S = 5e-4
-"""A thread that waits for Python's lock gets it after so long [s]; 5 ms, the default, is a quarter of a cycle."""
+"""Python's switch interval between threads [s]; the default of 5 ms is a quarter of a cycle."""
 EXIT_STOPPED = 3
-"""The program ran to its end, but had to stop the robot for a reason of its own."""
+"""The program ran to its end, but had stopped the robot for safety."""
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code: 0 done, 1 it could not go on, 2 wrong input, 3 the robot had to be stopped, 130
-    interrupted while it had no robot yet.
+    """Run the command and return its exit code: 0 success, 1 failure, 2 wrong input, 3 the robot was stopped for safety, 130
+    interrupted before a robot was connected.
     """
     try:
         return _main(argv)
@@ -85,11 +85,11 @@ def _main(argv: list[str] | None) -> int:
         raise ConfigError(f"--robot: '{args.robot}' is unknown{suggest(args.robot, [*KINDS, 'udp:HOST:PORT'])}")
     Log.check(args.log)
     policy = Policy(args.policy)
-    if args.robot in KINDS:  # what does not fit must be refused before a robot is asked to leave its own controller
+    if args.robot in KINDS:  # refuse a misfit before the robot leaves its own controller
         policy.contract.check_fits(KINDS[args.robot].facts)
     operator = Interruptible(make_operator(args))
-    tell = Telling()
-    hurries = take_priority()  # before any thread of a robot's SDK begins: threads inherit it
+    tell = StatusMessages()
+    hurries = take_priority()  # before a robot's SDK starts threads, which inherit it
     try:
         robot = _connect(args)
         operator.take()
@@ -133,10 +133,10 @@ def add_program_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def limits_of(args: argparse.Namespace) -> Limits:
-    """Return the limits that the flags ask for.
+    """Return the limits of the flags.
 
     Raises:
-        ConfigError: a number that makes no sense.
+        ConfigError: a number is outside its range.
     """
     if not args.seconds > 0.0:
         raise ConfigError(f"--seconds: must be above 0, got {args.seconds:g}")
@@ -149,10 +149,10 @@ def limits_of(args: argparse.Namespace) -> Limits:
 
 
 def make_operator(args: argparse.Namespace) -> Operator:
-    """Return who commands.
+    """Return the operator of the flags.
 
     Raises:
-        ConfigError: there is no such file, device or terminal.
+        ConfigError: the file, device or terminal does not exist.
     """
     if args.commands is not None:
         return Script(args.commands)
@@ -162,12 +162,12 @@ def make_operator(args: argparse.Namespace) -> Operator:
 
 
 class Interruptible(Operator):
-    """An operator who can also end the program by Ctrl-C and the like (`ENDING`): the robot is braked first. While there is
-    none yet, the program ends at once: nobody should have to wait until a robot has been made to leave its controller.
+    """An operator that also ends the program at signals such as Ctrl-C (`ENDING`). A connected robot is braked first; without
+    one the program ends at once.
     """
 
     def __init__(self, operator: Operator) -> None:
-        """Listen to signals on top of `operator`."""
+        """Handle signals in addition to the orders of `operator`."""
         self._operator, self._ends, self._has_robot = operator, False, False
         for name in ENDING:
             if hasattr(signal, name):
@@ -179,7 +179,7 @@ class Interruptible(Operator):
         self._ends = True
 
     def take(self) -> None:
-        """Take a robot: from now on there is one to be braked first."""
+        """Note that a robot is connected, so that signals brake it first."""
         self._has_robot = True
 
     def poll(self, seconds: float) -> Orders:
@@ -193,11 +193,11 @@ class Interruptible(Operator):
 
 
 def _connect(args: argparse.Namespace) -> Interface:
-    """Return the robot that --robot names.
+    """Return the interface to the robot of --robot.
 
     Raises:
-        ConfigError: that is no address, or what it needs is not installed.
-        RunError: it does not answer.
+        ConfigError: the address is invalid, or a package is not installed.
+        RunError: the robot does not answer.
     """
     if args.robot.startswith("udp:"):
         return UdpRobot(args.robot.removeprefix("udp:"))

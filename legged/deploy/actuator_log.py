@@ -1,4 +1,4 @@
-"""Of a log what an actuator is fitted to: samples at even times, in runs without gaps, while the motors follow targets."""
+"""Samples of a log for fitting actuators: evenly spaced, in runs without gaps, while the motors follow targets."""
 
 from collections.abc import Mapping
 
@@ -7,17 +7,18 @@ import numpy as np
 from legged.deploy.contract import Contract
 
 SHORTEST = 20
-"""Samples of a run, at least."""
+"""Smallest number of samples in a run."""
 UNEVEN = 0.75
-"""Share of a time step by which the time between two samples may differ from it: a clock may count milliseconds, and 400 Hz
-are 2 and 3 of them in turn; a sample that is missing makes it a whole step more."""
+"""Largest deviation of the time between two samples, as a share of a time step. A clock with a resolution of 1 ms alternates
+between 2 and 3 ms at 400 Hz; a missing sample adds a whole step."""
 
 
 def actuator_arrays(log: Mapping[str, np.ndarray], contract: Contract) -> dict[str, np.ndarray] | None:
-    """Return of the readings of a log (arrays as `Log.save` has them) those with the policy's gains and with torques, in runs
-    that end where a reading is missing; one that was sent again is left out: `joint_names` (D,), `run` (T,), `dt` [s],
-    `target`, `position` [rad], `velocity` [rad/s], `torque` [N m] (T, D), and the gains `stiffness`, `damping` (D,). None if
-    there are none.
+    """Return the readings of a log (arrays of `Log.save`) that have the policy's gains and torques; None without such
+    readings.
+
+    A missing reading ends a run; repeated readings are left out. The arrays are `joint_names` (D,), `run` (T,), `dt` [s],
+    `target`, `position` [rad], `velocity` [rad/s], `torque` [N m] (T, D), and the gains `stiffness`, `damping` (D,).
     """
     if "times" not in log:
         return None

@@ -1,4 +1,4 @@
-"""What the operator asks for: commands within what the policy knows, ramped, and a script of them for tests."""
+"""Commands and events of the operator: their types, a ramp within the policy's ranges, and scripts."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -16,40 +16,40 @@ RAMP = np.array([1.0, 1.0, 2.0])
 
 @dataclass(frozen=True)
 class Orders:
-    """What the operator wants now."""
+    """Present command and new events of the operator."""
 
     velocity: np.ndarray
-    """(3,) vx, vy [m/s], yaw rate [rad/s], or shares of the largest ones where `shares` says so."""
+    """(3,) vx, vy [m/s], yaw rate [rad/s], or shares of the largest values if `shares`."""
     events: tuple[Event, ...] = ()
-    """Asked for since the last look, the oldest first."""
+    """Events since the last poll, oldest first."""
     shares: bool = False
-    """Whether `velocity` is -1 to 1 of what the policy can be asked for, as a stick's position is."""
+    """`velocity` is a share, -1 to 1, of the policy's command range, like the position of a stick."""
     lost: str | None = None
-    """Why nobody is there to ask any more; None while somebody is."""
+    """Reason why the operator can no longer be reached; None while it can."""
 
 
 class Operator(ABC):
-    """Somebody who asks for something."""
+    """A source of commands and events."""
 
     @abstractmethod
     def poll(self, seconds: float) -> Orders:
-        """Return what is wanted `seconds` after the start of the program, without waiting."""
+        """Return the orders `seconds` after the start of the program, without waiting."""
 
-    def close(self) -> None:  # noqa: B027  (most have taken nothing)
-        """Give back what was taken, a terminal for instance."""
+    def close(self) -> None:  # noqa: B027  (most have nothing to release)
+        """Release resources, such as a terminal."""
 
 
 class Ramp:
-    """Commands as the policy gets them: none, or within its ranges and not too slow, changed bit by bit."""
+    """Commands for the policy: zero, or within its ranges and above its dead zone, with a limited rate of change."""
 
     def __init__(self, contract: Contract) -> None:
-        """Begin at no command."""
+        """Start at the command zero."""
         self._low, self._high = contract.command_ranges.T
         self._dead_zone, self._step = contract.dead_zone, RAMP * contract.control_dt
         self.command = np.zeros(3)
 
     def restart(self) -> None:
-        """Begin at no command again."""
+        """Return to the command zero at once."""
         self.command = np.zeros(3)
 
     def advance(self, orders: Orders) -> np.ndarray:
@@ -58,7 +58,7 @@ class Ramp:
         if orders.shares:
             velocity = np.where(velocity > 0.0, velocity * self._high, -velocity * self._low)
         velocity = np.nan_to_num(velocity)
-        # No command is 0 also where the ranges leave 0 out: a robot must always be able to halt.
+        # Zero stays allowed where the ranges exclude it, because a robot must always be able to stop.
         wanted = np.clip(velocity, self._low, self._high) if velocity.any() else np.zeros(3)
         if np.hypot(*wanted[:2]) < self._dead_zone:
             wanted[:2] = 0.0
@@ -67,13 +67,13 @@ class Ramp:
 
 
 class Script(Operator):
-    """A file of commands. Each line has a time [s] and either an event or vx, vy [m/s] and yaw rate [rad/s]."""
+    """Commands from a file. Each line has a time [s] and either an event or vx, vy [m/s] and yaw rate [rad/s]."""
 
     def __init__(self, path: Path) -> None:
-        """Read the file; empty lines and what follows a # are left out.
+        """Read the file; empty lines and comments after # are skipped.
 
         Raises:
-            ConfigError: it cannot be read, or has a line that is none.
+            ConfigError: the file cannot be read, or a line is invalid.
         """
         try:
             lines = path.read_text(encoding="utf-8").splitlines()

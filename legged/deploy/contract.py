@@ -1,4 +1,4 @@
-"""The contract of an exported policy: what policy.json says of it, read and compared with a robot."""
+"""The contract of an exported policy: the contents of policy.json, and their comparison with a robot."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -21,24 +21,24 @@ SENSORS = {
     "dof_vel": "joint velocities",
     "actions": "memory",
 }
-"""Observation term -> what a robot needs for it, of the terms that every robot of ours can measure or remembers."""
+"""Observation term -> sensor, command or memory that it needs, for the terms that every robot can provide."""
 SOURCE = "source "
-"""What the need of any other term begins with: a source of that name beside the sensors, such as an estimator or a map."""
+"""Prefix of the needs of all other terms: a source of that name, such as an estimator or a map."""
 SCANS = ("lowest", "own", "highest")
-"""What a point of the heights can read: the lowest of its cell and the next ones in x and y, its own, or the highest of the
-three."""
+"""Values that a point of the heights can read: the lowest of its cell and the next cells in x and y, its own cell's, or the
+highest of the three."""
 TOLERANCE = 1e-3
-"""Limits that differ by less, or by less than this share, are the same."""
+"""Largest difference, absolute or relative, at which limits count as equal."""
 
 
 def need_of(term: str) -> str:
-    """Return what a robot needs for an observation term: one of its sensors, or a source of the term's name."""
+    """Return the need of an observation term: a value of SENSORS, or a source of the term's name."""
     return SENSORS.get(term, f"{SOURCE}{term}")
 
 
 @dataclass(frozen=True)
 class Term:
-    """A term of the observation: it lies at `start` to `start + size` of one observation of its group."""
+    """A term of the observation in the columns `start` to `start + size` of one observation of its group."""
 
     name: str
     group: str
@@ -49,25 +49,25 @@ class Term:
     needs: str
     """A value of `SENSORS`, or `SOURCE` and a name."""
     points: np.ndarray | None
-    """(P, 2) where a height map is read, x forward and y left of the base, seen from above [m]; None for other terms."""
+    """(P, 2) points at which a height map is read, x forward and y left of the base [m]; None for other terms."""
     offset: float
-    """Observed heights are relative to this far below the base [m]."""
+    """Distance below the base from which observed heights are measured [m]."""
     limit: float
-    """Observed heights are at most this large [m]."""
+    """Largest observed height [m]."""
     deepest: float
-    """Low ground is observed at most this deep [m]."""
+    """Largest observed depth of low ground [m]."""
     scan: str
-    """What a point reads of a map of cells, one of `SCANS`."""
+    """Value that a point reads of a map of cells, one of `SCANS`."""
 
     @property
     def source(self) -> str | None:
-        """The source that the term needs beside sensors; None if it needs none."""
+        """Return the source that the term needs; None if sensors suffice."""
         return self.needs.removeprefix(SOURCE) if self.needs.startswith(SOURCE) else None
 
 
 @dataclass(frozen=True)
 class Group:
-    """A group of terms: `history` observations of `size` numbers each, the oldest first, from column `start` on."""
+    """A group of terms: `history` observations of `size` numbers each, oldest first, from column `start` on."""
 
     name: str
     start: int
@@ -87,25 +87,25 @@ class Memory:
 
 @dataclass(frozen=True)
 class Contract:
-    """What a policy expects of a robot. D joints, of which A have an action; SI units."""
+    """Requirements of a policy for a robot with D joints, A of which have an action; SI units."""
 
     path: Path
     task: str
     robot: str
     imu_body: str
-    """The body in whose frame angular velocity and gravity are observed."""
+    """Body in whose frame angular velocity and gravity are observed."""
     joint_names: tuple[str, ...]
     acted: np.ndarray
-    """(A,) the joint of each action."""
+    """(A,) joint index of each action."""
     default: np.ndarray
     """(D,) angles at action 0 [rad]."""
     crouch: np.ndarray | None
-    """(D,) angles by way of which a robot that lies stands up [rad]; None if there are none."""
+    """(D,) intermediate pose for standing up from the ground [rad]; None without one."""
     stiffness: np.ndarray
     """(D,) P gains [N m/rad], and D gains [N m s/rad]."""
     damping: np.ndarray
     position_limits: np.ndarray
-    """(D, 2) [rad]; infinite where the model has none."""
+    """(D, 2) [rad]; infinite where the model has no limit."""
     velocity_limits: np.ndarray
     """(D,) [rad/s]."""
     torque_limits: np.ndarray
@@ -119,23 +119,23 @@ class Contract:
     command_ranges: np.ndarray
     """(3, 2) lowest and highest vx, vy [m/s] and yaw rate [rad/s]."""
     dead_zone: float
-    """Horizontal commands slower than this were never asked for in training [m/s]."""
+    """Smallest horizontal command of the training other than zero [m/s]."""
     control_dt: float
     """Time for which an action is held [s]."""
     sim_dt: float
-    """Physics step of the training, in which the actuator's delay is counted [s]."""
+    """Physics step of the training; the unit of the actuator's delay [s]."""
     actuator: Mapping[str, Any]
-    """Section control.actuator of the training's configuration; empty for an export that does not say."""
+    """Section control.actuator of the training's configuration; empty for exports without it."""
     memory: Memory | None
 
     @property
     def width(self) -> int:
-        """Numbers that the policy is given."""
+        """Return the width of the policy's observation."""
         return sum(group.size * group.history for group in self.groups)
 
     @property
     def sources(self) -> dict[str, Term]:
-        """Source -> the first term that needs it."""
+        """Return source -> the first term that needs it."""
         found: dict[str, Term] = {}
         for term in self.terms:
             if term.source is not None:
@@ -146,8 +146,8 @@ class Contract:
         """Compare with a robot.
 
         Raises:
-            ConfigError: its joints have other names or another order, are weaker, slower or stop earlier than the policy
-                expects, its IMU is in another body, or it has not what an observation needs.
+            ConfigError: the robot's joints have other names or another order, or are weaker, slower or stop earlier than in
+                the training; its IMU is in another body; or it lacks a source that an observation needs.
         """
         if self.joint_names != robot.joint_names:
             raise ConfigError(f"{self.path}: joint_names: {_difference(self.joint_names, robot.joint_names, robot.name)}")
@@ -161,7 +161,7 @@ class Contract:
             ("velocity_limits", "rad/s", self.velocity_limits, robot.velocity_limits),
         ):
             for joint, mine, its in zip(self.joint_names, own, there, strict=True):
-                if not mine <= its * (1.0 + TOLERANCE):  # nor fits a robot whose limit is no number
+                if not mine <= its * (1.0 + TOLERANCE):  # also true for a limit of NaN
                     raise ConfigError(
                         f"{self.path}: {name}: the policy was trained with {mine:g} {unit} at '{joint}',"
                         f" '{robot.name}' has {its:g}"
@@ -185,7 +185,8 @@ def read_contract(path: Path) -> Contract:
     """Return the contract in a policy.json.
 
     Raises:
-        ConfigError: it cannot be read, is of another version, of a policy that this program cannot run, or says nonsense.
+        ConfigError: the file cannot be read, has another version, describes a policy that this program cannot run, or has
+            invalid values.
     """
     try:
         said = json.loads(path.read_text(encoding="utf-8"))
@@ -282,10 +283,10 @@ def _memory(said: Mapping[str, Any] | None) -> Memory | None:
 
 
 def _check_sizes(contract: Contract) -> None:
-    """Look for what a policy of ours cannot have.
+    """Check that the terms and groups of a contract are consistent.
 
     Raises:
-        ConfigError: there is something.
+        ConfigError: they are not.
     """
     path, groups = contract.path, {group.name: group for group in contract.groups}
     joints = len(contract.joint_names)
@@ -327,10 +328,10 @@ def _check_sizes(contract: Contract) -> None:
 
 
 def _check_numbers(contract: Contract) -> None:
-    """Look for numbers that would move a robot as no policy of ours does.
+    """Check the ranges of a contract's numbers.
 
     Raises:
-        ConfigError: there is one.
+        ConfigError: a number is outside its range.
     """
     low, high = contract.command_ranges.T
     for key, values, allowed, right in (
@@ -361,7 +362,7 @@ def _check_numbers(contract: Contract) -> None:
 
 
 def _difference(wanted: Sequence[str], there: Sequence[str], robot: str) -> str:
-    """Say in what two lists of joints differ first."""
+    """Return the first difference between two lists of joints, in words."""
     missing = [name for name in wanted if name not in there]
     if missing:
         return f"'{robot}' has no joint '{missing[0]}' (its joints: {', '.join(there)})"

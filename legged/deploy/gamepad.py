@@ -1,7 +1,7 @@
 """Commands by a gamepad, read from Linux's joystick device.
 
-An event of the device is 8 bytes: time [ms] uint32, value int16, type uint8 (1 button, 2 axis; 0x80 is added to those that
-tell the state at the start), number uint8 (Linux, Documentation/input/joydev/joystick-api.rst).
+An event of the device is 8 bytes: time [ms] uint32, value int16, type uint8 (1 button, 2 axis, plus 0x80 for events that
+report the initial state), number uint8 (Linux, Documentation/input/joydev/joystick-api.rst).
 """
 
 import os
@@ -17,25 +17,25 @@ from legged.errors import ConfigError
 EVENT = struct.Struct("<IhBB")
 BUTTON, AXIS, AT_START = 1, 2, 0x80
 LARGEST = 32767.0
-"""Value of an axis at its end."""
+"""Largest value of an axis."""
 STILL = 0.1
-"""Share of an axis within which a stick is at rest."""
+"""Dead zone of a stick as a share of its range."""
 DEVICE = Path("/dev/input/js0")
 AXES = {1: (0, -1.0), 0: (1, -1.0), 3: (2, -1.0)}
-"""Number of an axis -> axis of the command, and its sense: left stick up, left stick left, right stick left are positive."""
+"""Number of an axis -> axis of the command and sign: left stick up, left stick left and right stick left are positive."""
 BUTTONS = {0: Event.WALK, 1: Event.STOP, 2: Event.DAMPING, 3: Event.STAND, 6: Event.QUIT, 7: Event.IDLE}
-"""Number of a button -> event; on a pad of the Xbox kind A, B, X, Y, back and start."""
+"""Number of a button -> event; on an Xbox gamepad A, B, X, Y, back and start."""
 HELP = "Y stand up, A walk, B stop, X damping, start idle, back quit; left stick walks, right stick turns"
 
 
 class Gamepad(Operator):
-    """A gamepad; when it is unplugged nobody is there to ask any more."""
+    """A gamepad; when it is unplugged the operator counts as lost."""
 
     def __init__(self, device: Path = DEVICE) -> None:
         """Open the device.
 
         Raises:
-            ConfigError: there is none, or it is not this user's.
+            ConfigError: the device does not exist, or this user may not read it.
         """
         try:
             self._descriptor = os.open(device, os.O_RDONLY | os.O_NONBLOCK)
@@ -61,7 +61,7 @@ class Gamepad(Operator):
         return Orders(self._sticks.copy(), tuple(events), shares=True, lost=self._lost)
 
     def _bytes(self) -> bytes:
-        """Return what has come since the last call."""
+        """Return the bytes received since the last call."""
         found = b""
         while self._lost is None:
             try:

@@ -1,4 +1,4 @@
-"""What stands between the program and a robot: few numbers in, few numbers out."""
+"""The interface between the program and a robot."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -9,12 +9,12 @@ import numpy as np
 
 @dataclass(frozen=True)
 class RobotFacts:
-    """What an interface knows of its robot. D joints, in the order in which it gives and takes numbers."""
+    """Properties of a robot with D joints, in the order of its readings and commands."""
 
     name: str
     joint_names: tuple[str, ...]
     position_limits: np.ndarray
-    """(D, 2) [rad]; infinite where there are none."""
+    """(D, 2) [rad]; infinite without a limit."""
     velocity_limits: np.ndarray
     """(D,) [rad/s]."""
     torque_limits: np.ndarray
@@ -22,19 +22,19 @@ class RobotFacts:
     imu_body: str
     """Body in whose frame `Reading.quaternion` and `Reading.gyro` are given."""
     offers: frozenset[str] = frozenset()
-    """Sources beside the sensors of `Reading`: observation terms that an estimator, a map or a simulator gives."""
+    """Additional sources: observation terms from an estimator, a map or a simulator."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """What a robot measured at one moment."""
+    """Measurements of a robot at one moment."""
 
     time: float
-    """By the robot's clock [s]."""
+    """Time of the robot's clock [s]."""
     received: float
-    """When this machine got it, by `time.perf_counter` [s]."""
+    """Time of arrival on this machine, as `time.perf_counter` [s]."""
     quaternion: np.ndarray
-    """(4,) w, x, y, z; it turns the frame of `RobotFacts.imu_body` into the world's, whose z points up."""
+    """(4,) w, x, y, z; rotation from the frame of `RobotFacts.imu_body` to the world frame, whose z axis points up."""
     gyro: np.ndarray
     """(3,) angular velocity in the frame of `RobotFacts.imu_body` [rad/s]."""
     positions: np.ndarray
@@ -42,37 +42,35 @@ class Reading:
     velocities: np.ndarray
     """(D,) joint velocities [rad/s]."""
     torques: np.ndarray | None = None
-    """(D,) joint torques, measured or estimated [N m]; None if the robot gives none."""
+    """(D,) joint torques, measured or estimated [N m]; None if unknown."""
     temperatures: np.ndarray | None = None
-    """(D,) temperatures of the motors [degrees Celsius]; None if the robot gives none."""
+    """(D,) temperatures of the motors [degrees Celsius]; None if unknown."""
     sources: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Source -> its newest value: `base_lin_vel` (3,) in the frame of the IMU's body [m/s]; `heights` (P,) of the ground at
-    each of the points that were asked for, less that of the base [m]; others as their observation terms have them."""
+    """Source -> newest value: `base_lin_vel` (3,) in the frame of the IMU's body [m/s]; `heights` (P,) of the ground at the
+    requested points, relative to the base [m]; others in the form of their observation terms."""
     stop: bool = False
-    """Whether the operator asks for a stop by the robot's own remote control."""
+    """The operator requests a stop by the robot's remote control."""
 
 
 class Interface(ABC):
-    """A robot, or what stands in for one."""
+    """A robot or a simulated one."""
 
     facts: RobotFacts
 
     @abstractmethod
     def ask(self, sources: Mapping[str, np.ndarray | None]) -> None:
-        """Say which sources are wanted from now on; for `heights`, at which points (P, 2), x forward and y left of the base,
-        seen from above [m].
-        """
+        """Request sources from now on; `heights` comes with its points (P, 2), x forward and y left of the base [m]."""
 
     @abstractmethod
     def read(self) -> list[Reading]:
-        """Return what has come since the last call, the oldest first, without waiting; maybe nothing."""
+        """Return the readings since the last call, oldest first, without waiting; the list may be empty."""
 
     @abstractmethod
     def write(self, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:
-        """Ask for the torques stiffness * (positions - q) - damping * dq, (D,) each [rad], [N m/rad], [N m s/rad], until the
-        next call.
+        """Command the torques stiffness * (positions - q) - damping * dq until the next call, (D,) each [rad], [N m/rad],
+        [N m s/rad].
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of the robot."""
+        """Release the robot."""

@@ -23,13 +23,13 @@ EVENTS = {
     "\x03": Event.QUIT,
 }
 STEPS = {"w": (0, 1.0), "s": (0, -1.0), "a": (1, 1.0), "d": (1, -1.0), "q": (2, 1.0), "e": (2, -1.0)}
-"""Key -> axis of the command, and its sense."""
+"""Key -> axis of the command and sign."""
 SEQUENCE = re.compile("\x1b[\\[O][0-?]*[ -/]*[@-~]")
-"""What arrows and the like send (ECMA-48, 5.4): it begins as the escape key alone does, but is no key of ours."""
+"""Sequences of arrow and function keys (ECMA-48, 5.4), which begin with the escape character and are ignored."""
 SILENCE_S = 10.0
-"""A command lasts so long after the last key [s]: of whoever types nothing, nobody knows that he is still there."""
+"""Time after the last key at which a command ends, because the operator may have left [s]."""
 STEP = 0.1
-"""What a key changes a command by, as a share of the largest one."""
+"""Change of a command by one key, as a share of the largest command."""
 HELP = (
     "0 idle, 1 damping, 2 stand up, 3 walk, space stop, x quit;"
     f" w s forward and back, a d left and right, q e turn, r no command; a command ends {SILENCE_S:g} s after the last key"
@@ -37,13 +37,13 @@ HELP = (
 
 
 class Keyboard(Operator):
-    """The terminal that the program was started from; it is read key by key until `close`."""
+    """The terminal of the program, read key by key until `close`."""
 
     def __init__(self, descriptor: int | None = None) -> None:
-        """Take the terminal, standard input by default.
+        """Open the terminal, by default standard input.
 
         Raises:
-            ConfigError: there is none.
+            ConfigError: there is no terminal.
         """
         self._descriptor = sys.stdin.fileno() if descriptor is None else descriptor
         if not os.isatty(self._descriptor):
@@ -75,7 +75,7 @@ class Keyboard(Operator):
         return Orders(self._velocity.copy(), tuple(events), shares=True, lost=self._lost)
 
     def _keys(self) -> str:
-        """Return what was typed since the last call."""
+        """Return the characters typed since the last call."""
         found = b""
         while self._lost is None and select.select([self._descriptor], [], [], 0.0)[0]:
             try:
@@ -90,5 +90,5 @@ class Keyboard(Operator):
     def close(self) -> None:
         import termios
 
-        with suppress(termios.error):  # it may be gone; TCSANOW, because one that is held never drains
+        with suppress(termios.error):  # the terminal may be closed; TCSANOW, because a held terminal never drains
             termios.tcsetattr(self._descriptor, termios.TCSANOW, self._before)

@@ -1,4 +1,4 @@
-"""What a run leaves behind: every reading with the targets in force, to fit actuators to, and every cycle of it."""
+"""Log of a run: every reading with the targets at that time, and every cycle of the program."""
 
 import json
 import tempfile
@@ -17,14 +17,14 @@ from legged.errors import ConfigError, RunError
 STATES = tuple(state.value for state in State)
 ACTUATORS = "_actuators"
 MOST_READINGS, MOST_CYCLES = 300_000, 60_000
-"""Rows that are kept, the newest ones: twenty minutes at 250 readings and 50 cycles a second, some hundred megabytes."""
+"""Rows that are kept, the newest ones: twenty minutes at 250 readings and 50 cycles per second, a few hundred megabytes."""
 
 
 class Log:
-    """Collects numbers and writes them as one .npz file."""
+    """Collector of readings, cycles and notes, which are written as one .npz file."""
 
     def __init__(self, contract: Contract) -> None:
-        """Begin with nothing."""
+        """Start an empty log."""
         self._contract = contract
         self._said = json.dumps(json.loads(contract.path.read_text(encoding="utf-8")))
         self._readings: dict[str, deque[Any]] = {}
@@ -34,7 +34,7 @@ class Log:
     def add_reading(
         self, reading: Reading, state: State, targets: np.ndarray, stiffness: np.ndarray, damping: np.ndarray
     ) -> None:
-        """Add a reading, and what was being asked of the joints when it came."""
+        """Add a reading with the targets and gains in force at its arrival."""
         nothing = np.full(len(targets), np.nan)
         row = {
             "times": reading.time,
@@ -54,25 +54,25 @@ class Log:
             self._readings.setdefault(name, deque(maxlen=MOST_READINGS)).append(value)
 
     def add_cycle(self, state: State, **row: float | np.ndarray) -> None:
-        """Add a cycle of the program: its state, and numbers by name, the same names each time."""
+        """Add a cycle of the program: its state, and values by name; all cycles have the same names."""
         for name, value in {"state": STATES.index(state.value), **row}.items():
             self._cycles.setdefault(name, deque(maxlen=MOST_CYCLES)).append(np.copy(value))
 
     def note(self, seconds: float, text: str) -> None:
-        """Add what happened, a change of state for instance, so long after the start [s]."""
+        """Add a note, such as a change of state, at a time after the start [s]."""
         self._notes.append((seconds, text))
 
     @property
     def notes(self) -> list[str]:
-        """What happened so far."""
+        """Return the notes so far."""
         return [text for _, text in self._notes]
 
     @staticmethod
     def check(path: Path) -> None:
-        """Look before a run whether its log can be written to `path`.
+        """Check before a run that its log can be written to `path`.
 
         Raises:
-            ConfigError: it is a folder, or lies where none can be made or nothing can be written.
+            ConfigError: the path is a folder or not writable.
         """
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -86,16 +86,16 @@ class Log:
             raise ConfigError(f"--log: {path}: cannot be written ({getattr(error, 'strerror', None) or error})") from error
 
     def save(self, path: Path) -> None:
-        """Write the file. By reading: `times` by the robot's clock [s], `received` by this machine's [s], `targets` (T, D)
-        [rad], `stiffness`, `damping`, `positions` [rad], `velocities` [rad/s], `torques` [N m], `temperatures` [degrees
-        Celsius] (both NaN where there are none), `quaternions` (T, 4), `gyro` (T, 3), `state` (T,), a number of `states`. By
-        cycle, with `cycle_` before their names: what `add_cycle` was given. Beside them `joint_names`, `states`, `notes`,
-        `note_times` [s] and `contract` (JSON).
-        What actuators can be fitted to goes into a file of its own, with `ACTUATORS` after its name; there is none of a run
-        without such samples.
+        """Write the log.
+
+        Arrays by reading: `times` of the robot's clock [s], `received` of this machine's clock [s], `targets` (T, D) [rad],
+        `stiffness`, `damping`, `positions` [rad], `velocities` [rad/s], `torques` [N m] and `temperatures` [degrees Celsius],
+        both NaN if unknown, `quaternions` (T, 4), `gyro` (T, 3), and `state` (T,), an index into `states`. Arrays by cycle:
+        the values of `add_cycle`, with the prefix `cycle_`. The rest: `joint_names`, `states`, `notes`, `note_times` [s] and
+        `contract` (JSON). Samples for fitting actuators, if there are any, go to a second file with the suffix `ACTUATORS`.
 
         Raises:
-            RunError: it can't be written.
+            RunError: a file cannot be written.
         """
         arrays = {name: np.array(rows) for name, rows in self._readings.items()}
         arrays |= {f"cycle_{name}": np.array(rows) for name, rows in self._cycles.items()}
@@ -112,16 +112,16 @@ class Log:
             _write(beside, of_actuators)
             return
         try:
-            beside.unlink(missing_ok=True)  # of another run
+            beside.unlink(missing_ok=True)  # left by another run
         except OSError as error:
             raise RunError(f"{beside}: {error.strerror or error}") from error
 
 
 def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write a file, whole or not at all.
+    """Write a file atomically.
 
     Raises:
-        RunError: it can't be written.
+        RunError: the file cannot be written.
     """
     part = path.with_name(f".{path.name}.part.npz")
     try:

@@ -1,4 +1,4 @@
-"""What a policy sees, made of what a robot measures, as policy.json says."""
+"""Observations of a policy, computed from a robot's readings as policy.json describes."""
 
 from collections.abc import Mapping
 
@@ -9,29 +9,29 @@ from legged.deploy.interface import Reading
 
 
 def gravity_in(quaternion: np.ndarray) -> np.ndarray:
-    """Return the unit vector along gravity (3,) in the frame that `quaternion` (w, x, y, z) turns into the world's."""
+    """Return the unit vector along gravity (3,) in the frame that `quaternion` (w, x, y, z) rotates to the world frame."""
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
     return np.array([2.0 * (w * y - x * z), -2.0 * (y * z + w * x), 2.0 * (x * x + y * y) - 1.0])
 
 
 class Observer:
-    """Builds observations: terms, scaled and clipped, and the histories of their groups."""
+    """Builder of observations: scaled and clipped terms, and the histories of their groups."""
 
     def __init__(self, contract: Contract) -> None:
-        """Lay out the observation of `contract`; nothing has been observed yet."""
+        """Start with an empty history for the observation of `contract`."""
         self._contract = contract
         self._steps = {group.name: np.zeros((group.history, group.size)) for group in contract.groups}
         self._empty = True
 
     def restart(self) -> None:
-        """Forget the past: the next observation fills the histories, as the first of an episode does in training."""
+        """Clear the histories; the next observation fills them, as the first one of an episode does in training."""
         self._empty = True
 
     def observe(self, reading: Reading, command: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """Return the observation (width,) float32, after `command` (vx, vy, yaw rate) and the policy's last `actions` (A,).
+        """Return the observation (width,) float32, with `command` (vx, vy, yaw rate) and the policy's last `actions` (A,).
 
         Raises:
-            KeyError: a source that the policy needs has given nothing.
+            KeyError: a source that the policy needs is missing.
         """
         contract = self._contract
         values = self._values(reading, command, actions)
@@ -49,7 +49,7 @@ class Observer:
         return np.concatenate([self._steps[group.name].ravel() for group in contract.groups]).astype(np.float32)
 
     def _values(self, reading: Reading, command: np.ndarray, actions: np.ndarray) -> Mapping[str, np.ndarray]:
-        """Return what follows from the sensors, the command and the memory, by term."""
+        """Return the terms that need no source, by name."""
         return {
             "base_ang_vel": reading.gyro,
             "projected_gravity": gravity_in(reading.quaternion),

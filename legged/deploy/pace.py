@@ -1,4 +1,4 @@
-"""A fixed rate: when cycles begin, how long they take, and which were late."""
+"""A fixed cycle rate, with statistics of durations, delays and missed deadlines."""
 
 import os
 import time
@@ -8,24 +8,24 @@ from dataclasses import dataclass
 import numpy as np
 
 PRIORITY = 20
-"""Of a process that must begin its cycles in time, among those that Linux runs first come, first served (1 to 99)."""
+"""Real-time priority of the process under Linux's SCHED_FIFO (1 to 99)."""
 
 
 def take_priority(priority: int = PRIORITY) -> bool:
-    """Ask Linux to run this process before all that are not in a hurry; return whether it may.
+    """Request a real-time priority from Linux; return whether it was granted.
 
-    A user needs the right for it: a line `NAME - rtprio 20` in /etc/security/limits.conf.
+    It requires a permission: a line `NAME - rtprio 20` in /etc/security/limits.conf.
     """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    except (AttributeError, OSError):  # another system, or no right
+    except (AttributeError, OSError):  # another system, or no permission
         return False
     return True
 
 
 @dataclass(frozen=True)
 class CycleTimes:
-    """What the cycles of a run took [s]."""
+    """Statistics of the cycles of a run [s]."""
 
     count: int
     mean: float
@@ -33,12 +33,12 @@ class CycleTimes:
     p99: float
     longest: float
     late_p99: float
-    """How late cycles began, of which 1 % were later [s]."""
+    """99th percentile of the delay with which cycles began [s]."""
     missed: int
-    """Cycles that did not begin or end in time: a cycle that takes two and a half of them has missed two deadlines."""
+    """Missed deadlines; a cycle that takes two and a half periods misses two."""
 
     def line(self) -> str:
-        """Say it in one line, in milliseconds."""
+        """Return the statistics as a line of text, in milliseconds."""
         times = ", ".join(
             f"{name} {1e3 * value:.2f}"
             for name, value in (("mean", self.mean), ("p50", self.p50), ("p99", self.p99), ("max", self.longest))
@@ -47,19 +47,19 @@ class CycleTimes:
 
 
 class Pace:
-    """Cycles that begin every `dt` after a first one, however long each of them takes."""
+    """A clock of cycles that begin every `dt` after the first one, regardless of their durations."""
 
     def __init__(
         self, dt: float, clock: Callable[[], float] = time.perf_counter, sleep: Callable[[float], object] = time.sleep
     ) -> None:
-        """Begin the first cycle with the first call of `wait`."""
+        """Prepare the clock; the first call of `wait` begins the first cycle."""
         self._dt, self._clock, self._sleep = dt, clock, sleep
         self._due: float | None = None
         self._began = 0.0
         self.took: list[float] = []
-        """From a cycle's begin to its end [s]."""
+        """Duration of each cycle [s]."""
         self.late: list[float] = []
-        """From when a cycle should have begun until it did [s]."""
+        """Delay of the beginning of each cycle [s]."""
         self.missed = 0
         self.missed_in_a_row = 0
 
@@ -76,8 +76,8 @@ class Pace:
         return now
 
     def done(self) -> None:
-        """End a cycle. One that ends after the next should have begun has missed its deadline, and those of all cycles that
-        are overdue by then, which are left out.
+        """End a cycle. If it ends after the next one was due, it has missed its deadline and those of all overdue cycles,
+        which are skipped.
         """
         assert self._due is not None
         now = self._clock()
@@ -92,7 +92,7 @@ class Pace:
         self._due += self._dt * overdue
 
     def times(self) -> CycleTimes:
-        """Return what the cycles so far have taken."""
+        """Return the statistics of the cycles so far."""
         took = np.array(self.took or [0.0])
         return CycleTimes(
             count=len(self.took),

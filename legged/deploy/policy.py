@@ -1,4 +1,4 @@
-"""An exported policy that acts: policy.onnx and its contract, for one robot."""
+"""An exported policy for one robot: policy.onnx and its contract."""
 
 import json
 from pathlib import Path
@@ -12,26 +12,26 @@ from legged.deploy.observations import Observer
 from legged.errors import ConfigError
 
 WARM_UP = 20
-"""Runs of the network before the first that counts: the first ones take ten times as long."""
+"""Runs of the network at the start, because the first ones take ten times as long."""
 COMPARED = (
     *("contract_version", "joint_names", "action_joints", "imu_frame", "control_dt", "observation", "observation_groups"),
     *("observation_clip", "default_joint_angles", "action_scale", "action_clip", "stiffness", "damping", "recurrent"),
 )
-"""What the ONNX file's own metadata must say as policy.json does."""
+"""Keys whose values in the ONNX file's metadata must equal those of policy.json."""
 
 
 class Network:
-    """A policy.onnx: observation -> actions, with the hidden state of a recurrent one."""
+    """A policy.onnx: observation -> actions; it keeps the hidden state of a recurrent policy."""
 
     def __init__(self, path: Path, contract: Contract) -> None:
         """Load the file.
 
         Raises:
-            ConfigError: it cannot be read, has other sizes than the contract says, or is of another export.
+            ConfigError: the file cannot be read, has other sizes than the contract, or comes from another export.
         """
         try:
             options = onnxruntime.SessionOptions()
-            options.intra_op_num_threads = options.inter_op_num_threads = 1  # too small to be shared out
+            options.intra_op_num_threads = options.inter_op_num_threads = 1  # too small for several threads
             options.log_severity_level = 3
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # its errors have no class in common
@@ -66,7 +66,7 @@ class Network:
                 raise ConfigError(f"{contract.path}: {key}: is not that of {self._path}: they are of different exports")
 
     def restart(self) -> None:
-        """Forget the past."""
+        """Clear the hidden state."""
         if self._memory is not None:
             shape = (self._memory.layers, 1, self._memory.width)
             self._hidden = {name: np.zeros(shape, dtype=np.float32) for name in self._memory.inputs}
@@ -82,10 +82,10 @@ class Policy:
     """A policy on one robot: readings and commands -> joint targets, once every `contract.control_dt`."""
 
     def __init__(self, folder: Path) -> None:
-        """Load the export in `folder`, or the one whose policy.onnx `folder` is.
+        """Load the export in `folder`, or of the policy.onnx that `folder` names.
 
         Raises:
-            ConfigError: it is none, or one that this program cannot run.
+            ConfigError: there is no export, or this program cannot run it.
         """
         path = folder if folder.suffix == ".onnx" else folder / "policy.onnx"
         for needed in (path, path.with_name("policy.json")):
@@ -95,27 +95,27 @@ class Policy:
         self._network = Network(path, self.contract)
         self._observer = Observer(self.contract)
         self.actions = np.zeros(len(self.contract.acted))
-        """(A,) the last output, within plus and minus action_clip."""
+        """(A,) last output, within plus and minus action_clip."""
         self.observation = np.zeros(self.contract.width, dtype=np.float32)
-        """(width,) what the last call saw."""
+        """(width,) observation of the last call."""
 
     def restart(self) -> None:
-        """Begin anew: no memory, no last action, no history."""
+        """Clear the hidden state, the last action and the history."""
         self._network.restart()
         self._observer.restart()
         self.actions = np.zeros(len(self.contract.acted))
 
     def act(self, reading: Reading, command: np.ndarray) -> np.ndarray:
-        """Return the angles (D,) that the joints are asked for [rad]; not finite where the network's output is not.
+        """Return the joint targets (D,) [rad]; they are not finite where the network's output is not.
 
         Raises:
-            KeyError: a source that the policy needs has given nothing.
+            KeyError: a source that the policy needs is missing.
         """
         contract = self.contract
         self.observation = self._observer.observe(reading, command, self.actions)
         given = self._network.run(self.observation).astype(float)
         actions = np.clip(given, -contract.action_clip, contract.action_clip)
-        self.actions = np.where(np.isfinite(given), actions, np.nan)  # clipping would make a number of an infinite one
+        self.actions = np.where(np.isfinite(given), actions, np.nan)  # clipping would make an infinite output finite
         targets = contract.default.copy()
         targets[contract.acted] += contract.action_scale * self.actions
         return targets

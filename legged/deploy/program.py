@@ -1,4 +1,4 @@
-"""The program: a cycle that reads, decides, writes and logs, at the rate of the policy."""
+"""The control loop: read, decide, write and log, at the rate of the policy."""
 
 import gc
 import time
@@ -17,23 +17,21 @@ from legged.deploy.safety import Limits, Watch, braking, clamp_targets
 from legged.deploy.states import MOVING, Event, State, next_state
 
 STANDS_WITHIN = 0.6
-"""A robot stands when no joint is further from the default pose [rad]; its weight makes some of that."""
+"""Largest deviation of a joint from the default pose of a standing robot, whose weight causes part of it [rad]."""
 THERE = 0.05
-"""A robot is in the default pose when no joint is further from it [rad]: it has nothing to fold, and nothing to wait for."""
+"""Largest deviation of a joint at which the robot counts as in the default pose and need not fold its legs [rad]."""
 FAR = 100.0
-"""Angles that are further from 0 are no measurements [rad]."""
+"""Larger joint angles are invalid measurements [rad]."""
 HALT_S = 1.0
-"""A robot that walks is asked to stand still for so long before it stands [s]: joints that stop at 1 m/s make it fall."""
+"""Time for which a walking robot gets the command zero before it stands, because stopping at 1 m/s would make it fall [s]."""
 RETURN_S = 0.3
-"""A robot that has walked, or is there already, reaches the default pose in so long [s]: on some of its legs, or on two, it
-would tip over.
-"""
+"""Time to reach the default pose from walking or from nearby; a slower robot would tip over [s]."""
 SETTLE_S = 1.0
-"""Joints are braked for so long before the program lets go of the robot [s]."""
+"""Time for which joints are braked before the program releases the robot [s]."""
 
 
 def along(path: Sequence[np.ndarray], share: float) -> np.ndarray:
-    """Return the pose (D,) at a share of a path of poses, all legs of which take the same time and begin and end at rest."""
+    """Return the pose (D,) at a share of a path of poses; all its segments take the same time and start and end at rest."""
     legs = len(path) - 1
     i = min(int(share * legs), legs - 1)
     part = min(1.0, share * legs - i)
@@ -43,7 +41,7 @@ def along(path: Sequence[np.ndarray], share: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended."""
+    """Result of a run."""
 
     cycles: CycleTimes
     stops: tuple[str, ...]
@@ -53,7 +51,7 @@ class Outcome:
 
 
 class Program:
-    """One policy on one robot, under one operator."""
+    """Control loop of one policy on one robot with one operator."""
 
     def __init__(
         self,
@@ -66,10 +64,10 @@ class Program:
         sleep: Callable[[float], object] = time.sleep,
         tell: Callable[[str], object] = print,
     ) -> None:
-        """Compare policy and robot, and begin idle. `stand_s` is what standing up takes [s]; `tell` hears what happens.
+        """Check that policy and robot fit, and start idle. Standing up takes `stand_s` [s]; `tell` receives status lines.
 
         Raises:
-            ConfigError: they do not fit.
+            ConfigError: policy and robot do not fit.
         """
         policy.contract.check_fits(robot.facts)
         self._policy, self._robot, self._operator = policy, robot, operator
@@ -84,21 +82,21 @@ class Program:
         self.stops: list[str] = []
         self._reading: Reading | None = None
         self._ticks = False
-        """Whether the robot's clock has been seen to go on."""
+        """The robot's clock has advanced between readings."""
         self._path, self._path_s = [contract.default], stand_s
         self._since = self._start = 0.0
         self._walked_s = 0.0
         self._halting_s: float | None = None
-        """Time for which a robot that is to stand has had no command [s]; None if it is not to."""
+        """Time since which a robot that is about to stand has had the command zero [s]; None if it is not about to."""
         nothing = np.zeros(len(contract.joint_names))
         self._asked = (nothing, nothing, nothing)
-        """Targets and gains that the robot has been told last."""
+        """Last targets and gains that were sent to the robot."""
 
     def run(self, seconds: float = np.inf) -> Outcome:
-        """Run until the operator quits, or for so long [s]; then brake, and let go of the robot."""
+        """Run until the operator quits or for some time [s]; then brake and release the robot."""
         collects = gc.isenabled()
         gc.freeze()
-        gc.disable()  # a collection would take longer than a cycle may
+        gc.disable()  # a garbage collection takes longer than a cycle
         try:
             self._robot.ask({name: term.points for name, term in self._contract.sources.items()})
             self._start = self._clock()
@@ -121,7 +119,7 @@ class Program:
         return Outcome(self._pace.times(), tuple(self.stops), self._walked_s)
 
     def _cycle(self, now: float) -> bool:
-        """Do what a cycle consists of; return whether the operator quits."""
+        """Run one cycle; return whether the operator quits."""
         self._read()
         orders = self._operator.poll(now - self._start)
         reason = self._watch.reason(self._reading, now, self._pace.missed_in_a_row)
@@ -146,8 +144,8 @@ class Program:
         return Event.QUIT in events
 
     def _read(self) -> None:
-        """Take what has come, and log it with what was asked for when it did. A reading with the time of the last one is the
-        same measurement, as old as that, however often it is sent. A stop that any of them asks for is asked for.
+        """Process and log the new readings. A reading with the time of the last one is the same measurement sent again, and
+        keeps its age. A stop request in any of them counts.
         """
         stops = False
         for reading in self._robot.read():
@@ -164,7 +162,7 @@ class Program:
             self._reading = replace(self._reading, stop=True)
 
     def _handle(self, event: Event, reason: str | None, now: float) -> None:
-        """Follow an event, or say why not."""
+        """Execute an event, or report why it is refused."""
         if event is Event.STOP:
             self._stop("operator: stop", now)
             return
@@ -189,7 +187,7 @@ class Program:
             self._enter(following, now)
 
     def _crooked(self) -> str | None:
-        """Return which joint is not where a robot that stands has it; None if all are."""
+        """Return a message about the joint that is furthest from a standing pose; None if all are close to it."""
         if self._reading is None:
             return "nothing has been read yet"
         away = np.abs(self._reading.positions - self._contract.default)
@@ -199,7 +197,7 @@ class Program:
         return f"it does not stand: {name} is {away.max():.2f} rad from its default angle (allowed: {STANDS_WITHIN:g})"
 
     def _stop(self, reason: str, now: float) -> None:
-        """Go to the state `stop`, and say why."""
+        """Enter the state `stop` and report the reason."""
         if self.state is not State.STOP:
             self.stops.append(reason)
             self._say(f"stop: {reason}", now)
@@ -208,8 +206,8 @@ class Program:
     def _enter(self, state: State, now: float) -> None:
         self._say(f"{self.state.value} -> {state.value}", now)
         if state is State.STAND and self._reading is not None:
-            # Legs that lie anyhow are folded first. One that has walked stands already, and what carries it is how far its
-            # targets are from its joints: they go on from where they were.
+            # A lying robot folds its legs first. A robot that walked already stands; the differences between targets and
+            # joint angles carry its weight, so the targets continue from their last values.
             damped, bent = self.state is State.DAMPING, self._contract.crouch
             first = self._reading.positions if damped else self._asked[0]
             lies = damped and np.abs(first - self._contract.default).max() > THERE
@@ -221,7 +219,7 @@ class Program:
             self._ramp.restart()
 
     def _decide(self, orders: Orders, now: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return targets, P gains and D gains (D,) for the state as it is."""
+        """Return targets, P gains and D gains (D,) for the present state."""
         contract, reading = self._contract, self._reading
         nothing = np.zeros(len(contract.joint_names))
         if self.state in MOVING and reading is not None:
@@ -237,7 +235,7 @@ class Program:
             clamped = clamp_targets(targets, reading.positions, reading.velocities, contract)
             return clamped, contract.stiffness, contract.damping
         positions = contract.default
-        if reading is not None:  # the P gain is 0, but 0 times what is no number is none
+        if reading is not None:  # the P gain is 0, but 0 times NaN is NaN
             positions = np.where(np.abs(reading.positions) < FAR, reading.positions, positions)
         return positions, nothing, nothing if self.state is State.IDLE else self._braking
 
@@ -261,7 +259,7 @@ class Program:
         )
 
     def _settle(self) -> None:
-        """Brake the joints of a robot that may stand, until it lies."""
+        """Brake the joints until a standing robot has sunk to the ground."""
         if self.state in (State.IDLE, State.STOP) and self._reading is None:
             return
         if self.state in MOVING:
@@ -274,7 +272,7 @@ class Program:
             self._pace.done()
 
     def _settle_blindly(self) -> None:
-        """Do the same after a failure, whatever fails: one command alone may get lost."""
+        """Send braking commands after a failure and ignore further failures; several, because one may get lost."""
         contract = self._contract
         for _ in range(int(np.ceil(SETTLE_S / contract.control_dt))):
             with suppress(Exception):

@@ -1,4 +1,4 @@
-"""What keeps a robot and those around it whole: limits of targets, and reasons to stop."""
+"""Safety: limits of targets, and reasons to stop the robot."""
 
 from dataclasses import dataclass
 
@@ -9,53 +9,53 @@ from legged.deploy.interface import Reading
 from legged.deploy.observations import gravity_in
 
 SLOWEST_FALL = 0.5
-"""Share of a joint's largest speed at which damping asks for its whole torque."""
+"""Share of a joint's largest speed at which braking needs its whole torque."""
 AT_ONCE = 2.0
-"""A joint that is so many times faster than it may be for an instant is too fast at once."""
+"""Factor on the allowed joint speed above which the robot is stopped at once."""
 MOST_DAMPING = 4.0
-"""Damping is at most so many times the policy's own D gain, which the motors are known to be stable with."""
+"""Largest factor on the policy's D gain, at which the motors are known to be stable, for braking."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """When to stop."""
+    """Limits beyond which the robot is stopped."""
 
     max_tilt: float = 1.0
     """Largest angle between the base's up axis and the vertical [rad]."""
     max_age_s: float = 0.05
-    """Age of the newest reading [s]."""
+    """Largest age of the newest reading [s]."""
     speed_share: float = 1.2
     """Largest joint speed, as a share of the contract's velocity limit."""
     fast_s: float = 0.04
-    """Time for which a joint may be faster than that: a foot that hits an edge makes it so for an instant [s]."""
+    """Time for which a joint may be faster, as when a foot hits an edge [s]."""
     beyond: float = 0.2
-    """How far beyond its position limits a joint may be [rad]."""
+    """Largest distance of a joint beyond its position limits [rad]."""
     max_missed: int = 5
-    """Deadlines missed in a row."""
+    """Number of missed deadlines in a row at which the robot is stopped."""
     max_temperature: float = 90.0
-    """Of a motor [degrees Celsius]."""
+    """Largest temperature of a motor [degrees Celsius]."""
 
 
 class Watch:
-    """Looks for reasons to stop."""
+    """Check of readings for reasons to stop."""
 
     def __init__(self, contract: Contract, limits: Limits) -> None:
-        """Watch a robot of `contract`."""
+        """Check the robot of `contract` against `limits`."""
         self._contract, self.limits = contract, limits
         self._fastest = limits.speed_share * contract.velocity_limits
         self._fast_s = np.zeros(len(self._fastest))
-        """Time for which each joint has been too fast, less a quarter of that for which it was not since [s]."""
+        """Time for which each joint was too fast, minus a quarter of the time for which it was not since [s]."""
         self._seen: float | None = None
 
     def see(self, reading: Reading) -> None:
-        """Take a reading, each one that comes: how long joints are too fast is counted from one to the next."""
+        """Update the times for which joints are too fast; called for every reading."""
         passed = 0.0 if self._seen is None else np.clip(reading.received - self._seen, 0.0, self.limits.max_age_s)
         self._seen = reading.received
         fast = np.abs(reading.velocities) > self._fastest
         self._fast_s = np.maximum(0.0, self._fast_s + np.where(fast, passed, -0.25 * passed))
 
     def reason(self, reading: Reading | None, now: float, missed: int) -> str | None:
-        """Return why the robot must stop, in one line; None if nothing is wrong.
+        """Return the reason to stop the robot in one line; None if there is none.
 
         `reading` is the newest one, `now` the time by `time.perf_counter` [s], `missed` the deadlines missed in a row.
         """
@@ -116,8 +116,8 @@ def clamp_targets(
     velocities: np.ndarray,
     contract: Contract,
 ) -> np.ndarray:
-    """Return targets (D,) within the position limits, and so near to the joints that |kp (target - q) - kd dq| stays within
-    the torque limits [rad]. Where both cannot be had, that of torques is kept.
+    """Return targets (D,) within the position limits for which |kp (target - q) - kd dq| is within the torque limits [rad].
+    Where both are not possible, the torque limits take precedence.
     """
     kp, kd, most = contract.stiffness, contract.damping, contract.torque_limits
     inside = np.clip(targets, *contract.position_limits.T)
@@ -127,7 +127,7 @@ def clamp_targets(
 
 
 def braking(contract: Contract) -> np.ndarray:
-    """Return the D gains (D,) that brake joints [N m s/rad]: the whole torque at half the largest speed, but no more than
-    four times the policy's own D gain.
+    """Return the D gains (D,) for braking [N m s/rad]: the whole torque at half the largest speed, but at most four times the
+    policy's D gain.
     """
     return np.minimum(contract.torque_limits / (SLOWEST_FALL * contract.velocity_limits), MOST_DAMPING * contract.damping)

@@ -1,10 +1,10 @@
-"""The states of the program and how one leads to another."""
+"""States of the program and the transitions between them."""
 
 from enum import Enum
 
 
 class State(Enum):
-    """What the robot is being asked for."""
+    """State of the program."""
 
     IDLE = "idle"
     """No torque."""
@@ -15,11 +15,11 @@ class State(Enum):
     WALK = "walk"
     """The policy acts."""
     STOP = "stop"
-    """Joints are braked because something is wrong; only the operator leads out of it."""
+    """Joints are braked after a fault; only the operator can leave this state."""
 
 
 class Event(Enum):
-    """What the operator asks for, or the watch."""
+    """Request of the operator or of the safety checks."""
 
     IDLE = "idle"
     DAMPING = "damping"
@@ -40,11 +40,11 @@ TRANSITIONS = {
     (State.STOP, Event.DAMPING): State.DAMPING,
     **{(state, Event.STOP): State.STOP for state in State},
 }
-"""(state, event) -> the next state; what is not here is refused."""
+"""(state, event) -> the next state; all other pairs are refused."""
 MOVING = (State.STAND, State.WALK)
-"""States in which the robot must be healthy."""
+"""States in which the safety checks can stop the robot."""
 
 
 def next_state(state: State, event: Event) -> State | None:
-    """Return the state that an event leads to; None if it leads nowhere from here."""
+    """Return the state after an event; None if the event is refused in this state."""
     return TRANSITIONS.get((state, event))

@@ -1,4 +1,4 @@
-"""A robot behind UDP: our simulator in another process, or a bridge to a robot's own computer."""
+"""A robot reached by UDP: the simulator in another process, or a bridge to a robot's computer."""
 
 import json
 import socket
@@ -28,27 +28,27 @@ from legged.deploy.udp_packets import (
 from legged.errors import ConfigError, RunError
 
 ANSWER_S = 10.0
-"""A robot must answer a greeting within so long [s]."""
+"""Time within which a robot must answer a greeting [s]."""
 ASK_EVERY_S = 0.1
 SO_TIMESTAMP = getattr(socket, "SO_TIMESTAMP", 29)
-"""Linux's socket option that tells when a packet came, by `time.time`, and the name of what it tells."""
+"""Linux's socket option for arrival times of packets, as `time.time`, and the name of that information."""
 MOMENT = struct.Struct("@ll")
 """Seconds and microseconds."""
 SET_S = 0.01
-"""This machine's time of day has been set, if it is so much further from its other clock than at the last look [s]."""
+"""Change of the difference between this machine's two clocks that shows that its time of day was set [s]."""
 SOURCE_AGE_S = 0.2
-"""A source that has been silent for so long gives nothing any more [s], by this machine's clock: a robot may have none."""
+"""Age at which the value of a source expires, by this machine's clock, since a robot may have none [s]."""
 
 
 class UdpRobot(Interface):
-    """A robot that speaks the packets of `udp_packets`."""
+    """A robot that uses the packets of `udp_packets`."""
 
     def __init__(self, address: str) -> None:
         """Greet the robot at `address`, "host:port".
 
         Raises:
-            ConfigError: that is no address.
-            RunError: nobody answers there.
+            ConfigError: the address is invalid.
+            RunError: no robot answers.
         """
         host, _, port = address.rpartition(":")
         if not host or not port.isdecimal() or not 0 < int(port) < 2**16:
@@ -78,21 +78,21 @@ class UdpRobot(Interface):
                 opened = open_packet(data)
                 if opened is None or opened[0] != FACTS:
                     continue
-                with suppress(ValueError, KeyError, TypeError, RecursionError):  # somebody else's
+                with suppress(ValueError, KeyError, TypeError, RecursionError):  # not from a robot
                     return facts_of_json(json.loads(opened[2]))
         self._socket.close()
         raise RunError(f"--robot: no robot answers at udp:{address} within {ANSWER_S:g} s")
 
     def _send(self, data: bytes) -> None:
-        """Send a packet; one that cannot be sent is lost, like any other that gets lost on its way."""
+        """Send a packet; a failure counts as a lost packet."""
         try:
             self._socket.send(data)
         except OSError:
             return
 
     def _received(self) -> list[tuple[bytes, float]]:
-        """Return the packets that have come, and when each did, by `time.perf_counter` [s]; now, where the time of day by
-        which they came has been set in between.
+        """Return the new packets with their times of arrival, as `time.perf_counter` [s]. If the time of day was set in
+        between, the present time replaces them.
         """
         found: list[tuple[bytes, float]] = []
         now, behind = time.perf_counter(), time.perf_counter() - time.time()
@@ -100,7 +100,7 @@ class UdpRobot(Interface):
         while True:
             try:
                 data, notes, _, _ = self._socket.recvmsg(LARGEST, socket.CMSG_SPACE(MOMENT.size))
-            except OSError:  # there is no more, or nobody listens there: the answer to what was sent
+            except OSError:  # no more packets, or the last one sent had no receiver
                 return found
             came = time.time()
             for level, kind, value in notes:
@@ -143,7 +143,7 @@ class UdpRobot(Interface):
                 )
             )
         if found and not self._asked <= found[-1].sources.keys():
-            self._send(self._greeting)  # it may have been lost
+            self._send(self._greeting)  # the first one may be lost
         return found
 
     def write(self, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:

@@ -1,8 +1,8 @@
-"""Packets between the program and a robot behind UDP: our simulator, or whatever speaks the same.
+"""Packets between the program and a robot reached by UDP.
 
-A packet is `HEADER` (magic, kind, sequence number) and a body, all little-endian. The program greets with the sources that it
-wants, and the robot answers with its facts, both as JSON; then the robot sends states to whoever greeted last, and the
-program sends commands. Later packets have larger sequence numbers, each side counting its own.
+A packet is `HEADER` (magic, kind, sequence number) and a body, all little-endian. The program sends a greeting with the
+sources that it needs, and the robot answers with its facts, both as JSON. Then the robot sends states to the last sender of a
+greeting, and the program sends commands. Each side numbers its packets in increasing order.
 """
 
 import json
@@ -19,17 +19,17 @@ HEADER = struct.Struct("<4sBxxxI")
 MAGIC = b"LGD1"
 HELLO, FACTS, STATE, COMMAND, BYE = range(1, 6)
 STATE_HEAD = struct.Struct("<dHHB")
-"""Of a state: time [s], D, flags, number of sources. Then float32 w, x, y, z, gyro (3), q (D), dq (D), torques (D), and of
-each source its name (length as a byte, ASCII) and its numbers (how many as uint16, float32)."""
+"""Head of a state: time [s], D, flags, number of sources. Float32 w, x, y, z, gyro (3), q (D), dq (D) and torques (D) follow,
+and for each source its name (length as a byte, ASCII) and its numbers (count as uint16, float32)."""
 COMMAND_HEAD = struct.Struct("<IH")
-"""Of a command: sequence number of the state that it answers, D. Then float32 targets, P gains and D gains (D each)."""
+"""Head of a command: sequence number of the answered state, D. Float32 targets, P gains and D gains (D each) follow."""
 LARGEST = 60_000
-"""Bytes of a packet at most."""
+"""Largest size of a packet [bytes]."""
 
 
 @dataclass(frozen=True)
 class RobotState:
-    """A state as it is sent."""
+    """Contents of a state packet."""
 
     time: float
     quaternion: np.ndarray
@@ -46,7 +46,7 @@ def packet(kind: int, sequence: int, body: bytes = b"") -> bytes:
 
 
 def open_packet(data: bytes) -> tuple[int, int, bytes] | None:
-    """Return kind, sequence number and body of a packet; None if it is none of ours."""
+    """Return kind, sequence number and body of a packet; None for other data."""
     if len(data) < HEADER.size:
         return None
     magic, kind, sequence = HEADER.unpack_from(data)
@@ -75,7 +75,7 @@ def facts_of_json(said: Mapping[str, Any]) -> RobotFacts:
     """Return the facts that `facts_as_json` wrote.
 
     Raises:
-        ValueError, KeyError, TypeError: these are none.
+        ValueError, KeyError, TypeError: the data are no facts.
     """
     count = len(said["joint_names"])
     limits = np.array([[np.nan if x is None else x for x in pair] for pair in said["position_limits"]], dtype=float).reshape(
@@ -110,7 +110,7 @@ def unpack_state(body: bytes) -> RobotState:
     """Return the state in a body.
 
     Raises:
-        ValueError: it is cut short, or longer than it says.
+        ValueError: the body is too short or too long.
     """
     try:
         time, count, _, sources = STATE_HEAD.unpack_from(body)
@@ -141,10 +141,10 @@ def pack_command(answers: int, positions: np.ndarray, stiffness: np.ndarray, dam
 
 
 def unpack_command(body: bytes) -> tuple[int, np.ndarray]:
-    """Return the sequence number of the state that a command answers, and (3, D): targets, P gains, D gains.
+    """Return the sequence number of the state that a command answers, and its targets, P gains and D gains (3, D).
 
     Raises:
-        ValueError: it is cut short, longer than it says, or not finite.
+        ValueError: the body is too short or too long, or its numbers are not finite.
     """
     if len(body) < COMMAND_HEAD.size:
         raise ValueError("it is cut short")

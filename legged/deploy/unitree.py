@@ -1,4 +1,4 @@
-"""A Go2 or a G1 behind Unitree's SDK 2, on the network or in a simulator of its own."""
+"""A Go2 or a G1 controlled by Unitree's SDK 2, on the network or in Unitree's simulator."""
 
 import threading
 import time
@@ -29,46 +29,46 @@ SWITCHER = "unitree_sdk2py.comm.motion_switcher.motion_switcher_client"
 SIMULATOR_DOMAIN = 1
 """DDS domain of Unitree's own simulator."""
 REPEAT_S = 0.005
-"""A command is sent again after so long: motors, and simulators more so, expect more than one in a control step [s]."""
+"""Interval at which a command is repeated; motors and simulators expect several per control step [s]."""
 HOLD_S = 0.1
-"""A program that has written nothing for so long is taken for dead, and joints are braked [s]."""
+"""Time without a new command after which the program counts as dead and joints are braked [s]."""
 FIRST_STATE_S = 5.0
-"""A robot must send its first state within so long [s]."""
+"""Time within which a robot must send its first state [s]."""
 RELEASE_S = 10.0
-"""A robot must have let go of its own walking within so long [s]."""
+"""Time within which a robot must leave its own controller [s]."""
 BRAKING = 2.0
-"""D gain of joints that are braked because the program is dead [N m s/rad]."""
+"""D gain of joints that are braked after the program died [N m s/rad]."""
 
 
 class Wire(Protocol):
-    """What carries Unitree's messages."""
+    """Transport of Unitree's messages."""
 
     def new_command(self) -> Any:
         """Return a LowCmd_ of the robot's kind, with zeros."""
 
     def listen(self, heard: Callable[[Any], None]) -> None:
-        """Call `heard` with every LowState_, in a thread of its own."""
+        """Call `heard` with every LowState_ from another thread."""
 
     def take_over(self) -> None:
-        """Make the robot leave its own controller, before the first command: two programs must never command one robot.
+        """Make the robot leave its own controller before the first command, since two programs must never command one robot.
 
         Raises:
-            RunError: it does not, or does not answer.
+            RunError: the robot keeps its controller or does not answer.
         """
 
     def send(self, command: Any) -> None:
         """Send a LowCmd_."""
 
     def close(self) -> None:
-        """Let go."""
+        """Release the connection."""
 
 
 class SdkWire:
-    """The messages by Unitree's own SDK (the extra `unitree-sdk2`)."""
+    """Transport by Unitree's SDK (the extra `unitree-sdk2`)."""
 
     def __init__(self, kind: UnitreeKind, network: str | None, domain: int) -> None:
-        """Join the network: `network` names its interface, eth0 for instance; a DDS domain of 0 is a robot, and
-        `SIMULATOR_DOMAIN` what Unitree's simulator takes.
+        """Join the network by the interface `network`, such as eth0. The DDS domain 0 is a robot's, `SIMULATOR_DOMAIN` that
+        of Unitree's simulator.
 
         Raises:
             ConfigError: the SDK is not installed, or cannot join the network.
@@ -77,7 +77,7 @@ class SdkWire:
             channel = import_module("unitree_sdk2py.core.channel")
             default = import_module("unitree_sdk2py.idl.default")
             messages = import_module(f"unitree_sdk2py.idl.{kind.package}.msg.dds_")
-            # A simulator has no controller of its own, and nobody to answer for one.
+            # A simulator has no controller to leave.
             self._switcher = None if domain == SIMULATOR_DOMAIN else import_module(SWITCHER)
         except ImportError as error:
             raise ConfigError(
@@ -86,7 +86,7 @@ class SdkWire:
             ) from error
         try:
             channel.ChannelFactoryInitialize(domain, network)
-        except Exception as error:  # the SDK's own has no class of its own
+        except Exception as error:  # the SDK raises plain exceptions
             raise ConfigError(f"--network: {network or 'none given'}: domain {domain} cannot be joined ({error})") from error
         self._new: Callable[[], Any] = getattr(default, f"{kind.package}_msg_dds__LowCmd_")
         self._publisher = channel.ChannelPublisher(COMMAND_TOPIC, messages.LowCmd_)
@@ -118,7 +118,7 @@ class SdkWire:
         raise RunError(f"--robot: the robot's own controller is still on after {RELEASE_S:g} s; leave it by hand")
 
     def send(self, command: Any) -> None:
-        if self._publisher.Write(command) is False:  # it raises nothing
+        if self._publisher.Write(command) is False:  # the SDK does not raise
             raise RunError("--robot: Unitree's SDK could not send a command")
 
     def close(self) -> None:
@@ -127,14 +127,14 @@ class SdkWire:
 
 
 class UnitreeRobot(Interface):
-    """A robot of Unitree's. A thread sends the newest command again and again, and brakes the joints if the program dies."""
+    """A Unitree robot. A thread repeats the newest command, and brakes the joints if the program dies."""
 
     def __init__(self, name: str, wire: Wire, repeat_s: float = REPEAT_S) -> None:
-        """Listen to the robot `name`, a key of `KINDS`, until its first state has come, and make it leave its own controller.
+        """Wait for the first state of the robot `name`, a key of `KINDS`, and make it leave its own controller.
 
         Raises:
-            ConfigError: it is one with fewer joints; it has kept its controller.
-            RunError: nothing is heard of it, or it does not let go.
+            ConfigError: the robot has fewer joints.
+            RunError: the robot sends no state, or keeps its controller.
         """
         self.kind = KINDS[name]
         self.facts = self.kind.facts
@@ -159,7 +159,7 @@ class UnitreeRobot(Interface):
         self._repeater.start()
 
     def _meet(self, name: str) -> None:
-        """Wait for the first state, look whether it is that of the robot `name`, and take over."""
+        """Wait for the first state, check that it is from the robot `name`, and take over."""
         if not self._first.wait(FIRST_STATE_S):
             raise RunError(
                 f"--robot: {name}: no state came within {FIRST_STATE_S:g} s; is it on, and --network the right one?"
@@ -169,10 +169,10 @@ class UnitreeRobot(Interface):
             raise ConfigError(f"--robot: g1: mode_machine is {self._mode_machine}: this robot has {lacks}, not 29 joints")
         self._wire.take_over()
         with self._lock:
-            del self._heard[:-1]  # what it told while it let go
+            del self._heard[:-1]  # states from before
 
     def _hear(self, state: Any) -> None:
-        """Take a LowState_."""
+        """Store the reading of a LowState_."""
         received = time.perf_counter()
         motors = [state.motor_state[place] for place in self._places]
         reading = Reading(
@@ -193,7 +193,7 @@ class UnitreeRobot(Interface):
         self._first.set()
 
     def ask(self, sources: Mapping[str, np.ndarray | None]) -> None:
-        """Do nothing: it has no sources, and a policy that needs one has been refused."""
+        """Do nothing: the robot has no sources, and policies that need one are refused."""
 
     def read(self) -> list[Reading]:
         with self._lock:
@@ -213,7 +213,7 @@ class UnitreeRobot(Interface):
         copy_into(self._record, self._command)
 
     def _repeat(self) -> None:
-        """Send the newest command until the robot is let go of; brake once it is too old."""
+        """Send the newest command until the robot is released; brake once the command is too old."""
         nothing = np.zeros(len(self._places))
         while not self._closing.wait(self._repeat_s):
             with self._lock:
@@ -222,7 +222,7 @@ class UnitreeRobot(Interface):
                 if not self._braked and time.perf_counter() - self._written > HOLD_S:
                     self._fill(nothing, nothing, np.full(len(self._places), BRAKING))
                     self._braked = True
-                with suppress(Exception):  # what a later one may cure; who writes hears of it
+                with suppress(Exception):  # a later command may succeed; `write` raises its own errors
                     self._wire.send(self._command)
 
     def close(self) -> None:

@@ -1,7 +1,7 @@
-"""Unitree's low-level messages: their layout, their check sum, and what a Go2 and a G1 want in them.
+"""Unitree's low-level messages: their layout, their checksum, and their values for a Go2 and a G1.
 
 Layouts are those of the message definitions (IDL) that Unitree publishes with its SDK 2, "unitree_go" for Go2 and
-"unitree_hg" for G1, as C lays them out. The check sum is CRC-32/MPEG-2 (polynomial 0x04C11DB7, start 0xFFFFFFFF, nothing
+"unitree_hg" for G1, in C's memory layout. The checksum is CRC-32/MPEG-2 (polynomial 0x04C11DB7, start 0xFFFFFFFF, nothing
 reflected, no final exclusive or) over all but the last of the message's 32-bit words, the highest byte of each word first.
 """
 
@@ -48,11 +48,11 @@ HG_COMMAND = np.dtype(
 )
 """LowCmd of unitree_hg, 1004 bytes."""
 NO_POSITION, NO_VELOCITY = 2.146e9, 16000.0
-"""Targets that tell a motor of Go2 to follow none."""
+"""Targets for motors of Go2 without position or velocity control."""
 ENABLED, DISABLED = 1, 0
 """Modes of a motor."""
 SERIES = 0
-"""`mode_pr` under which the ankles and the waist of G1 take pitch and roll, as joints of ours do, not their two motors'."""
+"""`mode_pr` with which the ankles and the waist of G1 take pitch and roll angles instead of those of their two motors."""
 OTHER_G1 = {
     1: "23 joints",
     3: "a locked waist",
@@ -60,29 +60,29 @@ OTHER_G1 = {
     6: "a locked waist",
     9: "no legs",
 }
-"""`mode_machine` of a G1 that has not all of the 29 joints -> what it has (the table beside Unitree's description of G1)."""
+"""`mode_machine` of a G1 without all 29 joints -> its joints (from the table of Unitree's description of G1)."""
 BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
-"""Byte -> the same with its bits the other way round."""
+"""Byte -> the byte with its bits in reverse order."""
 SELECT, L2, B = (2, 3), (2, 5), (3, 1)
 """Keys of the remote control: byte of `wireless_remote` and bit in it."""
 
 
 @dataclass(frozen=True)
 class UnitreeKind:
-    """A robot of Unitree's: its messages, its joints, and the motor of each."""
+    """A Unitree robot: its messages, its joints, and the motor of each joint."""
 
     facts: RobotFacts
     motors: tuple[int, ...]
-    """(D,) place of each joint in `motor_cmd` and `motor_state`."""
+    """(D,) index of each joint in `motor_cmd` and `motor_state`."""
     command: np.dtype
     package: str
     """Package of the messages in Unitree's SDK."""
 
 
 def crc(message: bytes) -> int:
-    """Return the check sum of a message, whose last four bytes are its place.
+    """Return the checksum of a message, which belongs into its last four bytes.
 
-    zlib computes the reflected kind of the same polynomial: bits go in and come out the other way round.
+    zlib computes the reflected CRC of the same polynomial, so the bits of input and output are reversed.
     """
     words = np.frombuffer(message, "<u4")[:-1].astype(">u4").tobytes()
     reflected = zlib.crc32(words.translate(BITS)) ^ 0xFFFFFFFF
@@ -90,9 +90,9 @@ def crc(message: bytes) -> int:
 
 
 def new_command(kind: UnitreeKind, mode_machine: int) -> np.ndarray:
-    """Return a command, a record (), in which every joint's motor is on and asked for nothing, and all others are off.
+    """Return a command, a record (), in which the joints' motors are on without torque and all others are off.
 
-    `mode_machine` is what G1 said of itself in its state; Go2 has none.
+    `mode_machine` is the value in G1's state; Go2 has none.
     """
     message = np.zeros((), kind.command)
     motors = message["motor_cmd"]
@@ -108,8 +108,8 @@ def new_command(kind: UnitreeKind, mode_machine: int) -> np.ndarray:
 def fill_command(
     message: np.ndarray, kind: UnitreeKind, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray
 ) -> None:
-    """Ask the joints for angles (D,) [rad] with these gains (D,) [N m/rad], [N m s/rad], at velocity 0 and without a torque
-    beside them, and set the check sum.
+    """Set the targets (D,) [rad] and gains (D,) [N m/rad], [N m s/rad] of the joints, zero velocity and feedforward torque,
+    and the checksum.
     """
     motors, places = message["motor_cmd"], list(kind.motors)
     motors["q"][places], motors["kp"][places], motors["kd"][places] = positions, stiffness, damping
@@ -118,7 +118,7 @@ def fill_command(
 
 
 def copy_into(message: np.ndarray, target: Any) -> None:
-    """Give an object of Unitree's SDK the numbers of a record."""
+    """Copy the numbers of a record to an object of Unitree's SDK."""
     for name in message.dtype.names or ():
         value = message[name]
         if value.dtype.names and value.shape:
@@ -133,7 +133,7 @@ def copy_into(message: np.ndarray, target: Any) -> None:
 
 
 def pressed(remote: Any, key: tuple[int, int]) -> bool:
-    """Return whether a key of the remote control is held, by the bytes of `wireless_remote`."""
+    """Return whether a key of the remote control is pressed, from the bytes of `wireless_remote`."""
     byte, bit = key
     return bool(int(remote[byte]) >> bit & 1)
 
@@ -172,7 +172,7 @@ _G1_ARM = {
 
 
 def _side(side: str, parts: dict[str, tuple[float, float, float, float]]) -> dict[str, tuple[float, float, float, float]]:
-    """Return the joints of one side; to the right, rolls of hips and shoulders have the other sense."""
+    """Return the joints of one side; on the right, rolls of hips and shoulders have the opposite sign."""
     return {
         f"{side}_{part}_joint": (-limits[1], -limits[0], *limits[2:])
         if side == "right" and part in ("hip_roll", "shoulder_roll")
@@ -189,7 +189,7 @@ _G1 = {
     **_side("right", _G1_ARM),
 }
 KINDS = {
-    # Motors of Go2 come leg by leg, front right, front left, rear right, rear left; joints of ours begin with the left.
+    # The motors of Go2 are ordered front right, front left, rear right, rear left; the joints begin with the left.
     "go2": UnitreeKind(_facts("go2", "base", _GO2), (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8), GO_COMMAND, "unitree_go"),
     "g1": UnitreeKind(_facts("g1", "pelvis", _G1), tuple(range(29)), HG_COMMAND, "unitree_hg"),
 }

@@ -1,16 +1,16 @@
-"""policy.weights: a network as plain numbers, for computers without onnxruntime. `cpp/legged_policy.hpp` reads the same.
+"""policy.weights: a network as plain numbers, for computers without onnxruntime; `cpp/legged_policy.hpp` reads it too.
 
 All little-endian. `MAGIC`, the number of layers (uint32), then layer by layer: kind, detail, inputs, outputs (uint32 each),
 and float32 numbers, matrices row by row:
 
 - `NORMALISE`: means and divisors (inputs each); x -> (x - mean) / divisor.
 - `LINEAR`: matrix (outputs, inputs) and bias (outputs).
-- `ACTIVATION`: none; `detail` is its place in `ACTIVATIONS`.
+- `ACTIVATION`: no numbers; `detail` is its index in `ACTIVATIONS`.
 - `LSTM`: matrices (4 outputs, inputs) and (4 outputs, outputs) and two biases (4 outputs); gates i, f, g, o.
 - `GRU`: the same with 3 in place of 4; gates r, z, n. Both are as in torch.nn.
-- `KEEP`: none; what comes in goes on, and is kept for the next `JOIN`.
-- `JOIN`: none; what was kept, and after it what comes in: outputs are as many as both together. With these two a policy is
-  given what an estimator has found beside its observations.
+- `KEEP`: no numbers; passes its inputs on and keeps them for the next `JOIN`.
+- `JOIN`: no numbers; the outputs are the kept inputs followed by its own inputs. With these two a policy receives the outputs
+  of an estimator in addition to its observations.
 """
 
 import itertools
@@ -61,14 +61,14 @@ class Layer:
     inputs: int
     outputs: int
     arrays: tuple[np.ndarray, ...]
-    """Its numbers, in the order of the file."""
+    """Arrays of numbers, in the order of the file."""
 
 
 def shapes(kind: int, inputs: int, outputs: int) -> list[tuple[int, ...]]:
     """Return the shapes of a layer's arrays.
 
     Raises:
-        ValueError: there is no such kind of layer.
+        ValueError: the kind of layer does not exist.
     """
     if kind == NORMALISE:
         return [(inputs,), (inputs,)]
@@ -95,7 +95,7 @@ def unpack(data: bytes) -> list[Layer]:
     """Return the layers of a file.
 
     Raises:
-        ValueError: it is none, is cut short, or has layers that make no network.
+        ValueError: the data are no such file, too short, or their layers do not form a network.
     """
     if data[: len(MAGIC)] != MAGIC:
         raise ValueError("is no policy.weights of an export")
@@ -122,10 +122,10 @@ def unpack(data: bytes) -> list[Layer]:
 
 
 def _check_chain(layers: list[Layer]) -> None:
-    """Look whether what one layer gives is what the next one takes.
+    """Check that the outputs of each layer fit the inputs of the next.
 
     Raises:
-        ValueError: it is not, or there is none, or one that nobody knows.
+        ValueError: they do not, there are no layers, or a layer is unknown.
     """
     if not layers:
         raise ValueError("has no layers")
@@ -147,13 +147,13 @@ def _check_chain(layers: list[Layer]) -> None:
 
 
 class NumpyNetwork:
-    """The network of such a file, in float64, for a batch of observations; a recurrent one remembers from call to call."""
+    """The network of such a file in float64 for a batch of observations; it keeps the hidden state between calls."""
 
     def __init__(self, data: bytes) -> None:
-        """Take the contents of a file.
+        """Load the contents of a file.
 
         Raises:
-            ValueError: as `unpack`.
+            ValueError: as in `unpack`.
         """
         self._layers = unpack(data)
         self._functions = list(ACTIVATIONS.values())
@@ -161,7 +161,7 @@ class NumpyNetwork:
         self._cells: dict[int, np.ndarray] = {}
 
     def restart(self, begins: np.ndarray | None = None) -> None:
-        """Forget the past, of those of the batch in `begins` (N,) bool, or of all."""
+        """Clear the hidden state of the rows in the mask `begins` (N,), or of all rows."""
         for states in (self._hidden, self._cells):
             for state in states.values():
                 state[slice(None) if begins is None else begins] = 0.0

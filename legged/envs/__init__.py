@@ -1,4 +1,4 @@
-"""Tasks: the MDPs."""
+"""Tasks: Markov decision processes on batched physics."""
 
 from legged.envs.base_task import BaseTask
 from legged.envs.legged_robot import LeggedRobot

@@ -1,4 +1,4 @@
-"""What callers give a task: actions of any kind, with or without gradients being recorded."""
+"""Actions from callers: any kind of numbers, with or without recorded gradients."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,18 +10,18 @@ from torch import Tensor
 
 @contextmanager
 def ordinary_tensors() -> Iterator[None]:
-    """Record no gradients, but make no inference tensors either, even if the caller does: what a term keeps of one step must
-    be writable in the next, whoever makes that.
+    """Run the block without recording gradients and without inference mode, even if the caller uses it. An inference tensor
+    that a term keeps from one step could not be written outside inference mode in a later step.
     """
     with torch.inference_mode(False), torch.no_grad():
         yield
 
 
 def as_actions(actions: Any, num_envs: int, num_actions: int) -> Tensor:
-    """Return the actions that a caller gave as a tensor (N, D) of real numbers.
+    """Return `actions` as a tensor (N, D) of real numbers.
 
     Raises:
-        ValueError: they are none.
+        ValueError: they are not real numbers, or have another shape.
     """
     wanted = f"actions: expected real numbers of shape (N, D) = ({num_envs}, {num_actions})"
     try:

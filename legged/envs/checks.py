@@ -1,4 +1,4 @@
-"""Settings that are right by themselves and do not fit each other, or not the robot."""
+"""Checks of settings that are valid by themselves but may not fit each other or the task class."""
 
 from collections.abc import Iterable, Mapping
 from itertools import pairwise
@@ -6,37 +6,39 @@ from typing import get_args
 
 from legged.config.networks import check_networks, learns_from_teacher
 from legged.config.schema import LeggedConfig, TaskConfig
-from legged.envs.overrides import check_overrides, check_terms
+from legged.envs.class_checks import check_overrides, check_terms
 from legged.envs.randomization_checks import check_observed, check_randomization
 from legged.errors import ConfigError, suggest
 from legged.mdp.mirror_images import MirrorKind
 from legged.physics.quantities import LAST_STEP, STAGES
 
 RESERVED = {"falls", "episode_length", "non_finite_worlds", "contact_overflows"}
-"""Metrics that every task logs."""
+"""Names of metrics that every task logs."""
 FOLLOWING = ("lin_vel_rmse", "ang_vel_rmse", "falls", "return")
-"""What evaluations during training find of robots that follow commands; the first is what matters most."""
+"""Figures of evaluations during training, for robots that follow commands. The first one chooses the best policy by
+default.
+"""
 RETURNING = ("return", "falls", "episode_length")
-"""What they find of others."""
+"""The same for other tasks."""
 MOST_IN_A_POOL = 2**31 - 1
-"""Contacts or constraint rows of all robots, which engines count in 32 bits."""
+"""Largest number of contacts, or of constraint rows, of all robots. Engines count them in 32 bits."""
 MOST_SAMPLES = 2**28
-"""Samples of an iteration."""
+"""Largest number of samples in an iteration."""
 MOST_WEIGHTS = 2**30
-"""Weights of a network; with gradients and the optimiser's moments 16 GB."""
+"""Largest number of weights in a layered network. With gradients and the optimiser's moments they take 16 GB."""
 
 
 def check_task(cls: type, cfg: TaskConfig) -> None:
-    """Look for what can be wrong with the configuration of a task of class `cls`, of whatever kind.
+    """Check the configuration of a task of class `cls`, for all that does not depend on a robot.
 
     Raises:
-        ConfigError: there is something.
+        ConfigError: a setting does not fit the class or another setting.
     """
     check_overrides(cls)
     check_terms(cls, cfg)
     if cfg.train.algorithm.symmetry and not hasattr(cls, "MIRRORED"):
         where = cfg.origins.where("train.algorithm.symmetry")
-        raise ConfigError(f"{where}: {cls.__name__} knows no left and right; false learns without mirror images")
+        raise ConfigError(f"{where}: {cls.__name__} has no left and right; false learns without mirror images")
     check_networks(cfg)
     for name in RESERVED & cls.terms("_metric_"):  # type: ignore[attr-defined]
         raise ConfigError(f"{cls.__name__}._metric_{name}: every task logs Metrics/{name} already; give it another name")
@@ -56,8 +58,8 @@ def check_task(cls: type, cfg: TaskConfig) -> None:
 
 
 def evaluated_figures(cls: type, cfg: TaskConfig) -> tuple[str, ...]:
-    """Return the names of what evaluations during training find of a task of class `cls`; by the first, if nobody says by
-    which, the best policy is kept. The task's own metrics are among them.
+    """Return the names of the figures of evaluations during training, for a task of class `cls`: the standard ones, then the
+    task's own metrics. The first one chooses the best policy, unless train.runner.best_by names another one.
     """
     first = FOLLOWING if isinstance(cfg, LeggedConfig) else RETURNING
     return *first, *sorted(cls.terms("_metric_") - {*first})  # type: ignore[attr-defined]
@@ -69,10 +71,11 @@ def lower_is_better(figure: str) -> bool:
 
 
 def check_evaluation(cls: type, cfg: TaskConfig) -> None:
-    """Look whether the evaluations during training find what the configuration asks of them.
+    """Check the settings of evaluations during training.
 
     Raises:
-        ConfigError: a figure is none of theirs, there are none, or they are over before the first step.
+        ConfigError: a named figure does not exist, a stop needs evaluations and there are none, or an evaluation is shorter
+            than a control step.
     """
     runner, figures = cfg.train.runner, evaluated_figures(cls, cfg)
     asked = {f"train.runner.stop_at.{name}": name for name in runner.stop_at}
@@ -93,10 +96,10 @@ def check_evaluation(cls: type, cfg: TaskConfig) -> None:
 
 
 def check_lengths(cfg: TaskConfig) -> None:
-    """Hold an episode against the control step, and mini-batches against the samples.
+    """Check that an episode has at least one control step, and a mini-batch at least one sample.
 
     Raises:
-        ConfigError: an episode has no step, or a mini-batch no sample.
+        ConfigError: an episode or a mini-batch is too short.
     """
     origins = cfg.origins
     if round(cfg.env.episode_length_s / cfg.dt) < 1:
@@ -113,10 +116,10 @@ def check_lengths(cfg: TaskConfig) -> None:
 
 
 def check_sizes(cfg: TaskConfig) -> None:
-    """Look whether what is allocated for all robots together can be numbered.
+    """Check that the sizes of allocations for all robots stay below MOST_IN_A_POOL, MOST_SAMPLES and MOST_WEIGHTS.
 
     Raises:
-        ConfigError: it can't.
+        ConfigError: a size is too large.
     """
     robots, steps = cfg.env.num_envs, cfg.train.runner.num_steps_per_env
     for field in ("nconmax", "njmax"):
@@ -144,10 +147,11 @@ def check_sizes(cfg: TaskConfig) -> None:
 
 
 def check_mirror_kinds(task: str, mirrored: Mapping[str, str], used: Iterable[str], where: str) -> None:
-    """Look whether every observation in use says how it is mirrored, in a way that there is; `task` is the name of the class.
+    """Check that every observation in `used` has a valid kind in `mirrored`, the table MIRRORED of the class `task`. `where`
+    is the beginning of error messages.
 
     Raises:
-        ConfigError: `where`, and which one does not.
+        ConfigError: an observation has no kind, or an unknown one.
     """
     otherwise = "false learns without mirror images"
     kinds = get_args(MirrorKind)

@@ -12,15 +12,15 @@ Function = Callable[[], Tensor]
 
 
 class ConcurrentTerms:
-    """Terms that are evaluated at the same time as `check_termination`, on several streams; on the CPU one after the other.
+    """Terms that run at the same time as `check_termination`, on several streams. On the CPU they run one after the other.
 
-    On a GPU a term is a few launches that wait for one another and not for arithmetic: one after the other, the rewards of a
-    quadruped take a tenth of a step; on parallel streams they take next to nothing.
+    A term is a few launches, which on a GPU mostly wait for each other. One after the other, the rewards of a quadruped take
+    a tenth of a step; on parallel streams they take next to no time.
     """
 
     def __init__(self, device: torch.device, streams: int, settled: Callable[[], Mapping[str, Tensor]]) -> None:
-        """Share the terms out among so many streams; without any, all run when they are called. `settled` returns by name the
-        tensors that are written meanwhile, which no term here may read.
+        """Create the `streams` that terms are distributed over. With 0 streams every term runs when it is called. `settled`
+        returns by name the tensors that are written at the same time; terms here must not read them.
         """
         self._branches = [Branch(device) for _ in range(streams)]
         self._functions: list[dict[str, Function]] = [{} for _ in range(streams)]
@@ -29,8 +29,9 @@ class ConcurrentTerms:
         self._checked = False
 
     def add(self, prefix: str, functions: Mapping[str, Function]) -> dict[str, Function]:
-        """Take the functions by term that have the mark `@concurrent`. Return functions by term that give the same values as
-        those given, in the same order: a value of `start` once, otherwise a new one.
+        """Add the functions with the mark `@concurrent` to the streams. Return replacements of all `functions`, in the same
+        order. A replacement returns the value computed by `start` at its first call after it, and computes a new one at other
+        calls.
         """
         if not self._branches:
             return dict(functions)
@@ -43,10 +44,11 @@ class ConcurrentTerms:
         return lambda: self._values.pop(term) if term in self._values else function()
 
     def start(self) -> None:
-        """Evaluate the terms as things are now, at the same time as what follows, up to `join`.
+        """Start the evaluation of all terms from the current state. It runs at the same time as the following code, up to
+        `join`.
 
         Raises:
-            TermError: at the first call, if a term reads what is settled meanwhile.
+            TermError: at the first call, if a term reads a tensor of `settled`.
         """
         for branch, functions in zip(self._branches, self._functions, strict=True):
             if functions:
@@ -57,7 +59,7 @@ class ConcurrentTerms:
         self._checked = True
 
     def _check(self, function: Function) -> Tensor:
-        """Return the value of a term that reads nothing of what is settled meanwhile."""
+        """Return the value of a term, and check that it reads no tensor of `settled`."""
         forbidden = ForbidReads(
             self._settled(),
             "which is not settled yet for a term with @concurrent: remove that mark, so that the term runs after"
@@ -69,7 +71,7 @@ class ConcurrentTerms:
         return value
 
     def join(self) -> None:
-        """Let what follows wait for the values."""
+        """Let the following code wait for the values of all terms."""
         for branch, functions in zip(self._branches, self._functions, strict=True):
             if functions:
                 branch.join()

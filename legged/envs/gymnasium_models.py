@@ -7,7 +7,7 @@ from legged.errors import ConfigError
 
 
 def gymnasium_model(name: str) -> Path:
-    """Return the MJCF file `name` of Gymnasium's MuJoCo environments; Gymnasium itself is not imported.
+    """Return the path of the MJCF file `name` among Gymnasium's MuJoCo environments. Gymnasium itself is not imported.
 
     Raises:
         ConfigError: this installation of gymnasium has no such file.

@@ -1,6 +1,6 @@
-"""A planar cheetah with two legs runs as fast as it can: Gymnasium's HalfCheetah-v5, term by term.
+"""HalfCheetah: a planar cheetah with two legs runs as fast as it can. The terms are those of Gymnasium's HalfCheetah-v5.
 
-Wawrzynski, "A cat-like robot real-time learning to run", 2009; the model is Gymnasium's half_cheetah.xml.
+Wawrzynski, "A cat-like robot real-time learning to run", 2009. The model is Gymnasium's half_cheetah.xml.
 """
 
 import torch
@@ -13,23 +13,24 @@ from legged.physics import ModelScene, Scene
 
 
 class HalfCheetah(BaseTask):
-    """Nine generalised positions: x [m], z [m] and pitch [rad] of the torso, then six joints [rad] with a motor each. Nothing
-    ends an episode but time.
+    """Planar cheetah with nine generalised positions: x [m], z [m] and pitch [rad] of the torso, then six joints [rad] with a
+    motor each. Episodes end by time only.
     """
 
     GYMNASIUM_ID = "HalfCheetah-v5"
-    """What Gymnasium calls the same task: same observations, actions and rewards."""
+    """Gymnasium's id of the same task, with the same observations, actions and rewards."""
     POSITION_NOISE, VELOCITY_NOISE = 0.1, 0.1
-    """An episode begins within this of the model's own positions (even) and of rest (normal)."""
+    """Noise of initial states: half width of the uniform noise on the positions of the reference pose [m, rad], and standard
+    deviation of the normal velocities [m/s, rad/s]."""
 
     def make_scene(self) -> Scene:
-        """Take Gymnasium's cheetah on its floor."""
+        """Return Gymnasium's cheetah on its floor."""
         return ModelScene(gymnasium_model("half_cheetah.xml"))
 
     def _init_buffers(self) -> None:
         super()._init_buffers()
         self.last_x = torch.zeros(self.num_envs, device=self.device)
-        """(N,) x of the torso a control step before [m]."""
+        """(N,) x of the torso at the end of the last control step [m]."""
 
     def draw_reset(self) -> None:
         self.reset_qpos.uniform_(-self.POSITION_NOISE, self.POSITION_NOISE).add_(self.qpos0)
@@ -62,7 +63,7 @@ class HalfCheetah(BaseTask):
     @concurrent
     @unit("1")
     def _reward_control(self) -> Tensor:
-        """Squared actions."""
+        """Sum of squared actions."""
         return self.actions.square().sum(dim=1)
 
     @concurrent

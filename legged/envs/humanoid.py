@@ -1,7 +1,7 @@
-"""A humanoid runs as fast as it can, with the observations and rewards of the tutorial that came with MuJoCo XLA.
+"""Humanoid: a humanoid runs as fast as it can, with the observations and rewards of the tutorial of MuJoCo XLA.
 
 The task goes back to Tassa, Erez and Todorov, "Synthesis and stabilization of complex behaviors through online trajectory
-optimization", 2012; the model is Gymnasium's humanoid.xml.
+optimization", 2012. The model is Gymnasium's humanoid.xml.
 """
 
 from dataclasses import dataclass, field
@@ -18,36 +18,36 @@ from legged.envs.marks import concurrent, unit
 from legged.physics import ModelScene, Scene
 
 TORSO = 1
-"""Number of the floating body."""
+"""Index of the floating body."""
 
 
 @dataclass(frozen=True)
 class HumanoidConfig(TaskConfig):
-    """What the humanoid's task has beside every task's sections."""
+    """Configuration of the humanoid's task: the sections of every task, and two settings."""
 
     healthy_z: Range = field(default=(1.0, 1.5), metadata=quantity("m", between(0, 10)))
-    """Heights of the torso between which the humanoid counts as on its feet [m]."""
+    """Lowest and highest torso height at which the humanoid counts as on its feet [m]."""
     reset_noise: float = field(default=0.01, metadata=quantity("m, rad, m/s, rad/s", between(0, 1)))
-    """An episode begins within this of the model's own positions and of rest [m, rad, m/s, rad/s]."""
+    """Half width of the uniform noise on the positions and velocities of initial states [m, rad, m/s, rad/s]."""
 
 
 class Humanoid(BaseTask):
-    """A floating torso with 17 motors on 17 joints; 13 bodies, 23 degrees of freedom."""
+    """Humanoid with a floating torso and 17 motors on 17 joints; 13 bodies, 23 degrees of freedom."""
 
     Config: ClassVar[type[TaskConfig]] = HumanoidConfig
     cfg: HumanoidConfig
     QUANTITIES = ("subtree_com", "cinert", "cvel", "qfrc_actuator")
 
     def make_scene(self) -> Scene:
-        """Take Gymnasium's humanoid on its floor."""
+        """Return Gymnasium's humanoid on its floor."""
         return ModelScene(gymnasium_model("humanoid.xml"))
 
     def _init_buffers(self) -> None:
         super()._init_buffers()
         self.com = self.physics.quantity("subtree_com")[:, TORSO]
-        """(N, 3) centre of mass [m]."""
+        """(N, 3) centre of mass, world frame [m]."""
         self.com_velocity = torch.zeros(self.num_envs, 3, device=self.device)
-        """(N, 3) mean velocity of the centre of mass over the control step [m/s]."""
+        """(N, 3) mean velocity of the centre of mass over the control step, world frame [m/s]."""
         self.last_com = torch.zeros_like(self.com_velocity)
         self.cinert, self.cvel, self.qfrc_actuator = (self.physics.quantity(name) for name in self.QUANTITIES[1:])
 
@@ -65,7 +65,7 @@ class Humanoid(BaseTask):
         self.last_com.copy_(self.com)
 
     def healthy(self) -> Tensor:
-        """Return which humanoids are on their feet, (N,)."""
+        """Return a mask (N,) of the humanoids that are on their feet."""
         low, high = self.cfg.healthy_z
         height = self.physics.qpos[:, 2]
         return (height >= low) & (height <= high)
@@ -104,36 +104,36 @@ class Humanoid(BaseTask):
     @concurrent
     @unit("1")
     def _reward_alive(self) -> Tensor:
-        """Being on its feet."""
+        """Standing: 1 while the torso is at a healthy height, else 0."""
         return self.healthy().float()
 
     @concurrent
     @unit("1")
     def _reward_quadctrl(self) -> Tensor:
-        """Squared actions."""
+        """Sum of squared actions."""
         return self.actions.square().sum(dim=1)
 
     @concurrent
     def _terminate_unhealthy(self) -> Tensor:
-        """The torso is too low or too high."""
+        """Torso too low or too high."""
         return ~self.healthy()
 
     @concurrent
     @unit("m")
     def _metric_x_position(self) -> Tensor:
-        """How far forward of where it began the centre of mass is [m]."""
+        """Forward position of the centre of mass [m]."""
         return self.com[:, 0]
 
     @concurrent
     @unit("m")
     def _metric_y_position(self) -> Tensor:
-        """And how far to the left [m]."""
+        """Leftward position of the centre of mass [m]."""
         return self.com[:, 1]
 
     @concurrent
     @unit("m")
     def _metric_distance_from_origin(self) -> Tensor:
-        """How far from where it began the centre of mass is [m]."""
+        """Distance of the centre of mass from the world's origin [m]."""
         return self.com.norm(dim=1)
 
     @concurrent

@@ -1,4 +1,4 @@
-"""How a task judges a step: its rewards, its metrics, and the record of both."""
+"""Rewards, terminations and metrics of a task, and their record."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,21 +9,22 @@ from torch import Tensor
 from legged.config.schema import TaskConfig
 from legged.envs.concurrent_terms import ConcurrentTerms
 from legged.envs.marks import concurrent, is_concurrent
-from legged.mdp.faults import Faults
 from legged.mdp.metrics import Metrics
+from legged.mdp.nan_guard import NanGuard
 from legged.mdp.rewards import Rewards
 from legged.mdp.terminations import Terminations
 from legged.physics import Physics
 
 REWARD_STREAMS = 5
-"""Streams among which rewards are shared out: with so many, the rewards of an ANYmal take an H100 49 us instead of 90, and
-`check_termination` at the same time takes 34."""
+"""Number of streams that concurrent rewards are distributed over. With 5, the rewards of an ANYmal take an H100 49 us instead
+of 90; `check_termination`, which runs at the same time, takes 34 us.
+"""
 SETTLED = ("valid", "terminated_buf", "time_out_buf", "reset_buf", "rew_buf")
 """Tensors that `check_termination` and `compute_reward` write."""
 
 
 class JudgingTask:
-    """The part of a task that says what a step was worth."""
+    """Mixin of BaseTask with its rewards, terminations and metrics."""
 
     cfg: TaskConfig
     num_envs: int
@@ -37,7 +38,7 @@ class JudgingTask:
     time_out_buf: Tensor
     reset_buf: Tensor
     episode_length_buf: Tensor
-    faults: Faults
+    nan_guard: NanGuard
     check_termination: Callable[[], None]
     active_terminations: Callable[[], tuple[list[str], list[str]]]
     terms: Callable[[str], set[str]]
@@ -46,9 +47,9 @@ class JudgingTask:
     _clipped_actions: Tensor
 
     def _collect_judgements(self) -> None:
-        """Find the terminations, rewards and metrics that the configuration names."""
+        """Collect the terminations, rewards and metrics that the configuration names."""
         cfg = self.cfg.rewards
-        # An override of one of these may write what terms read.
+        # An override of one of these hooks may write tensors that terms read.
         hooks = (self.check_termination, self.measure, self.compute_reward)
         streams = (1, REWARD_STREAMS, 1) if all(is_concurrent(hook) for hook in hooks) else (0, 0, 0)
         self._concurrent_terminations, self._concurrent_rewards, self._concurrent_metrics = (
@@ -71,34 +72,36 @@ class JudgingTask:
         self.metrics = Metrics(metrics, *parts, full, self.num_envs, self.device)
 
     def _settled(self) -> dict[str, Tensor]:
-        """Return the tensors that are written after `_start_terms`, by name: this step's values are not there before."""
+        """Return by name the tensors that are written after `_start_terms`. Before, they hold values of the last step."""
         named = {name: getattr(self, name) for name in SETTLED}
         found = zip(self.terminations.names, self.terminations.found, strict=True)
         return named | {f"terminations.found of '{name}'": tensor for name, tensor in found}
 
     def _start_terms(self) -> None:
-        """Evaluate terms with the mark `@concurrent`, at the same time as `check_termination`."""
+        """Start the terms with the mark `@concurrent`. They run at the same time as `check_termination`."""
         self._concurrent_terminations.start()
         self._concurrent_rewards.start()
         self._concurrent_metrics.start()
 
     @concurrent
     def measure(self) -> None:
-        """Take in metrics of the step. Runs beside the rewards."""
+        """Hook: add the step to the metrics. Runs at the same time as the rewards."""
         self._concurrent_metrics.join()
         self.metrics.add_step(self.valid, self.physics.overflowed, self.terminations.found)
 
     @concurrent
     def compute_reward(self) -> None:
-        """Judge the step, before anything is reset."""
+        """Hook: compute the reward of the step, before anything is reset."""
         self._concurrent_rewards.join()
         self.rewards.compute(self.valid)
 
     def _record(self) -> None:
-        """Take in the episodes that end. Runs beside the curricula."""
+        """Add the episodes that end to the metrics. Runs at the same time as the curricula."""
         self.metrics.add_episodes(self.reset_buf, self.terminated_buf, self.episode_length_buf, self.rewards.sums)
 
     def _look_for_faults(self) -> None:
-        """Find out which states, actions and rewards are no numbers. Runs beside all that comes before `observe`."""
-        self.faults.check_state(self._in_bounds, self._clipped_actions)
-        self.faults.check_rewards(self.rewards.fine, self.valid)
+        """Record non-finite states, actions and rewards. Runs at the same time as the hooks from `update_curricula` to
+        `disturb`.
+        """
+        self.nan_guard.check_state(self._in_bounds, self._clipped_actions)
+        self.nan_guard.check_rewards(self.rewards.terms_finite, self.valid)

@@ -1,4 +1,4 @@
-"""Settings of a legged robot's task that are right by themselves and do not fit each other, or not the robot."""
+"""Checks of a legged robot's settings that are valid by themselves but may not fit each other or the robot."""
 
 from typing import Any
 
@@ -17,14 +17,14 @@ from legged.robots.robot import Robot
 from legged.terrain import check_terrain
 
 MOST_POINTS = 10_000
-"""Heights measured around a robot."""
+"""Largest number of points in the height scan."""
 
 
 def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
-    """Look for what can be wrong with the configuration of a task of class `cls` beside what every task's can be.
+    """Check the configuration of a legged robot's task of class `cls`, in addition to `check_task`.
 
     Raises:
-        ConfigError: there is something.
+        ConfigError: a setting does not fit the robot or another setting.
     """
     if cfg.train.algorithm.symmetry:
         check_symmetry(cls, cfg, robot)
@@ -44,21 +44,21 @@ def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
 
 
 def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
-    """Look whether robot, default pose, actions, observations and height scan have a mirror image.
+    """Check that robot, default pose, actions, observations and height scan have a mirror image.
 
     Raises:
-        ConfigError: one of them has none.
+        ConfigError: one of them has no mirror image.
     """
     origins = cfg.origins
     where, otherwise = origins.where("train.algorithm.symmetry"), "false learns without mirror images"
     if robot.mirror is None:
         raise ConfigError(f"{where}: '{robot.name}' is lopsided (joints and feet at zero angles); {otherwise}")
     uneven = robot.mirror.uneven_joint(robot.default_dof_pos)
-    if uneven is not None:  # `dof_pos` and actions count from there
+    if uneven is not None:  # `dof_pos` and actions are relative to the default pose
         partner = robot.mirror.joints[uneven]
         angles = ", ".join(f"{robot.joint_names[i]} {robot.default_dof_pos[i]:g} rad" for i in sorted({uneven, partner}))
         raise ConfigError(
-            f"{where}: the default_joint_angles of '{robot.name}' are no mirror image of themselves ({angles}); {otherwise}"
+            f"{where}: the default_joint_angles of '{robot.name}' are not the same left and right ({angles}); {otherwise}"
         )
     acted = acted_joints(robot, cfg.control, origins.where)
     image = mirror_of_actions(robot.mirror, acted)
@@ -83,11 +83,13 @@ def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
 
 
 def check_mirrored_draw(cfg: LeggedConfig, robot: Robot, name: str) -> None:
-    """Look whether a randomised property that is observed has as many numbers as its mirror image: those of bodies and shapes
-    are in no pairs, those of passive joints neither, and an offset that is one for all joints is none for a mirrored robot.
+    """Check that a randomised property which is observed has a mirror image.
+
+    Numbers for each body, shape or passive joint have none, because those are not paired left and right. One offset for all
+    joints has none either, because mirrored joints have offsets of either sign.
 
     Raises:
-        ConfigError: it has not.
+        ConfigError: it has no mirror image.
     """
     draw, kind = observed(cfg, name), MIRROR_KINDS[f"{PREFIX}{name}"]
     if draw is None:
@@ -106,10 +108,10 @@ def check_mirrored_draw(cfg: LeggedConfig, robot: Robot, name: str) -> None:
 
 
 def check_passive(cfg: LeggedConfig, robot: Robot) -> None:
-    """Look whether observations of passive joints are of a robot that has some.
+    """Check that passive joints are observed only of a robot that has them.
 
     Raises:
-        ConfigError: it has none.
+        ConfigError: the robot has no passive joints.
     """
     names = ("passive_pos", "passive_vel")
     for group, terms in ((name, group.terms) for name, group in groups_in(cfg).items()):
@@ -120,10 +122,10 @@ def check_passive(cfg: LeggedConfig, robot: Robot) -> None:
 
 
 def check_base_mass(cfg: LeggedConfig, robot: Robot) -> None:
-    """Look whether the lightest base that may be drawn has a mass.
+    """Check that the lightest base that can be drawn has a positive mass.
 
     Raises:
-        ConfigError: it has none.
+        ConfigError: its mass is zero or negative.
     """
     lowest = cfg.domain_rand.added_mass_range[0]
     if cfg.domain_rand.randomize_base_mass and robot.base_mass + lowest <= 0.0:
@@ -135,10 +137,10 @@ def check_base_mass(cfg: LeggedConfig, robot: Robot) -> None:
 
 
 def check_points(cfg: LeggedConfig) -> None:
-    """Look whether the height scan is of a size that fits memory.
+    """Check that the height scan has at most MOST_POINTS points, so that it fits memory.
 
     Raises:
-        ConfigError: it is not.
+        ConfigError: it has more points.
     """
     points = len(cfg.terrain.measured_points_x) * len(cfg.terrain.measured_points_y)
     if points > MOST_POINTS:
@@ -149,10 +151,10 @@ def check_points(cfg: LeggedConfig) -> None:
 
 
 def check_grid(cfg: LeggedConfig) -> None:
-    """Look whether the axes of the command grid that policies are judged on go from low to high in steps.
+    """Check that the axes of the command grid of evaluations go from low to high in positive steps.
 
     Raises:
-        ConfigError: one of them does not.
+        ConfigError: an axis does not.
     """
     for axis in ("vx", "vy", "yaw"):
         low, high, step = getattr(cfg.evaluation, axis)

@@ -1,6 +1,7 @@
-"""Names under which environment classes of legged_gym and its forks know what a task here calls otherwise, or has not.
+"""Attributes of legged_gym's environment classes and of its forks, for tasks here: other names of tensors, values computed on
+reading, and hints for attributes that do not exist.
 
-They cost nothing until they are read. What a fork's class sets itself takes their place, as any attribute does.
+They cost nothing until they are read. An attribute that a class sets itself has precedence.
 """
 
 import difflib
@@ -14,20 +15,20 @@ from torch import Tensor
 from legged.math import get_euler_xyz, masked_set_, quat_rotate
 
 FORWARD, DOWN, LEVEL = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 0.0, 0.0, 1.0)
-"""The x axis, the direction of gravity, and the orientation (x, y, z, w) that turns nothing."""
+"""Unit vectors of the x axis and of gravity, and the identity orientation (x, y, z, w)."""
 IN_PLACE = {f"__i{name}__" for name in ("add", "sub", "mul", "truediv", "floordiv", "mod", "pow", "and", "or", "xor")}
 
 
 class ReadOnly(Tensor):
-    """A tensor that is computed when it is read, so that writing into it, or into a part of it, would be lost: an error says
-    what is written instead. What is computed from it are ordinary tensors.
+    """Tensor that is computed on reading, so that writing into it or into a view of it would have no effect. An attempt to
+    write raises an AttributeError with an alternative. Results computed from it are ordinary tensors.
     """
 
     instead: str = ""
 
     @classmethod
     def of(cls, tensor: Tensor, instead: str) -> "ReadOnly":
-        """Return the same numbers; an attempt to write says `instead`."""
+        """Return a read-only view of `tensor`. An attempt to write raises an AttributeError with the text `instead`."""
         result = tensor.as_subclass(cls)
         result.instead = instead
         return result
@@ -49,24 +50,24 @@ class ReadOnly(Tensor):
 
 
 def _share(one: Tensor, other: Tensor) -> bool:
-    """Return whether two tensors have the same memory."""
+    """Return whether two tensors share memory."""
     strided = one.layout is other.layout is torch.strided
     return strided and one.untyped_storage()._cdata == other.untyped_storage()._cdata
 
 
 def _root_states(task: Any) -> Tensor:
-    """Return (N, 13) in Isaac Gym's layout."""
+    """Return the states of the bases (N, 13) in Isaac Gym's layout."""
     quat = task.base_quat
     velocity = quat_rotate(quat, task.base_lin_vel)
     return torch.cat([task.base_pos, quat[:, 1:], quat[:, :1], velocity, quat_rotate(quat, task.base_ang_vel)], dim=1)
 
 
 def _of_terrain(get: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return what reads the terrain's curriculum, where there is a terrain."""
+    """Return `get`, made to raise an AttributeError if the task has no terrain."""
 
     def read(task: Any) -> Any:
         if task.terrain_curriculum is None:
-            raise AttributeError("the ground is a plane (terrain.mesh_type), which has no tiles")
+            raise AttributeError("the ground is a plane (terrain.mesh_type) and has no tiles")
         return get(task)
 
     return read
@@ -93,8 +94,8 @@ def _obs_scales(task: Any) -> SimpleNamespace:
 
 
 def _noise_scale_vec(task: Any) -> Tensor:
-    sensors, noisy = task.observation_terms.sensors, task.cfg.observations.groups["actor"].noise
-    measured = sensors.noise if sensors is not None and noisy else {}  # sensors add the noise of what they measure
+    sensors, noisy = task.observation_terms.errors, task.cfg.observations.groups["actor"].noise
+    measured = sensors.noise if sensors is not None and noisy else {}  # noise that is added with the other errors
     return torch.cat([term.scale * measured.get(term.name, term.noise) for term in task.observation_groups["actor"].terms])
 
 
@@ -137,7 +138,7 @@ PLAIN: dict[str, Callable[[Any], Any]] = {
     "terrain_levels": _of_terrain(lambda task: task.terrain_curriculum.levels),
     "terrain_types": _of_terrain(lambda task: task.terrain_curriculum.columns),
 }
-"""Name -> what the task has under another one: numbers, texts, and tensors at their own addresses."""
+"""Name -> value that the task has under another name: numbers, texts, and tensors at their own addresses."""
 
 COMPUTED: dict[str, tuple[Callable[[Any], Tensor], str]] = {
     "root_states": (_root_states, "a state is put in place in reset_idx(mask), by self.physics.write(mask, qpos, qvel)"),
@@ -152,7 +153,7 @@ COMPUTED: dict[str, tuple[Callable[[Any], Tensor], str]] = {
     ),
     "joint_pos_target": (_joint_pos_target, "self.control makes it of the actions"),
 }
-"""Name -> what is computed whenever it is read, and what is said to who writes into it."""
+"""Name -> function that computes its value at each reading, and the hint in the error if a user writes into it."""
 
 CONSTANT: dict[str, Callable[[Any], Tensor]] = {
     "gravity_vec": lambda task: torch.tensor([DOWN], device=task.device).repeat(task.num_envs, 1),
@@ -165,7 +166,7 @@ CONSTANT: dict[str, Callable[[Any], Tensor]] = {
     "height_points": lambda task: torch.nn.functional.pad(task.height_scan.points, (0, 1)).repeat(task.num_envs, 1, 1),
     "terrain_origins": _of_terrain(lambda task: torch.tensor(task.terrain.origins, dtype=torch.float32, device=task.device)),
 }
-"""Name -> what is made once, when it is first read."""
+"""Name -> constant that is made at the first reading."""
 
 KEPT: dict[str, Callable[[Any], Tensor]] = {
     "last_root_vel": lambda task: _root_states(task)[:, 7:],
@@ -174,10 +175,10 @@ KEPT: dict[str, Callable[[Any], Tensor]] = {
     "last_dof_pos": lambda task: task.dof_pos,
     "last_last_actions": lambda task: task.last_actions,
 }
-"""Name -> what is kept of each step for the next one, from the first time on that it is read."""
+"""Name -> value of the last step, which is stored in every step from the first reading on."""
 
-_COUNT = "count in a tensor of your own, made in _init_buffers() and added to in place in advance()"
-_GYM = "there is no Isaac Gym: self.physics makes the steps, and the hooks of _step() are what a class overrides"
+_COUNT = "count in your own tensor: allocate it in _init_buffers() and add to it in place in advance()"
+_GYM = "there is no Isaac Gym: self.physics makes the steps, and a class overrides the hooks of _step()"
 _INDICES = (
     "torch.tensor([i for i, name in enumerate(self.dof_names) if 'hip' in name], device=self.device) in _init_buffers()"
 )
@@ -185,13 +186,13 @@ _BODIES = (
     "self.feet_pos and self.feet_vel (N, F, 3) have the feet; QUANTITIES = ('xpos', 'xquat', 'cvel') asks for all bodies"
 )
 _ANGLES = "self.rpy (N, 3) has roll, pitch and yaw, each in [-pi, pi]"
-_HISTORY = "observations.groups.<group>.history in the YAML says how many steps a group holds"
+_HISTORY = "observations.groups.<group>.history in the YAML is the number of steps that a group holds"
 _PICTURES = "nothing is drawn while training; play.py makes pictures (legged/rendering)"
 
 
 def _drawn(name: str) -> str:
-    """Say where what is drawn for each robot is."""
-    return f"self.randomization.fields['{name}'] is what domain_rand.ranges.{name} draws (docs/randomisation.md)"
+    """Return the hint at a randomised property."""
+    return f"self.randomization.fields['{name}'] has the values that domain_rand.ranges.{name} draws (docs/randomisation.md)"
 
 
 ABSENT = {
@@ -202,7 +203,7 @@ ABSENT = {
     "envs": _GYM,
     "actor_handles": _GYM,
     "sim_params": "self.cfg.sim.dt is the physics step, self.dt the control step",
-    "extras": "what is logged beside the rewards is a method _metric_<name>; step() returns extras of its own",
+    "extras": "write a method _metric_<name> for each figure to be logged; step() returns its own extras",
     "rigid_body_states": _BODIES,
     "rigid_body_state": _BODIES,
     "rigid_body_pos": _BODIES,
@@ -219,7 +220,7 @@ ABSENT = {
     "pitch": _ANGLES,
     "yaw": _ANGLES,
     "base_euler_xyz": _ANGLES,
-    "first_contact": "self.contacts.first_contact (N, F) says which feet touch down at this step",
+    "first_contact": "self.contacts.first_contact (N, F) is True for the feet that touch down at this step",
     "obs_history": _HISTORY,
     "obs_history_buf": _HISTORY,
     "env_frictions": _drawn("friction"),
@@ -236,28 +237,29 @@ ABSENT = {
     "Kd_factors": _drawn("d_gain"),
     "headless": _PICTURES,
     "debug_viz": _PICTURES,
-    "init_done": "_init_buffers() and what it calls run before the first step, everything else after them",
+    "init_done": "_init_buffers() runs before the first step; all other hooks run after it",
 }
-"""Name that is not there -> what takes its place."""
+"""Missing name -> hint at its replacement."""
 NAMES = {*PLAIN, *COMPUTED, *CONSTANT, *KEPT, *ABSENT}
 
 
 class LeggedGymNames:
-    """The half of a legged robot's task that answers to legged_gym's names. N robots, D joints, F feet, P heights.
+    """Mixin of LeggedRobot with legged_gym's names. N robots, D joints, F feet, P heights.
 
-    `root_states` (N, 13): position [m], orientation (x, y, z, w), linear and angular velocity, all in the world frame, as
-    Isaac Gym has them, where `base_quat` has w first and `base_lin_vel` and `base_ang_vel` are in the base frame. `dof_state`
-    (N * D, 2): angles and velocities. `feet_air_time` (N, F): swings that go on or end at this step [s]. `rpy` (N, 3): roll,
-    pitch, yaw [rad]. `friction_coeffs` (N, 1, 1), `height_points` (N, P, 3) in the yaw frame [m], `terrain_origins`
-    (rows, columns, 3), `noise_scale_vec` of the actor's columns; the others are as their counterparts here.
+    `root_states` (N, 13) has position [m], orientation (x, y, z, w), linear [m/s] and angular velocity [rad/s], all in the
+    world frame, as in Isaac Gym; `base_quat` has w first, and `base_lin_vel` and `base_ang_vel` are in the base frame.
+    `dof_state` (N * D, 2) has angles [rad] and velocities [rad/s]. `feet_air_time` (N, F) has the durations of swings that
+    continue or end at this step [s]. `rpy` (N, 3) has roll, pitch and yaw [rad]. `friction_coeffs` is (N, 1, 1),
+    `height_points` (N, P, 3) in the yaw frame [m], `terrain_origins` (rows, columns, 3); `noise_scale_vec` has a number for
+    each of the actor's columns. The other names are like their counterparts here.
     """
 
     reset_buf: Tensor
 
-    if not TYPE_CHECKING:  # a type checker should go on seeing what is not there
+    if not TYPE_CHECKING:  # so that a type checker still reports missing attributes
 
         def __getattr__(self, name: str) -> Any:
-            if hasattr(type(self), name):  # a property that failed: asked again, it says what it did not find itself
+            if hasattr(type(self), name):  # a property that failed: evaluating it again raises its own error
                 return object.__getattribute__(self, name)
             if name in NAMES:
                 try:
@@ -270,10 +272,10 @@ class LeggedGymNames:
             raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'{hint}")
 
     def _by_their_name(self, name: str) -> Any:
-        """Return what the task has under that name of legged_gym's.
+        """Return the value of one of legged_gym's names.
 
         Raises:
-            AttributeError: nothing, or not in this task; says what takes its place.
+            AttributeError: this task does not have it; the text has a hint at the replacement.
         """
         if name in PLAIN:
             return PLAIN[name](self)
@@ -289,7 +291,7 @@ class LeggedGymNames:
             graph = vars(self).get("_graph")
             if graph is not None and graph.captured:
                 raise AttributeError(
-                    "is kept from step to step only where a term reads it, which none did when the step began"
+                    "is stored from step to step only if a term reads it, and no term did when the step was captured"
                 )
             kept = torch.zeros_like(KEPT[name](self), memory_format=torch.contiguous_format)
             vars(self)[name] = kept
@@ -298,9 +300,9 @@ class LeggedGymNames:
         raise AttributeError(f"is not there; {ABSENT[name]}")
 
     def remember(self) -> None:
-        """Keep what was asked for of this step, before the task itself overwrites what it keeps."""
+        """Store the values of `KEPT` that were read, before the task overwrites its own stored values."""
         for name in vars(self).get("_kept_names", ()):
             vars(self)[name].copy_(KEPT[name](self))
-            if name == "last_last_actions":  # a new episode has none before it; `last_actions` is still the old one's here
+            if name == "last_last_actions":  # `last_actions` is here still that of the ended episode
                 masked_set_(vars(self)[name], self.reset_buf, 0.0)
         super().remember()  # type: ignore[misc]

@@ -1,4 +1,6 @@
-"""The legged robot that follows velocity commands: what its task adds to every task's loop. Its terms are in terms.py."""
+"""Task of legged robots that follow velocity commands: control, commands, contacts, terrain, randomisation and curricula. Its
+terms are in terms.py.
+"""
 
 from typing import Any, ClassVar
 
@@ -8,9 +10,9 @@ from torch import Tensor
 
 from legged.config.schema import LeggedConfig, TaskConfig
 from legged.envs.base_task import BaseTask
+from legged.envs.class_checks import check_overrides
 from legged.envs.legged_checks import check_legged
 from legged.envs.legged_gym_names import LeggedGymNames
-from legged.envs.overrides import check_overrides
 from legged.envs.terms import Terms
 from legged.math import evenly_spaced, quat_rotate
 from legged.mdp.actuator import with_rotors
@@ -29,13 +31,13 @@ from legged.robots.robot import Robot, load_robot
 from legged.terrain import Terrain
 
 POSES = 256
-"""Poses with closed loops that are drawn at the start."""
+"""Number of poses with closed loops that are drawn at the start."""
 
 
 class LeggedRobot(Terms, LeggedGymNames, BaseTask):
-    """A legged robot that follows velocity commands. Subclass it and add `_reward_<name>`, `_obs_<name>`, `_terminate_<name>`
-    or `_metric_<name>` methods; the configuration names the ones that run. N robots, D joints, F feet, B tracked collision
-    shapes.
+    """Legged robots that follow velocity commands. Subclass it and add methods `_reward_<name>`, `_obs_<name>`,
+    `_terminate_<name>` or `_metric_<name>`; the configuration names the ones that run. N robots, D joints, F feet, B tracked
+    collision shapes.
     """
 
     Config: ClassVar[type[TaskConfig]] = LeggedConfig
@@ -44,8 +46,8 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
     def __init__(
         self, cfg: LeggedConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None
     ) -> None:
-        """Build physics and MDP on `device`; with `graph`, the step is captured on a GPU. A `terrain` takes the place of
-        the one that the configuration asks for.
+        """Build physics and MDP on `device`; with `graph`, the step is captured on a GPU. A given `terrain` replaces that of
+        the configuration.
 
         Raises:
             ConfigError: the configuration names something that does not exist; nothing is compiled then.
@@ -56,41 +58,43 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
 
     @classmethod
     def check(cls, cfg: TaskConfig) -> None:
-        """Look for everything that can be wrong with a configuration, before anything is built.
+        """Check a configuration completely, before anything is built.
 
         Raises:
-            ConfigError: there is something.
+            ConfigError: the configuration is invalid for this task.
         """
-        check_overrides(cls)  # before anything else can fail for it
+        check_overrides(cls)  # first: a wrong override can make the other checks fail
         assert isinstance(cfg, LeggedConfig)
         robot = load_robot(cfg.robot, cfg.origins.where("robot"))
         super().check(cfg)
         check_legged(cls, cfg, robot)
 
-    # ---- what there is -----------------------------------------------------------------------------------------------
+    # ---- construction ------------------------------------------------------------------------------------------------
 
     def make_randomization(self) -> RobotRandomization:
-        """Draw friction and mass, which are drawn in any case, and what `domain_rand.ranges` names."""
+        """Return the randomisation: friction and base mass, which are always drawn, and the fields of
+        `domain_rand.ranges`.
+        """
         return RobotRandomization(self.cfg.domain_rand, self.num_envs, self.device)
 
     def make_scene(self) -> Scene:
-        """Put the robot on its ground."""
+        """Return the robot on its ground."""
         self.robot: Robot = with_rotors(load_robot(self.cfg.robot), self.cfg.control.actuator)
         self.terrain = self.terrain or self.make_terrain()
         return RobotScene(self.robot, self.terrain)
 
     def make_terrain(self) -> Terrain | None:
-        """Make the ground that the configuration asks for; None for a plane. A subclass may return one of its own."""
+        """Hook: return the ground of the configuration; None for a plane. A subclass may return another one."""
         cfg = self.cfg.terrain
         return None if cfg.mesh_type == "plane" else Terrain.build(cfg, self.cfg.env.seed)
 
     def _allocate(self) -> None:
-        """Leave out the actions of joints that are held."""
+        """Allocate the tensors of every task, with actions for the joints that are not held."""
         self.num_actions = len(acted_joints(self.robot, self.cfg.control))
         super()._allocate()
 
     def _init_buffers(self) -> None:
-        """Allocate what follows from the robot, its commands and its ground."""
+        """Allocate tensors and parts for the robot, its commands and its ground."""
         super()._init_buffers()
         cfg, robot, n, device = self.cfg, self.robot, self.num_envs, self.device
         kernels = self.physics.kernels
@@ -132,7 +136,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.measured_heights = self.height_scan.heights
         self.terrain_curriculum: TerrainCurriculum | None = None
         self.env_origins = torch.zeros(n, 3, device=device)
-        """(N, 3) where each robot starts, world frame [m]."""
+        """(N, 3) middle of the area in which each robot's episodes begin, world frame [m]."""
         if self.terrain is not None:
             self.terrain_curriculum = TerrainCurriculum(cfg.terrain, self.terrain, n, device, kernels)
             self.env_origins = self.terrain_curriculum.origins
@@ -144,7 +148,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self._reset_yaw = self.numbers.between(*cfg.init_state.yaw, 1)
         self.reset_qpos[:, 3] = 1.0
         self._poses: Tensor | None = None
-        """(K, nq) poses with closed loops, of which resets take one, where there are passive joints."""
+        """(K, nq - 7) joint positions of poses with closed loops, from which resets choose; None without passive joints."""
         if robot.passive is not None:
             where = cfg.origins.where("init_state.dof_pos_factor")
             poses = robot.passive.draw(robot.default_qpos, cfg.init_state.dof_pos_factor, POSES, cfg.env.seed, where)
@@ -157,7 +161,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
             self.passive_qvel_columns = torch.tensor(robot.passive.qvel_columns, device=device)
 
     def _soft_limits(self, robot: Robot) -> Tensor:
-        """Return joint limits (D, 2), shrunk about their middle by `soft_dof_pos_limit` [rad]."""
+        """Return joint limits (D, 2) [rad], shrunk about their middle by the factor `soft_dof_pos_limit`."""
         limits = torch.tensor(robot.dof_pos_limits, dtype=torch.float32, device=self.device)
         middle, half = limits.mean(dim=1, keepdim=True), 0.5 * (limits[:, 1:] - limits[:, :1])
         soft = half * self.cfg.rewards.soft_dof_pos_limit
@@ -165,7 +169,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         return torch.where(torch.isfinite(bounded), bounded, limits)
 
     def active_terminations(self) -> tuple[list[str], list[str]]:
-        """Leave out limits that are 0, and a terrain that is not there."""
+        """Return the terminations that are evaluated: without limits that are 0, and without `left_terrain` on a plane."""
         cfg = self.cfg.terminations
         limits = (("base_height", cfg.min_base_height), ("tilt", cfg.max_tilt))
         ours = {
@@ -178,7 +182,9 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         return [name for name in failures if name not in off], [name for name in time_outs if name not in off]
 
     def observation_scales(self) -> dict[str, Any]:
-        """Scale commands like the velocities that they ask for, unless told otherwise."""
+        """Return the factor on each term. Without a setting, commands have the factors of the velocities that they
+        command.
+        """
         scales = super().observation_scales()
         lin, ang = scales.get("base_lin_vel", 1.0), scales.get("base_ang_vel", 1.0)
         scales.setdefault("commands", [lin, lin, ang])
@@ -199,10 +205,10 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
             return None
         return MirrorImages(type(self).__name__, self.MIRRORED, self.observation_groups, self.control.acted, mirror, points)
 
-    # ---- one control step: what differs from every task's ------------------------------------------------------------
+    # ---- hooks of a control step -------------------------------------------------------------------------------------
 
     def set_controls(self) -> None:
-        """Tell the control law what is wanted of the joints."""
+        """Set the actions of the control law."""
         self.control.set_actions(self.actions)
 
     def apply_control(self) -> None:
@@ -214,8 +220,8 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.disturbances.draw()
 
     def draw_reset(self) -> None:
-        """Draw joints near the default pose and a base at its spawn height, moving. Of a robot with passive joints, a pose is
-        one of those that were drawn at the start: loops must close.
+        """Draw initial states: joints near the default pose, and a moving base at its spawn height. For a robot with passive
+        joints, choose one of the poses that were drawn at the start, because loops must close.
         """
         if self.terrain_curriculum is not None:
             self.terrain_curriculum.draw()
@@ -228,7 +234,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
             half_yaw = 0.5 * self._reset_yaw.values[:, 0]
             torch.cos(half_yaw, out=self.reset_qpos[:, 3])
             torch.sin(half_yaw, out=self.reset_qpos[:, 6])
-            # MuJoCo has the linear velocity of a floating base in the world frame, the angular one in the base's.
+            # In MuJoCo the linear velocity of a floating base is in the world frame, the angular velocity in the base frame.
             self.reset_qvel[:, :3].copy_(quat_rotate(self.reset_qpos[:, 3:7], self._reset_velocity.values[:, :3]))
 
     def sense(self) -> None:
@@ -249,7 +255,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
     def reset_idx(self, mask: Tensor) -> None:
         torch.add(self.env_origins, self._spawn.values, out=self.reset_qpos[:, :3])
         super().reset_idx(mask)
-        self.control.reset(mask)  # an actuator's past is at angles that may just have been drawn
+        self.control.reset(mask)  # last: the past of actuators is filled with default angles, which `redraw` may have changed
 
     def forget(self, mask: Tensor) -> None:
         super().forget(mask)
@@ -265,13 +271,15 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self._vary_velocity_limits(again=True)
 
     def _vary_control(self, again: bool = False) -> None:
-        """Give the control law what was drawn for it, or of that what has been drawn `again`."""
+        """Apply randomised properties to the control law: all of them, or with `again` those that change within steps."""
         names = self.randomization.redrawn if again else self.randomization.draws
         drawn = self.randomization.fields
         self.control.vary({name: drawn[name] for name in names})
 
     def _vary_velocity_limits(self, again: bool = False) -> None:
-        """Bring `dof_vel_limits`, and the speeds of motors, up to date with what was drawn, or drawn `again`."""
+        """Apply the randomised `velocity_limit` to `dof_vel_limits` and to the no-load speeds of motors. With `again`, apply
+        it only if it changes within steps.
+        """
         if "velocity_limit" in (self.randomization.redrawn if again else self.randomization.draws):
             factor = self.randomization.fields["velocity_limit"].view(self.num_envs, -1)
             torch.mul(self._nominal_vel_limits, factor, out=self.dof_vel_limits)
@@ -287,12 +295,12 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         return bool(self.cfg.domain_rand.forces)
 
     def disturb(self, mask: Tensor) -> None:
-        """Push the robots that are due."""
+        """Apply pushes, kicks and forces to the robots of `mask` (N,) that are due."""
         self.pushes.push(self.physics, mask)
         self.disturbances.act(self.physics, mask)
 
     def ask(self) -> None:
-        """Renew commands that are due, and steer towards headings."""
+        """Update commands that are due, and steer towards headings."""
         self.command_sampler.update(self.reset_buf, self.base_quat)
 
     def remember(self) -> None:
@@ -301,8 +309,8 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
 
     @torch.no_grad()
     def hold_commands(self, commands: Tensor, heading: Tensor | None = None) -> TensorDict:
-        """Ask for fixed vx, vy [m/s], yaw rate [rad/s], (N, 3) or (3,), until told otherwise; returns observations. With
-        `heading` (N,) [rad] and in heading mode, the yaw rate steers towards it instead.
+        """Set fixed commands vx, vy [m/s] and yaw rate [rad/s], (N, 3) or (3,), until the next call; return the observations.
+        With `heading` (N,) [rad] and in heading mode, the yaw rate steers towards it instead.
         """
         self.command_sampler.hold(commands, heading)
         self.observation_terms.evaluate(self.episode_length_buf == 0, again=True)
@@ -311,7 +319,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
             group.restart(self.episode_length_buf == 0)
         return self.get_observations()
 
-    # ---- curricula, and what is saved of the task --------------------------------------------------------------------
+    # ---- curricula and saved state -----------------------------------------------------------------------------------
 
     def reset_curricula(self) -> None:
         self.command_curriculum.reset()

@@ -13,8 +13,8 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 def unit(text: str) -> Callable[[Method], Method]:
-    """Declare the unit of what a term returns, such as "m^2/s^2"; "1" for a plain number. Columns of several units have
-    them separated by commas; the first counts where numbers are carried to another robot (docs/scaling.md).
+    """Declare the unit of a term's values, such as "m^2/s^2"; "1" for a plain number. Units of several columns are separated
+    by commas. The first unit counts when settings are rescaled for another robot (docs/scaling.md).
 
     Raises:
         ConfigError: the text is not a unit.
@@ -38,14 +38,15 @@ def unit_of(method: Any) -> str | None:
 
 
 def concurrent(method: Method) -> Method:
-    """Let a reward, a termination or a metric run on a parallel stream while `check_termination` settles which episodes end.
+    """Let a reward, a termination or a metric run on a parallel stream while `check_termination` determines which episodes
+    end.
 
-    Such a term must not read `terminated_buf`, `time_out_buf`, `reset_buf`, `valid` or `rew_buf`, which are not settled yet;
-    the first step raises a TermError if it does. It must not write what another term reads either. Terms without the mark
-    run once `check_termination` has settled which episodes end, in the order of the configuration.
+    Such a term must not read `terminated_buf`, `time_out_buf`, `reset_buf`, `valid` or `rew_buf`, which are not settled yet.
+    If it does, the first step raises a TermError. It must not write a tensor that another term reads either. Terms without
+    the mark run after `check_termination`, in the order of the configuration.
 
-    BaseTask's hooks `check_termination`, `measure` and `compute_reward` have the mark too: they write nothing that a term
-    with the mark reads. Where a class overrides one of them without the mark, all terms run as if they had none.
+    BaseTask's hooks `check_termination`, `measure` and `compute_reward` have the mark too: they write no tensor that a term
+    with the mark reads. If a class overrides one of them without the mark, all terms run as if they had no mark.
     """
     vars(getattr(method, "__func__", method))["_concurrent"] = True
     return method

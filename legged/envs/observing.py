@@ -1,33 +1,33 @@
-"""What networks see of a task: observation groups, and the sensors between its terms and the groups with noise."""
+"""Observation groups of a task, and the errors of the groups with noise."""
 
 from typing import Any
 
 from legged.config.networks import groups_in
 from legged.config.schema import TaskConfig
 from legged.mdp.height_map_errors import HeightMapErrors
+from legged.mdp.observation_errors import HEIGHTS, ObservationErrors
 from legged.mdp.observations import ObservationGroup, ObservationTerms
-from legged.mdp.sensors import HEIGHTS, Sensors
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.random_pool import RandomPool
 
 
 class ObservingTask:
-    """The half of a task that makes its observations."""
+    """Mixin of BaseTask with its observation groups and their errors."""
 
     cfg: TaskConfig  # type: ignore[assignment]
     observation_terms: ObservationTerms
-    numbers: UniformNumbers
+    numbers: RandomPool
 
     def observation_scales(self) -> dict[str, Any]:
-        """Return the factor on each term, a number or one for each of its columns; 1 for those that are missing."""
+        """Return the factor on each term: one number, or one for each of its columns. A missing term has the factor 1."""
         return dict(self.cfg.observations.scales)
 
     def make_height_map(self) -> HeightMapErrors | None:
-        """Return the map that the term `heights` is measured with, if it has errors."""
+        """Return the height map with errors that the term `heights` reads; None if the map has no errors."""
         return None
 
-    def make_sensors(self) -> Sensors | None:
-        """Return what measures the terms with bias, delay, lost packets or a map; None if there are none in a group with
-        noise.
+    def make_observation_errors(self) -> ObservationErrors | None:
+        """Return the errors of terms with bias, delay, loss or a map with errors. Return None if no group with noise has such
+        a term.
         """
         cfg, noise = self.cfg.observations, self._noise()
         noisy = {term for group in cfg.groups.values() if group.noise for term in group.terms} if cfg.add_noise else set()
@@ -38,7 +38,7 @@ class ObservingTask:
         if not measured:
             return None
         errors = (cfg.bias, cfg.delay, cfg.dropped)
-        return Sensors(self.observation_terms, sorted(measured), *errors, noise, self.numbers, height_map)
+        return ObservationErrors(self.observation_terms, sorted(measured), *errors, noise, self.numbers, height_map)
 
     def _noise(self) -> dict[str, float]:
         """Return the half width of each term's noise, in the term's unit."""
@@ -46,13 +46,13 @@ class ObservingTask:
         return {term: half * cfg.noise_level for term, half in cfg.noise.items()}
 
     def _group(self, name: str) -> ObservationGroup:
-        """Make the observation group `name`."""
+        """Build the observation group `name`."""
         cfg, terms = self.cfg.observations, self.observation_terms
         group = groups_in(self.cfg)[name]
         noisy = group.noise and cfg.add_noise
         noise = self._noise() if noisy else {}
-        measured = terms.sensors if noisy else None
-        if measured is not None:  # they add the noise of what they measure
+        measured = terms.errors if noisy else None
+        if measured is not None:  # these terms get their noise there
             noise = {term: half for term, half in noise.items() if term not in measured.names}
         scales = self.observation_scales()
         return ObservationGroup(measured or terms, group.terms, scales, noise, cfg.clip, group.history, self.numbers)

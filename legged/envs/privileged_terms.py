@@ -1,4 +1,4 @@
-"""Observations of what is randomised: what a critic or a teacher may be told, and a robot does not measure."""
+"""Privileged observations: randomised properties, which a critic or a teacher may observe and a robot cannot measure."""
 
 import math
 from collections.abc import Callable
@@ -19,10 +19,11 @@ PREFIX = "rand_"
 
 
 class PrivilegedTerms:
-    """The methods `_obs_rand_<field>`, one for each field of `physics.FIELDS`, and `_obs_push_force`; (N, 1) each, or
-    (N, rows) where every row has its own number. -1 and 1 are the ends of the range that the configuration names, however
-    far it has grown; with `log_uniform` in the logarithm. A field that only `domain_rand.observed_ranges` names has its
-    neutral value.
+    """Mixin of BaseTask with the terms `_obs_rand_<field>`, one for each field of `physics.FIELDS`, and `_obs_push_force`.
+
+    A field's term is (N, 1), or (N, rows) if every row has its own number. Its values -1 and 1 are the ends of the configured
+    range, even if the range has not fully grown; with `log_uniform` the scale is logarithmic. A field that only
+    `domain_rand.observed_ranges` names has its neutral value.
     """
 
     cfg: Any
@@ -46,7 +47,7 @@ class PrivilegedTerms:
 
 
 def _mirror_kind(name: str, field: Field) -> MirrorKind:
-    """Return how a field changes when left and right are exchanged. What bodies and shapes have of their own has no image."""
+    """Return the kind of a field's mirror image. A field with a number for each body or shape has none."""
     if name == "joint_offset":
         return "joints"
     if name.endswith("_y"):
@@ -55,22 +56,22 @@ def _mirror_kind(name: str, field: Field) -> MirrorKind:
 
 
 MIRROR_KINDS: dict[str, MirrorKind] = {f"{PREFIX}{name}": _mirror_kind(name, field) for name, field in FIELDS.items()}
-"""Privileged observation -> its kind."""
+"""Privileged observation -> kind of its mirror image."""
 MIRROR_KINDS["push_force"] = "vectors"
 
 
 def observed_forces(cfg: LeggedConfig) -> dict[str, ForceConfig]:
-    """Return the forces that are observed, whether they act or not."""
+    """Return the forces that are observed, by name: those that act, and those that are only observed."""
     return {**cfg.domain_rand.observed_forces, **cfg.domain_rand.forces}
 
 
 def largest_of(force: ForceConfig) -> float:
-    """Return the force of which an observed one is a share [N]."""
+    """Return the largest component of a force that can be drawn [N]. An observed force is a share of it."""
     return max(abs(end) for axis in (force.x, force.y, force.z) for end in axis)
 
 
 def observed(cfg: Any, name: str) -> DrawConfig | None:
-    """Return by what range a field is observed; None if the configuration names none."""
+    """Return the draw by whose range a field is normalised in observations; None if the configuration has no range for it."""
     rand = cfg.domain_rand
     entry = rand.observed_ranges.get(name, rand.ranges.get(name))
     if entry is None and name == "friction" and getattr(rand, "randomize_friction", False):
@@ -81,7 +82,7 @@ def observed(cfg: Any, name: str) -> DrawConfig | None:
 
 
 def normalised(values: Tensor, draw: DrawConfig) -> Tensor:
-    """Return values as -1 to 1 over the range of a draw; 0 for a range without width."""
+    """Return values scaled to -1 and 1 at the ends of a draw's range; 0 for a range without width."""
     low, high = draw.range
     if draw.distribution == "log_uniform":
         values, low, high = values.clamp(min=1e-9).log(), math.log(low), math.log(high)

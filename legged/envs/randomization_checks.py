@@ -1,4 +1,4 @@
-"""What of `domain_rand` is right by itself and does not fit the property, the task or the robot."""
+"""Checks of `domain_rand` settings that are valid by themselves but may not fit the property, the task or the robot."""
 
 from collections.abc import Callable
 
@@ -13,10 +13,10 @@ from legged.robots.robot import Robot
 
 
 def check_randomization(cfg: TaskConfig) -> None:
-    """Look for what can be wrong with the properties that are drawn, before anything is built.
+    """Check the ranges of randomised properties, before anything is built.
 
     Raises:
-        ConfigError: there is something.
+        ConfigError: a property or its draw is invalid, or does not fit the engine or the control law.
     """
     rand, legged = cfg.domain_rand, isinstance(cfg, LeggedConfig)
     for key, ranges in (("ranges", rand.ranges), ("observed_ranges", rand.observed_ranges)):
@@ -27,13 +27,15 @@ def check_randomization(cfg: TaskConfig) -> None:
         for name, entry in rand.ranges.items():
             if draw_of(entry).when != "start":
                 where = cfg.origins.where(f"domain_rand.ranges.{name}.when")
-                raise ConfigError(f"{where}: newton's {cfg.sim.solver} draws at the start only; sim.solver=mujoco does not")
+                raise ConfigError(
+                    f"{where}: newton's {cfg.sim.solver} draws at the start only; sim.solver=mujoco also draws later"
+                )
     if isinstance(cfg, LeggedConfig) and cfg.control.control_type == "T":
         for name in ("p_gain", "d_gain", "joint_offset"):
             if name in rand.ranges:
                 where = cfg.origins.where(f"domain_rand.ranges.{name}")
                 raise ConfigError(
-                    f"{where}: control.control_type T takes actions for torques, and has no {FIELDS[name].meaning}"
+                    f"{where}: control.control_type T takes actions as torques, and has no {FIELDS[name].meaning}"
                 )
     actuator = cfg.control.actuator if isinstance(cfg, LeggedConfig) else None
     if actuator is not None and actuator.network and not actuator.joints:
@@ -45,11 +47,15 @@ def check_randomization(cfg: TaskConfig) -> None:
                 )
     if isinstance(cfg, LeggedConfig) and cfg.control.control_type != "P" and "joint_offset" in rand.ranges:
         where = cfg.origins.where("domain_rand.ranges.joint_offset")
-        raise ConfigError(f"{where}: control.control_type V does not look at angles, of which encoders show too much")
+        raise ConfigError(f"{where}: control.control_type V does not look at joint angles, so an offset has no effect")
 
 
 def _check_draw(name: str, draw: DrawConfig, legged: bool, path: str, where: Callable[[str], str]) -> None:
-    """Look at one property."""
+    """Check the draw of one property; `legged` is True for tasks of legged robots.
+
+    Raises:
+        ConfigError: the property does not exist in this task, or its draw is invalid.
+    """
     if name not in FIELDS:
         known = suggest(name, FIELDS, "properties")
         raise ConfigError(f"{where(path)}: there is no property '{name}' to randomise{known}")
@@ -68,27 +74,35 @@ def _check_draw(name: str, draw: DrawConfig, legged: bool, path: str, where: Cal
     if draw.when == "interval" and not draw.interval_s:
         raise ConfigError(f"{where(f'{path}.when')}: interval needs an interval_s above 0 [s], such as interval_s: 4.0")
     if draw.when != "interval" and draw.interval_s:
-        told = f"is of `when: interval` only, got {draw.interval_s:g} with `when: {draw.when}`"
+        told = f"needs `when: interval`, got {draw.interval_s:g} with `when: {draw.when}`"
         raise ConfigError(f"{where(f'{path}.interval_s')}: {told}")
     _check_grow(draw, path, where)
     if draw.grow[1] and draw.when == "start":
-        raise ConfigError(f"{where(f'{path}.grow')}: what is drawn at the start can't grow; `when: reset` draws it again")
+        raise ConfigError(f"{where(f'{path}.grow')}: a property drawn at the start can't grow; `when: reset` draws at resets")
     if draw.grow[1] and field.derived:
         raise ConfigError(
-            f"{where(f'{path}.grow')}: can't grow: MuJoCo derives constants from it, which is done at the start, for models"
-            " that robots choose from"
+            f"{where(f'{path}.grow')}: can't grow: MuJoCo derives constants from it, so the models that robots choose from"
+            " are drawn at the start"
         )
 
 
 def _check_grow(of: DrawConfig | KickConfig | ForceConfig, path: str, where: Callable[[str], str]) -> None:
-    """Look at between which iterations something grows."""
+    """Check the iterations between which a range grows.
+
+    Raises:
+        ConfigError: the first equals the last, and they are not both 0.
+    """
     if of.grow != (0.0, 0.0) and of.grow[0] == of.grow[1]:
-        told = "expected [first, last] with first < last, or [0, 0] for none"
+        told = "expected [first, last] with first < last, or [0, 0] for no growth"
         raise ConfigError(f"{where(f'{path}.grow')}: {told}, got {list(of.grow)}")
 
 
 def _check_derived(cfg: TaskConfig) -> None:
-    """Look whether everything from which MuJoCo derives constants is drawn at the same moments."""
+    """Check that all properties from which MuJoCo derives constants are drawn at the same moments.
+
+    Raises:
+        ConfigError: two of them are drawn at different moments.
+    """
     moments = {}
     for name, entry in cfg.domain_rand.ranges.items():
         if FIELDS[name].derived:
@@ -104,28 +118,28 @@ def _check_derived(cfg: TaskConfig) -> None:
             names = ", ".join(moments)
             text = f"MuJoCo derives constants from {names} together, so they must have the same `when` and interval_s"
             if "added_base_mass" in moments and "added_base_mass" not in cfg.domain_rand.ranges:
-                text += " (randomize_base_mass draws at the start; added_base_mass among the ranges takes its place)"
+                text += " (randomize_base_mass draws at the start; an entry added_base_mass of ranges replaces it)"
             raise ConfigError(f"{cfg.origins.where(f'domain_rand.ranges.{path}')}: {first} is drawn {a}, {name} {b}: {text}")
 
 
 def check_disturbances(cfg: LeggedConfig, robot: Robot) -> None:
-    """Look for what can be wrong with kicks and forces.
+    """Check kicks and forces.
 
     Raises:
-        ConfigError: there is something.
+        ConfigError: one has no effect, an invalid growth, or a body that the robot does not have.
     """
     where = cfg.origins.where
     for name, kick in cfg.domain_rand.kicks.items():
         _check_grow(kick, f"domain_rand.kicks.{name}", where)
         if all(getattr(kick, axis) == (0.0, 0.0) for axis in ("x", "y", "z", "roll", "pitch", "yaw")):
             raise ConfigError(
-                f"{where(f'domain_rand.kicks.{name}')}: it kicks nothing; x, y, z, roll, pitch or yaw say how far"
+                f"{where(f'domain_rand.kicks.{name}')}: it kicks nothing; give a range for x, y, z, roll, pitch or yaw"
             )
     for name, force in cfg.domain_rand.forces.items():
         path = f"domain_rand.forces.{name}"
         _check_grow(force, path, where)
         if all(getattr(force, axis) == (0.0, 0.0) for axis in ("x", "y", "z")):
-            raise ConfigError(f"{where(path)}: it pushes nothing; x, y or z say how hard [N]")
+            raise ConfigError(f"{where(path)}: it pushes nothing; give a range for x, y or z [N]")
         bodies = body_names(robot)
         if force.body and force.body not in bodies:
             told = suggest(force.body, bodies, "bodies")
@@ -133,10 +147,10 @@ def check_disturbances(cfg: LeggedConfig, robot: Robot) -> None:
 
 
 def check_observed(cfg: TaskConfig) -> None:
-    """Look whether what groups observe of the randomisation is randomised, and has a mirror image where one is learned from.
+    """Check that observed properties are randomised, and that they have a mirror image if train.algorithm.symmetry is on.
 
     Raises:
-        ConfigError: it is not, or has none.
+        ConfigError: a property is not randomised, or has no mirror image.
     """
     for group, section in groups_in(cfg).items():
         for term in section.terms:
@@ -161,6 +175,6 @@ def check_observed(cfg: TaskConfig) -> None:
                 aside = [force.body for force in observed_forces(cfg).values() if force.body]
                 if aside:
                     raise ConfigError(
-                        f"{cfg.origins.where(path)}: push_force: of a force on '{aside[0]}' there is no mirror image, only of"
-                        " those on the base; train.algorithm.symmetry=false learns without"
+                        f"{cfg.origins.where(path)}: push_force: a force on '{aside[0]}' has no mirror image, only forces on"
+                        " the base have one; train.algorithm.symmetry=false learns without"
                     )

@@ -1,4 +1,4 @@
-"""The part of a task that gives what differs from environment to environment to those that it concerns."""
+"""Physics of a task with randomised properties, and their changes within steps."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +15,7 @@ from legged.process.startup import stage_ended
 
 
 class RandomizedTask:
-    """A third of a task: physics whose properties differ from environment to environment."""
+    """Mixin of BaseTask: physics whose properties differ from environment to environment."""
 
     cfg: TaskConfig
     num_envs: int
@@ -23,21 +23,26 @@ class RandomizedTask:
     physics: Physics
     randomization: Randomization
     QUANTITIES: ClassVar[tuple[str, ...]]
-    _beside: Branch
-    _aside: Branch
+    _stream_1: Branch
+    _stream_2: Branch
     field_rows: dict[str, int]
-    """Field that can be randomised -> how many joints, bodies or shapes have it."""
+    """Field that can be randomised -> number of joints, bodies or shapes that have it."""
 
     def make_randomization(self) -> Randomization:
-        """Draw what differs from environment to environment."""
+        """Return the randomised properties, drawn for every environment."""
         return Randomization(self.cfg.domain_rand.ranges, self.num_envs, self.device)
 
     def pushed_by_forces(self) -> bool:
-        """Return whether forces act on bodies from outside (`physics.forces`)."""
+        """Return whether external forces act on bodies (`physics.forces`)."""
         return False
 
     def _build_physics(self, scene: Scene) -> None:
-        """Build the physics of a scene, and give it what was drawn."""
+        """Build the physics of a scene, and apply the randomised properties.
+
+        Raises:
+            ConfigError: the engine or the model does not have a randomised property, or `each` is set for a property of which
+                a robot has only one number.
+        """
         cfg, where = self.cfg, self.cfg.origins.where
         fields = [name for name in self.randomization.fields if name in MODEL_FIELDS]
         check_ranges(cfg.domain_rand.ranges, scene, cfg.sim, where)
@@ -53,25 +58,26 @@ class RandomizedTask:
         self.randomization.apply(self.physics)
 
     def apply_randomization(self) -> None:
-        """Give what was drawn to all that it concerns, when a state was put back."""
+        """Apply the randomised properties again, after a saved state was loaded."""
         self.randomization.apply(self.physics)
 
     @contextmanager
     def redrawing(self, mask: Tensor) -> Iterator[None]:
-        """Draw again, beside the block, what is due, where episodes begin in the environments of `mask` (N,)."""
+        """Run `redraw` on a parallel stream of the block. Episodes begin in the environments of `mask` (N,)."""
         if not self.randomization.redrawn:
             yield
             return
-        with self._beside.fork():
+        with self._stream_1.fork():
             self.redraw(mask)
         yield
-        self._beside.join()
-        self._aside.join()
+        self._stream_1.join()
+        self._stream_2.join()
 
     def redraw(self, mask: Tensor) -> None:
-        """Draw again what is randomised and due, where episodes begin in the environments of `mask` (N,); only called where
-        something is drawn more than once. Runs beside `forget`.
+        """Hook: apply new values of randomised properties to the environments of `mask` (N,), whose episodes begin, and to
+        those whose interval has elapsed. Called only if some property changes within steps. Runs at the same time as
+        `forget`.
         """
         self.randomization.redraw(mask)
-        with self._aside.fork():
+        with self._stream_2.fork():
             self.randomization.rewrite(self.physics)

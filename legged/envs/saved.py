@@ -1,4 +1,6 @@
-"""What of a task is saved: the progress of its curricula in every checkpoint, and all of its state beside the newest."""
+"""State of a task for checkpoints. Every checkpoint holds the progress of curricula; the newest also has the full state of
+the simulation, in a separate file.
+"""
 
 from typing import Any
 
@@ -6,41 +8,43 @@ import torch
 from torch import Tensor
 
 from legged.envs.randomized import RandomizedTask
-from legged.mdp.faults import Faults
+from legged.mdp.nan_guard import NanGuard
 from legged.mdp.observations import ObservationGroup, ObservationTerms
 from legged.mdp.rewards import Rewards
 from legged.state import load_state, state_of, take
 
 
 class SavedTask(RandomizedTask):
-    """The half of a task that takes and gives its state."""
+    """Mixin of BaseTask that saves and loads its state."""
 
     rewards: Rewards
-    faults: Faults
+    nan_guard: NanGuard
     observation_groups: dict[str, ObservationGroup]
     observation_terms: ObservationTerms
 
     def progress(self) -> dict[str, Any]:
-        """Return how far the curricula have got: what every checkpoint holds, whatever the number of environments."""
+        """Return the progress of curricula, which every checkpoint holds. It fits any number of environments."""
         grown = self.randomization.progress()
         return {"randomization": grown} if grown else {}
 
     def load_progress(self, progress: dict[str, Any]) -> None:
-        """Go on from there; to be followed by `reset`."""
+        """Continue from the progress of a checkpoint. Call `reset` afterwards."""
         self.randomization.load_progress(progress.get("randomization", {}))
 
     def parts(self) -> dict[str, Any]:
-        """Return what has a state of its own (`STATE`), by name. A subclass adds its own."""
+        """Return the parts that have a `STATE`, by their names in saved states. A subclass adds its own parts."""
         return {
-            "faults": self.faults,
+            "faults": self.nan_guard,
             "randomization": self.randomization,
             "rewards": self.rewards,
             **{f"observations_{name}": group for name, group in self.observation_groups.items()},
-            **(sensors.parts() if (sensors := self.observation_terms.sensors) is not None else {}),
+            **(errors.parts() if (errors := self.observation_terms.errors) is not None else {}),
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Return copies of everything that the next step is a function of, beside the actions and torch's random numbers."""
+        """Return copies of all tensors that determine the next step, together with the actions and the state of torch's
+        random generator.
+        """
         return {
             "physics": {name: tensor.clone() for name, tensor in self.physics.state_tensors().items()},
             "task": {name: tensor.clone() for name, tensor in self._own_tensors().items()},
@@ -49,22 +53,23 @@ class SavedTask(RandomizedTask):
 
     @torch.no_grad()
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Put the task back into a saved state; the next step is then the one that would have followed.
+        """Load a saved state. The next step then equals the step that followed when the state was saved.
 
         Raises:
-            StateError: it is of another number of environments, or of another task; nothing should be used then.
+            StateError: the state belongs to another task or another number of environments. The task may be partly
+                overwritten then and must not be used.
         """
         try:
             for name, part in self.parts().items():
                 load_state(part, state.get(name, {}))
             take(self._own_tensors(), state.get("task", {}), type(self).__name__)
         finally:
-            self.apply_randomization()  # what is drawn and what the engine has must not part
+            self.apply_randomization()  # the engine must have the same properties as `randomization`, even after an error
         self.physics.load_state(state.get("physics", {}))
 
     def _own_tensors(self) -> dict[str, Tensor]:
-        """Return the task's own tensors of a row per environment, a subclass' among them; not those that are the parts' or
-        the physics'.
+        """Return the tensors with a row per environment that are attributes of the task, including those of subclasses.
+        Tensors that belong to a part or to the physics are left out.
         """
         owners = [self.physics, self.physics.robot_state, *self.parts().values()]
         others = [*self.physics.state_tensors().values()]

@@ -1,6 +1,6 @@
-"""Observations, rewards, terminations and metrics of a legged robot, and everything that they may read.
+"""Observations, rewards, terminations and metrics of a legged robot, and the tensors that they read.
 
-Formulas and names are legged_gym's (Rudin et al., arXiv 2109.11978); where a term differs, its docstring says so.
+Formulas and names are those of legged_gym (Rudin et al., arXiv 2109.11978). If a term differs, its docstring says so.
 """
 
 import torch
@@ -19,15 +19,17 @@ from legged.physics import Physics
 from legged.terrain import Terrain
 
 TERMINATION_FORCE = 1.0
-"""Contact force on a terminating shape that ends the episode, in units of what counts as a contact of a foot: 1 N, of light
-robots 1 % of their weight."""
+"""Contact force on a terminating shape that ends the episode, as a multiple of the contact threshold of the feet (1 N, or 1 %
+of the weight of a light robot).
+"""
 PENALISED_FORCE = 0.1
-"""Contact force on a penalised shape that counts as a collision, in the same units."""
+"""Contact force on a penalised shape that counts as a collision, as a multiple of the same threshold."""
 
 
 class Terms:
-    """The methods `_obs_<name>`, `_reward_<name>` and `_terminate_<name>` that a configuration can name, and metrics.
-    N robots, D joints, F feet, B tracked collision shapes; the task allocates what is declared here.
+    """Terms of a legged robot: the methods `_obs_<name>`, `_reward_<name>` and `_terminate_<name>` that a configuration can
+    name, and metrics `_metric_<name>`. N robots, D joints, F feet, B tracked collision shapes. The task allocates the tensors
+    that are declared here.
     """
 
     MIRRORED: dict[str, MirrorKind] = {
@@ -43,66 +45,75 @@ class Terms:
         "passive_vel": "passive",
         **MIRROR_KINDS,
     }
-    """Observation term -> how its numbers change when left and right are exchanged; a subclass adds its own terms'."""
+    """Observation term -> kind of its mirror image (left and right exchanged). A subclass adds its own terms."""
     cfg: LeggedConfig
     dt: float
     """Control step [s]."""
     physics: Physics
     base_pos: Tensor
-    """(N, 3) base in the world [m]; `base_quat` (N, 4) is its orientation (w, x, y, z)."""
+    """(N, 3) position of the base in the world frame [m]. `base_quat` (N, 4) is its orientation (w, x, y, z)."""
     base_quat: Tensor
     base_lin_vel: Tensor
-    """(N, 3) velocity in the base frame [m/s]; `base_ang_vel` (N, 3) [rad/s]."""
+    """(N, 3) linear velocity of the base in the base frame [m/s]. `base_ang_vel` (N, 3) is the angular velocity [rad/s]."""
     base_ang_vel: Tensor
     projected_gravity: Tensor
-    """(N, 3) direction of gravity in the base frame."""
+    """(N, 3) unit vector along gravity in the base frame."""
     dof_pos: Tensor
-    """(N, D) joint angles [rad]; `dof_vel`, and `last_dof_vel` a control step before [rad/s]."""
+    """(N, D) joint angles [rad]. `dof_vel` are joint velocities, `last_dof_vel` those of the step before [rad/s]."""
     dof_vel: Tensor
     last_dof_vel: Tensor
     default_dof_pos: Tensor
     """(D,) joint angles at action 0 [rad]."""
     passive_default_pos: Tensor
-    """(P,) passive hinges [rad] and slides [m] at action 0; where they are among the generalised positions and velocities.
-    Only robots with passive joints have these three."""
+    """(P,) positions of passive hinges [rad] and slides [m] at action 0. `passive_qpos_columns` and `passive_qvel_columns`
+    are their columns in qpos and qvel. Only robots with passive joints have these three tensors.
+    """
     passive_qpos_columns: Tensor
     passive_qvel_columns: Tensor
     dof_pos_limits: Tensor
-    """(D, 2) soft limits [rad]; `dof_vel_limits` (D,) [rad/s]."""
+    """(D, 2) soft limits of the joint angles [rad]. `dof_vel_limits`, (D,) or (N, D), are limits of the speeds [rad/s]."""
     dof_vel_limits: Tensor
     torques: Tensor
-    """(N, D) [N m]."""
+    """(N, D) joint torques of the last physics step [N m]."""
     actions: Tensor
-    """(N, A) of this step, one for each joint that is not held; `last_actions` of the step before."""
+    """(N, A) clipped actions of this step, one for each joint that is not held. `last_actions` are those of the step
+    before.
+    """
     last_actions: Tensor
     commands: Tensor
-    """(N, 4) vx, vy [m/s], yaw rate [rad/s], heading [rad]; `is_moving` (N,) whether any velocity is commanded."""
+    """(N, 4) commanded vx, vy [m/s], yaw rate [rad/s] and heading [rad]. `is_moving` (N,) is True if any motion is
+    commanded.
+    """
     is_moving: Tensor
     feet_pos: Tensor
-    """(N, F, 3) in the world [m]; `feet_vel` (N, F, 3) [m/s]."""
+    """(N, F, 3) positions of the feet in the world frame [m]. `feet_vel` (N, F, 3) are their velocities [m/s]."""
     feet_vel: Tensor
     contact_forces: Tensor
-    """(N, B, 3) in the world [N]; `feet_indices` and `penalised_indices` pick among the shapes."""
+    """(N, B, 3) contact forces on the tracked shapes in the world frame [N]. `feet_indices`, `penalised_indices` and
+    `termination_indices` select shapes."""
     feet_indices: Tensor
     _feet_shapes: slice | Tensor
-    """The feet among the shapes, and below the shapes that must not touch anything: a slice where they are evenly spaced,
-    which costs no launch."""
+    """Feet among the shapes, like `_terminating_shapes`: a slice if the indices are evenly spaced, since a slice costs no
+    launch.
+    """
     _terminating_shapes: slice | Tensor
     penalised_indices: Tensor
     posture_joints: Tensor
-    """(D,) 1 for joints that do not swing a leg forward and back, else 0."""
+    """(D,) 1 for joints that do not swing a leg forward and back, 0 for the others."""
     contacts: FeetContacts
     """Contact and swing times of the feet."""
     control: Control
     height_scan: HeightScan
-    """Heights of the ground: `measured_heights` (N, P) around each robot, `.ground` (N,) under it, world frame [m]."""
+    """Ground heights in the world frame [m]: `measured_heights` (N, P) around each robot, `height_scan.ground` (N,) under
+    it.
+    """
     measured_heights: Tensor
     terminated_buf: Tensor
-    """(N,) the episode ends now in a failure."""
+    """(N,) True if the episode ends now in a failure."""
     termination_indices: Tensor
-    """Shapes that must not touch anything."""
+    """Indices of the shapes whose contact ends an episode."""
     terrain: Terrain | None
-    """The ground; None on a plane."""
+    """Ground; None on a plane."""
 
     # ---- observations: (N, width) each; docstrings and units go into policy.json -----------------------------------------
 
@@ -159,12 +170,12 @@ class Terms:
         return self.heights_seen(self.measured_heights)
 
     def heights_seen(self, ground: Tensor) -> Tensor:
-        """Return what the term `heights` is for a ground at (N, P) in the world [m]."""
+        """Return the term `heights` for ground heights (N, P) in the world frame [m]."""
         seen = self.cfg.observations
         return (self.base_pos[:, 2:3] - seen.heights_offset - ground).clamp(-seen.heights_limit, seen.deepest)
 
     def _force(self, units: float) -> float:
-        """Return a force in units of what counts as a contact of this robot's feet [N]."""
+        """Return a force [N] given as a multiple of the contact threshold of this robot's feet."""
         return units * self.contacts.force
 
     # ---- rewards: (N,) each, times scale and control step ------------------------------------------------------------
@@ -204,74 +215,74 @@ class Terms:
     @concurrent
     @unit("m^2")
     def _reward_base_height(self) -> Tensor:
-        """Squared distance from the wanted base height above the mean of the ground around [m^2]."""
+        """Squared distance of the base's height, above the mean of the scanned ground, from base_height_target [m^2]."""
         height = self.base_pos[:, 2] - self.measured_heights.mean(dim=1)
         return (height - self.cfg.rewards.base_height_target).square()
 
     @concurrent
     @unit("N^2 m^2")
     def _reward_torques(self) -> Tensor:
-        """Squared torques [N^2 m^2]."""
+        """Sum of squared torques [N^2 m^2]."""
         return self.torques.square().sum(dim=1)
 
     @concurrent
     @unit("rad^2/s^2")
     def _reward_dof_vel(self) -> Tensor:
-        """Squared joint velocities [rad^2/s^2]."""
+        """Sum of squared joint velocities [rad^2/s^2]."""
         return self.dof_vel.square().sum(dim=1)
 
     @concurrent
     @unit("rad^2/s^4")
     def _reward_dof_acc(self) -> Tensor:
-        """Squared joint accelerations over a control step [rad^2/s^4]."""
+        """Sum of squared joint accelerations over a control step [rad^2/s^4]."""
         return squared_difference(self.last_dof_vel, self.dof_vel).sum(dim=1) / self.dt**2
 
     @concurrent
     @unit("1")
     def _reward_action_rate(self) -> Tensor:
-        """Squared change of the actions."""
+        """Sum of squared changes of the actions in a control step."""
         return squared_difference(self.last_actions, self.actions).sum(dim=1)
 
     @concurrent
     @unit("1")
     def _reward_collision(self) -> Tensor:
-        """Number of penalised shapes that touch something."""
+        """Number of penalised shapes in contact."""
         return (self.contact_forces[:, self.penalised_indices].norm(dim=2) > self._force(PENALISED_FORCE)).sum(
             dim=1, dtype=torch.float32
         )
 
     @unit("1")
     def _reward_termination(self) -> Tensor:
-        """Failing; added after the clip at zero."""
+        """Failure: 1 if the episode ends in a failure. It is added after the clip at zero."""
         return self.terminated_buf.float()
 
     @concurrent
     @unit("rad")
     def _reward_dof_pos_limits(self) -> Tensor:
-        """How far joints are outside their soft limits [rad]."""
+        """Angles of joints beyond their soft limits [rad]."""
         low, high = self.dof_pos_limits[:, 0], self.dof_pos_limits[:, 1]
         return ((low - self.dof_pos).clamp(min=0.0) + (self.dof_pos - high).clamp(min=0.0)).sum(dim=1)
 
     @concurrent
     @unit("rad/s")
     def _reward_dof_vel_limits(self) -> Tensor:
-        """How far joint speeds exceed their soft limits, at most 1 rad/s a joint [rad/s]."""
+        """Joint speeds beyond their soft limits, at most 1 rad/s a joint [rad/s]."""
         limit = self.dof_vel_limits * self.cfg.rewards.soft_dof_vel_limit
         return (self.dof_vel.abs() - limit).clamp(0.0, 1.0).sum(dim=1)
 
     @concurrent
     @unit("N m")
     def _reward_torque_limits(self) -> Tensor:
-        """How far torques exceed their soft limits [N m]."""
+        """Torques beyond their soft limits [N m]."""
         limit = self.control.torque_limits * self.cfg.rewards.soft_torque_limit
         return (self.torques.abs() - limit).clamp(min=0.0).sum(dim=1)
 
     @concurrent
     @unit("s")
     def _reward_feet_air_time(self) -> Tensor:
-        """Long swings: air time beyond the target, paid at touch-down while any velocity is commanded [s].
+        """Long swings: air time minus its target, paid at touch-down while any motion is commanded [s].
 
-        legged_gym asks for a horizontal command; turning on the spot is then never paid, and not learned.
+        legged_gym pays only under a horizontal command. Turning on the spot is then never paid, and not learned.
         """
         swing = self.contacts.last_air_time - self.cfg.rewards.air_time_target_s
         return (swing * self.contacts.first_contact).sum(dim=1) * self.is_moving
@@ -279,31 +290,32 @@ class Terms:
     @concurrent
     @unit("1")
     def _reward_stumble(self) -> Tensor:
-        """A foot hits something vertical: horizontal force above five times the vertical one."""
+        """Stumbling: 1 if the horizontal force on a foot exceeds five times the vertical one."""
         force = self.contact_forces[:, self.feet_indices]
         return (force[:, :, :2].norm(dim=2) > 5.0 * force[:, :, 2].abs()).any(dim=1).float()
 
     @concurrent
     @unit("rad")
     def _reward_stand_still(self) -> Tensor:
-        """Joint angles away from the default while no motion is commanded [rad]."""
+        """Sum of the joints' distances from their default angles, while no motion is commanded [rad]."""
         return (self.dof_pos - self.default_dof_pos).abs().sum(dim=1) * ~self.is_moving
 
     @concurrent
     @unit("N")
     def _reward_feet_contact_forces(self) -> Tensor:
-        """Foot forces beyond the allowed [N]."""
+        """Contact forces on feet beyond max_contact_force [N]."""
         force = self.contact_forces[:, self.feet_indices].norm(dim=2)
         return (force - self.cfg.rewards.max_contact_force).clamp(min=0.0).sum(dim=1)
 
     @concurrent
     @unit("s")
     def _reward_single_stance(self) -> Tensor:
-        """Steps of a biped, while exactly one foot stands and any velocity is commanded: half the target, and how long the
-        other foot has been in the air, up to the target, then the less the longer; after twice the target nothing [s].
+        """Steps of a biped: half of air_time_target_s plus the other foot's air time, while exactly one foot stands and any
+        motion is commanded [s].
 
-        Paid for any long swing, robots take one step a second, and can't turn or be steered in between. Paid for the swing
-        alone, short steps are worth next to nothing, and robots that began to hop on both feet go on hopping.
+        Beyond the target the air time counts less the longer it is; from twice the target on, the reward is 0. If any long
+        swing were paid, robots would take one step a second, and could not turn in between. If only the swing were paid,
+        short steps would be worth next to nothing, and robots that began to hop on both feet would go on hopping.
         """
         alone = (self.contacts.in_contact.sum(dim=1) == 1) & self.is_moving
         target = self.cfg.rewards.air_time_target_s
@@ -313,7 +325,7 @@ class Terms:
     @concurrent
     @unit("s")
     def _reward_uneven_steps(self) -> Tensor:
-        """Difference between the longest and the shortest of the feet's last swings, while any velocity is commanded: a limp
+        """Limping: difference between the longest and the shortest of the feet's last swings, while any motion is commanded
         [s].
         """
         swings = self.contacts.last_air_time
@@ -322,14 +334,14 @@ class Terms:
     @concurrent
     @unit("m^2/s^2")
     def _reward_feet_slide(self) -> Tensor:
-        """Squared horizontal speed of feet on the ground [m^2/s^2]."""
+        """Sum of squared horizontal speeds of feet on the ground [m^2/s^2]."""
         return (self.feet_vel[:, :, :2].square().sum(dim=2) * self.contacts.in_contact).sum(dim=1)
 
     @concurrent
     @unit("m^3/s")
     def _reward_feet_clearance(self) -> Tensor:
-        """Feet that move forward at another height above the lowest foot than the target: squared difference times horizontal
-        speed [m^3/s].
+        """Clearance of moving feet: squared difference between their height above the lowest foot and feet_clearance_target,
+        times their horizontal speed [m^3/s].
         """
         height = self.feet_pos[:, :, 2] - self.feet_pos[:, :, 2].amin(dim=1, keepdim=True)
         apart = (height - self.cfg.rewards.feet_clearance_target).square() * self.feet_vel[:, :, :2].norm(dim=2)
@@ -338,15 +350,15 @@ class Terms:
     @concurrent
     @unit("rad^2")
     def _reward_posture(self) -> Tensor:
-        """Squared angles away from the default, of joints that do not swing a leg forward: hips that spread or turn, waist,
-        arms [rad^2].
+        """Sum of squared distances from the default angles, for joints that do not swing a leg forward: hips that spread or
+        turn, waist, arms [rad^2].
         """
         return ((self.dof_pos - self.default_dof_pos) * self.posture_joints).square().sum(dim=1)
 
     @concurrent
     @unit("1")
     def _reward_no_fly(self) -> Tensor:
-        """Exactly one foot on the ground, the walk of a biped."""
+        """Walk of a biped: 1 while exactly one foot is on the ground."""
         touching = self.contact_forces[:, self.feet_indices, 2] > self._force(PENALISED_FORCE)
         return (touching.sum(dim=1) == 1).float()
 
@@ -354,27 +366,27 @@ class Terms:
 
     @concurrent
     def _terminate_contact(self) -> Tensor:
-        """A shape of the robot's `terminate_after_contacts_on` feels a force."""
+        """Contact of a shape in the robot's `terminate_after_contacts_on`."""
         return (self.contact_forces[:, self._terminating_shapes].norm(dim=2) > self._force(TERMINATION_FORCE)).any(dim=1)
 
     @concurrent
     def _terminate_base_height(self) -> Tensor:
-        """The base is too close to the ground under it."""
+        """Base lower than min_base_height above the ground under it."""
         return self.base_pos[:, 2] - self.height_scan.ground < self.cfg.terminations.min_base_height
 
     @concurrent
     def _terminate_tilt(self) -> Tensor:
-        """The base leans too far."""
+        """Base tilted by more than max_tilt."""
         return torch.acos((-self.projected_gravity[:, 2]).clamp(-1.0, 1.0)) > self.cfg.terminations.max_tilt
 
     @concurrent
     def _terminate_left_terrain(self) -> Tensor:
-        """The base is beyond the middle of the level ground around all tiles: it cannot be judged there."""
+        """Base beyond the middle of the level border around all tiles, where walking cannot be judged."""
         assert self.terrain is not None
         x, y = self.terrain.reach
         return (self.base_pos[:, 0].abs() > x) | (self.base_pos[:, 1].abs() > y)
 
-    # ---- metrics: (N,) each, averaged over robots and steps; of squared errors named `_rmse` the root is logged ----------
+    # ---- metrics: (N,) each, averaged over robots and steps; for names that end in `_rmse` the root is logged ------------
 
     @concurrent
     @unit("m^2/s^2")

@@ -1,1 +1,1 @@
-"""Single episodes: recorded, sorted by what went wrong, shown as pages, and their joints summed up."""
+"""Single episodes: recorded, sorted by what went wrong, shown as pages, with statistics of their joints."""

@@ -1,5 +1,5 @@
-"""Pictures of a recorded episode: its states are put into a task of one robot again, and drawn as play draws them. Where
-nothing can be drawn, the bodies' places as a stick figure.
+"""Pictures of a recorded episode. Its states are written into a task with one robot and drawn like those of play; without a
+renderer, the bodies' positions are drawn as a stick figure.
 """
 
 import base64
@@ -20,25 +20,25 @@ from legged.registry import make_task
 from legged.rendering import RobotsCamera, camera_of
 
 WIDTH, HEIGHT = 640, 360
-"""Of a picture [pixels]."""
+"""Size of a picture [pixels]."""
 FPS, MOST_PICTURES = 25.0, 400
-"""Pictures a second, and of an episode, at most: longer ones have fewer a second."""
+"""Pictures a second, and most pictures of an episode; longer episodes have fewer a second."""
 FILL, GLIDE = 0.5, 0.3
-"""Share of the picture that a robot fills, and of the way to it that the camera makes up in a picture."""
+"""Share of the picture that a robot fills, and share of the distance to it that the camera moves in a picture."""
 QUALITIES = (80, 70, 60, 50, 40, 30, 20, 15, 10)
-"""Of JPEG: the first whose pictures fit into BUDGET_MB all together."""
+"""Qualities of JPEG; the first whose pictures together fit into BUDGET_MB is taken."""
 BUDGET_MB = 3.0
-"""Room for the pictures; as text in a page they take a third more, and the numbers of 20 s of a G1 take 0.8 MB [MB]."""
+"""Room for the pictures of a page [MB]; base64 adds a third."""
 
 
 class Projector:
-    """Shows recorded episodes of one task: builds the task once, of one robot in the C engine."""
+    """Renderer of recorded episodes; builds their task once, with one robot in the C engine."""
 
     def __init__(self, episodes: Episodes, cfg: TaskConfig) -> None:
-        """Build the task that `cfg` describes, on the ground that the episodes were recorded on.
+        """Build the task that `cfg` describes, on the ground of the episodes.
 
         Raises:
-            ConfigError: that task is not there any more.
+            ConfigError: the task no longer exists, or its model has changed.
         """
         self.episodes = episodes
         nominal = cfg.trained()
@@ -51,9 +51,8 @@ class Projector:
                 raise ConfigError(f"{cfg.task}: its model has changed: {name} has {width} numbers, not as in the episodes")
 
     def show(self, number: int) -> dict[str, Any]:
-        """Return what a page draws beside the plots of an episode: `every` steps a picture, and `pictures` as JPEG in base64;
-        or, where nothing can be drawn, `why` not, and a stick figure: the `parents` of B bodies, and their `places`
-        (T', B, 3) [m], world frame.
+        """Return the film of an episode for its page: `every` steps a picture, and `pictures` as JPEG in base64. Without a
+        renderer, return the reason `why`, the `parents` of B bodies, and their `places` (T', B, 3) [m], world frame.
         """
         steps = int(self.episodes.lengths[number])
         every = max(1, round(1.0 / (FPS * self.episodes.dt)), -(-steps // MOST_PICTURES))
@@ -83,7 +82,7 @@ class Projector:
         return [base64.b64encode(picture).decode("ascii") for picture in found]
 
     def _put(self, one: dict[str, np.ndarray], step: int) -> None:
-        """Put the robot into a state, with the command that it had."""
+        """Put the robot into a recorded state, with its command."""
         task = self.task
         qpos, qvel = (torch.as_tensor(np.nan_to_num(one[name][step : step + 1])) for name in ("qpos", "qvel"))
         task.physics.write(torch.ones(1, dtype=torch.bool), qpos, qvel)

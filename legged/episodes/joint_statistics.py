@@ -1,4 +1,4 @@
-"""What joints do on average: mean and standard deviation of angle, velocity and torque, over time and over the gait cycle."""
+"""Statistics of joints: mean and standard deviation of angle, velocity and torque, over time and over the gait cycle."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -10,20 +10,20 @@ from legged.episodes.stored import Episodes
 from legged.errors import ConfigError
 
 SETTLE_S = 1.0
-"""At the start of an episode, when a robot falls onto its feet: not counted [s]."""
+"""Time at the start of an episode that is not counted, while a robot drops onto its feet [s]."""
 PHASES = 50
 """Points of a gait cycle."""
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 0.1, 2.0
-"""Between touch-downs that are nearer a foot has bounced, between those that are farther apart the robot has stood [s]."""
+"""Limits of a gait cycle: touch-downs closer together are bounces, those further apart have a stop between them [s]."""
 UNUSUAL = 0.5
-"""A cycle whose length differs from the median by more than this share of it is none of the gait: a stop, a stumble."""
+"""Cycles whose length differs from the median by more than this share are left out: stops and stumbles."""
 MEASURED = (("joint_pos", "angle"), ("joint_vel", "velocity"), ("torque", "torque"))
-"""Arrays that are summed up, and what they are called."""
+"""Arrays with statistics, and their titles."""
 
 
 @dataclass(frozen=True)
 class JointStatistics:
-    """Of D joints, over the steps after `SETTLE_S` of some episodes."""
+    """Statistics of D joints, over the steps after `SETTLE_S` of some episodes."""
 
     joints: list[str]
     units: dict[str, list[str]]
@@ -31,21 +31,21 @@ class JointStatistics:
     mean: dict[str, np.ndarray]
     """Array -> (D,)"""
     std: dict[str, np.ndarray]
-    """Likewise; of the steps themselves, all episodes taken together."""
+    """Array -> (D,) standard deviation over the steps of all episodes."""
     episodes: int
-    """How many were longer than `SETTLE_S`."""
+    """Number of episodes longer than `SETTLE_S`."""
     steps: int
     lost: int
-    """Steps that are left out because their numbers are not finite: physics blew up."""
+    """Number of steps left out because their numbers are not finite."""
     foot: str
-    """By whose touch-downs cycles are told; empty if the task has no feet."""
+    """Foot whose touch-downs delimit cycles; empty if the task has no feet."""
     cycles: dict[str, np.ndarray]
     """Array -> (C, PHASES, D) values over the phase of each cycle, from one touch-down on to the next."""
     cycle_s: np.ndarray
     """(C,) length of each cycle [s]."""
     duty: dict[str, float]
-    """Foot -> share of the cycles' steps at whose end it feels the ground, like the duty factor of an evaluation:
-    `feet_contact` holds each contact a step longer.
+    """Foot -> share of the cycles' steps at whose end it has contact, like the duty factor of an evaluation; `feet_contact`
+    holds each contact a step longer.
     """
 
     def over_cycle(self, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -54,14 +54,14 @@ class JointStatistics:
 
 
 def joint_statistics(episodes: Episodes, where: str = "POLICY") -> JointStatistics:
-    """Sum up the joints of some episodes; `where` is the flag that asks for it.
+    """Compute the statistics of some episodes; `where` is the argument for errors.
 
-    A cycle begins when the first foot touches down and ends when it does so the next time, if that is neither too soon nor
-    too late (`SHORTEST_CYCLE_S`, `LONGEST_CYCLE_S`, `UNUSUAL`); values are interpolated linearly at `PHASES` equal parts.
-    Steps whose numbers are not finite are left out, and cycles that have one.
+    A cycle lasts from a touch-down of the first foot to its next one, within the limits `SHORTEST_CYCLE_S`, `LONGEST_CYCLE_S`
+    and `UNUSUAL`. Its values are interpolated linearly at `PHASES` points. Steps with numbers that are not finite are left
+    out, and so are their cycles.
 
     Raises:
-        ConfigError: the task's joints are not known, or no episode is long enough.
+        ConfigError: the task has no joints with motors, or no episode is long enough.
     """
     if not episodes.about["joints"]:
         raise ConfigError(f"{where}: '{episodes.about['task']}' has no joints with a motor each")
@@ -109,7 +109,7 @@ def joint_statistics(episodes: Episodes, where: str = "POLICY") -> JointStatisti
 
 
 def cycles_of(contact: np.ndarray, dt: float) -> list[tuple[int, int]]:
-    """Return the first step of every cycle and that of the next one, of a foot that is in contact (T,) or not."""
+    """Return the first step of every cycle and that of the next, from the contacts (T,) of a foot."""
     down = np.asarray(contact) > 0.5
     touched = np.flatnonzero(down[1:] & ~down[:-1]) + 1
     pairs = [(int(begin), int(end)) for begin, end in pairwise(touched)]
@@ -117,7 +117,7 @@ def cycles_of(contact: np.ndarray, dt: float) -> list[tuple[int, int]]:
 
 
 def resampled(values: np.ndarray, begin: int, end: int) -> np.ndarray:
-    """Return (PHASES, D) values (T, D) from row `begin` on up to, and without, row `end`, interpolated."""
+    """Return (PHASES, D) values, interpolated from the rows `begin` to `end` (exclusive) of values (T, D)."""
     at = begin + (end - begin) * np.arange(PHASES) / PHASES
     below = np.floor(at).astype(int)
     share = (at - below)[:, None]
@@ -125,10 +125,10 @@ def resampled(values: np.ndarray, begin: int, end: int) -> np.ndarray:
 
 
 def check_comparable(one: JointStatistics, other: JointStatistics) -> None:
-    """Check that two policies move the same joints.
+    """Check that two policies have the same joints.
 
     Raises:
-        ConfigError: they do not.
+        ConfigError: their joints differ.
     """
     if one.joints != other.joints:
         only = [name for name in (*one.joints, *other.joints) if (name in one.joints) != (name in other.joints)]

@@ -1,9 +1,7 @@
-"""The page of an episode: one HTML file with pictures, numbers and the code that draws them; it asks no network."""
+"""The page of an episode: one HTML file that holds pictures, numbers and the script that draws them."""
 
 import base64
-import json
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -11,47 +9,37 @@ import numpy as np
 from legged.episodes.panels import Panels
 from legged.episodes.ranking import Figures
 from legged.episodes.stored import Episodes
+from legged.evaluation.reports.document import render
 from legged.evaluation.result_file import changes_text
 from legged.process.paths import relative, write_text
 
-WEB = Path(__file__).resolve().parent / "web"
-
 
 def page_name(number: int) -> str:
-    """Return what the page of an episode is called."""
+    """Return the file name of an episode's page."""
     return f"episode_{number:03d}.html"
 
 
 def write_page(folder: Path, episodes: Episodes, figures: Figures, number: int, film: dict[str, Any]) -> Path:
-    """Write the page of an episode into `folder`, with what `Projector.show` returned of it; return its path.
+    """Write the page of an episode into `folder`; return its path. `film` is the result of `Projector.show`.
 
     Raises:
-        RunError: it can't be written.
+        RunError: the page can't be written.
     """
-    panels = Panels(episodes, number)
+    panels, about = Panels(episodes, number), episodes.about
     sections = panels.sections()
-    about = episodes.about
-    title = f"{about['task']}, episode {number}: {_ending(episodes, figures, number)}"
     data = {
-        "title": title,
-        "summary": f"{about['checkpoint']} of {about.get('run', '')}, {about.get('physics', '')}; {_conditions(about)}",
         "steps": int(episodes.lengths[number]),
         "dt": episodes.dt,
         "film": film,
         "series": {name: _packed(array) for name, array in panels.arrays.items()},
         "sections": sections,
-        "tables": [
-            {"rows": _facts(episodes, figures, number), "numbers": False},
-            {"rows": _sums(episodes, number), "numbers": True},
-        ],
     }
-    # Within a script a text must not end it.
-    text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    page = Template((WEB / "page.html").read_text(encoding="utf-8")).substitute(
-        title=title.replace("&", "&amp;").replace("<", "&lt;"),
-        style=(WEB / "page.css").read_text(encoding="utf-8"),
-        script=(WEB / "page.js").read_text(encoding="utf-8"),
-        data=text,
+    page = render(
+        "episode.html",
+        title=f"{about['task']}, episode {number}: {_ending(episodes, figures, number)}",
+        summary=f"{about['checkpoint']} of {about.get('run', '')}, {about.get('physics', '')}; {_conditions(about)}",
+        tables=[_facts(episodes, figures, number), _sums(episodes, number)],
+        data=data,
     )
     path = folder / page_name(number)
     write_text(path, page)
@@ -71,7 +59,7 @@ def _ending(episodes: Episodes, figures: Figures, number: int) -> str:
 
 
 def _conditions(about: dict[str, Any]) -> str:
-    """Say under which conditions episodes were recorded."""
+    """Return the conditions of a recording as text."""
     text = (
         "noise, pushes and randomisation as trained" if about.get("as_trained") else "without noise, pushes and randomisation"
     )

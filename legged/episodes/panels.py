@@ -1,4 +1,4 @@
-"""The plots of an episode's page: which arrays are drawn how, of legged robots and of others."""
+"""The plots of an episode's page, for legged robots and for others."""
 
 import re
 from collections.abc import Sequence
@@ -11,31 +11,31 @@ from legged.figures import COLORS
 
 OTHERS = "#BBBBBB"
 MOST_PARTS = 7
-"""Reward parts that have a colour of their own, the largest ones; the rest is drawn as one."""
+"""Reward parts with their own colour, the largest ones; the rest is summed."""
 MOST_LINES = 8
-"""Of a plot."""
+"""Most lines of a plot."""
 SIDES = frozenset(
     (
         *("lf", "rf", "lh", "rh", "fl", "fr", "rl", "rr", "hl", "hr", "bl", "br", "ml", "mr", "l", "r"),
         *("left", "right", "front", "rear", "hind", "back"),
     )
 )
-"""Words in a joint's name that say which leg it is of."""
+"""Words in a joint's name for its leg."""
 
 
 class Panels:
-    """Collects the plots of one episode, and the arrays that they draw."""
+    """The plots of one episode and their arrays."""
 
     def __init__(self, episodes: Episodes, number: int) -> None:
         self.episodes, self.one = episodes, episodes.of(number)
         self.arrays: dict[str, np.ndarray] = {}
-        """Array -> (T, K) what is drawn."""
+        """Array -> (T, K) values."""
         self.joints = episodes.about["joints"]
 
     def sections(self) -> list[dict[str, Any]]:
-        """Return the parts of the page in order: title, plots, whether it is open at first.
+        """Return the sections of the page in order: title, plots, and whether the section is open at first.
 
-        Reward parts that the task multiplies with its step are drawn as they were before: paid a second.
+        Reward parts that the task multiplies by its step are drawn per second.
         """
         legged = "command" in self.one
         found = [*(self._of_legs() if legged else [self._of_root()]), self._rewards()]
@@ -52,7 +52,7 @@ class Panels:
         found.append(self._actions())
         return [section for section in found if section["panels"]]
 
-    # ---- what legged robots have ------------------------------------------------------------------------------------
+    # ---- legged robots ---------------------------------------------------------------------------------------------
 
     def _of_legs(self) -> list[dict[str, Any]]:
         one = self.one
@@ -60,7 +60,7 @@ class Panels:
         self.arrays["base_ang_vel"] = one["base_ang_vel"]
         x, y = one["qpos"][:, 4], one["qpos"][:, 5]
         self.arrays["height"] = one["qpos"][:, 2] - one["ground"]
-        # Of the base's upward axis, the vertical part is 1 - 2 (x^2 + y^2) of its quaternion.
+        # The vertical part of the base's upward axis is 1 - 2 (x^2 + y^2), with x and y of its quaternion.
         self.arrays["tilt"] = np.degrees(np.arccos(np.clip(1.0 - 2.0 * (x**2 + y**2), -1.0, 1.0)))
         linear = [
             line
@@ -97,20 +97,18 @@ class Panels:
             {**_line(name, "feet_contact", i, COLORS[i % len(COLORS)]), "above": 0.5}
             for i, name in enumerate(without_common_words(feet))
         ]
-        # What else touched the ground, or the robot itself, at any time.
+        # Other shapes with a contact, at any time.
         force = self.one["contact_force"]
         touched = [i for i, name in enumerate(contacts) if name not in feet and (force[:, i] > threshold).any()]
         self.arrays["other_force"] = force[:, touched] if touched else np.zeros((len(force), 1))
         rows += [{**_line(contacts[i], "other_force", k, "#666666"), "above": threshold} for k, i in enumerate(touched)]
         lines = [_line(foot, "feet_up_force", i, COLORS[i % len(COLORS)]) for i, foot in enumerate(feet)]
-        note = (
-            "Bars are contacts. Grey ones are of other shapes, which touched something." if touched else "Bars are contacts."
-        )
+        note = "Bars are contacts; grey bars are those of other shapes." if touched else "Bars are contacts."
         panels = [_panel("gait diagram", "", rows, kind="gait"), _panel("vertical force on the feet", "N", lines)]
         return _section("Feet", panels, note, wide=True)
 
     def _passive(self) -> dict[str, Any] | None:
-        """Return the joints of a legged robot that no motor drives; their positions alone."""
+        """Return the positions of joints without a motor, of a legged robot."""
         if "command" not in self.one:
             return None
         names = self.episodes.columns("qpos")
@@ -122,14 +120,14 @@ class Panels:
         panels = self._plain("passive", [names[i] for i in columns], "position", "rad, m or 1")
         return _section("Passive joints", panels, "No motor drives them.", is_open=False)
 
-    # ---- what every task has ----------------------------------------------------------------------------------------
+    # ---- all tasks --------------------------------------------------------------------------------------------------
 
     def _of_root(self) -> dict[str, Any]:
-        """Return the coordinates that no motor drives, of any other task."""
+        """Return the coordinates without a motor, of any other task."""
         panels = []
         for name, key, title, unit in (
-            ("qvel", "qvel", "velocities of what no motor drives", "m/s or rad/s"),
-            ("qpos", "qpos", "positions of what no motor drives", "m or rad"),
+            ("qvel", "qvel", "velocities without a motor", "m/s or rad/s"),
+            ("qpos", "qpos", "positions without a motor", "m or rad"),
         ):
             names = self.episodes.columns(name)
             driven = {joint[key] for joint in self.joints}
@@ -144,10 +142,10 @@ class Panels:
         unit = float(self.episodes.about.get("reward_unit", 1.0))
         self.arrays["reward_parts"] = parts / unit
         size = np.abs(np.nan_to_num(parts)).sum(axis=0)
-        note = "What is paid lies above zero, what it costs below."
+        note = "Rewards lie above zero, penalties below."
         if "termination" in names and size[names.index("termination")] > 0.0:
             once = float(parts[-1, names.index("termination")])
-            note += f" What a failure costs, {once:.3g} once, at the end, is left out."
+            note += f" The penalty of a failure, {once:.3g} at the end, is left out."
             size[names.index("termination")] = 0.0
         largest = [int(i) for i in np.argsort(-size, kind="stable") if size[i] > 0.0]
         if len(largest) > MOST_PARTS + 1:
@@ -166,7 +164,7 @@ class Panels:
         return "1/s" if float(self.episodes.about.get("reward_unit", 1.0)) != 1.0 else "1 a step"
 
     def _by_joint(self, title: str, name: str, limit: str, what: str, note: str, is_open: bool = True) -> dict[str, Any]:
-        """Return a plot for all joints that are called alike but for their leg."""
+        """Return a plot for each group of joints that differ only in their leg."""
         self.arrays[name] = self.one[name]
         panels = []
         for kind, members in groups_of([joint["name"] for joint in self.joints]):
@@ -186,7 +184,7 @@ class Panels:
         return _section("Actions", panels, is_open=False)
 
     def _plain(self, name: str, labels: Sequence[str], title: str, unit: str) -> list[dict[str, Any]]:
-        """Return the columns of an array that is drawn, so many in a plot as can be told apart."""
+        """Return plots of the columns of an array, at most `MOST_LINES` in each."""
         lines = [_line(label, name, i, COLORS[i % MOST_LINES]) for i, label in enumerate(labels)]
         return [_panel(title, unit, lines[i : i + MOST_LINES]) for i in range(0, len(lines), MOST_LINES)]
 
@@ -198,8 +196,8 @@ def joint_unit(array: str, of_position: str) -> str:
 
 
 def groups_of(names: Sequence[str]) -> list[tuple[str, list[int]]]:
-    """Return joints that are called alike but for the words that name a leg (`SIDES`), in the order of the first: what they
-    have in common, and their numbers. A joint that is like no other is alone, and so are more than `MOST_LINES`.
+    """Return the groups of joints whose names differ only in the words for a leg (`SIDES`), in order: their common name, and
+    their numbers. A joint without others is a group, and so is each of more than `MOST_LINES`.
     """
     found: dict[str, list[int]] = {}
     for i, name in enumerate(names):
@@ -213,13 +211,13 @@ def groups_of(names: Sequence[str]) -> list[tuple[str, list[int]]]:
 
 
 def _both(limit: Any) -> list[float]:
-    """Return both limits: of a range itself, of a largest size it and its negative, of nothing none."""
+    """Return both limits: those of a range, or a value and its negative; no limits for None."""
     return [] if limit is None else list(limit) if isinstance(limit, list) else [-limit, limit]
 
 
 def without_common_words(names: Sequence[str]) -> list[str]:
-    """Return names without the words that all of them have: LF_FOOT and RF_FOOT are LF and RF. One that would have none left
-    keeps all.
+    """Return names without the words that all have in common: LF_FOOT and RF_FOOT become LF and RF. A name without other
+    words stays whole.
     """
     words = [[word for word in re.split(r"[\W_]+", name) if word] for name in names]
     common = set.intersection(*map(set, words)) if words else set()

@@ -42,7 +42,7 @@ def write_parquet(episodes: Episodes, folder: Path) -> None:
     """Write TABLE into `folder`, a row a control step.
 
     Raises:
-        RunError: it can't be written.
+        RunError: the file can't be written.
     """
     import pyarrow
     from pyarrow import parquet

@@ -1,4 +1,4 @@
-"""What is recorded of a task in every control step: tensors with names, units and columns; and what its joints are."""
+"""The recorded quantities of a control step, as tensors with names, units and columns; and the joints of a task."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,21 +13,21 @@ from legged.envs import BaseTask, LeggedRobot
 
 AXES = ("x", "y", "z")
 FLAGS = ("failed", "timed_out")
-"""Columns that say how an episode ended, before those of the terms."""
+"""Columns for how an episode ended, before those of the terms."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """Something that N robots have at the end of a control step."""
+    """A quantity of N robots at the end of a control step."""
 
     name: str
     read: Callable[[], Tensor]
-    """(N, ...) as it is now."""
+    """Return its current values (N, ...)."""
     unit: str
     what: str
-    """In words, with the frame where there is one."""
+    """Description, with the frame if it has one."""
     columns: tuple[str, ...] = ()
-    """Names of what lies along its second axis, if it has one."""
+    """Names along its second axis, if it has one."""
 
 
 @dataclass(frozen=True)
@@ -36,15 +36,15 @@ class Joint:
 
     name: str
     unit: str
-    """Of its position: rad, or m where it slides."""
+    """Unit of its position: rad, or m for a slide."""
     qpos: int
-    """Its column of the generalised positions; likewise velocities."""
+    """Column of the generalised positions."""
     qvel: int
     range: tuple[float, float] | None
-    """Lowest and highest position; None if it has no stops."""
+    """Lowest and highest position; None without stops."""
     max_velocity: float | None
     max_torque: float | None
-    """Largest torque [N m], or force [N] where it slides, either way, whatever is drawn for it; None if nobody limits it."""
+    """Largest nominal torque [N m], or force [N] of a slide, either way; None without a limit."""
 
     def described(self) -> dict[str, Any]:
         """Return plain values, for a JSON file."""
@@ -52,7 +52,7 @@ class Joint:
 
 
 def quantities_of(task: BaseTask) -> list[Quantity]:
-    """Return what is recorded of a task, of legged robots more than of others. `ended` comes last."""
+    """Return the recorded quantities of a task; `ended` comes last."""
     physics = task.physics
     model = physics.model
     rewards = task.rewards
@@ -73,7 +73,7 @@ def quantities_of(task: BaseTask) -> list[Quantity]:
 
 
 def joints_of(task: BaseTask) -> list[Joint]:
-    """Return the joints with a motor, in the order of the motors; none if a motor drives something else than one joint."""
+    """Return the joints with a motor, in the order of the motors; none if a motor drives something other than one joint."""
     if isinstance(task, LeggedRobot):
         robot = task.robot
         limits = task.control.nominal["torque_limit"].tolist()
@@ -109,7 +109,7 @@ def joints_of(task: BaseTask) -> list[Joint]:
 
 
 def _of_legs(task: LeggedRobot) -> list[Quantity]:
-    """Return what only legged robots have."""
+    """Return the quantities of legged robots."""
     robot, joints, feet = task.robot, task.robot.joint_names, task.robot.feet_names
     feet_columns = task.feet_indices
     return [
@@ -146,7 +146,7 @@ def _of_legs(task: LeggedRobot) -> list[Quantity]:
 
 
 def _of_motors(task: BaseTask) -> list[Quantity]:
-    """Return what a model with motors on its joints has; nothing if its actuators are others."""
+    """Return the quantities of a model with motors on its joints; nothing for other actuators."""
     model, physics, joints = task.physics.model, task.physics, joints_of(task)
     if not joints:
         return []
@@ -168,7 +168,7 @@ def _of_motors(task: BaseTask) -> list[Quantity]:
 
 
 def _all_motors(model: mujoco.MjModel) -> bool:
-    """Say whether every actuator is a motor on one hinge or slide, whose torque is its control times a factor."""
+    """Return whether every actuator is a motor on one hinge or slide, with a torque proportional to its control."""
     numbers = model.actuator_trnid[:, 0]
     kinds = model.jnt_type[numbers] if (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT).all() else np.array([])
     scalar = np.isin(kinds, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE))

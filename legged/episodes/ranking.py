@@ -1,4 +1,4 @@
-"""What went wrong in which episode: figures of each, an order by one of them, and tables."""
+"""Figures of each episode, and an order by one of them."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from rich.markup import escape
-from rich.table import Table
 
 from legged.episodes.stored import NO_NUMBERS, TIME_UP, Episodes
 from legged.errors import ConfigError, suggest
@@ -18,11 +16,11 @@ class Column:
     """A figure of every episode."""
 
     name: str
-    """What --sort calls it."""
+    """Name for --sort."""
     title: str
     form: str
     low_first: bool = False
-    """Whether the smallest is the worst."""
+    """True if the smallest value is the worst."""
 
 
 COLUMNS = (
@@ -41,7 +39,7 @@ FELL = "fell"
 
 @dataclass(frozen=True)
 class Figures:
-    """What can be said of E episodes in a number each."""
+    """The figures of E episodes."""
 
     values: dict[str, np.ndarray]
     """Name of a column -> (E,); only those that the task has."""
@@ -52,7 +50,7 @@ class Figures:
     ended: list[list[str]]
     """Which terms ended each episode."""
     ends: list[str]
-    """All that can end an episode."""
+    """Names of everything that can end an episode."""
 
     @property
     def columns(self) -> list[Column]:
@@ -61,9 +59,8 @@ class Figures:
 
 
 def figures_of(episodes: Episodes) -> Figures:
-    """Compute the figures of all episodes. Errors of tracking are root mean squares over all steps, the first included;
-    energy is the sum of |torque * velocity| over joints and time, of those at the ends of control steps; power is that by the
-    length of the episode.
+    """Compute the figures of all episodes. Errors are root mean squares over all steps; energy is the sum of |torque *
+    velocity| at the ends of control steps, over joints and time; power is energy over the length of the episode.
     """
     count, strained = len(episodes), []
     ends = [*episodes.about["terminations"], TIME_UP, NO_NUMBERS]
@@ -100,11 +97,10 @@ def _rms(errors: np.ndarray) -> float:
 
 
 def order_of(figures: Figures, by: str, ended_by: str | None = None, flag: str = "--sort") -> list[int]:
-    """Return the numbers of the episodes, the worst first; with `ended_by`, only of those that this term ended, which may be
-    none.
+    """Return the numbers of the episodes, the worst first; with `ended_by`, only of those that this term ended.
 
     Raises:
-        ConfigError: the task has no such figure, or no such term.
+        ConfigError: the task lacks that figure or that term.
     """
     there = [FELL, *figures.values]
     if by not in there:
@@ -124,51 +120,34 @@ def order_of(figures: Figures, by: str, ended_by: str | None = None, flag: str =
 
 
 def check_ended(name: str, ends: Sequence[str]) -> None:
-    """Look whether an episode can end by the term of that name.
+    """Check that a term of that name can end an episode.
 
     Raises:
-        ConfigError: it can't.
+        ConfigError: there is no such term.
     """
     if name not in ends:
         raise ConfigError(f"--ended: {name}: no episode ends by it{suggest(name, ends)}")
 
 
 def _or_worst(value: Any, sign: float = 1.0) -> float:
-    """Return a number; where physics blew up it is none, and counts as the worst."""
+    """Return a number; infinity, the worst value, if it is not finite."""
     return float(value) if np.isfinite(value) else sign * np.inf
 
 
 def heads_of(figures: Figures) -> list[str]:
-    """Return the titles of the columns of a table."""
+    """Return the heads of the list's columns."""
     return ["episode", "ended by", *(column.title for column in figures.columns), *(["joint"] if figures.strained else [])]
 
 
 def row_of(figures: Figures, number: int) -> list[str]:
-    """Return an episode as a line of a table."""
+    """Return the row of an episode."""
     ended = ", ".join(figures.ended[number]) + (" (failed)" if figures.failed[number] else "")
     cells = [f"{figures.values[column.name][number]:{column.form}}" for column in figures.columns]
     return [str(number), ended, *cells, *([figures.strained[number]] if figures.strained else [])]
 
 
 def counts_text(figures: Figures) -> str:
-    """Say how many episodes there are, how many failed, and what ended them."""
+    """Return the numbers of episodes and failures, and the terms that ended episodes, as text."""
     counts = Counter(term for terms in figures.ended for term in terms)
     ended = ", ".join(f"{count} by {term}" for term, count in counts.most_common())
     return f"{len(figures.ended)} episodes, {int(figures.failed.sum())} failed; ended: {ended}"
-
-
-def episodes_table(figures: Figures, order: Sequence[int], title: str) -> Table:
-    """Return those episodes as a table for the screen."""
-    table = Table(title=escape(title), title_justify="left")
-    for i, head in enumerate(heads_of(figures)):
-        table.add_column(escape(head.replace(" [", "\n[")), justify="left" if i == 1 or head == "joint" else "right")
-    for number in order:
-        table.add_row(*(escape(cell) for cell in row_of(figures, number)))
-    return table
-
-
-def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = (0,)) -> str:
-    """Return a table in Markdown; the columns `left` are text, all others numbers."""
-    lines = [f"| {' | '.join(heads)} |", f"|{'|'.join('---' if i in left else '---:' for i in range(len(heads)))}|"]
-    lines += [f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in rows]
-    return "\n".join(lines) + "\n"

@@ -9,19 +9,19 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.envs import BaseTask, LeggedRobot
-from legged.envs.step_watchers import watch_steps
+from legged.envs.final_observation import watch_steps
 from legged.episodes.quantities import FLAGS, quantities_of
 from legged.episodes.stored import Episodes
 from legged.evaluation.overflows import Overflows
 
 CHUNK_MB = 64.0
-"""Room for a chunk of steps on the device [MiB]; it is fetched in one transfer."""
+"""Size of a chunk of steps on the device [MiB]; a chunk is fetched in one transfer."""
 LONGEST_CHUNK = 100
-"""Steps of a chunk, at most: so often robots are asked whether all have finished."""
+"""Most steps of a chunk; after each chunk the recorder checks whether all robots have finished."""
 
 
 class StepRecord:
-    """A row a robot with everything that is recorded of a step, written within the captured step."""
+    """A row for each robot with all recorded quantities of a step, written within the captured step."""
 
     def __init__(self, task: BaseTask) -> None:
         self.quantities = quantities_of(task)
@@ -29,7 +29,7 @@ class StepRecord:
         self.shapes = [tuple(value.shape[1:]) for value in values]
         self.widths = [int(np.prod(shape)) for shape in self.shapes]
         self.row = torch.zeros(task.num_envs, sum(self.widths), device=task.device)
-        """(N, W) the last step of every robot, before episodes began anew."""
+        """(N, W) last step of every robot, from before resets."""
 
     def take(self) -> None:
         """Write the row."""
@@ -38,7 +38,7 @@ class StepRecord:
         torch.cat([value.float() for value in values], dim=1, out=self.row)
 
     def split(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        """Return (T, ...) of every quantity by its name, out of rows (T, W)."""
+        """Return name -> (T, ...) values of every quantity, from rows (T, W)."""
         parts = np.split(rows, np.cumsum(self.widths)[:-1], axis=1)
         return {
             quantity.name: part.reshape(len(rows), *shape)
@@ -47,8 +47,8 @@ class StepRecord:
 
 
 def shares_of(episodes: int, robots: int) -> np.ndarray:
-    """Return (N,) how many episodes each robot contributes, decided before any begins: the number must not follow from how
-    long its episodes are.
+    """Return (N,) numbers of episodes of each robot. They are fixed beforehand, so that they do not depend on the lengths of
+    episodes.
     """
     return episodes // robots + (np.arange(robots) < episodes % robots)
 
@@ -61,13 +61,13 @@ def record_episodes(
     place: Callable[[], None] | None = None,
     graph: bool = True,
 ) -> tuple[Episodes, int]:
-    """Let every robot run its first episodes, `episodes` in all, each from a reset to its end; return them, and how many
-    times a robot lost contacts in a step for want of memory.
+    """Run the first episodes of every robot, `episodes` in all, each from a reset to its end; return them, and how often a
+    robot lost contacts in a step for want of memory.
 
-    Robot i contributes its first `shares_of(...)[i]` episodes and nothing more. So no episode is cut off, and short ones do
-    not come more often than long ones, as they do among the episodes that end first. With `command`, vx, vy [m/s] and yaw
-    rate [rad/s], all robots are asked for it all the time. `place` is called before they begin, to say where. With `graph`
-    the step is captured on a GPU.
+    Robot i contributes its first `shares_of(...)[i]` episodes. So no episode is cut off, and short episodes are not more
+    frequent than they should be, as they are among the episodes that end first. All robots hold `command`, vx, vy [m/s] and
+    yaw rate [rad/s], if it is given. `place` is called before the first reset to place robots. With `graph` the step is
+    captured on a GPU.
 
     Raises:
         TermError: the step cannot be captured.
@@ -89,7 +89,7 @@ def _run(
     shares: np.ndarray,
     command: tuple[float, float, float] | None,
 ) -> tuple["_Gathered", int]:
-    """Step until every robot has finished its share."""
+    """Step until every robot has finished its episodes."""
     n, width, device = task.num_envs, record.row.shape[1], torch.device(task.device)
     first_states = task.physics.qpos.shape[1] + task.physics.qvel.shape[1]
     longest = int(CHUNK_MB * 2**20 / (4 * n * (width + first_states)))
@@ -115,10 +115,10 @@ def _state(task: BaseTask) -> Tensor:
 
 
 class _Gathered:
-    """Episodes of N robots, put together from chunks of steps on the host."""
+    """Episodes of N robots, assembled on the host from chunks of steps."""
 
     def __init__(self, shares: np.ndarray, first_states: np.ndarray, width: int, ended: int) -> None:
-        """Want `shares` (N,) episodes, which begin in `first_states` (N, S). Rows are `width` wide; the flags that say how an
+        """Collect `shares` (N,) episodes, which begin in `first_states` (N, S). Rows are `width` wide; the flags of how an
         episode ended begin at the column `ended`.
         """
         self._shares, self._width, self._flags = shares, width, slice(ended, ended + len(FLAGS))
@@ -128,11 +128,11 @@ class _Gathered:
 
     @property
     def complete(self) -> bool:
-        """Whether every robot has finished its share."""
+        """True if every robot has finished its episodes."""
         return all(len(own) == share for own, share in zip(self._finished, self._shares, strict=True))
 
     def add(self, chunk: np.ndarray) -> None:
-        """Take in steps (T, N, width + S): rows, and the states that robots were left in, of new episodes where one ended."""
+        """Add steps (T, N, width + S): rows, and the states after them, which are those of new episodes after an end."""
         over = np.asarray(chunk[:, :, self._flags].any(axis=2))
         for robot, own in enumerate(self._finished):
             begin = 0
@@ -147,7 +147,7 @@ class _Gathered:
                 self._begun[robot].append(chunk[begin:, robot, : self._width].copy())
 
     def episodes(self, record: StepRecord) -> Episodes:
-        """Return them in order: the first of every robot, then the second."""
+        """Return the episodes in order: the first of every robot, then the second."""
         numbered = sorted((k, robot) for robot, own in enumerate(self._finished) for k in range(len(own)))
         rows = [self._finished[robot][k][0] for k, robot in numbered]
         arrays = record.split(np.concatenate(rows))

@@ -1,4 +1,4 @@
-"""A policy's episodes: the task rebuilt with or without what disturbs it, and what is said of it beside the numbers."""
+"""Episodes of a policy: the task is rebuilt with or without disturbances, and described for the file."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,7 +16,7 @@ from legged.episodes.stored import Episodes
 from legged.episodes.stored_check import FORMAT
 from legged.errors import ConfigError
 from legged.evaluation.overflows import warn_of_overflows
-from legged.evaluation.result_file import changes_of
+from legged.evaluation.result_file import changes_of, device_name
 from legged.physics import engine_name, resolve_physics
 from legged.play.playground import SETTING, Playground
 from legged.policies.episodes import unit_of
@@ -24,35 +24,35 @@ from legged.policies.restore import TrainedPolicy, restore, undisturbed
 from legged.terrain import Terrain
 
 MOST_EPISODES = 4096
-"""More are not recorded at once: at 20 s each they are some gigabytes."""
+"""Most episodes of a recording; at 20 s each they take some gigabytes."""
 
 
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
-"""The golden ratio less 1."""
+"""The golden ratio minus 1."""
 
 
 @dataclass(frozen=True)
 class Wish:
-    """What the command line asks for."""
+    """Choices of the command line."""
 
     episodes: int
     robots: int
     as_trained: bool = False
-    """With noise, pushes, curricula and what is randomised in the training."""
+    """Keep noise, pushes, curricula and randomisation of the training."""
     command: tuple[float, float, float] | None = None
-    """vx, vy [m/s], yaw rate [rad/s] that all robots are asked for; drawn as in the training if there is none."""
+    """vx, vy [m/s], yaw rate [rad/s] for all robots; commands of the training if None."""
     terrain: str | None = None
-    """Type of the tiles, as play has them; without it and a difficulty, the ground of the training."""
+    """Type of the tiles, as in play; without it and a difficulty, the ground of the training."""
     difficulty: float | None = None
     changes: tuple[tuple[str, Any], ...] = ()
-    """Overrides, which come last."""
+    """Overrides, applied last."""
 
 
 def check_wish(policy: TrainedPolicy, wish: Wish) -> Playground | None:
-    """Return the tiles that are asked for, None where the task keeps its own ground.
+    """Return the chosen tiles; None if the task keeps its own ground.
 
     Raises:
-        ConfigError: something asked for is not to be had.
+        ConfigError: a choice does not fit the task.
     """
     task = policy.cfg.task
     if not isinstance(policy.cfg, LeggedConfig):
@@ -73,11 +73,11 @@ def check_wish(policy: TrainedPolicy, wish: Wish) -> Playground | None:
 
 
 def ground_of(cfg: TaskConfig, chosen: dict[str, Any] | None) -> Terrain | None:
-    """Build the tiles again that episodes were recorded on; None where the task makes its ground itself. `cfg` is the task's
-    configuration, `chosen` what episodes.json says of its "ground".
+    """Build the tiles of recorded episodes again; return None if the task builds its ground itself. `cfg` is the task's
+    configuration, `chosen` the entry "ground" of episodes.json.
 
     Raises:
-        ConfigError: there are no such tiles.
+        ConfigError: the type of the tiles is unknown.
     """
     if chosen is None or not isinstance(cfg, LeggedConfig):
         return None
@@ -88,11 +88,11 @@ def ground_of(cfg: TaskConfig, chosen: dict[str, Any] | None) -> Terrain | None:
 def roll_out(
     policy: TrainedPolicy, wish: Wish, device: torch.device, graph: bool = True, where: str = "sim.physics"
 ) -> tuple[Episodes, TaskConfig]:
-    """Record a policy's episodes on `device`; return them, and the configuration that their task had. `where` says who asks
-    for the engine.
+    """Record a policy's episodes on `device`; return them and their task's configuration. `where` names the setting of the
+    engine in errors.
 
     Raises:
-        ConfigError: something asked for is not to be had, or the checkpoint does not fit.
+        ConfigError: a choice does not fit the task, or the checkpoint does not fit.
         TermError: the step cannot be captured.
     """
     playground = check_wish(policy, wish)
@@ -113,7 +113,7 @@ def roll_out(
         "checkpoint": policy.checkpoint.name,
         "run": "/".join(policy.folder.resolve().parts[-3:]),
         "physics": engine,
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+        "device": device_name(device),
         "as_trained": wish.as_trained,
         "changes": changes_of(wish.changes),
         "held_command": list(wish.command) if wish.command else None,
@@ -127,8 +127,8 @@ def roll_out(
 
 
 def spread(task: LeggedRobot) -> None:
-    """Put robots on tiles of all levels and types alike, where they stay: robot i on the level whose number is the fraction
-    of i times the golden ratio, so that any few of them are far apart.
+    """Put robots on tiles of all levels and types evenly, where they stay. The level of robot i is given by the fractional
+    part of i times the golden ratio, so that the levels of any few robots are far apart.
     """
     assert task.terrain_curriculum is not None, "the task stands on a plane"
     share = torch.arange(task.num_envs, device=task.device) * GOLDEN % 1.0
@@ -137,14 +137,14 @@ def spread(task: LeggedRobot) -> None:
 
 
 def _changes(policy: TrainedPolicy, wish: Wish, playground: Playground | None) -> list[tuple[str, Any]]:
-    """Return overrides under which a policy's robots run their episodes."""
+    """Return the overrides of a recording."""
     cfg = policy.cfg
     own: list[tuple[str, Any]] = [("env.num_envs", wish.robots)]
     if wish.as_trained:
         drawn = to_dict(cfg.domain_rand)
         own += [(f"domain_rand.{name}", drawn[name]) for name in ("ranges", "kicks", "forces") if drawn.get(name)]
     elif isinstance(cfg, LeggedConfig):
-        # Episodes end as in the training, unlike those in which something else is measured.
+        # Episodes keep the length of the training.
         own += [change for change in undisturbed(wish.robots, 0.0) if change[0] != "env.episode_length_s"]
         if playground is not None:
             own += [*SETTING, *playground.changes(cfg)]
@@ -154,7 +154,7 @@ def _changes(policy: TrainedPolicy, wish: Wish, playground: Playground | None) -
 
 
 def _about(task: BaseTask, record: StepRecord) -> dict[str, Any]:
-    """Return what the numbers are: of a task, whatever policy acts in it."""
+    """Return the description of the recorded arrays, which depends on the task only."""
     arrays = {
         quantity.name: {"unit": quantity.unit, "what": quantity.what, "columns": list(quantity.columns)}
         for quantity in record.quantities

@@ -1,4 +1,4 @@
-"""Recorded episodes, in memory and as files: episodes.npz, and episodes.json, which says what its arrays are."""
+"""Recorded episodes, in memory and as files: the arrays in episodes.npz, their description in episodes.json."""
 
 import json
 import zipfile
@@ -17,26 +17,26 @@ from legged.process.paths import make_folder, relative, replacing, write_text
 from legged.registry import task_schema
 
 ARRAYS, ABOUT, CONFIG = "episodes.npz", "episodes.json", "episodes.yaml"
-"""The files: numbers; what they are; the configuration of the task that the robots were in."""
+"""Files: arrays, their description, and the configuration of their task."""
 MADE_OF_THEM = ("episodes.md", "episodes.parquet", "episode_[0-9]*.html", "joint_statistics.*")
-"""Patterns of the files that others make of a recording, beside it."""
+"""Patterns of the files that are made from a recording, in the same folder."""
 TIME_UP, NO_NUMBERS = "time", "non_finite"
-"""How an episode ended that no term has ended."""
+"""Names for ends without a term: out of time, and physics that blew up."""
 
 
 DAMAGES = (OSError, ValueError, RecursionError, zipfile.BadZipFile, EOFError, KeyError, NotImplementedError, MemoryError)
-"""What json, zipfile and NumPy raise at files that are not what they should be."""
+"""Errors that json, zipfile and NumPy raise for damaged files."""
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """E whole episodes of R control steps in all. Row k of an episode is its state at the end of control step k + 1, with the
-    action, the command and the reward of that step.
+    """E whole episodes of R control steps in all. Row k of an episode holds the state at the end of control step k + 1, with
+    the action, the command and the reward of that step.
     """
 
     arrays: dict[str, np.ndarray]
     about: dict[str, Any]
-    """Names, units, limits, task, checkpoint: what episodes.json holds."""
+    """Contents of episodes.json: names, units, limits, task, checkpoint."""
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self.arrays[name]
@@ -54,11 +54,11 @@ class Episodes:
 
     @cached_property
     def lengths(self) -> np.ndarray:
-        """(E,) steps."""
+        """(E,) lengths in steps."""
         return np.diff(self.arrays["episode_start"])
 
     def rows(self, number: int) -> slice:
-        """Return where an episode lies among the rows."""
+        """Return the rows of an episode."""
         start = self.arrays["episode_start"]
         return slice(int(start[number]), int(start[number + 1]))
 
@@ -68,19 +68,19 @@ class Episodes:
         return {name: array[rows] for name, array in self.arrays.items() if name not in PER_EPISODE}
 
     def columns(self, name: str) -> list[str]:
-        """Return what lies along the second axis of an array."""
+        """Return the names of an array's columns."""
         return list(self.about["arrays"][name]["columns"])
 
     def ended(self, number: int) -> list[str]:
-        """Return the terms that ended an episode: their names, TIME_UP, or NO_NUMBERS where physics blew up."""
+        """Return the names of the terms that ended an episode, TIME_UP, or NO_NUMBERS if physics blew up."""
         terms = self.about["terminations"]
         found = [term for term, mine in zip(terms, self.arrays["ended_by"][number], strict=True) if mine]
         return found or [NO_NUMBERS if self.arrays["failed"][number] else TIME_UP]
 
 
 def save_episodes(episodes: Episodes, cfg: TaskConfig, folder: Path) -> None:
-    """Write the three files into `folder`; arrays as they are, with `time` [s] and `episode` beside them. They take the place
-    of an earlier recording, and what was made of that goes.
+    """Write the three files into `folder`; the arrays also hold `time` [s] and `episode`. An earlier recording is replaced,
+    and files made from it are removed.
 
     Raises:
         ConfigError, RunError: a file can't be written.
@@ -88,8 +88,7 @@ def save_episodes(episodes: Episodes, cfg: TaskConfig, folder: Path) -> None:
     make_folder(folder)
     with replacing(folder / ARRAYS) as part:
         np.savez(part, **clock_of(episodes), **episodes.arrays)  # type: ignore[arg-type]
-        # Now that there is room for the numbers. Without the old description, nobody takes them for those of the old policy
-        # if the new one can't be written.
+        # Once the new arrays are written, the old description must not describe them if a later write fails.
         for name in (ABOUT, CONFIG, *MADE_OF_THEM):
             for path in folder.glob(name):
                 path.unlink()
@@ -98,7 +97,7 @@ def save_episodes(episodes: Episodes, cfg: TaskConfig, folder: Path) -> None:
 
 
 def clock_of(episodes: Episodes) -> dict[str, np.ndarray]:
-    """Return `episode` (T,), which one each row is of, and `time` (T,), how long it has lasted [s]."""
+    """Return `episode` (R,), the episode of each row, and `time` (R,), the time since its start [s]."""
     lengths = episodes.lengths
     steps = np.concatenate([np.arange(1, count + 1) for count in lengths])
     return {
@@ -108,7 +107,7 @@ def clock_of(episodes: Episodes) -> dict[str, np.ndarray]:
 
 
 def load_episodes(folder: Path, where: str) -> Episodes:
-    """Read what `save_episodes` wrote; `where` is the flag that names the folder.
+    """Read the files of `save_episodes`; `where` is the flag that names the folder.
 
     Raises:
         ConfigError: the folder holds no episodes, or damaged ones.
@@ -127,10 +126,10 @@ def load_episodes(folder: Path, where: str) -> Episodes:
 
 
 def load_config(folder: Path, where: str) -> TaskConfig:
-    """Return the configuration of the task that stored episodes are of.
+    """Return the configuration of the task of stored episodes.
 
     Raises:
-        ConfigError: the file is not there, or no longer fits the schema.
+        ConfigError: the file is missing, or no longer fits the schema.
     """
     path = folder / CONFIG
     if not path.is_file():

@@ -1,1 +1,1 @@
-"""How well a policy does: tracking errors, success on terrain, crossings."""
+"""Evaluations of policies: tracking errors, success on terrain, other engines."""

@@ -1,6 +1,5 @@
-"""All checkpoints of a run, in the order they were written: after how long a training had a robot that walks."""
+"""All checkpoints of a run, evaluated in the order they were written, and the first of them that walks."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -8,28 +7,28 @@ import torch
 
 from legged.errors import ConfigError
 from legged.evaluation.overflows import warn_of_overflows
-from legged.evaluation.result_file import changes_of
+from legged.evaluation.result_file import changes_of, write_result
 from legged.evaluation.velocity_grid import Grid
 from legged.evaluation.velocity_tracking import measure_tracking, ready_to_track
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.run_folder import checkpoints
 from legged.physics import engine_name
 from legged.policies.restore import TrainedPolicy
-from legged.process.paths import make_folder, relative, write_text
+from legged.process.paths import relative
 
 WALKING_RMSE = 0.15
-"""A robot that walks has a smaller velocity RMSE, if nothing else is asked for [m/s]."""
+"""Largest velocity RMSE of a robot that walks, by default [m/s]."""
 WALKING_FALLS = 0.01
-"""A robot that walks has a smaller share of falls, if nothing else is asked for."""
+"""Largest share of falls of a robot that walks, by default."""
 LARGEST_RMSE = 100.0
 """Largest velocity RMSE that can be asked for [m/s]."""
 
 
 def check_limits(rmse: float, falls: float) -> None:
-    """Check what --rmse and --falls ask of a robot that walks.
+    """Check the limits --rmse and --falls.
 
     Raises:
-        ConfigError: no robot could meet it, or every one would.
+        ConfigError: a limit is out of bounds.
     """
     for flag, value, most in (("--rmse", rmse, LARGEST_RMSE), ("--falls", falls, 1.0)):
         if not value > 0:
@@ -48,14 +47,14 @@ def evaluate_all_checkpoints(
     rmse: float = WALKING_RMSE,
     falls: float = WALKING_FALLS,
 ) -> int:
-    """Measure every checkpoint in the policy's folder on the grid, print a line on each, and say when the first one walked:
-    mean velocity RMSE below `rmse` [m/s] and share of falls below `falls`. Write time_to_walk.json into `folder`; return the
-    exit code.
+    """Measure every checkpoint in the policy's folder on the grid, print a line for each, and name the first that walks: with
+    a mean velocity RMSE below `rmse` [m/s] and a share of falls below `falls`. Write time_to_walk.json into `folder`; return
+    the exit code.
 
     Seconds are wall time from the start of the process that wrote the checkpoint, imports and all.
 
     Raises:
-        ConfigError: a checkpoint does not say when it was written; nothing is measured then.
+        ConfigError: a checkpoint holds no time; nothing is measured then.
         RunError: the file can't be written.
     """
     there = {path: _written_at(path) for path in checkpoints(policy.folder).values()}
@@ -87,7 +86,6 @@ def evaluate_all_checkpoints(
         f"{limits}: " + (f"after {first['wall_s']:.1f} s, {first['iteration']} iterations" if first else "never"), flush=True
     )
     warn_of_overflows("tracking", lost)
-    make_folder(folder)
     path = folder / "time_to_walk.json"
     engine, changes = engine_name(task.cfg.sim, device), changes_of(asked)
     result = {
@@ -102,16 +100,16 @@ def evaluate_all_checkpoints(
         "checkpoints": rows,
         "contact_overflows": lost,
     }
-    write_text(path, json.dumps(result, indent=1, allow_nan=False))
+    write_result(path, result)
     print(f"written: {relative(path)}")
     return 0
 
 
 def _written_at(path: Path) -> float:
-    """Return when a checkpoint was written, since its process began [s].
+    """Return the time at which a checkpoint was written, since the start of its process [s].
 
     Raises:
-        ConfigError: it does not say.
+        ConfigError: the checkpoint holds no time.
     """
     seconds = (read_checkpoint(path).get("infos") or {}).get("wall_s")
     if not isinstance(seconds, int | float):
@@ -120,5 +118,5 @@ def _written_at(path: Path) -> float:
 
 
 def walks(row: dict[str, Any], rmse: float, falls: float) -> bool:
-    """Say whether a checkpoint is good enough; one whose robots all fell has no error."""
+    """Return whether a checkpoint walks; a checkpoint whose robots all fell has no error."""
     return row["rmse_lin"] is not None and row["rmse_lin"] < rmse and row["falls"] < falls

@@ -1,38 +1,41 @@
-"""Several evaluations side by side, as tables and as curves; those of one task in one engine, made alike, are its seeds."""
+"""Several evaluations next to each other, as tables and as curves. Evaluations of one task in one engine under one condition
+are its seeds.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from rich.markup import escape
+import numpy as np
 from rich.table import Table
 
 from legged.errors import ConfigError, suggest
 from legged.evaluation.engines import engine_of
+from legged.evaluation.reports.charts import Line, draw_charts
 from legged.evaluation.result_file import changes_text, grid_text, tracking_of
-from legged.evaluation.success_report import TRAINED, TRAINED_LABEL, as_success
-from legged.figures import COLORS, figure
+from legged.evaluation.success_report import success_chart, types_in
+from legged.evaluation.tables import screen_table
 
 Key = tuple[str, str, str]
-"""Task, physics, and under what conditions it was measured where those are not the policy's own or not the same for all."""
+"""Task, engine, and conditions that differ from the policy's own or between evaluations."""
 Evaluations = dict[Key, list[dict[str, Any]]]
-"""What evaluations have in common -> results, one a seed."""
+"""Key -> results, one a seed."""
 FIGURES = (
-    ("velocity RMSE, mean [m/s]", "rmse_lin", "mean", 1.0, 3),
-    ("velocity RMSE, worst cell [m/s]", "rmse_lin", "worst", 1.0, 3),
-    ("yaw rate RMSE, mean [rad/s]", "rmse_ang", "mean", 1.0, 3),
-    ("yaw rate RMSE, worst cell [rad/s]", "rmse_ang", "worst", 1.0, 3),
-    ("falls [%]", "falls", None, 100.0, 2),
+    ("velocity RMSE, mean [m/s]", "rmse_lin", "mean", 1.0, ".3f"),
+    ("velocity RMSE, worst cell [m/s]", "rmse_lin", "worst", 1.0, ".3f"),
+    ("yaw rate RMSE, mean [rad/s]", "rmse_ang", "mean", 1.0, ".3f"),
+    ("yaw rate RMSE, worst cell [rad/s]", "rmse_ang", "worst", 1.0, ".3f"),
+    ("falls [%]", "falls", None, 100.0, ".2f"),
 )
-"""Label, where it is in a result, factor, decimals."""
+"""Label, place in a result, factor, format."""
 
 
 def keep_types(results: Sequence[dict[str, Any]], types: Sequence[str]) -> None:
-    """Leave only some terrain types in `results`, in the order given.
+    """Remove all terrain types but `types` from the results, and order them so.
 
     Raises:
-        ConfigError: a type is in none of them.
+        ConfigError: no result has a type.
     """
     there = {name for result in results for name in result.get("success", {}).get("types", {})}
     for name in types:
@@ -45,8 +48,8 @@ def keep_types(results: Sequence[dict[str, Any]], types: Sequence[str]) -> None:
 
 
 def grouped(results: Sequence[dict[str, Any]]) -> Evaluations:
-    """Return the seeds of the same task in the same engine together, in the order of their first: those that were measured
-    with the same fields changed, and on the same grid of commands.
+    """Return the results in groups of the same task, engine, changed fields and grid of commands, in the order of their
+    first.
     """
     grids = [grid_text(result) for result in results]
     told = len(set(grids) - {""}) > 1
@@ -58,51 +61,55 @@ def grouped(results: Sequence[dict[str, Any]]) -> Evaluations:
 
 
 def spread(values: Sequence[float]) -> float:
-    """Return how far the farthest value is from the mean, as a share of it; 0 where all are 0."""
+    """Return the largest distance of a value from the mean, as a share of the mean; 0 if all values are 0."""
     middle = mean(values)
     return max(abs(value - middle) for value in values) / middle if middle else 0.0
 
 
 def tracking_table(groups: Evaluations) -> Table:
-    """Return a column a group: mean over its seeds, the spread where there are several, and how many of them have the number
-    where not all do.
-    """
-    table = Table(title="following commands: mean of seeds (farthest from it)", title_justify="left")
-    table.add_column("measure")
-    for key, results in groups.items():
-        table.add_column(escape(heading(key, len(results))), justify="right")
-    for label, name, part, factor, decimals in FIGURES:
-        cells = []
+    """Return a table with a column a group: the mean over its seeds and the farthest seed's distance from it."""
+    rows = []
+    for label, name, part, factor, form in FIGURES:
+        row = [label]
         for results in groups.values():
             found = [tracking_of(result)[name] for result in results]
             every = [value if part is None else value[part] for value in found]
-            values = [factor * value for value in every if value is not None]
-            if not values:  # every robot fell before it was measured
-                cells.append("none")
-                continue
-            told = [f"{100 * spread(values):.0f} %"] if len(values) > 1 else []
-            if len(values) < len(results):  # of the others every robot fell
-                told.append(f"of {len(values)} of {len(results)} seeds")
-            cells.append(f"{mean(values):.{decimals}f}" + (f" ({', '.join(told)})" if told else ""))
-        table.add_row(escape(label), *cells)
-    return table
+            values = [factor * value for value in every if value is not None]  # null if every robot fell
+            row.append(_mean_text(values, len(results), form, f"{100 * spread(values):.0f} %") if values else "none")
+        rows.append(row)
+    return screen_table("following commands: mean of seeds (farthest from it)", ["measure", *_heads(groups)], rows)
 
 
 def episodes_comparison(groups: Evaluations) -> Table:
-    """Return a column a group of evaluations of episodes: mean over its seeds, and the range where there are several."""
-    table = Table(title="episodes: mean of seeds (lowest to highest)", title_justify="left")
-    table.add_column("measure")
-    for key, results in groups.items():
-        table.add_column(escape(heading(key, len(results))), justify="right")
+    """Return a table of evaluations of episodes with a column a group: the mean over its seeds and their range."""
     found = [[_episode_figures(result["episodes"]) for result in results] for results in groups.values()]
+    rows = []
     for label in dict.fromkeys(label for seeds in found for seed in seeds for label in seed):
         columns = [[seed[label] for seed in seeds if label in seed] for seeds in found]
-        table.add_row(escape(label), *(_mean_and_range(values) for values in columns))
-    return table
+        forms = [".1f" if values and abs(mean(values)) >= 100 else ".2f" for values in columns]
+        texts = [_range_text(values, len(values), form, form) for values, form in zip(columns, forms, strict=True)]
+        rows.append([label, *texts])
+    return screen_table("episodes: mean of seeds (lowest to highest)", ["measure", *_heads(groups)], rows)
+
+
+def _heads(groups: Evaluations) -> list[str]:
+    return [heading(key, len(results)) for key, results in groups.items()]
+
+
+def _mean_text(values: Sequence[float], seeds: int, form: str, spread_text: str) -> str:
+    """Return a mean; in brackets the spread of several values, and their number if not all seeds have one."""
+    notes = [spread_text] if len(values) > 1 else []
+    notes += [f"of {len(values)} of {seeds} seeds"] if len(values) < seeds else []
+    return f"{mean(values):{form}}" + (f" ({', '.join(notes)})" if notes else "")
+
+
+def _range_text(values: Sequence[float], seeds: int, form: str, range_form: str) -> str:
+    """Return a mean with the range of the values; an empty text without values."""
+    return _mean_text(values, seeds, form, f"{min(values):{range_form}} to {max(values):{range_form}}") if values else ""
 
 
 def _episode_figures(episodes: dict[str, Any]) -> dict[str, float]:
-    """Return label -> number of what is compared of an evaluation of episodes."""
+    """Return label -> number of the compared figures of an evaluation of episodes."""
     return {
         "return": episodes["return"]["mean"],
         "standard deviation of the return": episodes["return"]["std"],
@@ -114,105 +121,54 @@ def _episode_figures(episodes: dict[str, Any]) -> dict[str, float]:
     }
 
 
-def _mean_and_range(values: Sequence[float]) -> str:
-    """Return numbers in words; nothing of none."""
-    if not values:
-        return ""
-    decimals = 1 if abs(mean(values)) >= 100 else 2
-    text = f"{mean(values):.{decimals}f}"
-    return f"{text} ({min(values):.{decimals}f} to {max(values):.{decimals}f})" if len(values) > 1 else text
-
-
 def heading(key: Key, seeds: int) -> str:
-    """Return a group in words."""
+    """Return the heading of a group."""
     task, physics, conditions = key
     text = f"{task}\n{engine_of(physics).label}, {seeds} seed{'s' if seeds > 1 else ''}"
     return f"{text}\n{conditions}" if conditions else text
 
 
 def shares(results: Sequence[dict[str, Any]], terrain: str) -> dict[float, list[float]]:
-    """Return size -> success of every seed that was measured on that type, for the sizes that all of those have."""
-    entries = [_types(result)[terrain] for result in results if terrain in _types(result)]
+    """Return size -> success of every seed that was measured on a type, for the sizes that all of them have."""
+    entries = [types_in(result)[terrain] for result in results if terrain in types_in(result)]
     found = [{point["size"]: point["share"] for point in entry["points"]} for entry in entries]
     common = set.intersection(*(set(one) for one in found)) if found else set()
     return {size: [one[size] for one in found] for size in sorted(common)}
 
 
 def types_of(groups: Evaluations) -> dict[str, dict[str, Any]]:
-    """Return terrain type -> one of its entries, of all types that were measured."""
-    entries = [_types(result) for results in groups.values() for result in results]
+    """Return terrain type -> one of its entries, for all types that were measured."""
+    entries = [types_in(result) for results in groups.values() for result in results]
     return {name: entry for one in entries for name, entry in one.items()}
 
 
-def _types(result: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return terrain type -> what was measured on it; nothing of an evaluation without success."""
-    found: dict[str, dict[str, Any]] = result.get("success", {}).get("types", {})
-    return found
-
-
 def success_table(groups: Evaluations) -> Table:
-    """Return a line a type and size: mean success over seeds, the range where there are several, and of how many they are
-    where not all were measured on that type.
-    """
-    table = Table(title="success [%]: mean of seeds (lowest to highest)", title_justify="left")
-    table.add_column("terrain")
-    table.add_column("size", justify="right")
-    for key, results in groups.items():
-        table.add_column(escape(heading(key, len(results))), justify="right")
+    """Return a table with a line a type and size: the mean success over seeds and their range."""
+    rows: list[list[str] | None] = []
     for name, entry in types_of(groups).items():
-        columns = [shares(results, name) for results in groups.values()]
+        columns = [
+            {size: [100 * value for value in found] for size, found in shares(results, name).items()}
+            for results in groups.values()
+        ]
         for i, size in enumerate(sorted(set().union(*columns))):
-            cells = [_share(column.get(size, []), len(seeds)) for column, seeds in zip(columns, groups.values(), strict=True)]
-            table.add_row(escape(name if i == 0 else ""), escape(f"{size:g} {entry['unit']}"), *cells)
-        table.add_section()
-    return table
-
-
-def _share(values: Sequence[float], seeds: int) -> str:
-    if not values:
-        return ""
-    told = [f"{100 * min(values):.0f} to {100 * max(values):.0f}"] if len(values) > 1 else []
-    if len(values) < seeds:
-        told.append(f"of {len(values)} of {seeds} seeds")
-    return f"{100 * mean(values):.1f}" + (f" ({', '.join(told)})" if told else "")
+            each = zip(columns, groups.values(), strict=True)
+            cells = [_range_text(column.get(size, []), len(seeds), ".1f", ".0f") for column, seeds in each]
+            rows.append([name if i == 0 else "", f"{size:g} {entry['unit']}", *cells])
+        rows.append(None)
+    return screen_table("success [%]: mean of seeds (lowest to highest)", ["terrain", "size", *_heads(groups)], rows)
 
 
 def draw_comparison(groups: Evaluations, path: Path) -> None:
-    """Draw a panel a terrain type: a colour a task and its conditions, a line style an engine, a band from the worst to the
-    best seed.
-    """
-    names = types_of(groups)
-    tasks = list(dict.fromkeys((task, conditions) for task, _, conditions in groups))
-    colors = {task: COLORS[i % len(COLORS)] for i, task in enumerate(tasks)}
-    columns = min(2, len(names))
-    rows = -(-len(names) // columns)
-    with figure(path, (4.8 * columns + 0.2, 2.6 * rows + 1.0), rows, columns, share_y=True) as (drawn, axes):
-        from matplotlib.lines import Line2D
-
-        for axis in axes.flat[len(names) :]:
-            axis.set_visible(False)
-        for axis, (name, entry) in zip(axes.flat, names.items(), strict=False):
-            for (task, physics, conditions), results in groups.items():
-                found, engine, color = shares(results, name), engine_of(physics), colors[task, conditions]
-                if not found:  # no line: one without points that is not clipped takes all room from the panel
-                    continue
-                means = [mean(values) for values in found.values()]
-                axis.plot(list(found), means, engine.line, marker=engine.marker, ms=3, color=color, clip_on=False)
-                low, high = ([pick(values) for values in found.values()] for pick in (min, max))
-                axis.fill_between(list(found), low, high, color=color, alpha=0.15, lw=0)
-            entries = [_types(result).get(name) for results in groups.values() for result in results]
-            for end in {one["trained_to"] for one in entries if one is not None} - {None}:
-                axis.axvline(end, **TRAINED)
-            axis.set_title(name.replace("_", " "), fontsize="medium")
-            as_success(axis, entry)
-        for axis in axes[:, 0]:
-            axis.set_ylabel("success")
-        keys = []
-        for (task, physics, conditions), results in groups.items():
-            engine, seeds = engine_of(physics), sum("success" in result for result in results)
-            text = f"{task}, {engine.label}" + (f", {seeds} seeds" if seeds > 1 else "")
-            text += f"\n{conditions}" if conditions else ""
-            color = colors[task, conditions]
-            keys.append(Line2D([], [], color=color, ls=engine.line, marker=engine.marker, ms=4, label=text))
-        keys.append(Line2D([], [], **TRAINED, label=TRAINED_LABEL))
-        drawn.legend(handles=keys, loc="outside lower center", ncols=2, frameon=False)
+    """Draw success into a PNG file: a panel a terrain type, a line a group, with a band from the worst to the best seed."""
+    charts = []
+    for name in types_of(groups):
+        lines = []
+        for key, results in groups.items():
+            found, entries = shares(results, name), [types_in(result)[name] for result in results if name in types_in(result)]
+            if found:
+                worst, middle, best = (np.array([of(values) for values in found.values()]) for of in (min, mean, max))
+                label = heading(key, sum("success" in result for result in results))
+                lines.append((entries[0], Line(label, np.array(list(found)), middle, (worst, best), markers=True)))
+        if lines:
+            charts.append(success_chart(name.replace("_", " "), lines))
+    draw_charts(charts, path)

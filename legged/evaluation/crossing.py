@@ -1,38 +1,36 @@
-"""How a policy crosses into other engines: the same commands in every engine and solver."""
+"""Evaluation of a policy in every engine and solver, with the same commands."""
 
-import json
 import time
 from pathlib import Path
 from typing import Any
 
 import torch
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from legged.config import override
 from legged.errors import RunError
 from legged.evaluation.engines import ENGINES
-from legged.evaluation.result_file import changes_of
+from legged.evaluation.result_file import changes_of, device_name, write_result
+from legged.evaluation.tables import screen_table
 from legged.evaluation.velocity_grid import Grid
 from legged.evaluation.velocity_tracking import measure_tracking, ready_to_track
 from legged.figures import COLORS, figure
 from legged.physics import engine_name
 from legged.policies.restore import TrainedPolicy
-from legged.process.paths import make_folder, relative, write_text
+from legged.process.paths import relative
 
 EVERYWHERE = "all"
-"""The value of --physics that asks for this."""
+"""Value of --physics for all engines."""
 
 
 def cross(
     policy: TrainedPolicy, grid: Grid, asked: list[tuple[str, Any]], device: torch.device, graph: bool, folder: Path
 ) -> int:
-    """Measure, print and draw; crossing.json in `folder` is written anew after every engine. Return the exit code.
+    """Measure, print and draw; crossing.json in `folder` is written after every engine. Return the exit code.
 
-    Engines run on `device`, the C engine on the CPU. `asked` is what the command line changes beside the engine.
+    Engines run on `device`, the C engine on the CPU. `asked` holds the other overrides of the command line.
     """
-    make_folder(folder)
     path = folder / "crossing.json"
     failure: RunError | None = None
     result: dict[str, Any] = {
@@ -47,9 +45,9 @@ def cross(
         where = torch.device("cpu") if name == "mujoco" else device
         result["engines"].append(_measured(policy, grid, [*asked, *engine.overrides], where, graph))
         try:
-            write_text(path, json.dumps(result, indent=1, allow_nan=False))
+            write_result(path, result)
             failure = None
-        except RunError as error:  # what is measured is shown all the same, and the disk may have room again by then
+        except RunError as error:  # the table is printed all the same, and the disk may have room later
             failure = error
     Console(width=110).print(crossing_table(result))
     if failure is not None:
@@ -62,7 +60,7 @@ def cross(
 def _measured(
     policy: TrainedPolicy, grid: Grid, asked: list[tuple[str, Any]], device: torch.device, graph: bool
 ) -> dict[str, Any]:
-    """Return one engine's figures. Speed is that of the whole evaluation loop, without start-up and compilation."""
+    """Return the figures of one engine; steps/s is that of the evaluation loop, without start-up and compilation."""
     name = engine_name(override(policy.cfg, asked).sim, device)
     print(f"{name}: {grid.size_text}", flush=True)
     task, act = ready_to_track(policy, grid, asked, device, graph)
@@ -71,7 +69,7 @@ def _measured(
     seconds = time.perf_counter() - start
     return {
         "physics": name,
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+        "device": device_name(device),
         "rmse_lin": figures["rmse_lin"]["mean"],
         "rmse_ang": figures["rmse_ang"]["mean"],
         "falls": figures["falls"],
@@ -83,33 +81,21 @@ def _measured(
 
 
 def crossing_table(result: dict[str, Any]) -> Table:
-    """Return a line an engine; an engine in which every robot fell before it was measured has no errors."""
+    """Return a table with a line an engine; an engine in which every robot fell early has no errors."""
     cells = len(result["grid"]["vx"]) * len(result["grid"]["vy"]) * len(result["grid"]["yaw"])
     title = f"{result['task']} ({result['checkpoint']}): {cells} commands x {result['robots_per_cell']} robots"
-    table = Table(title=escape(title), title_justify="left")
-    table.add_column("engine", no_wrap=True)
-    for head in ("velocity RMSE", "yaw rate RMSE", "falls", "cost of\ntransport", "base height", "lost\ncontacts", "steps/s"):
-        table.add_column(head, justify="right")
-
-    def number(value: float | None, form: str) -> str:
-        return "none" if value is None else form.format(value)
-
-    for row in result["engines"]:
-        table.add_row(
-            row["physics"],
-            number(row["rmse_lin"], "{:.3f} m/s"),
-            number(row["rmse_ang"], "{:.3f} rad/s"),
-            f"{100 * row['falls']:.1f} %",
-            number(row["cost_of_transport"], "{:.2f}"),
-            number(row["base_height"], "{:.3f} m"),
-            str(row["contact_overflows"]),
-            f"{row['steps_per_s']:,.0f}",
-        )
-    return table
+    forms = {"rmse_lin": "{:.3f} m/s", "rmse_ang": "{:.3f} rad/s", "falls": "{:.1f} %"}
+    forms |= {"cost_of_transport": "{:.2f}", "base_height": "{:.3f} m", "contact_overflows": "{}", "steps_per_s": "{:,.0f}"}
+    rows = [
+        [row["physics"], *("none" if row[key] is None else form.format(row[key]) for key, form in forms.items())]
+        for row in ({**row, "falls": 100 * row["falls"]} for row in result["engines"])
+    ]
+    heads = ("velocity RMSE", "yaw rate RMSE", "falls", "cost of\ntransport", "base height", "lost\ncontacts", "steps/s")
+    return screen_table(title, ("engine", *heads), rows)
 
 
 def draw_crossing(result: dict[str, Any], path: Path) -> None:
-    """Draw bars, an engine each: errors, falls, speed."""
+    """Draw bars, one an engine: errors, falls, speed."""
     rows = result["engines"]
     names = [row["physics"] for row in rows]
     panels = (

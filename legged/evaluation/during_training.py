@@ -1,4 +1,4 @@
-"""What a policy is worth while it is trained: measured between iterations, on robots of its own that nothing disturbs."""
+"""Evaluations during training: a policy is measured between iterations, on undisturbed robots in a separate task."""
 
 from dataclasses import replace
 from typing import Any
@@ -23,17 +23,17 @@ from legged.policies.restore import nominal
 from legged.registry import make_task, task_class
 
 HOLD_S = 3.0
-"""Time a command is held, if nobody says how long [s]."""
+"""Default time for which a command is held [s]."""
 SETTLE_S = 1.0
-"""Part of it, from the start, in which errors are not measured; at most a third of a shorter one [s]."""
+"""Time at its start in which errors are not measured; at most a third of a shorter hold [s]."""
 
 
 def few_commands(cfg: LeggedConfig) -> Grid:
-    """Return the grid on which a task is judged, its commands shared out among `train.runner.evaluate_envs` robots; if
-    there are more commands than robots, with axes that leave out values between the ends.
+    """Return the grid of commands for `train.runner.evaluate_envs` robots. With more commands than robots, axes are thinned
+    out between their ends.
 
     Raises:
-        ConfigError: an axis of the configuration is none.
+        ConfigError: an axis of the configuration is not a range.
     """
     axes, runner = axes_of(cfg), cfg.train.runner
     hold_s = runner.evaluate_s or HOLD_S
@@ -46,27 +46,27 @@ def few_commands(cfg: LeggedConfig) -> Grid:
 
 
 def thinned(values: list[float]) -> list[float]:
-    """Return about half of some values, evenly spread, the first and the last among them; of two, the first."""
+    """Return about half of the values, evenly spread, with the first and the last; of two values, the first."""
     keep = (len(values) + 1) // 2
     last = len(values) - 1
     return [values[round(i * last / (keep - 1))] for i in range(keep)] if keep > 1 else values[:1]
 
 
 class TrainingEvaluation:
-    """Measures a policy by a task of its own, with what the training's task has but noise, pushes, randomisation and
-    curricula. It begins every time with the same random numbers, and leaves the training's alone.
+    """Measurement of a policy in a separate task: that of the training without noise, pushes, randomisation and curricula.
+    Every measurement starts from the same random state, and the training's generators keep theirs.
     """
 
     def __init__(self, training: BaseTask) -> None:
-        """Build the task, on the device and in the engine of the `training`; on a GPU whose step was captured, the step of
-        the evaluation is a CUDA graph too.
+        """Build the task on the device and in the engine of the `training`. On a GPU whose step was captured, the step of the
+        evaluation is a CUDA graph too.
 
         Raises:
-            ConfigError: the grid of commands is none.
+            ConfigError: the grid of commands is invalid.
         """
         cfg, device = training.cfg, torch.device(training.device)
         self.figures: tuple[str, ...] = evaluated_figures(task_class(cfg.task), cfg)
-        """Names of what is found, what matters most first."""
+        """Names of the figures, the most important first."""
         self._grid = few_commands(cfg) if isinstance(cfg, LeggedConfig) else None
         engine = resolve_physics(cfg.sim.physics, device, num_envs=cfg.env.num_envs)
         asked: list[tuple[str, Any]] = [("sim.physics", "mujoco" if training.physics.why_c_engine else engine)]
@@ -101,7 +101,7 @@ class TrainingEvaluation:
             self._standing = torch.zeros(task.num_envs, 3, device=device)
 
     def _step(self) -> None:
-        """Make one control step and take its reward and errors in."""
+        """Make one control step and add its reward and errors."""
         task = self.task
         task.step_in_place(self._actor(self._observations))
         self._return.add_(torch.where(self._running, task.rew_buf, self._zero))
@@ -116,12 +116,12 @@ class TrainingEvaluation:
             self._ang.add_(self._measured * yaw_rate_error(self._commands, ang_vel))
 
     def measure(self, policy: nn.Module) -> dict[str, float]:
-        """Return figure -> value for an rsl-rl model like the task's, which is not changed: over the robots' first episode.
+        """Return figure -> value over the robots' first episode, for an rsl-rl model like the task's, which is not changed.
 
         `return` is the mean undiscounted sum of scale * term over steps, `falls` the share of robots that failed,
         `episode_length` the mean number of steps until then. Of robots that follow commands, `lin_vel_rmse` [m/s] and
         `ang_vel_rmse` [rad/s] are the root mean square errors of each command, averaged over commands, as `evaluate` has
-        them, but that a robot which has fallen counts as standing still from then on. The task's other metrics are means
+        them, but a fallen robot counts as standing still. The task's other metrics are means
         over robots and steps.
         """
         task, grid = self.task, self._grid
@@ -152,7 +152,7 @@ class TrainingEvaluation:
         return dict(zip(names, numbers, strict=True))
 
     def _found(self, measured: int) -> dict[str, Tensor]:
-        """Return the figures as 0-dimensional tensors, after so many steps in which errors were `measured`."""
+        """Return the figures as 0-dimensional tensors, after `measured` steps in which errors were added."""
         own = {name.removeprefix("Metrics/"): value for name, value in self.task.metrics.flush().items()}
         found = {
             "return": self._return.mean() / unit_of(self.task),
@@ -166,10 +166,10 @@ class TrainingEvaluation:
 
 
 def check_commands(cfg: TaskConfig) -> None:
-    """Look whether the commands of the evaluations during training can be made of a task's configuration.
+    """Check that a grid of commands for evaluations during training follows from a task's configuration.
 
     Raises:
-        ConfigError: they can't.
+        ConfigError: an axis is not a range.
     """
     if cfg.train.runner.evaluate_interval and isinstance(cfg, LeggedConfig):
         few_commands(cfg)

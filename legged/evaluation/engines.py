@@ -1,4 +1,4 @@
-"""The physics engines in which policies are measured: how each is asked for, what it is called and how its curves look."""
+"""The physics engines in which policies are measured: settings, labels and looks of curves."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,14 +9,14 @@ from legged.config.schema import NewtonSolver
 
 @dataclass(frozen=True)
 class Engine:
-    """An engine, or a solver of Newton's."""
+    """An engine, or a solver of Newton."""
 
     label: str
     line: str
-    """Line style of its curves, as matplotlib writes it."""
+    """Line style of its curves, as in matplotlib."""
     marker: str
     overrides: Sequence[tuple[str, Any]] = ()
-    """Settings that ask for it."""
+    """Settings that choose it."""
 
 
 ENGINES = {
@@ -27,9 +27,9 @@ ENGINES = {
         for name in get_args(NewtonSolver)
     },
 }
-"""Every engine, by the name that `legged.physics.engine_name` gives it."""
+"""Every engine, by its name from `legged.physics.engine_name`."""
 
 
 def engine_of(name: str) -> Engine:
-    """Return the engine of that name; one of which this version knows nothing is called by its name."""
+    """Return the engine of that name; an unknown engine is labelled by its name."""
     return ENGINES.get(name, Engine(name, ":", "x"))

@@ -1,6 +1,5 @@
-"""Episodes of a task without commands, as its policy was exported or in an engine: measured, printed, written."""
+"""Evaluation of tasks without commands: full episodes are measured, printed and written."""
 
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,14 +10,14 @@ from rich.console import Console
 
 from legged.config import override
 from legged.evaluation.overflows import warn_of_overflows
-from legged.evaluation.result_file import changes_of, file_name
+from legged.evaluation.result_file import changes_of, device_name, file_name, write_result
 from legged.physics import engine_name
 from legged.policies.episodes import episodes_table, for_episodes, measure_episodes
 from legged.policies.restore import TrainedPolicy, restore
-from legged.process.paths import make_folder, relative, write_text
+from legged.process.paths import relative
 
 MOST_EPISODES = 2**16
-"""More are not simulated at once."""
+"""Most episodes at once."""
 
 
 def evaluate_episodes(
@@ -30,23 +29,28 @@ def evaluate_episodes(
     folder: Path,
     where: str = "sim.physics",
 ) -> int:
-    """Run `episodes` robots through their first full episode, without noise and with nothing randomised; print a table and
-    write evaluation_<physics>.json into `folder`. Return the exit code. `where` says who asks for the engine.
+    """Run `episodes` robots through their first full episode, without noise and randomisation; print a table and write
+    evaluation_<physics>.json into `folder`. Return the exit code. `where` names the setting of the engine in errors.
     """
     start = time.perf_counter()
     calm, changes = for_episodes(policy, episodes)
     engine = engine_name(override(policy.cfg, asked).sim, device, where)
     task, act = restore(calm, [*changes, *asked], device, graph)
     measured = measure_episodes(task, act)
-    name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
-    result = {**header(policy, engine, name, asked), "wall_s": time.perf_counter() - start, "episodes": measured}
+    result = {
+        **header(policy, engine, device_name(device), asked),
+        "wall_s": time.perf_counter() - start,
+        "episodes": measured,
+    }
     code = report(result, folder)
     warn_of_overflows("episodes", measured["contact_overflows"])
     return code
 
 
 def header(policy: TrainedPolicy, engine: str, device: str, asked: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """Return what every result says of what was measured; of what was `asked` for, the fields that were changed."""
+    """Return the fields that every result has; `asked` are overrides, of which the result names those that change the
+    conditions.
+    """
     what = {"task": policy.cfg.task, "checkpoint": policy.checkpoint.name, "physics": engine, "device": device}
     changes = changes_of(asked)
     return {**what, "changes": changes} if changes else what
@@ -60,8 +64,7 @@ def report(result: dict[str, Any], folder: Path) -> int:
     """
     title = f"{result['task']} ({result['checkpoint']}) in {result.get('environment', result['physics'])}"
     Console(width=110).print(episodes_table(result["episodes"], title))
-    make_folder(folder)
     path = folder / file_name(result["physics"])
-    write_text(path, json.dumps(result, indent=1, allow_nan=False))
+    write_result(path, result)
     print(f"written: {relative(path)}")
     return 0

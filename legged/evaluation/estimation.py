@@ -1,4 +1,4 @@
-"""How well a policy's estimator knows what only the simulator does."""
+"""Errors of a policy's estimator, which predicts quantities that only the simulator knows."""
 
 import math
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from legged.learning.estimator import EstimatingModel, EstimationErrors
 
 
 class EstimateMeter:
-    """Sums the square errors of a policy's estimates; of a policy that estimates nothing, nothing."""
+    """Sums of the squared errors of a policy's estimates; empty for a policy without an estimator."""
 
     def __init__(self, task: BaseTask, act: Callable[[TensorDict], Tensor]) -> None:
         """Measure the policy `act`, if it is an `Actor` with an estimator."""
@@ -28,7 +28,7 @@ class EstimateMeter:
             self._units = [unit_of(getattr(type(task), f"_obs_{name}")) for name in self._errors.names]
 
     def add(self, observations: TensorDict, counted: Tensor) -> None:
-        """Compare what the policy estimates from `observations` with what is in them, of the robots in `counted` (N,)."""
+        """Add the errors of the estimates from `observations` for the robots in `counted` (N,)."""
         if self._network is None:
             return
         squares = self._errors.squares(self._network.estimate(observations), observations[ESTIMATED])
@@ -37,7 +37,7 @@ class EstimateMeter:
 
     def found(self) -> dict[str, Any]:
         """Return, as `estimates`, for each term the root mean square error of its numbers over robots and steps, with its
-        unit; null if none was counted. Nothing for a policy that estimates nothing.
+        unit; null if no step was counted. Return nothing for a policy without an estimator.
         """
         if self._network is None:
             return {}

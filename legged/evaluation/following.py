@@ -1,6 +1,5 @@
-"""How well legged robots follow commands, and how hard a terrain they cross: measured, printed, drawn, written."""
+"""Evaluation of legged robots: errors on a grid of commands and success over difficulty."""
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ import torch
 from legged.config import LeggedConfig, override
 from legged.evaluation.episodes import header
 from legged.evaluation.overflows import warn_of_overflows
-from legged.evaluation.result_file import file_name, kept_success, kept_tracking, tracking_of
+from legged.evaluation.result_file import device_name, file_name, kept_success, kept_tracking, tracking_of, write_result
 from legged.evaluation.success import success_over_difficulty
 from legged.evaluation.success_report import draw_success, print_success, with_other_engines
 from legged.evaluation.tracking_report import draw_tracking, print_tracking
@@ -19,7 +18,7 @@ from legged.evaluation.velocity_grid import Grid
 from legged.evaluation.velocity_tracking import measure_tracking, ready_to_track
 from legged.physics import engine_name
 from legged.policies.restore import TrainedPolicy
-from legged.process.paths import make_folder, relative, write_text
+from legged.process.paths import relative
 from legged.terrain import BUMPS
 
 
@@ -34,10 +33,10 @@ def evaluate_following(
     folder: Path,
     where: str = "sim.physics",
 ) -> int:
-    """Measure tracking on the grid, if there is one, and success at all `sizes` of each terrain type, `robots` a size. Print
-    tables, then write evaluation_<physics>.json and .png and success_<physics>.png into `folder`. Return the exit code. A
-    part that is not measured stays in the file as it was if that part is of the same checkpoint. `where` is the argument that
-    names the engine.
+    """Measure tracking on the grid, if there is one, and success at all `sizes` of each terrain type with `robots` a size.
+    Print tables, then write evaluation_<physics>.json and .png and success_<physics>.png into `folder`. Return the exit code.
+    A part that is not measured stays in the file if it is of the same checkpoint. `where` names the setting of the engine in
+    errors.
 
     Raises:
         RunError: a file can't be written.
@@ -46,7 +45,7 @@ def evaluate_following(
     cfg = policy.cfg
     assert isinstance(cfg, LeggedConfig), "the task has no velocity commands"
     engine = engine_name(override(cfg, asked).sim, device, where)
-    head = header(policy, engine, torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu", asked)
+    head = header(policy, engine, device_name(device), asked)
     tracking, lost = ({}, 0) if grid is None else _tracking(policy, grid, asked, device, graph)
     success = success_over_difficulty(policy, sizes, robots, asked, device, graph) if sizes else None
     # The screen comes first: a full disk cannot take it away.
@@ -57,7 +56,6 @@ def evaluate_following(
     if success is not None:
         print_success(success)
         warn_of_overflows("success", success["contact_overflows"])
-    make_folder(folder)
     path = folder / file_name(engine)
     result = {
         **head,
@@ -65,7 +63,7 @@ def evaluate_following(
         **(tracking or kept_tracking(path, head)),
         **(kept_success(path, head) if success is None else {"success": success}),
     }
-    write_text(path, json.dumps(result, indent=1, allow_nan=False))
+    write_result(path, result)
     written = [path]
     if tracking:
         written.append(path.with_suffix(".png"))

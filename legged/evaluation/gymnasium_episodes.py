@@ -1,4 +1,4 @@
-"""An exported policy in Gymnasium's own environment, scored by Gymnasium."""
+"""An exported policy in Gymnasium's environment, with Gymnasium's returns."""
 
 import io
 import json
@@ -18,18 +18,18 @@ from legged.policies.restore import TrainedPolicy, restore
 from legged.registry import task_class
 
 ENGINE = "gymnasium"
-"""What files and tables call it, beside the names of engines."""
+"""Name in files and tables, like that of an engine."""
 EPISODES = 20
-"""Episodes that are run if nobody asks for another number."""
+"""Default number of episodes."""
 REWARD = "reward_"
-"""How names of the parts of a reward begin that Gymnasium gives with each step."""
+"""Prefix of the names of reward parts that Gymnasium returns with each step."""
 
 
 def environment_of(task: str) -> str:
-    """Return what Gymnasium calls a task (`GYMNASIUM_ID` of its class).
+    """Return the name of a task's environment in Gymnasium (`GYMNASIUM_ID` of its class).
 
     Raises:
-        ConfigError: it has no such task.
+        ConfigError: the task has no environment in Gymnasium.
     """
     found = getattr(task_class(task), "GYMNASIUM_ID", None)
     if not isinstance(found, str):
@@ -57,8 +57,8 @@ def evaluate_in_gymnasium(policy: TrainedPolicy, episodes: int, asked: list[tupl
 
 @torch.inference_mode()
 def run_exported(exported: Path, name: str, episodes: int) -> dict[str, Any]:
-    """Run policy.pt of the folder `exported` in the environment `name` of Gymnasium; return as `measure_episodes` does:
-    returns are Gymnasium's, terms are the parts of the reward that it tells.
+    """Run policy.pt of the folder `exported` in the environment `name` of Gymnasium. Return the form of `measure_episodes`,
+    with Gymnasium's returns and the reward parts that it names as terms.
 
     Raises:
         ConfigError: there is no such environment, or it has other observations or actions.

@@ -8,10 +8,10 @@ import numpy as np
 Z95 = 1.959964
 """Quantile of the normal distribution [standard deviations]."""
 DRAWS = 2000
-"""Samples that a bootstrap draws."""
+"""Samples of a bootstrap."""
 
 FEWEST = 2
-"""Values that tell how far they scatter, at least: an interval of fewer would have no width."""
+"""Fewest values of an interval; the spread of a single value is not known."""
 
 Interval = tuple[float, float]
 
@@ -21,12 +21,12 @@ def wilson(successes: int, trials: int, z: float = Z95) -> Interval:
     share, scale = successes / trials, 1.0 + z**2 / trials
     middle = (share + 0.5 * z**2 / trials) / scale
     half = z / scale * sqrt(share * (1.0 - share) / trials + 0.25 * z**2 / trials**2)
-    return max(0.0, min(share, middle - half)), min(1.0, max(share, middle + half))  # the share itself, whatever was rounded
+    return max(0.0, min(share, middle - half)), min(1.0, max(share, middle + half))  # contains the share in spite of rounding
 
 
 def newcombe(first: tuple[int, int], second: tuple[int, int]) -> Interval:
-    """Return the interval of the difference second - first of two shares, each (successes, trials), out of the Wilson
-    intervals of both (R. G. Newcombe, Statistics in Medicine 17, 1998, method 10).
+    """Return the interval of the difference second - first of two shares, each (successes, trials), from the Wilson intervals
+    of both (R. G. Newcombe, Statistics in Medicine 17, 1998, method 10).
     """
     (a, (a_low, a_high)), (b, (b_low, b_high)) = ((n / of, wilson(n, of)) for n, of in (first, second))
     return (
@@ -36,9 +36,9 @@ def newcombe(first: tuple[int, int], second: tuple[int, int]) -> Interval:
 
 
 def mean_of_shares(shares: Sequence[tuple[int, int]]) -> tuple[float, Interval]:
-    """Return the mean of some shares, each (successes, trials), all of the same weight, and its interval out of their Wilson
-    intervals: squared distances to their ends add (G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008). It is not empty
-    where all shares are 0 or 100 %.
+    """Return the mean of equally weighted shares, each (successes, trials), and its interval from their Wilson intervals:
+    squared distances to their ends add (G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008). The interval has a width
+    even if all shares are 0 or 100 %.
     """
     found = [(n / of, *wilson(n, of)) for n, of in shares]
     mean = sum(share for share, _, _ in found) / len(found)
@@ -47,8 +47,8 @@ def mean_of_shares(shares: Sequence[tuple[int, int]]) -> tuple[float, Interval]:
 
 
 def normal_mean(mean: float, std: float, count: int) -> Interval | None:
-    """Return the interval of a mean over `count` values, by their standard deviation (that of a sample, with `count` - 1) and
-    the normal distribution; None of fewer than two values.
+    """Return the interval of a mean over `count` values, from their sample standard deviation and the normal distribution;
+    None for fewer than two values.
     """
     if count < FEWEST:
         return None
@@ -57,9 +57,9 @@ def normal_mean(mean: float, std: float, count: int) -> Interval | None:
 
 
 def welch(first: tuple[float, float, int], second: tuple[float, float, int]) -> Interval | None:
-    """Return the interval of the difference second - first of two means, each (mean, standard deviation of a sample, count),
-    whose standard deviations may differ (B. L. Welch 1947), by the normal distribution: counts are large. Return None where
-    one of them is of fewer than two values.
+    """Return the interval of the difference second - first of two means, each (mean, sample standard deviation, count), whose
+    standard deviations may differ (B. L. Welch 1947), by the normal distribution, because counts are large. Return None if a
+    mean has fewer than two values.
     """
     if min(first[2], second[2]) < FEWEST:
         return None
@@ -69,8 +69,8 @@ def welch(first: tuple[float, float, int], second: tuple[float, float, int]) -> 
 
 
 def bootstrap_mean(values: Sequence[float], seed: int = 0) -> Interval | None:
-    """Return the percentile bootstrap interval of the mean of some values (B. Efron 1979), the same at every call; None of
-    fewer than two values.
+    """Return the percentile bootstrap interval of the mean of some values (B. Efron 1979), with a fixed seed; None for fewer
+    than two values.
     """
     if len(values) < FEWEST:
         return None

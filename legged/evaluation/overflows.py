@@ -1,4 +1,4 @@
-"""Contacts that an engine lost for want of memory while something was measured."""
+"""Contacts that an engine lost for want of memory during a measurement."""
 
 import sys
 from typing import Any
@@ -9,7 +9,7 @@ from legged.envs import BaseTask
 
 
 class Overflows:
-    """Counts lost contacts: robots times control steps. The task's own count begins anew with every rollout that it logs."""
+    """Counter of lost contacts: robots times control steps. The task starts its own count anew with every rollout it logs."""
 
     NAME = "Metrics/contact_overflows"
 
@@ -22,12 +22,12 @@ class Overflows:
             self._logged.append(extras["log"][self.NAME])
 
     def total(self, task: BaseTask) -> int:
-        """Return all since the task was reset; to be asked once."""
+        """Return the count since the task was reset; it can be read once."""
         return int(sum(self._logged, task.metrics.flush()[self.NAME]))
 
 
 def warn_of_overflows(what: str, lost: int) -> None:
-    """Say that results with lost contacts are not to be trusted."""
+    """Print a warning that results with lost contacts are not to be trusted."""
     if lost:
         print(
             f"warning: {what}: contacts were lost for want of memory, {lost} times (robots x steps); raise sim.nconmax and"

@@ -1,4 +1,4 @@
-"""What a policy does in C MuJoCo: one robot on a plane, one command after the other."""
+"""A policy in C MuJoCo: one robot on a plane, one command after the other."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,25 +14,25 @@ from legged.policies.foreign import ForeignPolicy
 from legged.robots.robot import Robot
 
 SETTLING_S = 2.0
-"""Time after which velocities are measured, of single commands [s]."""
+"""Time of a single command after which velocities are measured [s]."""
 FALLEN = 1.0
-"""Lean of the base beyond which a robot has fallen [rad]."""
+"""Lean of the base that counts as a fall [rad]."""
 SOLVER = SimConfig(physics="mujoco", iterations=50, ls_iterations=20)
-"""Pyramidal cones and the step of our tasks, solved to the end."""
+"""Solver settings: pyramidal cones, iterated to convergence."""
 
 
 @dataclass(frozen=True)
 class Played:
-    """What came of a command."""
+    """The result of a command."""
 
     command: tuple[float, ...]
     """vx, vy [m/s], yaw rate [rad/s]."""
     velocity: tuple[float, ...]
-    """The same as they were on average after the first seconds, base frame; NaN where it fell before."""
+    """Mean velocity after the first seconds, base frame; NaN after an earlier fall."""
     height: float
     """Lowest height of the base after the first seconds [m]."""
     fell_after: float | None
-    """When it fell [s]; None if it did not."""
+    """Time of the fall [s]; None without a fall."""
 
 
 @dataclass(frozen=True)
@@ -40,19 +40,19 @@ class Moment:
     """A robot at the end of a control step."""
 
     time: float
-    """Since the start [s]."""
+    """Time since the start [s]."""
     velocity: np.ndarray
     """(3,) vx, vy [m/s] and yaw rate [rad/s], base frame."""
     height: float
-    """Of the base above the ground [m]."""
+    """Height of the base above the ground [m]."""
     fallen: bool
 
 
 class Stage:
-    """A robot on a plane, driven by a policy as its layout says."""
+    """A robot on a plane, driven by a policy through its layout."""
 
     def __init__(self, robot: Robot, policy: ForeignPolicy, friction: float) -> None:
-        """Build the model, with that friction between robot and ground."""
+        """Build the model with `friction` between robot and ground."""
         self.robot, self.policy = robot, policy
         self.model = RobotScene(robot).model(replace(SOLVER, dt=policy.layout.sim_dt))
         self.model.geom_friction[[self.model.geom(name).id for name in robot.shape_names], 0] = friction
@@ -61,7 +61,7 @@ class Stage:
         self._start = _standing(self.model, robot, policy)
 
     def walk(self, command: np.ndarray, seconds: float) -> Iterator[Moment]:
-        """Yield each control step of a walk of so long [s] from the default pose with the feet on the ground; a fall ends it.
+        """Yield each control step of a walk of `seconds` from the default pose with the feet on the ground; a fall ends it.
         `command` (3,) is vx, vy [m/s], yaw rate [rad/s].
         """
         model, policy, data = self.model, self.policy, mujoco.MjData(self.model)
@@ -89,7 +89,7 @@ class Stage:
 def play(
     robot: Robot, policy: ForeignPolicy, commands: Sequence[Sequence[float]], seconds: float, friction: float
 ) -> list[Played]:
-    """Play every command for so long [s], from the default pose with the feet on the ground, at that friction."""
+    """Play every command for `seconds`, from the default pose with the feet on the ground, at that friction."""
     stage = Stage(robot, policy, friction)
     return [_play(stage, np.array(command, dtype=float), seconds) for command in commands]
 
@@ -107,7 +107,7 @@ def _play(stage: Stage, command: np.ndarray, seconds: float) -> Played:
 
 
 def follow(robot: Robot, policy: ForeignPolicy, grid: Grid, friction: float) -> dict[str, Any]:
-    """Return how well the grid's commands are followed, one robot each: root mean squares over the control steps after
+    """Return the errors on the grid's commands, one robot each: root mean squares over the control steps after
     `grid.settle_s`, up to a fall, of the horizontal velocity's error [m/s] and the yaw rate's [rad/s], mean and worst cell;
     the share of falls; and in "cells" the same by command.
     """

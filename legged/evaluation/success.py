@@ -1,9 +1,9 @@
-"""Success over difficulty: from how hard a tile of each terrain type a policy still walks out.
+"""Success over difficulty: the share of robots that walk out of tiles of each terrain type, over their size.
 
-Sizes and commands are those of Rudin et al. (arXiv 2109.11978), Fig. 5: robots start in the middle of a tile, are
-asked for 0.75 m/s forward and up to 0.1 m/s sideways, and keep their heading; sizes go on beyond those of training. What
-counts as success is defined by `Scores`. All this is for a robot half a metre high: lengths are times the `terrain.scale`
-of the task, velocities times its root (the same Froude number).
+Sizes and commands are those of Rudin et al. (arXiv 2109.11978), Fig. 5. Robots start in the middle of a tile and keep their
+heading; commands are 0.75 m/s forward and up to 0.1 m/s sideways. Sizes go beyond those of training. `Scores` defines
+success. These numbers hold for a robot half a metre high: lengths scale with `terrain.scale`, velocities with its square root
+(constant Froude number).
 """
 
 import gc
@@ -30,13 +30,13 @@ from legged.terrain import METRES, TERRAIN_TYPES, hardest_difficulty, terrain_ty
 TILE = 8.0
 """Side of a tile [m]."""
 DISTANCE = 4.0
-"""How far from its start a robot must get [m]: half a tile."""
+"""Distance from the start that counts as success [m]: half a tile."""
 TIME_S = 20.0
-"""Time it has for that [s]."""
+"""Time limit for this distance [s]."""
 FORWARD, SIDEWAYS = 0.75, 0.1
-"""Velocity asked for: forward, and the largest to either side [m/s]."""
+"""Commanded velocity: forward, and the largest to either side [m/s]."""
 SPAWN_RANGE = 0.1
-"""Robots start at most this far from the middle of their tile, in x and in y, so that no two starts are the same [m]."""
+"""Robots start at most this far from the middle of their tile, in x and in y, so that their starts differ [m]."""
 OF_STEPS = (
     *("stairs_up", "stairs_down", "step", "obstacles"),
     *("narrow_stairs_up", "narrow_stairs_down", "dense_blocks", "kerbs", "rubble"),
@@ -60,36 +60,37 @@ FEWER: dict[str, tuple[float, ...]] = {
 }
 """Type -> the sizes that are measured without `--full`, where they are fewer."""
 SMALLEST = 0.001
-"""The least that a size may be [m] or [degrees]."""
+"""Smallest size [m] or [degrees]."""
 MOST_SIZES = 100
-"""Sizes of one type that can be measured: each has tiles of its own, all in one map."""
+"""Most sizes of one type; all their tiles lie in one map."""
 TYPES_HELP = (
     "terrain types to cross, with sizes of your own if you like: stairs_up,kerbs=0.17,stairs_down=0.2:0.3:0.05; those of the"
     " training by default"
 )
 
 OPEN, REACHED, FELL, STUCK = range(4)
-"""What has become of a robot."""
+"""Outcomes of a robot."""
 
 
 class Scores:
-    """The first thing that happens to each of N robots: it gets far enough away from its start, it falls (the task terminates
-    it), or its time is up, by our clock or by a time-out of the task. What it does after that, or after a reset, does not
-    count.
+    """The first event of each of N robots: it gets far enough from its start, it falls (the task terminates it), or its time
+    is up, by this clock or by a time-out of the task. Later events do not count.
     """
 
     def __init__(self, start: Tensor, distance: float = DISTANCE) -> None:
-        """Begin with robots that stand at `start` (N, 2 or more), world frame [m], and have to get `distance` away [m]."""
+        """Take robots that stand at `start` (N, 2 or more), world frame [m], and have to get `distance` away [m]."""
         self._start, self._distance = start[:, :2].clone(), distance
         self.outcome = torch.full((len(start),), OPEN, device=start.device)
         """(N,) OPEN, REACHED, FELL or STUCK."""
         self.time_s = torch.zeros(len(start), device=start.device)
-        """(N,) when it happened [s]."""
+        """(N,) time of the event [s]."""
 
     def update(self, time_s: float, base_pos: Tensor, terminated: Tensor, timed_out: Tensor) -> None:
-        """Judge a control step that ends at `time_s`: bases at (N, 3), failures (N,), time-outs of the task (N,)."""
+        """Update the outcomes after a control step that ends at `time_s` [s]: bases at (N, 3), failures (N,), time-outs of
+        the task (N,).
+        """
         waiting = self.outcome == OPEN
-        # A robot whose episode ended in this step has been put back to its start already: its position says nothing.
+        # A robot whose episode ended in this step is back at its start already, so its position does not count.
         reached = waiting & ~(terminated | timed_out) & ((base_pos[:, :2] - self._start).norm(dim=1) >= self._distance)
         self.time_s.masked_fill_(reached | (waiting & (terminated | timed_out)), time_s)
         self.outcome.masked_fill_(waiting & timed_out, STUCK)
@@ -97,38 +98,38 @@ class Scores:
         self.outcome.masked_fill_(reached, REACHED)
 
     def finish(self) -> None:
-        """End the time of those that are left."""
+        """Mark the robots without an event as stuck."""
         waiting = self.outcome == OPEN
         self.outcome.masked_fill_(waiting, STUCK)
         self.time_s.masked_fill_(waiting, TIME_S)
 
     @property
     def done(self) -> bool:
-        """Whether something has happened to everyone."""
+        """True if every robot has an outcome."""
         return not bool((self.outcome == OPEN).any())
 
 
-# ---- what is measured ------------------------------------------------------------------------------------------------
+# ---- sizes and tiles --------------------------------------------------------------------------------------------------
 
 
 def sizes_of(name: str, full: bool, scale: float = 1.0) -> tuple[float, ...]:
-    """Return the sizes of a type that are measured on ground of that scale, growing, in its unit."""
+    """Return the sizes of a type on ground of that scale, in its unit, in ascending order."""
     kind = TERRAIN_TYPES[name]
     found = SIZES.get(name) if full else FEWER.get(name, SIZES.get(name))
-    # Of a type that is not listed, what training could hold and one step more.
+    # A type that is not listed has the sizes of training and one step more.
     found = found or tuple(sorted(kind.size(d) for d in (0.2, 0.4, 0.6, 0.8, 1.0, 1.2)))
     return found if kind.unit != METRES or scale == 1.0 else tuple(round(size * scale, 6) for size in found)
 
 
 def chosen_sizes(cfg: LeggedConfig, asked: str | None, full: bool, scale: float) -> dict[str, tuple[float, ...]]:
-    """Return type -> the sizes that are measured, growing, in its unit: of the types in the comma-separated list `asked`,
-    else of those the task was trained on (none on a plane).
+    """Return type -> sizes in its unit, in ascending order: for the types in the comma-separated list `asked`, else for those
+    of the training (none on a plane).
 
-    A type of the list may name its sizes, which are taken as they are: 'stairs_up=0.25', 'kerbs=0.1:0.2:0.05'. Those of all
-    others are those of `sizes_of`, on ground of that `scale`.
+    A type of the list may name its sizes: 'stairs_up=0.25', 'kerbs=0.1:0.2:0.05'. Other types have the sizes of `sizes_of` on
+    ground of that `scale`.
 
     Raises:
-        ConfigError: one is no type or comes twice, a size is none, or the policy cannot see terrain.
+        ConfigError: a type is unknown or comes twice, a size is out of bounds, or the policy cannot see terrain.
     """
     if asked is None:
         return {name: sizes_of(name, full, scale) for name in trained_to(cfg) if name != "flat"}
@@ -140,7 +141,7 @@ def chosen_sizes(cfg: LeggedConfig, asked: str | None, full: bool, scale: float)
 
 
 def _named_sizes(name: str, text: str) -> tuple[float, ...]:
-    """Return the sizes of a type that somebody has named, '0.25' or '0.1:0.2:0.05', in its unit."""
+    """Return the named sizes of a type, '0.25' or '0.1:0.2:0.05', in its unit."""
     flag, kind = f"--types: {name}", TERRAIN_TYPES[name]
     low, high, step = read_range(flag, text, f"{name}=0.1:0.2:0.05")
     if not SMALLEST <= low <= high <= kind.largest:
@@ -158,7 +159,7 @@ def trained_to(cfg: LeggedConfig) -> dict[str, float]:
 
 
 def to_run_out(cfg: LeggedConfig, num_envs: int) -> list[tuple[str, Any]]:
-    """Return overrides for a task of robots that walk out of tiles in the direction in which they find themselves."""
+    """Return overrides for a task of robots that walk out of tiles along their initial heading."""
     return [
         *undisturbed(num_envs, TIME_S),
         *on_terrain(cfg, TILE * cfg.terrain.scale, SPAWN_RANGE * cfg.terrain.scale),
@@ -182,8 +183,8 @@ def place(task: LeggedRobot, robots: int) -> None:
 def measure_success(
     task: LeggedRobot, act: Callable[[TensorDict], Tensor], sizes: Sequence[float], robots: int
 ) -> tuple[list[dict[str, Any]], int]:
-    """Run one type on a task with `robots` robots for each size on `tiles_of_sizes`; return its points, and how many times a
-    robot lost contacts in a control step for want of memory.
+    """Run one type on a task with `robots` robots for each size on `tiles_of_sizes`; return its points, and how often a robot
+    lost contacts in a control step for want of memory.
     """
     scores, lost = run_out(task, act, robots)
     outcomes, times = scores.outcome.view(-1, robots).cpu(), scores.time_s.view(-1, robots).cpu()
@@ -192,8 +193,8 @@ def measure_success(
 
 @torch.inference_mode()
 def run_out(task: LeggedRobot, act: Callable[[TensorDict], Tensor], robots: int) -> tuple[Scores, int]:
-    """Let all robots walk out of their tiles, `robots` of them on each kind of tile; return what has become of them, and how
-    many times a robot lost contacts.
+    """Run all robots out of their tiles, `robots` of them on each kind of tile; return their scores, and how often a robot
+    lost contacts.
     """
     place(task, robots)
     task.reset()
@@ -214,7 +215,7 @@ def run_out(task: LeggedRobot, act: Callable[[TensorDict], Tensor], robots: int)
 
 
 def point(size: float, outcomes: Tensor, times: Tensor) -> dict[str, Any]:
-    """Return the figures of the robots of one size: what became of them (n,), and when (n,) [s]."""
+    """Return the figures of the robots of one size, from their outcomes (n,) and times (n,) [s]."""
     reached = outcomes == REACHED
     trials, successes = len(outcomes), int(reached.sum())
     low, high = wilson(successes, trials)
@@ -239,8 +240,8 @@ def success_over_difficulty(
     device: torch.device,
     graph: bool = True,
 ) -> dict[str, Any]:
-    """Measure all `sizes` of each type, `robots` robots each, and print a line about each type; `changes` to the
-    configuration come after our own. Return plain numbers and lists.
+    """Measure all `sizes` of each type with `robots` robots each, and print a line a type; `changes` to the configuration
+    come after those of the measurement. Return plain numbers and lists.
     """
     assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
     cfg: Any = override(policy.cfg, changes)  # another scale asks for other lengths
@@ -280,9 +281,9 @@ def _on_type(
     device: torch.device,
     graph: bool,
 ) -> tuple[list[dict[str, Any]], int]:
-    """Build the task for one type and measure; a function of its own, so that nothing refers to it afterwards."""
+    """Build the task for one type and measure; after the call nothing refers to the task."""
     cfg: Any = override(policy.cfg, changes)
     terrain = tiles_of_sizes(name, sizes, cfg.terrain, cfg.env.seed)
-    gc.collect()  # the task before this one lives in a cycle of references; two need not fit on a GPU
+    gc.collect()  # the task before this one is in a reference cycle, and a GPU may not hold two
     task, act = restore(policy, changes, device, graph, terrain)
     return measure_success(task, act, sizes, robots)

@@ -1,16 +1,18 @@
 """Success over difficulty as a table and as curves."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
-from legged.evaluation.engines import ENGINES
-from legged.evaluation.result_file import check_success, file_name
-from legged.figures import COLORS, figure
+from legged.evaluation.engines import ENGINES, engine_of
+from legged.evaluation.json_forms import check_form
+from legged.evaluation.reports.charts import Chart, Line, draw_charts
+from legged.evaluation.result_file import SUCCESS, file_name
+from legged.evaluation.tables import screen_table
 from legged.terrain import TERRAIN_TYPES
 
 PANELS = {
@@ -20,42 +22,33 @@ PANELS = {
     "slopes": ("slope_up", "slope_down"),
     "rough slopes": ("rough_slope_up", "rough_slope_down"),
 }
-"""Types that share a panel; every other type has one of its own."""
-TRAINED: dict[str, Any] = {"color": "0.25", "ls": ":", "lw": 1.4, "zorder": 2}
-"""The line where training ended."""
+"""Types that share a panel; every other type has its own."""
 TRAINED_LABEL = "hardest of training"
 
 
 def print_success(success: dict[str, Any]) -> None:
-    """Print one line a point; sizes beyond those of training are marked."""
-    rule = success["definition"]
-    head = f"success: {rule['distance_m']:.3g} m from the start within {rule['time_s']:g} s, asked for {rule['vx']:.3g} m/s"
-    table = Table(title=escape(head), title_justify="left")
-    for name in ("terrain", "size", "success", "95 % interval", "fell", "stuck", "time to success"):
-        table.add_column(name, justify="left" if name == "terrain" else "right")
-    beyond = False
+    """Print a table with a line a point; sizes harder than those of training are marked."""
+    rule, beyond = success["definition"], False
+    title = f"success: {rule['distance_m']:.3g} m from the start within {rule['time_s']:g} s, asked for {rule['vx']:.3g} m/s"
+    rows: list[list[str] | None] = []
     for name, entry in success["types"].items():
         for i, point in enumerate(entry["points"]):
             mark = is_beyond(name, point["size"], entry["trained_to"])
             beyond |= mark
             time_s = point["mean_time_s"]
-            table.add_row(
-                escape(name) if i == 0 else "",
-                f"{point['size']:.3g} {entry['unit']}{' *' if mark else '  '}",
-                f"{point['successes']}/{point['robots']} = {100 * point['share']:.0f} %",
-                f"{100 * point['low']:.0f} to {100 * point['high']:.0f} %",
-                str(point["fell"]),
-                str(point["stuck"]),
-                "" if time_s is None else f"{time_s:.1f} s",
-            )
-        table.add_section()
-    Console(width=110).print(table)
+            row = [name if i == 0 else "", f"{point['size']:.3g} {entry['unit']}{' *' if mark else '  '}"]
+            row.append(f"{point['successes']}/{point['robots']} = {100 * point['share']:.0f} %")
+            row += [f"{100 * point['low']:.0f} to {100 * point['high']:.0f} %", str(point["fell"]), str(point["stuck"])]
+            rows.append([*row, "" if time_s is None else f"{time_s:.1f} s"])
+        rows.append(None)
+    heads = ("terrain", "size", "success", "95 % interval", "fell", "stuck", "time to success")
+    Console(width=110).print(screen_table(title, heads, rows))
     if beyond:
         print("* harder than in training")
 
 
 def is_beyond(name: str, size: float, trained_to: float | None) -> bool:
-    """Say whether a size is harder than the hardest of training; never where the type was not trained on."""
+    """Return whether a size is harder than the hardest of training; False if the type was not trained on."""
     if trained_to is None:
         return False
     kind = TERRAIN_TYPES[name]
@@ -64,7 +57,7 @@ def is_beyond(name: str, size: float, trained_to: float | None) -> bool:
 
 
 def with_other_engines(result: dict[str, Any], path: Path) -> list[dict[str, Any]]:
-    """Return `result`, and those of other engines that lie beside `path` (evaluation_<physics>.json), are of the same
+    """Return `result`, and the results of other engines next to `path` (evaluation_<physics>.json) that are of the same
     checkpoint and were measured with the same fields changed.
     """
     found = [result]
@@ -74,7 +67,7 @@ def with_other_engines(result: dict[str, Any], path: Path) -> list[dict[str, Any
             continue
         try:
             saved = json.loads(other.read_text(encoding="utf-8"))
-            check_success(saved, str(other))
+            check_form(saved, SUCCESS, str(other))
             points = [point for entry in saved["success"]["types"].values() for point in entry["points"]]
             drawable = "robots_per_point" in saved["success"] and all({"low", "high"} <= point.keys() for point in points)
             same = all(saved.get(key) == result.get(key) for key in ("task", "checkpoint", "changes"))
@@ -86,78 +79,68 @@ def with_other_engines(result: dict[str, Any], path: Path) -> list[dict[str, Any
 
 
 def draw_success(results: list[dict[str, Any]], path: Path) -> None:
-    """Draw success over size with its intervals: a panel a kind of terrain, a colour a type, a line style an engine. A dotted
-    line is where training ended.
+    """Draw success over size with its intervals into a PNG file: a panel a kind of terrain, a line a type and an engine."""
+    rule, robots = results[0]["success"]["definition"], results[0]["success"]["robots_per_point"]
+    text = (
+        f"{results[0]['task']}: robots that get {rule['distance_m']:.3g} m from their start within {rule['time_s']:g} s"
+        f"\n{robots} robots a point"
+    )
+    draw_charts(success_charts(results), path, text)
+
+
+def success_charts(results: Sequence[dict[str, Any]]) -> list[Chart]:
+    """Return a chart a kind of terrain: success over size, one line a type and engine."""
+    found = []
+    for title, types in panels_of([name for result in results for name in types_in(result)]).items():
+        entries = {
+            _label(name, result["physics"], types, results): types_in(result)[name]
+            for name in types
+            for result in results
+            if name in types_in(result)
+        }
+        found.append(success_chart(title, [(entry, success_line(label, entry)) for label, entry in entries.items()]))
+    return found
+
+
+def types_in(result: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return terrain type -> its measurements; an empty mapping for an evaluation without success."""
+    found: dict[str, dict[str, Any]] = result.get("success", {}).get("types", {})
+    return found
+
+
+def _label(name: str, physics: str, types: Sequence[str], results: Sequence[dict[str, Any]]) -> str:
+    """Return the words that tell a line from the others of its chart."""
+    words = [name.replace("_", " ")] if len(types) > 1 else []
+    return ", ".join([*words, *([engine_of(physics).label] if len(results) > 1 else [])])
+
+
+def success_line(label: str, entry: dict[str, Any]) -> Line:
+    """Return success over size of one terrain type, with its intervals where the file has them."""
+    points = sorted(entry["points"], key=lambda point: point["size"])
+    size, share = (np.array([point[key] for point in points], dtype=float) for key in ("size", "share"))
+    band = None
+    if all(isinstance(point.get(key), int | float) for point in points for key in ("low", "high")):
+        band = (np.array([point["low"] for point in points]), np.array([point["high"] for point in points]))
+    return Line(label, size, share, band, markers=True)
+
+
+def success_chart(title: str, lines: Sequence[tuple[dict[str, Any], Line]]) -> Chart:
+    """Return the chart of success over the size of a terrain type, from entries of results and their lines. A dotted line
+    marks the hardest size of training; it names its runs where they differ in it.
     """
-    panels = panels_of([name for result in results for name in result["success"]["types"]])
-    columns = min(2, len(panels))
-    rows = -(-len(panels) // columns)
-    with figure(path, (4.8 * columns + 0.2, 2.9 * rows + 1.0), rows, columns, share_y=True) as (drawn, axes):
-        from matplotlib.lines import Line2D
-
-        for axis in axes.flat[len(panels) :]:
-            axis.set_visible(False)
-        for axis, (title, names) in zip(axes.flat, panels.items(), strict=False):
-            axis.set_title(title if len(names) > 1 else names[0].replace("_", " "))
-            _draw_panel(axis, results, names)
-        for axis in axes[:, 0]:
-            axis.set_ylabel("success")
-        keys = []
-        for result in results:
-            engine = ENGINES[result["physics"]]
-            text = f"{engine.label}, {result['success']['robots_per_point']} robots a point"
-            keys.append(Line2D([], [], color="0.3", ls=engine.line, marker=engine.marker, ms=4, label=text))
-        if any(entry["trained_to"] is not None for result in results for entry in result["success"]["types"].values()):
-            keys.append(Line2D([], [], **TRAINED, label=TRAINED_LABEL))
-        drawn.legend(handles=keys, loc="outside lower center", ncols=len(keys) if columns > 1 else 1, frameon=False)
-        rule = results[0]["success"]["definition"]
-        text = (
-            f"{results[0]['task']}: robots that get {rule['distance_m']:.3g} m from their start within {rule['time_s']:g} s"
-        )
-        size = "medium" if columns == 1 else "large"
-        drawn.suptitle(text if columns > 1 else text.replace(": ", "\n"), fontsize=size)
-
-
-def as_success(axis: Any, entry: dict[str, Any]) -> None:
-    """Label the axes of a panel of success over the size of a terrain type, and scale success from 0 to 100 %."""
-    from matplotlib.ticker import PercentFormatter
-
-    axis.set_xlabel(f"{entry['what']} [{entry['unit']}]")
-    axis.set_ylim(0.0, 1.04)
-    axis.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-    axis.grid(alpha=0.3)
-    axis.spines[["top", "right"]].set_visible(False)
-
-
-def _draw_panel(axis: Any, results: list[dict[str, Any]], names: tuple[str, ...]) -> None:
-    """Draw the curves of some types, of all engines."""
-    from matplotlib.patches import Patch
-    from matplotlib.ticker import MultipleLocator
-
-    for color, name in zip(COLORS, names, strict=False):
-        for result in results:
-            entry = result["success"]["types"].get(name)
-            if entry is None:
-                continue
-            engine = ENGINES[result["physics"]]
-            size, share, low, high = ([point[key] for point in entry["points"]] for key in ("size", "share", "low", "high"))
-            axis.plot(size, share, engine.line, marker=engine.marker, ms=4, color=color, clip_on=False, zorder=3)
-            if len(size) > 1:
-                axis.fill_between(size, low, high, color=color, alpha=0.12, lw=0)
-            else:  # a band has no width there
-                axis.vlines(size, low, high, color=color, lw=1.0)
-            as_success(axis, entry)
-            if entry["unit"] == "degrees":
-                axis.xaxis.set_major_locator(MultipleLocator(5))
-            if entry["trained_to"] is not None:
-                axis.axvline(entry["trained_to"], **TRAINED)
-    if len(names) > 1:
-        patches = [Patch(color=color, label=name.replace("_", " ")) for color, name in zip(COLORS, names, strict=False)]
-        axis.legend(handles=patches, loc="best", frameon=False, handlelength=1.0)
+    ends: dict[float, list[str]] = {}
+    for entry, line in lines:
+        if entry["trained_to"] is not None:
+            ends.setdefault(float(entry["trained_to"]), []).append(line.name)
+    several = len(ends) > 1
+    walls = tuple((f"{TRAINED_LABEL}: {', '.join(names)}" if several else TRAINED_LABEL, end) for end, names in ends.items())
+    what, unit = lines[0][0]["what"], lines[0][0]["unit"]
+    drawn = [line for _, line in lines]
+    return Chart(f"success: {title}", f"{what} [{unit}]", drawn, unit=what, high=1.0, percent=True, walls=walls)
 
 
 def panels_of(names: list[str]) -> dict[str, tuple[str, ...]]:
-    """Return title -> the types of a panel, of those that were measured."""
+    """Return title -> types of a panel, for the types in `names`."""
     there = dict.fromkeys(names)
     shared = {title: tuple(name for name in types if name in there) for title, types in PANELS.items()}
     panels = {title: types for title, types in shared.items() if types}

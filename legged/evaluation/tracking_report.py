@@ -1,4 +1,4 @@
-"""How well a policy follows commands, as a table and as heat maps."""
+"""The errors of a policy on the grid of commands, as a table and as heat maps."""
 
 import warnings
 from pathlib import Path
@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
+from legged.evaluation.tables import screen_table
 from legged.evaluation.velocity_grid import AXES
 from legged.figures import figure
 
@@ -18,7 +17,7 @@ GAIT = (
     ("base height", "base_height", 1.0, "{:.3f} m"),
     ("thigh or shank contact", "thigh_contact", 100.0, "{:.2f} % of steps"),
 )
-"""Label, name in a cell, factor, how it is written; none where every robot fell before it was measured."""
+"""Label, name in a cell, factor, format; null where every robot fell before it was measured."""
 
 
 def print_tracking(result: dict[str, Any]) -> None:
@@ -27,27 +26,25 @@ def print_tracking(result: dict[str, Any]) -> None:
     title = f"{result['task']} ({result['checkpoint']}) in {result['physics']}"
     if result["ground"]:
         title += f", on level ground with bumps of up to {100 * result['bumps']:.2g} cm"
-    table = Table(title=escape(title), title_justify="left")
-    for name, justify in (("measure", "left"), ("value", "right"), ("where", "left")):
-        table.add_column(name, justify=justify)  # type: ignore[arg-type]
+    rows: list[list[str]] = []
     cells = f"{len(result['cells'])} cells x {result['robots_per_cell']} robots x {result['measured_s']:.0f} s"
     for name, unit, errors in (("velocity", "m/s", lin), ("yaw rate", "rad/s", ang)):
         if errors["mean"] is None:
-            table.add_row(f"{name} RMSE", "none", "every robot fell before it was measured")
+            rows.append([f"{name} RMSE", "none", "every robot fell before it was measured"])
             continue
-        table.add_row(f"{name} RMSE, mean", f"{errors['mean']:.3f} {unit}", cells)
-        table.add_row(f"{name} RMSE, worst cell", f"{errors['worst']:.3f} {unit}", _command(errors["worst_cell"]))
+        rows.append([f"{name} RMSE, mean", f"{errors['mean']:.3f} {unit}", cells])
+        rows.append([f"{name} RMSE, worst cell", f"{errors['worst']:.3f} {unit}", _command(errors["worst_cell"])])
     for name, error in result.get("estimates", {}).items():
         value = "none" if error["rmse"] is None else f"{error['rmse']:.3f} {error['unit'] or ''}".rstrip()
-        table.add_row(f"estimated {name.replace('_', ' ')} RMSE", value, "over all cells")
-    table.add_row("falls", f"{100 * result['falls']:.2f} %", "of the robots, within the hold")
+        rows.append([f"estimated {name.replace('_', ' ')} RMSE", value, "over all cells"])
+    rows.append(["falls", f"{100 * result['falls']:.2f} %", "of the robots, within the hold"])
     if result["cost_of_transport"] is not None:
-        table.add_row("cost of transport", f"{result['cost_of_transport']:.2f}", "sum |torque * speed| / (weight * speed)")
+        rows.append(["cost of transport", f"{result['cost_of_transport']:.2f}", "sum |torque * speed| / (weight * speed)"])
     at = _command(gait["command"])
     for label, name, factor, form in GAIT:
         value = gait[name]
-        table.add_row(label, "none" if value is None else form.format(factor * value), at)
-    Console(width=110).print(table)
+        rows.append([label, "none" if value is None else form.format(factor * value), at])
+    Console(width=110).print(screen_table(title, ("measure", "value", "where"), rows, left=(0, 2)))
 
 
 def _command(cell: list[float]) -> str:
@@ -55,12 +52,12 @@ def _command(cell: list[float]) -> str:
 
 
 PANELS = (("rmse_lin", 2, "vy", "velocity RMSE [m/s]"), ("rmse_ang", 1, "yaw", "yaw rate RMSE [rad/s]"))
-"""What heat maps show: a figure of a cell, the axis over which its mean is taken, the axis that goes up, the title."""
+"""Heat maps: figure of a cell, axis over which its mean is taken, axis that goes up, title."""
 
 
 def grid_means(result: dict[str, Any], name: str, over: int) -> np.ndarray:
-    """Return the mean of a figure over axis `over` of the command grid, (values of vx, values of the other command); NaN
-    where no robot was left to be measured.
+    """Return the mean of a figure over axis `over` of the command grid, (values of vx, values of the other command); NaN for
+    cells in which every robot fell early.
     """
     shape = tuple(len(result["grid"][axis]) for axis in AXES)
     values = np.array([cell[name] for cell in result["cells"]], dtype=float).reshape(shape)

@@ -1,4 +1,4 @@
-"""The grid of velocity commands that a policy is measured on."""
+"""The grid of velocity commands on which policies are measured."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,11 +15,11 @@ from legged.errors import ConfigError
 AXES = {"vx": "m/s", "vy": "m/s", "yaw": "rad/s"}
 """Commands and their units."""
 AXIS = "-1:1:0.5"
-"""Commands of an axis of which nothing is said."""
+"""Default commands of an axis."""
 MOST_ROBOTS = 2**20
-"""More are not simulated at once."""
+"""Most robots at once."""
 MOST_VALUES = 10_000
-"""Commands on an axis, at most."""
+"""Most commands on an axis."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Grid:
     hold_s: float = 4.0
     """Time a command is held [s]."""
     settle_s: float = 1.0
-    """Part of it, from the start, that is not measured [s]."""
+    """Time at its start that is not measured [s]."""
 
     @property
     def cells(self) -> np.ndarray:
@@ -43,7 +43,7 @@ class Grid:
 
     @property
     def num_cells(self) -> int:
-        """Return C, without making them."""
+        """Return the number C of commands."""
         return len(self.vx) * len(self.vy) * len(self.yaw)
 
     @property
@@ -58,7 +58,7 @@ class Grid:
 
     @property
     def size_text(self) -> str:
-        """Return the grid in words: '125 commands x 16 robots'."""
+        """Return the size of the grid as text: '125 commands x 16 robots'."""
         return f"{self.num_cells} commands x {self.robots} robots"
 
 
@@ -66,7 +66,7 @@ def axis_values(flag: str, text: str) -> list[float]:
     """Read an axis: '-1:1:0.5' -> [-1, -0.5, 0, 0.5, 1]; a single number is a single value.
 
     Raises:
-        ConfigError: not of that form.
+        ConfigError: the text has another form.
     """
     low, high, step = read_range(flag, text, f"{flag}=-1:1:0.5")
     if max(abs(low), abs(high)) > FASTEST:
@@ -78,7 +78,7 @@ def read_range(flag: str, text: str, example: str) -> tuple[float, float, float]
     """Read 'low:high:step', or a single number, which is both ends.
 
     Raises:
-        ConfigError: not of that form.
+        ConfigError: the text has another form.
     """
     try:
         parts = [float(part) for part in text.split(":")]
@@ -93,10 +93,10 @@ def read_range(flag: str, text: str, example: str) -> tuple[float, float, float]
 
 
 def axes_of(cfg: LeggedConfig) -> dict[str, list[float]]:
-    """Return the values of each axis, by its name, of the grid on which a task is judged.
+    """Return the values of each axis, by its name, of the grid in a task's configuration.
 
     Raises:
-        ConfigError: an axis is none, or has too many.
+        ConfigError: an axis is not a range, or has too many values.
     """
     check_grid(cfg)
     given = {axis: getattr(cfg.evaluation, axis) for axis in AXES}
@@ -112,15 +112,15 @@ def spaced(
     what: str = "cells of this axis alone",
     most: int = MOST_VALUES,
 ) -> list[float]:
-    """Return the values of a range, none beyond `high`; `where`, `given` and `what` are what an error says of them.
+    """Return the values of a range up to `high`; `where`, `given` and `what` are words for errors.
 
     Raises:
-        ConfigError: they are more than `most`.
+        ConfigError: the range has more than `most` values.
     """
     count = (high - low) / step + 1.0
     if count > most:
         raise ConfigError(f"{where}: '{given}' makes {count:,.0f} {what}; at most {most:,} are possible")
-    whole = int(count + 1e-9)  # 0:0.3:0.1 is three steps, whatever their quotient was rounded to
+    whole = int(count + 1e-9)  # 0:0.3:0.1 has three steps, although 0.3 / 0.1 < 3
     return [round(float(value), 6) for value in low + step * np.arange(whole)]
 
 
@@ -128,7 +128,7 @@ def check_size(grid: Grid) -> None:
     """Check that the robots of a grid can be simulated at once.
 
     Raises:
-        ConfigError: there are none, or more than any machine holds.
+        ConfigError: there are no robots or too many.
     """
     if grid.robots < 1:
         raise ConfigError(f"--robots: must be at least 1, got {grid.robots}")
@@ -140,7 +140,7 @@ def check_size(grid: Grid) -> None:
 
 
 def mean_and_worst(values: np.ndarray, cells: np.ndarray) -> dict[str, Any]:
-    """Return both of `values` (C,) over the `cells` (C, 3) that have one, which is not NaN; null if none has."""
+    """Return mean and worst of `values` (C,) over the `cells` (C, 3) whose value is not NaN; null if all are."""
     if np.isnan(values).all():
         return {"mean": None, "worst": None, "worst_cell": None}
     worst = int(np.nanargmax(values))
@@ -148,5 +148,5 @@ def mean_and_worst(values: np.ndarray, cells: np.ndarray) -> dict[str, Any]:
 
 
 def number_or_null(value: float) -> float | None:
-    """Return a float that JSON can hold; what is not defined is null."""
+    """Return a float for JSON; null for a value that is not finite."""
     return float(value) if np.isfinite(value) else None

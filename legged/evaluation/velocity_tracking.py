@@ -1,4 +1,4 @@
-"""How well a policy follows velocity commands: measured over a grid of held ones."""
+"""Errors of a policy that follows velocity commands, over a grid of constant ones."""
 
 from collections.abc import Callable
 from typing import Any
@@ -27,7 +27,7 @@ SLOWEST = 0.1
 def ready_to_track(
     policy: TrainedPolicy, grid: Grid, asked: list[tuple[str, Any]], device: torch.device, graph: bool
 ) -> tuple[LeggedRobot, Actor]:
-    """Build a task of grid.num_envs robots and the policy that acts in it; `asked` is what the command line changes.
+    """Build a task of grid.num_envs robots and the policy that acts in it; `asked` holds the overrides of the command line.
 
     The task stands on a plane or, if it has terrain, on bumpy level ground.
     """
@@ -41,8 +41,8 @@ def ready_to_track(
 def place_to_track(
     cfg: LeggedConfig, grid: Grid, asked: list[tuple[str, Any]]
 ) -> tuple[list[tuple[str, Any]], Terrain | None]:
-    """Return overrides, `asked` among them, for a task of grid.num_envs robots that nothing disturbs, and the bumpy level
-    ground that it stands on; None for the plane of a task without terrain.
+    """Return overrides, with `asked`, for a task of grid.num_envs undisturbed robots, and its bumpy level ground; None for
+    the plane of a task without terrain.
     """
     changes = undisturbed(grid.num_envs, grid.hold_s)
     if cfg.terrain.mesh_type == "plane":
@@ -56,11 +56,10 @@ def place_to_track(
 def measure_tracking(task: LeggedRobot, act: Callable[[TensorDict], Tensor], grid: Grid) -> dict[str, Any]:
     """Run the grid on a task of grid.num_envs robots; return plain numbers and lists, one entry a cell in "cells".
 
-    A robot that falls counts as a fall and is measured up to its fall; one whose episode a time-out of the task ends, up to
-    that. Errors are instantaneous, per control step, and so is
-    the power of the cost of transport: that of the last physics step of each, which is less than the mean over all of them.
-    `contact_overflows` counts the robots and steps in which contacts were lost for want of memory; `estimates` are the errors
-    of a policy that estimates something.
+    A robot is measured until it falls or its episode ends by a time-out. Errors are those at the ends of control steps. The
+    power of the cost of transport is that of the last physics step of each control step, which is below the mean over all.
+    `contact_overflows` counts robots times steps that lost contacts for want of memory; `estimates` holds the errors of a
+    policy with an estimator.
     """
     cells = grid.cells
     device = torch.device(task.device)

@@ -1,1 +1,1 @@
-"""Actuators fitted to logs of a robot: how a log is read, what is fitted to it, and how well that fits."""
+"""Fitting of actuators to logs of a robot: reading logs, fitting models and measuring their errors."""

@@ -1,4 +1,4 @@
-"""How well fits of an actuator predict torques that they were not fitted to: numbers, and a picture."""
+"""Errors of fitted actuators on held-out torques: numbers and a picture."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,27 +12,27 @@ from legged.fitting.parametric import Drive
 
 MEASURED = "#000000"
 COLORS = {"ideal PD": "#E69F00", "parametric": "#0072B2", "network": "#D55E00"}
-"""Of the fits, after Okabe and Ito."""
+"""Colours of the fits, from the palette of Okabe and Ito."""
 SHOWN_S = 2.0
-"""Time that the picture shows [s]."""
+"""Time range of the picture [s]."""
 POINTS = 4000
-"""Measurements in the plane of torque and speed."""
+"""Number of measurements in the plot of torque over speed."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """What one way of prediction says of a log."""
+    """Prediction of the torques of a log by one model."""
 
     name: str
     log: ActuatorLog
-    """At the time step that it works at."""
+    """Log at the time step of the model."""
     torque: np.ndarray
     """(T, D) [N m]."""
 
 
 def errors(fit: Fit) -> dict[str, float]:
-    """Return the root mean squared error and the largest error on held-out samples [N m], and the share of their variance
-    that is explained.
+    """Return the root mean squared error and the largest error on held-out samples [N m], and the explained share of their
+    variance.
     """
     held = fit.log.held_out
     measured = fit.log.torque[held]
@@ -46,7 +46,7 @@ def errors(fit: Fit) -> dict[str, float]:
 
 
 def actuator_section(log: ActuatorLog, drive: Drive, sim_dt: float) -> dict[str, Any]:
-    """Return the section `control.actuator` that says what was fitted, for the joints of the log."""
+    """Return the section `control.actuator` of a fitted drive for the joints of the log."""
 
     def named(value: float) -> dict[str, float]:
         return {name: float(f"{value:.4g}") for name in log.joint_names}
@@ -65,7 +65,7 @@ def draw(path: Path, log: ActuatorLog, fits: list[Fit], drive: Drive) -> None:
     """Write a picture: torques over time and errors of each fit on held-out samples, and torque over speed.
 
     Raises:
-        RunError: the file can't be written.
+        RunError: the file cannot be written.
     """
     held = log.held_out
     joint = int(np.argmax(log.torque[held].std(axis=0)))
@@ -100,7 +100,7 @@ def draw(path: Path, log: ActuatorLog, fits: list[Fit], drive: Drive) -> None:
 
 
 def _shown(log: ActuatorLog) -> np.ndarray:
-    """Return the first held-out samples of a log, of one run."""
+    """Return the indices of the first held-out samples of a log, all of one run."""
     held = log.held_out
     start = int(np.flatnonzero(held)[0])
     rows = np.arange(start, min(start + round(SHOWN_S / log.dt), len(held)))

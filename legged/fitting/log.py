@@ -13,14 +13,14 @@ from legged.robots.patterns import match_names
 NEEDED = ("joint_names", "target", "position", "velocity", "torque")
 OPTIONAL = ("dt", "time", "run", "stiffness", "damping", "torque_limit")
 BLOCKS = 10
-"""A run is cut into so many blocks of time, of which every `HELD_OUT`th is kept for the judgement."""
+"""Blocks of time of a run; every `HELD_OUT`th block is held out."""
 HELD_OUT = 5
 FEWEST_HELD_OUT = 0.1
-"""Share of the samples that whole runs must come to, to be kept."""
+"""Smallest share of the samples that whole runs must have to be held out."""
 UNEVEN = 0.01
-"""Share of the mean time step by which samples may be out of step."""
+"""Largest deviation of the time between samples, as a share of the mean time step."""
 SHORTEST = 200
-"""Samples of a joint, at least."""
+"""Smallest number of samples of a joint."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class ActuatorLog:
     joint_names: tuple[str, ...]
     dt: float
     run: np.ndarray
-    """(T,) number of the run that each sample belongs to; samples of a run follow each other without a gap."""
+    """(T,) number of each sample's run; runs have no gaps."""
     target: np.ndarray
-    """(T, D) target angles as the controller sent them [rad]."""
+    """(T, D) target angles sent by the controller [rad]."""
     position: np.ndarray
     """(T, D) measured angles [rad]."""
     velocity: np.ndarray
@@ -40,15 +40,15 @@ class ActuatorLog:
     torque: np.ndarray
     """(T, D) measured torques [N m]."""
     stiffness: np.ndarray | None = None
-    """(D,) gains of the drives [N m/rad] and [N m s/rad], if they are known."""
+    """(D,) gains of the drives [N m/rad] and [N m s/rad], if known."""
     damping: np.ndarray | None = None
     torque_limit: np.ndarray | None = None
-    """(D,) limits that the drives keep [N m], if they are known."""
+    """(D,) torque limits of the drives [N m], if known."""
 
     @property
     def held_out(self) -> np.ndarray:
-        """(T,) bool: samples that nothing is fitted to, about a fifth: whole runs, or every fifth block of time where there
-        are few runs, or nearly all samples are of one.
+        """Return the mask (T,) of held-out samples, about a fifth: whole runs, or every fifth block of time if there are few
+        runs or one run has nearly all samples.
         """
         runs, lengths = np.unique(self.run, return_counts=True)
         if len(runs) >= HELD_OUT:
@@ -63,10 +63,10 @@ class ActuatorLog:
         return held
 
     def only(self, patterns: Sequence[str]) -> "ActuatorLog":
-        """Return the log of the joints whose names contain one of the patterns; without patterns, all of it.
+        """Return the log of the joints whose names contain one of the patterns; without patterns, the whole log.
 
         Raises:
-            ConfigError: a pattern matches none.
+            ConfigError: a pattern matches no joint.
         """
         if not patterns:
             return self
@@ -76,11 +76,10 @@ class ActuatorLog:
         return replace(self, joint_names=tuple(self.joint_names[i] for i in keep), **arrays, **of_joints)
 
     def resampled(self, dt: float) -> "ActuatorLog":
-        """Return the log at samples `dt` [s] apart: measurements between two samples lie on the line between them, a target
-        is the last one that was sent.
+        """Return the log at samples `dt` [s] apart: measurements are interpolated linearly, targets are the last ones sent.
 
         Raises:
-            ConfigError: the log's own samples are further apart.
+            ConfigError: the log's samples are further apart.
         """
         if np.isclose(dt, self.dt, rtol=UNEVEN):
             return replace(self, dt=dt)
@@ -104,7 +103,7 @@ class ActuatorLog:
 
 
 def _about_a_fifth(lengths: np.ndarray) -> tuple[list[int], float]:
-    """Return some runs, every fifth before the others, whose lengths come near a fifth of all, and their share of it."""
+    """Return some runs, preferably every fifth, whose lengths add up to about a fifth, and their share of all samples."""
     order = [i for first in reversed(range(HELD_OUT)) for i in range(first, len(lengths), HELD_OUT)]
     wanted, held, chosen = lengths.sum() / HELD_OUT, 0, []
     for i in order:
@@ -115,19 +114,18 @@ def _about_a_fifth(lengths: np.ndarray) -> tuple[list[int], float]:
 
 
 def read_log(path: Path) -> ActuatorLog:
-    """Read a log: `joint_names` (D,), `target`, `position`, `velocity`, `torque` (T, D), and `dt` or `time` (T,) [s]. It may
-    have `run` (T,), where it consists of several, and of the drives `stiffness`, `damping` and `torque_limit`, a number or
-    (D,).
+    """Return the log in a file: `joint_names` (D,), `target`, `position`, `velocity`, `torque` (T, D), and `dt` or `time`
+    (T,) [s]. Optional are `run` (T,), and `stiffness`, `damping` and `torque_limit` of the drives, a number or (D,).
 
     Raises:
-        ConfigError: something is missing, of another shape, no number, one that cannot be, or sampled unevenly.
+        ConfigError: an array is missing, has another shape or invalid numbers, or is sampled unevenly.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or 'no .npz file'}") from error
-    except Exception as error:  # zipfile's, numpy's and zlib's own
+    except Exception as error:  # zipfile, numpy and zlib raise their own
         raise ConfigError(f"{path}: no .npz file of plain arrays") from error
     for name in arrays:
         if name not in NEEDED + OPTIONAL:
@@ -153,7 +151,7 @@ def read_log(path: Path) -> ActuatorLog:
         raise ConfigError(f"{path}: run: expected ({shape[0]},), got {run.shape}")
     if run.dtype.kind not in "bfiu" or not np.isfinite(run).all():
         raise ConfigError(f"{path}: run: expected finite numbers")
-    # A number that comes back, as where two logs were put together, is another run: there is a gap in between.
+    # A run number that occurs again, as in concatenated logs, is another run.
     run = np.concatenate([[0], np.cumsum(run[1:] != run[:-1])])
     for name in OPTIONAL[3:]:
         if name in arrays:
@@ -168,16 +166,15 @@ def read_log(path: Path) -> ActuatorLog:
 
 
 def check_alike(log: ActuatorLog, path: Path) -> None:
-    """Look whether what a log states of its joints' drives is the same for all: one drive is fitted to them, with one
-    friction. And whether there is anything to fit it to.
+    """Check that all joints of a log have the same gains and limits, since one drive is fitted to all, and that torques vary.
 
     Raises:
-        ConfigError: it is not, or there is nothing.
+        ConfigError: they do not.
     """
     fitted_to = log.torque[~log.held_out]
     if fitted_to.min() == fitted_to.max():
         raise ConfigError(f"{path}: torque: is {fitted_to[0, 0]:g} N m throughout; nothing can be fitted to that")
-    known = log.stiffness is not None and log.damping is not None  # one alone is not used
+    known = log.stiffness is not None and log.damping is not None  # a single gain is not used
     for name in (*(OPTIONAL[3:5] if known else ()), OPTIONAL[5]):
         values = getattr(log, name)
         if values is None or np.allclose(values, values[0], rtol=1e-4, atol=0.0):
@@ -193,7 +190,7 @@ def _numbers(values: np.ndarray, where: str) -> np.ndarray:
     """Return an array as float64.
 
     Raises:
-        ConfigError: it holds anything but finite numbers.
+        ConfigError: the array holds other values than finite numbers.
     """
     if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
         raise ConfigError(f"{where}: expected finite numbers")
@@ -204,7 +201,7 @@ def _time_step(arrays: dict[str, np.ndarray], run: np.ndarray, path: Path) -> fl
     """Return the time between two samples [s].
 
     Raises:
-        ConfigError: nobody says it, it changes within a run, or `dt` and `time` say two.
+        ConfigError: the time is missing, changes within a run, or differs between `dt` and `time`.
     """
     if "dt" in arrays:
         given = _numbers(arrays["dt"], f"{path}: dt")
@@ -222,10 +219,10 @@ def _time_step(arrays: dict[str, np.ndarray], run: np.ndarray, path: Path) -> fl
 
 
 def _even_step(times: np.ndarray, run: np.ndarray, path: Path) -> float:
-    """Return the time between two samples by the time of each [s].
+    """Return the time between two samples, computed from `times` [s].
 
     Raises:
-        ConfigError: it changes within a run.
+        ConfigError: the time changes within a run.
     """
     time = _numbers(times, f"{path}: time")
     if time.shape != run.shape:

@@ -1,7 +1,7 @@
-"""A drive with known parts fitted to a log: P and D gains, delay, torque-speed line of the motor, friction of the joint.
+"""A parametric drive fitted to a log: P and D gains, delay, torque-speed line of the motor and friction of the joint.
 
-The formulas are those of legged/mdp/actuator.py. Numbers are found by Levenberg's and Marquardt's method on the squared error
-of the torque, for each delay; the delay with the least error is taken.
+The formulas are those of legged/mdp/actuator.py. For each delay the Levenberg-Marquardt method minimises the squared error of
+the torque; the delay with the smallest error is chosen.
 """
 
 from dataclasses import dataclass, replace
@@ -11,28 +11,28 @@ import numpy as np
 from legged.fitting.log import ActuatorLog
 
 SEEN = 0.002
-"""Share of samples at the motor's limit below which the limit is not told from the data."""
+"""Share of samples at the motor's limit below which the limit is not identified."""
 MOST_ITERATIONS = 60
 DAMPING, EASIER, HARDER = 1e-3, 0.3, 4.0
-"""Of Levenberg and Marquardt: the damping at the start, and its factors after a step that helped and one that did not."""
+"""Levenberg-Marquardt: initial damping, and its factors after an accepted and after a rejected step."""
 FINEST = 1e-9
 """Relative improvement at which the search ends."""
 MOST_SAMPLES = 40_000
-"""Samples that the last searches look at, spread over the log."""
+"""Samples of the last searches, spread over the log."""
 ROUGHLY = 4_000
 """Samples of the first search, over all delays."""
 SMOOTHING = 0.1
 """Speed below which Coulomb friction fades [rad/s]."""
 WORTH = 0.005
-"""Share of the squared error that a peak of the friction at low speed has to explain, to be told from the data."""
+"""Share of the squared error that a friction peak at low speed must explain to be identified."""
 NARROWEST, WIDEST = 0.5 * SMOOTHING, 0.1
-"""Stribeck velocities that a log can show: at least so many rad/s, for friction fades below, and at most this share of the
-fastest speed, for a wider "peak" fits whatever else falls with speed."""
+"""Range of identifiable Stribeck velocities: at least NARROWEST [rad/s], below which friction fades, and at most the share
+WIDEST of the largest speed, above which a "peak" fits other effects of speed."""
 
 
 @dataclass(frozen=True)
 class Drive:
-    """Numbers of a drive; all joints of a fit share them."""
+    """Parameters of a drive, shared by all joints of a fit."""
 
     stiffness: float
     """[N m/rad]"""
@@ -68,7 +68,7 @@ class Drive:
         return asked - self.friction(velocity)
 
     def friction(self, velocity: np.ndarray) -> np.ndarray:
-        """Return the torque by which the joint resists [N m]."""
+        """Return the friction torque [N m]."""
         slow = np.exp(-((velocity / self.stribeck_velocity) ** 2))
         dry = self.coulomb + (self.breakaway - self.coulomb) * slow
         return dry * np.tanh(velocity / SMOOTHING) + self.viscous * velocity
@@ -79,8 +79,8 @@ class Drive:
 
 
 def delayed(log: ActuatorLog, samples: float) -> np.ndarray:
-    """Return the targets (T, D) of a log as they were some samples before, on the line between two where it is no whole
-    number of them; at the start of a run, the first target.
+    """Return the targets (T, D) of a log delayed by a number of samples, interpolated linearly; at the start of a run the
+    first target.
     """
     first = np.maximum.accumulate(np.where(np.r_[True, np.diff(log.run) != 0], np.arange(len(log.run)), 0))
     whole = int(np.floor(samples))
@@ -91,9 +91,9 @@ def delayed(log: ActuatorLog, samples: float) -> np.ndarray:
 
 
 def fit_drive(log: ActuatorLog, longest_delay: float = 0.05) -> Drive:
-    """Return the drive that explains a log's torques best, held-out samples left out. Gains that the log states, the same
-    for all joints, are taken as they are. Without them the damping has the viscous friction in it: they can't be told apart.
-    Breakaway friction is the Coulomb friction unless the log shows a peak at low speed.
+    """Return the drive with the smallest error on a log's torques, without the held-out samples. Gains in the log are kept.
+    Without them the damping includes the viscous friction, which cannot be identified separately. Breakaway friction equals
+    Coulomb friction unless the log shows a peak at low speed.
     """
     every = np.flatnonzero(~log.held_out)
     effort = np.inf if log.torque_limit is None else float(log.torque_limit.max())
@@ -106,7 +106,7 @@ def fit_drive(log: ActuatorLog, longest_delay: float = 0.05) -> Drive:
         error = delayed(log, samples)[rows].ravel() - position
         return _search(replace(start, delay=samples * log.dt), error, velocity, torque, _free(log, limited, peaked))
 
-    # The delay first, roughly: in whole samples, with the motor's line and without.
+    # First search the delay in whole samples, with and without the motor's limit.
     start = _start(log, effort)
     torques, speeds = np.abs(log.torque[every]), np.abs(log.velocity[every])
     limits = replace(start, stall_torque=1.2 * torques.max(), no_load_speed=1.5 * max(speeds.max(), 1.0))
@@ -126,7 +126,7 @@ def fit_drive(log: ActuatorLog, longest_delay: float = 0.05) -> Drive:
 
 
 def _start(log: ActuatorLog, effort: float) -> Drive:
-    """Return where the search begins: the gains that are known, or those of a straight line, and little friction."""
+    """Return the start of the search: known gains or those of a linear regression, and little friction."""
     if log.stiffness is not None and log.damping is not None:
         stiffness, damping = float(log.stiffness.mean()), float(log.damping.mean())
     else:
@@ -137,13 +137,13 @@ def _start(log: ActuatorLog, effort: float) -> Drive:
 
 
 def _without_peak(drive: Drive) -> Drive:
-    """Return a drive whose dry friction is the same at all speeds, about as large as the given one's."""
+    """Return a drive whose dry friction is constant and about as large as that of the given one."""
     dry = max(drive.coulomb, min(drive.breakaway, float(drive.friction(np.array(5.0 * SMOOTHING)))), 1e-6)
     return replace(drive, coulomb=dry, breakaway=dry, stribeck_velocity=2.0 * SMOOTHING)
 
 
 def _free(log: ActuatorLog, limited: bool, peaked: bool) -> tuple[str, ...]:
-    """Return the names of the numbers that are searched for; without a peak, breakaway friction is Coulomb friction."""
+    """Return the names of the free parameters; without a peak, breakaway friction equals Coulomb friction."""
     known = log.stiffness is not None and log.damping is not None
     gains = ("viscous",) if known else ("stiffness", "damping")
     limits = ("stall_torque", "no_load_speed") if limited else ()
@@ -154,8 +154,8 @@ def _free(log: ActuatorLog, limited: bool, peaked: bool) -> tuple[str, ...]:
 def _search(
     start: Drive, error: np.ndarray, velocity: np.ndarray, torque: np.ndarray, free: tuple[str, ...]
 ) -> tuple[float, Drive]:
-    """Return the mean squared error and the drive with the least of it near `start`, by the logarithms of its free
-    numbers.
+    """Return the mean squared error and the drive of a local minimum near `start`, searched in the logarithms of the free
+    parameters.
     """
     start = start if "viscous" in free else replace(start, viscous=0.0)
 
@@ -190,6 +190,6 @@ def _search(
 
 
 def _share_limited(drive: Drive, log: ActuatorLog, rows: np.ndarray) -> float:
-    """Return the share of samples in which the motor's line, not the effort limit, holds the torque down."""
+    """Return the share of samples in which the motor's torque-speed line, not the effort limit, reduces the torque."""
     free = replace(drive, stall_torque=np.inf, no_load_speed=np.inf)
     return float(np.mean(np.abs(drive.predict(log)[rows] - free.predict(log)[rows]) > 1e-6))

@@ -1,4 +1,4 @@
-"""A network trained on a log of an actuator, which legged/mdp/actuator_network.py then runs."""
+"""Training of actuator networks on logs, for legged/mdp/actuator_network.py."""
 
 from collections.abc import Callable, Sequence
 
@@ -12,19 +12,19 @@ from legged.mdp.actuator_network import ActuatorNetwork, NetworkWeights
 
 LEARNING_RATE = {"mlp": 3e-3, "lstm": 1e-2}
 BATCH = 4096
-"""Samples of an update of an MLP."""
+"""Batch size of an MLP."""
 CHUNK, BURN_IN, CHUNKS = 60, 15, 64
-"""Of an LSTM: samples of a sequence, those at its start that are not judged, and sequences of an update."""
+"""LSTM: samples of a sequence, samples at its start without loss, and sequences of an update."""
 
 
 def train_network(
     log: ActuatorLog, kind: str, hidden: Sequence[int], samples: int, spacing: int, updates: int, seed: int
 ) -> NetworkWeights:
-    """Return a network (`mlp` or `lstm`) of `hidden` units a layer, trained on the samples of a log that are not held out. An
-    MLP sees `samples` of them, `spacing` apart.
+    """Return a network (`mlp` or `lstm`) with `hidden` units per layer, trained on the samples of a log that are not held
+    out. The inputs of an MLP are `samples` time steps, `spacing` samples apart.
 
     Raises:
-        ConfigError: the runs are too short for it.
+        ConfigError: the runs are too short.
     """
     error = log.target - log.position
     used = ~log.held_out
@@ -32,7 +32,7 @@ def train_network(
     random = torch.Generator().manual_seed(seed)
     state = torch.get_rng_state()
     try:
-        torch.manual_seed(seed)  # of torch's initial weights
+        torch.manual_seed(seed)  # for the initial weights
         train = _train_mlp if kind == "mlp" else _train_lstm
         layers = train(
             log,
@@ -51,7 +51,7 @@ def train_network(
 
 
 def predict(weights: NetworkWeights, log: ActuatorLog) -> np.ndarray:
-    """Return the torques (T, D) of a log as the network gives them in a task [N m]: step by step, each run from its start."""
+    """Return the torques (T, D) of a log by the network [N m], step by step as in a task, with a reset at each run."""
     joints = len(log.joint_names)
     network = ActuatorNetwork(weights, 1, joints, log.dt, torch.device("cpu"))
     error = torch.tensor(log.target - log.position, dtype=torch.float32)
@@ -71,10 +71,10 @@ def _spread(values: np.ndarray) -> float:
 
 
 def _rows(log: ActuatorLog, past: int) -> np.ndarray:
-    """Return the samples that may be learned from with `past` samples before them in the same run, none of them held out.
+    """Return the indices of training samples with at least `past` samples before them in the same run, none held out.
 
     Raises:
-        ConfigError: there are none.
+        ConfigError: there are no such samples.
     """
     usable = ~log.held_out
     starts = np.r_[True, (np.diff(log.run) != 0) | (np.diff(usable.astype(int)) != 0)]
@@ -150,7 +150,7 @@ def _train_lstm(
 
 
 def _minimise(network: nn.Module, loss: Callable[[], Tensor], updates: int, rate: float) -> None:
-    """Make so many updates by Adam, with steps that become smaller down to nothing."""
+    """Make a number of Adam updates with a learning rate that decays to zero."""
     optimiser = torch.optim.Adam(network.parameters(), rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
     for _ in range(updates):

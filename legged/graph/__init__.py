@@ -1,1 +1,1 @@
-"""A step as one CUDA graph, and the guard that checks on the CPU that it could be one."""
+"""The control step as one CUDA graph, and a guard that checks on a CPU if the step can be captured."""

@@ -1,4 +1,4 @@
-"""The numbers of Python in a step, as tensors that lie on the device before a CUDA graph is recorded."""
+"""Constants of a control step: its Python numbers as tensors that are on the device before a CUDA graph is captured."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,44 +10,45 @@ from torch import Tensor
 
 
 class HostReadError(RuntimeError):
-    """Code of the step wants a tensor's value on the host, or hands it something of the host's that a graph can't hold."""
+    """Error for code of the step that reads a tensor's value on the host, or uses host data that a CUDA graph can't hold."""
 
 
 class Constants:
-    """Tensors of the Python numbers in a step, made once each on the device: a graph can't copy from the host.
+    """Cache of tensors made from the step's Python numbers. Each is made once on the device, because a graph can't copy from
+    the host.
 
-    Lists in an index, numpy arrays among them, become tensors of positions; of a list of bools, whose size is known, the
-    positions of its Trues. `torch.tensor` and its kin become copies of such a constant.
+    Lists and numpy arrays in an index become tensors of positions. A list of bools becomes the positions of its True values,
+    whose number is known. Calls such as `torch.tensor` become copies of a cached constant.
     """
 
     def __init__(self) -> None:
         self._made: dict[Any, Tensor] = {}
         self.complete = False
-        """Whether the step has been run, so that another number would be one that changes from step to step."""
+        """True once the step has run. A new constant then means that a number changes from step to step."""
         self.making = False
-        """Whether a constant is being made just now."""
+        """True while a constant is being made."""
 
     def __len__(self) -> int:
         return len(self._made)
 
     def get(self, key: Any, make: Callable[[], Tensor]) -> Tensor:
-        """Return the constant of that key, made if there is none yet.
+        """Return the constant of a key; make it if it is missing.
 
         Raises:
-            HostReadError: the step asks for one that the step before it did not.
+            HostReadError: the constant is missing, and the step before did not need it.
         """
         if key not in self._made:
             if self.complete:
                 raise HostReadError(
                     "makes a tensor of other numbers than the step before; a CUDA graph repeats the first ones"
                 )
-            with self._free(), torch.inference_mode(False):  # an ordinary tensor, so that autograd may keep it too
+            with self._free(), torch.inference_mode(False):  # an ordinary tensor, which autograd may keep
                 self._made[key] = make()
         return self._made[key]
 
     @contextmanager
     def _free(self) -> Iterator[None]:
-        """Let the block do what the step may not."""
+        """Switch off the guard's checks in the block."""
         self.making = True
         try:
             yield
@@ -55,8 +56,8 @@ class Constants:
             self.making = False
 
     def pick(self, tensor: Tensor, index: Any) -> tuple[Tensor, Any]:
-        """Return a tensor and an index that give what `tensor[index]` does, where `index` has numbers that are tensors of its
-        device, as `forces[:, feet[0]]`: torch would read each on the host.
+        """Return a tensor and an index that select the same as `tensor[index]`, where `index` holds scalar tensors on the
+        device, as in `forces[:, feet[0]]`. torch would read each of these on the host.
         """
         parts = index if isinstance(index, tuple) else (index,)
         for place, part in enumerate(parts):
@@ -64,29 +65,29 @@ class Constants:
                 before, after = parts[:place], parts[place:]
                 from_behind = any(other is Ellipsis for other in before)
                 dim = tensor.dim() - sum(map(_dimensions, after)) if from_behind else sum(map(_dimensions, before))
-                tensor = tensor[(*[slice(None)] * dim, part.view(1).long())]  # short integers are no index of a list
+                tensor = tensor[(*[slice(None)] * dim, part.view(1).long())]  # torch refuses short integers here
                 parts = (*before, 0, *after[1:])
         return tensor, parts if isinstance(index, tuple) else parts[0]
 
     def index(self, tensor: Tensor, index: Any) -> Any:
-        """Return an index of `tensor` that says the same without lists, arrays, or tensors of another device."""
+        """Return an equivalent index of `tensor` without lists, arrays, or tensors of another device."""
         parts = index if isinstance(index, tuple) else (index,)
         if any(isinstance(part, list | tuple) and holds_tensors(part) for part in parts):
             raise HostReadError("indexes by a list of tensors, whose values a CUDA graph cannot hold; torch.stack them")
         if isinstance(index, list) and any(not isinstance(value, int | np.integer | np.bool_) for value in index):
-            return index  # torch takes most of these for tuples, and warns
+            return index  # torch takes most of these for tuples and warns
         pieces = tuple(piece for part in parts for piece in self._positions(tensor, index, part))
         return pieces if isinstance(index, tuple) or len(pieces) != 1 else pieces[0]
 
     def _positions(self, tensor: Tensor, index: Any, part: Any) -> tuple[Any, ...]:
-        """Return what takes the place of one part of an index."""
+        """Return the replacement for one part of an index."""
         elsewhere = isinstance(part, Tensor) and part.device != tensor.device
         if not elsewhere and not isinstance(part, list | tuple | range | np.ndarray):
             return (part,)
         with self._free():
             array = np.asarray(part)
         if array.dtype == bool:
-            if not self.complete:  # torch's own error where the mask has another shape
+            if not self.complete:  # raises torch's own error for a mask of the wrong shape
                 with self._free():
                     torch.empty(1, device="cpu").expand(tensor.shape).__getitem__(index)
             return tuple(self._constant(rows, tensor.device) for rows in np.nonzero(array))
@@ -101,13 +102,13 @@ class Constants:
 
 
 def _is_number(part: Any) -> bool:
-    """Return whether a part of an index is a tensor of one whole number."""
+    """Return True if a part of an index is a scalar tensor of an integer."""
     kinds = (torch.int64, torch.int32, torch.int16, torch.int8)
     return isinstance(part, Tensor) and part.dim() == 0 and part.dtype in kinds
 
 
 def _dimensions(part: Any) -> int:
-    """Return how many dimensions of a tensor a part of an index takes up."""
+    """Return the number of a tensor's dimensions that a part of an index uses up."""
     if part is None or part is Ellipsis or isinstance(part, bool):
         return 0
     is_mask = isinstance(part, Tensor | np.ndarray) and part.dtype in (torch.bool, torch.uint8, np.bool_)
@@ -115,12 +116,12 @@ def _dimensions(part: Any) -> int:
 
 
 def holds_tensors(data: Any) -> bool:
-    """Return whether there are tensors in nested lists."""
+    """Return True if nested lists contain a tensor."""
     return isinstance(data, Tensor) or (isinstance(data, list | tuple) and any(holds_tensors(value) for value in data))
 
 
 def key_of(data: Any) -> Any:
-    """Return what tells numbers, nested lists and arrays of them apart; None for anything else."""
+    """Return a key that identifies the values of a number, a nested list or an array; None for other types."""
     if isinstance(data, np.ndarray):
         return data.dtype.str, data.shape, data.tobytes()
     if isinstance(data, list | tuple | range):

@@ -1,4 +1,6 @@
-"""What no CUDA graph can hold, found on any machine: host reads, host data, Python state that a replay would freeze."""
+"""Guard that finds, on any machine, the code that a CUDA graph can't hold: host reads, host data, and changing Python
+state.
+"""
 
 import sys
 from collections import deque
@@ -22,9 +24,9 @@ from legged.graph.python_state import attributes, random_states, shown
 __all__ = ["ForbidHostReads", "ForbidReads", "HostReadError", "calling"]
 
 aten = torch.ops.aten
-ON_THE_DEVICE = "say device=self.device"
+ON_THE_DEVICE = "pass device=self.device"
 NEXT_TO = ("torch", "numpy", "warp", "contextlib")
-"""Modules whose own frames say nothing of who called them."""
+"""Modules that `caller` skips, because they only pass calls on."""
 
 
 _active: "ForbidHostReads | None" = None
@@ -32,8 +34,8 @@ _active: "ForbidHostReads | None" = None
 
 @contextmanager
 def calling(term: str) -> Iterator[None]:
-    """Name `term` in the error if the block fails, also while a graph is being captured; under the guard, look what it does
-    to Python's state.
+    """Name `term` in the error if the block fails, also during a capture. Under the guard, also check that the term leaves
+    the Python state unchanged.
     """
     try:
         with _active.inside(term) if _active is not None else nullcontext():
@@ -46,22 +48,23 @@ def calling(term: str) -> Iterator[None]:
 
 
 class ForbidHostReads:
-    """Refuses, in its block, what would make a GPU wait for the host or what no graph can hold: `.item()`, `if tensor`,
-    `nonzero`, indexing by a mask, copies to and from the host, tensors made without a device, random numbers of the host.
+    """Guard that refuses, in its block, operations that make a GPU wait for the host or that a graph can't hold: `.item()`,
+    `if tensor`, `nonzero`, indexing by a mask, copies to and from the host, tensors made without a device, random numbers of
+    the host.
 
-    Used again and again on one step, it also compares the steps, from the third on: the attributes of `owner` that are no
-    tensors must stay, the numbers handed to torch must be the same, and nothing may be read that the step before allocated,
-    for a graph goes on reading what was there when it was captured. (To allocate a tensor, keep it as an attribute and read
-    it outside the step, or later in the same step, is harmless.) The first steps may set up whatever they keep.
+    If the same step runs several times, the guard also compares the runs, from the third on. The attributes of `owner` other
+    than tensors must not change. The numbers passed to torch must be the same. The step must not read a tensor that the step
+    before allocated, because a graph goes on reading the memory of its capture. A tensor may be allocated, kept as an
+    attribute, and read outside the step or later in the same step. The first runs may set up anything that they keep.
 
-    Physics engines of this package are left alone: those on the host work on numpy's arrays, and are never captured.
+    This package's own physics engines are exempt. Those on the host work on numpy arrays and are never captured.
     """
 
     STEPS = 3
-    """Steps after which all has been judged."""
+    """Number of runs that complete all checks."""
 
     def __init__(self, device: torch.device | None = None, owner: Any = None) -> None:
-        """Guard a step on `device`, the CPU by default, of a task `owner`."""
+        """Guard a step on `device`, the CPU by default, of the task `owner`."""
         self.device = device or torch.device("cpu")
         self.owner = owner
         self.constants = Constants()
@@ -75,7 +78,7 @@ class ForbidHostReads:
 
     @property
     def compares(self) -> bool:
-        """Whether this step is judged by the one before."""
+        """True if this step is compared with the one before."""
         return self._steps >= self.STEPS
 
     def __enter__(self) -> "ForbidHostReads":
@@ -102,14 +105,14 @@ class ForbidHostReads:
 
     @contextmanager
     def recording(self) -> Iterator[None]:
-        """Refuse new constants in the block, while a graph is recorded: those it needs are there."""
+        """Refuse new constants in the block, in which a graph is captured. All constants that it needs exist already."""
         self.constants.complete = True
         with self._calls:
             yield
 
     @contextmanager
     def inside(self, term: str) -> Iterator[None]:
-        """Take the block for a term of the task."""
+        """Run the block as the term `term` of the task."""
         before, self._place = self._python_state(), term
         try:
             yield
@@ -118,7 +121,7 @@ class ForbidHostReads:
             self._place = ""
 
     def refuse(self, reason: str) -> None:
-        """Raise, unless it is a physics engine that asks.
+        """Raise an error, unless a physics engine of this package makes the call.
 
         Raises:
             HostReadError: with that reason.
@@ -148,7 +151,7 @@ class ForbidHostReads:
     # ---- what the modes see ----------------------------------------------------------------------------------------------
 
     def run(self, func: Any, args: Any, kwargs: Any) -> Any:
-        """Run one operator, and compare it with that of the step before."""
+        """Run one operator and compare it with that of the step before."""
         inputs = [value for value in tree_leaves((args, kwargs)) if value is not None]
         over = overwritten(func, args, kwargs)
         read = [value for value in inputs if all(value is not other for other in over)]
@@ -170,7 +173,7 @@ class ForbidHostReads:
         return result
 
     def _judge(self, seen: "Seen", kept: dict[int, Tensor]) -> None:
-        """Compare an operator with the one at its place in the step before."""
+        """Compare an operator with the one in the same place of the step before."""
         place = len(self._record)
         before = self._record_before[place] if place < len(self._record_before) else Seen("nothing", {})
         if seen.call != before.call:
@@ -186,7 +189,7 @@ class ForbidHostReads:
             )
 
     def _tensors(self) -> Iterator[tuple[str, Tensor]]:
-        """Return the owner's attributes that are tensors, or lists or tables of them."""
+        """Yield the owner's tensors: attributes, and entries of its lists and dictionaries."""
         for name, value in getattr(self.owner, "__dict__", {}).items():
             parts = (
                 value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple | deque) else (value,)
@@ -195,19 +198,19 @@ class ForbidHostReads:
 
 
 class ForbidReads(TorchDispatchMode):
-    """Refuses, in its block, operators that read some tensors, or a part of them."""
+    """Dispatch mode that refuses, in its block, operators that read certain tensors or parts of them."""
 
     def __init__(self, tensors: Mapping[str, Tensor], reason: str) -> None:
-        """Refuse to read `tensors`, by the names that errors call them, for a `reason` that follows the name."""
+        """Refuse reads of `tensors`, a map from their names in errors. An error gives the `reason` after the name."""
         super().__init__()
         self._names = {memory_of(tensor): name for name, tensor in tensors.items()}
         self._reason = reason
 
     def judge(self, value: Any) -> None:
-        """Refuse a value that holds one of the tensors.
+        """Check that a value holds none of the tensors.
 
         Raises:
-            HostReadError: it does.
+            HostReadError: it holds one.
         """
         for part in tree_leaves(value):
             memory = memory_of(part)
@@ -221,36 +224,37 @@ class ForbidReads(TorchDispatchMode):
 
 @dataclass(frozen=True)
 class Seen:
-    """An operator that a step ran."""
+    """Record of one operator that a step ran."""
 
     call: str
-    """Its name and what it was given that is no tensor."""
+    """Name of the operator and its arguments other than tensors."""
     memory: dict[int, StorageWeakRef]
-    """Memory of the tensors it was given which the step did not make; kept, so that none is mistaken for a later one."""
+    """Memory of the argument tensors that the step itself did not make. The references prevent confusion with later tensors
+    in the same place."""
 
 
 def memory_of(value: Any) -> int | None:
-    """Return what tells the memory of a tensor from all other memory that is known."""
+    """Return an identifier of a tensor's memory, unique among all memory that is still referenced."""
     return value.untyped_storage()._cdata if isinstance(value, Tensor) and value.layout is torch.strided else None
 
 
 OVERWRITING = ("copy_", "fill_", "zero_", "uniform_", "normal_", "random_", "bernoulli_", "exponential_")
-"""Methods that do not look at what was in the tensor."""
+"""Methods that overwrite a tensor without reading it."""
 
 
 def overwritten(func: Any, args: Any, kwargs: Any) -> list[Tensor]:
-    """Return the tensors that an operator writes without reading them."""
+    """Return the tensors that an operator overwrites without reading them."""
     found = [kwargs[a.name] for a in func._schema.arguments if a.is_out and a.name in kwargs]
     return tree_leaves(found) + ([args[0]] if func._schema.name.removeprefix("aten::") in OVERWRITING else [])
 
 
 def fills(tensor: Tensor) -> bool:
-    """Return whether a tensor is all of its memory."""
+    """Return True if a tensor covers all of its memory."""
     return tensor.numel() * tensor.element_size() == tensor.untyped_storage().nbytes()
 
 
 def caller() -> str:
-    """Return the module whose code asks torch for something."""
+    """Return the name of the module that calls torch."""
     frame = sys._getframe(1)
     while frame is not None:
         name = frame.f_globals.get("__name__", "")
@@ -261,7 +265,7 @@ def caller() -> str:
 
 
 def default_device() -> torch.device | None:
-    """Return what `torch.set_default_device` or `with torch.device(...)` asked for."""
+    """Return the device set by `torch.set_default_device` or `with torch.device(...)`, or None."""
     asked = [mode.device for mode in _get_current_function_mode_stack() if isinstance(mode, DeviceContext)]
     return asked[-1] if asked else None
 
@@ -272,7 +276,7 @@ DECOMPOSED = "looks on the host whether it converged (svd, eigh, eig, and pinv, 
 
 
 class _Operators(TorchDispatchMode):
-    """Sees every operator that runs, whoever calls it."""
+    """Dispatch mode that sees every operator, including those that torch calls itself."""
 
     REASONS = {
         aten._local_scalar_dense.default: "reads a value on the host (.item(), float(tensor), if tensor)",
@@ -298,7 +302,7 @@ class _Operators(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        with self:  # in inference mode composite operators (item, one-argument where) arrive whole: take them apart
+        with self:  # in inference mode, composite operators (item, one-argument where) arrive whole: take them apart
             result = func.decompose(*args, **kwargs)
         if result is not NotImplemented:
             return result
@@ -308,7 +312,7 @@ class _Operators(TorchDispatchMode):
         return self._guard.run(func, args, kwargs)
 
     def _reason(self, func: Any, args: Any, kwargs: Any) -> str:
-        """Return why the operator is refused; empty if it is not."""
+        """Return why the operator is refused; empty if it is allowed."""
         if func in (aten.index.Tensor, aten.index_put_.default, aten.index_put.default):
             if any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
                 return "indexes by a mask, whose size is unknown; use torch.where or masked_fill"
@@ -326,7 +330,7 @@ class _Operators(TorchDispatchMode):
 
 
 class _Calls(TorchFunctionMode):
-    """Sees what Python calls of torch, and puts constants in the place of the host's numbers."""
+    """Function mode that sees Python's calls of torch, and replaces the host's numbers by constants."""
 
     REASONS = {
         Tensor.cpu: "copies to the host (.cpu())",
@@ -358,19 +362,19 @@ class _Calls(TorchFunctionMode):
             return self._constant(func, args[1], args, kwargs, (args[0].dtype, args[0].device))
         elif func in _device_constructors() or func is torch.normal:
             return self._factory(func, args, kwargs)
-        elif func is torch.nn.functional.one_hot and len(args) > 1 and args[1] > 0:  # on the CPU alone it looks at the values
+        elif func is torch.nn.functional.one_hot and len(args) > 1 and args[1] > 0:  # the CPU version reads the values
             return (args[0].unsqueeze(-1) == torch.arange(args[1], device=args[0].device)).long()
         return func(*args, **kwargs)
 
     def _is_host(self, *values: Any) -> bool:
-        """Return whether one of the values means the CPU. On a machine without a GPU the task's own device is one, too:
-        there, only its name as text.
+        """Return True if one of the values means the CPU. On a machine without a GPU the task's own device is the CPU too, so
+        only the text "cpu" counts there.
         """
         kinds = str if self._guard.device.type == "cpu" else str | torch.device
         return any(isinstance(value, kinds) and torch.device(value).type == "cpu" for value in values)
 
     def _factory(self, func: Any, args: Any, kwargs: Any) -> Any:
-        """Call a function that makes a tensor out of nothing, or of the host's data, unless a graph could not hold it."""
+        """Call a function that makes a tensor from nothing or from host data, unless a graph can't hold it."""
         given = [*args, *kwargs.values()]
         of_tensor = bool(given) and isinstance(given[0], Tensor) and (func in self.OF_DATA or func is torch.normal)
         device = kwargs.get("device") or default_device()
@@ -378,7 +382,7 @@ class _Calls(TorchFunctionMode):
             return func(*args, **kwargs)
         if device is None:
             self._guard.refuse(f"torch.{func.__name__} without a device makes a tensor on the CPU: {ON_THE_DEVICE}")
-        elif self._is_host(device) and not caller().startswith("legged."):  # a learner has its device as text
+        elif self._is_host(device) and not caller().startswith("legged."):  # the learner's device is a text
             self._guard.refuse(f"torch.{func.__name__} makes a tensor on the CPU: {ON_THE_DEVICE}")
         elif func in self.OF_DATA:
             return self._constant(func, given[0], args, kwargs, (device,))

@@ -1,4 +1,4 @@
-"""State that Python keeps and a CUDA graph does not: attributes that are no tensors, random generators of the host."""
+"""Python state that a CUDA graph does not replay: attributes other than tensors, and the host's random generators."""
 
 import random
 from collections import deque
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 LIBRARIES = ("builtins", "legged", "mujoco", "newton", "numpy", "tensordict", "torch", "warp")
-"""Packages whose objects are no state of the user's."""
+"""Packages whose objects hold no state of the user."""
 
 
 def random_states() -> dict[str, Any]:
@@ -18,9 +18,10 @@ def random_states() -> dict[str, Any]:
 
 
 def plain_state(value: Any, depth: int = 3) -> Any:
-    """Return what a Python value is now, comparable: numbers, text, containers of them, arrays, random generators, and
-    objects of the user's own classes. Tensors and the parts of a task count for nothing: they are judged by what is read of
-    them.
+    """Return a comparable form of a Python value.
+
+    The value may be a number, a text, an array, a random generator, an object of a user's class, or a container of these.
+    Tensors and the parts of a task are left out. For these, the guard compares the operators that read them.
     """
     if value is None or isinstance(value, bool | int | float | complex | str | bytes | np.generic):
         return repr(value)
@@ -51,6 +52,6 @@ def attributes(owner: Any, depth: int = 3) -> dict[str, Any]:
 
 
 def shown(state: Any) -> str:
-    """Return its text, cut where it is long."""
+    """Return a state as text, cut if it is long."""
     text = str(state)
     return text if len(text) <= 40 else f"{text[:37]}..."

@@ -1,4 +1,4 @@
-"""The control step as one CUDA graph, and the guard that keeps it capturable on machines without a GPU."""
+"""The control step as one CUDA graph, with the guard that keeps the step capturable on machines without a GPU."""
 
 import gc
 from collections.abc import Callable, Iterator
@@ -12,11 +12,11 @@ __all__ = ["Branch", "ForbidHostReads", "ForbidReads", "HostReadError", "StepGra
 
 
 class Branch:
-    """Work beside the main line of the step: on a GPU a second stream, in the captured graph a parallel branch.
+    """Work in parallel to the rest of the step: a second stream on a GPU, and a parallel branch of the captured graph.
 
-    The step's small launches are bound by latency, so independent ones are free side by side. Tensors that both lines
-    touch must be allocated before (a stream may reuse what another still reads), and `join` must come before the
-    next physics step (the solver's conditional node cannot be captured while a branch is open).
+    The step's small launches are bound by latency, so parallel ones cost nothing. Tensors that both streams use must be
+    allocated before `fork`, because a stream may reuse memory that another still reads. Call `join` before the next physics
+    step, because the solver's conditional node cannot be captured while a branch is open.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -25,7 +25,7 @@ class Branch:
 
     @contextmanager
     def fork(self) -> Iterator[None]:
-        """Let the block run at the same time as what follows it, up to `join`."""
+        """Run the block in parallel to the code after it, up to `join`."""
         if self._stream is None:
             yield
             return
@@ -34,15 +34,17 @@ class Branch:
             yield
 
     def join(self) -> None:
-        """Let what follows wait for the block."""
+        """Make the code after this call wait for the block."""
         if self._stream is not None:
             torch.cuda.current_stream(self._stream.device).wait_stream(self._stream)
 
 
 @contextmanager
 def garbage_kept() -> Iterator[None]:
-    """Let nothing in reference cycles be freed within the block. A task of before may have left its CUDA graph in one, and to
-    free a graph is a call that CUDA forbids during a capture: the capture in progress would be lost.
+    """Switch off garbage collection in the block.
+
+    A reference cycle may hold the CUDA graph of an earlier task. CUDA forbids freeing a graph during a capture, and the
+    capture would fail.
     """
     collects = gc.isenabled()
     gc.disable()
@@ -54,10 +56,10 @@ def garbage_kept() -> Iterator[None]:
 
 
 class StepGraph:
-    """Runs a step function: eagerly on the CPU, by replaying one captured CUDA graph on a GPU.
+    """Runner of a step function: eagerly on the CPU, by replays of a captured CUDA graph on a GPU.
 
-    The function must only touch tensors of fixed address. The constructor calls it a few times (this compiles kernels
-    and checks that it can be captured), so the caller resets its state afterwards.
+    The function may only use tensors with fixed addresses. The constructor calls it a few times, to compile kernels and to
+    check that it can be captured. The caller resets its state afterwards.
     """
 
     WARM_UP_STEPS = 3
@@ -70,16 +72,16 @@ class StepGraph:
         warm_up_steps: int = WARM_UP_STEPS,
         rehearse: Callable[[], None] | None = None,
     ) -> None:
-        """Check or capture `function`; with `enabled` false it runs eagerly and unchecked. Of a function that does the same
-        many times, `rehearse` does it once: enough to warm up, and to check.
+        """Check or capture `function`. With `enabled` false it runs eagerly and unchecked. If `function` repeats the same
+        work many times, `rehearse` does that work once, which is enough for warm-up and check.
 
         Raises:
             TermError: a term of the task can't be captured.
-            HostReadError: another part of the step can't.
+            HostReadError: another part of the step can't be captured.
         """
         self._function, self._rehearse, self._warm_up_steps = function, rehearse or function, warm_up_steps
         self._graph: torch.cuda.CUDAGraph | None = None
-        # What does the same many times shows in one time all that it does; of a step, several are compared.
+        # A function that repeats the same work needs one check. For a single step, several runs are compared.
         self._checks = ForbidHostReads.STEPS if rehearse is None else 1
         self._guard = ForbidHostReads(device, getattr(function, "__self__", None))
         if not enabled:
@@ -94,19 +96,21 @@ class StepGraph:
             raise
 
     def _check(self) -> None:
-        """Run under the guard, which says what is wrong, where a failed capture only says that something is."""
+        """Run the step under the guard, which names the cause of an error. A failed capture would not."""
         for step in range(self._checks):
-            # One step uses up random numbers, as any rehearsal does; those it is compared with leave the host's alone.
+            # The first step uses up random numbers, as any rehearsal does. The steps compared with it leave the host's
+            # generator unchanged.
             with torch.random.fork_rng(devices=[], enabled=step > 0), self._guard:
                 self._rehearse()
 
     def _capture(self, device: torch.device) -> "torch.cuda.CUDAGraph":
         import warp as wp
 
-        wp.init()  # a step that launches nothing of Warp's may be the first to ask for it
+        wp.init()  # a step without kernels of Warp has not called this yet
         stream = torch.cuda.Stream(device)
         stream.wait_stream(torch.cuda.current_stream(device))
-        # Warp looks up a device at its first use, and a stream when it first sees it: within a capture that would break it.
+        # Warp looks up a device at its first use, and a stream when it first sees it. During a capture these calls would
+        # fail.
         with wp.ScopedStream(wp.stream_from_torch(stream), sync_enter=False):
             wp.zeros(1, dtype=float, device=wp.device_from_torch(device))
         with torch.cuda.stream(stream):
@@ -116,11 +120,11 @@ class StepGraph:
         torch.cuda.current_stream(device).wait_stream(stream)
         torch.cuda.synchronize(device)
         graph = torch.cuda.CUDAGraph()
-        # Of several processes each has a thread that looks after its collectives, and may ask CUDA about them meanwhile.
+        # With several processes, each has a thread for its collectives, which may call CUDA during the capture.
         error_mode = "thread_local" if torch.distributed.is_initialized() else "global"
         failure: Exception | None = None
         try:
-            # Torch owns the capture; Warp is told of it, so that the solver's loop becomes a conditional node.
+            # Torch owns the capture. Warp is told of it, so that the solver's loop becomes a conditional node.
             with garbage_kept(), torch.cuda.graph(graph, stream=stream, capture_error_mode=error_mode):
                 warp_stream = wp.stream_from_torch(torch.cuda.current_stream(device))
                 with wp.ScopedStream(warp_stream, sync_enter=False), wp.ScopedCapture(stream=warp_stream, external=True):
@@ -131,14 +135,14 @@ class StepGraph:
                         failure = error
                         raise
         except Exception as error:
-            failure = failure or error  # ending a broken capture fails too, with an error that says nothing of the cause
+            failure = failure or error  # ending a broken capture fails too, and its error hides the cause
         if failure is not None:
             raise failure
         return graph
 
     @property
     def captured(self) -> bool:
-        """Whether a CUDA graph is replayed."""
+        """True if a CUDA graph is replayed."""
         return self._graph is not None
 
     def __call__(self) -> None:

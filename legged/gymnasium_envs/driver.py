@@ -1,4 +1,4 @@
-"""What both kinds of environment share: a task, its random numbers, its spaces and its camera."""
+"""Shared parts of both kinds of environment: the task, its random numbers, its spaces and its camera."""
 
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -11,33 +11,33 @@ from torch import Tensor
 from legged.commandline.arguments import pick_device
 from legged.config.checks import shown
 from legged.config.networks import groups_of
-from legged.envs.step_watchers import keep_final_step
+from legged.envs.final_observation import keep_final_step
 from legged.errors import ConfigError, suggest
 from legged.gymnasium_envs.random_stream import RandomStream
 from legged.registry import make_task, task_config
 from legged.rendering import ModelCamera, RobotsCamera, camera_of
 
 Seen = Literal["actor", "dict"]
-"""What is observed: what the policy is given, side by side, or every group by its name."""
+"""Form of the observations: the policy's groups side by side, or a dictionary of all groups."""
 SEEN = ("actor", "dict")
 RENDER_MODES = ["rgb_array"]
 REWARD = "reward_"
-"""How the parts of the reward are called in infos."""
+"""Prefix of the reward terms in infos."""
 LARGEST_SEED = 2**63
 LARGEST_PICTURE = 16384
-"""Most pixels along a side of a picture: what graphics cards draw into at most."""
+"""Largest side of a picture, a limit of graphics cards [pixels]."""
 
 
 class Driver:
-    """A task that keeps the last step of every episode, and draws from random numbers of its own."""
+    """A task that keeps the last step of every episode and has its own random numbers."""
 
     def __init__(
         self, task: str, num_envs: int, device: str, physics: str, config: Mapping[str, Any] | None, observations: Seen
     ) -> None:
-        """Build it.
+        """Build the task.
 
         Raises:
-            ConfigError: there is no such task, device or setting, or one has a value that it can't have.
+            ConfigError: the task, the device or a setting does not exist, or a value is not allowed.
         """
         if observations not in SEEN:
             raise ConfigError(f"observations: got {shown(observations)}{suggest(str(observations)[:100], SEEN)}")
@@ -49,12 +49,12 @@ class Driver:
         self.random = RandomStream(self.device)
         with self.random.used():
             self.task = make_task(cfg, self.device, graph=False)
-            # On a GPU the step is captured once, with what is kept; on the CPU there is no graph to check it for.
+            # On a GPU the captured step includes the copies of final states; on the CPU no graph needs a check.
             self.final = keep_final_step(self.task, graph=self.device.type == "cuda")
             self._beginning = self._tried()
         self._seeded = False
         self.groups = None if observations == "dict" else groups_of(cfg, "actor")
-        """The groups that are seen side by side; None for all, by name."""
+        """Observation groups side by side; None for a dictionary of all groups."""
         self._camera: ModelCamera | RobotsCamera | None = None
 
     @staticmethod
@@ -69,7 +69,7 @@ class Driver:
         return list(config.items())
 
     def _tried(self) -> dict[str, Any]:
-        """Make a step that leaves no trace, and return the state before it: a term may make a buffer at its first call."""
+        """Return the initial state with the buffers that terms create at their first call; makes a step and undoes it."""
         before = self.task.state_dict()
         self.task.step(torch.zeros_like(self.task.actions))
         beginning = {part: {**state, **before[part]} for part, state in self.task.state_dict().items()}
@@ -97,11 +97,11 @@ class Driver:
     # ---- steps -------------------------------------------------------------------------------------------------------
 
     def reset(self, seed: int | None, options: dict[str, Any] | None, chosen: np.random.Generator) -> Any:
-        """Begin an episode in every environment; returns what is seen. With a seed everything is as it was when the task was
-        built, curricula included, but for the random numbers; without one they go on, and begin with one that `chosen` gives.
+        """Start an episode in every environment and return the observations. A seed restores the initial state, curricula
+        included, and seeds the random numbers. Without one they continue; `chosen` draws the first seed.
 
         Raises:
-            ConfigError: there are options.
+            ConfigError: `options` are given.
         """
         if options:
             raise ConfigError(f"reset: options: there are none; got {shown(options)}")
@@ -115,28 +115,28 @@ class Driver:
             return self._seen(dict(self.task.reset().items()))
 
     def step(self, actions: Any) -> tuple[Any, Tensor]:
-        """Make a step under `actions` (N, D); returns what is seen and the rewards (N,), in tensors of their own.
+        """Make a step with `actions` (N, D); return the observations and the rewards (N,) in new tensors.
 
         Raises:
-            ValueError: the actions have another shape, or are no real numbers.
+            ValueError: the actions have another shape, or are not real numbers.
         """
         with self.random.used():
             observations, rewards, _, _ = self.task.step(actions)
         return self._seen(dict(observations.items())), rewards
 
     def final_observations(self) -> Any:
-        """Return what was seen at the end of the last step before any environment was reset, in tensors of their own."""
+        """Return the observations of the last step before environments were reset, in new tensors."""
         return self._seen({name: seen.clone() for name, seen in self.final.observations.items()})
 
     def reward_parts(self, to_numpy: bool) -> dict[str, Any]:
-        """Return the parts of the last rewards, (N,) each, in tensors or arrays of their own."""
+        """Return the terms of the last rewards, (N,) each, in new tensors or arrays."""
         rewards = self.task.rewards
         parts = rewards.last.clone()
         rows = parts.cpu().numpy() if to_numpy else parts  # all in one copy
         return {f"{REWARD}{name}": part for name, part in zip(rewards.names, rows, strict=True)}
 
     def _seen(self, groups: dict[str, Tensor]) -> Any:
-        """Choose among the observation groups."""
+        """Return the observations in the requested form."""
         if self.groups is None:
             return groups
         chosen = [groups[name] for name in self.groups]
@@ -146,21 +146,18 @@ class Driver:
 
     @property
     def fps(self) -> int:
-        """Pictures a second that show real time: one for each step."""
+        """Return the picture rate of real time: one picture per step [1/s]."""
         return max(1, round(1.0 / self.task.dt))
 
     def picture(self, env: int, width: int, height: int) -> np.ndarray:
-        """Return (height, width, 3) uint8: one environment as it is now.
+        """Return a picture (height, width, 3) uint8 of the present state of one environment.
 
         Raises:
-            RunError: nothing can be rendered here.
+            RunError: this machine cannot render.
         """
         if self._camera is None:
             self._camera = camera_of(self.task, 1, width, height)
-        if isinstance(self._camera, RobotsCamera):
-            self._camera.turn_to(env)
-        else:
-            self._camera.followed = env
+        self._camera.turn_to(env)
         return self._camera.picture()
 
     def close(self) -> None:
@@ -191,3 +188,24 @@ def checked_size(width: int, height: int) -> tuple[int, int]:
         if isinstance(side, bool) or not isinstance(side, (int, np.integer)) or not 1 <= side <= LARGEST_PICTURE:
             raise ConfigError(f"{name}: must be a whole number of pixels from 1 to {LARGEST_PICTURE}, got {shown(side)}")
     return int(width), int(height)
+
+
+def as_numpy(value: Any) -> Any:
+    """Return a tensor, or the tensors of a dictionary, as arrays; those of tensors on the CPU share their memory."""
+    if isinstance(value, dict):
+        return {name: as_numpy(part) for name, part in value.items()}
+    return value.cpu().numpy() if isinstance(value, Tensor) else value
+
+
+def row(value: Any, index: int) -> Any:
+    """Return one row of an array, or of the arrays of a dictionary."""
+    return {name: part[index] for name, part in value.items()} if isinstance(value, dict) else value[index]
+
+
+def rows_of(value: Any, mask: np.ndarray) -> np.ndarray:
+    """Return an array (N,) of objects, as Gymnasium stores final observations: copies of the rows in `mask` (N,) or None."""
+    found = np.full(len(mask), None, dtype=object)
+    for index in mask.nonzero()[0].tolist():
+        one = row(value, index)
+        found[index] = {name: part.copy() for name, part in one.items()} if isinstance(one, dict) else one.copy()
+    return found

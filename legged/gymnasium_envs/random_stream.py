@@ -1,4 +1,4 @@
-"""Random numbers of an environment's own: tasks draw from torch's generators, which a whole process shares."""
+"""Random numbers of a single environment: tasks draw from torch's generators, which are global to the process."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,16 +8,16 @@ from torch import Tensor
 
 
 class RandomStream:
-    """States of torch's generators, of the CPU and of one GPU, that are in force only inside `used`."""
+    """States of torch's generators for the CPU and one GPU, which are active only inside `used`."""
 
     def __init__(self, device: torch.device) -> None:
-        """Go on from where torch's generators stand when it is first used."""
+        """Start from the state that torch's generators have at the first use."""
         self._device = device
         self._states: list[Tensor] | None = None
 
     @contextmanager
     def used(self) -> Iterator[None]:
-        """In the block torch draws from this stream; everyone else's random numbers go on afterwards as if it was not."""
+        """Let torch draw from this stream inside the block; restore the global state afterwards."""
         outside = self._read()
         if self._states is not None:
             self._write(self._states)
@@ -28,7 +28,7 @@ class RandomStream:
             self._write(outside)
 
     def seed(self, seed: int) -> None:
-        """Begin the stream anew from a number."""
+        """Restart the stream from a seed."""
         with self.used():
             torch.random.default_generator.manual_seed(seed)
             if self._device.type == "cuda":

@@ -1,4 +1,4 @@
-"""A task as one environment of Gymnasium's."""
+"""A task as a single Gymnasium environment."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -7,14 +7,11 @@ import gymnasium
 import numpy as np
 import torch
 
-from legged.gymnasium_envs.arrays import as_numpy, row
-from legged.gymnasium_envs.driver import RENDER_MODES, Driver, Seen, checked_render_mode, checked_size
+from legged.gymnasium_envs.driver import RENDER_MODES, Driver, Seen, as_numpy, checked_render_mode, checked_size, row
 
 
 class TaskEnv(gymnasium.Env):
-    """One environment of a task. `step` gives what was seen at the end of an episode, not what the next one begins with;
-    `reset` begins the next one.
-    """
+    """One environment of a task. At the end of an episode `step` returns its last observation; `reset` starts the next."""
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES}  # type: ignore[misc]
 
@@ -33,7 +30,7 @@ class TaskEnv(gymnasium.Env):
         """Build the task `task`; the arguments are explained in docs/gymnasium.md.
 
         Raises:
-            ConfigError: there is no such task, device or setting, or one has a value that it can't have.
+            ConfigError: the task, the device or a setting does not exist, or a value is not allowed.
         """
         self.render_mode = checked_render_mode(render_mode)
         self._size = checked_size(width, height)
@@ -46,14 +43,14 @@ class TaskEnv(gymnasium.Env):
 
     @property
     def task(self) -> Any:
-        """The task itself, a `legged.envs.BaseTask`. When an episode is over it is in the next one already."""
+        """Return the task, a `legged.envs.BaseTask`. After the end of an episode it is already in the next one."""
         return self._driver.task
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode; returns what is seen, and no infos.
+        """Start an episode; return the observation and empty infos.
 
         Raises:
-            ConfigError: there are options.
+            ConfigError: `options` are given.
         """
         super().reset(seed=seed)
         seen = self._driver.reset(seed, options, self.np_random)
@@ -61,12 +58,12 @@ class TaskEnv(gymnasium.Env):
         return row(as_numpy(seen), 0), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Make a step under `action` (D,). Returns what is seen, the reward, whether the episode has ended in a failure,
-        whether it has been cut off by time, and in infos the parts of the reward, `reward_<name>`.
+        """Make a step with `action` (D,). Return the observation, the reward, whether the episode ended in a failure, whether
+        its time ran out, and infos with the reward terms, `reward_<name>`.
 
         Raises:
-            ResetNeeded: no episode has begun.
-            ValueError: the action has another shape, or is no real numbers.
+            ResetNeeded: no episode is running.
+            ValueError: the action has another shape, or is not of real numbers.
         """
         if self._over:
             raise gymnasium.error.ResetNeeded("the episode is over, or none has begun: call reset() before step()")
@@ -83,7 +80,7 @@ class TaskEnv(gymnasium.Env):
         """Return a picture (height, width, 3) uint8, or None without a `render_mode`.
 
         Raises:
-            RunError: nothing can be rendered here.
+            RunError: this machine cannot render.
         """
         if self.render_mode is None:
             gymnasium.logger.warn('render() shows nothing without a render mode: make(..., render_mode="rgb_array")')
@@ -93,12 +90,12 @@ class TaskEnv(gymnasium.Env):
         return self._driver.picture(0, *self._size)
 
     def _show_the_end(self) -> None:
-        """Put the task back to the end of the episode, for pictures: nothing but a reset can follow."""
+        """Restore the end of the episode for pictures; only a reset can follow."""
         final, task = self._driver.final, self.task
         task.physics.write(torch.ones_like(task.reset_buf), final.qpos, final.qvel)
         task.sense()
         self._shows_the_next = False
 
     def close(self) -> None:
-        """Free what draws."""
+        """Free the camera."""
         self._driver.close()

@@ -1,4 +1,4 @@
-"""A task as many environments of Gymnasium's that are stepped as one."""
+"""A task as a vector of Gymnasium environments."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -8,13 +8,12 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from legged.gymnasium_envs.arrays import as_numpy, rows_of
-from legged.gymnasium_envs.driver import RENDER_MODES, Driver, Seen, checked_render_mode, checked_size
+from legged.gymnasium_envs.driver import RENDER_MODES, Driver, Seen, as_numpy, checked_render_mode, checked_size, rows_of
 
 
 class TaskVectorEnv(VectorEnv):
-    """The N environments of a task. Those whose episode ends are reset within the same step: what is returned is the first
-    observation of the next episode, the last one of the old is in `infos["final_obs"]`.
+    """The N environments of a task. At the end of an episode an environment is reset within the same step: `step` returns the
+    first observation of the next episode, and `infos["final_obs"]` has the last one of the old.
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
@@ -39,7 +38,7 @@ class TaskVectorEnv(VectorEnv):
         """Build the task `task`; the arguments are explained in docs/gymnasium.md.
 
         Raises:
-            ConfigError: there is no such task, device or setting, or one has a value that it can't have.
+            ConfigError: the task, the device or a setting does not exist, or a value is not allowed.
         """
         self.num_envs, self.render_mode = num_envs, checked_render_mode(render_mode)
         self._size, self._to_numpy = checked_size(width, height), to_numpy
@@ -52,29 +51,29 @@ class TaskVectorEnv(VectorEnv):
 
     @property
     def task(self) -> Any:
-        """The task itself, a `legged.envs.BaseTask`."""
+        """Return the task, a `legged.envs.BaseTask`."""
         return self._driver.task
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode in every environment; returns what is seen, (N, width), and no infos.
+        """Start an episode in every environment; return the observations (N, width) and empty infos.
 
         Raises:
-            ConfigError: there are options.
+            ConfigError: `options` are given.
         """
         super().reset(seed=seed)
         seen = self._driver.reset(seed, options, self.np_random)  # type: ignore[arg-type]
         return (as_numpy(seen) if self._to_numpy else seen), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Make a step under `actions` (N, D). Returns what is seen (N, width), the rewards (N,), which episodes have ended in
-        a failure and which have been cut off by time, (N,) bool each, and infos.
+        """Make a step with `actions` (N, D). Return the observations (N, width), the rewards (N,), masks (N,) of the episodes
+        that ended in a failure and of those whose time ran out, and infos.
 
-        Infos have the parts of the reward, `reward_<name>` (N,); of environments whose episode has ended they are in
-        `final_info`, and what was seen last is in `final_obs`: with NumPy an array of N objects, None where no episode has
-        ended, and nothing at all if none has; with tensors (N, width), to be read where the mask `_final_obs` is true.
+        Infos have the reward terms, `reward_<name>` (N,). For environments whose episode ended, these are in `final_info` and
+        the last observations in `final_obs`. With NumPy `final_obs` is an array of N objects, None where no episode ended,
+        and is absent if none ended; with tensors it is (N, width), valid where the mask `_final_obs` is true.
 
         Raises:
-            ValueError: the actions have another shape, or are no real numbers.
+            ValueError: the actions have another shape, or are not real numbers.
         """
         seen, rewards = self._driver.step(actions)
         terminated, truncated = self.task.terminated_buf.clone(), self.task.time_out_buf.clone()
@@ -94,7 +93,7 @@ class TaskVectorEnv(VectorEnv):
         """Return a picture (height, width, 3) uint8 of each environment, or None without a `render_mode`.
 
         Raises:
-            RunError: nothing can be rendered here.
+            RunError: this machine cannot render.
         """
         if self.render_mode is None:
             gymnasium.logger.warn('render() shows nothing without a render mode: make_vec(..., render_mode="rgb_array")')
@@ -102,15 +101,15 @@ class TaskVectorEnv(VectorEnv):
         return tuple(self._driver.picture(env, *self._size) for env in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Free what draws."""
+        """Free the camera."""
         self._driver.close()
 
 
 def masked(values: Mapping[str, Any], mask: Any) -> dict[str, Any]:
-    """Return infos as Gymnasium has them: each value (N, ...) with a mask (N,) of those whom it is about."""
+    """Return infos in Gymnasium's form: each value (N, ...) with a mask (N,) of the environments for which it is valid."""
     return {key: value for name, part in values.items() for key, value in ((name, part), (f"_{name}", mask))}
 
 
 def endings(final_obs: Any, parts: Mapping[str, Any], ended: Any) -> dict[str, Any]:
-    """Return what infos say of the environments of `ended` (N,)."""
+    """Return the infos of the environments in `ended` (N,)."""
     return masked({"final_obs": final_obs, "final_info": masked(parts, ended)}, ended)

@@ -1,1 +1,3 @@
-"""rsl-rl's PPO and its training loop, and the same without the host in it; runs, checkpoints and what is shown of them."""
+"""rsl-rl's PPO and distillation, in rsl-rl's training loop or one that keeps the host out; runs, checkpoints and their
+display.
+"""

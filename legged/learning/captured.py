@@ -1,4 +1,4 @@
-"""Training in which an iteration is two calls: a rollout and an update, on a GPU one CUDA graph each."""
+"""Training loop that makes two calls an iteration, a rollout and an update. On a GPU each call replays one CUDA graph."""
 
 import math
 import time
@@ -14,31 +14,31 @@ from torch import Tensor
 from legged.config.networks import ESTIMATED
 from legged.envs import BaseTask
 from legged.graph.step_graph import StepGraph
+from legged.learning.async_readback import AsyncReadback
 from legged.learning.display import Display
+from legged.learning.divergence import Diverged
 from legged.learning.estimator import EstimatingModel, EstimationErrors
 from legged.learning.evaluations import Ended
 from legged.learning.logger import Interrupted
 from legged.learning.ppo import DevicePPO
-from legged.learning.reading import Reading
 from legged.learning.rollout import Rollout, Steps
 from legged.learning.runner import Runner
 from legged.learning.update_threads import UpdateThreads
-from legged.learning.watch import Diverged
 from legged.process.cores import available_cores
 from legged.process.ranks import Ranks
 from legged.process.startup import stage_ended
 
 ROLLOUTS_TO_WARM_UP = 1
-"""Steps have been warmed up when the task was built."""
+"""Number of warm-up rollouts before capture. One is enough, because the task warmed up its step when it was built."""
 LOGGED = "log/"
-"""How the names of what a task logs begin in a reading."""
+"""Prefix of the names of the task's log entries in a readback."""
 
 
 class CapturedRunner(Runner):
-    """As Runner, with the host out of the loop: it launches, and reads what is logged once an iteration. On a GPU it launches
-    an iteration before it logs the last one, so that the device never waits for the log.
+    """Runner whose loop keeps the host out of the way: it launches work, and reads the logged numbers once an iteration.
 
-    Checkpoints, configuration and logs are those of Runner, and so is `learn` where a feature needs it (`why_stock`).
+    On a GPU it launches the next iteration before it logs the last one, so the device never waits for the log. Checkpoints,
+    configuration and logs are those of Runner. Where a feature needs rsl-rl's own loop (`why_stock`), `learn` is Runner's.
     """
 
     alg: DevicePPO
@@ -53,7 +53,7 @@ class CapturedRunner(Runner):
             errors = EstimationErrors(env.observation_groups[ESTIMATED])
             self.alg.learn_to_estimate(errors, env.cfg.train.policy.estimator.learning_rate)
         self.why_stock = self.alg.why_stock
-        """What keeps training on rsl-rl's own loop; empty if nothing does."""
+        """Reason why training uses rsl-rl's own loop; empty if it does not."""
         if torch.device(device) != torch.device(env.device):  # type: ignore[arg-type]
             self.why_stock = f"the task is on {env.device}, the networks are on {device}"
 
@@ -71,7 +71,7 @@ class CapturedRunner(Runner):
         warmup = self.env.cfg.train.algorithm.critic_warmup_iterations
         collect, update, update_critic = self._capture(rollout, self.current_learning_iteration < warmup)
         stage_ended("training captured")
-        if not self._go_on() and init_at_random_ep_len:
+        if not self._restore_state() and init_at_random_ep_len:
             length = self.env.episode_length_buf
             self.env.episode_length_buf = torch.randint_like(length, high=int(self.env.max_episode_length))
         self.logger.init_logging_writer()
@@ -79,7 +79,7 @@ class CapturedRunner(Runner):
         first = self.current_learning_iteration
         total = first + num_learning_iterations
         clock: Clock | None = None
-        unlogged: Made | None = None
+        unlogged: LaunchedIteration | None = None
         for iteration in range(first, total):
             clock = Clock(torch.device(self.device), clock)
             collect()
@@ -88,40 +88,42 @@ class CapturedRunner(Runner):
                 (update_critic if iteration < warmup else update)()
             clock.lap()
             self.current_learning_iteration = iteration
-            made = Made(iteration, first, total, self._read(rollout), clock)
+            launched = LaunchedIteration(iteration, first, total, self._read(rollout), clock)
             if unlogged is not None:
-                self._log_before(unlogged, made)
-            unlogged = made
+                self._log_before(unlogged, launched)
+            unlogged = launched
             saves = self.logger.writer is not None and iteration % self.cfg["save_interval"] == 0
             evaluates = self.evaluations is not None and self.evaluations.may_be_due(iteration + 1, total)
-            # The one before the last is not left for later: who asks to stop then does so before the training is complete.
+            # The last but one is logged at once, so that a request to stop takes effect before the training is complete.
             if not self._runs_ahead or saves or evaluates or iteration == first or iteration + 2 >= total:
-                self._log(made)
+                self._log(launched)
                 unlogged = None
             if iteration == first:
                 stage_ended("first iteration")
             if saves:
                 self.save(str(Path(self.logger.log_dir) / f"model_{iteration}.pt"))
             if saves or evaluates:
-                clock = None  # what they take is no time of an iteration
+                clock = None  # the time of an iteration excludes saving and evaluation
         if self.logger.writer is not None:
             self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
             self.logger.stop_logging_writer()
 
     @property
     def _runs_ahead(self) -> bool:
-        """Whether the next iteration is launched before one is logged. Several processes log in step, because the log asks
-        all of them whether to stop.
+        """True if the next iteration is launched before the last one is logged. Several processes log in step, because all of
+        them must agree to stop.
         """
         return torch.device(self.device).type == "cuda" and not self.is_distributed
 
     def _steps(self) -> Steps:
-        """Return what makes the steps of an iteration."""
+        """Return the object that collects the rollouts."""
         return Rollout(self.env, self.alg)
 
     def _capture(self, rollout: Steps, warms_up: bool) -> tuple[Callable[[], None], Callable[[], None], Callable[[], None]]:
-        """Return rollout, update, and update of the value function alone if training begins with some of those (`warms_up`;
-        else the update again), as graphs where the task's step is one. Networks and task are as before afterwards.
+        """Return three functions: the rollout, the update, and the update of the value function alone.
+
+        They are CUDA graphs where the task's step is one. The third function differs from the second only if training begins
+        with updates of the value function (`warms_up`). Networks and task are afterwards as they were before.
         """
         device = torch.device(self.device)
         enabled = self.env.captured
@@ -140,7 +142,7 @@ class CapturedRunner(Runner):
             known = {id(tensor) for tensor, _ in before}
             for state in self.alg.optimizer.state.values():
                 for tensor in state.values():
-                    if id(tensor) not in known:  # it came to be in the trial steps
+                    if id(tensor) not in known:  # created in the trial steps
                         tensor.zero_()
         if enabled:
             rollout.forget()
@@ -152,14 +154,14 @@ class CapturedRunner(Runner):
     def _episodes(self) -> dict[str, Tensor]:
         return super()._episodes() if self._rollout is None else self._rollout.episodes
 
-    def _read(self, rollout: Steps) -> Reading:
-        """Ask for what is logged of the iteration that was just launched."""
+    def _read(self, rollout: Steps) -> AsyncReadback:
+        """Begin to read the logged numbers of the iteration that was just launched."""
         logged = self.env.log_rollout() if self.logger.writer is not None else {}
         named = {LOGGED + name: value for name, value in logged.items()}
-        return Reading({"ended": rollout.ended, **self.alg.outcome(), **named})
+        return AsyncReadback({"ended": rollout.ended, **self.alg.outcome(), **named})
 
-    def _log_before(self, made: "Made", following: "Made") -> None:
-        """Log an iteration while the device computes the `following` one; if training ends here, log that one too, because
+    def _log_before(self, launched: "LaunchedIteration", following: "LaunchedIteration") -> None:
+        """Log an iteration while the device computes the `following` one. If training ends here, log that one too, because
         the networks have learned from it.
 
         Raises:
@@ -167,18 +169,18 @@ class CapturedRunner(Runner):
             Diverged: numbers have been NaN or infinite for too long.
         """
         try:
-            self._log(made)
+            self._log(launched)
         except Interrupted:
             with suppress(Interrupted, Ended):
                 self._log(following)
             raise
         except Diverged:
-            self.current_learning_iteration = made.iteration
+            self.current_learning_iteration = launched.iteration
             raise
 
-    def _log(self, made: "Made") -> None:
-        """Log an iteration; waits for it to end."""
-        logger, numbers = self.logger, made.reading.numbers()
+    def _log(self, launched: "LaunchedIteration") -> None:
+        """Wait for an iteration to end and log it."""
+        logger, numbers = self.logger, launched.readback.numbers()
         ended, returns, lengths, squares = numbers.pop("ended")
         if ended:
             logger.return_std = math.sqrt(squares / ended)
@@ -190,11 +192,11 @@ class CapturedRunner(Runner):
         rate = numbers.pop("rate")[0] if "rate" in numbers else self.alg.learning_rate
         if numbers:
             logger.ep_extras.append({name.removeprefix(LOGGED): torch.tensor(value) for name, (value,) in numbers.items()})
-        collect_s, learn_s = made.clock.seconds()
+        collect_s, learn_s = launched.clock.seconds()
         logger.log(
-            it=made.iteration,
-            start_it=made.first,
-            total_it=made.total,
+            it=launched.iteration,
+            start_it=launched.first,
+            total_it=launched.total,
             collect_time=collect_s,
             learn_time=learn_s,
             loss_dict=losses,
@@ -206,24 +208,26 @@ class CapturedRunner(Runner):
 
 @torch.no_grad()
 def copies(tensors: Iterable[Tensor]) -> list[Tensor]:
-    """Copy outside autograd: a copy that knew its parameter would keep the node that accumulates the parameter's gradient,
-    and with it the stream the copy was made on, which no capture on another stream may wait for.
+    """Copy tensors outside autograd.
+
+    A copy that autograd knows would keep the node that accumulates the parameter's gradient, and with it the stream of the
+    copy. A capture on another stream may not wait for that stream.
     """
     return [tensor.clone() for tensor in tensors]
 
 
 class Clock:
-    """Times of laps on a device; on a GPU measured there, without making anything wait."""
+    """Stopwatch for consecutive laps. On a GPU, events on the device measure the times without making anything wait."""
 
     def __init__(self, device: torch.device, before: "Clock | None" = None) -> None:
-        """Start at once, or where the clock `before` ended, so that what was done meanwhile counts as well."""
+        """Start now, or where the clock `before` ended, so that the work between the two is included."""
         self._cuda = device.type == "cuda"
         self._marks: list[Any] = [] if before is None else before._marks[-1:]
         if before is None:
             self.lap()
 
     def lap(self) -> None:
-        """End a lap."""
+        """End the current lap."""
         if self._cuda:
             mark = torch.cuda.Event(enable_timing=True)
             mark.record()
@@ -232,7 +236,7 @@ class Clock:
             self._marks.append(time.perf_counter())
 
     def seconds(self) -> list[float]:
-        """Each lap's time [s]; waits for the last one to end."""
+        """Wait for the last lap to end and return the time of each lap [s]."""
         pairs = list(zip(self._marks, self._marks[1:], strict=False))
         if not self._cuda:
             return [end - start for start, end in pairs]
@@ -241,14 +245,14 @@ class Clock:
 
 
 @dataclass(frozen=True)
-class Made:
-    """An iteration that was launched, and what is to be logged of it."""
+class LaunchedIteration:
+    """An iteration that was launched, with the numbers to log for it."""
 
     iteration: int
     first: int
-    """The training's first iteration."""
+    """First iteration of this training."""
     total: int
-    """Iterations there will be in the end, with those of the run that this one goes on from."""
-    reading: Reading
+    """Iterations of the whole training, including those of the run that this one resumes."""
+    readback: AsyncReadback
     clock: Clock
-    """Of its rollout and its update."""
+    """Laps of its rollout and its update."""

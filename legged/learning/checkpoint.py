@@ -1,6 +1,7 @@
-"""Checkpoint files: plain data, written whole or not at all, and checked before anything is built from them.
+"""Checkpoint files. They hold plain data, are written atomically, and are checked before anything is built from them.
 
-The layout is rsl-rl's (actor_state_dict, critic_state_dict, optimizer_state_dict, iter, infos); what is ours is in `infos`.
+The layout is rsl-rl's (actor_state_dict, critic_state_dict, optimizer_state_dict, iter, infos). The entries that this package
+adds are in `infos`.
 """
 
 import io
@@ -22,22 +23,23 @@ from legged.process.paths import relative, write_bytes
 from legged.robots.robot import load_robot
 
 FORMAT = 2
-"""Version of `infos`. Files without one, of rsl-rl or from before there were versions, are read as 1."""
+"""Version of `infos`. Files without a version (rsl-rl's, and old ones of this package) count as 1."""
 Saved = dict[str, Any]
 
 
 def write_checkpoint(path: Path, saved: Saved) -> None:
-    """Write a checkpoint that is whole or not there."""
-    buffer = io.BytesIO()  # onto a full disk torch.save fails with a message that says nothing of it
+    """Write a checkpoint atomically."""
+    buffer = io.BytesIO()  # on a full disk, torch.save fails with a message that hides the cause
     torch.save(saved, buffer)
     write_bytes(path, buffer.getbuffer())
 
 
 def load_plain(path: Path, device: str = "cpu") -> Any:
-    """Return what a file of torch holds, if that is plain data: numbers, text, tensors, lists, dictionaries. Run nothing.
+    """Return the content of a torch file that holds only plain data: numbers, text, tensors, lists, dictionaries. No code in
+    it runs.
 
     Raises:
-        ConfigError: the file can't be read, is none of torch, or holds something else.
+        ConfigError: the file can't be read, is not a torch file, or holds anything else.
     """
     name = relative(path)
     try:
@@ -50,7 +52,7 @@ def load_plain(path: Path, device: str = "cpu") -> Any:
         if "weights_only" in str(error):
             raise ConfigError(f"{name}: not a checkpoint (it holds more than plain data, which could run code)") from error
         raise ConfigError(f"{name}: not a checkpoint ({_first_line(error)})") from error
-    except Exception as error:  # torch raises half a dozen kinds for files that are none of its own
+    except Exception as error:  # torch raises half a dozen types of errors for a foreign file
         raise ConfigError(f"{name}: not a checkpoint ({_first_line(error)})") from error
 
 
@@ -60,10 +62,10 @@ def _first_line(error: Exception) -> str:
 
 
 def read_checkpoint(path: Path, device: str = "cpu") -> Saved:
-    """Return the content of a checkpoint, whose parts are of the right kind and whose weights are finite.
+    """Return the content of a checkpoint, with the types of its entries checked and all weights finite.
 
     Raises:
-        ConfigError: the file is missing, no checkpoint, of a newer format, or damaged.
+        ConfigError: the file is missing, is not a checkpoint, has a newer format, or is damaged.
     """
     saved = load_plain(path, device)
     name = relative(path)
@@ -83,7 +85,7 @@ def read_checkpoint(path: Path, device: str = "cpu") -> Saved:
 
 
 def networks_in(saved: Mapping[str, Any]) -> list[str]:
-    """Return the networks that a checkpoint holds: actor and critic, or the actor alone, which is enough to act."""
+    """Return the names of the networks in a checkpoint: actor and critic, or the actor alone, which is enough to act."""
     return [network for network in NETWORKS if f"{network}_state_dict" in saved]
 
 
@@ -111,11 +113,11 @@ INFOS: dict[str, Kind] = {
     "wall_s": float,
     "evaluation": {str: float},
 }
-"""Entry -> what it is made of: a type, some types, or {type: kind of each value}."""
+"""Entry -> its type: one type, several types, or {type: type of each value}."""
 
 
 def _check_kind(where: str, found: Mapping[str, Any], kinds: Mapping[str, Kind]) -> None:
-    """Raise ConfigError if an entry of `found` is not of its kind; one that is missing is looked for by others."""
+    """Raise ConfigError if an entry of `found` has the wrong type. Missing entries pass; their users check for them."""
     for key, kind in kinds.items():
         if key not in found:
             continue
@@ -128,7 +130,7 @@ def _check_kind(where: str, found: Mapping[str, Any], kinds: Mapping[str, Kind])
 
 
 def is_kind(value: Any, kind: Kind) -> bool:
-    """Whether a value is made of what `kind` says; numbers are finite, and lists hold plain values only."""
+    """Return True if a value has the type `kind`. Numbers must be finite, and lists may hold plain values only."""
     if isinstance(kind, dict):
         ((of_keys, of_values),) = kind.items()
         return isinstance(value, dict) and all(is_kind(k, of_keys) and is_kind(v, of_values) for k, v in value.items())
@@ -143,20 +145,20 @@ def is_kind(value: Any, kind: Kind) -> bool:
 
 
 def check_weights(state: dict[str, Any], where: str) -> None:
-    """Raise ConfigError, which begins with `where`, if a network's state is not made of finite tensors."""
+    """Raise ConfigError, with a text that begins with `where`, if a network's state is not made of finite tensors."""
     for name, tensor in state.items():
         if not isinstance(name, str) or not isinstance(tensor, Tensor):
-            raise ConfigError(f"{where} is damaged ({name!r} is no tensor)")
+            raise ConfigError(f"{where} is damaged ({name!r} is not a tensor)")
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             raise ConfigError(f"{where} is damaged ({name} holds NaN or infinite numbers)")
 
 
 def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str, waiting: int = 0) -> dict[str, Any]:
-    """Return the state of an optimiser from a checkpoint, with the moments checked and everything but the learning rate
-    as it is set up here. The first `waiting` parameters may have no moments yet, if none of them has any.
+    """Return an optimiser's state from a checkpoint, with checked moments. Every setting but the learning rate is that of
+    `optimizer`. The first `waiting` parameters may lack moments, if none of these has any.
 
     Raises:
-        ConfigError: it is not that of an optimiser of these parameters; begins with `where`.
+        ConfigError: the state does not fit these parameters; the text begins with `where`.
     """
     groups = optimizer.state_dict()["param_groups"]
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
@@ -178,7 +180,7 @@ def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str, wait
 
 
 def describe(task: BaseTask) -> dict[str, Any]:
-    """Return what a checkpoint says of where it fits: `infos` without what changes during a training."""
+    """Return the constant part of a checkpoint's `infos`: the task, robot, observations and networks that it fits."""
     robot = getattr(task, "robot", None)
     return {
         "format": FORMAT,
@@ -192,7 +194,7 @@ def describe(task: BaseTask) -> dict[str, Any]:
 
 
 def observation_layout(task: BaseTask) -> dict[str, dict[str, int]]:
-    """Return the widths of terms: group -> term -> width."""
+    """Return the layout of the observations: group -> term -> width."""
     return {
         name: {term.name: term.columns.stop - term.columns.start for term in group.terms}
         for name, group in task.observation_groups.items()
@@ -200,7 +202,7 @@ def observation_layout(task: BaseTask) -> dict[str, dict[str, int]]:
 
 
 def networks(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
-    """Return what of `train.policy` decides which weights each network has, and what they compute."""
+    """Return, for each network, the settings of `train.policy` that decide its weights and its outputs."""
     policy = cfg.train.policy
     recurrent = policy.rnn_type != "none"
     shared = {
@@ -219,14 +221,14 @@ def networks(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
     described = {}
     for name in NETWORKS:
         read = groups_of(cfg, name)
-        own = {"observations": list(read), "history": groups[read[0]].history}  # the latter for versions that know no other
+        own = {"observations": list(read), "history": groups[read[0]].history}  # for old versions
         hidden = list(getattr(policy, f"{name}_hidden_dims"))
         described[name] = {"hidden_dims": hidden, **own, **shared, **({**std, **estimating} if name == "actor" else {})}
     return described
 
 
 def network_of(state: dict[str, Any]) -> dict[str, Any]:
-    """Return the same, as far as weights tell, of a checkpoint that does not say it."""
+    """Return the same settings for a checkpoint that lacks them, as far as the weights in `state` show them."""
     hidden, estimator = (
         [(*tensor.shape, 0)[0] for name, tensor in state.items() if name.startswith(part) and name.endswith(".weight")][:-1]
         for part in ("mlp.", "estimator.")
@@ -243,14 +245,14 @@ def network_of(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def described_networks(saved: Saved) -> dict[str, dict[str, Any]]:
-    """Return what a checkpoint says of each network, and beside it what only its weights tell."""
+    """Return the settings of each network in a checkpoint, completed by what only the weights show."""
     said: dict[str, Any] = saved["infos"].get("networks", {})
     return {name: {**network_of(saved[f"{name}_state_dict"]), **said.get(name, {})} for name in networks_in(saved)}
 
 
 def histories(saved: Saved) -> dict[str, int]:
-    """Return the steps that each observation group of a checkpoint holds, as far as it says so. Before groups had names of
-    their own, each network read the group of its name.
+    """Return the number of steps in each observation group of a checkpoint, where it is known. In old files each network
+    reads the group of its own name.
     """
     infos = saved["infos"]
     old = {name: said["history"] for name, said in infos.get("networks", {}).items() if "history" in said}
@@ -261,7 +263,7 @@ def check_fits(path: Path, saved: Saved, cfg: TaskConfig) -> None:
     """Compare a checkpoint with a configuration, before the task is built.
 
     Raises:
-        ConfigError: it was made for another robot, other observations, or other networks.
+        ConfigError: the checkpoint was made for another robot, other observations, or other networks.
     """
     name, infos = relative(path), saved["infos"]
     check_joints(name, infos.get("robot", {}), cfg)
@@ -286,7 +288,7 @@ def check_joints(name: str, made_for: Mapping[str, Any], cfg: TaskConfig) -> Non
     """Compare the robot of a checkpoint, its `name` and `joints`, with that of a configuration.
 
     Raises:
-        ConfigError: it has other joints, or in another order.
+        ConfigError: the robot has other joints, or the same in another order.
     """
     joints = made_for.get("joints")
     if joints is None or not isinstance(cfg, LeggedConfig):
@@ -301,7 +303,7 @@ def check_networks_fit(name: str, saved: Saved, cfg: TaskConfig) -> None:
     """Compare the networks of a checkpoint with those of a configuration.
 
     Raises:
-        ConfigError: they have other weights, compute something else, or read other groups.
+        ConfigError: the networks have other weights, compute something else, or read other groups.
     """
     described = described_networks(saved)
     for network in described:
@@ -316,10 +318,10 @@ def check_networks_fit(name: str, saved: Saved, cfg: TaskConfig) -> None:
 
 
 def check_optimizer(path: Path, saved: Saved, cfg: TaskConfig) -> None:
-    """Check that the state of the optimiser in a checkpoint is that of the configured one.
+    """Check that the optimiser of a checkpoint is the configured one. Checkpoints that do not name theirs used Adam.
 
     Raises:
-        ConfigError: it is of another one; those that do not say it are of Adam.
+        ConfigError: it is another one.
     """
     found, wanted = saved["infos"].get("optimizer", "adam"), cfg.train.algorithm.optimizer
     if found != wanted:
@@ -328,7 +330,7 @@ def check_optimizer(path: Path, saved: Saved, cfg: TaskConfig) -> None:
 
 
 def describe_mismatch(path: Path, saved: Saved, wanted: dict[str, Any], task: str) -> str:
-    """Return what differs between a checkpoint's policy and the one that the built task needs."""
+    """Return the first difference between a checkpoint's policy and the one that the built task needs."""
     found = saved["actor_state_dict"]
     text = f"{relative(path)}: made for another task than '{task}'"
     for name in dict.fromkeys([*wanted, *found]):

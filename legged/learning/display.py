@@ -1,4 +1,4 @@
-"""What is seen of a training: a compact live table, or plain lines where there is no terminal."""
+"""Console display of a training: a compact live table, or plain lines where there is no terminal."""
 
 import sys
 from dataclasses import dataclass
@@ -19,17 +19,17 @@ PLAIN_LINES_EVERY_S = 2.0
 
 @dataclass(frozen=True)
 class Style:
-    """How a metric is written, other than by its name and two decimals."""
+    """Format of a metric that differs from the default, its name and two decimals."""
 
     row: str
-    """What the table calls it."""
+    """Label in the table."""
     word: str
-    """What the line calls it; empty if it follows the metric before it."""
+    """Label on the line; empty if the metric continues the one before it."""
     spec: str
     unit: str
     factor: float = 1.0
     of: str = ""
-    """What the table says after the unit."""
+    """Text after the unit in the table."""
 
 
 STYLES = {
@@ -38,14 +38,14 @@ STYLES = {
     "falls": Style("falls", "falls", ".1f", "%", 100.0, " of episodes"),
     "episode_length": Style("episode length", "episode", ".0f", "steps"),
 }
-"""The metrics that come first, in this order, where a task logs them."""
+"""Metrics that come first, in this order, if the task logs them."""
 ON_THE_LINE = len(STYLES)
-"""Metrics on the line; a task that logs fewer of those gets others in their place."""
+"""Number of metrics on the line. A task that lacks some of `STYLES` shows others in their place."""
 WARNINGS = {
-    "non_finite_worlds": "{:.0f} robots reset after numbers that are none (docs/training.md)",
+    "non_finite_worlds": "{:.0f} robots reset for NaN or infinite numbers (docs/training.md)",
     "contact_overflows": "contacts lost in {:.0f} robot steps: raise sim.nconmax, sim.njmax",
 }
-"""Metrics of what should never happen: shown if it did."""
+"""Metrics of faults, shown if they are above 0."""
 
 
 @dataclass(frozen=True)
@@ -63,19 +63,20 @@ class Progress:
     """Mean return of the last 100 episodes."""
     action_std: float
     values: dict[str, float]
-    """The task's log: `rew_<term>` per second of a full episode, `Metrics/...` and other sections; NaN for no value yet."""
+    """Log of the task: `rew_<term>` per second of a full episode, `Metrics/...` and other sections; NaN for an entry without
+    a value so far."""
     behavior: float | None = None
-    """Of a student, the mean loss between its actions and its teacher's."""
+    """Mean loss between a student's actions and its teacher's; None without a teacher."""
 
     def metrics(self) -> dict[str, float]:
-        """Return the metrics of the task by name, those with a style of their own first."""
+        """Return the task's metrics by name, those of `STYLES` first."""
         section = "Metrics/"
         found = {key.removeprefix(section): value for key, value in self.values.items() if key.startswith(section)}
         first = {name: found[name] for name in STYLES if name in found}
         return {**first, **{name: value for name, value in found.items() if name not in (*STYLES, *WARNINGS)}}
 
     def others(self) -> dict[str, float]:
-        """Return the entries of sections that have no place of their own, as 'section: name'."""
+        """Return the log entries that the display has no fixed place for, as 'section: name'."""
         found = {}
         for key, value in self.values.items():
             section, _, name = key.partition("/")
@@ -94,14 +95,14 @@ class Progress:
         )
 
     def _word(self, name: str, value: float) -> str:
-        """Return a metric as the line has it, with the space before it."""
+        """Return the text of a metric on the line, with the space before it."""
         style = STYLES.get(name)
         if style is None:
             return f"  {plain(name)} {number(value):>8}"
         return (f"  {style.word} " if style.word else " ") + styled(value, style)
 
     def _reward(self) -> str:
-        """Return the mean return, a dash before the first episode has ended."""
+        """Return the mean return, or a dash before the first episode has ended."""
         return "-" if isnan(self.reward) else f"{self.reward:.2f}"
 
     def level(self) -> str:
@@ -120,7 +121,7 @@ class Progress:
         return "".join(f"  estimated {plain(name)} {value:.3f}" for name, value in found)
 
     def levels(self) -> dict[str, str]:
-        """Return for each terrain type its mean level, and the shares of episodes that moved up and down."""
+        """Return, for each terrain type, its mean level and the shares of episodes that moved up and down."""
         found = {}
         for key, level in self.values.items():
             name = key.removeprefix("Terrain/level_")
@@ -131,12 +132,12 @@ class Progress:
         return found
 
     def warnings(self) -> str:
-        """Return what should never happen, if it did."""
+        """Return the text of all faults that occurred."""
         counts = {text: self.values.get(f"Metrics/{name}", 0.0) for name, text in WARNINGS.items()}
         return "".join(f"  ! {text.format(count)}" for text, count in counts.items() if count > 0)
 
     def table(self, title: str) -> Table:
-        """Return the iteration as a table, reward terms beside the state of training."""
+        """Return the iteration as a table with two halves: the state of training, and the reward terms."""
         left = {
             "iteration": f"{self.iteration} / {self.total}",
             "elapsed, to go": f"{_time(self.elapsed_s)}, {_time(self.eta_s)}",
@@ -172,25 +173,25 @@ def plain(name: str) -> str:
 
 
 def styled(value: float, style: Style) -> str:
-    """Return a number with its unit, a dash for one that has no value yet."""
+    """Return a number with its unit, or a dash for NaN."""
     return "-" if isnan(value) else f"{style.factor * value:{style.spec}} {style.unit}"
 
 
 def number(value: float) -> str:
-    """Return a number of unknown size in at most nine letters, a dash for one that has no value yet."""
+    """Return a number of any size in at most nine characters, or a dash for NaN."""
     if isnan(value):
         return "-"
     return f"{value:.2f}" if value == 0.0 or 0.005 <= abs(value) < 1e5 else f"{value:.2e}"
 
 
 class Display:
-    """Shows the progress of one training on the console. Use as a context."""
+    """Context manager that shows the progress of one training on the console."""
 
     def __init__(self, title: str) -> None:
-        """`title` heads the live table."""
+        """Take the `title` of the live table."""
         self.title = title
         console = Console()
-        live = sys.stdout.isatty() and not console.is_dumb_terminal  # of a dumb one no line can be drawn anew
+        live = sys.stdout.isatty() and not console.is_dumb_terminal  # a dumb terminal can't redraw a line
         self._live = Live(console=console, refresh_per_second=4) if live else None
         self._last_line_s = -PLAIN_LINES_EVERY_S
 
@@ -204,7 +205,7 @@ class Display:
             self._live.stop()
 
     def show(self, progress: Progress) -> None:
-        """Show an iteration. Plain lines come at most every two seconds; the first and the last always do."""
+        """Show an iteration. Plain lines appear at most every two seconds, except the last one, which always appears."""
         if self._live:
             self._live.update(progress.table(self.title))
             return

@@ -1,4 +1,6 @@
-"""rsl-rl's distillation, updated without a host read: the student acts, the teacher says what it would have done."""
+"""rsl-rl's distillation without host reads in the update. The student acts, and learns the actions that the teacher would
+have taken.
+"""
 
 import warnings
 from collections.abc import Sequence
@@ -16,53 +18,53 @@ from legged.learning.recurrent import Memory
 
 
 class DeviceDistillation(Distillation):
-    """DAgger (Ross et al., arXiv 1011.0686) as rsl-rl computes it, of students with or without a memory.
+    """DAgger (Ross et al., arXiv 1011.0686) as rsl-rl computes it, for recurrent and other students.
 
-    What differs is how often the host waits: losses are summed on the device and read once an iteration; without a memory
-    the steps of a gradient are one batch; the optimiser is fused. A teacher with a memory keeps it from one iteration to the
-    next, where rsl-rl's begins anew. With `stock`, rsl-rl's own update and loop run.
+    The differences from rsl-rl are these. Losses are summed on the device and read once an iteration. A student without
+    recurrent layers learns from all steps of a gradient in one batch. The optimiser is fused. A recurrent teacher keeps its
+    hidden state from one iteration to the next, while rsl-rl resets it. With `stock`, rsl-rl's own update and loop run.
     """
 
     def __init__(self, student: MLPModel, teacher: MLPModel, *args: Any, stock: bool = False, **kwargs: Any) -> None:
-        for parameter in student.distribution.parameters():  # no loss depends on the noise with which the student acts
+        for parameter in student.distribution.parameters():  # no loss depends on the noise of the student's actions
             parameter.requires_grad_(False)
-        with warnings.catch_warnings():  # of steps that are left over, of which the configuration allows none
+        with warnings.catch_warnings():  # rsl-rl warns of left-over steps, which the configuration forbids
             warnings.simplefilter("ignore")
             super().__init__(student, teacher, *args, **kwargs)
         name = kwargs.get("optimizer", "adam")
         parameters = [parameter for parameter in self.student.parameters() if parameter.requires_grad]
         self.why_stock = "train.runner.loop is stock" if stock else "" if name == "adam" else f"the optimiser is {name}"
-        """What keeps the update on rsl-rl's own path; empty if nothing does."""
+        """Reason why rsl-rl's own update is used; empty if it is not."""
         if self.why_stock:
             self.optimizer = resolve_optimizer(name)(parameters, lr=self.learning_rate)  # type: ignore[operator]
         else:
             on_gpu = parameters[0].is_cuda
             self.optimizer = torch.optim.Adam(parameters, lr=self.learning_rate, fused=True, capturable=on_gpu)
-            # Where this is 1, a fused step changes nothing: neither parameters nor moments nor its count.
+            # While this is 1, a fused step changes nothing: neither the parameters, nor the moments, nor the step count.
             self.optimizer.found_inf = torch.zeros((), device=self.device)  # type: ignore[attr-defined]
             if self.is_multi_gpu:
                 self._shared = SharedGradients(parameters, self.gpu_world_size)
         self.memory = Memory(self.student, self.storage.num_envs)
-        """What the student remembers of each robot, where it acts."""
+        """Hidden state of the student for each robot, during the rollout."""
         self.memory_before = [part.clone() for part in self.memory.parts]
-        """The same before the first step of the stored rollout."""
+        """Hidden state before the first step of the stored rollout."""
         self._losses = torch.zeros(2, device=self.device)
-        """Mean loss of the last update, and the share of its gradients that were taken."""
+        """Mean loss of the last update, and the share of its gradients that were finite and used."""
         self.left_out = 0.0
-        """Share of the last update's gradients that were no numbers, and changed nothing."""
+        """Share of the last update's gradients that were NaN or infinite and therefore not used."""
 
     @property
     def actor(self) -> MLPModel:
-        """The student."""
+        """Policy that acts, which is the student."""
         return self._raw_student
 
     @property
     def fits_graph(self) -> bool:
-        """Whether an update can be captured: not of recurrent layers, whose launches the GPU's library chooses."""
+        """True if an update can be captured. Recurrent layers can't be, because the GPU's library chooses their launches."""
         return not self.student.is_recurrent
 
     def tensors(self) -> list[Tensor]:
-        """Everything that an update changes: parameters, normaliser, moments of the optimiser."""
+        """Return everything that an update changes: parameters, normaliser, moments of the optimiser."""
         moments = [tensor for state in self.optimizer.state.values() for tensor in state.values()]
         return [*self.student.state_dict(keep_vars=True).values(), *moments]
 
@@ -71,7 +73,7 @@ class DeviceDistillation(Distillation):
         return action_std(self.student)
 
     def update(self) -> dict[str, float]:
-        """Learn in all epochs over the stored rollout; return the mean loss."""
+        """Learn for all epochs from the stored rollout and return the mean loss."""
         if self.why_stock:
             return super().update()
         self.learn()
@@ -79,7 +81,7 @@ class DeviceDistillation(Distillation):
         return self.losses()
 
     def learn(self, epochs: int | None = None) -> None:
-        """Learn in all epochs over the stored rollout, or in the first `epochs`, without a host read."""
+        """Learn for all epochs, or for `epochs` of them, from the stored rollout, without a host read."""
         self._losses.zero_()
         epochs = epochs or self.num_learning_epochs
         observations = self.storage.observations
@@ -92,27 +94,29 @@ class DeviceDistillation(Distillation):
             update_normalizer(self.student.obs_normalizer, inputs.flatten(0, 1))
 
     def outcome(self) -> dict[str, Tensor]:
-        """Return what an update leaves on the device to be read: `losses` (2,), and `std` (D,) of the actions."""
+        """Return the results of an update, on the device: `losses` (2,), and the standard deviation `std` (D,) of the
+        actions.
+        """
         return {"losses": self._losses, "std": self.action_std()}
 
     def losses(self, numbers: Sequence[float] | None = None) -> dict[str, float]:
-        """Return the mean loss of a step from the `numbers` of an update's outcome, and take `left_out` from them; read from
-        the device, of the last update, where none are given. NaN if none was taken.
+        """Return the mean loss of a step, and set `left_out`. Both come from `numbers`, the `losses` of an `outcome`; without
+        them, those of the last update are read from the device. The loss is NaN if no gradient was used.
         """
         loss, taken = self._losses.tolist() if numbers is None else numbers
         self.left_out = 1.0 - taken
         return {"behavior": loss}
 
     def _epoch(self, inputs: Tensor) -> None:
-        """Learn from all steps of `inputs` (T, N, W) once: those of a gradient side by side."""
+        """Learn once from all steps of `inputs` (T, N, W). The steps of one gradient form one batch."""
         labels = self.storage.privileged_actions
         for x, wanted in zip(inputs.split(self.gradient_length), labels.split(self.gradient_length), strict=True):
             actions = output_of(self.student, x.flatten(0, 1), self.use_mixed_precision)
-            # The mean over all of them, where rsl-rl adds the means of single steps.
+            # This is the mean over the steps, times their number; rsl-rl adds up the means of single steps.
             self._descend(len(x) * self.loss_fn(actions, wanted.flatten(0, 1)))
 
     def _epoch_with_memory(self, inputs: Tensor) -> None:
-        """Learn from them step by step, from what the student remembered before the first one."""
+        """Learn once from all steps of `inputs` (T, N, W), in order, starting from the hidden state before the first step."""
         memory = self.memory.copy(self.memory_before)
         loss = torch.zeros((), device=self.device)
         for t, x in enumerate(inputs):
@@ -127,7 +131,7 @@ class DeviceDistillation(Distillation):
         self.memory.take(memory.parts)
 
     def _descend(self, loss: Tensor) -> None:
-        """Step down the gradient of a `loss` () of `gradient_length` steps; not if a gradient is no number."""
+        """Take a gradient step on the `loss` () of `gradient_length` steps. Skip it if a gradient is NaN or infinite."""
         mean = loss.detach() / self.gradient_length
         if self.is_multi_gpu:
             self._shared.zero_()
@@ -143,8 +147,8 @@ class DeviceDistillation(Distillation):
         self._losses += torch.where(fine, torch.stack([mean, torch.ones_like(mean)]), 0.0)
 
     def save(self) -> dict:
-        """Return the student as the `actor` of a checkpoint, the teacher, and the optimiser as rsl-rl has it, which is not
-        fused and counts its steps on the host.
+        """Return the parts of a checkpoint: the student as `actor`, the teacher, and the optimiser in rsl-rl's form, which is
+        not fused and counts its steps on the host.
         """
         saved = self.optimizer.state_dict()
         state = {
@@ -161,7 +165,7 @@ class DeviceDistillation(Distillation):
         }
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """Take student, teacher and optimiser of a checkpoint; the learning rate is the configuration's."""
+        """Load student, teacher and optimiser from a checkpoint. The learning rate stays that of the configuration."""
         parts = load_cfg or {"optimizer": True, "iteration": True}
         self._raw_student.load_state_dict(loaded_dict["actor_state_dict"], strict=strict)
         self._raw_teacher.load_state_dict(loaded_dict["teacher_state_dict"], strict=strict)

@@ -1,4 +1,4 @@
-"""What the processes of a training on several GPUs do together: begin, add up, agree, end."""
+"""Communication between the processes of a training on several GPUs."""
 
 import os
 
@@ -15,10 +15,10 @@ class RankLost(Exception):
 
 
 def check_reachable(ranks: Ranks) -> None:
-    """Check that this process is told where it meets the others, if there are any.
+    """Check that the environment names the meeting point of the processes, if there are several.
 
     Raises:
-        ConfigError: it is not; another program's WORLD_SIZE may be left in the environment.
+        ConfigError: it does not; another program's WORLD_SIZE may be left in the environment.
     """
     missing = [name for name in ("MASTER_ADDR", "MASTER_PORT") if not os.environ.get(name)]
     if ranks.several and missing:
@@ -29,7 +29,7 @@ def check_reachable(ranks: Ranks) -> None:
 
 
 def join(ranks: Ranks, device: torch.device) -> None:
-    """Meet the other processes, once; with NCCL on GPUs, gloo without."""
+    """Join the process group, once; with NCCL on GPUs and gloo on the CPU."""
     if dist.is_initialized():
         return
     check_reachable(ranks)
@@ -41,36 +41,37 @@ def join(ranks: Ranks, device: torch.device) -> None:
 
 
 def leave() -> None:
-    """Wait until all are done, so that none is ended while another still saves."""
+    """Wait until all processes are done, so that no process ends while another still saves."""
     if dist.is_initialized():
         dist.barrier()
         dist.destroy_process_group()
 
 
 def sum_over_ranks_(tensor: Tensor) -> Tensor:
-    """Add up `tensor` over all processes, in place; by itself it is its sum."""
+    """Sum `tensor` over all processes in place and return it. A single process returns it unchanged."""
     if dist.is_initialized():
         dist.all_reduce(tensor)
     return tensor
 
 
 def any_rank(asked: bool, device: torch.device) -> bool:
-    """Whether any process asks for something. All must call it; it waits for all of them."""
+    """Return True if `asked` is true in any process. All processes must call this together, and wait for each other."""
     if not dist.is_initialized():
         return asked
     return bool(sum_over_ranks_(torch.tensor(float(asked), device=device)).item())
 
 
 class SharedGradients:
-    """The gradients of all parameters side by side in one buffer, which is averaged over processes in one go, and at the
-    end of it the numbers on which a step depends, such as the divergence from which the learning rate follows: so all
-    processes take the same step, or none.
+    """Buffer for the gradients of all parameters, which is averaged over all processes in one operation.
+
+    The end of the buffer holds further numbers on which a gradient step depends, such as the divergence that sets the
+    learning rate. So all processes take the same step, or all skip it.
     """
 
     MOST_NUMBERS = 2
 
     def __init__(self, parameters: list[torch.nn.Parameter], count: int) -> None:
-        """Make the parameters' gradients views of the buffer; there are `count` processes."""
+        """Make the parameters' gradients views of the buffer. `count` is the number of processes."""
         self._count = count
         sizes = [p.numel() for p in parameters]
         self._buffer = torch.zeros(sum(sizes) + self.MOST_NUMBERS, device=parameters[0].device)
@@ -79,11 +80,11 @@ class SharedGradients:
             parameter.grad = piece.view_as(parameter)
 
     def zero_(self) -> None:
-        """Begin a mini-batch; what follows adds to the gradients in place."""
+        """Set all gradients to 0. The next backward pass adds to them in place."""
         self._buffer.zero_()
 
     def average_(self, *numbers: Tensor) -> None:
-        """Make the mean over all processes of this one's gradients and `numbers` () each."""
+        """Replace the gradients and the `numbers` () by their means over all processes."""
         for place, number in zip(self._numbers, numbers, strict=False):
             place.copy_(number)
         sum_over_ranks_(self._buffer)

@@ -1,7 +1,8 @@
-"""A policy whose first part estimates what only the simulator knows, such as the velocity of the base.
+"""Policy with an estimator: a first part that estimates quantities that only the simulator knows, such as the velocity of the
+base.
 
-Ji et al., arXiv 2202.05481, train policy and estimator in the same iterations on the same samples: PPO the one, the error of
-its estimates the other.
+Ji et al., arXiv 2202.05481, train policy and estimator in the same iterations on the same samples. PPO trains the policy, and
+the error of the estimates trains the estimator.
 """
 
 import copy
@@ -17,14 +18,14 @@ from torch import Tensor, nn
 from legged.mdp.observations import ObservationGroup
 
 TARGETS = "estimator"
-"""Observation set, in rsl-rl's terms, of what is estimated."""
+"""Name of the estimator's targets among rsl-rl's observation sets."""
 SECTION = "Estimator/"
-"""How the names of the estimates' errors begin in TensorBoard."""
+"""Prefix of the estimates' errors in TensorBoard."""
 
 
 class EstimatingModel(MLPModel):
-    """An MLP policy that is given, after its normalised observations (width I), E estimates and L free outputs that another
-    MLP makes of the same observations.
+    """MLP policy with an estimator, a second MLP that reads the same normalised observations (width I). The policy reads
+    these observations, then the estimator's E estimates and L free outputs.
     """
 
     def __init__(
@@ -41,29 +42,31 @@ class EstimatingModel(MLPModel):
         latent: int,
         policy_gradient: bool,
     ) -> None:
-        """Build both networks; arguments are rsl-rl's, and for the last three `EstimatorConfig` says what they mean."""
+        """Build both networks. The arguments are rsl-rl's, except for the last three, which are fields of
+        `EstimatorConfig`.
+        """
         self.target_groups = list(obs_groups[TARGETS])
         """Observation groups of the targets."""
         self.estimates = sum(obs[name].shape[-1] for name in self.target_groups)
-        """E, numbers that are estimated."""
+        """Number of estimated values E."""
         self._latent, self._policy_gradient = latent, policy_gradient
         super().__init__(
             obs, obs_groups, obs_set, output_dim, list(hidden_dims), activation, obs_normalization, distribution_cfg
         )
         self.estimator = MLP(self.obs_dim, self.estimates + latent, list(estimator_hidden_dims), activation)
-        """(n, I) -> (n, E + L), the estimates first."""
+        """Network (n, I) -> (n, E + L) with the estimates first."""
 
     def _get_latent_dim(self) -> int:
         return self.obs_dim + self.estimates + self._latent
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
-        """Return what the policy's layers are given for observations by group: (..., I + E + L)."""
+        """Return the input of the policy's layers, (..., I + E + L), for observations by group."""
         x = super().get_latent(obs, masks, hidden_state)
         return self.joined(x, self.estimator(x))
 
     def joined(self, x: Tensor, found: Tensor) -> Tensor:
-        """Return what the policy's layers are given: normalised observations `x` (..., I), and what the estimator has
-        `found` in them (..., E + L). Through the estimates no gradient is passed on, unless that is wanted.
+        """Return the input of the policy's layers: normalised observations `x` (..., I), followed by the estimator's output
+        `found` (..., E + L). The estimates are detached, unless the policy's gradient is to train them.
         """
         if self._policy_gradient:
             return torch.cat([x, found], dim=-1)
@@ -72,7 +75,9 @@ class EstimatingModel(MLPModel):
         return torch.cat([x, found[..., : self.estimates].detach(), found[..., self.estimates :]], dim=-1)
 
     def estimate(self, obs: TensorDict) -> Tensor:
-        """Return the estimates (N, E) for observations by group, scaled like the terms that they are of."""
+        """Return the estimates (N, E) for observations by group. They have the scales of the observation terms that they
+        estimate.
+        """
         return self.estimator(super().get_latent(obs))[..., : self.estimates]
 
     def as_jit(self) -> nn.Module:
@@ -89,7 +94,7 @@ class EstimatingModel(MLPModel):
 
 
 class EstimatingLayers(nn.Module):
-    """The layers of an EstimatingModel without gradients, from normalised observations on."""
+    """Layers of an EstimatingModel, from the normalised observations on, without gradients."""
 
     def __init__(self, model: EstimatingModel) -> None:
         """Copy the layers of `model`."""
@@ -102,21 +107,21 @@ class EstimatingLayers(nn.Module):
 
 
 class EstimationErrors:
-    """How far estimates are from their targets, term by term, each in the term's own unit."""
+    """Errors of the estimates for each term, in the term's own unit."""
 
     def __init__(self, group: ObservationGroup) -> None:
         """Take the observation group of the targets."""
         self.names: tuple[str, ...] = tuple(term.name for term in group.terms)
-        """The terms that are estimated."""
+        """Names of the estimated terms."""
         scale = torch.cat([term.scale for term in group.terms])
-        # A target that is scaled by 0 is known exactly, and has no unit to be measured in.
+        # A target with the scale 0 is always 0. Its error is 0, and has no unit.
         self._factors = torch.where(scale == 0.0, torch.zeros_like(scale), scale.reciprocal()).square()
         self._shares = torch.zeros(len(scale), len(self.names), device=scale.device)
         for i, term in enumerate(group.terms):
             self._shares[term.columns, i] = 1.0 / (term.columns.stop - term.columns.start)
 
     def squares(self, estimates: Tensor, targets: Tensor) -> Tensor:
-        """Return for each sample and term (n, terms) the mean square error of its numbers, of estimates and targets (n, E),
-        scaled both.
+        """Return the mean square error (n, terms) of each sample and term. `estimates` and `targets` (n, E) are both
+        scaled.
         """
         return ((estimates - targets).square() * self._factors) @ self._shares

@@ -1,4 +1,4 @@
-"""Evaluations during a training: when they are due, which policy was the best, and whether a target is reached."""
+"""Evaluations during a training: the schedule, the best policy so far, and the target at which training ends."""
 
 import math
 import time
@@ -17,67 +17,69 @@ from legged.learning.run_folder import BEST_MODEL
 from legged.process.paths import write_bytes
 
 SECTION = "Evaluation/"
-"""How the names of the figures begin in TensorBoard."""
+"""Prefix of the figures in TensorBoard."""
 
 
 class Measurement(Protocol):
-    """What measures a policy: legged.evaluation.during_training has one."""
+    """Interface of an object that measures a policy. Implementation: legged.evaluation.during_training."""
 
     @property
     def figures(self) -> Sequence[str]:
-        """What it finds; the first is what matters most."""
+        """Names of the figures that it measures, the most important one first."""
 
     def measure(self, policy: nn.Module) -> dict[str, float]:
-        """Return figure -> value."""
+        """Measure a policy and return figure -> value."""
 
 
 @dataclass(frozen=True)
 class Evaluated:
-    """What one evaluation has found."""
+    """Result of one evaluation."""
 
     iterations: int
-    """That the policy had been trained for."""
+    """Iterations for which the policy had been trained."""
     figures: Mapping[str, float]
     loop_s: float
-    """Time in iterations until then, of this process [s]."""
+    """Time that this process had spent in iterations [s]."""
     steps: int
-    """Of all robots until then, by this process."""
+    """Control steps of all robots that this process had made."""
 
 
 class Ended(Exception):
-    """Training was ended by an evaluation; raised at the end of an iteration, when networks and optimiser agree."""
+    """Error raised when an evaluation ends the training, at the end of an iteration, when networks and optimiser agree."""
 
 
 class Evaluations:
-    """Evaluates a policy now and then, and remembers what was found."""
+    """Regular evaluations of a policy during training, with their results."""
 
     def __init__(self, cfg: TaskConfig, measurement: Measurement, clock: Callable[[], float] = time.perf_counter) -> None:
-        """`clock` gives seconds."""
+        """Take the settings of `cfg`, the measurement, and a `clock` that returns seconds."""
         self._runner, self._measurement, self._clock = cfg.train.runner, measurement, clock
         self.best_by = self._runner.best_by or measurement.figures[0]
-        """The figure by which the best policy is kept."""
+        """Figure that decides which policy is the best."""
         self.best: float | None = None
-        """The best value of it so far."""
+        """Best value of that figure so far."""
         self.history: list[Evaluated] = []
-        """What was found, in that order."""
+        """Results of all evaluations, in order."""
         self.spent_s = 0.0
-        """Time that evaluations have taken [s]."""
+        """Time spent on evaluations [s]."""
         self._last_s = 0.0
         self._best_before: Path | None = None
         self.reached = False
-        """Whether the target is reached."""
+        """True if the target has been reached."""
         self.why_end = ""
-        """Why training should end; empty while it should not."""
+        """Reason why training should end; empty if it should go on."""
         self.listener: Callable[[Evaluated], str] | None = None
-        """Is told of every evaluation, and may say why training should end."""
+        """Function that receives every result and returns a reason to end the training, or an empty text."""
 
     def may_be_due(self, iterations: int, total: int) -> bool:
-        """Return whether to ask `due` after so many `iterations` of `total`: at every interval, and at the end."""
+        """Return True if an evaluation may be due after `iterations` of `total`: at every interval, and at the end."""
         return iterations == total or iterations % self._runner.evaluate_interval == 0
 
     def due(self, iterations: int, total: int, loop_s: float) -> bool:
-        """Return whether to evaluate after so many `iterations` of `total`, which have taken `loop_s` [s]: at every interval,
-        if there is time for it and for the last one, and at the end.
+        """Return True if an evaluation is due after `iterations` of `total`, which took `loop_s` [s].
+
+        That is at the end, and at every interval at which the share of evaluation time allows this evaluation and the last
+        one.
         """
         if iterations == total:
             return True
@@ -87,8 +89,8 @@ class Evaluations:
         return share >= 1.0 or not self.history or self.spent_s + 2.0 * self._last_s <= share * loop_s
 
     def evaluate(self, policy: nn.Module, iterations: int, loop_s: float, steps: int) -> bool:
-        """Measure a policy that was trained for so many `iterations`, `loop_s` seconds and `steps`; return whether it is the
-        best so far. Afterwards `why_end` says whether training should end.
+        """Measure a policy that was trained for `iterations`, `loop_s` seconds and `steps`. Return True if it is the best so
+        far. Afterwards `why_end` tells if training should end.
         """
         start = self._clock()
         found = Evaluated(iterations, self._measurement.measure(policy), loop_s, steps)
@@ -103,7 +105,7 @@ class Evaluations:
         return improved
 
     def _judge(self, found: Evaluated) -> None:
-        """Decide whether training should end."""
+        """Decide if training should end."""
         target = self._runner.stop_at
         if target and all(reaches(name, found.figures[name], value) for name, value in target.items()):
             self.reached = True
@@ -113,7 +115,7 @@ class Evaluations:
             self.why_end = self.listener(found)
 
     def summary(self, loop_s: float) -> list[str]:
-        """Return lines on what was found in a training whose iterations took `loop_s` [s]."""
+        """Return summary lines for a training whose iterations took `loop_s` [s]."""
         lines = [self.why_end] if self.why_end else []
         if self.best is not None:
             how = f"{self.best_by} {self.best:.4g}"
@@ -126,20 +128,20 @@ class Evaluations:
         return lines
 
     def go_on_from(self, checkpoint: Path) -> None:
-        """Take over the best policy of the run that a training is resumed from, if it is not younger than its `checkpoint`,
-        and if it was judged by the same figure.
+        """Take over the best policy of the run that is resumed, unless it is newer than the `checkpoint` or was chosen by
+        another figure.
         """
         path = checkpoint.with_name(BEST_MODEL)
         try:
             best, iteration = read_checkpoint(path), read_checkpoint(checkpoint)["iter"]
-        except ConfigError:  # there is none
+        except ConfigError:  # there is no best policy
             return
         value = best["infos"].get("evaluation", {}).get(self.best_by)
         if value is not None and best["iter"] <= iteration:
             self.best, self._best_before = value, path
 
     def begin_in(self, folder: Path) -> None:
-        """Copy the best policy from before into the folder of a run that begins.
+        """Copy the best policy of the resumed run into the new run's folder.
 
         Raises:
             RunError: it can't be written.
@@ -149,10 +151,10 @@ class Evaluations:
 
 
 def is_better(figure: str, value: float, than: float) -> bool:
-    """Return whether a value of a figure is better than another one."""
+    """Return True if `value` of a figure is better than another value, `than`."""
     return value < than if lower_is_better(figure) else value > than
 
 
 def reaches(figure: str, value: float, target: float) -> bool:
-    """Return whether a value of a figure is as good as its target."""
+    """Return True if a value of a figure is at least as good as its target."""
     return value == target or is_better(figure, value, target)

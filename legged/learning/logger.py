@@ -1,4 +1,6 @@
-"""rsl-rl's logger, which writes to TensorBoard as ever but hands the console to our display; it also ends a training."""
+"""rsl-rl's logger, which writes to TensorBoard, with this package's display on the console. It also decides when a training
+stops.
+"""
 
 import contextlib
 import io
@@ -14,51 +16,52 @@ from torch.utils.tensorboard import SummaryWriter
 
 from legged.learning.display import Display, Progress
 from legged.learning.distributed import any_rank
-from legged.learning.divergence_meter import DivergenceMeter
+from legged.learning.divergence import FAULT, MINI_BATCHES, Diverged, DivergenceDetector
 from legged.learning.estimator import SECTION as ESTIMATES
 from legged.learning.evaluations import SECTION, Ended
+from legged.learning.kl_meter import KLMeter
 from legged.learning.trackers import Tracker, open_writer
-from legged.learning.watch import FAULT, MINI_BATCHES, Diverged, FaultWatch
 from legged.process.neighbours import Neighbours
 
 
 class Interrupted(Exception):
-    """Training was asked to stop; raised at the end of an iteration, when networks and optimiser agree."""
+    """Error raised when a training was asked to stop, at the end of an iteration, when networks and optimiser agree."""
 
 
 class QuietLogger(Logger):
-    """Logs iterations; at the end of one, training stops here if that was asked for, or if it can't go on."""
+    """Logger of iterations. At the end of an iteration it stops the training on request, or if the training has diverged."""
 
     device: str
 
     def __init__(self, *args: Any, display: Display | None = None, left_out: Callable[[], float], **kwargs: Any) -> None:
-        """`left_out` gives the share of the last update's mini-batches that changed nothing."""
+        """Take `left_out`, which returns the share of the last update's mini-batches that were skipped. Other arguments are
+        rsl-rl's.
+        """
         super().__init__(*args, **kwargs)
         self.display, self._left_out = display, left_out
-        self.watch = FaultWatch(self.cfg["num_steps_per_env"] * self.num_envs)
+        self.divergence = DivergenceDetector(self.cfg["num_steps_per_env"] * self.num_envs)
         self.stop_requested = False
         self.evaluate: Callable[[int, int], dict[str, float]] = lambda _iterations, _total: {}
-        """Evaluates the policy after so many iterations of a total, where that is due, and gives what it finds."""
+        """Function that takes the number of finished iterations and their total. It evaluates the policy if that is due, and
+        returns the figures."""
         self.why_end: Callable[[], str] | None = None
-        """Says why the last evaluation ends the training, or nothing; None where no process evaluates."""
+        """Function that returns why the last evaluation ends the training, or an empty text; None if no process evaluates."""
         self.neighbours: Neighbours | None = None
-        """Other trainings on this device, for the times to be understood; the first process counts them."""
+        """Counter of other trainings on this device, which explain slow times; None except in the first process."""
         self.loop_s = 0.0
-        """Time spent in iterations so far, this process [s]."""
+        """Time that this process has spent in iterations [s]."""
         self.return_std: float | None = None
-        """Standard deviation of the returns of the episodes that ended in the last rollout in which any did; of those in the
-        buffer of returns where the training loop does not say.
-        """
-        self.divergence: DivergenceMeter | None = None
-        """What hears of the divergence where rsl-rl's own update computes it."""
+        """Standard deviation of the returns of the episodes that ended in the last rollout with such episodes. If the
+        training loop leaves it None, that of rsl-rl's buffer of returns is logged."""
+        self.kl_meter: KLMeter | None = None
+        """Recorder of the KL divergence in rsl-rl's own update."""
         self.latest: dict[str, float] = {}
-        """The last value of everything the task logs, NaN while it had none: an iteration in which no episode ended has no
-        episode means.
-        """
+        """Last value of everything that the task logs. An entry is NaN until it has a value; episode means have none before
+        an episode ends."""
 
     @property
     def steps_per_iteration(self) -> int:
-        """Steps of all robots, on all GPUs."""
+        """Control steps of all robots on all GPUs in one iteration."""
         return self.cfg["num_steps_per_env"] * self.num_envs * self.gpu_world_size
 
     def init_logging_writer(self) -> None:
@@ -72,28 +75,28 @@ class QuietLogger(Logger):
             self.writer = open_writer(self.env_cfg, self.log_dir)  # type: ignore[assignment,arg-type]
 
     def stop_logging_writer(self) -> None:
-        """End TensorBoard's writer and its thread, which rsl-rl leaves open. A tracker stays open until `hand_over`."""
+        """Close TensorBoard's writer and its thread, which rsl-rl leaves open. A tracker stays open until `hand_over`."""
         if isinstance(self.writer, SummaryWriter | Tracker):
             self.writer.close()
 
     def hand_over(self, iteration: int) -> None:
-        """Give the tracker, if there is one, the videos and reports that are in the run folder, and end it."""
+        """Give the videos and reports in the run folder to the tracker, if there is one, and close it."""
         if isinstance(self.writer, Tracker):
             self.writer.hand_over(Path(self.log_dir), iteration)
 
     def log(self, it: int, start_it: int, total_it: int, collect_time: float, learn_time: float, **kwargs: Any) -> None:
-        """Write one iteration, show it, and stop if that was asked for, of any process.
+        """Write and show one iteration. Stop if any process was asked to, or has a reason to.
 
         Raises:
-            Interrupted: it was asked for.
-            Ended: an evaluation says so.
+            Interrupted: a process was asked to stop.
+            Ended: an evaluation ended the training.
             Diverged: numbers have been NaN or infinite for too long.
         """
-        # An episode mean has no value (NaN) in a rollout in which none ended; leave it out rather than write NaN.
+        # An episode mean is NaN in a rollout in which no episode ended. Such entries are left out.
         values: dict[str, float] = {}
         names = dict.fromkeys((name for entry in self.ep_extras for name in entry if not name.startswith(FAULT)), math.nan)
         for entry in self.ep_extras:
-            stacked = torch.stack([value.reshape(()) for value in entry.values()]).tolist()  # one transfer, not twenty
+            stacked = torch.stack([value.reshape(()) for value in entry.values()]).tolist()  # one transfer instead of twenty
             values.update({key: value for key, value in zip(entry, stacked, strict=True) if value == value})
         evaluated = self.evaluate(it + 1, total_it)
         values.update({f"{SECTION}{name}": value for name, value in evaluated.items() if math.isfinite(value)})
@@ -103,19 +106,19 @@ class QuietLogger(Logger):
         left_out = self._left_out()
         if left_out > 0.0:
             values[MINI_BATCHES] = left_out
-        self.ep_extras[:] = [dict(values)] if values else []  # a copy: rsl-rl puts tensors in
-        kl = self.divergence.flush() if self.divergence else None
+        self.ep_extras[:] = [dict(values)] if values else []  # a copy, because rsl-rl adds tensors
+        kl = self.kl_meter.flush() if self.kl_meter else None
         losses = {name: loss for name, loss in given.items() if name not in estimated} | ({} if kl is None else {"kl": kl})
         losses = {name: loss for name, loss in losses.items() if math.isfinite(loss)}
         self._log_return_std(it)
-        device, self.device = self.device, "cpu"  # of numbers that are on the host already: no launch for each of them
+        device, self.device = self.device, "cpu"  # the numbers are on the host; this avoids a launch for each of them
         try:
             with contextlib.redirect_stdout(io.StringIO()):
                 super().log(it, start_it, total_it, collect_time, learn_time, loss_dict=losses, **kwargs)
         finally:
             self.device = device
-        self.ep_extras.clear()  # rsl-rl leaves them where nothing is written, as in all processes but the first
-        self.watch.judge(values, left_out)
+        self.ep_extras.clear()  # rsl-rl clears them only where it writes, in the first process
+        self.divergence.update(values, left_out)
         self.latest = names | {name: value for name, value in self.latest.items() if not name.startswith(FAULT)} | values
         self.loop_s += collect_time + learn_time
         if self.neighbours is not None:
@@ -136,15 +139,15 @@ class QuietLogger(Logger):
                     behavior=losses.get("behavior"),
                 )
             )
-        if any_rank(bool(self.watch.why_stop), torch.device(self.device)):
-            raise Diverged(self.watch.why_stop or "numbers of another process were NaN or infinite")
+        if any_rank(bool(self.divergence.why_stop), torch.device(self.device)):
+            raise Diverged(self.divergence.why_stop or "numbers of another process were NaN or infinite")
         if self.why_end is not None and any_rank(bool(self.why_end()), torch.device(self.device)) and it + 1 < total_it:
             raise Ended
         if any_rank(self.stop_requested, torch.device(self.device)) and it + 1 < total_it:
             raise Interrupted
 
     def _log_return_std(self, it: int) -> None:
-        """Write how much returns of episodes differ, which rsl-rl leaves out."""
+        """Write the standard deviation of the episodes' returns, which rsl-rl does not log."""
         if self.writer is not None and self.rewbuffer:
             std = statistics.pstdev(self.rewbuffer) if self.return_std is None else self.return_std
             if math.isfinite(std):

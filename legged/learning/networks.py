@@ -1,4 +1,4 @@
-"""Actor and critic as a configuration describes them, in rsl-rl's terms, and what they make of their inputs."""
+"""Actor and critic: rsl-rl's settings for them, and their forward passes during an update."""
 
 import math
 from typing import Any
@@ -19,11 +19,11 @@ from legged.learning.distributed import sum_over_ranks_
 from legged.learning.estimator import TARGETS
 
 UNBOUNDED = (1e-6, 1e6)
-"""Bounds of the standard deviation that rsl-rl has in any case."""
+"""Bounds of the standard deviation that rsl-rl applies by default."""
 
 
 def network_settings(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
-    """Return the dictionaries `actor`, `critic` and `obs_groups` that rsl-rl wants."""
+    """Return rsl-rl's dictionaries `actor`, `critic` and `obs_groups`."""
     policy = cfg.train.policy
     groups = {network: list(groups_of(cfg, network)) for network in NETWORKS}
     if policy.estimator.targets:
@@ -36,7 +36,7 @@ def network_settings(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
 
 
 def _estimating(policy: PolicyConfig) -> dict[str, Any]:
-    """Return what an actor with an estimator has beside the others' settings: nothing without one."""
+    """Return the further settings of an actor with an estimator; empty without one."""
     estimator = policy.estimator
     if not estimator.targets:
         return {}
@@ -49,7 +49,7 @@ def _estimating(policy: PolicyConfig) -> dict[str, Any]:
 
 
 def _shared(policy: PolicyConfig) -> dict[str, Any]:
-    """Return what actor and critic have in common."""
+    """Return the settings that actor and critic share."""
     shared: dict[str, Any] = {
         "class_name": "MLPModel",
         "activation": policy.activation,
@@ -62,7 +62,7 @@ def _shared(policy: PolicyConfig) -> dict[str, Any]:
 
 
 def actor_settings(policy: PolicyConfig) -> dict[str, Any]:
-    """Return the dictionary of a network that acts: an actor, a student, a teacher."""
+    """Return rsl-rl's dictionary of a network that acts: an actor, a student or a teacher."""
     distribution = {
         "class_name": "HeteroscedasticGaussianDistribution" if policy.state_dependent_std else "GaussianDistribution",
         "init_std": policy.init_noise_std,
@@ -73,8 +73,8 @@ def actor_settings(policy: PolicyConfig) -> dict[str, Any]:
 
 
 def build_actor(cfg: TaskConfig, observations: TensorDict, num_actions: int) -> MLPModel:
-    """Build the policy's network alone, for observations like those given, on the CPU. No random number of the caller's is
-    drawn for its weights.
+    """Build the policy's network alone, on the CPU, for observations with these shapes. The caller's random generators stay
+    untouched.
     """
     settings = network_settings(cfg)
     kind, rest = resolve_class(settings["actor"])
@@ -83,8 +83,8 @@ def build_actor(cfg: TaskConfig, observations: TensorDict, num_actions: int) -> 
 
 
 def action_std(actor: MLPModel) -> Tensor:
-    """Return the standard deviations (D,) of a policy's actions, where they do not depend on the state, within their bounds;
-    it can be differentiated.
+    """Return the standard deviations (D,) of a policy's actions, within their bounds and with a gradient. The policy must
+    have one that does not depend on the state.
     """
     distribution = actor.distribution
     if distribution.std_type == "scalar":
@@ -93,8 +93,8 @@ def action_std(actor: MLPModel) -> Tensor:
 
 
 @torch.no_grad()
-def begin_std(actor: MLPModel, cfg: TaskConfig) -> None:
-    """Set the standard deviation of a policy's actions, where it does not depend on the state, to that of a new policy."""
+def reset_std(actor: MLPModel, cfg: TaskConfig) -> None:
+    """Set the standard deviation of a policy's actions to the initial one, if it does not depend on the state."""
     distribution, std = actor.distribution, cfg.train.policy.init_noise_std
     if type(distribution) is GaussianDistribution:
         if distribution.std_type == "scalar":
@@ -104,9 +104,10 @@ def begin_std(actor: MLPModel, cfg: TaskConfig) -> None:
 
 
 def keep_std_in_bounds(actor: MLPModel, optimizer: torch.optim.Optimizer) -> None:
-    """Put a learned standard deviation that has left its bounds back onto them after each step of the optimiser.
+    """Clamp a learned standard deviation to its bounds after each step of the optimiser.
 
-    rsl-rl clamps it where it is used. Beyond the bounds that passes no gradient on: without this it would never come back.
+    rsl-rl clamps it only where it is used. Outside the bounds that clamp has no gradient, so the parameter would never come
+    back.
     """
     distribution = actor.distribution
     if type(distribution) is not GaussianDistribution or tuple(distribution.std_range) == UNBOUNDED:
@@ -124,10 +125,11 @@ def keep_std_in_bounds(actor: MLPModel, optimizer: torch.optim.Optimizer) -> Non
 
 
 def use_matmul(cfg: TaskConfig) -> None:
-    """Set, for this process, how exactly a GPU multiplies matrices, and by which library a CPU does.
+    """Set the precision of matrix products on a GPU, and their library on a CPU, for this process.
 
-    On processors with AVX-512 that are not Intel's, torch's own choice, MKL, takes 2.5 times as long as oneDNN. That one is
-    taken where it may use bfloat16; it does only where there are units for it (AMX), and there MKL stays.
+    On processors with AVX-512 that are not Intel's, torch's default library MKL takes 2.5 times as long as oneDNN. torch uses
+    oneDNN if bfloat16 is allowed. oneDNN still computes in float32, unless the processor has bfloat16 units (AMX); in that
+    case MKL stays.
     """
     rounded = cfg.train.runner.matmul == "tf32"
     torch.backends.cuda.matmul.allow_tf32 = rounded
@@ -138,16 +140,16 @@ def use_matmul(cfg: TaskConfig) -> None:
 
 
 def output_of(model: MLPModel, inputs: Tensor, mixed_precision: bool) -> Tensor:
-    """Return what a network makes of its inputs (n, width): (n, outputs), float32. With mixed precision its layers compute
-    in bfloat16.
+    """Return a network's outputs (n, outputs), float32, for its inputs (n, width). With mixed precision its layers compute in
+    bfloat16.
     """
-    # A graph must cast the weights anew at every replay, so none may come from autocast's cache.
+    # A graph must cast the weights at every replay, so autocast must not cache the cast weights.
     with torch.autocast(inputs.device.type, torch.bfloat16, mixed_precision, cache_enabled=False):
         return layers_of(model.mlp, model.obs_normalizer(inputs), mixed_precision)
 
 
 def layers_of(layers: torch.nn.Sequential, x: Tensor, mixed_precision: bool) -> Tensor:
-    """Return what layers make of `x` (n, width): (n, outputs), float32."""
+    """Return the outputs (n, outputs), float32, of layers for `x` (n, width)."""
     if x.device.type == "cpu" and not mixed_precision:
         return apply_layers(layers, x)
     return layers(x).float()
@@ -155,8 +157,8 @@ def layers_of(layers: torch.nn.Sequential, x: Tensor, mixed_precision: bool) -> 
 
 @torch.no_grad()
 def update_normalizer(normalizer: EmpiricalNormalization, x: Tensor) -> None:
-    """Take samples (n, width) of all processes into the running mean and variance, as rsl-rl does, but in place: a graph
-    knows addresses.
+    """Update the running mean and variance with samples (n, width) of all processes, as rsl-rl does. Update in place, because
+    a graph needs fixed addresses.
     """
     mean, variance = x.mean(dim=0, keepdim=True), x.var(dim=0, unbiased=False, keepdim=True)
     count = len(x)

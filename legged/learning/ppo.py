@@ -1,4 +1,6 @@
-"""rsl-rl's PPO, updated without a host read: the same losses and steps, in closed form, on data shuffled once."""
+"""rsl-rl's PPO without host reads in the update. Losses and gradient steps are the same, in closed form, on data that is
+shuffled once.
+"""
 
 import math
 from collections.abc import Sequence
@@ -16,64 +18,63 @@ from legged.learning.estimator import SECTION, EstimatingModel, EstimationErrors
 from legged.learning.networks import action_std, layers_of, output_of, update_normalizer
 
 LOWEST_RATE, HIGHEST_RATE, RATE_STEP = 1e-5, 1e-2, 1.5
-"""Bounds of the adaptive learning rate and the factor by which it moves, as in rsl-rl."""
+"""Bounds of the adaptive learning rate and the factor of one change, as in rsl-rl."""
 FEW = 1e-8
 LOSSES = ("value", "surrogate", "entropy", "kl", "symmetry")
-"""What is logged of an update, by rsl-rl's names, and `kl`, the divergence of the policy that acted from the one that learns;
-the last, how far the policy is from its mirror image, with symmetry.
-"""
+"""Logged losses of an update, by rsl-rl's names. `kl` is the divergence from the policy that acted to the policy that learns.
+`symmetry`, logged only with symmetry, is the distance of the policy from its mirror image."""
 HALF_LOG_2PI = 0.9189385332046727
-"""0.5 * log(2 pi)."""
+"""Constant 0.5 * log(2 pi)."""
 
 
 class DevicePPO(CriticWarmup):
     """PPO (Schulman et al., arXiv 1707.06347) as rsl-rl computes it, for Gaussian MLP policies.
 
-    What differs is where and how often: the learning rate is a tensor on the device; samples are shuffled into contiguous
-    memory once an update, not gathered for every mini-batch; log-probability, entropy and divergence of the Gaussian are
-    written out; the optimiser is fused; and losses are summed on the device and read once. Where a feature needs rsl-rl's
-    own update (`why_stock`), that runs. Where the actor has an estimator, that learns from the same mini-batches.
+    The differences from rsl-rl are these. The learning rate is a tensor on the device. Samples are shuffled into contiguous
+    memory once an update, instead of being gathered for every mini-batch. The Gaussian's log-probability, entropy and
+    divergence are written out. The optimiser is fused. Losses are summed on the device and read once. An actor's estimator
+    learns from the same mini-batches. Where a feature needs rsl-rl's own update (`why_stock`), that one runs.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._rate: Tensor | None = None
         super().__init__(*args, **kwargs)
         self.why_stock = self._why_stock()
-        """What keeps the update on rsl-rl's own path; empty if nothing does."""
+        """Reason why rsl-rl's own update is used; empty if it is not."""
         if not self.why_stock:
             self._rate = torch.tensor(self._initial_rate, device=self.device)
             parameters = [p for part in self._parts() for p in part]
             capturable = self._rate.is_cuda
             self.optimizer = torch.optim.Adam(self._optimized(), lr=self._rate, fused=True, capturable=capturable)
-            # Where this is 1, a fused step changes nothing: neither parameters nor moments nor its count.
+            # While this is 1, a fused step changes nothing: neither the parameters, nor the moments, nor the step count.
             self.optimizer.found_inf = torch.zeros((), device=self.device)  # type: ignore[attr-defined]
             if self.is_multi_gpu:
                 self._shared = SharedGradients(parameters, self.gpu_world_size)
         count = len(LOSSES) if self.symmetry else len(LOSSES) - 1
         self._errors: EstimationErrors | None = None
         self._losses = torch.zeros(count + 1, device=self.device)
-        """Means over the mini-batches of the last update, by `LOSSES`, of the estimates' square errors, if there are any, by
-        term, and the share of mini-batches that were taken."""
+        """Means over the mini-batches of the last update: the losses in the order of `LOSSES`, the estimates' square errors
+        by term if there is an estimator, and the share of mini-batches that were used."""
         self._one = torch.ones((), device=self.device)
         self._critic_alone = False
-        """Whether the update that runs, or is captured, changes the value function alone."""
+        """True while the update that runs, or is captured, changes the value function alone."""
         self.left_out = 0.0
-        """Share of the last update's mini-batches that changed nothing, because a gradient was no number."""
+        """Share of the last update's mini-batches that were skipped, because a gradient was NaN or infinite."""
 
     fits_graph = True
-    """Whether an update can be captured; what can't be captured at all has rsl-rl's own loop."""
+    """True if an update can be captured. Features that can't be captured use rsl-rl's own loop."""
 
     def learn_to_estimate(self, errors: EstimationErrors, learning_rate: float) -> None:
-        """Say how errors of the actor's estimates are measured, and the step size with which its estimator learns; to be
-        called once, before the first update of an actor that has one.
+        """Set the measure of the estimates' errors and the learning rate of the actor's estimator. Call this once, before the
+        first update.
         """
         self._errors = errors
         self._losses = torch.zeros(len(self._losses) + len(errors.names), device=self.device)
         self.optimizer.param_groups[-1]["lr"] = learning_rate
 
     def _parts(self) -> list[list[torch.nn.Parameter]]:
-        """Return the parameters that learn, of the actor, of the critic, and of the actor's estimator if it has one: each of
-        them has a norm of gradients of its own.
+        """Return the parameters of the actor, of the critic, and of the actor's estimator if it has one. Gradients are
+        clipped for each of these lists separately.
         """
         of_actor = list(self.actor.parameters())
         parts = [of_actor, list(self.critic.parameters())]
@@ -84,21 +85,23 @@ class DevicePPO(CriticWarmup):
         return [[parameter for parameter in part if parameter.requires_grad] for part in parts]
 
     def _optimized(self) -> list[dict[str, Any]]:
-        """Return the optimiser's groups of parameters: actor and critic, whose rate adapts, and the estimator if there is
-        one, whose rate is a plain number.
+        """Return the optimiser's parameter groups: actor and critic with the adaptive learning rate, and the estimator, if
+        there is one, with a constant rate.
         """
         actor, critic, *estimator = self._parts()
         return [{"params": [*actor, *critic]}, *({"params": part, "lr": 1e-3} for part in estimator)]
 
     def tensors(self) -> list[Tensor]:
-        """Everything that an update changes: parameters, normalisers, moments of the optimiser, learning rate."""
+        """Return everything that an update changes: parameters, normalisers, moments of the optimiser, learning rate."""
         models = [tensor for model in (self.actor, self.critic) for tensor in model.state_dict(keep_vars=True).values()]
         moments = [tensor for state in self.optimizer.state.values() for tensor in state.values()]
         assert self._rate is not None
         return [*models, *moments, self._rate]
 
     def _why_stock(self) -> str:
-        """Name the first thing that only rsl-rl's own update can do; empty if there is none. Configurations reach all."""
+        """Return the first feature that only rsl-rl's own update supports; empty without one. A configuration can ask
+        for each of them.
+        """
         if self.symmetry and self.symmetry.use_mirror_loss:
             return "a mirror loss"
         for name, model in (("actor", self.actor), ("critic", self.critic)):
@@ -112,7 +115,7 @@ class DevicePPO(CriticWarmup):
 
     @property
     def learning_rate(self) -> float:  # type: ignore[override]
-        """The learning rate now; reading it waits for the device."""
+        """Current learning rate. Reading it waits for the device."""
         return self._initial_rate if self._rate is None else float(self._rate)
 
     @learning_rate.setter
@@ -123,10 +126,10 @@ class DevicePPO(CriticWarmup):
             self._rate.fill_(value)
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """As rsl-rl, of a checkpoint of either class."""
+        """Load a checkpoint of this class or of rsl-rl's PPO."""
         rates = [group["lr"] for group in self.optimizer.param_groups]
         iteration = super().load(loaded_dict, load_cfg, strict)
-        if self._rate is not None:  # loading puts the saved number in place of the tensor
+        if self._rate is not None:  # loading replaces the tensor by the saved number
             groups = self.optimizer.param_groups
             self._rate.fill_(groups[0]["lr"])
             for group, rate in zip(groups, (self._rate, *rates[1:]), strict=True):
@@ -136,7 +139,9 @@ class DevicePPO(CriticWarmup):
         return iteration
 
     def save(self) -> dict:
-        """As rsl-rl, whose optimiser is not fused and has its learning rate and step counts on the host."""
+        """Return the parts of a checkpoint in rsl-rl's form, whose optimiser is not fused and has its learning rate and step
+        counts on the host.
+        """
         saved = super().save()
         if self._rate is not None:
             optimizer = saved["optimizer_state_dict"]
@@ -148,7 +153,7 @@ class DevicePPO(CriticWarmup):
         return saved
 
     def update(self) -> dict[str, float]:
-        """All epochs over the stored rollout; returns the mean losses."""
+        """Learn for all epochs from the stored rollout and return the mean losses."""
         if self.why_stock:
             return super().update()
         (self.learn_critic if self.warming_up() else self.learn)()
@@ -156,14 +161,14 @@ class DevicePPO(CriticWarmup):
         return self.losses()
 
     def learn_critic(self, epochs: int | None = None) -> None:
-        """Learn as `learn` does, but change the value function alone: the policy is kept, with its normaliser."""
+        """Learn as `learn` does, but change the value function alone. The policy and its normaliser stay as they are."""
         self._critic_alone = True
         self.learn(epochs)
         self._critic_alone = False
 
     def fill_moments(self) -> None:
-        """Give every parameter that has no moments yet the ones that the optimiser would begin with, so that a graph knows
-        where they are before the first step that uses them.
+        """Create the optimiser's initial moments for every parameter that has none, so that a graph knows their addresses
+        before the first step that uses them.
         """
         for group in self.optimizer.param_groups:
             for parameter in group["params"]:
@@ -173,7 +178,9 @@ class DevicePPO(CriticWarmup):
                     self.optimizer.state[parameter].update({"step": step, **moments})
 
     def learn(self, epochs: int | None = None) -> None:
-        """All epochs over the stored rollout, or the first `epochs`: no host read, so that one graph can hold it."""
+        """Learn for all epochs, or for `epochs` of them, from the stored rollout. Nothing is read on the host, so one graph
+        can hold the update.
+        """
         self._losses.zero_()
         batches = self._mini_batches()
         for _ in range(epochs or self.num_learning_epochs):
@@ -184,16 +191,18 @@ class DevicePPO(CriticWarmup):
         self._update_normalizers()
 
     def outcome(self) -> dict[str, Tensor]:
-        """What an update leaves on the device to be read: `losses` (K,), of which `losses` makes sense, `std` (D,) of the
-        actions, and the learning `rate` ().
+        """Return the results of an update, on the device: `losses` (K,) in the form that the method `losses` takes, the
+        standard deviation `std` (D,) of the actions, and the learning `rate` ().
         """
         rate = {} if self._rate is None else {"rate": self._rate}
         return {"losses": self._losses, "std": self.action_std(), **rate}
 
     def losses(self, numbers: Sequence[float] | None = None) -> dict[str, float]:
-        """Mean losses of an update from the `numbers` of its outcome, as is `left_out`; read from the device, of the last
-        update, where none are given. NaN if no mini-batch had any. Beside them the root mean square errors of the estimates
-        by term, `Estimator/<term>_rmse`, each in the term's unit.
+        """Return the mean losses of an update, and set `left_out`. Both come from `numbers`, the `losses` of an `outcome`;
+        without them, those of the last update are read from the device.
+
+        Losses are NaN if all mini-batches were skipped. The root mean square errors of the estimates follow as
+        `Estimator/<term>_rmse`, each in the term's unit.
         """
         *losses, taken = self._losses.tolist() if numbers is None else numbers
         self.left_out = 1.0 - taken
@@ -204,11 +213,12 @@ class DevicePPO(CriticWarmup):
 
     @torch.no_grad()
     def _mini_batches(self) -> list[tuple[Tensor, ...]]:
-        """Return the rollout, shuffled: for each mini-batch of n samples the networks' inputs, actions (n, D), old
-        log-probabilities, advantages, old values, returns (n,) each, and the old Gaussian's mean (n, D) and std (n, D).
+        """Return the shuffled rollout as mini-batches of n samples. Each has the inputs of actor and critic (n, width), the
+        actions (n, D), the old log-probabilities, advantages, old values and returns (n,), and the mean and standard
+        deviation (n, D) of the old Gaussian.
 
-        With symmetry, each but the last two also holds the mirror images, after the samples: 2 n. With an estimator, its
-        targets (2 n or n, E) come at the end.
+        With symmetry, the mirror images follow the samples, in all but the last two: 2 n rows. With an estimator, its targets
+        (n or 2 n, E) come last.
         """
         st = self.storage
         observations, actions = st.observations.flatten(0, 1), st.actions.flatten(0, 1)
@@ -236,7 +246,7 @@ class DevicePPO(CriticWarmup):
         return list(zip(*shuffled, strict=True))
 
     def _order(self, count: int) -> Tensor:
-        """Return a random permutation of `count` samples; by sorting, which a graph can hold."""
+        """Return a random permutation of `count` samples. It comes from a sort, which a graph can hold."""
         return torch.rand(count, device=self.device).argsort()
 
     def _step(
@@ -252,8 +262,8 @@ class DevicePPO(CriticWarmup):
         old_std: Tensor,
         targets: Tensor | None = None,
     ) -> Tensor:
-        """One mini-batch: adapt the learning rate, step down the gradient; returns its losses, as in `LOSSES`, and 1. If a
-        gradient is no number, nothing is changed, and all that is returned is 0.
+        """Adapt the learning rate, take a gradient step on one mini-batch, and return its losses in the order of `LOSSES`,
+        followed by 1. If a gradient is NaN or infinite, change nothing and return zeros.
         """
         samples = len(old_mean)
         if self.normalize_advantage_per_mini_batch:
@@ -275,7 +285,8 @@ class DevicePPO(CriticWarmup):
         loss = surrogate + self.value_loss_coef * value_loss - self.entropy_coef * entropy
         errors: tuple[Tensor, ...] = ()
         if targets is not None and estimates is not None:
-            # Both losses in one backward pass: they meet in no parameter but the hidden layers of an estimator with a latent.
+            # One backward pass serves both losses. They share no parameter but the hidden layers of an estimator with a
+            # latent.
             loss = loss + (estimates - targets).square().mean()
             assert self._errors is not None
             errors = self._errors.squares(estimates[:samples].detach(), targets[:samples]).mean(dim=0).unbind()
@@ -286,8 +297,8 @@ class DevicePPO(CriticWarmup):
             losses.append((mean[samples:] - images[samples:]).square().mean())
 
         kl = divergence(old_mean, old_std, mean[:samples].detach(), std.detach())
-        losses.insert(LOSSES.index("kl"), kl)  # the tensor, into which several processes put their mean below
-        # The clipped value loss passes no gradient on for a value that is NaN, so it is looked at by itself.
+        losses.insert(LOSSES.index("kl"), kl)  # this tensor is averaged over the processes below
+        # The clipped value loss has no gradient for a value that is NaN, so its own value is checked as well.
         valued = value_loss.detach().clone()
         if self._critic_alone:
             loss = self.value_loss_coef * value_loss
@@ -308,9 +319,11 @@ class DevicePPO(CriticWarmup):
         return torch.where(fine, torch.stack([*losses, *errors, self._one]).detach(), 0.0)
 
     def _step_critic(self, figures: list[Tensor], valued: Tensor) -> Tensor:
-        """End a mini-batch of which the value function alone learns, whose loss was `valued` (); returns what `_step` does,
-        of `figures`. The optimiser passes over parameters without a gradient: gradients of 0 would count as steps, and the
-        first real ones would be too large.
+        """Take the gradient step of the value function alone, with the loss `valued` (), and return `figures` and 1 as
+        `_step` does.
+
+        The actor's gradients are set to None, because the optimiser skips parameters without a gradient. It would count zero
+        gradients as steps, and the first real steps would then be too large.
         """
         of_actor = [(parameter, parameter.grad) for parameter in self.actor.parameters()]
         for parameter, _ in of_actor:
@@ -318,13 +331,13 @@ class DevicePPO(CriticWarmup):
         fine = (self._clip_gradients() + valued) < torch.inf
         torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
         self.optimizer.step()
-        for parameter, gradient in of_actor:  # of several processes, a part of the buffer that they share
+        for parameter, gradient in of_actor:  # with several processes, a view of the shared buffer
             parameter.grad = gradient
         return torch.where(fine, torch.stack([*figures, self._one]).detach(), 0.0)
 
     def _clip_gradients(self) -> Tensor:
         """Clip the gradients of actor, critic and estimator, each to the norm `max_grad_norm`, as torch's clip_grad_norm_
-        does one after the other; returns the sum () of the norms before.
+        does. Return the sum () of the norms before clipping.
         """
         gradients = [[parameter.grad for parameter in part if parameter.grad is not None] for part in self._parts()]
         of_each = torch.stack(torch._foreach_norm([gradient for some in gradients for gradient in some]))
@@ -336,7 +349,9 @@ class DevicePPO(CriticWarmup):
         return norms.sum()
 
     def _act(self, inputs: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Return the mean actions (n, D) for the actor's inputs (n, width), and its estimates (n, E) if it makes any."""
+        """Return the mean actions (n, D) for the actor's inputs (n, width), and its estimates (n, E), or None without an
+        estimator.
+        """
         actor, mixed = self.actor, self.use_mixed_precision
         if not isinstance(actor, EstimatingModel):
             return output_of(actor, inputs, mixed), None
@@ -351,7 +366,7 @@ class DevicePPO(CriticWarmup):
 
     @torch.no_grad()
     def _adapt_rate(self, kl: Tensor) -> None:
-        """Move the learning rate so that the mean divergence `kl` () becomes the wanted one."""
+        """Move the learning rate so that the mean divergence `kl` () approaches `desired_kl`."""
         assert self._rate is not None
         slower = (self._rate / RATE_STEP).clamp(min=LOWEST_RATE)
         faster = (self._rate * RATE_STEP).clamp(max=HIGHEST_RATE)
@@ -367,11 +382,13 @@ class DevicePPO(CriticWarmup):
 
 @torch.no_grad()
 def divergence(old_mean: Tensor, old_std: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    """Mean () of KL(old || new) over Gaussians of means (n, D) and standard deviations (n, D), new ones (D,)."""
+    """Return the mean KL(old || new) () between Gaussians with means (n, D). The old standard deviations are (n, D), the new
+    ones (D,).
+    """
     moved = (old_std.square() + (old_mean - mean).square()) / (2.0 * std.square())
     return (torch.log(std / old_std) + moved - 0.5).sum(dim=1).mean()
 
 
 def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    """Log-density (...,) of `x` (..., D) under a Gaussian of mean (..., D) and standard deviation (D,)."""
+    """Return the log-density (...,) of `x` (..., D) under a Gaussian of mean (..., D) and standard deviation (D,)."""
     return -0.5 * ((x - mean) / std).square().sum(dim=-1) - std.log().sum() - x.shape[-1] * HALF_LOG_2PI

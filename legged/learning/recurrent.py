@@ -1,4 +1,4 @@
-"""Recurrent policies: their memory, and the kind of one that a checkpoint holds."""
+"""Hidden states of recurrent policies, and the recurrent layers in a checkpoint."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 GATES = {4: "lstm", 3: "gru"}
-"""Rows of a recurrent layer's weights, over its width -> its kind."""
+"""Number of gates, which is the rows of a recurrent layer's weights over its width -> type of the layer."""
 
 
 def hidden_states(networks: Mapping[str, Any], num_envs: int) -> dict[str, Tensor]:
-    """Return the hidden states (layers, N, width) of those of rsl-rl's networks that have any, by name and number; zeros
-    take the place of one that is not there yet.
+    """Return the hidden states (layers, N, width) of the recurrent ones among rsl-rl's `networks`, by name and number. A
+    missing state is created as zeros.
     """
     found: dict[str, Tensor] = {}
     for name, network in networks.items():
@@ -29,9 +29,11 @@ def hidden_states(networks: Mapping[str, Any], num_envs: int) -> dict[str, Tenso
 
 
 def keep_shape_of_one_robot(policy: Any) -> None:
-    """Let a recurrent policy of rsl-rl give the log-probabilities of T steps of a single robot as (T,). Its update has those
-    that were stored in this shape where a mini-batch is a single robot; of (T, 1) and (T,) it would make the ratio of every
-    step to every other one, (T, T). Those of more robots, (T, n), and of one step, (N,), are left as they are.
+    """Make a recurrent policy of rsl-rl return the log-probabilities of T steps of one robot as (T,).
+
+    If a mini-batch has a single robot, rsl-rl stores the old log-probabilities in that shape. Its update would broadcast (T,
+    1) and (T,) to (T, T), the ratio of every step to every other. Log-probabilities of several robots, (T, n), and of one
+    step, (N,), stay unchanged.
     """
     ask = policy.get_output_log_prob
 
@@ -43,12 +45,12 @@ def keep_shape_of_one_robot(policy: Any) -> None:
 
 
 def parts_of(layers: torch.nn.Module) -> int:
-    """Return how many tensors the hidden state of recurrent layers is made of."""
+    """Return the number of tensors in the hidden state of recurrent layers."""
     return 2 if isinstance(layers, torch.nn.LSTM) else 1
 
 
 def rnn_of(state: dict[str, Tensor]) -> tuple[str, int, int]:
-    """Return kind, width and number of the recurrent layers in a model's state; ("none", 0, 0) without any."""
+    """Return type, width and number of the recurrent layers in a model's state; ("none", 0, 0) without any."""
     layers = [name for name in state if "weight_hh_l" in name]
     if not layers:
         return "none", 0, 0
@@ -57,21 +59,22 @@ def rnn_of(state: dict[str, Tensor]) -> tuple[str, int, int]:
 
 
 class Memory:
-    """What one of rsl-rl's networks remembers of N robots; nothing of a network without recurrent layers, which acts too. The
-    tensors keep their addresses in `take` and `forget_`, for a graph; the others are for who differentiates.
+    """Hidden state of one of rsl-rl's networks for N robots; empty for a network without recurrent layers.
+
+    `take` keeps the addresses of the tensors, as a graph needs. The other methods make new tensors, as autograd needs.
     """
 
     def __init__(self, network: Any, num_envs: int, parts: list[Tensor] | None = None) -> None:
-        """Be what the network itself remembers, or other `parts`, (layers, N, width) each."""
+        """Use the hidden state of the network itself, or the tensors `parts` (layers, N, width)."""
         self.network = network
         self.parts = [*hidden_states({"": network}, num_envs).values()] if parts is None else parts
 
     def copy(self, parts: list[Tensor]) -> "Memory":
-        """Return a memory of the same network that holds `parts`."""
+        """Return a Memory of the same network that holds `parts`."""
         return Memory(self.network, 0, [*parts])
 
     def act(self, inputs: Tensor) -> Tensor:
-        """Return the mean actions (N, D) for `inputs` (N, W), and remember them."""
+        """Return the mean actions (N, D) for `inputs` (N, W), and advance the hidden state."""
         x = self.network.obs_normalizer(inputs)
         if self.parts:
             x, after = self.network.rnn.rnn(x.unsqueeze(0), tuple(self.parts) if len(self.parts) > 1 else self.parts[0])
@@ -80,15 +83,15 @@ class Memory:
         return self.network.distribution.deterministic_output(self.network.mlp(x))
 
     def forget(self, ended: Tensor) -> None:
-        """Remember nothing of the robots in `ended` (N, 1)."""
+        """Reset the hidden state of the robots whose episodes `ended` (N, 1)."""
         self.parts = [part.masked_fill(ended, 0.0) for part in self.parts]
 
     def detach(self) -> None:
-        """Pass no gradient on to what was before."""
+        """Detach the hidden state, so that no gradient reaches earlier steps."""
         self.parts = [part.detach() for part in self.parts]
 
     @torch.no_grad()
     def take(self, parts: list[Tensor]) -> None:
-        """Remember what another memory holds, in place."""
+        """Copy the tensors of another Memory, in place."""
         for part, value in zip(self.parts, parts, strict=True):
             part.copy_(value)

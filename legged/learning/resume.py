@@ -12,8 +12,8 @@ from legged.learning.run_folder import find_checkpoint, find_run, run_config
 from legged.process.paths import relative
 from legged.registry import task_class, task_config
 
-OF_A_RUN = ("train.runner.run_name", "train.runner.max_iterations", "train.runner.experiment_name")
-"""Settings that say nothing of how is trained."""
+RUN_SETTINGS = ("train.runner.run_name", "train.runner.max_iterations", "train.runner.experiment_name")
+"""Settings that do not affect how the policy is trained."""
 
 KEPT = ("train.algorithm.class_name", "train.distillation.teacher")
 """Settings that a resumed training can't change."""
@@ -23,8 +23,10 @@ def resumed(
     task: str, asked: Iterable[tuple[str, Any]], load_run: str | None, iteration: int | str | None
 ) -> tuple[TaskConfig, Path, list[str]]:
     """Return the configuration to continue with, the checkpoint to continue from, and a line for each setting that `asked`
-    changes. `load_run` names a run of the task, None the newest; `iteration` is a number, 'best' or None for the latest. All
-    that can be wrong is found here, before anything is built.
+    changes.
+
+    `load_run` names a run of the task, or is None for the newest. `iteration` is a number, 'best', or None for the latest.
+    All errors are found here, before anything is built.
 
     Raises:
         ConfigError: there is no such run, it has another task, robot, observation or network, or it has finished.
@@ -43,13 +45,13 @@ def resumed(
     for key in KEPT:
         old, new = (value_at(to_dict(one), key) for one in (before, cfg))
         if old != new:
-            raise ConfigError(f"{cfg.origins.where(key)}: a resumed training keeps its own, '{old}'; got '{new}'")
+            raise ConfigError(f"{cfg.origins.where(key)}: a resumed training can't change '{old}'; got '{new}'")
     task_class(cfg.task).check(cfg)
     path = find_checkpoint(folder, iteration)
     saved = read_checkpoint(path)
     check_fits(path, saved, cfg)
     if "optimizer_state_dict" not in saved:
-        raise ConfigError(f"{relative(path)}: holds no optimiser; it can be played, not trained on")
+        raise ConfigError(f"{relative(path)}: holds no optimiser, so its training can't be resumed; it can only be played")
     check_optimizer(path, saved, cfg)
     done, until = saved["iter"] + 1, cfg.train.runner.max_iterations
     if done >= until:
@@ -60,10 +62,10 @@ def resumed(
 
 
 def changes(before: TaskConfig, after: TaskConfig, asked: Iterable[str]) -> list[str]:
-    """Say 'env.seed 7 -> 3' for those of the dotted paths `asked` whose value is another one now."""
+    """Return a line such as 'env.seed 7 -> 3' for each of the dotted paths `asked` whose value has changed."""
     found = []
     for path in dict.fromkeys(asked):
         old, new = (value_at(to_dict(cfg), path) for cfg in (before, after))
-        if old != new and path not in OF_A_RUN:
+        if old != new and path not in RUN_SETTINGS:
             found.append(f"{path} {old} -> {new}")
     return found

@@ -1,4 +1,4 @@
-"""A rollout without a host read: policy, sampling, task and returns, written straight into rsl-rl's storage."""
+"""Rollout without host reads. Policy, sampling, task and returns write straight into rsl-rl's storage."""
 
 from abc import ABC, abstractmethod
 
@@ -11,27 +11,26 @@ from legged.learning.ppo import DevicePPO, gaussian_log_prob
 
 
 class Steps(ABC):
-    """The T control steps of an iteration, as rsl-rl's training loop makes them, in one function that a graph can hold. A
-    subclass says who acts (`_act`), and what follows from all steps together (`_judge`).
+    """Rollout of T control steps, as in rsl-rl's training loop, in one function that a graph can hold. A subclass computes
+    the actions (`_act`), and the quantities that need all steps (`_finish`).
     """
 
     def __init__(self, env: BaseTask, storage: RolloutStorage) -> None:
-        """Roll out a task into a storage on the same device."""
+        """Take a task and a storage on the same device."""
         self.env, self.storage = env, storage
         st = storage
         self._observations = {name: group.buffer for name, group in env.observation_groups.items()}
         self._cut_off = torch.zeros_like(st.rewards)
-        """(T, N, 1) whether the step ended its episode by time."""
-        # Sums by robot, added up at the end of a rollout: so a step costs fewer launches.
+        """Tensor (T, N, 1), 1 where the step ended its episode by a time-out."""
+        # These sums are kept for each robot and added up at the end of the rollout, which saves launches in each step.
         self._so_far = torch.zeros(2, env.num_envs, device=env.device)
         self._return, self._length = self._so_far.unbind()
         self._ended = torch.zeros(3, env.num_envs, device=env.device)
         self._zero = torch.zeros((), device=env.device)
         self._return_at = torch.zeros_like(st.rewards).squeeze(-1)  # (T, N) return of the episode so far, after each step
         self.ended = torch.zeros(4, device=env.device)
-        """(4,) of the episodes that ended in the last rollout: number, sum of returns, sum of lengths [steps], sum of the
-        squared differences of returns from their mean.
-        """
+        """Statistics (4,) of the episodes that ended in the last rollout: their number, the sum of returns, the sum of
+        lengths [steps], and the sum of squared differences of the returns from their mean."""
 
     @property
     def episodes(self) -> dict[str, Tensor]:
@@ -39,26 +38,26 @@ class Steps(ABC):
         return {"return": self._return, "length": self._length}
 
     def forget(self) -> None:
-        """Begin all episodes anew."""
+        """Reset the returns and lengths of all episodes."""
         self._so_far.zero_()
 
     @torch.no_grad()
     def collect(self, steps: int | None = None) -> None:
-        """Make T steps into the storage, and what follows from them; `steps`, to rehearse, are fewer of them."""
+        """Make T steps, or `steps` of them for a rehearsal, and compute the quantities that need all steps."""
         self._ended.zero_()
         for t in range(steps or self.storage.num_transitions_per_env):
             self._step(t)
         torch.sum(self._ended, dim=1, out=self.ended[:3])
-        self._spread()
-        self._judge()
+        self._sum_squared_differences()
+        self._finish()
 
     @abstractmethod
     def _act(self, t: int) -> Tensor:
         """Return the actions (N, D) of step `t`."""
 
     @abstractmethod
-    def _judge(self) -> None:
-        """Compute what acting did not need, for all steps at once."""
+    def _finish(self) -> None:
+        """Compute, for all steps at once, the quantities that are not needed to act."""
 
     def _step(self, t: int) -> None:
         env, st = self.env, self.storage
@@ -84,19 +83,19 @@ class Steps(ABC):
         self._ended[1:].add_(torch.where(env.reset_buf, self._so_far, self._zero))
         self._so_far.masked_fill_(env.reset_buf, 0.0)
 
-    def _spread(self) -> None:
-        """Sum the squared differences of the returns of ended episodes from their mean: in two passes, because a sum of
-        squares would lose them in float32 where the mean is large.
+    def _sum_squared_differences(self) -> None:
+        """Sum the squared differences between the returns of ended episodes and their mean. This takes a second pass, because
+        a sum of squares would lose them in float32 where the mean is large.
         """
         moved = self._return_at - self.ended[1] / self.ended[0]
         self.ended[3].copy_(torch.where(self.storage.dones.squeeze(-1).bool(), moved.square(), self._zero).sum())
 
 
 class Rollout(Steps):
-    """The steps from which PPO learns."""
+    """Rollout for PPO."""
 
     def __init__(self, env: BaseTask, alg: DevicePPO) -> None:
-        """Roll out a task for a learner on the same device."""
+        """Take a task and a learner on the same device."""
         super().__init__(env, alg.storage)
         self.alg = alg
         st = alg.storage
@@ -111,8 +110,8 @@ class Rollout(Steps):
         alg.storage.distribution_params[0][t].copy_(mean)
         return actions
 
-    def _judge(self) -> None:
-        """Compute log-probabilities, values, what they add to rewards, returns and advantages."""
+    def _finish(self) -> None:
+        """Compute log-probabilities, values, the rewards' time-out terms, returns and advantages."""
         alg, st = self.alg, self.alg.storage
         std = alg.action_std()
         st.distribution_params[1].copy_(std.expand_as(st.actions))
@@ -120,17 +119,17 @@ class Rollout(Steps):
         st.values.copy_(alg.critic.mlp(alg.critic.get_latent(st.observations)))
         if alg.reward_scale != 1.0:
             st.rewards.mul_(alg.reward_scale)
-        # The value of the state that was acted on stands for the one that a time-out cut off, as in rsl-rl.
+        # At a time-out, the value of the state that was acted on replaces that of the next state, as in rsl-rl.
         st.rewards.add_(alg.gamma * self._cut_off * st.values)
         self._returns()
 
     def _returns(self) -> None:
-        """Generalised advantage estimation (Schulman et al., arXiv 1506.02438), backwards over the storage."""
+        """Compute generalised advantage estimation (Schulman et al., arXiv 1506.02438), backwards over the storage."""
         alg, st = self.alg, self.alg.storage
         last = alg.critic.mlp(alg.critic.get_latent(self._observations))
         following = torch.cat([st.values[1:], last.unsqueeze(0)])
         alive = 1.0 - st.dones.float()
-        sums = st.rewards + alive * alg.gamma * following - st.values  # temporal differences, to which later ones are added
+        sums = st.rewards + alive * alg.gamma * following - st.values  # temporal differences; the loop adds later ones
         decay = alive * (alg.gamma * alg.lam)
         for t in reversed(range(len(sums) - 1)):
             sums[t].add_(decay[t] * sums[t + 1])

@@ -17,7 +17,7 @@ from legged.config.checks import shown
 from legged.config.legged import LeggedConfig
 from legged.config.loader import actuator_path, read_yaml
 from legged.errors import ConfigError, suggest
-from legged.learning.given import GIVEN_FILE
+from legged.learning.invocation import INVOCATION_FILE
 from legged.process.paths import data_folder, exists, make_folder, not_made, relative, write_bytes, write_text
 from legged.registry import YAML_ENDINGS, register_file, task_config, task_names, task_schema
 
@@ -28,22 +28,22 @@ NOTE_FILE = "note.txt"
 SHIPPED_MODEL = "model.pt"
 BEST_MODEL = "model_best.pt"
 BEST = "best"
-"""What --checkpoint calls it."""
+"""Value of --checkpoint that selects the best model."""
 GIT_S = 30.0
-"""Git has so long to answer; on a slow network disk it may take its time [s]."""
+"""Time limit for git, which can be slow on a network disk [s]."""
 
 
 def experiment_folder(cfg: TaskConfig) -> Path:
-    """Say where the runs of a task lie; the configuration has plain names only."""
+    """Return the folder of a task's runs. The configuration allows plain names only, so it lies in logs/."""
     return LOGS / (cfg.train.runner.experiment_name or cfg.task)
 
 
 def create_run(cfg: TaskConfig) -> Path:
-    """Make a new run folder with the resolved configuration and the state of the code. It is nobody else's, also where
-    several processes make theirs in the same second.
+    """Make a new run folder with the resolved configuration and the state of the code. Two processes never get the same
+    folder, even in the same second.
 
     Raises:
-        ConfigError: the folder's name can't be one.
+        ConfigError: its name is not a valid folder name.
         RunError: it can't be made or written.
     """
     parent = experiment_folder(cfg)
@@ -57,7 +57,7 @@ def create_run(cfg: TaskConfig) -> Path:
             folder = parent / f"{stamped(cfg)}-{number}"
         except (OSError, ValueError) as error:
             raise not_made(folder, error) from error
-    if isinstance(cfg, LeggedConfig) and cfg.control.actuator.network:  # which may be moved while the run is kept
+    if isinstance(cfg, LeggedConfig) and cfg.control.actuator.network:  # a copy, in case the original moves
         write_bytes(folder / MOTORS, Path(cfg.control.actuator.network).read_bytes())
         cfg = replace(cfg, control=replace(cfg.control, actuator=replace(cfg.control.actuator, network=MOTORS)))
     write_text(folder / CONFIG_FILE, to_yaml(cfg))
@@ -66,18 +66,20 @@ def create_run(cfg: TaskConfig) -> Path:
 
 
 def stamped(cfg: TaskConfig) -> str:
-    """Return the name of a run that begins now: date, time and, if it has one, its own name."""
+    """Return the name of a run that begins now: date and time, and the run's own name if it has one."""
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     return f"{stamp}_{cfg.train.runner.run_name}" if cfg.train.runner.run_name else stamp
 
 
 def discard_run(folder: Path) -> None:
-    """Remove the folder of a run that failed before its first checkpoint, and the folders above it that are empty then; a
-    folder that holds anything else stays. The state that is written just before a checkpoint is of no use without it.
+    """Remove the folder of a run that failed before its first checkpoint, and parent folders that are then empty. Keep a
+    folder that holds anything else.
+
+    A state file without its checkpoint is removed too, because it is of no use.
     """
     if checkpoints(folder) or (folder / BEST_MODEL).is_file():
         return
-    ours = [folder / name for name in (CONFIG_FILE, CODE_FILE, GIVEN_FILE, NOTE_FILE, MOTORS)]
+    ours = [folder / name for name in (CONFIG_FILE, CODE_FILE, INVOCATION_FILE, NOTE_FILE, MOTORS)]
     ours += [*folder.glob("events.out.tfevents.*"), *folder.glob("state_*.pt")]
     with suppress(OSError):
         for path in ours:
@@ -87,8 +89,10 @@ def discard_run(folder: Path) -> None:
 
 
 def code_state() -> str:
-    """Version, commit, status and difference of the code that runs. The last three only if it lies in the git repository of
-    this project: one in which it is installed belongs to somebody else. Of files that git does not track, only the names.
+    """Return version, commit, status and diff of the running code.
+
+    Commit, status and diff are given only if the code lies in this project's own git repository. Untracked files appear by
+    name only.
     """
     package = Path(__file__).resolve().parents[1]
     version = f"legged {_version()}\n"
@@ -105,15 +109,15 @@ def code_state() -> str:
         difference = _git(package.parent, "diff", "--no-ext-diff", "--no-color", "HEAD") if changed else ""
         return f"{version}commit {commit}\n{status}\n{difference}"
     except FileNotFoundError:
-        return f"{version}git is not on the PATH: the commit is not known\n"
+        return f"{version}git is not on the PATH, so the commit is unknown\n"
     except subprocess.CalledProcessError:
         return f"{version}not in a git repository of its own\n"
     except (OSError, subprocess.TimeoutExpired, ValueError) as error:
-        return f"{version}git could not be asked: {error}\n"
+        return f"{version}git failed: {error}\n"
 
 
 def _git(folder: Path, *args: str) -> str:
-    """Return what git says about the repository that a folder lies in, whatever the environment names."""
+    """Return the output of git for the repository of a folder. Git's environment variables are ignored."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     command = ["git", "-C", str(folder), *args]
     result = subprocess.run(command, capture_output=True, check=True, timeout=GIT_S, env=environment)
@@ -121,7 +125,7 @@ def _git(folder: Path, *args: str) -> str:
 
 
 def _version() -> str:
-    """Return the version of this package as it is installed."""
+    """Return the installed version of this package."""
     try:
         return metadata.version("legged")
     except metadata.PackageNotFoundError:
@@ -129,10 +133,10 @@ def _version() -> str:
 
 
 def find_run(cfg: TaskConfig, load_run: str | None) -> Path:
-    """Return the run folder that `load_run` names (a name in the task's experiment, a path, or nothing for the newest).
+    """Return the run folder that `load_run` names: a name in the task's experiment, a path, or None for the newest.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: there is no such run.
     """
     parent = experiment_folder(cfg)
     runs = sorted((p for p in parent.glob("*") if checkpoints(p)), key=_last_saved)
@@ -144,22 +148,28 @@ def find_run(cfg: TaskConfig, load_run: str | None) -> Path:
             raise ConfigError(f"{where}: there is no run with a checkpoint in {relative(parent)}{which}; train one first")
         return runs[-1]
     for folder in (parent / str(load_run), Path(str(load_run))):
-        with suppress(OSError, ValueError):  # no name of a folder
+        with suppress(OSError, ValueError):  # not a valid folder name
             if str(load_run).strip() and folder.is_dir():
                 return folder
     raise ConfigError(f"--load-run: there is no run '{load_run}'{suggest(str(load_run), [p.name for p in runs], 'runs')}")
 
 
 def run_named(name: str, where: str, begun: bool = False) -> Path:
-    """Return the run folder that a user names. `name` is a run's folder; or `<experiment>/<run>` below logs/; or a task, or
-    its YAML file, whose newest run counts, or else its shipped policy; or an experiment, whose newest run counts. A run needs
-    a checkpoint, unless `begun` allows one that has only begun. `where` is the argument that gave the name.
+    """Return the run folder for a `name` that a user gave.
+
+    The name can be one of these:
+
+    - a run's folder, or `<experiment>/<run>` below logs/;
+    - a task or its YAML file: its newest run, or else its shipped policy;
+    - an experiment: its newest run.
+
+    The run needs a checkpoint, unless `begun` allows a run without one. `where` is the argument that gave the name.
 
     Raises:
         ConfigError: there is no such run.
     """
     top = data_folder("resources").parent
-    with suppress(OSError, ValueError):  # not the name of a folder
+    with suppress(OSError, ValueError):  # not a valid folder name
         for folder in (parent / name for parent in (Path(), LOGS, top) if name.strip()):
             if exists(folder / CONFIG_FILE):
                 return folder
@@ -182,12 +192,12 @@ def run_named(name: str, where: str, begun: bool = False) -> Path:
                 return max(runs, key=_last_saved)
     known = [f"{run.parent.name}/{run.name}" for run in LOGS.glob("*/*") if is_run(run)]
     if exists(Path(name)) and Path(name).is_dir():
-        raise ConfigError(f"{where}: {shown(name)} holds no run: it has no {CONFIG_FILE}, nor has a folder in it")
+        raise ConfigError(f"{where}: {shown(name)} holds no run: there is no {CONFIG_FILE} in it or in its folders")
     raise ConfigError(f"{where}: there is no task and no run {shown(name)}{suggest(name[:100], [*task_names(), *known])}")
 
 
 def own_run(name: str, where: str) -> Path:
-    """Return the folder of one of the user's own runs, named as for `run_named`; it may have begun only.
+    """Return the folder of one of this user's runs, named as for `run_named`. The run need not have a checkpoint.
 
     Raises:
         ConfigError: there is no such run, or the name is that of a shipped policy.
@@ -199,10 +209,10 @@ def own_run(name: str, where: str) -> Path:
 
 
 def newest_run(where: str) -> Path:
-    """Return the run folder in logs/ that was begun or written to last.
+    """Return the run folder in logs/ that began or wrote a checkpoint last.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: there is no run.
     """
     runs = [run for run in LOGS.glob("*/*") if _has_begun(run)]
     if not runs:
@@ -215,11 +225,11 @@ def _has_begun(folder: Path) -> bool:
 
 
 def find_checkpoint(folder: Path, checkpoint: int | str | None) -> Path:
-    """Return the checkpoint of that iteration in a run folder, the one that evaluations during training found to be the
-    best (BEST), or the latest.
+    """Return a checkpoint of a run folder: that of the iteration `checkpoint`, the best one of the evaluations during
+    training (BEST), or by default the latest.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: the folder has no such checkpoint.
     """
     if checkpoint == BEST:
         if not (folder / BEST_MODEL).is_file():
@@ -238,8 +248,9 @@ def find_checkpoint(folder: Path, checkpoint: int | str | None) -> Path:
 
 
 def of_another_policy(folder: Path, checkpoint: object) -> bool:
-    """Return whether an evaluation that is of the file `checkpoint` is of another policy than the last one in its folder:
-    of one from before the training went on, or of one that was asked for. The name that a shipped policy had is not known.
+    """Return True if an evaluation of the file `checkpoint` does not describe the last policy in its folder: the training has
+    gone on since, or the evaluation was made of another checkpoint. Shipped policies never count, because their original file
+    name is unknown.
     """
     found = checkpoints(folder)
     last = found[max(found)].name if found else SHIPPED_MODEL
@@ -247,13 +258,13 @@ def of_another_policy(folder: Path, checkpoint: object) -> bool:
 
 
 def shipped_policy(task: str) -> Path | None:
-    """Return the folder of the policy that comes with this package for a task, if there is one."""
+    """Return the folder of the policy that this package ships for a task, or None."""
     folder = data_folder("resources") / "policies" / task
     return folder if (folder / SHIPPED_MODEL).is_file() else None
 
 
 def run_config(folder: Path, where: str = "POLICY") -> TaskConfig:
-    """Return the configuration that a run was trained with. `where` is the argument that named the run.
+    """Return the configuration with which a run was trained. `where` is the argument that named the run.
 
     Raises:
         ConfigError: the folder has none, or it no longer fits the schema.
@@ -267,22 +278,22 @@ def run_config(folder: Path, where: str = "POLICY") -> TaskConfig:
 
 
 def _last_saved(folder: Path) -> float:
-    """Return when the latest checkpoint of a run was written, or, before the first one, when the run began [s since 1970].
-    Evaluations and videos in the folder do not count.
+    """Return the time at which the latest checkpoint of a run was written, or at which the run began if it has none [s since
+    1970]. Evaluations and videos in the folder do not count.
     """
     stamps = []
     for path in list(checkpoints(folder).values()) or [folder / CONFIG_FILE]:
-        with suppress(OSError):  # removed meanwhile
+        with suppress(OSError):  # removed in the meantime
             stamps.append(path.stat().st_mtime)
     return max(stamps, default=0.0)
 
 
 def checkpoints(folder: Path) -> dict[int, Path]:
-    """Checkpoints of a folder by iteration, in that order; the one of a shipped policy counts as 0."""
+    """Return the checkpoints of a folder, sorted by iteration. A shipped policy has the iteration 0."""
     found: dict[int, Path] = {}
     for path in folder.glob("model*.pt"):
         match = re.fullmatch(r"model_(\d+)\.pt", path.name, re.ASCII)
-        if not path.is_file():  # a folder of that name, or a link to a file that has gone
+        if not path.is_file():  # a folder with that name, or a broken link
             continue
         if match:
             found[int(match.group(1))] = path

@@ -1,7 +1,7 @@
-"""The rest of a training beside its checkpoint: random generators, robots, episodes. With it a resumed training goes on as if
-it had never stopped; without it robots start anew.
+"""State of a training beyond its checkpoint: random generators, robots, episodes. With this state a resumed training
+continues as if it had never stopped. Without it, robots start anew.
 
-It is as large as the robots are many, so only the newest is kept: state_<iteration>.pt beside model_<iteration>.pt.
+The state grows with the number of robots, so only the newest is kept: state_<iteration>.pt next to model_<iteration>.pt.
 """
 
 import random
@@ -22,7 +22,7 @@ from legged.process.paths import relative
 from legged.state import StateError
 
 FORMAT = 2
-OF_THE_STATE = (
+STATE_SETTINGS = (
     "terrain",
     "domain_rand",
     "init_state",
@@ -33,35 +33,38 @@ OF_THE_STATE = (
     "env.seed",
     "env.num_envs",
 )
-"""Settings that are in the state as numbers: robots that went on where they were would go on with the old ones."""
+"""Settings whose effects are stored in the state. If one of them changes, the robots can't continue from the state, because
+they would still have the old values."""
 
 
 def state_path(checkpoint: Path) -> Path:
-    """Say where the state that belongs to a checkpoint lies, if there is one."""
+    """Return the path of the state of a checkpoint, which may not exist."""
     return checkpoint.with_name(checkpoint.name.replace("model", "state", 1))
 
 
 def write_run_state(checkpoint: Path, state: dict[str, Any]) -> None:
-    """Write the state that belongs to a checkpoint: before the checkpoint, so that the newest always has one."""
+    """Write the state of a checkpoint. This comes before the checkpoint itself, so that the newest checkpoint always has a
+    state.
+    """
     write_checkpoint(state_path(checkpoint), {"format": FORMAT, **state})
 
 
 def remove_older(checkpoint: Path) -> None:
-    """Remove the states of other checkpoints in the folder."""
+    """Remove the states of the other checkpoints in the folder."""
     for path in checkpoint.parent.glob("state_*.pt"):
         if path != state_path(checkpoint):
             path.unlink(missing_ok=True)
 
 
 def read_run_state(checkpoint: Path, checkpoint_id: str) -> dict[str, Any]:
-    """Read the state that belongs to a checkpoint, which says the same `id`.
+    """Read the state of a checkpoint. Its `id` must be `checkpoint_id`.
 
     Raises:
-        StateError: there is none, or it can't be used.
+        StateError: there is no state, or it can't be used.
     """
     path = state_path(checkpoint)
     if not path.is_file():
-        raise StateError(f"there is no {path.name} beside it")
+        raise StateError(f"there is no {path.name} next to it")
     try:
         state = load_plain(path)
     except ConfigError as error:
@@ -77,18 +80,18 @@ def read_run_state(checkpoint: Path, checkpoint_id: str) -> dict[str, Any]:
 
 
 def check_same_world(before: TaskConfig, after: TaskConfig) -> None:
-    """Find out whether the robots of a run can go on where they were, under the configuration `after`.
+    """Check that the robots of a run can continue from their state under the configuration `after`.
 
     Raises:
-        StateError: they can't: a setting that their state is made of is another one.
+        StateError: a setting that is part of the state has changed.
     """
     for name, (was, now) in differences([to_dict(before), to_dict(after)]).items():
-        if any(name == path or name.startswith(f"{path}.") for path in OF_THE_STATE):
+        if any(name == path or name.startswith(f"{path}.") for path in STATE_SETTINGS):
             raise StateError(f"{name} was {was}, and is {now} now")
 
 
 def generators() -> dict[str, Any]:
-    """Read the state of every random generator of this process, as plain data."""
+    """Return the state of every random generator of this process, as plain data."""
     version, numbers, gauss = random.getstate()
     name, keys, position, has_gauss, cached = np.random.get_state(legacy=True)
     assert isinstance(keys, np.ndarray)
@@ -101,10 +104,10 @@ def generators() -> dict[str, Any]:
 
 
 def set_generators(state: dict[str, Any]) -> None:
-    """Go on from saved states; a GPU's that is not here is left out.
+    """Restore the random generators. The state of a GPU's generator is skipped if this machine has no GPU.
 
     Raises:
-        StateError: they are damaged.
+        StateError: the states are damaged.
     """
     try:
         version, numbers, gauss = state["python"]
@@ -114,14 +117,14 @@ def set_generators(state: dict[str, Any]) -> None:
         torch.set_rng_state(state["torch"])
         if isinstance(state["cuda"], Tensor) and torch.cuda.is_available():
             torch.cuda.set_rng_state(state["cuda"])
-    except Exception as error:  # every generator refuses in a way of its own what is none of its states
+    except Exception as error:  # each generator raises its own types for a wrong state
         raise StateError(f"its random generators are damaged ({error})") from error
 
 
 @contextmanager
 def kept_generators(device: torch.device) -> Iterator[None]:
-    """Let the block draw random numbers without a trace: the generators of this process, of the host and of every GPU if
-    `device` is one, go on afterwards as if nothing had been drawn.
+    """Restore the random generators of this process after the block: those of the host and, if `device` is a GPU, of every
+    GPU.
     """
     python, of_numpy = random.getstate(), np.random.get_state()
     gpus = range(torch.cuda.device_count()) if device.type == "cuda" else []

@@ -1,4 +1,4 @@
-"""rsl-rl's OnPolicyRunner with what it leaves out: task state in checkpoints, safe files, a clean stop."""
+"""rsl-rl's OnPolicyRunner, extended by task state in checkpoints, safe files and a clean stop."""
 
 import contextlib
 import io
@@ -26,10 +26,12 @@ from legged.learning.checkpoint import (
 )
 from legged.learning.display import Display
 from legged.learning.distributed import RankLost, join, leave
-from legged.learning.divergence_meter import DivergenceMeter
+from legged.learning.divergence import Diverged
 from legged.learning.evaluations import Ended, Evaluations
+from legged.learning.gradient_guard import GradientGuard
+from legged.learning.kl_meter import KLMeter
 from legged.learning.logger import Interrupted, QuietLogger
-from legged.learning.networks import begin_std, keep_std_in_bounds, network_settings, use_matmul
+from legged.learning.networks import keep_std_in_bounds, network_settings, reset_std, use_matmul
 from legged.learning.recurrent import hidden_states, keep_shape_of_one_robot
 from legged.learning.run_folder import BEST_MODEL, CONFIG_FILE, run_config
 from legged.learning.run_state import (
@@ -40,10 +42,8 @@ from legged.learning.run_state import (
     set_generators,
     write_run_state,
 )
-from legged.learning.step_guard import StepGuard
 from legged.learning.symmetry import augment, images_of
-from legged.learning.transfer import check_built, tell_taken, what_is_taken
-from legged.learning.watch import Diverged
+from legged.learning.transfer import check_built, transfer_summary, transferable_parts
 from legged.process.paths import relative
 from legged.process.ranks import Ranks
 from legged.process.startup import STARTED_S
@@ -51,10 +51,10 @@ from legged.state import StateError, take
 
 
 def runner_config(task: BaseTask, algorithm_class: str) -> dict[str, Any]:
-    """Return the dictionary rsl-rl wants.
+    """Return rsl-rl's configuration dictionary.
 
     Raises:
-        ConfigError: the task is to learn from mirror images, and has none.
+        ConfigError: the task has no mirror images, but is to learn from them.
     """
     cfg, runner = task.cfg, task.cfg.train.runner
     settings = {name: value for name, value in vars(cfg.train.algorithm).items() if name != "class_name"}
@@ -77,27 +77,27 @@ def runner_config(task: BaseTask, algorithm_class: str) -> dict[str, Any]:
 
 
 def loop_settings(runner: RunnerConfig) -> dict[str, Any]:
-    """Return what rsl-rl wants to know of the training loop."""
+    """Return rsl-rl's settings of the training loop."""
     return {
         "num_steps_per_env": runner.num_steps_per_env,
         "save_interval": runner.save_interval,
         "run_name": runner.run_name,
         "logger": runner.logger,
-        "check_for_nan": False,  # it would wait for the GPU at every step; the task terminates and counts such robots
+        "check_for_nan": False,  # the check would wait for the GPU at every step; the task itself ends and counts such robots
     }
 
 
 class Runner(OnPolicyRunner):
-    """Trains a task with rsl-rl's PPO."""
+    """Runner that trains a task with rsl-rl's PPO."""
 
     env: BaseTask
     ALGORITHM = "PPO"
-    """Class of the learner, by rsl-rl's names or as module:class."""
+    """Class of the learner: one of rsl-rl's names, or module:class."""
 
     def __init__(
         self, env: BaseTask, log_dir: Path | None = None, device: str = "cpu", display: Display | None = None
     ) -> None:
-        """`log_dir` is where checkpoints and TensorBoard files go; without one nothing is written."""
+        """Take the folder `log_dir` for checkpoints and TensorBoard files; None writes nothing."""
         config = self._configuration(env)
         use_matmul(env.cfg)
         with contextlib.redirect_stdout(io.StringIO()):
@@ -107,11 +107,11 @@ class Runner(OnPolicyRunner):
         self._transferred_from: dict[str, Any] | None = None
         self._last_saved = ""
         self.evaluations: Evaluations | None = None
-        """What evaluates the policy during training; of several processes, in the first."""
+        """Evaluations of the policy during training. Of several processes, only the first has them."""
         keep_std_in_bounds(self.alg.get_policy(), self.alg.optimizer)
         if self.alg.get_policy().is_recurrent:
             keep_shape_of_one_robot(self.alg.get_policy())
-        self._guard = None if hasattr(self.alg.optimizer, "found_inf") else StepGuard(self.alg.optimizer)
+        self._guard = None if hasattr(self.alg.optimizer, "found_inf") else GradientGuard(self.alg.optimizer)
         self.logger = QuietLogger(
             log_dir=str(log_dir) if log_dir else None,
             cfg=self.cfg,
@@ -124,10 +124,10 @@ class Runner(OnPolicyRunner):
             display=display,
             left_out=self._left_out,
         )
-        self.logger.divergence = DivergenceMeter(self.alg.actor)
+        self.logger.kl_meter = KLMeter(self.alg.actor)
 
     def _configuration(self, env: BaseTask) -> dict[str, Any]:
-        """Return the dictionary rsl-rl wants for a task."""
+        """Return rsl-rl's configuration dictionary for a task."""
         return runner_config(env, self.ALGORITHM)
 
     def _networks(self) -> dict[str, Any]:
@@ -135,22 +135,22 @@ class Runner(OnPolicyRunner):
         return {"actor": self.alg.actor, "critic": self.alg.critic}
 
     def _left_out(self) -> float:
-        """Return the share of the last update's mini-batches that changed nothing: their gradients were no numbers."""
+        """Return the share of the last update's mini-batches that were skipped for NaN or infinite gradients."""
         return self.alg.left_out if self._guard is None else self._guard.flush()
 
     def stop(self) -> None:
-        """Ask `learn` to stop after the iteration that is going on."""
+        """Ask `learn` to stop after the current iteration."""
         self.logger.stop_requested = True
 
     def evaluate_with(self, evaluations: Evaluations | None) -> None:
-        """Evaluate the policy during training; None in those of several processes that leave it to the first."""
+        """Set the evaluations of the policy during training. In a group of processes, all but the first pass None."""
         self.evaluations = evaluations
         self.logger.why_end = lambda: "" if evaluations is None else evaluations.why_end
         if evaluations is not None:
             self.logger.evaluate = self._evaluate
 
     def _evaluate(self, iterations: int, total: int) -> dict[str, float]:
-        """Evaluate where that is due, and keep the best policy; return what was found."""
+        """Evaluate the policy if that is due, keep it if it is the best, and return the figures."""
         evaluations, logger = self.evaluations, self.logger
         assert evaluations is not None
         if not evaluations.due(iterations, total, logger.loop_s):
@@ -158,7 +158,7 @@ class Runner(OnPolicyRunner):
         steps = logger.tot_timesteps + logger.steps_per_iteration
         best = evaluations.evaluate(self.alg.get_policy(), iterations, logger.loop_s, steps)
         figures = evaluations.history[-1].figures
-        found = {name: value for name, value in figures.items() if math.isfinite(value)}  # of others a checkpoint holds none
+        found = {name: value for name, value in figures.items() if math.isfinite(value)}  # a checkpoint holds no NaN
         if best and logger.writer is not None:
             path = Path(logger.log_dir) / BEST_MODEL
             write_checkpoint(path, self._content(path, {"evaluation": found}))
@@ -166,18 +166,19 @@ class Runner(OnPolicyRunner):
         return found
 
     def train(self, until_iteration: int) -> bool:
-        """Learn up to iteration `until_iteration`, or to the target; false if stopped before. Leaves a checkpoint either way,
-        and the other processes, if there are any.
+        """Train up to iteration `until_iteration` or to the target, and leave a checkpoint. Return False if the training was
+        stopped before. At the end, leave the group of processes.
 
         Raises:
-            RankLost: one of those has died.
-            Diverged: numbers went on being NaN or infinite; the last checkpoint is good.
+            RankLost: another process has died.
+            Diverged: numbers were NaN or infinite for too long; the last checkpoint is good.
         """
         finished = True
         try:
             self.learn(until_iteration - self.current_learning_iteration, init_at_random_ep_len=True)
         except (Interrupted, Ended) as end:
-            # Who evaluates nothing is told by the first process, in which nothing but a target ends a training of several.
+            # Only a target ends a training of several processes. A process without evaluations learns of it from the first
+            # one.
             finished = isinstance(end, Ended) and (self.evaluations is None or self.evaluations.reached)
             if self.logger.writer is not None:
                 self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
@@ -189,14 +190,16 @@ class Runner(OnPolicyRunner):
             good = f"; the last checkpoint is {self._last_saved}" if self._last_saved else ""
             raise Diverged(f"stopped after iteration {self.current_learning_iteration + 1}: {error}{good}") from error
         except RuntimeError as error:
-            if self.is_distributed and "by peer" in str(error):  # gloo notices; with NCCL torchrun ends who waits
+            if self.is_distributed and "by peer" in str(error):  # gloo reports it; with NCCL, torchrun does
                 raise RankLost(f"rank {self.gpu_global_rank}: another process has ended; torchrun says which") from error
             raise
         leave()
         return finished
 
     def _configure_multi_gpu(self) -> None:
-        """As rsl-rl, and on the CPU too: each process of torchrun has the device it was given, and meets the others."""
+        """Join the group of processes, as rsl-rl does, but on the CPU too, and with the device that torchrun gave each
+        process.
+        """
         ranks = Ranks.now()
         self.is_distributed = ranks.several
         self.gpu_world_size, self.gpu_global_rank, self.gpu_local_rank = ranks.count, ranks.rank, ranks.local_rank
@@ -210,20 +213,20 @@ class Runner(OnPolicyRunner):
             join(ranks, torch.device(self.device))
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
-        """Train for a number of iterations; robots that go on where they stopped keep their episodes."""
+        """Train for a number of iterations. Robots that continue from a state keep their episodes."""
         warmup = self.env.cfg.train.algorithm.critic_warmup_iterations
         self.alg.warmup_left = max(0, warmup - self.current_learning_iteration)
-        goes_on = self._go_on()
+        goes_on = self._restore_state()
         super().learn(num_learning_iterations, init_at_random_ep_len and not goes_on)
 
     def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
-        """Write a checkpoint, and beside it the state of everything else, which the newest alone keeps.
+        """Write a checkpoint, and next to it the state of everything else. Only the newest checkpoint keeps a state.
 
         Raises:
             RunError: weights are NaN or infinite, or a file can't be written.
         """
         saved = self._content(Path(path), infos)
-        if not self.is_distributed:  # the other processes' robots are not here
+        if not self.is_distributed:  # the robots of the other processes are not here
             saved["infos"]["id"] = uuid4().hex
             state = {"generators": generators(), "task": self.env.state_dict(), "episodes": self._episodes()}
             state["memory"] = {name: tensor.clone() for name, tensor in self._memory().items()}
@@ -234,10 +237,10 @@ class Runner(OnPolicyRunner):
         self.logger.save_model(path, self.current_learning_iteration)
 
     def _content(self, path: Path, infos: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Return what a checkpoint holds, with `infos` among what is ours.
+        """Return the content of a checkpoint, with `infos` added to its own.
 
         Raises:
-            RunError: weights are NaN or infinite; names the `path` that is not written.
+            RunError: weights are NaN or infinite; the text names `path`, which is not written.
         """
         saved = self.alg.save()
         try:
@@ -251,24 +254,24 @@ class Runner(OnPolicyRunner):
             **describe(self.env),
             "task_state": self.env.progress(),
             "learning_rate": self.alg.learning_rate,
-            "wall_s": time.perf_counter() - STARTED_S,  # since this process began
+            "wall_s": time.perf_counter() - STARTED_S,  # since the start of this process
         }
         if self._transferred_from is not None:
             saved["infos"]["transferred_from"] = self._transferred_from
         return saved
 
     def load(self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None) -> dict:
-        """Restore networks, optimiser (if the checkpoint holds it; shipped ones do not), iteration count and the progress of
-        the task's curricula from a checkpoint.
+        """Restore networks, optimiser, iteration count and the progress of the curricula from a checkpoint. Shipped policies
+        have no optimiser.
 
         Raises:
-            ConfigError: the file is no checkpoint, or of a network of another size.
+            ConfigError: the file is not a checkpoint, or its networks have other sizes.
         """
         saved = read_checkpoint(Path(path), map_location or self.device)
         infos = saved["infos"]
         self._load_learner(Path(path), saved, load_cfg, strict)
         self._transferred_from = infos.get("transferred_from")
-        # rsl-rl saves the index of the last finished iteration; going on from it would repeat that one.
+        # rsl-rl saves the index of the last finished iteration. The next one follows it.
         self.current_learning_iteration = saved["iter"] + 1
         try:
             if "task_state" in infos:
@@ -278,8 +281,8 @@ class Runner(OnPolicyRunner):
         return infos
 
     def _load_learner(self, path: Path, saved: dict[str, Any], parts: dict | None = None, strict: bool = True) -> None:
-        """Take the networks, the optimiser (if there is one) and the learning rate of a checkpoint that was read, or those
-        `parts` of it.
+        """Load networks, optimiser (if there is one) and learning rate from the content of a checkpoint, or only those
+        `parts`.
 
         Raises:
             ConfigError: they do not fit.
@@ -288,7 +291,7 @@ class Runner(OnPolicyRunner):
         parts = {"optimizer": "optimizer_state_dict" in saved, **parts}
         if parts["optimizer"]:
             wanted, where = saved["optimizer_state_dict"], f"{relative(path)}: its optimiser"
-            waiting = len([*self.alg.get_policy().parameters()])  # of the policy, while a value function learned alone
+            waiting = len([*self.alg.get_policy().parameters()])  # these may lack moments
             saved["optimizer_state_dict"] = fit_optimizer(wanted, self.alg.optimizer, where, waiting)
         try:
             self.alg.load(saved, parts, strict)
@@ -298,36 +301,38 @@ class Runner(OnPolicyRunner):
             raise ConfigError(describe_mismatch(path, saved, policy, self.env.cfg.task)) from error
 
     def _set_rate(self, saved: float) -> None:
-        """Go on with the learning rate of a checkpoint where it adapts, with that of the configuration where it is fixed."""
+        """Set the learning rate: that of the checkpoint if it adapts, that of the configuration if it is fixed."""
         settings = self.env.cfg.train.algorithm
         self.alg.learning_rate = settings.learning_rate if settings.schedule == "fixed" else saved
-        first = self.alg.optimizer.param_groups[0]  # an estimator's, which comes after it, has a rate of its own
+        first = self.alg.optimizer.param_groups[0]  # the estimator's group comes after it and keeps its own rate
         if not isinstance(first["lr"], Tensor):
             first["lr"] = self.alg.learning_rate
 
     def transfer(self, path: str) -> str:
-        """Take networks, normaliser and optimiser of another task's checkpoint, to begin a training with them: iterations,
-        curricula and robots begin anew. Return what was taken, in words.
+        """Begin a training with networks, normaliser and optimiser of another task's checkpoint. Iterations, curricula and
+        robots begin anew. Return a summary.
 
         Raises:
-            ConfigError: the file is no checkpoint, or its observations, actions or networks are others.
+            ConfigError: the file is not a checkpoint, or its observations, actions or networks differ.
         """
-        saved = what_is_taken(read_checkpoint(Path(path), self.device), self.env.cfg)
+        saved = transferable_parts(read_checkpoint(Path(path), self.device), self.env.cfg)
         check_built(Path(path), saved, self.env)
         settings = self.env.cfg.train.algorithm
         if saved["infos"].get("optimizer", "adam") != settings.optimizer:
             saved.pop("optimizer_state_dict", None)
         self._load_learner(Path(path), saved)
         if "critic_state_dict" not in saved:
-            begin_std(self.alg.get_policy(), self.env.cfg)
+            reset_std(self.alg.get_policy(), self.env.cfg)
         task = saved["infos"].get("task", "")
         self._transferred_from = {"file": relative(Path(path)), "task": task, "iteration": saved["iter"]}
-        return tell_taken(Path(path), saved, self.alg.get_policy(), self.env.cfg, self.alg.learning_rate)
+        return transfer_summary(Path(path), saved, self.alg.get_policy(), self.env.cfg, self.alg.learning_rate)
 
     def resume(self, path: str) -> str:
-        """Load a checkpoint to train on from. Robots, random numbers and episodes go on where they were, if their state lies
-        beside it and the ground and what is drawn for robots are as they were; else all robots begin anew on the tiles that
-        they had reached. Returns why they do, or nothing.
+        """Load a checkpoint and continue its training. Return the reason why robots begin anew, or an empty text if they
+        continue.
+
+        Robots, random numbers and episodes continue if the checkpoint has a state, and the terrain and the randomisation are
+        the same. Otherwise all robots begin anew on the tiles that they had reached.
         """
         infos = self.load(path)
         if self.is_distributed:
@@ -338,7 +343,7 @@ class Runner(OnPolicyRunner):
                 if (Path(path).parent / CONFIG_FILE).is_file():
                     check_same_world(run_config(Path(path).parent), self.env.cfg)
                 self._take(state)
-                self._state = state  # taken once more when training begins, after the trial steps of a capture
+                self._state = state  # restored again when training begins, after the trial steps of a capture
                 return ""
             except StateError as error:
                 why = str(error)
@@ -346,8 +351,8 @@ class Runner(OnPolicyRunner):
         self.env.reset()
         return why
 
-    def _go_on(self) -> bool:
-        """Take the state that was resumed from, if there is one and training has not begun yet."""
+    def _restore_state(self) -> bool:
+        """Restore the state of the resumed run, once, when training begins. Return True if there was one."""
         if self._state is None:
             return False
         self._take(self._state)
@@ -355,16 +360,16 @@ class Runner(OnPolicyRunner):
         return True
 
     def _take(self, state: dict[str, Any]) -> None:
-        """Put task, episodes and random generators into a state; StateError if it does not fit."""
+        """Load a state into task, episodes and random generators. Raises StateError if it does not fit."""
         self.env.load_state_dict(state["task"])
         take(self._episodes(), state["episodes"], "episodes")
         take(self._memory(), state.get("memory", {}), "memory")
         set_generators(state["generators"])
 
     def _episodes(self) -> dict[str, Tensor]:
-        """Return and length so far of the episode of each environment, (N,) each, as they are counted for the log."""
+        """Return the return and length so far of each environment's episode, (N,) each, as counted for the log."""
         return {"return": self.logger.cur_reward_sum, "length": self.logger.cur_episode_length}
 
     def _memory(self) -> dict[str, Tensor]:
-        """Return what recurrent networks remember of their robots, (layers, N, width) each; nothing without any."""
+        """Return the hidden states of recurrent networks, (layers, N, width) each; empty without such networks."""
         return hidden_states(self._networks(), self.env.num_envs)

@@ -1,4 +1,4 @@
-"""rsl-rl's PPO on rewards times a factor: a value function learns slowly what is in the thousands."""
+"""rsl-rl's PPO with scaled rewards. A value function learns slowly if returns are in the thousands."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 class ScaledRewards(PPO):
-    """PPO that learns from `reward_scale` times the task's rewards; what is logged and measured is not scaled."""
+    """PPO that learns from `reward_scale` times the task's rewards. Logs and evaluations are not scaled."""
 
     reward_scale = 1.0
     """Factor on the rewards."""

@@ -1,4 +1,4 @@
-"""The rollout of a student: it acts, and its teacher says what it would have done, on the student's states."""
+"""Rollout of a student, with the actions that its teacher would have taken in the same states."""
 
 import torch
 from torch import Tensor
@@ -10,16 +10,16 @@ from legged.learning.rollout import Steps
 
 
 class StudentRollout(Steps):
-    """The steps from which a student learns."""
+    """Rollout for distillation."""
 
     def __init__(self, env: BaseTask, alg: DeviceDistillation) -> None:
-        """Roll out a task for a learner on the same device."""
+        """Take a task and a learner on the same device."""
         super().__init__(env, alg.storage)
         self.alg = alg
         self.student, self.teacher = alg.memory, Memory(alg.teacher, env.num_envs)
 
     def forget(self) -> None:
-        """Begin all episodes anew."""
+        """Reset all episodes and hidden states."""
         super().forget()
         for memory in (self.student, self.teacher):
             for part in memory.parts:
@@ -27,7 +27,7 @@ class StudentRollout(Steps):
 
     @torch.no_grad()
     def collect(self, steps: int | None = None) -> None:
-        """Make T steps into the storage, with what the teacher would have done; `steps`, to rehearse, are fewer of them."""
+        """Make T steps, or `steps` of them for a rehearsal, and add the teacher's actions."""
         for before, now in zip(self.alg.memory_before, self.student.parts, strict=True):
             before.copy_(now)
         super().collect(steps)
@@ -40,7 +40,7 @@ class StudentRollout(Steps):
         return torch.addcmul(mean, self.alg.action_std(), torch.randn_like(mean))
 
     def _advance(self, memory: Memory) -> Tensor:
-        """Return the mean actions (N, D) of a network for the observations now, and let it remember them in place."""
+        """Return the mean actions (N, D) of a network for the current observations, and advance its hidden state in place."""
         now = memory.copy(memory.parts)
         actions = now.act(torch.cat([self._observations[name] for name in memory.network.obs_groups], dim=-1))
         memory.take(now.parts)
@@ -52,7 +52,7 @@ class StudentRollout(Steps):
             for part in memory.parts:
                 part.masked_fill_(self.env.reset_buf.unsqueeze(1), 0.0)
 
-    def _judge(self) -> None:
-        """Let a teacher that has no memory say for all steps at once what it would have done."""
+    def _finish(self) -> None:
+        """Compute the actions of a teacher without recurrent layers for all steps at once."""
         if not self.teacher.parts:
             self.storage.privileged_actions.copy_(self.alg.teacher(self.storage.observations))

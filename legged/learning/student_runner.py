@@ -1,4 +1,4 @@
-"""Training of a student, which learns to act as a teacher would, in the loop of CapturedRunner."""
+"""Training of a student, which learns to act like a teacher, in the loop of CapturedRunner."""
 
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from legged.learning.teacher import Teacher
 
 
 class StudentRunner(CapturedRunner):
-    """As CapturedRunner, of a student: checkpoints hold it as the actor, its teacher, and no value function."""
+    """CapturedRunner for a student. Its checkpoints hold the student as the actor, the teacher, and no value function."""
 
     ALGORITHM = "legged.learning.distillation:DeviceDistillation"
 
@@ -28,10 +28,10 @@ class StudentRunner(CapturedRunner):
         device: str = "cpu",
         display: Display | None = None,
     ) -> None:
-        """`env` shows the teacher what it sees (`with_teacher`).
+        """Take a task `env` that also has the teacher's observations (`with_teacher`).
 
         Raises:
-            ConfigError: the teacher's weights are of another network.
+            ConfigError: the teacher's weights do not fit its network.
         """
         self.teacher = teacher
         super().__init__(env, log_dir, device, display)
@@ -45,7 +45,7 @@ class StudentRunner(CapturedRunner):
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train for a number of iterations."""
-        if self.why_stock:  # rsl-rl's update begins with what its last one has left
+        if self.why_stock:  # rsl-rl's update starts from the hidden state after the last one
             self.alg.last_hidden_states = (self.alg.student.get_hidden_state(), None)
         super().learn(num_learning_iterations, init_at_random_ep_len)
 
@@ -81,5 +81,5 @@ class StudentRunner(CapturedRunner):
         return saved
 
     def _set_rate(self, saved: float) -> None:
-        """Go on with the learning rate of the configuration: a student's does not adapt, and is none of PPO's."""
+        """Set the learning rate of the configuration. A student's rate does not adapt, and has its own setting."""
         self.alg.learning_rate = self.alg.optimizer.param_groups[0]["lr"] = self.env.cfg.train.distillation.learning_rate

@@ -1,4 +1,4 @@
-"""Learning from every sample also as its mirror image (Mittal et al., arXiv 2403.04359)."""
+"""Learning from every sample and its mirror image (Mittal et al., arXiv 2403.04359)."""
 
 import torch
 from tensordict import TensorDict
@@ -10,23 +10,23 @@ from legged.mdp.mirror_images import MirrorImages
 
 
 def images_of(task: BaseTask) -> MirrorImages:
-    """Return the mirror images of a task that is to learn from them.
+    """Return the mirror images of a task.
 
     Raises:
-        ConfigError: it has none, or one of its terms is not as wide as its kind in `MIRRORED` says.
+        ConfigError: the task has none, or a term's width differs from that of its kind in `MIRRORED`.
     """
     images = task.mirror_images()
     if images is None:
         where = task.cfg.origins.where("train.algorithm.symmetry")
-        raise ConfigError(f"{where}: {type(task).__name__} has no mirror images; false learns without")
+        raise ConfigError(f"{where}: {type(task).__name__} has no mirror images; must be false")
     return images
 
 
 def augment(
     images: MirrorImages, env: BaseTask, obs: TensorDict | None, actions: Tensor | None
 ) -> tuple[TensorDict | None, Tensor | None]:
-    """Return a batch and, after it, its mirror image: (n, ...) -> (2 n, ...). With `images` given, it is what rsl-rl's
-    symmetry extension asks for.
+    """Append to a batch its mirror image: (n, ...) -> (2 n, ...). With `images` bound, this is the function that rsl-rl's
+    symmetry extension calls.
     """
     seen = done = None
     if obs is not None:

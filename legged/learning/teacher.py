@@ -1,4 +1,4 @@
-"""The teacher of a student: any policy of ours, with the observations that it was trained on."""
+"""Teacher of a student: any policy of this package, with the observations that it was trained on."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -28,27 +28,27 @@ from legged.registry import task_class
 
 FIELD = "train.distillation.teacher"
 PREFIX = "teacher_"
-"""What precedes the names of a teacher's observation groups in the task of its student."""
+"""Prefix of the names of a teacher's observation groups in its student's task."""
 OF_A_NETWORK = ("activation", "obs_normalization", "noise_std_type", "state_dependent_std", "rnn_type")
 OF_ACTIONS = ("control_type", "action_scale", "held", "clip_actions")
-"""Fields of `control` that say what an action means."""
+"""Fields of `control` that define the meaning of an action."""
 
 
 @dataclass(frozen=True)
 class Teacher:
-    """A policy that says what it would have done."""
+    """Policy that a student imitates."""
 
     origin: Mapping[str, str | int]
-    """Its file, task and iteration."""
+    """File, task and iteration of the policy."""
     groups: Mapping[str, ObservationGroupConfig]
-    """The observation groups that it reads, by their names in the student's task, in order; without noise."""
+    """Observation groups that the policy reads, in order and without noise, by their names in the student's task."""
     network: Mapping[str, Any]
-    """What its network is made of, as checkpoints describe networks; `observations` names its groups here."""
+    """Description of the network, as in checkpoints. Its entry `observations` has the names in the student's task."""
     weights: Mapping[str, Tensor]
 
     @property
     def policy(self) -> PolicyConfig:
-        """Its network as a configuration would say it."""
+        """Description of the network as a configuration."""
         said = {name: self.network[name] for name in OF_A_NETWORK if name in self.network}
         if said["rnn_type"] != "none":
             said |= {name: self.network[name] for name in ("rnn_hidden_dim", "rnn_num_layers")}
@@ -56,27 +56,27 @@ class Teacher:
         return PolicyConfig(actor_hidden_dims=tuple(hidden), actor_observations=tuple(groups), **said)
 
     def told(self) -> str:
-        """Return in words who it is."""
+        """Return a text that names the teacher."""
         return f"{self.origin['file']} ({self.origin['task']}, iteration {self.origin['iteration']})"
 
 
 def find_teacher(cfg: TaskConfig) -> Teacher:
-    """Find the teacher that a student's configuration names, and look whether the student's task can show it what it was
-    trained to see.
+    """Find the teacher that a student's configuration names. Check that the student's task offers the observations that the
+    teacher was trained on.
 
     Raises:
-        ConfigError: there is none, or it sees or does something else.
+        ConfigError: there is no teacher, or its observations or actions differ.
     """
     name, where = cfg.train.distillation.teacher, cfg.origins.where(FIELD)
     if not name:
-        raise ConfigError(f"--teacher: '{cfg.task}' learns from a teacher, and none is named; --teacher RUN does")
+        raise ConfigError(f"--teacher: '{cfg.task}' learns from a teacher; name one with --teacher POLICY")
     file = Path(name) if name.endswith(".pt") and exists(Path(name)) else None
     path = file or find_checkpoint(run_named(name, where), None)
     there, saved = run_config(path.parent), read_checkpoint(path)
     check_joints(f"{where}: {relative(path)}", made_for(path, saved), cfg)
     check_networks_fit(relative(path), {name: part for name, part in saved.items() if name != "critic_state_dict"}, there)
     if there.train.policy.estimator.targets:
-        raise ConfigError(f"{where}: {relative(path)} has an estimator, and no teacher can have one")
+        raise ConfigError(f"{where}: {relative(path)} has an estimator, which a teacher can't have")
     read = groups_of(there, "actor")
     groups = {PREFIX + group: replace(there.observations.groups[group], noise=False) for group in read}
     terms = dict.fromkeys(term for group in groups.values() for term in group.terms)
@@ -84,10 +84,10 @@ def find_teacher(cfg: TaskConfig) -> Teacher:
     if missing:
         known = suggest(missing[0], task_class(cfg.task).terms("_obs_"), "observations")
         unknown = ", ".join(f"'{term}'" for term in missing)
-        raise ConfigError(f"{where}: {relative(path)} observes {unknown}, which '{cfg.task}' has not{known}")
+        raise ConfigError(f"{where}: {relative(path)} observes {unknown}, which '{cfg.task}' does not have{known}")
     found = differences(cfg, there, terms)
     if found:
-        raise ConfigError(f"{where}: {relative(path)} was made for other numbers than '{cfg.task}': {'; '.join(found)}")
+        raise ConfigError(f"{where}: {relative(path)} was trained with other settings than '{cfg.task}': {'; '.join(found)}")
     network = {**networks(there)["actor"], "observations": list(groups)}
     origin: dict[str, str | int] = {"file": relative(path), "task": there.task, "iteration": saved["iter"]}
     teacher = Teacher(origin, groups, network, saved["actor_state_dict"])
@@ -96,8 +96,8 @@ def find_teacher(cfg: TaskConfig) -> Teacher:
 
 
 def differences(here: TaskConfig, there: TaskConfig, terms: Iterable[str]) -> list[str]:
-    """Say 'observations.clip 100 there, 10 here' for what makes the same terms other numbers in the tasks of a student and of
-    its teacher, or the same actions other movements.
+    """Return a line such as 'observations.clip 100 there, 10 here' for each setting that changes the values of the `terms` or
+    the effect of actions, and that differs between the student's task and the teacher's.
     """
     pairs: dict[str, tuple[Any, Any]] = {"the control step": (here.dt, there.dt)}
     for name in OF_ACTIONS:
@@ -119,7 +119,7 @@ def differences(here: TaskConfig, there: TaskConfig, terms: Iterable[str]) -> li
 
 
 def _observed_as(cfg: TaskConfig, name: str) -> str:
-    """Return in words the range of which an observed property is a share."""
+    """Return a text for the range that scales an observed property."""
     draw = observed(cfg, name)
     if draw is None:
         return "not drawn"
@@ -128,22 +128,20 @@ def _observed_as(cfg: TaskConfig, name: str) -> str:
 
 
 def _largest_forces(cfg: TaskConfig) -> str:
-    """Return in words the forces of which observed ones are shares."""
+    """Return a text for the forces that scale the observed ones."""
     forces = observed_forces(cfg) if isinstance(cfg, LeggedConfig) else {}
     return ", ".join(f"{name} up to {largest_of(force):g} N" for name, force in forces.items()) or "none"
 
 
 def _shown(value: Any) -> str:
-    """Return a value as an error shows it: a list of many numbers by their count and its ends."""
+    """Return a value as text for an error. A long list is given by its length and its ends."""
     if isinstance(value, tuple) and len(value) > 3:
         return f"{len(value)} from {value[0]:g} to {value[-1]:g}" if isinstance(value[0], float) else f"{len(value)} names"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def scale_of(cfg: TaskConfig, term: str) -> float | tuple[float, float]:
-    """Return the factor on an observation term; commands are scaled like the velocities that they ask for, linear and about
-    the vertical, unless told otherwise.
-    """
+    """Return the factor of an observation term. Commands have the factors of linear and angular velocity by default."""
     scales = cfg.observations.scales
     if term == "commands" and term not in scales and isinstance(cfg, LeggedConfig):
         return scales.get("base_lin_vel", 1.0), scales.get("base_ang_vel", 1.0)
@@ -151,17 +149,17 @@ def scale_of(cfg: TaskConfig, term: str) -> float | tuple[float, float]:
 
 
 def with_teacher(cfg: TaskConfig, teacher: Teacher) -> TaskConfig:
-    """Return the configuration of a student's task that also shows the teacher what it sees.
+    """Return the configuration of a student's task with the teacher's observation groups added.
 
     Raises:
-        ConfigError: a group of the student's has the name of one of those.
+        ConfigError: a group of the student has the name of one of these groups.
     """
     groups = cfg.observations.groups
     for name, group in teacher.groups.items():
         if groups.get(name, group) != group:
             where = cfg.origins.where(f"observations.groups.{name}")
-            raise ConfigError(f"{where}: this is what the teacher's group is called; give the student's another name")
-    # A student has no value function, and learns from no mirror images: no observation of the teacher's needs to have one.
+            raise ConfigError(f"{where}: the teacher's group has this name; rename the student's group")
+    # A student has no value function and does not learn from mirror images. The teacher's observations therefore need none.
     algorithm = replace(cfg.train.algorithm, symmetry=False, critic_warmup_iterations=0)
     return replace(
         cfg,
@@ -171,10 +169,10 @@ def with_teacher(cfg: TaskConfig, teacher: Teacher) -> TaskConfig:
 
 
 def teacher_in(path: Path, saved: Saved) -> Teacher:
-    """Return the teacher that a checkpoint of a student holds.
+    """Return the teacher stored in a student's checkpoint.
 
     Raises:
-        ConfigError: it holds none.
+        ConfigError: the checkpoint holds no teacher.
     """
     infos, name = saved["infos"], relative(path)
     try:
@@ -184,6 +182,6 @@ def teacher_in(path: Path, saved: Saved) -> Teacher:
         teacher = Teacher({"file": name, "task": "", "iteration": 0, **infos["teacher"]}, groups, network, weights)
         teacher.policy  # noqa: B018 (it is complete)
     except (KeyError, TypeError) as error:
-        raise ConfigError(f"{name}: holds no teacher to go on learning from ({error})") from error
+        raise ConfigError(f"{name}: holds no teacher to continue with ({error})") from error
     check_weights(saved["teacher_state_dict"], f"{name}: its teacher")
     return teacher

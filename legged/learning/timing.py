@@ -1,4 +1,4 @@
-"""How long a training took: timing.json in its run folder."""
+"""Duration of a training: timing.json in its run folder."""
 
 import json
 from dataclasses import asdict, dataclass, fields
@@ -14,42 +14,44 @@ TIMING_FILE = "timing.json"
 
 @dataclass(frozen=True)
 class Timing:
-    """Times of the process that trained, and what they are times of."""
+    """Times of one training process, with the work done in them."""
 
     task: str
     finished: bool
-    """Whether it came to its last iteration, or reached its target."""
+    """True if the training reached its last iteration or its target."""
     robots: int
-    """Of all processes."""
+    """Robots of all processes."""
     iterations: int
-    """That were made by this process; a resumed training has more behind it."""
+    """Iterations made by this process. A resumed training has earlier ones, made by other processes."""
     resumed: bool
     steps: int
-    """Of all robots."""
+    """Control steps of all robots."""
     start_up_s: float
-    """Until everything was built: imports, and kernels where they were compiled [s]."""
+    """Time until everything was built, with imports and the compilation of kernels [s]."""
     loop_s: float
-    """In iterations, one after the other, with what is logged of them; of rsl-rl's own loop without [s]."""
+    """Time in iterations. It includes logging, except in rsl-rl's own loop [s]."""
     wall_s: float
-    """From the start of the process to here: beside the two above, graphs captured, checkpoints and evaluations [s]."""
+    """Time since the start of the process. It adds to the two above the capture of graphs, checkpoints and evaluations [s].
+    """
     device: str
     kernels_compiled: int
-    """Modules of Warp's kernels that its cache lacked."""
+    """Modules of Warp kernels that its cache lacked."""
     beside: int = 0
-    """The most other trainings that were seen on the same device at one time; of several GPUs, on the first one's."""
+    """Largest number of other trainings seen at one time on the same device; with several GPUs, on that of the first process.
+    """
     error: str = ""
-    """What ended it, in one line, where that was neither its last iteration nor a signal."""
+    """Cause of the end, in one line; empty if that was the last iteration or a signal."""
     evaluation_s: float = 0.0
-    """In evaluations during training [s]."""
+    """Time in evaluations during training [s]."""
 
     @property
     def steps_per_s(self) -> float:
-        """Steps of all robots in a second of training loop."""
+        """Steps of all robots per second of the training loop."""
         return self.steps / max(self.loop_s, 1e-9)
 
     @property
     def company(self) -> str:
-        """With how many others the device was shared, to be written behind a comma; nothing where with none."""
+        """Text ", beside n other trainings"; empty if the device was not shared."""
         return f", beside {self.beside} other training{'s' * (self.beside > 1)}" if self.beside else ""
 
 
@@ -57,17 +59,17 @@ def write_timing(folder: Path, timing: Timing) -> None:
     """Write the times of a training into its run folder.
 
     Raises:
-        RunError: it can't be written.
+        RunError: the file can't be written.
     """
     said = asdict(timing) | {"steps_per_s": timing.steps_per_s}
     write_text(folder / TIMING_FILE, json.dumps(said, indent=1, allow_nan=False) + "\n")
 
 
 def read_timing(folder: Path) -> Timing | None:
-    """Read the times of the training of a run folder; None where it says nothing of them, as older ones do.
+    """Read the times of a training from its run folder. Return None for runs of old versions, which lack them.
 
     Raises:
-        ConfigError: the file is none that was written here.
+        ConfigError: the file is damaged.
     """
     path = folder / TIMING_FILE
     if not path.is_file():
@@ -81,4 +83,4 @@ def read_timing(folder: Path) -> Timing | None:
                 raise TypeError(f"{field.name}: expected {kind.__name__}, got {shown(said.get(field.name))}")
         return Timing(**given)
     except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
-        raise ConfigError(f"{relative(path)}: does not say how long a training took ({error})") from error
+        raise ConfigError(f"{relative(path)}: does not hold the times of a training ({error})") from error

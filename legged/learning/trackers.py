@@ -1,4 +1,6 @@
-"""Trackers beside TensorBoard, by rsl-rl's writers: W&B and others. None is needed; one that fails ends nothing."""
+"""Experiment trackers, such as W&B, that run next to TensorBoard through rsl-rl's writers. They are optional, and a failing
+tracker does not end a training.
+"""
 
 import inspect
 import sys
@@ -17,15 +19,15 @@ from legged.user_modules import find_modules_in
 
 TENSORBOARD = "tensorboard"
 FLUSH_S = 10
-"""TensorBoard's file is written so often [s]."""
+"""Interval at which TensorBoard's file is written [s]."""
 SECONDS = "/time"
-"""How names end whose steps are seconds; trackers count iterations."""
+"""Ending of the tags whose steps are seconds. Trackers count iterations, so they don't get these."""
 FILES = ("config.yaml", "code.diff", "timing.json", "report.html", "report.md", "evaluation_*.json", "*.gif", "*.png")
-"""What of a run folder is handed to a tracker at the end, beside videos."""
+"""Files of a run folder that a tracker gets at the end, in addition to videos."""
 
 
 def check_tracker(cfg: TaskConfig) -> None:
-    """Look whether the tracker that a configuration asks for is there.
+    """Check that the configured tracker is available.
 
     Raises:
         ConfigError: it is not.
@@ -35,8 +37,8 @@ def check_tracker(cfg: TaskConfig) -> None:
 
 
 def _writer_class(cfg: TaskConfig) -> type[LogWriter]:
-    """Return the class of the writer that a configuration asks for. Raises as `check_tracker`."""
-    from rsl_rl.utils import neptune_log_writer, wandb_log_writer  # they import their trackers, where those are installed
+    """Return the class of the configured writer. Raises the errors of `check_tracker`."""
+    from rsl_rl.utils import neptune_log_writer, wandb_log_writer  # these modules import their trackers if installed
 
     name, where = cfg.train.runner.logger, cfg.origins.where("train.runner.logger")
     known: dict[str, tuple[Any, str, type]] = {
@@ -55,7 +57,7 @@ def _writer_class(cfg: TaskConfig) -> type[LogWriter]:
     find_modules_in(str(Path.cwd()))
     try:
         found = getattr(import_module(module), attribute)
-    except Exception as error:  # whatever a user's module does
+    except Exception as error:  # a user's module can raise anything
         raise ConfigError(f"{where}: {shown(name)} can't be imported ({type(error).__name__}: {error})") from error
     if not (isinstance(found, type) and issubclass(found, LogWriter)):
         raise ConfigError(f"{where}: {shown(name)} does not extend rsl_rl.utils.log_writer.LogWriter")
@@ -63,11 +65,11 @@ def _writer_class(cfg: TaskConfig) -> type[LogWriter]:
 
 
 def open_writer(cfg: TaskConfig, folder: str) -> "SummaryWriter | Tracker":
-    """Open the writers that a configuration asks for, for a run folder: TensorBoard's, and maybe a tracker's beside it.
+    """Open the configured writers for a run folder: TensorBoard's, and that of a tracker if there is one.
 
     Raises:
-        ConfigError: as `check_tracker`.
-        RunError: the tracker does not start: nobody has logged in, or it can't be reached.
+        ConfigError: as in `check_tracker`.
+        RunError: the tracker does not start, for want of a login or a connection.
     """
     runner = cfg.train.runner
     if runner.logger == TENSORBOARD:
@@ -79,14 +81,14 @@ def open_writer(cfg: TaskConfig, folder: str) -> "SummaryWriter | Tracker":
     try:
         writer = kind(**given)
         writer.store_config(_Plain(to_dict(cfg)), to_dict(cfg.train))
-    except Exception as error:  # of each tracker its own
+    except Exception as error:  # each tracker raises its own types
         text = " ".join(str(error).split()) or type(error).__name__
         raise RunError(f"train.runner.logger: {runner.logger} does not start: {text[:300]}") from error
     return Tracker(writer, folder)
 
 
 class _Plain:
-    """A configuration as rsl-rl's writers ask for it."""
+    """Adapter that gives rsl-rl's writers the configuration as a dictionary."""
 
     def __init__(self, values: dict[str, Any]) -> None:
         self._values = values
@@ -96,10 +98,10 @@ class _Plain:
 
 
 class Tracker(LogWriter):
-    """TensorBoard with a tracker beside it. A tracker that fails is told of once and left out from then on."""
+    """Writer to TensorBoard and a tracker. After the first failure it prints a warning and leaves the tracker out."""
 
     def __init__(self, writer: LogWriter, folder: str) -> None:
-        """`writer` is the tracker's, which may write TensorBoard's file itself, as rsl-rl's do."""
+        """Take the tracker's `writer`, which may write TensorBoard's file itself, as rsl-rl's writers do."""
         self._writer = writer
         self._both = isinstance(writer, SummaryWriter)
         self._tensorboard = writer if isinstance(writer, SummaryWriter) else SummaryWriter(folder, flush_secs=FLUSH_S)
@@ -125,11 +127,11 @@ class Tracker(LogWriter):
         self._try(self._writer.stop)
 
     def close(self) -> None:
-        """End TensorBoard's file; the tracker stays open for what is written at the end of a run."""
+        """Close TensorBoard's file. The tracker stays open for files written at the end of a run."""
         self._tensorboard.close()
 
     def hand_over(self, folder: Path, iteration: int) -> None:
-        """Give the tracker the videos and reports that are in a run folder, then end it."""
+        """Give the tracker the videos and reports of a run folder, then close it."""
         for pattern in FILES:
             for path in sorted(folder.glob(pattern)):
                 self.save_file(str(path))
@@ -143,7 +145,7 @@ class Tracker(LogWriter):
             return
         try:
             call()
-        except Exception as error:  # the network's, the tracker's
+        except Exception as error:  # errors of the network or the tracker
             self._failed = True
             text = " ".join(str(error).split()) or type(error).__name__
             print(f"warning: the tracker has failed and is left out: {text[:300]}", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""Networks of another training, with which `legged train --transfer` begins."""
+"""Transfer of networks from another training, for `legged train --transfer`."""
 
 from collections.abc import Iterable, Mapping
 from itertools import zip_longest
@@ -26,36 +26,38 @@ from legged.registry import task_config
 from legged.robots.robot import load_robot
 
 OPTIMIZERS = {"adam": "Adam", "adamw": "AdamW", "sgd": "SGD", "rmsprop": "RMSprop"}
-"""Optimisers by their names in a configuration."""
+"""Optimiser's name in a configuration -> name in torch."""
 
 Terms = dict[str, int | None]
-"""Term -> its width, None where that is not known, in order."""
+"""Terms of an observation group, in order: name -> width, or None if unknown."""
 
 
 def transferred(
     task: str, overrides: Iterable[tuple[str, Any]], source: str, iteration: int | str | None, on_cpu: bool
 ) -> tuple[TaskConfig, Path]:
-    """Return the configuration to train `task` with, and the checkpoint to begin with: that of the run that `source` names as
-    POLICY, at an iteration, 'best' or None for the latest. All that can be compared without building the task is compared.
+    """Return the configuration to train `task` with, and the checkpoint to begin with. `source` names a run or policy;
+    `iteration` is a number, 'best', or None for the latest.
+
+    The checkpoint is compared with the configuration as far as possible without building the task.
 
     Raises:
-        ConfigError: there is no such run, or its robot, observations or networks are others.
+        ConfigError: there is no such run, or its robot, observations or networks differ.
     """
     cfg = task_config(task, overrides, on_cpu)
     if learns_from_teacher(cfg):
-        raise ConfigError(f"--transfer: '{cfg.task}' learns from a teacher, and begins anew; --teacher names that one")
+        raise ConfigError(f"--transfer: '{cfg.task}' learns from a teacher, and begins anew; --teacher names the teacher")
     path = find_checkpoint(run_named(source, "--transfer"), iteration)
     check_source(path, read_checkpoint(path), cfg)
     return cfg, path
 
 
 def check_source(path: Path, saved: Saved, cfg: TaskConfig) -> None:
-    """Compare a checkpoint with the configuration of another task, as far as can be without building that.
+    """Compare a checkpoint with the configuration of another task, as far as possible without building that task.
 
     Raises:
-        ConfigError: its robot, observations or networks are others.
+        ConfigError: the robot, observations or networks differ.
     """
-    saved = what_is_taken(saved, cfg)
+    saved = transferable_parts(saved, cfg)
     if "critic_state_dict" not in saved and not cfg.train.algorithm.critic_warmup_iterations:
         raise ConfigError(
             f"{relative(path)}: holds a policy alone, without a value function; it can be played, not trained on"
@@ -71,9 +73,9 @@ def check_source(path: Path, saved: Saved, cfg: TaskConfig) -> None:
     check_networks_fit(relative(path), saved, cfg)
 
 
-def what_is_taken(saved: Saved, cfg: TaskConfig) -> Saved:
-    """Return the parts of a checkpoint that a training of `cfg` begins with: all of them; or where its value function learns
-    alone at first, the policy.
+def transferable_parts(saved: Saved, cfg: TaskConfig) -> Saved:
+    """Return the parts of a checkpoint with which a training of `cfg` begins: all parts, or only the policy if the value
+    function learns alone at first.
     """
     if not cfg.train.algorithm.critic_warmup_iterations:
         return saved
@@ -82,10 +84,10 @@ def what_is_taken(saved: Saved, cfg: TaskConfig) -> Saved:
 
 
 def check_built(path: Path, saved: Saved, task: BaseTask) -> None:
-    """Compare the observations and actions of a task with those of a checkpoint, now with their widths.
+    """Compare the observations and actions of a built task with those of a checkpoint, with their widths.
 
     Raises:
-        ConfigError: they are others.
+        ConfigError: they differ.
     """
     cfg = task.cfg
     here: dict[str, Terms] = {name: {**terms} for name, terms in observation_layout(task).items()}
@@ -99,8 +101,8 @@ def check_built(path: Path, saved: Saved, task: BaseTask) -> None:
 
 
 def made_for(path: Path, saved: Saved) -> Mapping[str, Any]:
-    """Return the `name` and the `joints` of the robot of a checkpoint; nothing if it has none. Those of a file from before
-    they were written are its run's.
+    """Return `name` and `joints` of a checkpoint's robot; empty without a robot. For old files, the run's configuration gives
+    them.
     """
     said: dict[str, Any] = saved["infos"].get("robot", {})
     if "joints" in said or saved["infos"].get("format", 1) > 1:
@@ -113,7 +115,7 @@ def made_for(path: Path, saved: Saved) -> Mapping[str, Any]:
 
 
 def terms_of(path: Path, saved: Saved) -> dict[str, Terms]:
-    """Return the terms of each observation group of a checkpoint, or of its run's if it does not say them."""
+    """Return the terms of each observation group of a checkpoint. For old files, the run's configuration gives them."""
     layout = saved["infos"].get("observations")
     if layout is not None:
         return layout
@@ -132,7 +134,7 @@ def _check_observations(
     """Compare the groups that `networks` read, term by term.
 
     Raises:
-        ConfigError: some differ; with the first difference of each.
+        ConfigError: some differ; the text gives the first difference of each.
     """
     differences = []
     for name in dict.fromkeys(group for network in networks for group in groups_of(cfg, network)):
@@ -147,7 +149,7 @@ def _check_observations(
 
 
 def first_difference(here: Terms, there: Terms) -> str:
-    """Return in what the terms of a group differ first, in name, place or width; empty if they are the same."""
+    """Return the first difference between the terms of two groups, in name, place or width; empty if they are equal."""
     for number, (mine, theirs) in enumerate(zip_longest(here.items(), there.items()), 1):
         if mine is None or theirs is None or mine[0] != theirs[0] or (None not in (mine[1], theirs[1]) and mine != theirs):
             return f"term {number} is {_shown(mine)} here, {_shown(theirs)} there"
@@ -155,15 +157,15 @@ def first_difference(here: Terms, there: Terms) -> str:
 
 
 def _shown(term: tuple[str, int | None] | None) -> str:
-    """Return a term as an error shows it: 'heights' (187)."""
+    """Return a term as text for an error, such as 'heights' (187)."""
     if term is None:
         return "none"
     name, width = term
     return f"'{name}'" if width is None else f"'{name}' ({width})"
 
 
-def tell_taken(path: Path, saved: Saved, actor: Any, cfg: TaskConfig, learning_rate: float) -> str:
-    """Return in words what was taken from a checkpoint, as it is in the networks now, and what begins anew."""
+def transfer_summary(path: Path, saved: Saved, actor: Any, cfg: TaskConfig, learning_rate: float) -> str:
+    """Return a text of two lines: the parts of a checkpoint that the networks hold now, and the parts that begin anew."""
     sizes = [_sizes(network) for network in described_networks(saved).values()]
     alone = len(sizes) == 1
     networks = f"actor and critic {sizes[0]}" if len({*sizes}) == 1 else f"actor {sizes[0]} and critic {sizes[-1]}"
@@ -194,7 +196,7 @@ def tell_taken(path: Path, saved: Saved, actor: Any, cfg: TaskConfig, learning_r
 
 
 def _from(path: Path, saved: Saved) -> str:
-    """Return in words which checkpoint was taken from."""
+    """Return a text that names the source checkpoint."""
     task = saved["infos"].get("task", "no task named")
     return f"took from {relative(path.parent)} ({task}, iteration {saved['iter']})"
 

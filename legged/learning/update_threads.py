@@ -1,4 +1,4 @@
-"""How many threads compute an update on the CPU: as many as there are cores, unless one is faster because others are busy."""
+"""Number of threads for an update on the CPU: all cores, or one if other programs keep the cores busy."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -7,30 +7,33 @@ from contextlib import contextmanager
 import torch
 
 SLOWER = 1.3
-"""An update that takes so many times as long as the best with as many threads means that the machine is shared."""
+"""Factor by which an update must exceed the best time, with the same number of threads, to show that the machine is shared.
+"""
 LOOK_AGAIN = 20
-"""Updates with one thread after which all are tried again."""
+"""Number of updates with one thread, after which all threads are tried again."""
 
 
 class UpdateThreads:
-    """Chooses the number of torch's threads for each update by how long the last ones took.
+    """Chooser of torch's number of threads for each update, based on the times of the last updates.
 
-    With several threads an operation ends when the slowest has its core; beside another program that takes one core of two,
-    one thread is faster. For networks and batches as ours the numbers are the same however many threads compute them.
+    With several threads an operation ends when the slowest thread gets its core. If another program takes one core of two,
+    one thread is faster. The results do not depend on the number of threads (cpu_layers.py).
     """
 
     def __init__(self, most: int, clock: Callable[[], float] = time.perf_counter) -> None:
-        """`most` are the cores that may be used; `clock` gives seconds."""
+        """Take the number `most` of cores that may be used, and a `clock` that returns seconds."""
         self._most, self._clock = max(most, 1), clock
         self._last: dict[int, float] = {}
         self._best: dict[int, float] = {}
         self._since = 0
         self.count = self._most
-        """Threads of the next update."""
+        """Number of threads of the next update."""
 
     @contextmanager
     def use(self) -> Iterator[None]:
-        """Compute an update in the block; elsewhere torch uses one thread, and the cores are left to physics."""
+        """Run an update in the block with the chosen number of threads. Elsewhere torch uses one thread, and the other cores
+        do physics.
+        """
         before = torch.get_num_threads()
         torch.set_num_threads(self.count)
         start = self._clock()
@@ -50,7 +53,7 @@ class UpdateThreads:
         if used == self._most:
             shared = seconds > SLOWER * self._best[used]
             unknown = 1 not in self._last
-            # Try one thread once, and again whenever all of them have become slow.
+            # Try one thread once, and again whenever updates with all threads have become slow.
             self.count = 1 if shared or unknown or self._last[1] < seconds else self._most
             if self.count == 1:
                 self._since = 0

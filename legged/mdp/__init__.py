@@ -1,1 +1,1 @@
-"""The parts of a Markov decision process: each a noun, in torch, for N environments at once."""
+"""The parts of a Markov decision process, each for N environments at once, in torch."""

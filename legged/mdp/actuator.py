@@ -1,7 +1,7 @@
-"""Motors that are not ideal: delay of targets, torque over speed, friction of joints, laws that were learned from data.
+"""Motors that are not ideal: delay of targets, torque-speed line, friction of joints, actuators learned from data.
 
-The torque-speed line is that of a direct-current motor: its torque falls from the stall torque at rest to nothing at the
-no-load speed (any textbook; Isaac Lab's DCMotor, mjlab's dc_actuator and Newton's ClampingDCMotor have the same one).
+The torque-speed line is that of a direct-current motor: its torque falls from the stall torque at rest to zero at the no-load
+speed (any textbook; Isaac Lab's DCMotor, mjlab's dc_actuator and Newton's ClampingDCMotor have the same line).
 Friction is Coulomb's and viscous friction with the Stribeck effect, after Armstrong-Helouvry, Dupont, Canudas de Wit, "A
 survey of models, analysis tools and compensation methods for the control of machines with friction", Automatica 30 (1994),
 smoothed at rest.
@@ -20,7 +20,7 @@ from legged.config.schema import ActuatorConfig, LeggedControlConfig
 from legged.errors import ConfigError
 from legged.math import masked_set_
 from legged.mdp.actuator_network import ActuatorNetwork, NetworkWeights
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.random_pool import RandomPool
 from legged.robots.patterns import match_names
 from legged.robots.robot import Robot
 
@@ -28,36 +28,39 @@ if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
 
 LARGEST_GAIN = 2.0
-"""Change of a joint's speed within a physics step that its torque-speed line may cause, over how far the speed is off."""
+"""Largest gain of a torque-speed line: the change of a joint's speed within a physics step, divided by the distance of its
+speed from the line. With a larger gain the speed diverges."""
 
 
 def is_ideal(cfg: ActuatorConfig) -> bool:
-    """Return whether motors give what the control law asks for, at once, up to their effort limit."""
+    """Return whether motors give the torque of the control law at once, up to their effort limit."""
     friction = any(any(table.values()) for table in (cfg.coulomb_friction, cfg.breakaway_friction, cfg.viscous_friction))
     return cfg.model == "ideal" and not friction and cfg.delay == (0, 0) and not cfg.network
 
 
 class MotorCurve:
-    """Between what torques the motors of D joints can choose at a velocity."""
+    """Torque-speed lines of the motors of D joints, which limit the torque at a velocity."""
 
     def __init__(self, stall_torque: Tensor, no_load_speed: Tensor) -> None:
-        """Take what a motor gives at rest [N m] and at what speed it gives nothing [rad/s], (D,) each. A motor is ideal where
-        both are infinite: it gives what the joint bears, whatever is drawn for that.
+        """Set the torque at rest [N m] and the speed at which the torque is zero [rad/s], (D,) each. A motor is ideal if both
+        are infinite: only the effort limit of its joint limits its torque.
         """
         self.stall_torque, self.no_load_speed = stall_torque, no_load_speed
-        """(D,) each; no-load speeds (N, D) once they `vary` from robot to robot."""
+        """(D,) each. No-load speeds become (N, D) at the first call of `vary`."""
         self.nominal_speed = no_load_speed
 
     def vary(self, factor: Tensor) -> None:
-        """Multiply no-load speeds by a factor (N, 1) or (N, D). The first call allocates, later ones write in place."""
+        """Set no-load speeds to their nominal values times `factor`, (N, 1) or (N, D). The first call allocates; later calls
+        write in place.
+        """
         if self.no_load_speed is self.nominal_speed:
             self.no_load_speed = factor * self.nominal_speed
             return
         torch.mul(self.nominal_speed, factor, out=self.no_load_speed)
 
     def limits(self, dof_vel: Tensor, effort: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the lowest and the highest torque (N, D) [N m] at velocities (N, D) [rad/s], where joints bear `effort`,
-        (D,) or (N, D) [N m].
+        """Return the lowest and the highest torque (N, D) [N m] at velocities (N, D) [rad/s], within the effort limits
+        `effort`, (D,) or (N, D) [N m].
         """
         share = dof_vel / self.no_load_speed
         high = torch.minimum(torch.maximum(self.stall_torque * (1.0 - share), -effort), effort)
@@ -66,29 +69,30 @@ class MotorCurve:
 
 
 class Friction:
-    """Torque by which D joints resist their motion."""
+    """Friction torque of D joints: Coulomb, Stribeck and viscous friction."""
 
     def __init__(
         self, coulomb: Tensor, breakaway: Tensor, viscous: Tensor, stribeck_velocity: float, smoothing: float
     ) -> None:
-        """Take friction of a moving joint and at the start of its motion [N m] and viscous friction [N m s/rad], (D,) each,
-        and the speeds [rad/s] by which it falls from the one to the other, and below which it fades.
+        """Set the coefficients, (D,) each: `coulomb` is the friction of a moving joint and `breakaway` that at the start of a
+        motion [N m]; `viscous` is in [N m s/rad]. Friction falls from `breakaway` to `coulomb` over `stribeck_velocity`, and
+        fades to zero below the speed `smoothing` [rad/s].
         """
         self.coulomb, self.extra, self.viscous = coulomb, breakaway - coulomb, viscous
         self.stribeck_velocity, self.smoothing = stribeck_velocity, smoothing
 
     def torques(self, dof_vel: Tensor) -> Tensor:
-        """Return (N, D) [N m], with the sign of the velocities (N, D) [rad/s]."""
+        """Return the friction (N, D) [N m], with the sign of the velocities (N, D) [rad/s]."""
         slow = torch.exp(-(dof_vel / self.stribeck_velocity).square())
         return (self.coulomb + self.extra * slow) * torch.tanh(dof_vel / self.smoothing) + self.viscous * dof_vel
 
 
 class Actuator:
-    """What stands between targets and joint torques, of N robots with D joints.
+    """Actuators of N robots with D joints: delay, motor and friction between targets and joint torques.
 
-    Targets come once a control step. Each robot has them after its delay of some physics steps; before the first has come,
-    its joints have the target of action 0. What the law asks for is then limited to what the motor can give, and less by
-    friction.
+    A target is set once a control step. It reaches the law after the robot's delay, in physics steps; before the first target
+    arrives, joints have the target of action 0. The torque of the law is limited to that of the motor, then friction is
+    subtracted.
     """
 
     STATE: tuple[str, ...] = ("targets", "delay")
@@ -100,13 +104,14 @@ class Actuator:
         middle: Tensor,
         shape: tuple[int, int],
         sim_dt: float,
-        numbers: UniformNumbers,
+        numbers: RandomPool,
         kernels: "TaskKernels | None" = None,
     ) -> None:
-        """Build for `shape` (N, D) on the device of `middle`, the target of action 0 (D,) or (). Delays come from `numbers`.
+        """Build actuators of `shape` (N, D) on the device of `middle`, the target of action 0, (D,) or (). Delays are drawn
+        from the pool `numbers`.
 
         Raises:
-            ConfigError: as `check_actuator`.
+            ConfigError: as for `check_actuator`.
         """
         check_actuator(robot, cfg, sim_dt)
         actuator, device = cfg.actuator, middle.device
@@ -117,7 +122,7 @@ class Actuator:
 
         self.decimation, self._kernels = cfg.decimation, kernels
         self.middle = middle
-        """(D,), (N, D) or () the target of action 0."""
+        """(D,), (N, D) or () target of action 0."""
         stall, fastest = map(tensor, motor_numbers(robot, actuator))
         self.curve = MotorCurve(torch.where(fastest.isfinite(), stall, torch.inf), fastest)
         coulomb, breakaway, viscous = map(tensor, friction_numbers(robot, actuator))
@@ -127,12 +132,12 @@ class Actuator:
         self._has_curve = actuator.model == "dc_motor"
         low, high = actuator.delay
         self.shortest, self.longest = low, high
-        """Range of the delay, in physics steps."""
+        """Range of the delay, in physics steps, ends included."""
         kept = 1 + math.ceil(high / cfg.decimation)
         self.targets = middle.expand(kept, n, joints).clone()
-        """(K, N, D) targets of this control step and of those before."""
+        """(K, N, D) targets of the last K control steps, newest first."""
         self.newest = self.targets[0]
-        """(N, D) the target of this control step, to be written."""
+        """(N, D) target of this control step, which the control law writes."""
         self.delay = torch.full((n,), high, dtype=torch.int32, device=device)
         """(N,) delay of each robot, in physics steps."""
         self._varies = actuator.delay_varies and low < high
@@ -147,7 +152,7 @@ class Actuator:
             self.STATE = (*self.STATE, "past")
 
     def describe(self, joint: int) -> str:
-        """Return what is not ideal about the motor of a joint, in a few words."""
+        """Return the properties of a joint's motor that are not ideal, in a few words."""
         curve, friction, parts = self.curve, self.friction, []
         if self.network is not None and bool(self._by_network[joint]):
             parts.append(f"torque by a network ({self.network.kind})")
@@ -163,12 +168,12 @@ class Actuator:
 
     @property
     def past(self) -> Tensor:
-        """What a network remembers."""
+        """Hidden state of the network."""
         assert self.network is not None
         return self.network.state
 
     def advance(self) -> None:
-        """Make room for a new target, which is to be written to `newest`."""
+        """Shift the targets by one control step. Afterwards the new target must be written to `newest`."""
         if len(self.targets) > 1:
             self.targets[1:].copy_(self.targets[:-1].clone())
         self._steps = 0
@@ -190,9 +195,11 @@ class Actuator:
         effort: Tensor,
         out: Tensor,
     ) -> None:
-        """Write to `out` the torques (N, D) of one physics step at joint angles [rad] and velocities [rad/s], (N, D) each.
-        `law` makes of targets the torques that are asked for; where it is the P law, `gains` are its stiffness and damping.
-        Joints bear `effort` [N m]; it and gains are (D,) or (N, D).
+        """Write to `out` the torques (N, D) [N m] of one physics step, at joint angles [rad] and velocities [rad/s], (N, D)
+        each.
+
+        `law` computes the commanded torques (N, D) from targets (N, D). For the P law, `gains` are its stiffness and damping.
+        `effort` are the effort limits of the joints [N m]. Gains and limits are (D,) or (N, D).
         """
         if self._kernels is not None and gains is not None and self.network is None:
             curve, friction = self.curve, self.friction
@@ -212,7 +219,7 @@ class Actuator:
         self._steps += 1
 
     def _limit(self, asked: Tensor, dof_vel: Tensor, effort: Tensor, out: Tensor) -> None:
-        """Write to `out` what motors give of the torques that are asked for, less friction, (N, D) each."""
+        """Write to `out` (N, D) the commanded torques `asked` (N, D), limited by the motors, less friction [N m]."""
         if self._has_curve:
             low, high = self.curve.limits(dof_vel, effort)
             asked = torch.minimum(torch.maximum(asked, low), high)
@@ -223,10 +230,12 @@ class Actuator:
         torch.clamp(asked, -effort, effort, out=out)
 
     def reset(self, mask: Tensor) -> None:
-        """Forget the past of the robots in `mask` (N,) and draw their delay; where delays vary, draw those of all robots."""
+        """Reset the state of the robots in `mask` (N,), and draw their delay. With delay_varies, draw the delay of all
+        robots.
+        """
         if self._drawn is not None:
             drawn = self._drawn.values[:, 0].clamp(max=float(self.longest)).int()
-            if self._varies:  # what arrived by the last physics step stays, however late the next target is
+            if self._varies:  # a target that arrived by the last physics step stays in force, however late the next one is
                 latest = (torch.div(self.delay, self.decimation, rounding_mode="floor") + 1) * self.decimation
                 torch.where(mask, drawn, torch.minimum(drawn, latest), out=self.delay)
             else:
@@ -238,11 +247,11 @@ class Actuator:
 
 
 def modelled_joints(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str) -> tuple[int, ...]:
-    """Return the joints that have the model, and the network if there is one. `where` makes of a dotted path how an error
-    begins.
+    """Return the indices of the joints that have the motor model, and the network if there is one. `where` turns a dotted
+    path into the beginning of an error message.
 
     Raises:
-        ConfigError: a pattern that matches no joint.
+        ConfigError: a pattern matches no joint.
     """
     if not cfg.joints:
         return tuple(range(robot.num_dof))
@@ -250,11 +259,11 @@ def modelled_joints(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], st
 
 
 def motor_numbers(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str) -> tuple[np.ndarray, np.ndarray]:
-    """Return stall torque [N m] and no-load speed [rad/s] of all joints, (D,); that of ideal motors is infinite. `where` is
-    as for `modelled_joints`.
+    """Return stall torque [N m] and no-load speed [rad/s] of all joints, (D,) each. The speed of ideal motors is infinite.
+    `where` is as for `modelled_joints`.
 
     Raises:
-        ConfigError: as there, or a motor whose speed nobody states.
+        ConfigError: a pattern matches no joint, or a motor has neither a no-load speed nor a velocity limit.
     """
     stall = by_joint(cfg.stall_torque, robot, where("control.actuator.stall_torque"), robot.torque_limits)
     speed = by_joint(cfg.no_load_speed, robot, where("control.actuator.no_load_speed"), robot.dof_vel_limits)
@@ -266,11 +275,11 @@ def motor_numbers(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str]
 
 
 def with_rotors(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str) -> Robot:
-    """Return the robot with the rotors that the configuration states, the same one if there are none. `where` is as for
-    `modelled_joints`.
+    """Return the robot with the rotor inertias of the configuration (control.actuator.armature), or the same robot if there
+    are none. `where` is as for `modelled_joints`.
 
     Raises:
-        ConfigError: a pattern that matches no joint.
+        ConfigError: a pattern matches no joint.
     """
     if not cfg.armature:
         return robot
@@ -280,11 +289,11 @@ def with_rotors(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] =
 def friction_numbers(
     robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Coulomb friction, friction at the start of a motion [N m] and viscous friction [N m s/rad] of all joints, (D,).
-    `where` is as for `modelled_joints`.
+    """Return Coulomb and breakaway friction [N m] and viscous friction [N m s/rad] of all joints, (D,) each. `where` is as
+    for `modelled_joints`.
 
     Raises:
-        ConfigError: a pattern that matches no joint, or less friction at the start of a motion than in it.
+        ConfigError: a pattern matches no joint, or breakaway friction is below Coulomb friction.
     """
     nothing = np.zeros(robot.num_dof)
     coulomb = by_joint(cfg.coulomb_friction, robot, where("control.actuator.coulomb_friction"), nothing)
@@ -295,17 +304,17 @@ def friction_numbers(
         least = f"its coulomb_friction of {coulomb[joint]:g} N m"
         raise ConfigError(
             f"{where('control.actuator.breakaway_friction')}: {breakaway[joint]:g} N m for '{robot.joint_names[joint]}' is"
-            f" less than {least}; what a joint must overcome to begin to move is at least that"
+            f" less than {least}; breakaway friction must be at least Coulomb friction"
         )
     return coulomb, breakaway, viscous
 
 
 def by_joint(table: Mapping[str, float], robot: Robot, where: str, otherwise: np.ndarray) -> np.ndarray:
-    """Return for each joint the number of the longest pattern in its name, (D,), and of joints without one that of
-    `otherwise`.
+    """Return a number for each joint, (D,): the entry of the longest pattern of `table` in the joint's name, else that of
+    `otherwise` (D,).
 
     Raises:
-        ConfigError: a pattern that matches no joint.
+        ConfigError: a pattern matches no joint.
     """
     match_names(tuple(table), robot.joint_names, where)
     found = [max((p for p in table if p in name), key=len, default=None) for name in robot.joint_names]
@@ -313,11 +322,12 @@ def by_joint(table: Mapping[str, float], robot: Robot, where: str, otherwise: np
 
 
 def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where: Callable[[str], str] = str) -> None:
-    """Look whether the actuators fit the robot, its control law and the physics step. `where` is as for `modelled_joints`.
+    """Check that the actuators fit the robot, its control law and the physics step `sim_dt` [s]. `where` is as for
+    `modelled_joints`.
 
     Raises:
-        ConfigError: a pattern matches no joint, a speed is missing, a motor is too strong for the physics step, or a network
-            is not there, is none, needs another law than P or another time step.
+        ConfigError: a pattern matches no joint, a speed is missing, a motor is too strong for the physics step, or the
+            network file is missing or invalid, or needs the P law or another physics step.
     """
     actuator = cfg.actuator
     _check_line(with_rotors(robot, actuator, where), *motor_numbers(robot, actuator, where), sim_dt, where)
@@ -330,11 +340,12 @@ def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where:
 
 
 def check_motor_model(actuator: ActuatorConfig, origins: Origins) -> None:
-    """Look whether numbers of a torque-speed line are given to motors that have none. Who says `ideal` may leave those of a
-    file: so the same motors are tried without their line.
+    """Check that ideal motors are given no torque-speed line by mistake. A setting `ideal` is allowed over the numbers of a
+    file, so that the same motors can be tried without their line.
 
     Raises:
-        ConfigError: nobody has said what the motors are, or the command line gives numbers and leaves them ideal.
+        ConfigError: numbers of a line are given and the motor model is not set, or the command line gives the numbers and
+            does not set the model to `ideal` as well.
     """
     path, told = "control.actuator.model", origins.of("control.actuator.model")
     for name in ("stall_torque", "no_load_speed"):
@@ -343,7 +354,7 @@ def check_motor_model(actuator: ActuatorConfig, origins: Origins) -> None:
         where = f"control.actuator.{name}"
         if told == "the default" or (origins.of(where) == "command line" and told != "command line"):
             raise ConfigError(
-                f"{origins.where(where)}: is of motors with a torque-speed line, and these are ideal: "
+                f"{origins.where(where)}: only motors with a torque-speed line have it, and these are ideal: "
                 f"set {path} to dc_motor, or to ideal if that is meant"
             )
 
@@ -351,11 +362,11 @@ def check_motor_model(actuator: ActuatorConfig, origins: Origins) -> None:
 def check_slowest(
     robot: Robot, cfg: LeggedControlConfig, sim_dt: float, lowest: float, where: Callable[[str], str] = str
 ) -> None:
-    """Look whether torque-speed lines still fit the physics step where no-load speeds are drawn, at the `lowest` factor on
-    them. `where` is as for `modelled_joints`.
+    """Check that torque-speed lines fit the physics step if no-load speeds are randomised, at the `lowest` factor on them.
+    `where` is as for `modelled_joints`.
 
     Raises:
-        ConfigError: a motor is too strong for the physics step then, as for `check_actuator`.
+        ConfigError: at that factor a motor is too strong for the physics step, as for `check_actuator`.
     """
     gain = _line_gains(with_rotors(robot, cfg.actuator, where), *motor_numbers(robot, cfg.actuator, where), sim_dt)
     i = int(np.argmax(gain))
@@ -369,15 +380,20 @@ def check_slowest(
 
 
 def _line_gains(robot: Robot, stall: np.ndarray, speed: np.ndarray, sim_dt: float) -> np.ndarray:
-    """Return by how much a joint in the air gets faster or slower within a physics step, over how far its speed is off the
-    line of its motor, (D,); 0 of ideal motors, whose speed is infinite.
+    """Return the gain of each torque-speed line, (D,): the change of speed of a joint in the air within a physics step,
+    divided by the distance of its speed from the line. It is 0 for ideal motors, whose no-load speed is infinite.
     """
     return sim_dt * stall / (robot.inertia * speed)
 
 
 def _check_line(robot: Robot, stall: np.ndarray, speed: np.ndarray, sim_dt: float, where: Callable[[str], str]) -> None:
-    """Raise ConfigError where a torque-speed line is so steep that a joint in the air gains or loses more than twice the
-    speed that it is off within a physics step: on its line such a motor pushes and brakes in turn, and gets nowhere.
+    """Check that no torque-speed line is too steep for the physics step.
+
+    On a line with a gain above LARGEST_GAIN a joint in the air changes its speed, within a physics step, by more than twice
+    its distance from the line. Such a motor pushes and brakes in turn.
+
+    Raises:
+        ConfigError: a line is too steep.
     """
     gain = _line_gains(robot, stall, speed, sim_dt)
     i = int(np.argmax(gain))
@@ -389,5 +405,5 @@ def _check_line(robot: Robot, stall: np.ndarray, speed: np.ndarray, sim_dt: floa
         f"{where('control.actuator.stall_torque')}: '{name}' turns {inertia:.2g} kg m^2 with the leg in the air, by a motor "
         f"of {stall[i]:g} N m at rest and none at {speed[i]:g} rad/s: in physics steps of {sim_dt:g} s it would push and "
         f"brake in turn. Give its rotor's inertia (control.actuator.armature, {1.06 * rotor:.2g} kg m^2 or more), or make "
-        f"sim.dt {0.94 * sim_dt * LARGEST_GAIN / gain[i]:.2g} s or less"  # of two digits, to the safe side
+        f"sim.dt {0.94 * sim_dt * LARGEST_GAIN / gain[i]:.2g} s or less"  # factors round two digits to the safe side
     )

@@ -1,7 +1,9 @@
-"""Actuators learned from data: joint torque from errors and velocities of the last moments (MLP), or from all before (LSTM).
+"""Actuators learned from data: a network predicts joint torque from position errors and velocities. An MLP sees the last few
+samples; an LSTM remembers all samples.
 
 The MLP is that of Hwangbo et al., "Learning agile and dynamic motor skills for legged robots", Science Robotics 4 (2019),
-eaau5872: position error and velocity now and at two moments before, small layers with softsign. All joints share one network.
+eaau5872: position error and velocity of now and of two earlier samples, small layers with softsign. All joints share a
+network.
 """
 
 from dataclasses import dataclass, field
@@ -22,28 +24,29 @@ KINDS = ("mlp", "lstm")
 FORMAT = 1
 """Version of the file's layout."""
 WIDEST, DEEPEST = 1024, 16
-"""Units of a layer, and layers, at most."""
+"""Largest number of units in a layer, and of layers."""
 TOLERANCE = 1e-3
-"""Share of a physics step by which the samples of a network may lie beside physics steps."""
+"""Largest deviation between samples of a network and physics steps, as a share of a physics step."""
 
 
 @dataclass(frozen=True)
 class NetworkWeights:
-    """What a file of a learned actuator holds (.npz, nothing in it is code)."""
+    """Contents of a file of a learned actuator (.npz, without code)."""
 
     kind: str
     """`mlp` or `lstm`."""
     dt: float
-    """Time between the samples that it was trained on [s]."""
+    """Time between the samples that the network was trained on [s]."""
     samples: int
-    """Samples that an MLP sees: now and at `samples - 1` moments before, `dt` apart; 1 for an LSTM."""
+    """Samples that an MLP sees: the current one and `samples - 1` earlier ones, `dt` apart. 1 for an LSTM."""
     scales: np.ndarray
     """(3,) factors on position errors [1/rad], on velocities [s/rad] and on the output [N m]."""
     layers: tuple[dict[str, np.ndarray], ...]
-    """Of each linear layer `weight` (out, in) and `bias` (out,); an LSTM's cells before, with `input` (4 H, in), `hidden`
-    (4 H, H) and `bias` (4 H,), for the gates i, f, g, o in torch's order."""
+    """Weights by layer. A linear layer has `weight` (out, in) and `bias` (out,). The cells of an LSTM come first, with
+    `input` (4 H, in), `hidden` (4 H, H) and `bias` (4 H,), for the gates i, f, g, o in torch's order.
+    """
     facts: dict[str, float] = field(default_factory=dict)
-    """What the fit says of itself, such as its error on data that it had not seen."""
+    """Figures of the fit, such as its error on held-out data."""
 
     def save(self, path: Path) -> None:
         """Write the file."""
@@ -55,27 +58,32 @@ class NetworkWeights:
 
     @classmethod
     def load(cls, path: str | Path, where: str = "control.actuator.network") -> "NetworkWeights":
-        """Read a file; `where` is how an error begins.
+        """Read a file. `where` is the beginning of error messages.
 
         Raises:
-            ConfigError: it is not there, or is no file of a learned actuator.
+            ConfigError: the file is missing, or is not a file of a learned actuator.
         """
         try:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
         except OSError as error:
-            raise ConfigError(f"{where}: {path}: {error.strerror or 'no file of a learned actuator (.npz)'}") from error
-        except Exception as error:  # zipfile's, numpy's and zlib's own, of a damaged file
-            raise ConfigError(f"{where}: {path}: no file of a learned actuator (.npz), as fit_actuator writes") from error
+            raise ConfigError(f"{where}: {path}: {error.strerror or 'not a file of a learned actuator (.npz)'}") from error
+        except Exception as error:  # a damaged file raises errors of zipfile, numpy and zlib
+            raise ConfigError(f"{where}: {path}: not a file of a learned actuator (.npz), as fit_actuator writes") from error
         try:
             return cls._of(arrays)
         except (KeyError, ValueError, TypeError) as error:
             said = f"'{error.args[0]}' is missing" if isinstance(error, KeyError) else str(error)
-            raise ConfigError(f"{where}: {path}: no file of a learned actuator: {said}") from error
+            raise ConfigError(f"{where}: {path}: not a file of a learned actuator: {said}") from error
 
     @classmethod
     def _of(cls, arrays: dict[str, np.ndarray]) -> "NetworkWeights":
-        """Return what a file's arrays mean; KeyError or ValueError if they mean nothing."""
+        """Return the weights in the arrays of a file.
+
+        Raises:
+            KeyError: an array is missing.
+            ValueError: the arrays do not describe a network.
+        """
         if int(arrays["format"]) != FORMAT:
             raise ValueError(f"its format is {int(arrays['format'])}, not {FORMAT}")
         kind, dt, samples = str(arrays["kind"]), float(arrays["dt"]), int(arrays["samples"])
@@ -91,7 +99,12 @@ class NetworkWeights:
         return weights
 
     def _check(self) -> None:
-        """Look whether layers fit each other; ValueError or KeyError if they don't."""
+        """Check that layers fit each other.
+
+        Raises:
+            KeyError: an array is missing.
+            ValueError: a layer does not fit the one before, or has non-finite weights.
+        """
         if not (self.dt > 0.0 and self.samples > 0 and self.scales.shape == (3,) and 0 < len(self.layers) <= DEEPEST):
             raise ValueError("its header makes no sense")
         width = 2 * self.samples
@@ -102,29 +115,29 @@ class NetworkWeights:
             if not 0 < out <= WIDEST or any(layer[name].shape != shape for name, shape in shapes.items()):
                 raise ValueError(f"layer {i} does not fit the one before")
             if not all(np.isfinite(array).all() for array in layer.values()):
-                raise ValueError(f"layer {i} has weights that are no numbers")
+                raise ValueError(f"layer {i} has weights that are NaN or infinite")
             width = out
         if width != 1:
-            raise ValueError(f"it gives {width} numbers, not a torque")
+            raise ValueError(f"it returns {width} numbers instead of one torque")
 
     def steps_between(self, sim_dt: float, where: str = "control.actuator.network") -> int:
-        """Return how many physics steps of `sim_dt` [s] lie between two samples.
+        """Return the number of physics steps of `sim_dt` [s] between two samples.
 
         Raises:
-            ConfigError: no whole number of them, or of an LSTM, which sees every step, more than one.
+            ConfigError: the number is not whole; or it is more than 1 for an LSTM, which sees every physics step.
         """
         steps = round(self.dt / sim_dt)
         if steps < 1 or abs(self.dt / sim_dt - steps) > TOLERANCE or (self.kind == "lstm" and steps != 1):
             allowed = f"{self.dt:g}" if self.kind == "lstm" else f"{self.dt:g} or a whole part of it"
             raise ConfigError(
-                f"{where}: was trained on samples {self.dt:g} s apart, which physics steps of sim.dt={sim_dt:g} do not meet;"
+                f"{where}: was trained on samples {self.dt:g} s apart, which does not fit physics steps of sim.dt={sim_dt:g};"
                 f" sim.dt must be {allowed} (fit_actuator --dt trains for another one)"
             )
         return steps
 
 
 class ActuatorNetwork:
-    """A learned actuator evaluated for all joints of all robots, M = N D of them, once a physics step."""
+    """Learned actuator, evaluated once a physics step for all D joints of all N robots."""
 
     def __init__(
         self,
@@ -135,10 +148,10 @@ class ActuatorNetwork:
         device: torch.device,
         kernels: "TaskKernels | None" = None,
     ) -> None:
-        """Start with nothing remembered: all errors, velocities and hidden states are 0.
+        """Build the network, with all past errors, velocities and hidden states 0.
 
         Raises:
-            ConfigError: the physics step [s] does not fit the samples that the network was trained on.
+            ConfigError: the physics step `sim_dt` [s] does not fit the samples that the network was trained on.
         """
         self.kind, self._kernels = weights.kind, kernels
         self._shape, self._rows = (num_envs, joints), num_envs * joints
@@ -151,8 +164,9 @@ class ActuatorNetwork:
         else:
             shape = (2 * len(self._hidden), max(self._hidden, default=1), joints)
         self.state = torch.zeros(num_envs, *shape, device=device)
-        """(N, steps, 2, D) scaled errors and velocities of the last steps, the newest first; of an LSTM (N, 2 cells, H, D),
-        the hidden states of each cell and then its cell states.
+        """State of the network. MLP: (N, steps, 2, D) scaled errors and velocities of the last physics steps, newest first.
+        LSTM:
+        (N, 2 * cells, H, D), for each cell its hidden state, then its cell state.
         """
         if kernels is not None:
             widths = [2 * weights.samples, *(len(layer["bias"]) for layer in weights.layers)]
@@ -166,8 +180,8 @@ class ActuatorNetwork:
             self._found = torch.zeros(self._shape, device=device)
 
     def torques(self, error: Tensor, dof_vel: Tensor) -> Tensor:
-        """Return torques (N, D) [N m] for errors, target less angle [rad], and velocities [rad/s], (N, D) each, of this
-        step.
+        """Return the torques (N, D) [N m] of this physics step, for errors, target minus angle [rad], and velocities [rad/s],
+        (N, D) each.
         """
         if self._kernels is not None:
             net = (self._weights, self._widths, self.state, self._scratch, self._found)
@@ -184,7 +198,7 @@ class ActuatorNetwork:
             self.state[:, 1:].copy_(self.state[:, :-1].clone())
         torch.mul(error, self._position, out=self.state[:, 0, 0])
         torch.mul(dof_vel, self._velocity, out=self.state[:, 0, 1])
-        # All errors, then all velocities, the newest of each first; a column is a joint of a robot.
+        # Rows: all errors, then all velocities, newest first. Columns: joints of robots.
         x = self.state[:, :: self._every].permute(2, 1, 0, 3).reshape(2 * self._samples, self._rows)
         for layer in self._layers[:-1]:
             x = torch.nn.functional.softsign(torch.addmm(layer["bias"].unsqueeze(1), layer["weight"], x))
@@ -203,5 +217,5 @@ class ActuatorNetwork:
         return torch.addmm(self._layers[-1]["bias"].unsqueeze(1), self._layers[-1]["weight"], x)
 
     def reset(self, mask: Tensor) -> None:
-        """Forget the past of the robots in `mask` (N,)."""
+        """Reset the state of the robots in `mask` (N,)."""
         masked_set_(self.state, mask, 0.0)

@@ -1,4 +1,4 @@
-"""The command curriculum: ranges widen while robots follow."""
+"""Command curriculum: ranges of commands widen while robots follow them."""
 
 from typing import TYPE_CHECKING
 
@@ -12,11 +12,11 @@ if TYPE_CHECKING:
 
 
 class CommandCurriculum:
-    """Widens the range of each command axis (vx, vy, yaw rate) by itself while that axis is followed.
+    """Curriculum that widens the range of each command axis (vx, vy, yaw rate) separately, while robots follow that axis.
 
-    Judged once a window, on the robots that are asked for more than half of the current range: the mean velocity they
-    reach in the direction asked for, as a share of what is asked. Unlike a tracking error, that share is not blurred by
-    the sway of a gait or by exploration, and standing still scores 0 however narrow the range.
+    Each axis is judged once per window, on the robots whose command exceeds half of the current range. The figure is their
+    mean velocity in the commanded direction, as a share of the commanded one. Unlike a tracking error, that share is not
+    blurred by the sway of a gait or by exploration, and standing still scores 0 however narrow the range is.
     """
 
     STATE = ("share", "_sums", "_steps")
@@ -24,7 +24,7 @@ class CommandCurriculum:
     def __init__(
         self, cfg: CommandCurriculumConfig, full_ranges: Tensor, dt: float, kernels: "TaskKernels | None" = None
     ) -> None:
-        """Widen up to `full_ranges` (3, 2); `dt` is the control step [s]."""
+        """Set the widest ranges, `full_ranges` (3, 2). `dt` is the control step [s]."""
         self.cfg, self.full_ranges, self._kernels = cfg, full_ranges.clone(), kernels
         self._full_limit = full_ranges.abs().amax(dim=1)
         self._half_limit = 0.5 * self._full_limit
@@ -32,25 +32,25 @@ class CommandCurriculum:
         device = full_ranges.device
         self.share = torch.ones(3, device=device)
         """(3,) share of the full range that is in use."""
-        # Views of one block, so that a new window is one launch.
+        # Views of one tensor, so that clearing a window is one launch.
         self._window = torch.zeros(7, device=device)
-        self._sums = self._window[:6].view(2, 3)  # velocity reached in the direction asked for, velocity asked for
+        self._sums = self._window[:6].view(2, 3)  # velocity reached in the commanded direction, commanded velocity
         self._steps = self._window[6]
         self._zero = torch.zeros((), device=device)
         self.reset()
 
     def reset(self) -> None:
-        """Go back to the ranges that training starts with."""
+        """Reset to the ranges that training starts with."""
         self.share.fill_(self.cfg.start if self.cfg.enabled else 1.0)
         self._window.zero_()
 
     def write_ranges(self, ranges: Tensor) -> None:
-        """Put the lowest and highest command of each axis now into `ranges` (3, 2)."""
+        """Write the current lowest and highest command of each axis into `ranges` (3, 2)."""
         torch.mul(self.full_ranges, self.share.unsqueeze(1), out=ranges)
 
     def update(self, commands: Tensor, lin_vel: Tensor, ang_vel: Tensor, valid: Tensor) -> None:
-        """Judge one step: commands (N, 3) as vx, vy, yaw rate, velocities (N, 3) in the base frame; `valid` (N,) robots that
-        count.
+        """Add a control step: `commands` (N, 3) as vx, vy, yaw rate, and velocities (N, 3) in the base frame [m/s, rad/s].
+        Only robots of `valid` (N,) count. At the end of a window, widen the ranges of the axes that were followed.
         """
         if not self.cfg.enabled:
             return
@@ -72,17 +72,17 @@ class CommandCurriculum:
         self._window.masked_fill_(due, 0.0)
 
     def metrics(self) -> dict[str, Tensor]:
-        """Return the widest command of each axis now, fresh 0-dimensional tensors."""
+        """Return the current widest command of each axis as fresh 0-dimensional tensors, by name in TensorBoard."""
         if not self.cfg.enabled:
             return {}
         names = ("command_vx", "command_vy", "command_yaw")
         return dict(zip(names, (self._full_limit * self.share).unbind(), strict=True))
 
     def progress(self) -> dict[str, Tensor]:
-        """Return how far it has got, whatever the number of robots."""
+        """Return the progress of the curriculum, for any number of robots."""
         return {"share": self.share.clone()}
 
     def load_progress(self, state: dict[str, Tensor]) -> None:
-        """Go on from there; a curriculum that is off keeps the full ranges."""
+        """Continue from the progress in `state`. A disabled curriculum keeps the full ranges."""
         if self.cfg.enabled:
             self.share.copy_(state["share"].to(self.share.device))

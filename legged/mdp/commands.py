@@ -1,4 +1,4 @@
-"""Velocity commands: sampling, holding, heading mode."""
+"""Velocity commands: sampling, fixed commands, heading mode."""
 
 from typing import TYPE_CHECKING
 
@@ -7,21 +7,21 @@ from torch import Tensor
 
 from legged.config.schema import CommandsConfig
 from legged.math import masked_set_, wrap_to_pi, yaw_of
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.random_pool import RandomPool
 
 if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
 
 MOVING = 0.1
-"""Norm of (vx, vy, yaw rate) above which a robot is asked to move."""
+"""Norm of (vx, vy, yaw rate) above which a command counts as motion."""
 STANDING = 4
-"""The last kind of command."""
+"""Index of the kind of command that stands still."""
 HEADING_GAIN = 0.5
 """Yaw rate per heading error in heading mode [1/s]."""
 
 
 class Commands:
-    """What each robot is asked to do: (vx, vy) [m/s] and yaw rate [rad/s] in the base frame, and a heading [rad]."""
+    """Commands of N robots: (vx, vy) [m/s] and yaw rate [rad/s] in the base frame, and a heading in the world [rad]."""
 
     STATE = ("commands", "is_moving", "ranges", "time_left", "held", "steered", "standing")
 
@@ -32,40 +32,43 @@ class Commands:
         dt: float,
         device: torch.device,
         kernels: "TaskKernels | None" = None,
-        numbers: UniformNumbers | None = None,
+        numbers: RandomPool | None = None,
     ) -> None:
-        """Start all commands at zero, due to be sampled at the first update; `dt` is the control step [s]."""
+        """Set all commands to zero, due to be sampled at the first update. `dt` is the control step [s]. Random numbers come
+        from the pool `numbers`.
+        """
         self.cfg, self.dt, self._kernels = cfg, dt, kernels
         ranges = (cfg.ranges.lin_vel_x, cfg.ranges.lin_vel_y, cfg.ranges.ang_vel_yaw)
         self.full_ranges = torch.tensor(ranges, device=device)
         self.ranges = self.full_ranges.clone()
-        """(3, 2) lowest and highest vx, vy, yaw rate that are sampled now; a curriculum writes them in place."""
+        """(3, 2) current lowest and highest vx, vy, yaw rate. A curriculum writes them in place."""
         self.commands = torch.zeros(num_envs, 4, device=device)
         """(N, 4) vx, vy [m/s], yaw rate [rad/s], heading [rad]."""
         self.is_moving = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        """(N,) whether the robot is asked to move at all, turning on the spot included."""
+        """(N,) True if any motion is commanded, turning on the spot included."""
         self.time_left = torch.zeros(num_envs, device=device)
-        """(N,) time until the next sample [s]."""
+        """(N,) time until the next command is sampled [s]."""
         self.held = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        """(N,) robots whose command was given by `hold` and is not sampled."""
+        """(N,) True for robots whose command was given by `hold` and is not sampled."""
         self.steered = torch.ones(num_envs, dtype=torch.bool, device=device)
-        """(N,) robots whose yaw rate follows from their heading, in heading mode."""
+        """(N,) True for robots whose yaw rate steers towards their heading, in heading mode."""
         self.standing = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        """(N,) robots that are asked to stand still, also in heading mode."""
+        """(N,) True for robots whose command is to stand still. In heading mode, too, they do not turn."""
         self._sample = torch.zeros(num_envs, 4, device=device)
         self._sample_standing = torch.zeros_like(self.standing)
-        self.numbers = numbers or UniformNumbers(num_envs, device)
+        self.numbers = numbers or RandomPool(num_envs, device)
         self._velocity = self.numbers.between(0.0, 1.0, 3)
         self._heading = self.numbers.between(*cfg.ranges.heading, 1)
         self._chance = self.numbers.between(0.0, 1.0, 1)
-        # Kinds of commands: one axis only, of three, which a cube of random commands hardly contains; all axes; none.
+        # Kinds of commands: only vx, only vy, only yaw rate, all axes, none. Independent sampling of three axes hardly ever
+        # gives a command along one axis only.
         single, standing = cfg.single_axis_share * (1.0 - cfg.standing_share) / 3.0, cfg.standing_share
         self._up_to = torch.tensor([single, 2.0 * single, 3.0 * single, 1.0 - standing], device=device)
         kept = torch.cat([torch.eye(3), torch.ones(1, 3), torch.zeros(1, 3)])
-        self._kept = torch.cat([kept, torch.ones(5, 1)], dim=1).to(device)  # a heading is kept by all kinds
+        self._kept = torch.cat([kept, torch.ones(5, 1)], dim=1).to(device)  # all kinds keep the heading
 
     def draw(self) -> None:
-        """Make a new command for every robot, for those that `update` finds due, of numbers just drawn."""
+        """Sample a new command for every robot from the drawn numbers. `update` gives it to the robots that are due."""
         low, high = self.ranges[:, 0], self.ranges[:, 1]
         torch.addcmul(low, high - low, self._velocity.values, out=self._sample[:, :3])
         self._sample[:, 3:].copy_(self._heading.values)
@@ -76,12 +79,14 @@ class Commands:
         torch.eq(kind, STANDING, out=self._sample_standing)
 
     def update(self, reset: Tensor, base_quat: Tensor) -> None:
-        """Take the drawn command where an episode begins or the time is up, then steer towards the headings."""
+        """Update commands by a control step: give the sampled command to robots whose episode begins (`reset` (N,)) or whose
+        time is up, then steer towards the headings. `base_quat` (N, 4) are the orientations of the bases.
+        """
         if self._kernels is not None:
             self._update_in_one_launch(reset, base_quat)
             return
         self.time_left.sub_(self.dt)
-        due = (reset | (self.time_left <= 0.5 * self.dt)) > self.held  # the one and not the other
+        due = (reset | (self.time_left <= 0.5 * self.dt)) > self.held  # due and not held
         masked_set_(self.commands, due, self._sample)
         masked_set_(self.standing, due, self._sample_standing)
         masked_set_(self.time_left, due, self.cfg.resampling_time_s)
@@ -102,8 +107,8 @@ class Commands:
         self._kernels.renew_commands(*masks, *drawn, base_quat, *times, *steering, MOVING, *written)
 
     def hold(self, commands: Tensor, heading: Tensor | None = None) -> None:
-        """Give all robots fixed commands, (N, 3) or one (3,) for all, which are not sampled any more. With `heading` (N,)
-        [rad] and in heading mode, their yaw rate goes on steering them towards it.
+        """Set fixed commands of all robots, (N, 3) or one (3,) for all; they are not sampled any more. With `heading` (N,)
+        [rad] and in heading mode, the yaw rate keeps steering towards it.
         """
         self.commands[:, :3].copy_(commands)
         self.held.fill_(True)

@@ -1,4 +1,4 @@
-"""Contact and swing times of the feet, kept whether or not a reward asks for them."""
+"""Contact and swing times of the feet. They are updated whether or not a reward reads them."""
 
 from typing import TYPE_CHECKING
 
@@ -11,21 +11,21 @@ if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
 
 CONTACT_FORCE = 1.0
-"""Vertical force above which a foot counts as in contact, of robots that weigh more than 100 N [N]."""
+"""Vertical force above which a foot counts as in contact, for robots that weigh more than 100 N [N]."""
 SHARE_OF_WEIGHT = 0.01
-"""The same of lighter robots, of their weight: a foot of a robot of 400 g would never feel 1 N."""
+"""The same threshold for lighter robots, as a share of their weight: a foot of a robot of 400 g would never feel 1 N."""
 GRAVITY = 9.81
-"""Acceleration by which mass is weight [m/s^2]."""
+"""Acceleration of gravity, for weights [m/s^2]."""
 
 
 def contact_force(mass: float) -> float:
-    """Return the vertical force above which a foot of a robot of that mass [kg] counts as in contact [N]."""
+    """Return the vertical force [N] above which a foot counts as in contact, for a robot of that `mass` [kg]."""
     return min(CONTACT_FORCE, SHARE_OF_WEIGHT * GRAVITY * mass)
 
 
 class FeetContacts:
-    """Contacts of F feet of N robots. A foot is in contact if it feels the ground now or felt it a step before, so that
-    a single missed sample does not split a stance.
+    """Contacts of F feet of N robots. A foot is in contact if it touches the ground now or did so a step before, so that a
+    single missed sample does not split a stance.
     """
 
     STATE = ("_flags", "_times")
@@ -39,15 +39,15 @@ class FeetContacts:
         kernels: "TaskKernels | None" = None,
         force: float = CONTACT_FORCE,
     ) -> None:
-        """Start all feet on the ground, at rest; `dt` is the control step [s], `force` what counts as a contact [N]."""
+        """Clear all times and contacts. `dt` is the control step [s]; `force` is the threshold of a contact [N]."""
         self.dt, self._kernels, self.force = dt, kernels, force
-        # Views of two blocks, so that a reset is two launches.
+        # Views of two tensors, so that a reset is two launches.
         self._flags = torch.zeros(num_envs, 3, num_feet, dtype=torch.bool, device=device)
         self._times = torch.zeros(num_envs, 2, num_feet, device=device)
         self.in_contact, self.first_contact, self._touching = self._flags.unbind(dim=1)
-        """(N, F) the foot is on the ground; it touched down at this step."""
+        """(N, F) True if the foot is on the ground; True if it touched down at this step."""
         self.air_time, self.last_air_time = self._times.unbind(dim=1)
-        """(N, F) length of the swing that is going on, 0 in contact, and of the last finished one [s]."""
+        """(N, F) duration of the current swing, 0 in contact; and duration of the last finished swing [s]."""
 
     def update(self, feet_forces: Tensor) -> None:
         """Advance by one control step; `feet_forces` (N, F, 3) in the world frame [N]."""
@@ -59,12 +59,14 @@ class FeetContacts:
         touching = feet_forces[:, :, 2] > self.force
         torch.logical_or(touching, self._touching, out=self.in_contact)
         self._touching.copy_(touching)
-        torch.logical_and(self.air_time, self.in_contact, out=self.first_contact)  # it was in the air: a time above 0
+        torch.logical_and(
+            self.air_time, self.in_contact, out=self.first_contact
+        )  # an air time above 0: the foot was in the air
         self.air_time.add_(self.dt)
         torch.where(self.first_contact, self.air_time, self.last_air_time, out=self.last_air_time)
         self.air_time.masked_fill_(self.in_contact, 0.0)
 
     def reset(self, mask: Tensor) -> None:
-        """Forget the past of the robots in `mask`."""
+        """Reset contacts and times of the robots in `mask` (N,)."""
         masked_set_(self._flags, mask, False)
         masked_set_(self._times, mask, 0.0)

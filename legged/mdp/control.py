@@ -1,4 +1,4 @@
-"""Action -> joint torque."""
+"""Control laws: actions to joint torques."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -12,7 +12,7 @@ from legged.config.schema import LeggedControlConfig
 from legged.errors import ConfigError
 from legged.math import masked_set_
 from legged.mdp.actuator import Actuator, is_ideal
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.random_pool import RandomPool
 from legged.robots.patterns import match_names, match_values
 from legged.robots.robot import Robot
 
@@ -27,7 +27,7 @@ class Control:
     V: stiffness * (action_scale * action - dq) - damping * ddq, with ddq over one physics step
     T: action_scale * action
 
-    D joints, of which A have an action; for the others, which are held, the law has 0 in its place.
+    A of D joints have an action. The others are held: the law takes 0 as their action.
     """
 
     STATE = ("_last_dof_vel",)
@@ -39,13 +39,13 @@ class Control:
         torques: Tensor,
         sim_dt: float,
         kernels: "TaskKernels | None" = None,
-        numbers: UniformNumbers | None = None,
+        numbers: RandomPool | None = None,
     ) -> None:
-        """Write torques to `torques` (N, D), the physics' own tensor, which takes their device along. Gains come
-        from `cfg` if it names any, else from the robot. Delays of targets are drawn from `numbers`.
+        """Build the control law on the device of `torques` (N, D), the physics' own tensor, which the law writes. Gains come
+        from `cfg` if it names any, else from the robot. Delays of targets are drawn from the pool `numbers`.
 
         Raises:
-            ConfigError: a pattern that matches no joint, a joint without a gain or scale, or joints held without P.
+            ConfigError: a pattern matches no joint, a joint has no gain or scale, or joints are held without P.
         """
 
         def tensor(values: np.ndarray) -> Tensor:
@@ -53,14 +53,15 @@ class Control:
 
         self.control_type, self.sim_dt, self._kernels = cfg.control_type, sim_dt, kernels
         self.acted = acted_joints(robot, cfg)
-        """(A,) the joint of each action."""
+        """(A,) index of each action's joint."""
         scales = action_scales(robot, cfg)
         self.action_scale = cfg.action_scale if isinstance(cfg.action_scale, float) else tensor(scales)
-        """Of all actions, or (A,)."""
+        """Scale of all actions, or (A,) of each."""
         stiffness, damping = control_gains(robot, cfg)
         self.stiffness, self.damping = tensor(stiffness), tensor(damping)
-        """(D,) gains [N m/rad], [N m s/rad]; (N, D) once something `vary` was given differs from robot to robot, as are the
-        `torque_limits` [N m] then."""
+        """(D,) gains [N m/rad] and [N m s/rad]. They and `torque_limits` [N m] become (N, D) once `vary` has been given
+        values that differ from robot to robot.
+        """
         self.default_dof_pos = tensor(robot.default_dof_pos)
         self.torque_limits = tensor(robot.torque_limits)
         self._lowest_torques = -self.torque_limits
@@ -68,25 +69,25 @@ class Control:
         """(N, D) torques of the last physics step [N m]."""
         self._zero = torch.zeros((), device=torques.device)
         self.zero_dof_pos = self.default_dof_pos
-        """(D,) or (N, D) true joint angles at which encoders show the default ones [rad]."""
+        """(D,) or (N, D) true joint angles at which encoders show the default angles [rad]."""
         self.nominal = {"p_gain": self.stiffness, "d_gain": self.damping, "torque_limit": self.torque_limits}
-        """Gains and limits (D,) that the factors given to `vary` act on, by its names: whatever is drawn, they stay."""
+        """Nominal gains and limits (D,), by the names of `vary`, which multiplies them by its factors. They never change."""
         self._varied = False
         self._target = torch.zeros_like(self.torques)  # joint angles, velocities or torques
         self._columns = None if len(self.acted) == robot.num_dof else torch.tensor(self.acted, device=torques.device)
         self._last_dof_vel = torch.zeros_like(self.torques)
         self.actuator: Actuator | None = None
-        """What motors do that are not ideal."""
+        """Model of motors that are not ideal; None for ideal motors."""
         if not is_ideal(cfg.actuator):
             middle = self.default_dof_pos if cfg.control_type == "P" else self._zero
-            drawn = numbers or UniformNumbers(len(torques), torques.device)
+            drawn = numbers or RandomPool(len(torques), torques.device)
             self.actuator = Actuator(robot, cfg, middle, (len(torques), robot.num_dof), sim_dt, drawn, kernels)
             self._target = self.actuator.newest
 
     def vary(self, drawn: Mapping[str, Tensor]) -> None:
-        """Take what differs from robot to robot: factors on gains and limits, and the angle that encoders show too much [rad]
-        (fields of `physics.FIELDS`), (N,) or (N, D) each. The first call allocates, and says which they are; later ones
-        write in place.
+        """Apply randomised properties, (N,) or (N, D) each: factors on gains and torque limits, and `joint_offset`, the error
+        of the encoders [rad]. Other fields of `physics.FIELDS` in `drawn` are ignored. The first call allocates for the
+        fields that it is given; later calls write in place.
         """
         each = {
             name: values.view(len(values), -1) for name, values in drawn.items() if name in (*self.nominal, "joint_offset")
@@ -117,11 +118,11 @@ class Control:
         if "torque_limit" in each:
             torch.neg(self.torque_limits, out=self._lowest_torques)
         if "joint_offset" in each:
-            # The law sees q + offset where the joint is at q: as if it was asked for an angle that is less by the offset.
+            # For a joint at q the law sees q + offset. That equals a target which is smaller by the offset.
             torch.sub(self.default_dof_pos, each["joint_offset"], out=self.zero_dof_pos)
 
     def set_actions(self, actions: Tensor) -> None:
-        """Take the actions (N, A) that the following calls of `compute` realise."""
+        """Set the actions (N, A) that the following calls of `compute` carry out."""
         if self.actuator is not None:
             self.actuator.advance()
         middle = self.zero_dof_pos if self.control_type == "P" else self._zero
@@ -131,7 +132,7 @@ class Control:
         torch.add(middle, self.spread(actions), out=self._target)
 
     def spread(self, actions: Tensor) -> Tensor:
-        """Return actions (N, A) times their scales, (N, D); 0 for joints that are held."""
+        """Return actions (N, A) times their scales, by joint (N, D). Held joints have 0."""
         scaled = actions * self.action_scale
         return scaled if self._columns is None else torch.zeros_like(self.torques).index_copy_(1, self._columns, scaled)
 
@@ -151,7 +152,7 @@ class Control:
         return torch.clamp(asked, self._lowest_torques, self.torque_limits, out=self.torques)
 
     def _law(self, dof_pos: Tensor, dof_vel: Tensor, target: Tensor) -> Tensor:
-        """Return the torques (N, D) that the law asks for, whatever the motors can give [N m]."""
+        """Return the torques (N, D) [N m] of the law, before the limits of the motors."""
         if self.control_type == "P":
             return torch.addcmul(self.stiffness * (target - dof_pos), self.damping, dof_vel, value=-1.0)
         if self.control_type == "V":
@@ -162,7 +163,7 @@ class Control:
         return target
 
     def reset(self, mask: Tensor) -> None:
-        """Forget the past of the robots in `mask`, for the law that has one."""
+        """Reset the state of law and actuators of the robots in `mask` (N,)."""
         if self.control_type == "V":
             masked_set_(self._last_dof_vel, mask, 0.0)
         if self.actuator is not None:
@@ -170,8 +171,11 @@ class Control:
 
 
 def control_gains(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> tuple[np.ndarray, np.ndarray]:
-    """Return stiffness and damping of a task, (D,): its own tables where it has them, else the robot's. `where` makes of a
-    dotted path how an error begins.
+    """Return stiffness and damping of a task, (D,) each: from the tables in `cfg` if it has any, else from the robot. `where`
+    turns a dotted path into the beginning of an error message.
+
+    Raises:
+        ConfigError: a pattern matches no joint, or a joint has no gain.
     """
 
     def gains(name: str, own: dict[str, float], of_robot: np.ndarray) -> np.ndarray:
@@ -181,10 +185,11 @@ def control_gains(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str],
 
 
 def acted_joints(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> tuple[int, ...]:
-    """Return the joints that have an action, (A,): all but those that are held. `where` is as for `control_gains`.
+    """Return the indices of the joints that have an action, (A,): all joints that are not held. `where` is as for
+    `control_gains`.
 
     Raises:
-        ConfigError: a pattern that matches no joint, no joint left, or joints held by another law than P.
+        ConfigError: a pattern matches no joint, all joints are held, or joints are held by another law than P.
     """
     if not cfg.held:
         return tuple(range(robot.num_dof))
@@ -200,7 +205,8 @@ def action_scales(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str],
     """Return the scale of each action, (A,). `where` is as for `control_gains`.
 
     Raises:
-        ConfigError: as `acted_joints`, a pattern that matches no joint with an action, or such a joint without a scale.
+        ConfigError: as for `acted_joints`; or a pattern matches no joint with an action, or a joint with an action has no
+            scale.
     """
     acted = acted_joints(robot, cfg, where)
     if not isinstance(cfg.action_scale, dict):

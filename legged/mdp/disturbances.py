@@ -1,12 +1,12 @@
-"""Kicks of the base and forces on bodies, each robot at its own moments."""
+"""Disturbances: kicks of the base and forces on bodies, at random intervals for each robot."""
 
 import torch
 from torch import Tensor
 
 from legged.config.schema import DrawConfig, ForceConfig, KickConfig, LeggedDomainRandConfig
 from legged.math import masked_set_, uniform
-from legged.mdp.draws import Draws
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.distributions import Distributions
+from legged.mdp.random_pool import RandomPool
 from legged.physics import Physics
 
 AXES = ("x", "y", "z")
@@ -16,8 +16,8 @@ TURNS = ("roll", "pitch", "yaw")
 def _columns(
     cfg: KickConfig | ForceConfig, names: tuple[str, ...], times: tuple[str, ...]
 ) -> tuple[list[DrawConfig], list[float]]:
-    """Return how the components `names` of a disturbance, which may grow, and then its `times`, which do not, are drawn; and
-    from what they grow.
+    """Return the distribution of each random column of a disturbance, and the value that each range grows from. The columns
+    are its components `names`, whose ranges may grow from 0, then its `times`, whose ranges do not grow.
     """
     columns = [DrawConfig(range=getattr(cfg, name), grow=cfg.grow) for name in names]
     columns += [DrawConfig(range=getattr(cfg, name)) for name in times]
@@ -25,23 +25,27 @@ def _columns(
 
 
 class Kicks:
-    """Changes of the base's velocity now and then."""
+    """Kicks: sudden changes of the base's velocity at random intervals."""
 
     STATE = ("time_left",)
     WIDTH = 7
-    """Numbers that are drawn for one: the change, and the time until the next."""
+    """Random columns of a kick: 6 for the change of velocity, 1 for the time until the next kick."""
 
     def __init__(self, cfg: KickConfig, dt: float, time_left: Tensor) -> None:
-        """Spread the first kicks over a whole interval; `dt` is the control step [s]."""
+        """Spread the first kicks over a whole interval. `dt` is the control step [s]; `time_left` (N,) is written in
+        place.
+        """
         self.columns, self.start = _columns(cfg, (*AXES, *TURNS), ("interval_s",))
-        """How its numbers are drawn, and from what they grow."""
+        """Distribution of each random column, and the value that its range grows from."""
         self._dt = dt
         self.time_left = time_left
         """(N,) time until the next kick [s]."""
         time_left.copy_(uniform(0.0, cfg.interval_s[1], (len(time_left),), time_left.device))
 
     def take(self, drawn: Tensor) -> None:
-        """Let `drawn` (N, 7) be what is drawn for each robot: of its next kick the velocity and the interval after it."""
+        """Set the tensor `drawn` (N, 7) that holds each robot's next kick: its velocity [m/s, rad/s] and the interval after
+        it [s].
+        """
         self.velocity, self._next = drawn[:, :6], drawn[:, 6]
 
     def act(self, physics: Physics, mask: Tensor) -> None:
@@ -53,27 +57,29 @@ class Kicks:
 
 
 class Forces:
-    """A force on one body for a time, now and then."""
+    """Pushes: a force on one body for a duration, at random intervals."""
 
     STATE = ("left", "force")
     WIDTH = 5
-    """Numbers that are drawn for one: the force, the interval and the duration."""
+    """Random columns of a push: 3 for the force, 1 for the interval, 1 for the duration."""
 
     def __init__(self, cfg: ForceConfig, body: int, dt: float, left: Tensor, force: Tensor) -> None:
-        """Push the `body` of that number in the model; spread the first pushes over a whole interval."""
+        """Push the body with index `body` in the model. The first pushes are spread over a whole interval. `dt` is the
+        control step [s]; `left` (N, 2) and `force` (N, 3) are written in place.
+        """
         self.columns, self.start = _columns(cfg, AXES, ("interval_s", "duration_s"))
-        """How its numbers are drawn, and from what they grow."""
+        """Distribution of each random column, and the value that its range grows from."""
         self._dt, self.body = dt, body
         self.left, self.force = left, force
-        """(N, 2) time that the push now lasts on, and until the next one begins [s]; (N, 3) force now, world frame [N]."""
+        """(N, 2) time until the current push ends and until the next one begins [s]; (N, 3) force now, world frame [N]."""
         left[:, 1] = uniform(0.0, cfg.interval_s[1], (len(left),), left.device)
 
     def take(self, drawn: Tensor) -> None:
-        """Let `drawn` (N, 5) be what is drawn for each robot: of its next push the force, the interval and the duration."""
+        """Set the tensor `drawn` (N, 5) that holds each robot's next push: its force [N], interval [s] and duration [s]."""
         self.drawn = drawn
 
     def act(self, physics: Physics, mask: Tensor) -> None:
-        """Begin and end pushes; those of robots that are not in `mask` (N,) end."""
+        """Begin and end the pushes that are due. Pushes of robots outside `mask` (N,) end."""
         assert physics.forces is not None
         self.left.sub_(self._dt)
         passed = self.left <= 0.5 * self._dt
@@ -86,7 +92,7 @@ class Forces:
 
 
 class Disturbances:
-    """All kicks and forces of a task, whose numbers lie side by side, so that one launch can be for all of them."""
+    """All kicks and forces of a task. Their numbers share tensors, so that one launch handles all of them."""
 
     def __init__(
         self,
@@ -94,9 +100,11 @@ class Disturbances:
         physics: Physics,
         dt: float,
         steps_per_iteration: int,
-        numbers: UniformNumbers,
+        numbers: RandomPool,
     ) -> None:
-        """Make those that `cfg` names; `dt` is the control step [s]. Numbers that they draw are of `numbers`."""
+        """Build the kicks and forces that `cfg` names. `dt` is the control step [s]; `steps_per_iteration` are the control
+        steps of a training iteration, by which ranges grow. Random numbers come from the pool `numbers`.
+        """
         self._dt, self._kernels = dt, physics.kernels
         num_envs, device = numbers.num_envs, numbers.device
         self._time_left = torch.zeros(num_envs, len(cfg.kicks), device=device)
@@ -116,12 +124,12 @@ class Disturbances:
         }
         """Name -> force that acts on a body."""
         self.STATE: tuple[str, ...] = ()
-        """Names of the tensors that are saved: none where there is nothing."""
+        """Names of the tensors that are saved; empty without disturbances."""
         self._all: tuple[Kicks | Forces, ...] = (*self.kicks.values(), *self.forces.values())
         if not self._all:
             return
         self.steps = torch.zeros((), device=device)
-        """Control steps since training began, by which they grow."""
+        """() control steps since training began, by which ranges grow."""
         self.STATE = ("steps",)
         for k, part in enumerate(self._all):
             for name in part.STATE:
@@ -129,7 +137,7 @@ class Disturbances:
                 self.STATE = (*self.STATE, f"{name}_{k}")
         columns = [column for part in self._all for column in part.columns]
         start = [value for part in self._all for value in part.start]
-        self._draws = Draws(columns, start, device, steps_per_iteration, within=False)
+        self._draws = Distributions(columns, start, device, steps_per_iteration, within=False)
         self._even = self._draws.ask(numbers)
         self._drawn = torch.zeros(num_envs, len(columns), device=device)
         for part, drawn in zip(self._all, self._drawn.split([part.WIDTH for part in self._all], dim=1), strict=True):
@@ -140,12 +148,14 @@ class Disturbances:
         self._no_forces = torch.zeros(num_envs, 0, 6, device=device)
 
     def draw(self) -> None:
-        """Draw a disturbance of each kind for every robot. Runs beside the step; nothing is launched where there is none."""
+        """Draw the next disturbances of every robot. Runs on a parallel stream of the step; launches nothing without
+        disturbances.
+        """
         if self._all:
             self._draws.write(self._even.values, self.steps, self._drawn, self._kernels)
 
     def act(self, physics: Physics, mask: Tensor) -> None:
-        """Disturb the robots of `mask` (N,), whose episodes go on."""
+        """Apply the disturbances that are due to the robots of `mask` (N,), whose episodes continue."""
         if not self._all:
             return
         if self._kernels is not None:
@@ -164,22 +174,22 @@ class Disturbances:
         self.steps.add_(1.0)
 
     def end(self, physics: Physics) -> None:
-        """Let go of all robots: episodes begin anew in each of them, outside of a step."""
+        """End all pushes. Called outside a step, when all robots begin a new episode."""
         if physics.forces is not None:
             physics.forces.zero_()
         for force in self.forces.values():
             force.force.zero_()
 
     def progress(self) -> dict[str, Tensor]:
-        """Return how far they have grown; empty where there are none."""
+        """Return the steps by which ranges have grown; empty without disturbances."""
         return {"steps": self.steps.clone()} if self._all else {}
 
     def load_progress(self, progress: dict[str, Tensor]) -> None:
-        """Go on from there."""
+        """Continue from the growth that `progress` returned."""
         if "steps" in progress and self._all:
             self.steps.copy_(progress["steps"])
 
 
 def body_number(physics: Physics, name: str) -> int:
-    """Return the number of a body in the physics' model; without a name that of the floating base."""
+    """Return the index of a body in the physics' model. With an empty name, return that of the floating base."""
     return int(physics.model.jnt_bodyid[0]) if not name else int(physics.model.body(name).id)

@@ -1,4 +1,4 @@
-"""What is wrong with a map of heights that a robot makes while it walks."""
+"""Errors of the height map that a robot makes while it walks: offset, drift and holes."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -9,7 +9,7 @@ from torch import Tensor
 from legged.config.schema import HeightMapConfig
 from legged.math import masked_set_
 from legged.mdp.height_scan import HeightScan
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.random_pool import RandomPool
 
 if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
@@ -21,7 +21,9 @@ def is_exact(cfg: HeightMapConfig) -> bool:
 
 
 class HeightMapErrors:
-    """The map of N robots lies beside the ground, by an amount that grows, and knows nothing of some of P points."""
+    """Height maps of N robots with errors: the map is displaced from the ground, the displacement drifts, and some of P
+    points are unknown.
+    """
 
     STATE = ("error", "rate", "holes")
 
@@ -32,12 +34,14 @@ class HeightMapErrors:
         pose: tuple[Tensor, Tensor],
         seen: Callable[[Tensor], Tensor],
         dt: float,
-        numbers: UniformNumbers,
+        numbers: RandomPool,
         kernels: "TaskKernels | None" = None,
     ) -> None:
-        """Read heights around the `pose` of bases, positions (N, 3) and orientations (N, 4) in the world. Where the map may
-        be displaced, they are looked up by `scan`, which nobody else uses then; else they are those that it has. `seen` makes
-        the observation of ground heights (N, P) in the world; `dt` is the control step [s].
+        """Read heights around the `pose` of bases, positions (N, 3) and orientations (N, 4) in the world frame.
+
+        If the map can be displaced horizontally, heights are looked up by `scan`, which must belong to this object alone;
+        otherwise the heights that `scan` holds are used. `seen` turns ground heights (N, P) in the world frame into the
+        observation. `dt` is the control step [s]. Random numbers come from the pool `numbers`.
         """
         self._scan, self._seen, self._kernels = scan, seen, kernels
         self._position, self._orientation = pose
@@ -47,18 +51,20 @@ class HeightMapErrors:
         half = torch.tensor([cfg.shift, cfg.shift, cfg.offset, moves, moves, dt * cfg.drift], device=device)
         self._drawn = numbers.between(-half, half, 6)
         self.error = torch.zeros(num_envs, 3, device=device)
-        """(N, 3) where the map lies, world frame [m]."""
+        """(N, 3) displacement of the map, world frame [m]."""
         self.rate = torch.zeros_like(self.error)
-        """(N, 3) how far it moves there in a control step [m]."""
+        """(N, 3) change of the displacement in a control step, world frame [m]."""
         self._place = torch.zeros_like(self.error)
         self._share, self._lost = cfg.holes, cfg.lost
         points = scan.heights.shape[1] if cfg.holes or cfg.lost else 0
         self._holes_drawn = numbers.between(0.0, 1.0, points + 1) if points else None
         self.holes = torch.zeros(num_envs, points, dtype=torch.bool, device=device)
-        """(N, P) points of which nothing is known, if there are any."""
+        """(N, P) True at unknown points; (N, 0) if the map has no holes."""
 
     def advance(self, begun: Tensor) -> None:
-        """Let a control step pass, in which the episodes of `begun` (N,) are new."""
+        """Advance the drift by one control step, and draw new errors for the robots of `begun` (N,), whose episodes are
+        new.
+        """
         if self._kernels is not None:
             chances = self._holes_drawn.values if self._holes_drawn is not None else self._drawn.values[:, :0]
             drawn = (begun, self._drawn.values, chances, self._share, self._lost)
@@ -72,14 +78,14 @@ class HeightMapErrors:
             masked_set_(self.holes, begun, (chances[:, :-1] < self._share) | (chances[:, -1:] < self._lost))
 
     def read(self) -> Tensor:
-        """Return the observation of the heights that the map has (N, P)."""
+        """Return the observation (N, P) of the map's heights."""
         if self._moved:
-            # The map has at a place what the ground has where the map should have been.
+            # A map displaced by `error` shows at a place x the ground at x - error.
             torch.sub(self._position, self.error, out=self._place)
             self._scan.update(self._place, self._orientation)
         return torch.nan_to_num(self._seen(self._scan.heights + self.error[:, 2:]), nan=0.0)
 
     def cut_holes(self, observed: Tensor) -> None:
-        """Write 0 into observations (N, P) of which nothing is known."""
+        """Write 0 into the observations (N, P) of unknown points."""
         if self._holes_drawn is not None:
             observed.masked_fill_(self.holes, 0.0)

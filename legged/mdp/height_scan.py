@@ -14,12 +14,13 @@ if TYPE_CHECKING:
 
 
 class HeightScan:
-    """A grid of P points around each robot, turned with its heading. On a plane all heights are 0.
+    """Ground heights at a grid of P points around each robot, turned with its heading. On a plane all heights are 0.
 
-    What a point reads of the cells around it, and the base of the ground below it, is terrain.scan (HeightMap.scan_map).
+    terrain.scan chooses how a point's height, and that of the ground under the base, follows from the cells around it
+    (HeightMap.scan_map).
     """
 
-    STATE: tuple[str, ...] = ()  # heights follow from where the robots are
+    STATE: tuple[str, ...] = ()  # heights follow from the robots' poses
 
     def __init__(
         self,
@@ -29,16 +30,18 @@ class HeightScan:
         device: torch.device,
         kernels: "TaskKernels | None" = None,
     ) -> None:
-        """Scan at cfg.measured_points_x times cfg.measured_points_y, x changing slowest."""
+        """Build the grid of cfg.measured_points_x by cfg.measured_points_y, with x changing slowest. Without `terrain` the
+        ground is a plane.
+        """
         self._on_plane, self._kernels = terrain is None, kernels
         x = torch.tensor(cfg.measured_points_x, device=device)
         y = torch.tensor(cfg.measured_points_y, device=device)
         self.points = torch.cartesian_prod(x, y)
-        """(P, 2) in the base's frame, seen from above [m]."""
+        """(P, 2) x and y of the points in the yaw frame [m]."""
         self.heights = torch.zeros(num_envs, len(self.points), device=device)
-        """(N, P) height of the ground there, world frame [m]."""
+        """(N, P) height of the ground at the points, world frame [m]."""
         self.ground = torch.zeros(num_envs, device=device)
-        """(N,) height of the ground under each base [m]."""
+        """(N,) height of the ground under each base, world frame [m]."""
         if terrain is not None:
             ground = terrain.height_map
             found = torch.tensor(ground.scan_map(cfg.scan), device=device)
@@ -46,11 +49,13 @@ class HeightScan:
             self._origin = torch.tensor(ground.origin, dtype=torch.float32, device=device)
             self._last = [float(size - 1) for size in found.shape]
             self._map = found.flatten()
-            # In cells, and with the base's own place as the last point, so that one lookup finds all.
+            # In cells. The last point is the base's own position, so that one lookup finds all heights.
             self._x, self._y = (torch.cat([self.points, torch.zeros(1, 2, device=device)]) / ground.cell).T.contiguous()
 
     def update(self, base_pos: Tensor, base_quat: Tensor) -> None:
-        """Look up the heights for bases at (N, 3), (N, 4) in the world; outside the map, those at its border."""
+        """Update the heights for bases at positions (N, 3) and orientations (N, 4) in the world frame. Points outside the map
+        have the height at its border.
+        """
         if self._on_plane:
             return
         if self._kernels is not None:
@@ -62,7 +67,7 @@ class HeightScan:
         row, column = ((base_pos[:, :2] - self._origin) / self._cell).nan_to_num().split(1, dim=1)
         rows = row.addcmul(cos, self._x).addcmul_(sin, self._y, value=-1.0).clamp_(0.0, self._last[0]).floor_()
         columns = column.addcmul(sin, self._x).addcmul_(cos, self._y).clamp_(0.0, self._last[1]).floor_()
-        # Numbered in float32, which is exact: `check_terrain` admits no larger map.
+        # Cell numbers are exact in float32: `check_terrain` refuses larger maps.
         cells = columns.add_(rows, alpha=self._columns).int()
         found = self._map[cells]
         self.heights.copy_(found[:, :-1])

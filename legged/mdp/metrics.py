@@ -1,4 +1,4 @@
-"""What is logged about a rollout: means by name, accumulated on the device without synchronisation."""
+"""Means that are logged of a rollout, accumulated on the device without synchronisation."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -8,11 +8,11 @@ from torch import Tensor
 from legged.graph.step_graph import calling
 
 SQUARED = "_rmse"
-"""How the name of a metric ends whose term gives squared errors, and of whose mean the root is logged."""
+"""Ending of the names of metrics that return squared errors. The root of their mean is logged."""
 
 
 class Metrics:
-    """Sums over robots and steps, and over episodes that ended, since the last `flush`."""
+    """Sums over robots and steps, and over finished episodes, since the last `flush`."""
 
     def __init__(
         self,
@@ -23,15 +23,15 @@ class Metrics:
         num_envs: int,
         device: torch.device,
     ) -> None:
-        """Take functions by metric, each giving (N,). Reward sums of episodes are divided by `reward_unit` before they are
-        averaged: legged_gym logs them per second of a full episode.
+        """Build empty sums for the metrics in `functions`, each returning (N,). Reward sums of episodes are divided by
+        `reward_unit` before they are averaged: legged_gym logs them per second of a full episode.
         """
         self._functions = dict(functions)
         self.reward_names, self.termination_names = tuple(reward_names), tuple(termination_names)
         self.reward_unit, self.num_envs = reward_unit, num_envs
-        # Sums by robot, of which `flush` makes those over robots: so a step costs two launches a table and not three.
+        # Sums by robot. `flush` adds up the robots, so that a step costs two launches a table instead of three.
         self._metrics = torch.zeros(len(self._functions), num_envs, device=device)
-        # Steps, those of valid robots, lost contacts, what each termination has ended.
+        # Rows: steps, steps of valid robots, steps with lost contacts, episodes ended by each termination.
         self._counts = torch.zeros(3 + len(self.termination_names), num_envs, device=device)
         self._ended = torch.zeros(2, num_envs, device=device)  # episodes, falls
         self._lengths = torch.zeros(num_envs, device=device)
@@ -40,8 +40,11 @@ class Metrics:
         self._zero = torch.zeros((), device=device)
 
     def add_step(self, valid: Tensor, overflowed: Tensor, ended_by: Sequence[Tensor]) -> None:
-        """Take the metrics of the robots of `valid` (N,), count those of `overflowed` (N,), which lost contacts, and those
-        that each termination has ended, (N,) bool.
+        """Add a step: the metrics of the robots of `valid` (N,), the number of robots of `overflowed` (N,), which lost
+        contacts, and the number of robots that each termination has ended, `ended_by` (N,) bool each.
+
+        Raises:
+            TermError: a metric fails, or does not return (N,).
         """
         values = []
         for name, function in self._functions.items():
@@ -55,20 +58,22 @@ class Metrics:
         self._counts.add_(torch.stack([self._always, valid, overflowed, *ended_by]))
 
     def add_episodes(self, ended: Tensor, failed: Tensor, length: Tensor, reward_sums: Tensor) -> None:
-        """Take in episodes that end at this step: masks (N,), lengths in steps (N,), reward sums (terms, N)."""
+        """Add the episodes that end at this step: masks `ended` and `failed` (N,), `length` (N,) in steps, `reward_sums`
+        (terms, N).
+        """
         self._ended.add_(torch.stack([ended, failed]))
         self._lengths.addcmul_(ended, length)
         self._rewards.add_(torch.where(ended, reward_sums, self._zero))
 
     def flush(self) -> dict[str, Tensor]:
-        """Return means since the last flush as fresh 0-dimensional tensors, by their name in TensorBoard; then start anew."""
+        """Return means since the last flush as fresh 0-dimensional tensors, by name in TensorBoard, then clear all sums."""
         all_steps, steps, overflows, *ended = self._counts.sum(dim=1).unbind()
         episodes, falls = self._ended.sum(dim=1).unbind()
         metrics, rewards = self._metrics.sum(dim=1).unbind(), (self._rewards.sum(dim=1) / self.reward_unit).unbind()
         length = self._lengths.sum()
         for sums in (self._counts, self._ended, self._metrics, self._rewards, self._lengths):
             sums.zero_()
-        # No finished episode in the window: 0 / 0, NaN, says "no value" where 0 would look like a bad one.
+        # Without a finished episode the mean is 0 / 0 = NaN, which means "no value". A 0 would look like a bad result.
         log = {f"rew_{name}": value / episodes for name, value in zip(self.reward_names, rewards, strict=True)}
         for name, value in zip(self._functions, metrics, strict=True):
             mean = value / steps

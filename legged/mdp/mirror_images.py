@@ -1,4 +1,4 @@
-"""Observations and actions seen in a mirror: left legs for right ones, leftward for rightward."""
+"""Mirror images of observations and actions: left legs are exchanged for right ones, leftward for rightward."""
 
 from collections.abc import Mapping, Sequence
 from typing import Literal
@@ -25,19 +25,20 @@ MirrorKind = Literal[
     "vectors",
     "of_joints",
 ]
-"""How the numbers of an observation change. `vector`: (x, y, z) of a velocity or direction; `rotation`: of an angular
-velocity; `command`: (vx, vy, yaw rate); `joints`, `actions`, `passive` (joints), `feet`: a number for each; `heights`: the
-height scan; `same`: numbers that know no side; `scalar`: one such; `sideways`: one number that is positive to the left;
-`vectors`: several of them, (x, y, z) each; `of_joints`: a property without sides of each joint, or one for all."""
+"""Kind of an observation, which determines its mirror image. `vector`: (x, y, z) of a velocity or direction; `rotation`:
+(x, y, z) of an angular velocity; `command`: (vx, vy, yaw rate); `joints`, `actions`, `passive` (joints), `feet`: a number for
+each; `heights`: the height scan; `same`: numbers without a side; `scalar`: one number without a side; `sideways`: one number
+that is positive to the left; `vectors`: several vectors, (x, y, z) each; `of_joints`: a property of each joint that has no
+side, or one number for all joints."""
 SIGNS = {"vector": (1.0, -1.0, 1.0), "rotation": (-1.0, 1.0, -1.0), "command": (1.0, -1.0, -1.0)}
 """Kind of term -> signs of its three numbers. A rotation is a pseudo-vector: it keeps its y."""
 
 Image = tuple[Tensor, Tensor]
-"""(columns, signs), each (width,): the mirror image of `x` (n, width) is x[:, columns] * signs."""
+"""Mirror image as (columns, signs), each (width,): the image of `x` (n, width) is x[:, columns] * signs."""
 
 
 class MirrorImages:
-    """Columns and signs under which the observations and actions of a task turn into those of its mirrored robot."""
+    """Mirror images of all observation groups of a task, and of its actions."""
 
     def __init__(
         self,
@@ -48,19 +49,19 @@ class MirrorImages:
         mirror: Mirror,
         points: Tensor,
     ) -> None:
-        """Mirror every observation group, and the actions as the term `actions`.
+        """Compute the image of every observation group. Actions are mirrored like the term `actions`.
 
-        `kinds` says for each term how it is mirrored (`MirrorKind`), `owner` is the name of the task's class, for errors.
-        `acted` (A,) is the joint of each action. `points` (P, 2) are where heights are measured, in the yaw frame [m].
+        `kinds` has the `MirrorKind` of each term. `owner` is the name of the task's class, for errors. `acted` (A,) is the
+        joint of each action. `points` (P, 2) are the points of the height scan in the yaw frame [m].
 
         Raises:
-            ConfigError: a term has no kind, one that there is not, or not as many numbers as its kind.
+            ConfigError: a term has no kind, an unknown kind, or another number of columns than its kind.
         """
         self._owner, self._kinds, self._mirror, self._points = owner, kinds, mirror, points.cpu()
         self._acted = acted
         device = next(iter(groups.values())).buffer.device
         self.groups = {name: self._group(group) for name, group in groups.items()}
-        """Group -> its image, of all steps of its history."""
+        """Group -> its image, for all steps of its history."""
         columns, signs = self._term("actions", len(acted))
         self.actions: Image = (columns.to(device), signs.to(device))
         """Image of the actions."""
@@ -77,7 +78,11 @@ class MirrorImages:
         return (columns + steps).flatten().to(device), signs.repeat(group.history).to(device)
 
     def _term(self, name: str, width: int) -> Image:
-        """Return the image of a term by itself."""
+        """Return the image of a term, with columns counted from its first one.
+
+        Raises:
+            ConfigError: it has no kind, or another number of columns than its kind.
+        """
         if name not in self._kinds:
             raise ConfigError(f"{self._owner}.MIRRORED does not say how observation '{name}' is mirrored")
         kind = self._kinds[name]
@@ -88,7 +93,9 @@ class MirrorImages:
         return columns, signs
 
     def _image_of(self, kind: str, width: int) -> Image:
-        """Return the image of a kind of term, of as many numbers as the kind has; `same` takes any `width`."""
+        """Return the image of a kind of term. The kind determines the number of columns; only `same`, `vectors` and
+        `of_joints` look at `width`.
+        """
         if kind in SIGNS:
             return torch.arange(len(SIGNS[kind])), torch.tensor(SIGNS[kind])
         if kind == "joints":
@@ -98,7 +105,9 @@ class MirrorImages:
         if kind == "actions":
             image = mirror_of_actions(self._mirror, self._acted)
             if image is None:
-                raise ConfigError(f"{self._owner}: control.held: joints are held on one side only, so actions have no image")
+                raise ConfigError(
+                    f"{self._owner}: control.held: joints are held on one side only, so actions have no mirror image"
+                )
             return torch.tensor(image[0]), torch.tensor(image[1])
         if kind == "sideways":
             return torch.zeros(1, dtype=torch.long), torch.tensor([-1.0])
@@ -120,8 +129,10 @@ class MirrorImages:
 
 
 def mirror_of_actions(mirror: Mirror, acted: Sequence[int]) -> tuple[list[int], list[float]] | None:
-    """Return for each action, of the joints `acted`, the one whose place it takes over, and its sign; None where a joint has
-    an action and its partner has none.
+    """Return, for each action of the joints `acted`, the index of the action whose place it takes in the mirror, and its
+    sign.
+
+    Return None if a joint has an action and its partner on the other side has none.
     """
     number = {joint: i for i, joint in enumerate(acted)}
     if any(mirror.joints[joint] not in number for joint in acted):

@@ -1,4 +1,4 @@
-"""Observation groups: named terms, each evaluated once a step, then scaled, noised, clipped and laid side by side."""
+"""Observation groups: named terms, each evaluated once a step, then scaled, given noise, clipped and concatenated."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,18 +8,23 @@ from torch import Tensor
 
 from legged.graph.step_graph import calling
 from legged.math import masked_set_
-from legged.mdp.sensors import Sensors
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.observation_errors import ObservationErrors
+from legged.mdp.random_pool import RandomPool
 
 
 class ObservationTerms:
-    """The terms that a task's groups name, evaluated once a step for all of them and laid side by side."""
+    """Observation terms of all groups of a task, each evaluated once a step, then concatenated."""
 
     def __init__(self, functions: Mapping[str, Callable[[], Tensor]]) -> None:
-        """Take functions by term, in order, each (N, width); each is called once to learn its width."""
+        """Call the function of each term once, to learn its width. Each returns (N, width).
+
+        Raises:
+            TermError: a term fails, or returns something else than (N, width).
+            ValueError: there is no term.
+        """
         self._functions = dict(functions)
         self.columns: dict[str, slice] = {}
-        """Term -> where it lies in `values`."""
+        """Term -> its columns in `values`."""
         start = 0
         sample = None
         for name, function in self._functions.items():
@@ -32,15 +37,20 @@ class ObservationTerms:
         if sample is None:
             raise ValueError("observations need at least one term")
         self.values = torch.zeros(sample.shape[0], start, device=sample.device)
-        """(N, width) the terms as groups read them, with 0 for what is no number."""
+        """(N, width) terms as groups read them, with 0 in place of NaN and infinite numbers."""
         self.raw = self.values
-        """(N, width) the terms as they gave them, numbers or not."""
-        self.sensors: Sensors | None = None
-        """What measures some of the terms, for groups with noise; None if sensors are ideal but for their noise."""
+        """(N, width) terms as their functions returned them, NaN and infinite numbers included."""
+        self.errors: ObservationErrors | None = None
+        """Errors of some terms, for groups with noise; None if there are no errors but noise."""
 
     def evaluate(self, begun: Tensor | None = None, again: bool = False) -> None:
-        """Bring `raw` and `values` up to date, and the sensors: by a control step, in which the episodes of `begun` (N,) are
-        new, or `again` in the same one; without `begun` they only show what they would measure.
+        """Evaluate all terms into `raw` and `values`, then update `errors` by a control step.
+
+        Robots of `begun` (N,) have new episodes. With `again`, `errors` repeat the measurement of the same step. Without
+        `begun`, `errors` only show the measurement that the step would give, and their state stays.
+
+        Raises:
+            TermError: a term fails.
         """
         found = []
         for name, function in self._functions.items():
@@ -48,15 +58,15 @@ class ObservationTerms:
                 found.append(function())
         self.raw = torch.cat(found, dim=1).float()
         torch.nan_to_num(self.raw, nan=0.0, posinf=0.0, neginf=0.0, out=self.values)
-        if self.sensors is not None and begun is None:
-            self.sensors.preview()
-        elif self.sensors is not None and begun is not None:
-            self.sensors.update(begun, again)
+        if self.errors is not None and begun is None:
+            self.errors.preview()
+        elif self.errors is not None and begun is not None:
+            self.errors.update(begun, again)
 
 
 @dataclass(frozen=True)
 class ObservationTerm:
-    """One term of a group and where it lies in the buffer."""
+    """One term of a group, with its columns in a step of the buffer."""
 
     name: str
     columns: slice
@@ -67,23 +77,28 @@ class ObservationTerm:
 
 
 class ObservationGroup:
-    """What one network sees: (N, width), rewritten in place; or with a history, the last steps side by side, oldest first:
-    (N, history * width).
+    """Input of a network, (N, history * width): the concatenated terms of the last `history` steps, oldest first. The buffer
+    is rewritten in place.
     """
 
     STATE = ("_steps",)
 
     def __init__(
         self,
-        source: ObservationTerms | Sensors,
+        source: ObservationTerms | ObservationErrors,
         names: Sequence[str],
         scales: Mapping[str, Sequence[float] | float],
         noise: Mapping[str, float],
         clip: float,
         history: int = 1,
-        numbers: UniformNumbers | None = None,
+        numbers: RandomPool | None = None,
     ) -> None:
-        """Make the group of the terms `names` of `source`, in that order. No noise where none is named."""
+        """Build the group of the terms `names` of `source`, in that order.
+
+        `scales` and `noise` (half widths in the term's unit, before scaling) have entries by term; without one, the scale is
+        1 and there is no noise. The scaled values are clipped to plus and minus `clip`. Noise is drawn from the pool
+        `numbers`.
+        """
         self.clip, self.history = clip, history
         self.terms: list[ObservationTerm] = []
         num_envs, device = source.values.shape[0], source.values.device
@@ -98,30 +113,30 @@ class ObservationGroup:
             start += width
         self._steps = torch.zeros(num_envs, history, start, device=device)
         self.buffer = self._steps.flatten(1)
-        """(N, history * width) what the network is given."""
+        """(N, history * width) input of the network."""
         self._now = self._steps[:, -1]
-        # Terms that lie side by side already are read where they are; others are picked column by column.
+        # Adjacent terms are read as a slice; others are picked column by column.
         together = columns == list(range(columns[0], columns[0] + start))
         self._values = source.values[:, columns[0] : columns[0] + start] if together else source.values
         self._columns = None if together else torch.tensor(columns, device=device)
         self._scale = torch.cat([term.scale for term in self.terms])
         half = torch.cat([torch.full_like(term.scale, term.noise) for term in self.terms])
         width = half * self._scale
-        self.numbers = numbers or UniformNumbers(num_envs, device)
+        self.numbers = numbers or RandomPool(num_envs, device)
         self._noise = self.numbers.between(-width, width, start) if bool(half.any()) else None
 
     def advance(self) -> None:
-        """Make room for a new step, forgetting the oldest."""
+        """Shift the history by one step, and drop the oldest."""
         if self.history > 1:
             self._steps[:, :-1].copy_(self._steps[:, 1:].clone())
 
     def compute(self) -> None:
-        """Take the terms' values into the newest step."""
+        """Write the terms' values into the newest step."""
         self._write(self._now)
 
     def preview(self, out: Tensor) -> None:
-        """Write into `out` (N, history * width) what `advance` and `compute` would make of the terms' values now; the group
-        itself stays as it is.
+        """Write into `out` (N, history * width) the buffer that `advance` and `compute` would give now. The group itself
+        stays as it is.
         """
         steps = out.view_as(self._steps)
         if self.history > 1:
@@ -129,7 +144,7 @@ class ObservationGroup:
         self._write(steps[:, -1])
 
     def _write(self, step: Tensor) -> None:
-        """Write the terms' values, scaled, noised and clipped, into `step` (N, width)."""
+        """Write the terms' values, scaled, with noise, and clipped, into `step` (N, width)."""
         values = self._values if self._columns is None else self._values.index_select(1, self._columns)
         if self._noise is None:
             torch.mul(values, self._scale, out=step)

@@ -1,4 +1,4 @@
-"""What differs from world to world, drawn at the start, at resets or at intervals; and legged_gym's pushes."""
+"""Domain randomisation: properties drawn per world at the start, at resets or at intervals; and legged_gym's pushes."""
 
 from collections.abc import Collection, Mapping
 from itertools import accumulate
@@ -10,31 +10,35 @@ from torch import Tensor
 from legged.config.randomization import DrawConfig, Range, draw_of
 from legged.config.schema import LeggedDomainRandConfig
 from legged.math import masked_set_, uniform
-from legged.mdp.draws import Draws
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.distributions import Distributions
+from legged.mdp.random_pool import RandomPool
 from legged.physics import FIELDS, MODEL_FIELDS, Physics
 
 if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
 
 VARIANTS = 1024
-"""Models among which worlds choose where masses, inertias or armatures are drawn again: constants are derived from them when
-they are drawn, which is not done within a step."""
+"""Model variants that worlds choose from, if masses, inertias or armatures change within steps. MuJoCo derives constants from
+these fields. That cannot be done within a step, so variants are drawn at the start, with their constants."""
 
 
 class Randomization:
-    """Draws properties of the model and of the control law, a number per world and field, or one for each row of it."""
+    """Random properties of the model and of the control law: a number per world and field, or one for each row of the
+    field.
+    """
 
     STATE: tuple[str, ...] = ("drawn",)
 
     def __init__(self, ranges: Mapping[str, Range | DrawConfig], num_envs: int, device: torch.device) -> None:
-        """Draw from `ranges`: field of `physics.FIELDS` -> lowest and highest value, or how it is drawn."""
+        """Draw one number per world and field. `ranges` maps a field of `physics.FIELDS` to its lowest and highest value, or
+        to its distribution.
+        """
         self.draws = {name: draw_of(entry) for name, entry in ranges.items()}
-        """Field -> how it is drawn."""
+        """Field -> its distribution and the moments of its draws."""
         self.columns = {name: slice(k, k + 1) for k, name in enumerate(ranges)}
-        """Field -> where in `drawn` its numbers are."""
+        """Field -> its columns in `drawn`."""
         self.drawn = torch.zeros(num_envs, len(ranges), device=device)
-        """(N, V) what each world has of each field, in the order of the ranges."""
+        """(N, V) current values of each world, by field in the order of the ranges."""
         for column, (name, entry) in enumerate(ranges.items()):
             if isinstance(entry, DrawConfig):
                 self.drawn[:, column] = self._draws([name]).at_once(num_envs)[:, 0]
@@ -42,22 +46,26 @@ class Randomization:
                 self.drawn[:, column] = uniform(*entry, (num_envs,), device)
         again = [name for name, draw in self.draws.items() if draw.when != "start"]
         self.redrawn = tuple(again)
-        """Fields that are drawn again within steps."""
+        """Fields with `when: reset` or `interval`, which change within steps."""
         self.chosen_fields = tuple(name for name in again if FIELDS[name].derived)
-        """Those of them from which constants are derived, of which worlds choose a variant of all together."""
+        """Fields among `redrawn` from which MuJoCo derives constants. Worlds choose one variant of all of them together."""
         if again:
             self.steps = torch.zeros((), device=device)
-            """Control steps since training began, by which ranges grow."""
+            """() control steps since training began, by which ranges grow."""
             self.STATE = ("drawn", "steps")
 
-    def _draws(self, names: Collection[str], widths: Mapping[str, int] | None = None, pace: int = 1) -> Draws:
-        """Return what draws the columns of some fields."""
+    def _draws(self, names: Collection[str], widths: Mapping[str, int] | None = None, pace: int = 1) -> Distributions:
+        """Return the distributions of the fields `names`, with `widths` columns each (else 1). `pace` is the number of
+        control steps in a training iteration.
+        """
         wide = [name for name in names for _ in range((widths or {}).get(name, 1))]
         neutral = [FIELDS[name].neutral for name in wide]
-        return Draws([self.draws[name] for name in wide], neutral, self.drawn.device, pace)
+        return Distributions([self.draws[name] for name in wide], neutral, self.drawn.device, pace)
 
     def widen(self, rows: Mapping[str, int]) -> None:
-        """Draw numbers for each row of the fields that ask for it, now that it is known how many `rows` they have."""
+        """Draw a number for each row of the fields with `each`, and the variants of `chosen_fields`. `rows` has the number of
+        rows by field, which is known once the model is built.
+        """
         widths = {name: rows[name] if self.is_each(name) else 1 for name in self.draws}
         if any(self.is_each(name) for name in widths) or self.chosen_fields:
             parts, start = [], 0
@@ -68,9 +76,9 @@ class Randomization:
             self.drawn = torch.cat(parts, dim=1)
         if self.chosen_fields:
             self.variants = self._draws(self.chosen_fields, widths).at_once(VARIANTS)
-            """(K, W) numbers of the fields of which worlds choose, by variant."""
+            """(K, W) numbers of `chosen_fields`, by variant."""
             self.chosen = torch.randint(VARIANTS, (len(self.drawn),), device=self.drawn.device)
-            """(N,) the variant of each world."""
+            """(N,) index of each world's variant."""
             found, start = self.variants[self.chosen], 0
             for name in self.chosen_fields:
                 self._of(name).copy_(found[:, start : start + widths[name]])
@@ -79,33 +87,35 @@ class Randomization:
             self.STATE = (*self.STATE, "variants", "chosen")
 
     def is_each(self, name: str) -> bool:
-        """Whether a field has a number for each row."""
+        """Return whether a field has a number for each row."""
         each = self.draws[name].each
         return FIELDS[name].each if each is None else each
 
     def _of(self, name: str) -> Tensor:
-        """Return the columns of a field, (N, 1) or (N, rows), a view."""
+        """Return a view of the columns of a field, (N, 1) or (N, rows)."""
         return self.drawn[:, self.columns[name]]
 
     @property
     def fields(self) -> dict[str, Tensor]:
-        """What is randomised, and what was drawn for it: (N,), or (N, rows)."""
+        """Randomised fields and their current values, (N,) or (N, rows) each."""
         return {name: self._of(name) if self.is_each(name) else self._of(name)[:, 0] for name in self.draws}
 
     def apply(self, physics: Physics) -> None:
-        """Give the physics what was drawn, at start-up and when a state was put back."""
+        """Write the drawn values into the physics. Called at the start, and after a saved state was loaded."""
         for field, values in self.fields.items():
             if field in MODEL_FIELDS and field not in self.chosen_fields:
                 physics.randomize(field, values)
         if self.chosen_fields:
-            if self._given is None or not torch.equal(self._given, self.variants):  # to derive constants takes a while
+            if self._given is None or not torch.equal(self._given, self.variants):  # deriving constants is slow
                 widths = [self.columns[name].stop - self.columns[name].start for name in self.chosen_fields]
                 physics.set_variants(dict(zip(self.chosen_fields, self.variants.split(widths, dim=1), strict=True)))
                 self._given = self.variants.clone()
             physics.choose_variants(torch.ones_like(self.chosen, dtype=torch.bool), self.chosen)
 
-    def prepare(self, physics: Physics, numbers: UniformNumbers, dt: float, steps_per_iteration: int) -> None:
-        """Prepare for draws within steps of `dt` [s], from `numbers`; nothing is done where there are none."""
+    def prepare(self, physics: Physics, numbers: RandomPool, dt: float, steps_per_iteration: int) -> None:
+        """Allocate buffers for draws within control steps of `dt` [s], from the pool `numbers`. Does nothing if no field
+        changes within steps.
+        """
         if not self.redrawn:
             return
         device, worlds = self.drawn.device, len(self.drawn)
@@ -115,7 +125,7 @@ class Randomization:
         self._even = self._own.ask(numbers) if self._own is not None else None
         self._choice = numbers.between(0.0, float(VARIANTS), 1) if self.chosen_fields else None
         self._new_chosen = torch.zeros(worlds, dtype=torch.long, device=device)
-        # What is new lies in the order of `own`, then of the chosen fields; the first moment is never, the second a reset.
+        # New values lie in the order of `own`, then of the chosen fields. Moment 0 is "never", 1 a reset, 2 and on intervals.
         intervals = sorted({self.draws[name].interval_s for name in self.redrawn if self.draws[name].when == "interval"})
         order, place, moment = [*own, *self.chosen_fields], [], []
         starts = dict(zip(order, accumulate((widths[name] for name in order), initial=0), strict=False))
@@ -131,7 +141,9 @@ class Randomization:
         self._kernels = physics.kernels
         self._interval = torch.tensor([float(max(1, round(each / dt))) for each in intervals], device=device)
         self.steps_left = torch.floor(torch.rand(worlds, len(intervals), device=device) * self._interval) + 1.0
-        """(N, I) control steps until the next draw of each interval; the first ones are spread over a whole interval."""
+        """(N, I) control steps until the next draw of each of I intervals. The first draws are spread over a whole
+        interval.
+        """
         self.STATE = (*self.STATE, "steps_left")
         self._chosen, self._chosen_at = self._new_chosen, 0
         if self.chosen_fields:
@@ -144,7 +156,9 @@ class Randomization:
             physics.prepare_redraws(self.drawn, known, self._of_model)
 
     def draw(self) -> None:
-        """Draw for every world what those that are due will take. Runs beside the step."""
+        """Draw new values for every world. `redraw` applies them to the worlds that are due. Runs on a parallel stream of the
+        step.
+        """
         if not self.redrawn:
             return
         if self._kernels is not None:
@@ -163,7 +177,9 @@ class Randomization:
         torch.index_select(torch.cat(parts, dim=1), 1, self._place, out=self._fresh)
 
     def redraw(self, reset: Tensor) -> None:
-        """Let the worlds that are due take what was drawn, within a step, where episodes begin in those of `reset` (N,)."""
+        """Apply the values of `draw`, within a step, to the worlds of `reset` (N,), whose episodes begin, and to worlds whose
+        interval has elapsed.
+        """
         if self._kernels is not None:
             found = (self.steps_left, self._due, self._any_due, self.steps.view(1))
             choice = (self._chosen_at, self._new_chosen, self._chosen, self._chosen_due)
@@ -177,14 +193,14 @@ class Randomization:
                 masked_set_(self.chosen, self._chosen_due, self._new_chosen)
 
     def rewrite(self, physics: Physics) -> None:
-        """Give the physics what has been drawn again, within a step."""
+        """Write the values that `redraw` has changed into the physics, within a step."""
         if self.chosen_fields:
             physics.choose_variants(self._chosen_due, self.chosen)
         if self._of_model:
             physics.redraw(self._any_due)
 
     def _find_moments(self, reset: Tensor) -> None:
-        """Find out of what each world takes new numbers now, and count the steps."""
+        """Set `_due` to the moments that have come for each world, and count the step."""
         self._due[:, 1].copy_(reset)
         if len(self._interval):
             self.steps_left.sub_(1.0)
@@ -194,17 +210,17 @@ class Randomization:
         self.steps.add_(1.0)
 
     def progress(self) -> dict[str, Tensor]:
-        """Return how far ranges have grown, whatever the number of worlds; empty if none does."""
+        """Return the steps by which ranges have grown, for any number of worlds; empty if no range grows."""
         return {"steps": self.steps.clone()} if any(draw.grow[1] > 0.0 for draw in self.draws.values()) else {}
 
     def load_progress(self, progress: Mapping[str, Tensor]) -> None:
-        """Go on from there."""
+        """Continue from the growth that `progress` returned."""
         if "steps" in progress and self.redrawn:
             self.steps.copy_(progress["steps"])
 
 
 class RobotRandomization(Randomization):
-    """Randomization with the friction and the base mass of a legged robot."""
+    """Randomisation of a legged robot, with legged_gym's settings for friction and base mass."""
 
     def __init__(
         self,
@@ -212,16 +228,16 @@ class RobotRandomization(Randomization):
         num_envs: int,
         device: torch.device,
     ) -> None:
-        """Draw friction from `friction_buckets` values and a mass, also where they are switched off, then from `cfg.ranges`,
-        which take the place of both.
+        """Draw friction from `friction_buckets` values and the mass added to the base, even if they are switched off; then
+        draw from `cfg.ranges`, which replace both.
         """
         low, high = cfg.friction_range
         buckets = uniform(low, high, (cfg.friction_buckets,), device)
         self.cfg = cfg
         self.friction = buckets[torch.randint(cfg.friction_buckets, (num_envs,), device=device)]
-        """(N,) friction of each robot's shapes, if randomised."""
+        """(N,) friction of each robot's shapes; used with randomize_friction."""
         self.added_mass = uniform(*cfg.added_mass_range, (num_envs,), device)
-        """(N,) mass added to each base [kg], if randomised."""
+        """(N,) mass added to each base [kg]; used with randomize_base_mass."""
         super().__init__(cfg.ranges, num_envs, device)
         self.STATE = ("friction", "added_mass", *self.STATE)
 
@@ -234,7 +250,7 @@ class RobotRandomization(Randomization):
 
 
 class Pushes:
-    """Pushes each robot now and then, at its own moments."""
+    """Pushes of legged_gym: at intervals, each robot's base gets a random horizontal velocity."""
 
     STATE = ("push_time_left",)
 
@@ -245,19 +261,21 @@ class Pushes:
         dt: float,
         device: torch.device,
         kernels: "TaskKernels | None" = None,
-        numbers: UniformNumbers | None = None,
+        numbers: RandomPool | None = None,
     ) -> None:
-        """Spread the first pushes over a whole interval; `dt` is the control step [s]."""
+        """Spread the first pushes over a whole interval. `dt` is the control step [s]. Velocities are drawn from the pool
+        `numbers`.
+        """
         self.cfg, self.dt, self._kernels = cfg, dt, kernels
         self.push_time_left = uniform(0.0, cfg.push_interval_s, (num_envs,), device)
         """(N,) time until the next push [s]."""
-        self.numbers = numbers or UniformNumbers(num_envs, device)
+        self.numbers = numbers or RandomPool(num_envs, device)
         self._velocity = self.numbers.between(-cfg.max_push_vel_xy, cfg.max_push_vel_xy, 2)
         self._due = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._delta = torch.zeros(num_envs, 2, device=device)
 
     def push(self, physics: Physics, mask: Tensor) -> None:
-        """Set the base's horizontal velocity, world frame, of the robots in `mask` (N,) that are due, to one just drawn."""
+        """Push the robots in `mask` (N,) that are due: set the base's horizontal velocity, world frame, to the drawn one."""
         if not self.cfg.push_robots:
             return
         if self._kernels is not None:

@@ -8,14 +8,14 @@ from torch import Tensor
 
 from legged.graph.step_graph import calling
 from legged.math import masked_set_
-from legged.mdp.faults import LARGEST
+from legged.mdp.nan_guard import LARGEST
 
 if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
 
 
 class Rewards:
-    """The sum of scale * dt * term. `termination` is added after the clip at zero, as in legged_gym."""
+    """Reward of a step: the sum of scale * dt * term. `termination` is added after the clip at zero, as in legged_gym."""
 
     STATE = ("sums",)
 
@@ -28,7 +28,9 @@ class Rewards:
         total: Tensor,
         kernels: "TaskKernels | None" = None,
     ) -> None:
-        """Take functions and scales by term; `dt` is the control step [s]; sums are written to `total` (N,)."""
+        """Build the sum of the terms in `functions`, with their `scales` by name. `dt` is the control step [s], or 1 for
+        scales that are not per second. Sums are written to `total` (N,); with `only_positive` they are clipped at zero.
+        """
         num_envs, device = len(total), total.device
         self._kernels = kernels
         self.functions = dict(functions)
@@ -47,14 +49,17 @@ class Rewards:
         self.last = torch.zeros_like(self.sums)
         """(terms, N) each scaled term of the last step."""
         self._zero = torch.zeros((), device=device)
-        self.fine = torch.ones(len(self.names), num_envs, dtype=torch.bool, device=device)
-        """(terms, N) whether each term was a number at the last step."""
+        self.terms_finite = torch.ones(len(self.names), num_envs, dtype=torch.bool, device=device)
+        """(terms, N) True where a term was finite at the last step."""
         self.episode_sums = {name: self.sums[i] for i, name in enumerate(self.names)}
         """The rows of `sums` by name."""
 
     def compute(self, valid: Tensor) -> Tensor:
-        """Evaluate all terms; robots outside `valid` (N,), whose physics blew up, get zero, and so does a term that is no
-        number.
+        """Evaluate all terms, and return `total`. Robots outside `valid` (N,), whose physics has diverged, get zero. A term
+        that is not finite counts as zero.
+
+        Raises:
+            TermError: a term fails, or returns something else than (N,) or one number.
         """
         if not self.functions:
             return self.total
@@ -62,22 +67,22 @@ class Rewards:
         for name, function in self.functions.items():
             with calling(f"_reward_{name}"):
                 value = function()
-                if isinstance(value, int | float):  # the same for every robot, such as `return 1.0` for being alive
+                if isinstance(value, int | float):  # one number for all robots, such as `return 1.0` for being alive
                     value = torch.full_like(self.total, value)
                 if not isinstance(value, Tensor):
                     raise ValueError(f"must return a tensor ({self.num_envs},), got {type(value).__name__}")
                 if value.shape != (self.num_envs,):
                     raise ValueError(f"must return a tensor ({self.num_envs},), got {tuple(value.shape)}")
             values.append(value)
-        # Stacked, so that scaling, masking and summing cost a launch each and not one a term.
+        # Stacked, so that scaling, masking and summing cost one launch each instead of one per term.
         stacked = torch.stack(values).float()
         if self._kernels is not None:
             rule = (self._factors, self._before_clip, valid, LARGEST, self.only_positive)
-            self._kernels.add_rewards(stacked, *rule, self.fine, self.last, self.sums, self.total)
+            self._kernels.add_rewards(stacked, *rule, self.terms_finite, self.last, self.sums, self.total)
             return self.total
         scaled = stacked * self._factors
-        torch.lt(scaled.abs(), LARGEST, out=self.fine)
-        scaled = torch.where(self.fine & valid, scaled, self._zero, out=self.last)
+        torch.lt(scaled.abs(), LARGEST, out=self.terms_finite)
+        scaled = torch.where(self.terms_finite & valid, scaled, self._zero, out=self.last)
         self.sums.add_(scaled)
         if not self.only_positive:
             return torch.sum(scaled, dim=0, out=self.total)
@@ -85,5 +90,5 @@ class Rewards:
         return self.total.copy_(total + (scaled * (1.0 - self._before_clip)).sum(dim=0))
 
     def reset(self, mask: Tensor) -> None:
-        """Begin new sums for the robots in `mask`."""
+        """Reset the sums of the robots in `mask` (N,) to zero."""
         masked_set_(self.sums.t(), mask, 0.0)

@@ -1,4 +1,4 @@
-"""Terms that end episodes, by name."""
+"""Termination terms, which end episodes."""
 
 from collections.abc import Callable, Mapping
 from functools import reduce
@@ -10,7 +10,9 @@ from legged.graph.step_graph import calling
 
 
 class Terminations:
-    """The terms that end episodes: failures, after which nothing is to be gained, and time-outs, which are nobody's fault."""
+    """Termination terms of two kinds: failures, after which no reward is expected, and time-outs, whose value is
+    bootstrapped.
+    """
 
     def __init__(
         self,
@@ -20,16 +22,21 @@ class Terminations:
         timed_out: Tensor,
         ended: Tensor,
     ) -> None:
-        """Take functions by term, each giving (N,) bool; write results to `failed`, `timed_out` and `ended`, (N,) bool."""
+        """Set the functions of failures and time-outs by term, each returning (N,) bool. Results are written to `failed`,
+        `timed_out` and `ended`, (N,) bool each.
+        """
         self._failures, self._time_outs = dict(failures), dict(time_outs)
         self.names = (*failures, *time_outs)
         self.failed, self.timed_out, self.ended = failed, timed_out, ended
         self.found: list[Tensor] = [torch.zeros_like(failed) for _ in self.names]
-        """For each term the robots (N,) that it has ended at the last step."""
+        """For each term a mask (N,) of the robots whose episodes it ended at the last step."""
 
     def evaluate(self, valid: Tensor, over: Tensor) -> None:
-        """Judge the step: the robots outside `valid` (N,) have failed and those of `over` (N,) are out of time whatever the
-        terms say. Who has failed is not out of time as well.
+        """Evaluate all terms. Whatever the terms return, robots outside `valid` (N,) have failed, and robots of `over` (N,)
+        are timed out. A failed robot is never also timed out.
+
+        Raises:
+            TermError: a term fails, or does not return (N,) bool.
         """
         failures = [self._value(name, function) for name, function in self._failures.items()]
         time_outs = [self._value(name, function) for name, function in self._time_outs.items()]
@@ -37,7 +44,7 @@ class Terminations:
         torch.logical_not(valid, out=self.failed)
         for found in failures:
             self.failed.logical_or_(found)
-        torch.gt(reduce(torch.logical_or, time_outs, over), self.failed, out=self.timed_out)  # the one and not the other
+        torch.gt(reduce(torch.logical_or, time_outs, over), self.failed, out=self.timed_out)  # timed out and not failed
         torch.logical_or(self.failed, self.timed_out, out=self.ended)
 
     def _value(self, name: str, function: Callable[[], Tensor]) -> Tensor:

@@ -1,4 +1,4 @@
-"""The terrain curriculum: robots move to harder tiles while they get across, and back while they do not."""
+"""Terrain curriculum: robots that walk far enough move to harder tiles, others to easier ones."""
 
 from typing import TYPE_CHECKING
 
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 
 
 class TerrainCurriculum:
-    """Which tile each robot lives on: its column (a terrain type) for good, its row (a level) by success.
+    """Tile of each robot. Its column (a terrain type) is fixed; its row (a level) changes with success.
 
-    As in legged_gym: a robot that got further than half a tile from the middle of its own moves up, one that got less
-    than half as far as its command asked moves down, and from the top it goes to a random level. A policy that is always
-    promoted thus has a mean level of 6.0 over ten rows, not 9.
+    The rule is legged_gym's. A robot that got further than half a tile from the middle of its tile moves up a level. A robot
+    that got less than half as far as its command asked moves down. From the top level a robot goes to a random one.
+    Therefore a policy that is always promoted has a mean level of 6.0 over ten rows, not 9.
     """
 
     STATE = ("levels", "columns", "origins", "_sums")
@@ -40,7 +40,7 @@ class TerrainCurriculum:
         self.columns = torch.arange(num_envs, device=device) * columns // num_envs
         """(N,) column of each robot's tile."""
         self.origins = torch.zeros(num_envs, 3, device=device)
-        """(N, 3) where each robot's tile has its middle, world frame [m]."""
+        """(N, 3) middle of each robot's tile, world frame [m]."""
         self.names = terrain.type_names
         kinds = torch.tensor([self.names.index(name) for name in terrain.types], device=device)
         self._of_type = torch.nn.functional.one_hot(kinds[self.columns], len(self.names)).t().float()  # (K, N)
@@ -52,18 +52,18 @@ class TerrainCurriculum:
         self._place()
 
     def reset(self) -> None:
-        """Go back to the levels that training starts with."""
+        """Reset to the levels that training starts with."""
         self.levels.copy_(self._first_levels)
         self._sums.zero_()
         self._place()
 
     def draw(self) -> None:
-        """Draw a level for every robot, for those that finish the hardest one."""
+        """Draw a random level for every robot. Robots that finish the hardest level go there."""
         self._random.random_(0, self.rows)
 
     def update(self, mask: Tensor, base_pos: Tensor, asked: Tensor) -> None:
-        """Judge the robots of `mask` (N,), whose episodes end: where they are (N, 3), and how far their command asked
-        them to go in an episode (N,) [m].
+        """Move the robots of `mask` (N,), whose episodes end, to their next levels. `base_pos` (N, 3) is their final position
+        [m]; `asked` (N,) is the distance that their command asks for in an episode [m].
         """
         if not self.enabled:
             return
@@ -82,7 +82,7 @@ class TerrainCurriculum:
         self._place()
 
     def place_at(self, levels: Tensor, columns: Tensor) -> None:
-        """Put the robots on given tiles, (N,) each, where they stay."""
+        """Put the robots on the tiles at `levels` and `columns`, (N,) each, and disable the curriculum."""
         self.enabled = False
         self.levels.copy_(levels)
         self.columns.copy_(columns)
@@ -92,8 +92,9 @@ class TerrainCurriculum:
         torch.index_select(self._tiles, 0, self.levels * self._count + self.columns, out=self.origins)
 
     def metrics(self) -> dict[str, Tensor]:
-        """Return fresh tensors: per type the mean level, and the shares of ended episodes that moved up and down, averaged
-        over about the last ten calls (one rollout ends few episodes of each type).
+        """Return fresh 0-dimensional tensors by name in TensorBoard: the mean level, and for each terrain type the mean level
+        and the shares of ended episodes that moved up and down. Shares are averaged over about the last ten calls, since one
+        rollout ends few episodes of each type.
         """
         if not self.enabled:
             return {}
@@ -107,12 +108,12 @@ class TerrainCurriculum:
         return log
 
     def progress(self) -> dict[str, Tensor]:
-        """Return how far the robots have got."""
+        """Return the levels of the robots."""
         return {"levels": self.levels.clone()}
 
     def load_progress(self, state: dict[str, Tensor]) -> None:
-        """Go on from there; with another number of robots, from levels drawn out of the saved ones. The robots must be reset
-        afterwards: they still stand on the tiles that they had.
+        """Continue from saved levels. With another number of robots, levels are drawn from the saved ones. Reset the robots
+        afterwards: until then they stand on their old tiles.
         """
         saved = state["levels"].to(self.levels.device).clamp(max=self.rows - 1)
         if len(saved) != len(self.levels):

@@ -1,4 +1,4 @@
-"""How far robots are from the velocities that they are asked for, squared."""
+"""Squared errors between commanded and actual velocities."""
 
 from torch import Tensor
 
@@ -17,6 +17,7 @@ def velocity_error(commands: Tensor, base_lin_vel: Tensor) -> Tensor:
 def yaw_rate_error(commands: Tensor, base_ang_vel: Tensor) -> Tensor:
     """Return the squared error of the yaw rate, (N,) [rad^2/s^2].
 
-    `commands` are as above, `base_ang_vel` (N, 3) is the base's angular velocity, base frame [rad/s].
+    `commands` (N, 3 or more) are as for `velocity_error`, `base_ang_vel` (N, 3) is the base's angular velocity in the base
+    frame [rad/s].
     """
     return squared_difference(commands[:, 2], base_ang_vel[:, 2])

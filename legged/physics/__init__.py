@@ -1,4 +1,4 @@
-"""Physics engines behind one interface. A new one is a file here and a line in `make_physics`."""
+"""Physics engines behind one interface. A new engine is one file here and one branch in `make_physics`."""
 
 from collections.abc import Callable, Collection
 from importlib.util import find_spec
@@ -36,18 +36,18 @@ __all__ = [
 
 
 MANY_WORLDS = 256
-"""So many worlds, and more, are a training: without a GPU, too, it is worth compiling kernels for it."""
+"""Number of worlds from which `auto` chooses mujoco_warp without a GPU too: for so many, compiling its kernels pays."""
 
 
 def resolve_physics(name: str, device: torch.device, where: str = "sim.physics", num_envs: int = 1) -> str:
-    """Return the engine that `auto` means on a device: mujoco_warp on a GPU, and without one for many worlds, else the C
-    engine. `where` says who asks.
+    """Return the name of the engine that runs on a device. `auto` means mujoco_warp on a GPU, and on a CPU for `MANY_WORLDS`
+    or more; otherwise it means the C engine. Error messages begin with `where`, the setting's dotted path.
 
-    Without a GPU it is mujoco_warp's fused step that is meant: `make_physics` takes the C engine for a model that it does not
-    fit.
+    On a CPU, `auto` takes mujoco_warp for its fused step only: `make_physics` returns the C engine for a model that the fused
+    step does not support.
 
     Raises:
-        ConfigError: the C engine was asked for on a GPU, or an engine that is not installed.
+        ConfigError: the C engine was requested on a GPU, or the requested engine is not installed.
     """
     if name == "auto":
         return "mujoco_warp" if device.type == "cuda" or num_envs >= MANY_WORLDS else "mujoco"
@@ -59,7 +59,11 @@ def resolve_physics(name: str, device: torch.device, where: str = "sim.physics",
 
 
 def engine_name(sim: SimConfig, device: torch.device, where: str = "sim.physics", num_envs: int = 1) -> str:
-    """What files and tables call the engine: mujoco, mujoco_warp, or newton_<solver>. Raises as `resolve_physics`."""
+    """Return the name of the engine for files and tables: mujoco, mujoco_warp, or newton_<solver>.
+
+    Raises:
+        ConfigError: as `resolve_physics`.
+    """
     engine = resolve_physics(sim.physics, device, where, num_envs)
     return f"newton_{sim.solver}" if engine == "newton" else engine
 
@@ -72,23 +76,23 @@ def check_engine(
     randomized: Collection[str] = (),
     quantities: Collection[str] = (),
 ) -> None:
-    """Check that the engine of `sim.physics` can simulate a scene, randomise those fields and compute those quantities.
-    `where` says who set a dotted path of the configuration.
+    """Check that the engine of `sim.physics` can simulate a scene, randomise the fields `randomized` and compute
+    `quantities`. `where` maps a dotted path of the configuration to the beginning of an error message.
 
     Raises:
-        ConfigError: it cannot, or it is not installed, or not for this device.
-        ValueError: there is no such field or quantity.
+        ConfigError: the engine cannot do this, is not installed, or does not run on the device.
+        ValueError: a field or a quantity does not exist.
     """
     for field in randomized:
         if field not in MODEL_FIELDS:
-            raise ValueError(f"there is no field '{field}' of the model to randomise{suggest(field, MODEL_FIELDS, 'fields')}")
+            raise ValueError(f"randomize: there is no model field '{field}'{suggest(field, MODEL_FIELDS, 'fields')}")
     check_quantities(quantities)
     if resolve_physics(sim.physics, device, where("sim.physics")) != "newton":
         return
     others = "sim.physics=mujoco_warp or mujoco"
     if not isinstance(scene, RobotScene):
         raise ConfigError(
-            f"{where('sim.physics')}: newton simulates robots with a floating base, not {scene.name}; {others} take any"
+            f"{where('sim.physics')}: newton simulates robots with a floating base, not {scene.name}; {others} do"
         )
     if scene.robot.passive is not None:
         raise ConfigError(
@@ -115,18 +119,17 @@ def make_physics(
     where: Callable[[str], str] = str,
     pushed: bool = False,
 ) -> Physics:
-    """Return `num_envs` worlds of `scene` in the engine that `sim.physics` names. Engines are imported here, so that none
-    is needed but the one used.
+    """Return `num_envs` worlds of `scene` in the engine that `sim.physics` names. Only the requested engine is imported.
 
     Args:
-        scene: what a world consists of.
-        sim: engine and solver.
+        scene: contents of one world.
+        sim: engine, solver and their settings.
         num_envs: number of worlds.
-        device: where all tensors live.
-        randomized: fields (`fields.FIELDS`) that `Physics.randomize` will be given.
-        quantities: arrays of MuJoCo's data that `Physics.quantity` will be asked for.
-        where: makes of a dotted path of the configuration how an error about it begins.
-        pushed: whether forces act on bodies from outside (`Physics.forces`).
+        device: device of all tensors.
+        randomized: fields (`fields.FIELDS`) that `Physics.randomize` will receive.
+        quantities: arrays of MuJoCo's data that `Physics.quantity` will return.
+        where: maps a dotted path of the configuration to the beginning of an error message.
+        pushed: True if the task applies external forces to bodies (`Physics.forces`).
 
     Raises:
         ConfigError, ValueError: as `check_engine`.
@@ -158,7 +161,7 @@ def make_physics(
 
 
 def kernel_cache() -> Path:
-    """The folder in which Warp keeps compiled kernels."""
+    """Return the folder in which Warp keeps compiled kernels."""
     from legged.physics.warp.compile import cache_folder
 
     return cache_folder()

@@ -1,4 +1,4 @@
-"""The interface that every physics engine is put behind."""
+"""The interface of all physics engines."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
@@ -17,129 +17,137 @@ if TYPE_CHECKING:
 
 
 class Physics(ABC):
-    """N independent worlds in one engine, in MuJoCo's generalised coordinates. Back-ends convert their engine's
-    conventions; nobody else sees them. All tensors are allocated once and written in place.
+    """N independent worlds in one engine, in MuJoCo's generalised coordinates. Each subclass converts between its engine's
+    conventions and MuJoCo's. All tensors are allocated once and written in place.
     """
 
     num_envs: int
     dt: float
-    """Physics step [s]."""
+    """Duration of a physics step [s]."""
     device: torch.device
     capturable: bool
-    """Whether step, refresh, write and push may run inside a CUDA graph capture."""
+    """True if step, refresh, write and push may run inside a CUDA graph capture."""
     model: mujoco.MjModel
-    """One world in MuJoCo: names, masses, joints, actuators, pictures."""
+    """MuJoCo model of one world: names, masses, joints, actuators, geometry for rendering."""
     qpos: Tensor
-    """(N, nq) float32 positions in MuJoCo's layout: [m] and [rad]; of a free joint the position, world frame, and the
-    orientation (w, x, y, z). Live after a step, and after a refresh what was written."""
+    """(N, nq) float32 positions in MuJoCo's layout, [m] and [rad]. A free joint has its position, world frame, then its
+    orientation (w, x, y, z). Current after a step; after a refresh it includes writes."""
     qvel: Tensor
-    """(N, nv) float32 velocities in MuJoCo's layout: [m/s] and [rad/s]; of a free joint the linear one of its origin, world
-    frame, then the angular one, body frame. Live as `qpos`."""
+    """(N, nv) float32 velocities in MuJoCo's layout, [m/s] and [rad/s]. A free joint has the linear velocity of its origin,
+    world frame, then its angular velocity, body frame. Current as `qpos`."""
     ctrl: Tensor
-    """(N, nu) float32 controls, in the unit that the model's actuators take ([N m] for motors of gear 1); the task writes
-    them in place before a step, and they are held until written again."""
+    """(N, nu) float32 controls, in the unit of the model's actuators ([N m] for motors of gear 1). The task writes them in
+    place before a step; they keep their values until written again."""
     forces: Tensor | None = None
-    """(N, B, 6) forces and torques on the bodies of `model` [N], [N m], world frame, at their centres of mass, which the task
-    writes in place; held until written again, or until a world is. None where the physics was not told of any."""
+    """(N, B, 6) external forces [N] and torques [N m] on the bodies of `model`, world frame, at their centres of mass. The
+    task writes them in place; they keep their values until written again or until `write` resets the world. None unless the
+    physics was made with `pushed`."""
     robot_state: RobotState | None = None
-    """What is seen of a robot with a floating base and feet; None for any other model."""
+    """State of a robot with a floating base and feet; None for any other model."""
     why_library: str = ""
-    """Why some of a step are an engine's own launches, where ours could take their place; empty where they do, or where there
-    are none."""
+    """Reason for which parts of a step use the launches of the engine's library instead of the fused step. Empty if the fused
+    step makes all of it, or if the engine has no fused step."""
     why_c_engine: str = ""
-    """Why it is the C engine, where `auto` would take our own step for so many worlds; empty elsewhere."""
+    """Reason for which `auto` chose the C engine instead of the fused step for this many worlds; empty otherwise."""
     fitted: str = ""
-    """Which simple shapes stand for meshes, because the collider of the terrain knows none; empty if none do."""
+    """Description of the simple shapes that replace meshes, which the terrain collider does not support; empty without such
+    shapes."""
     compiled: int = 0
-    """Modules of kernels that were compiled when it was built, because the cache lacked them."""
+    """Number of kernel modules that were compiled for this physics, because the cache lacked them."""
     overflowed: Tensor
-    """(N,) bool: worlds that lost contacts or constraint rows for want of memory since the last refresh."""
+    """(N,) bool: worlds that lost contacts or constraint rows since the last refresh, because their memory was full."""
     kernels: "TaskKernels | None" = None
-    """What parts of a task take in place of torch's launches, where an engine can launch its own."""
+    """Warp kernels that replace torch operations in parts of a task; None if the engine does not use Warp."""
     library_step: Callable[[], None] | None = None
-    """A physics step as the engine's library makes it by itself, to compare with, where ours is another one."""
+    """Physics step of the engine's library, for comparison with the fused step; None if `step` is that step already."""
     _quantities: dict[str, Tensor]
-    """Those that were asked for, by name."""
+    """Requested quantities by name."""
 
     @abstractmethod
     def step(self) -> None:
-        """Advance by dt under `ctrl`; `qpos` and `qvel` are live afterwards, the rest after refresh."""
+        """Advance by dt under `ctrl`. Afterwards `qpos` and `qvel` are current; all other outputs are current after
+        `refresh`.
+        """
 
     @abstractmethod
     def refresh(self) -> None:
-        """Make all that is seen agree with the engine: kinematics, no dynamics; forces stay those of the last step."""
+        """Update all outputs from the engine's state by kinematics alone. Contact forces remain those of the last step."""
 
     @abstractmethod
     def write(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
-        """Put the worlds of `mask` (N,) into a state: `qpos` (N, nq) and `qvel` (N, nv), layout and frames as those here.
+        """Set the state of the worlds in `mask` (N,) to `qpos` (N, nq) and `qvel` (N, nv), in the layout and frames of the
+        attributes.
 
-        Clears their controls, activations, contact forces and the solver's warm start; other worlds stay bit-identical.
+        This clears controls, activations, contact forces and the solver's warm start of these worlds. Other worlds stay
+        bit-identical.
         """
 
     @abstractmethod
     def push(self, mask: Tensor, delta: Tensor) -> None:
-        """Add `delta` (N, K) to the first K of `qvel` in the worlds of `mask` (N,): with a floating base, to its linear
-        velocity, world frame [m/s], first.
+        """Add `delta` (N, K) to the first K columns of `qvel` in the worlds of `mask` (N,). With a floating base, the first
+        columns are its linear velocity, world frame [m/s].
         """
 
     @abstractmethod
     def randomize(self, field: str, values: Tensor) -> None:
-        """Give a field of the table `fields.FIELDS` its values, at start-up: (N,), one per world, or (N, rows), one for each
-        thing that has the property. They take the place of values given before.
+        """Set a field of the table `fields.FIELDS` at start-up. `values` are (N,), one per world, or (N, rows), one per body,
+        joint or shape that has the property. They replace earlier values.
 
         Raises:
-            ValueError: the field is none of those that the physics was made for, or the values have another shape.
+            ValueError: the physics was not made for this field, or the values have another shape.
         """
 
     @abstractmethod
     def prepare_redraws(self, drawn: Tensor, columns: Mapping[str, slice], fields: Collection[str]) -> None:
-        """Prepare for `redraw` of `fields`, none of them one that others are derived from: `columns` says where in `drawn`
-        (N, V), always the same tensor, the values of each field are, one for a world or one for each row. Those of all
-        fields are there that `fields` share an array with.
+        """Prepare `redraw` for `fields`, which must not be derived fields (`Field.derived`). `drawn` (N, V) is the tensor
+        that every `redraw` reads. `columns` gives each field's columns in it: one per world, or one per row. If another field
+        changes the same array, its columns must be included.
         """
 
     @abstractmethod
     def redraw(self, mask: Tensor) -> None:
-        """Let the worlds of `mask` (N,) have what is in `drawn` now: within a step, which may be captured."""
+        """Copy the current values of `drawn` into the model arrays of the worlds in `mask` (N,). This may be captured in a
+        step.
+        """
 
     @abstractmethod
     def set_variants(self, values: Mapping[str, Tensor]) -> None:
-        """Derive the constants of K models, each with the `values` (K, 1) or (K, rows) of fields from which others are
-        derived: C MuJoCo does it for all engines, within some 0.05 ms each.
+        """Prepare K variants of the model from `values`, (K, 1) or (K, rows) per derived field. C MuJoCo computes the derived
+        constants for every engine, in about 0.05 ms per variant.
         """
 
     @abstractmethod
     def choose_variants(self, mask: Tensor, chosen: Tensor) -> None:
-        """Let the worlds of `mask` (N,) have the masses, inertias and constants of the models `chosen` (N,) int64: within a
-        step, which may be captured.
+        """Copy masses, inertias and derived constants of the variants `chosen` (N,) int64 into the worlds of `mask` (N,).
+        This may be captured in a step.
         """
 
     def quantity(self, name: str) -> Tensor:
-        """Return a derived array of MuJoCo's data by its name there, (N, ...) float32 in MuJoCo's layout, frames and units
-        (`quantities.STAGES` and `LAST_STEP`); always the same tensor, current after a refresh.
+        """Return an array of MuJoCo's data by its MuJoCo name: (N, ...) float32 in MuJoCo's layout, frames and units
+        (`quantities.STAGES` and `LAST_STEP`). It is always the same tensor, and current after a refresh.
 
         Raises:
-            ValueError: it was not asked for when the physics was made.
+            ValueError: the physics was not made for this quantity.
         """
         return found(name, self._quantities)
 
     @abstractmethod
     def state_tensors(self) -> dict[str, Tensor]:
-        """Return the engine's own arrays of which a step is a function, (N, ...) each, beside `ctrl`, and what is
-        seen of the last step: copies of them put back by `load_state` give the same steps again, bit by bit on a CPU.
+        """Return the arrays (N, ...) that determine the following steps, except `ctrl`, and the outputs of the last step.
+        After `load_state` with copies of them, the engine repeats the same steps; on a CPU they are bit-identical.
         """
 
     def load_state(self, saved: Mapping[str, Tensor]) -> None:
-        """Put all worlds into a state that was copied from `state_tensors`, and refresh.
+        """Set all worlds to a copy of `state_tensors`, and refresh.
 
         Raises:
-            StateError: it is of another engine, model or number of worlds.
+            StateError: the state belongs to another engine, another model, or another number of worlds.
         """
         take(self.state_tensors(), saved, type(self).__name__)
         self.refresh()
-        if self.robot_state is not None:  # the engine still has the forces of its own last step
+        if self.robot_state is not None:  # the engine still holds the forces of its own last step
             self.robot_state.contact_forces.copy_(saved["contact_forces"])
 
     @abstractmethod
     def copy_to(self, env_id: int, data: mujoco.MjData) -> None:
-        """Put one world's positions and velocities into a C MjData, and compute its kinematics, for rendering."""
+        """Copy the positions and velocities of one world into a C MjData, and compute its kinematics, for rendering."""

@@ -1,4 +1,4 @@
-"""MuJoCo's warnings: each kind once on standard error, and none in a file in the working directory."""
+"""Handling of MuJoCo's warnings: each kind is printed once on standard error, and MUJOCO_LOG.TXT is not written."""
 
 import re
 import sys
@@ -8,25 +8,25 @@ from contextlib import contextmanager
 import mujoco
 
 
-def teller() -> Callable[[str], None]:
-    """Make a handler of warnings that tells each kind of them once."""
-    told: set[str] = set()
+def warning_printer() -> Callable[[str], None]:
+    """Return a handler that prints each kind of warning once."""
+    printed: set[str] = set()
 
-    def tell(text: str) -> None:
+    def print_warning(text: str) -> None:
         text = text.partition(" Time =")[0]
         kind = re.sub(r"\d+", "#", text)
-        if kind not in told:
-            told.add(kind)
-            sys.stderr.write(f"warning: MuJoCo: {text}\n")  # at once: the engine warns from several threads
+        if kind not in printed:
+            printed.add(kind)
+            sys.stderr.write(f"warning: MuJoCo: {text}\n")  # in one write, because the engine warns from several threads
 
-    return tell
+    return print_warning
 
 
 @contextmanager
-def told_once() -> Iterator[None]:
-    """Tell each kind of warning once in the block, a command; what took warnings before does so again afterwards."""
+def each_warning_once() -> Iterator[None]:
+    """Print each kind of warning once within the block. Afterwards, restore the previous handler."""
     before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(teller())
+    mujoco.set_mju_user_warning(warning_printer())
     try:
         yield
     finally:
@@ -34,6 +34,8 @@ def told_once() -> Iterator[None]:
 
 
 def keep_out_of_files() -> None:
-    """Tell each kind of warning once from now on, where nobody else takes them: MuJoCo would write MUJOCO_LOG.TXT."""
+    """Install a handler that prints each kind of warning once, unless another handler is installed. Without one, MuJoCo would
+    write MUJOCO_LOG.TXT.
+    """
     if mujoco.get_mju_user_warning() is None:
-        mujoco.set_mju_user_warning(teller())
+        mujoco.set_mju_user_warning(warning_printer())

@@ -1,4 +1,4 @@
-"""Where the feet of a robot are, and how fast, from its joints: the chains of hinges, and their kinematics in torch."""
+"""Forward kinematics of a robot's feet: chains of hinges between base and feet, evaluated in torch."""
 
 from dataclasses import dataclass
 
@@ -15,27 +15,29 @@ from legged.robots.robot import Robot
 
 @dataclass(frozen=True)
 class FootChains:
-    """The hinges between each foot and the base, driven or passive. Arrays are (levels, F, ...), from the foot up to the
-    base; lengths in metres. A hinge turns points about its axis, in a frame that stands fixed in the frame of the next one.
+    """Hinges between each foot and the base, driven or passive. Arrays are (levels, F, ...), ordered from the foot to the
+    base; lengths are in metres. Each hinge has a frame that is fixed in the frame of the next hinge at angle 0, and turns
+    points about its axis.
     """
 
     offset: np.ndarray
-    """(F, 3) the foot in the frame of its first hinge: the mean of the centres of its shapes."""
+    """(F, 3) position of the foot in the frame of its first hinge: the mean of the centres of the foot's shapes."""
     position: np.ndarray
-    """(levels, F) where the hinge's angle is among MuJoCo's generalised positions, and its rate among the velocities."""
+    """(levels, F) index of the hinge's angle in MuJoCo's generalised positions; `speed` is its index in the velocities."""
     speed: np.ndarray
     axis: np.ndarray
     anchor: np.ndarray
     body_pos: np.ndarray
-    """(levels, F, 3) pose of the hinge's frame, at angle 0, in that of the next one; `body_quat` its orientation."""
+    """(levels, F, 3) position of the hinge's frame at angle 0, in the frame of the next hinge; `body_quat` is its
+    orientation."""
     body_quat: np.ndarray
 
     @classmethod
     def of(cls, model: mujoco.MjModel, robot: Robot) -> "FootChains":
-        """The chains of a robot.
+        """Return the chains of a robot.
 
         Raises:
-            ConfigError: feet on different numbers of hinges, or a joint in between that is no hinge.
+            ConfigError: the feet have different numbers of hinges, or a joint between base and foot is not a hinge.
         """
         base = model.body(robot.file.base).id
         feet, offsets = [], []
@@ -46,7 +48,9 @@ class FootChains:
             feet.append(chain)
             offsets.append(offset)
         if len({len(chain) for chain in feet}) != 1 or not feet[0]:
-            raise ConfigError(f"{robot.folder}: feet: all feet must hang on the same number of bodies that turn, one or more")
+            raise ConfigError(
+                f"{robot.folder}: feet: all feet must have the same number of hinges between them and the base, at least one"
+            )
         levels = list(zip(*feet, strict=True))
         return cls(
             offset=np.array(offsets),
@@ -61,7 +65,7 @@ class FootChains:
 
 @dataclass
 class _Hinge:
-    """A hinge, and the pose of its frame at angle 0 in that of the next one towards the base."""
+    """A hinge, and the pose of its frame at angle 0 in the frame of the next hinge towards the base."""
 
     joint: int
     pos: np.ndarray
@@ -69,19 +73,19 @@ class _Hinge:
 
 
 def _hinges(model: mujoco.MjModel, body: int, base: int, offset: np.ndarray, where: str) -> tuple[list[_Hinge], np.ndarray]:
-    """Return the hinges from `body` up to `base`, and the point `offset` of the body in the frame of the first one. Bodies
-    that are welded to the next one have none; several hinges of one body follow each other.
+    """Return the hinges from `body` up to `base`, and the body's point `offset` in the frame of the first hinge. A body that
+    is welded to its parent adds no hinge; the hinges of one body follow each other. Error messages begin with `where`.
 
     Raises:
-        ConfigError: a joint is no hinge; `where` says who asks.
+        ConfigError: a joint is not a hinge.
     """
     found: list[_Hinge] = []
     while body not in (0, base):
         for joint in reversed(range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])):
             if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
-                raise ConfigError(f"{where}: joint '{model.joint(joint).name}' between base and foot is no hinge")
+                raise ConfigError(f"{where}: joint '{model.joint(joint).name}' between base and foot is not a hinge")
             found.append(_Hinge(joint, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])))
-            if model.qpos0[model.jnt_qposadr[joint]] != 0.0:  # bodies are drawn at the reference angle
+            if model.qpos0[model.jnt_qposadr[joint]] != 0.0:  # a model describes its bodies at the joints' reference angles
                 _turn_back(model, found[-1])
         if found:
             found[-1].pos, found[-1].quat = _moved(model, body, found[-1].pos, found[-1].quat)
@@ -92,7 +96,7 @@ def _hinges(model: mujoco.MjModel, body: int, base: int, offset: np.ndarray, whe
 
 
 def _turn_back(model: mujoco.MjModel, hinge: _Hinge) -> None:
-    """Turn a hinge's frame from its reference angle to angle 0, about its anchor."""
+    """Rotate a hinge's frame about its anchor from the reference angle to angle 0."""
     anchor, turned = model.jnt_pos[hinge.joint], np.zeros(3)
     reference = float(model.qpos0[model.jnt_qposadr[hinge.joint]])
     mujoco.mju_axisAngle2Quat(hinge.quat, model.jnt_axis[hinge.joint], -reference)
@@ -101,7 +105,9 @@ def _turn_back(model: mujoco.MjModel, hinge: _Hinge) -> None:
 
 
 def _moved(model: mujoco.MjModel, body: int, pos: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a pose in a body as one in its parent, with the body as it is drawn; exactly the body's own, if it is none."""
+    """Return a pose in a body's frame as a pose in the parent's frame, at the reference angles. The identity pose gives
+    exactly the body's own pose.
+    """
     if not pos.any() and quat[0] == 1.0:
         return model.body_pos[body].copy(), model.body_quat[body].copy()
     turned, both = np.zeros(3), np.zeros(4)
@@ -112,32 +118,33 @@ def _moved(model: mujoco.MjModel, body: int, pos: np.ndarray, quat: np.ndarray) 
 
 @dataclass(frozen=True)
 class _Level:
-    """One hinge of each chain, as matrices on vectors in columns."""
+    """One hinge of every chain, as matrices that act on column vectors."""
 
     position: Tensor
-    """(F,) where the angle is in the positions, and the rate in the velocities."""
+    """(F,) index of the angle in the positions; `speed` is its index in the velocities."""
     speed: Tensor
     anchor: Tensor
     """(F, 3, 1) [m]"""
     along: Tensor
     """(F, 3, 3) projection on the axis a: a a^T."""
     across: Tensor
-    """(F, 3, 3) cross product with it: a x."""
+    """(F, 3, 3) matrix of the cross product with the axis: a x."""
     mount: Tensor | None
-    """(F, 3, 3) orientation of its frame in the next one; none if all frames are parallel."""
+    """(F, 3, 3) orientation of the hinge's frame in the next frame; None if all these frames are parallel."""
     pos: Tensor
-    """(F, 3, 1) place of its frame in the next one [m]."""
+    """(F, 3, 1) position of the hinge's frame in the next frame [m]."""
 
 
 class FeetKinematics:
     """Forward kinematics of the feet in torch.
 
-    Engines compute them at the start of a step; computed here from the live joint state they are never stale, and
-    cost no engine call. Worlds are the last dimension, along which memory runs: with vectors last it takes twice as long.
+    An engine's own kinematics describe the start of a step. These are computed from the current joint state, so they are
+    never stale, and they need no engine call. Worlds are the last dimension, which is contiguous in memory: with vectors
+    last, the computation takes twice as long.
     """
 
     def __init__(self, model: mujoco.MjModel, robot: Robot, qpos: Tensor, qvel: Tensor) -> None:
-        """For robots whose live coordinates are `qpos` (N, nq) and `qvel` (N, nv), MuJoCo's."""
+        """Compute from `qpos` (N, nq) and `qvel` (N, nv), the current coordinates in MuJoCo's layout."""
         self._qpos, self._qvel = qpos, qvel
         chains = FootChains.of(model, robot)
 
@@ -162,10 +169,12 @@ class FeetKinematics:
         ]
 
     def write(self, state: RobotState) -> None:
-        """The live base and joint state -> state.feet_pos [m] and state.feet_vel [m/s], (N, F, 3), world frame."""
+        """Write `state.feet_pos` [m] and `state.feet_vel` [m/s], (N, F, 3), world frame, from the current base and joint
+        state.
+        """
         feet, worlds = len(self._offset), len(state.base_pos)
         angles, rates = self._qpos.t().contiguous(), self._qvel.t().contiguous()
-        moved = torch.zeros(feet, 3, 2, worlds)  # points and their velocities, in the base frame at the end
+        moved = torch.zeros(feet, 3, 2, worlds)  # points and their velocities; after the last level, in the base frame
         moved[:, :, 0] = self._offset
         for level in self._levels:
             moved[:, :, 0] -= level.anchor
@@ -189,5 +198,5 @@ class FeetKinematics:
 
 
 def _apply(matrix: Tensor, moved: Tensor) -> Tensor:
-    """(F, 3, 3) on the second dimension of (F, 3, 2, N)."""
+    """Apply matrices (F, 3, 3) to the second dimension of `moved` (F, 3, 2, N)."""
     return (matrix @ moved.flatten(2)).view_as(moved)

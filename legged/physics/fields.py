@@ -1,4 +1,4 @@
-"""What can be randomised: one table, field -> arrays of MuJoCo's model, for all engines that bear MuJoCo's names."""
+"""Table of the fields that can be randomised: field -> arrays of MuJoCo's model, for all engines that use MuJoCo's names."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_invw
 
 
 def moving_bodies(model: mujoco.MjModel) -> np.ndarray:
-    """Return the bodies that some joint moves."""
+    """Return the ids of the bodies that at least one joint moves."""
     return np.flatnonzero(model.body_weldid)
 
 
 def floating_bodies(model: mujoco.MjModel) -> np.ndarray:
-    """Return the bodies with a free joint."""
+    """Return the ids of the bodies with a free joint."""
     return model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
 
 
@@ -30,19 +30,19 @@ def joint_dofs(model: mujoco.MjModel) -> np.ndarray:
 
 
 def linear_actuators(model: mujoco.MjModel) -> np.ndarray:
-    """Return the actuators that pull by gear * gain * control: no muscles, nothing without a first gear."""
+    """Return the actuators whose force is gear * gain * control: without muscles, and with a non-zero first gear."""
     muscle = model.actuator_gaintype == mujoco.mjtGain.mjGAIN_MUSCLE
     return np.flatnonzero((model.actuator_gear[:, 0] != 0.0) & ~muscle)
 
 
 def per_gear(model: mujoco.MjModel) -> np.ndarray:
-    """Return what one unit of force is in each actuator's gain, (nu,)."""
+    """Return the gain that corresponds to one unit of force, for each actuator, (nu,)."""
     gear = model.actuator_gear[:, 0]
     return np.divide(1.0, gear, out=np.zeros_like(gear), where=gear != 0.0)
 
 
 def limited_actuators(model: mujoco.MjModel) -> np.ndarray:
-    """Return the actuators whose force has a limit."""
+    """Return the actuators with a force limit."""
     return np.flatnonzero(model.actuator_forcelimited)
 
 
@@ -52,49 +52,52 @@ def damping_ratio(model: mujoco.MjModel) -> np.ndarray:
 
 
 def mirrored_per_gear(model: mujoco.MjModel) -> np.ndarray:
-    """Return the same for the bias on position, of those actuators that have one, (nu,)."""
+    """Return the bias on position that corresponds to one unit of force per control, (nu,): `-per_gear` for actuators with an
+    affine bias, 0 for others.
+    """
     return -per_gear(model) * (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
 
 
 @dataclass(frozen=True)
 class Change:
-    """How one array of the model takes the values of a field."""
+    """Effect of a field's values on one array of the model."""
 
     array: str
     how: Literal["set", "add", "scale"]
     column: int | None = None
-    """None for arrays of one number a row, and for all columns of others."""
+    """Column of the array that changes; None for all columns, and for arrays with one number per row."""
     weight: Callable[[mujoco.MjModel], np.ndarray] | None = None
-    """Factor on the values for each row of the array; 1 without."""
+    """Function of the model that returns a factor on the values for each row of the array; None for the factor 1."""
     least: float | None = 0.0
-    """What the array must not fall below, if anything."""
+    """Smallest allowed number in the array; None for no limit."""
     bounce: Literal["", "ratio", "inverse"] = ""
-    """Whether the values are restitution, of which the array takes the damping ratio or its inverse."""
+    """Conversion of the values from restitution: the array takes the damping ratio ("ratio") or its inverse. Empty if the
+    values are not restitution."""
 
 
 @dataclass(frozen=True)
 class Field:
-    """A property that may differ from world to world."""
+    """A property that may differ between worlds."""
 
     meaning: str
     unit: str
     what: str
-    """What has the property."""
+    """Plural name of the things that have the property, for error messages."""
     rows: Callable[[Scene, mujoco.MjModel], np.ndarray]
-    """Those rows of the arrays that change."""
+    """Function that returns the rows of the arrays that change."""
     changes: tuple[Change, ...]
     derived: bool = False
-    """Whether constants of the model must be derived again."""
+    """True if constants of the model must be derived again."""
     neutral: float = 0.0
-    """The value that changes nothing, or is usual."""
+    """Value that changes nothing, or the usual value."""
     lowest: float | None = None
-    """The lowest value that has a meaning, if there is one."""
+    """Lowest meaningful value; None without a limit."""
     highest: float | None = None
-    """And the highest."""
+    """Highest meaningful value; None without a limit."""
     law: bool = False
-    """Whether the control law of legged robots takes it, for each joint."""
+    """True if the control law of legged robots uses the field, for each joint."""
     each: bool = False
-    """Whether each row has a number of its own, unless the configuration says otherwise."""
+    """True if each row has its own value, unless the configuration says otherwise."""
 
 
 LEAST_MASS = 1e-6
@@ -109,8 +112,8 @@ FIELDS = {
         neutral=1.0,
     ),
     "restitution": Field(
-        "share of its speed that a shape keeps when it bounces, made by less damping of its contacts at the same stiffness;"
-        " below 0.135 the damping stays the model's",
+        "share of its speed that a shape keeps when it bounces, from a lower damping of its contacts at the same stiffness;"
+        " below 0.135 the damping ratio is 1",
         "1",
         "shapes",
         lambda scene, model: scene.shapes(model),
@@ -182,7 +185,7 @@ FIELDS = {
         (Change("dof_frictionloss", "add"),),
     ),
     "joint_offset": Field(
-        "what each joint's encoder shows beside the true angle, to the control law and in `dof_pos`",
+        "error of each joint's encoder, added to the true angle in the control law and in `dof_pos`",
         "rad",
         "joints with a motor",
         lambda _, model: np.arange(model.nu),
@@ -191,7 +194,7 @@ FIELDS = {
         each=True,
     ),
     "motor_strength": Field(
-        "factor on the force or torque that each actuator makes of what is asked of it",
+        "factor on the force or torque that each actuator produces for a control",
         "1",
         "actuators",
         lambda _, model: linear_actuators(model),
@@ -200,7 +203,7 @@ FIELDS = {
         lowest=0.0,
     ),
     "actuator_gain": Field(
-        "force or torque added per unit of control; a position servo's pull towards its target grows alike",
+        "force or torque added per unit of control; a position servo's force towards its target grows with it",
         "N m or N",
         "actuators",
         lambda _, model: linear_actuators(model),
@@ -223,7 +226,7 @@ FIELDS = {
         for name, of in (
             ("p_gain", "the stiffness of each joint's control law"),
             ("d_gain", "the damping of each joint's control law"),
-            ("velocity_limit", "each joint's velocity limit, of which rewards and torque-speed curves know"),
+            ("velocity_limit", "each joint's velocity limit in rewards and torque-speed curves"),
         )
     },
     "torque_limit": Field(
@@ -237,25 +240,25 @@ FIELDS = {
         law=True,
     ),
 }
-"""Field -> what it changes. Those that scale an array come before those that add to it."""
+"""Field name -> field. Fields that scale an array precede those that add to it."""
 MODEL_FIELDS = {name: field for name, field in FIELDS.items() if field.changes}
-"""Those that change the model, and that `Physics.randomize` takes; the others are the control law's alone."""
+"""Fields that change the model, which `Physics.randomize` accepts. The others affect only the control law."""
 
 NEWTONS_FIELDS = ("friction", "added_base_mass")
-"""What can be randomised in all of newton's solvers: its model has names and arrays of its own. Its MuJoCo solver takes
-all."""
+"""Fields that can be randomised in every Newton solver, whose model has its own names and arrays. Newton's MuJoCo solver
+supports all fields."""
 
 
 def row_counts(scene: Scene, model: mujoco.MjModel) -> dict[str, int]:
-    """Return of each field how many rows of its arrays change, or how many joints have it."""
+    """Return, for each field, the number of rows that it changes, or the number of joints that have it."""
     return {name: len(field.rows(scene, model)) for name, field in FIELDS.items()}
 
 
 def own_array(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """Return an array of the model by the name that it has in changes; gravity as a row, (1, 3)."""
+    """Return an array of the model by its name in `Change`; gravity has one row, (1, 3)."""
     return model.opt.gravity[None] if name == GRAVITY else getattr(model, name)
 
 
 def changed_arrays(fields: Collection[str]) -> tuple[str, ...]:
-    """Return the names of the arrays that `fields` change, each once; those that are derived are not among them."""
+    """Return the names of the arrays that `fields` change, without duplicates and without derived arrays."""
     return tuple(dict.fromkeys(change.array for name in fields for change in FIELDS[name].changes))

@@ -1,4 +1,6 @@
-"""The C engine on all CPU cores, through `mujoco.batch.Batch`: the default without a GPU, and the reference."""
+"""C MuJoCo on all CPU cores, through `mujoco.batch.Batch`: the default engine without a GPU, and the reference for the
+others.
+"""
 
 from collections.abc import Collection, Mapping
 
@@ -27,7 +29,7 @@ OVERFLOW = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjW
 
 
 class MujocoPhysics(Physics):
-    """N worlds in C MuJoCo, float64 inside, float32 outside."""
+    """N worlds in C MuJoCo, which computes in float64; inputs and outputs are float32."""
 
     capturable = False
 
@@ -41,20 +43,24 @@ class MujocoPhysics(Physics):
         quantities: Collection[str] = (),
         pushed: bool = False,
     ) -> None:
-        """Build the scene and place all worlds at the model's initial state; `device` must be the CPU."""
+        """Build the scene and set all worlds to the model's initial state.
+
+        Raises:
+            ValueError: `device` is not the CPU.
+        """
         if device.type != "cpu":
-            raise ValueError(f"the engine mujoco runs on the CPU, not on {device}")
+            raise ValueError(f"the engine mujoco runs on the CPU only, not on {device}")
         keep_out_of_files()
         self.num_envs, self.dt, self.device = num_envs, sim.dt, device
         self.model = scene.model(sim, contact_sensors=True)
-        # A world that blows up must stay non-finite until the task sees it; the engine would put it back silently.
+        # A world that diverges must stay non-finite until the task sees it; the engine would reset it silently.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        # A world holds one robot; looking for parts that do not touch each other costs 6 % of a step.
+        # A world holds one robot, and finding its constraint islands costs 6 % of a step.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
         keep_centres_apart(self.model, randomized)
         self._randomized = RandomizedModel(scene, self.model, randomized, torch.float64, device)
         self._redrawn: tuple[str, ...] = ()
-        """Names of the arrays that a redraw changes."""
+        """Names of the arrays that `redraw` changes."""
         self._variants: dict[str, np.ndarray] = {}
         self.qpos, self.qvel = torch.zeros(num_envs, self.model.nq), torch.zeros(num_envs, self.model.nv)
         self.ctrl = torch.zeros(num_envs, self.model.nu)
@@ -91,7 +97,7 @@ class MujocoPhysics(Physics):
     def refresh(self) -> None:
         self._read()
         if self._robot is not None:
-            self._robot.read()  # first: the sensors hold what the last call left
+            self._robot.read()  # first, since the sensors hold the results of the last call
         self._reader.read()
         warnings = self.batch.warning[:, OVERFLOW, 1]
         self.overflowed.copy_(torch.from_numpy((warnings > self._warnings).any(axis=1)))
@@ -127,7 +133,7 @@ class MujocoPhysics(Physics):
         self._reader.stale.fill_(True)
 
     def _array(self, name: str) -> np.ndarray:
-        """Return an array of the model, (N, ...), that worlds have for themselves."""
+        """Return the per-world copies of an array of the model, (N, ...)."""
         return self.batch.expand(f"opt.{name}")[:, None] if name == GRAVITY else self.batch.expand(name)
 
     def prepare_redraws(self, drawn: Tensor, columns: Mapping[str, slice], fields: Collection[str]) -> None:
@@ -171,28 +177,28 @@ class MujocoPhysics(Physics):
 
 
 class _RobotReader:
-    """Fills the fields of RobotState that are no views of qpos and qvel."""
+    """Computes the fields of RobotState that are not views of qpos and qvel."""
 
     def __init__(self, batch: Batch, state: RobotState, robot: Robot, qpos: Tensor, qvel: Tensor) -> None:
-        """For the model of `batch`, which has contact sensors, and the task's `qpos` (N, nq) and `qvel` (N, nv)."""
+        """Read the contact sensors of the model of `batch`, and the task's `qpos` (N, nq) and `qvel` (N, nv)."""
         self.stepped = False
-        """Whether the sensors hold forces that `state` does not hold yet."""
+        """True if the sensors hold forces that `state` does not hold yet."""
         self._state = state
         start, end = contact_sensor_columns(batch.model, robot)
         self._forces = batch.bind("sensordata")[:, start:end]
         self._feet = FeetKinematics(batch.model, robot, qpos, qvel)
         contacts = robot.contact_of_shape
         self._contacts = None if len(set(contacts)) == len(contacts) else torch.tensor(contacts)
-        """Contact of each shape; none where each shape has its own."""
+        """Contact index of each shape; None if each shape has its own contact."""
         self._down = torch.tensor([0.0, 0.0, -1.0]).expand(len(state.base_pos), 3)
 
     def read(self) -> None:
-        """Read velocities and gravity in the base's frame, feet, and, once a step, forces."""
+        """Update velocities and gravity in the base frame, the feet, and, once after a step, contact forces."""
         state = self._state
         state.base_lin_vel.copy_(quat_rotate_inverse(state.base_quat, state.base_lin_vel_w))
         state.projected_gravity.copy_(quat_rotate_inverse(state.base_quat, self._down))
         self._feet.write(state)
-        if self.stepped:  # a write in between has cleared its worlds' forces
+        if self.stepped:  # a write after the last read has cleared the forces of its worlds
             forces = torch.from_numpy(-self._forces.astype(np.float32)).view(len(self._forces), -1, 3)
             if self._contacts is None:
                 state.contact_forces.copy_(forces)
@@ -202,31 +208,31 @@ class _RobotReader:
 
 
 class _QuantityReader:
-    """Keeps the quantities that were asked for: copies of the batch's arrays, brought up to date where they are stale."""
+    """Copies of the requested quantities from the batch's arrays, updated for the worlds whose state has changed."""
 
     def __init__(self, batch: Batch, names: Collection[str]) -> None:
-        """Bind `names`, none of which costs anything but itself."""
+        """Bind the quantities `names`; others cost nothing."""
         self._batch, self._stage = batch, stage_of(names)
         self._bound = {name: batch.bind(name) for name in names}
         self.values = {name: torch.zeros(bound.shape) for name, bound in self._bound.items()}
         self.of_last_step = {name: self.values[name] for name in LAST_STEP if name in names}
         self.stale = torch.ones(batch.nsim, dtype=torch.bool)
-        """(N,) worlds whose state has changed since the last reading."""
+        """(N,) worlds whose state has changed since the last `read`."""
 
     def note_step(self) -> None:
-        """Take what the step that was just made leaves: no later call computes it."""
+        """Copy the quantities that only a step computes."""
         self.stale.fill_(True)
         for name, value in self.of_last_step.items():
             value.copy_(torch.from_numpy(self._bound[name].astype(np.float32)))
 
     def note_write(self, mask: Tensor) -> None:
-        """Forget the last step of the worlds of `mask` (N,)."""
+        """Clear the last step's quantities in the worlds of `mask` (N,)."""
         self.stale |= mask
         for value in self.of_last_step.values():
             value.masked_fill_(mask.view(-1, 1), 0.0)
 
     def read(self) -> None:
-        """Compute and copy what depends on the state alone."""
+        """Compute and copy the quantities that depend on the state alone."""
         if self._stage and self.stale.any():
             worlds = self.stale.nonzero().flatten()
             ids = worlds.numpy()

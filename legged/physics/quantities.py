@@ -1,4 +1,4 @@
-"""Arrays of MuJoCo's data that a task may ask for, and what must be computed for each."""
+"""Arrays of MuJoCo's data that a task may request, and the computation that each one needs."""
 
 from collections.abc import Collection, Mapping
 
@@ -14,22 +14,26 @@ STAGES = {
     "cinert": mujoco.mjtStage.mjSTAGE_POS,
     "cvel": mujoco.mjtStage.mjSTAGE_VEL,
 }
-"""Quantity -> the forward stage that brings it up to date. (N, nbody, ...): positions of bodies [m] and orientations
-(w, x, y, z), world frame; centres of mass of subtrees [m]; inertias (10) and velocities (6: angular, linear) about the centre
-of mass of the kinematic tree, world frame."""
+"""Quantity -> forward stage that updates it. All are (N, nbody, ...): body positions [m] and orientations (w, x, y, z), world
+frame; centres of mass of subtrees [m]; inertias (10) and velocities (6: angular, linear) about the centre of mass of the
+kinematic tree, world frame."""
 LAST_STEP = ("qfrc_actuator",)
-"""Quantities of the last step, zero after a write: (N, nv) generalised forces of actuators [N m] or [N]."""
+"""Quantities of the last step, which are zero after a write: (N, nv) generalised actuator forces [N m] or [N]."""
 
 
 def check_quantities(names: Collection[str]) -> None:
-    """Raises ValueError where one of `names` is none of those above."""
+    """Check that all `names` are quantities.
+
+    Raises:
+        ValueError: a name is not in `STAGES` or `LAST_STEP`.
+    """
     for name in names:
         if name not in STAGES and name not in LAST_STEP:
             raise ValueError(f"there is no quantity '{name}'{suggest(name, (*STAGES, *LAST_STEP), 'quantities')}")
 
 
 def stage_of(names: Collection[str]) -> int:
-    """Return the last forward stage that `names` need; 0 for none."""
+    """Return the last forward stage that `names` need, or 0 if they need no stage."""
     return max((int(STAGES[name]) for name in names if name in STAGES), default=0)
 
 
@@ -37,8 +41,8 @@ def found(name: str, quantities: Mapping[str, Tensor]) -> Tensor:
     """Return the tensor of a quantity.
 
     Raises:
-        ValueError: it was not asked for when the physics was made.
+        ValueError: the physics was not made for this quantity.
     """
     if name not in quantities:
-        raise ValueError(f"quantity: make_physics was not told of '{name}'{suggest(name, quantities, 'it was of')}")
+        raise ValueError(f"quantity: the physics was not made for '{name}'{suggest(name, quantities, 'it was made for')}")
     return quantities[name]

@@ -1,4 +1,4 @@
-"""The arrays of a model that differ from world to world, from the values given for its fields."""
+"""Model arrays that differ between worlds, computed from the values of randomised fields."""
 
 import copy
 from collections.abc import Callable, Collection, Mapping
@@ -17,30 +17,31 @@ from legged.physics.scene import Scene
 
 
 class RandomizedModel:
-    """The arrays of a model, per world, from the values given for its fields."""
+    """Per-world arrays of a model, computed from the values of randomised fields."""
 
     def __init__(
         self, scene: Scene, model: mujoco.MjModel, fields: Collection[str], dtype: torch.dtype, device: torch.device
     ) -> None:
-        """Let those `fields` be given; arrays are made of `dtype` on `device`, as the engine keeps them."""
+        """Accept values of `fields`. Arrays have the type `dtype` and lie on `device`."""
         self.model, self._scene, self._dtype, self._device = model, scene, dtype, device
         self.rows = {name: field.rows(scene, model) for name, field in MODEL_FIELDS.items() if name in fields}
-        """Rows of the arrays that each field changes."""
+        """Field -> rows of the arrays that it changes."""
         self._values: dict[str, Tensor] = {}
         self.bounces = DampingOfBounces(device, dtype) if "restitution" in fields else None
-        """What makes damping of restitution, where that is among the fields."""
+        """Converter from restitution to damping ratios; None unless restitution is among the fields."""
 
     def give(self, field: str, values: Tensor) -> dict[str, Tensor]:
-        """Take `values` (N,) of a field, one per world, or (N, rows); return the arrays that it changes, (N, ...).
+        """Take the `values` of a field, (N,) or (N, rows), and return the arrays that it changes, (N, ...).
 
-        They are made from the model's own numbers and all values given so far: to give a field again replaces its values.
+        The arrays are computed from the model's own numbers and the latest values of all fields. Values given again replace
+        earlier ones.
 
         Raises:
-            ValueError: the field is none of those that may be given, or the values have another shape.
+            ValueError: the model was not made for this field, or the values have another shape.
         """
         if field not in self.rows:
-            told = suggest(field, self.rows, "those are")
-            raise ValueError(f"randomize: '{field}' is none of the fields that make_physics was told of{told}")
+            hint = suggest(field, self.rows, "it was made for")
+            raise ValueError(f"randomize: the physics was not made for the field '{field}'{hint}")
         rows = len(self.rows[field])
         if values.dim() != 1 and values.shape[1:] != (rows,):
             raise ValueError(f"randomize: values of {field} must be (N,) or (N, {rows}), not {tuple(values.shape)}")
@@ -48,7 +49,7 @@ class RandomizedModel:
         return self.arrays(changed_arrays([field]), self._values)
 
     def arrays(self, names: Collection[str], values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return arrays by their names, (N, ...), for `values` of fields, (N, 1) or (N, rows)."""
+        """Return arrays by name, (N, ...), for the `values` of fields, (N, 1) or (N, rows)."""
         worlds = len(next(iter(values.values())))
         found = {}
         for array in names:
@@ -76,9 +77,9 @@ class RandomizedModel:
         part[:, rows] = {"set": values.expand_as(old), "add": old + values, "scale": old * values}[change.how]
 
     def variants(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return, for values (K, 1) or (K, rows) of fields that others are derived from, the arrays that they change and
-        those that C MuJoCo derives from them (`DERIVED`), (K, ...) each: as many models as worlds may choose from, so that
-        none is derived within a step.
+        """Return the arrays of K model variants, (K, ...), for `values` of derived fields, (K, 1) or (K, rows). The result
+        holds the arrays that these fields change and those that C MuJoCo derives from them (`DERIVED`). Variants are computed
+        in advance, so that no constant is derived within a step.
         """
         on_host = RandomizedModel(self._scene, self.model, values, torch.float64, torch.device("cpu"))
         changed = on_host.arrays(changed_arrays(values), values)
@@ -97,8 +98,8 @@ class RandomizedModel:
 
 
 def keep_centres_apart(model: mujoco.MjModel, fields: Collection[str]) -> None:
-    """Tell MuJoCo, of a model whose centres of mass are going to move, that they are not where bodies have their origin: it
-    leaves out what that saves.
+    """Mark the bodies of a model as having their centre of mass away from their origin, if `fields` move centres of mass.
+    MuJoCo otherwise uses shortcuts that assume the two coincide.
     """
     if "body_ipos" in changed_arrays(fields):
         model.body_sameframe[:] = 0
@@ -109,12 +110,14 @@ def keep_centres_apart(model: mujoco.MjModel, fields: Collection[str]) -> None:
 def check_ranges(
     ranges: Mapping[str, Range | DrawConfig], scene: Scene, sim: SimConfig, where: Callable[[str], str] = str
 ) -> None:
-    """Check `ranges`, field -> lowest and highest value, or more, against a scene; `where` says who set a dotted path.
+    """Check `ranges`, field -> lowest and highest value or a `DrawConfig`, against a scene. `where` maps a dotted path of the
+    configuration to the beginning of an error message.
 
     Raises:
-        ConfigError: there is no such field, the scene has nothing that it changes, or the lowest values leave no mass.
+        ConfigError: a field does not exist, the scene has nothing that the field changes, or the lowest value is too low, for
+            example because it leaves no mass.
     """
-    model = scene.model(sim, "none") if ranges else None  # no field is the ground's, which takes long to build
+    model = scene.model(sim, "none") if ranges else None  # no field changes the ground, and building it takes long
     for name in ranges:
         if name not in FIELDS:
             path = where("domain_rand.ranges")
@@ -127,14 +130,14 @@ def check_ranges(
         if not len(field.rows(scene, model)):
             raise ConfigError(f"{path}: {scene.name} has no {field.what}")
         if name == "restitution" and (model.geom_solref[field.rows(scene, model), 0] <= 0.0).any():
-            told = "contacts have a stiffness of their own (a negative solref), in place of a time constant"
-            raise ConfigError(f"{path}: {scene.name}: {told}")
+            reason = "contacts have a stiffness (a negative solref) instead of a time constant"
+            raise ConfigError(f"{path}: {scene.name}: {reason}")
         changed = given.give(name, torch.tensor([low], dtype=torch.float64)) if field.changes else {}
         for change in field.changes:
             rows = changed[change.array][:, field.rows(scene, model)]
             numbers = rows if change.column is None else rows[:, :, change.column]
             if change.least is not None and numbers.min() < change.least:
                 raise ConfigError(
-                    f"{path}: its lowest value, {low:g} ({field.meaning}), makes a {change.array} of {numbers.min():g};"
-                    f" at least {change.least:g} must be left"
+                    f"{path}: its lowest value, {low:g} ({field.meaning}), makes {change.array} {numbers.min():g};"
+                    f" it must be at least {change.least:g}"
                 )

@@ -1,4 +1,4 @@
-"""From how much of its speed a body keeps when it bounces to the damping of its contacts: MuJoCo has no restitution."""
+"""Contact damping that realises a given restitution, which MuJoCo's contact model does not have as a parameter."""
 
 import math
 
@@ -9,8 +9,8 @@ POINTS = 1024
 
 
 def kept_speed(ratio: float) -> float:
-    """Return the share of its speed that a body keeps which bounces off a spring with a damper of damping ratio `ratio`, from
-    0 to 1, where the contact ends as soon as it no longer pushes.
+    """Return the restitution of a body on a spring and damper with damping ratio `ratio` (0 to 1): the share of its speed
+    that it keeps. The contact ends as soon as it no longer pushes.
 
     Source: Schwager and Poeschel, Coefficient of restitution and linear-dashpot model revisited (Granular Matter 9, 2007),
     equation 21: exp(-r / w * angle) with w = sqrt(1 - r^2) and angle = atan2(2 r w, 2 r^2 - 1); exp(-2) at r = 1.
@@ -22,7 +22,7 @@ def kept_speed(ratio: float) -> float:
 
 
 def _ratios() -> list[float]:
-    """Return the damping ratios at which 0, 1 / POINTS, ... and all of the speed is kept."""
+    """Return the damping ratios for restitutions 0, 1 / POINTS, 2 / POINTS, ..., 1."""
     found = []
     for k in range(POINTS + 1):
         low, high = 0.0, 1.0
@@ -34,19 +34,19 @@ def _ratios() -> list[float]:
 
 
 LEAST_RATIO = 0.01
-"""Contacts are damped at least so much: without any, a robot that stands never comes to rest."""
+"""Smallest damping ratio of contacts: without damping, a standing robot never comes to rest."""
 
 
 class DampingOfBounces:
-    """Restitution -> damping ratio of contacts, by a table: nothing is solved for within a step."""
+    """Table that maps restitution to the damping ratio of contacts, so that no equation is solved within a step."""
 
     def __init__(self, device: torch.device, dtype: torch.dtype) -> None:
         self.table = torch.tensor(_ratios(), dtype=dtype, device=device).clamp_(min=LEAST_RATIO)
-        """(POINTS + 1,) ratios."""
+        """(POINTS + 1,) damping ratios."""
 
     def ratio(self, restitution: Tensor) -> Tensor:
-        """Return damping ratios for shares of the speed that bounces keep, of any shape. Less than exp(-2) = 0.135 is not to
-        be had with a ratio of at most 1, at which it stays.
+        """Return the damping ratios for restitutions of any shape. Ratios are limited to 1, whose restitution is exp(-2) =
+        0.135; smaller restitutions get this ratio too.
         """
         place = restitution.clamp(0.0, 1.0) * POINTS
         index = place.long().clamp(max=POINTS - 1)

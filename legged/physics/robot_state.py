@@ -1,4 +1,4 @@
-"""What the task sees of a robot with a floating base and feet."""
+"""State of a robot with a floating base and feet, as the task reads it."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,11 @@ from legged.robots.robot import Robot
 
 @dataclass(frozen=True)
 class RobotState:
-    """What the task sees of N robots: float32 tensors, allocated once, written in place by the physics engine. Those that
-    `Physics.qpos` and `Physics.qvel` hold are views of them, live after a step; the others are current after a refresh.
+    """State of N robots, as the task reads it: float32 tensors, allocated once, which the physics engine writes in place.
+    Fields that are views of `Physics.qpos` or `Physics.qvel` are current after a step; the others are current after a
+    refresh.
 
-    D joints and F feet in the robot's order, B contacts (`Robot.contact_names`).
+    D joints and F feet are in the robot's order; B is the number of contacts (`Robot.contact_names`).
     """
 
     base_pos: Tensor
@@ -23,7 +24,7 @@ class RobotState:
     base_lin_vel: Tensor
     """(N, 3) velocity of the base's origin, base frame [m/s]."""
     base_lin_vel_w: Tensor
-    """(N, 3) the same, world frame [m/s]."""
+    """(N, 3) velocity of the base's origin, world frame [m/s]."""
     base_ang_vel: Tensor
     """(N, 3) angular velocity of the base, base frame [rad/s]."""
     projected_gravity: Tensor
@@ -33,17 +34,17 @@ class RobotState:
     dof_vel: Tensor
     """(N, D) joint velocities [rad/s]."""
     feet_pos: Tensor
-    """(N, F, 3) centres of the feet, world frame [m]: of a foot of several shapes the mean of theirs."""
+    """(N, F, 3) centres of the feet, world frame [m]. The centre of a foot of several shapes is the mean of their centres."""
     feet_vel: Tensor
-    """(N, F, 3) velocities of those points, world frame [m/s]."""
+    """(N, F, 3) velocities of the feet's centres, world frame [m/s]."""
     contact_forces: Tensor
-    """(N, B, 3) sum of contact forces on each collision shape, or on all of a foot, world frame, at the last physics step
-    [N]; zero after a reset."""
+    """(N, B, 3) sum of the contact forces on each collision shape, or on all shapes of a foot, world frame, at the last
+    physics step [N]; zero after a reset."""
 
 
 class DrivenJoints:
-    """Angles and velocities of the joints with a motor, copied out of the generalised coordinates where passive joints lie
-    between them. Where none does, RobotState has views, and there is nothing to copy.
+    """Copies the angles and velocities of the driven joints out of the generalised coordinates, for robots whose passive
+    joints lie between them. For other robots RobotState has views, and nothing is copied.
     """
 
     def __init__(self, qpos: Tensor, qvel: Tensor, state: RobotState, robot: Robot) -> None:
@@ -56,14 +57,14 @@ class DrivenJoints:
         ]
 
     def read(self) -> None:
-        """Bring them up to date."""
+        """Copy the current angles and velocities."""
         for source, target, columns in self._pairs:
             torch.index_select(source, 1, columns, out=target)
 
 
 def robot_state(qpos: Tensor, qvel: Tensor, robot: Robot) -> RobotState:
-    """Return the state of robots whose generalised positions are `qpos` (N, nq) and velocities `qvel` (N, nv): views of them
-    where they hold a field, zeroed tensors elsewhere.
+    """Return the state of robots with generalised positions `qpos` (N, nq) and velocities `qvel` (N, nv). Its fields are
+    views of them where possible, and zeroed tensors otherwise.
     """
 
     def zeros(*shape: int) -> Tensor:
@@ -86,7 +87,7 @@ def robot_state(qpos: Tensor, qvel: Tensor, robot: Robot) -> RobotState:
 
 
 def _view(array: Tensor, columns: tuple[int, ...]) -> Tensor:
-    """Return those columns of an array (N, K) as a view, if they lie side by side, else zeros of their shape."""
+    """Return columns of an array (N, K) as a view if they are contiguous; otherwise return zeros of the same shape."""
     first, count = columns[0], len(columns)
     if columns == tuple(range(first, first + count)):
         return array[:, first : first + count]

@@ -1,4 +1,4 @@
-"""The ground that play shows: a few tiles of chosen types and sizes, in which every robot has its place."""
+"""The ground of `play`: a few tiles of chosen types and sizes, with a place for every robot."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,36 +13,36 @@ from legged.errors import ConfigError
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, check_terrain, terrain_type, tile_size
 
 DIFFICULTIES = (0.5, 0.8)
-"""Difficulty of the tiles on which robots start, and of those behind them, which they reach."""
+"""Difficulties of the tiles on which robots start, and of the next tiles."""
 COLUMNS = 4
-"""Tiles side by side where there is only one type; those of random types differ."""
+"""Tiles side by side of a single type; tiles of random types differ."""
 SETTING: tuple[tuple[str, Any], ...] = (
     ("terrain.border_size", 3.0),
     ("terrain.spawn_range", 0.3),
     ("init_state.yaw", [0.0, 0.0]),
 )
-"""Overrides that others may follow: little ground around the tiles, starts near their middle, facing along x."""
+"""Overrides: a narrow border, starts near the middle of tiles, facing along x; later overrides may replace them."""
 ROWS_NEEDED = 128
 """Constraint rows that a robot on steps needs in mujoco-warp."""
 
 
 @dataclass(frozen=True)
 class Playground:
-    """Two rows of tiles, each column of one type. Robots start in the middle of the first row's and walk along x, out of
-    their tile and into the one behind it.
+    """Two rows of tiles, each column of one type. Robots start in the middle of tiles in the first row and walk along x into
+    the second row.
     """
 
     rows: tuple[tuple[TileSpec, ...], tuple[TileSpec, ...]]
     order: tuple[int, ...]
-    """Columns in the order in which robots are put there: those worth seeing first."""
+    """Columns in the order in which robots are placed, the most important first."""
 
     @classmethod
     def of(cls, cfg: LeggedConfig, name: str | None, difficulty: float | None) -> "Playground | None":
-        """Return what --terrain and --difficulty ask for: COLUMNS tiles of the type `name`, else one of each of the task's
-        own types; None for a task on a plane.
+        """Return the playground of --terrain and --difficulty: COLUMNS tiles of the type `name`, or else one of each type of
+        the task; None for a task on a plane.
 
         Raises:
-            ConfigError: no such type, or no such difficulty.
+            ConfigError: the type or the difficulty does not exist.
         """
         if difficulty is not None and not 0.0 <= difficulty <= 1.0:
             raise ConfigError(f"--difficulty: must be between 0 and 1, got {difficulty:g}")
@@ -63,7 +63,7 @@ class Playground:
             order = sorted(range(COLUMNS), key=lambda c: abs(c - 0.5 * (COLUMNS - 1)))
 
         def size_of(kind: str, d: float) -> float:
-            """Return the size of the training, where that is fixed and nobody asks for another."""
+            """Return the size of the training if it is fixed and no difficulty is given."""
             return tile_size(cfg.terrain, kind, d) if difficulty is None else TERRAIN_TYPES[kind].sized(d, cfg.terrain.scale)
 
         front, back = (
@@ -74,11 +74,11 @@ class Playground:
 
     @property
     def types(self) -> list[str]:
-        """Return the types there are, each once."""
+        """Return the types of the tiles, each once."""
         return list(dict.fromkeys(spec.type for spec in self.rows[0]))
 
     def changes(self, cfg: LeggedConfig) -> list[tuple[str, Any]]:
-        """Return overrides under which a task of configuration `cfg` stands on this ground; what its policy sees stays."""
+        """Return overrides that put a task of configuration `cfg` on this ground, with unchanged observations."""
         shares = dict.fromkeys(cfg.terrain.proportions, 0.0) | dict.fromkeys(self.types, 1.0 / len(self.types))
         return [
             ("terrain.mesh_type", "height_map"),
@@ -92,26 +92,26 @@ class Playground:
         ]
 
     def build(self, cfg: LeggedConfig) -> Terrain:
-        """Build the terrain; `cfg`, with the changes above, says how large tiles are.
+        """Return the terrain with the tile size of `cfg`, which includes the changes above.
 
         Raises:
-            ConfigError: too small.
+            ConfigError: the tiles are too small.
         """
         check_terrain(cfg.terrain, cfg.origins)
         return Terrain.of_tiles(self.rows, cfg.terrain, np.random.default_rng(cfg.env.seed))
 
     def columns(self, num_envs: int, shift: int = 0) -> list[int]:
-        """Return the column of each of that many robots; `shift` moves all on to the next ones in `order`."""
+        """Return the column of each robot; `shift` moves all robots on in `order`."""
         return [self.order[(i + shift) % len(self.order)] for i in range(num_envs)]
 
     def place(self, task: LeggedRobot, shift: int = 0) -> None:
-        """Give every robot its tile, where its next episodes begin."""
+        """Assign every robot its tile for the next episodes."""
         assert task.terrain_curriculum is not None, "the task stands on a plane"
         columns = torch.tensor(self.columns(task.num_envs, shift), device=task.device)  # type: ignore[arg-type]
         task.terrain_curriculum.place_at(torch.zeros_like(columns), columns)
 
     def label(self, terrain: Terrain, base_pos: Sequence[float]) -> str:
-        """Name the tile below `base_pos` (x, y, ...), or the nearest one: 'stairs_up, step height 0.194 m'."""
+        """Return the name of the tile below or nearest to `base_pos` (x, y, ...): 'stairs_up, step height 0.194 m'."""
         first = terrain.origins[0, 0]
         r, c = (
             int(np.clip(np.round((base_pos[axis] - first[axis]) / terrain.tile_size[axis]), 0, count - 1))
@@ -120,7 +120,7 @@ class Playground:
         return label(self.rows[r][c].type, [self.rows[r][c].size])
 
     def labels(self) -> dict[str, str]:
-        """Return type -> its name with the sizes there are of it."""
+        """Return type -> its name with all its sizes."""
         return {
             kind: label(kind, list(dict.fromkeys(spec.size for row in self.rows for spec in row if spec.type == kind)))
             for kind in self.types
@@ -128,6 +128,6 @@ class Playground:
 
 
 def label(kind: str, sizes: Sequence[float]) -> str:
-    """Name tiles of one type and some sizes: 'stairs_up, step height 0.14 to 0.194 m'."""
+    """Return the name of tiles of one type and some sizes: 'stairs_up, step height 0.14 to 0.194 m'."""
     info = TERRAIN_TYPES[kind]
     return kind if kind == "flat" else f"{kind}, {info.what} {info.text(*sizes)}"

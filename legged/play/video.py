@@ -14,20 +14,20 @@ from legged.process.paths import DISK_FULL, make_folder, relative, replacing
 from legged.rendering import camera_of
 
 FPS = 25
-"""Frames a second; fewer where control steps are longer."""
+"""Frames per second; fewer if control steps are longer."""
 GIF_FPS = 8
 GIF_S = 12.0
-"""Length of a GIF; as many seconds of the film as a page can take [s]."""
+"""Length of a GIF [s]."""
 
 
 class Video:
-    """Collects pictures of a task's first robots while it is stepped; without a folder it does nothing."""
+    """Recorder of pictures of a task's first robots; without a folder it does nothing."""
 
     def __init__(self, task: BaseTask, count: int, folder: Path | None, gif: bool = False) -> None:
-        """Open the camera and make the folder.
+        """Create the camera and the folder.
 
         Raises:
-            RunError: nothing can be rendered, or the folder can't be made.
+            RunError: this machine cannot render, or the folder cannot be created.
         """
         self.folder, self.gif = folder, gif
         self.camera = camera_of(task, count) if folder else None
@@ -41,24 +41,24 @@ class Video:
         self._start = time.perf_counter()
 
     def follow(self, robot: int) -> None:
-        """Put another robot in the middle of the picture, from now on; on a plane all are in it."""
+        """Follow another robot from now on; on a plane all robots are visible."""
         if self.camera:
             self.camera.followed = robot
 
     def due(self, step: int) -> bool:
-        """Say whether a frame is to be taken after this control step."""
+        """Return whether a frame is due after this control step."""
         return self.camera is not None and step % self.every == 0
 
     def take(self, *lines: str) -> None:
-        """Take a frame, with `lines` written on it."""
+        """Record a frame with lines of text."""
         if self.camera:
             self.frames.append(self.camera.picture(lines))
 
     def write(self) -> None:
-        """Write play.mp4 and, if asked for, a smaller play.gif.
+        """Write play.mp4 and, with `gif`, a smaller play.gif.
 
         Raises:
-            RunError: one of them can't be written.
+            RunError: a file cannot be written.
         """
         if not (self.camera and self.folder):
             return
@@ -70,10 +70,10 @@ class Video:
 
 
 def write_mp4(frames: list[np.ndarray], path: Path, fps: float) -> None:
-    """Write pictures (height, width, 3) uint8 as a film of so many a second.
+    """Write pictures (height, width, 3) uint8 as a film with `fps` pictures per second.
 
     Raises:
-        RunError: it can't be written.
+        RunError: the film cannot be written.
     """
     try:
         import imageio_ffmpeg  # nothing but a film needs it
@@ -86,7 +86,7 @@ def write_mp4(frames: list[np.ndarray], path: Path, fps: float) -> None:
     wanted = ["-an", "-codec:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2"]
     with replacing(path) as part:
         command = [program, "-y", "-loglevel", "error", *given, *wanted, str(part)]
-        # It says with its exit code that a disk is full, which a pipe to it would not.
+        # Through a pipe ffmpeg would not report a full disk; its exit code does.
         done = subprocess.run(command, input=np.stack(frames).tobytes(), capture_output=True, check=False)
         if done.returncode:
             said = done.stderr.decode("utf-8", errors="replace").strip().splitlines() or [f"exit code {done.returncode}"]

@@ -1,4 +1,4 @@
-"""MuJoCo's viewer with a robot that follows the keyboard."""
+"""MuJoCo's viewer with keyboard commands."""
 
 import time
 from collections.abc import Callable
@@ -26,20 +26,20 @@ PANELS = {"show_left_ui": False, "show_right_ui": False}
 
 
 class Keyboard:
-    """Key presses -> a command (vx, vy, yaw rate), kept inside the ranges of the task."""
+    """Key presses -> a command (vx, vy, yaw rate) within the ranges of the task."""
 
     MOVES = {UP: (0, 1), DOWN: (0, -1), COMMA: (1, 1), PERIOD: (1, -1), LEFT: (2, 1), RIGHT: (2, -1)}
 
     def __init__(self, low: list[float], high: list[float]) -> None:
-        """Begin at rest; `low` and `high` are the least and the greatest command of each axis."""
+        """Start with the command zero; `low` and `high` are the limits of each axis."""
         self.low, self.high = low, high
         self.command = [0.0, 0.0, 0.0]
         self.restart = False
         self.tile = 0
-        """How many times the next tile was asked for."""
+        """Number of requests for the next tile."""
 
     def press(self, key: int) -> None:
-        """Take one key, by GLFW's code; others mean nothing."""
+        """Process a key by its GLFW code; other keys have no effect."""
         if key in self.MOVES:
             axis, sign = self.MOVES[key]
             moved = round(self.command[axis] + sign * STEP[axis], 3)
@@ -123,7 +123,7 @@ def _window(model: mujoco.MjModel, data: mujoco.MjData, press: Callable[[int], N
 
 
 def begin_anew(task: LeggedRobot, playground: Playground | None, keyboard: Keyboard) -> None:
-    """Put the robots back to their start, on terrain on the tile that the keyboard asks for, and name it."""
+    """Reset the robots, on terrain on the tile that the keyboard selects, and print its name."""
     if playground and task.terrain:
         playground.place(task, keyboard.tile)
     task.reset()

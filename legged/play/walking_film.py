@@ -47,7 +47,7 @@ def film(policy: TrainedPolicy, side: int) -> Film:
 
     Raises:
         ConfigError: the policy follows no commands, or does not fit its task.
-        RunError: nothing can be rendered.
+        RunError: this machine cannot render.
     """
     cfg = walker(policy)
     task, act, playground = _on_ground(policy, cfg)
@@ -92,7 +92,7 @@ def _on_ground(policy: TrainedPolicy, cfg: LeggedConfig) -> tuple[LeggedRobot, A
 
 @torch.inference_mode()
 def _walk(task: LeggedRobot, act: Actor, playground: Playground | None, camera: RobotsCamera) -> Iterator[np.ndarray]:
-    """Give the pictures of the film."""
+    """Yield the pictures of the film."""
     if playground is not None:
         playground.place(task)
     task.reset()
@@ -142,8 +142,8 @@ def _write_gif(pictures: Film, path: Path, colors: int, scale: float) -> tuple[i
 
 
 def _palette(pixels: np.ndarray, colors: int) -> Image.Image:
-    """Return a palette for pixels (..., 3) uint8. A colour counts with the root of how often it is there, else the floor has
-    all of them and a small robot is grey.
+    """Return a palette for pixels (..., 3) uint8. The weight of a colour is the square root of its frequency, so that the
+    floor does not take all colours.
     """
     fine = (pixels.reshape(-1, 3) >> 2).astype(np.int64)
     found, counts = np.unique(fine @ np.array([1 << 12, 1 << 6, 1]), return_counts=True)

@@ -1,4 +1,4 @@
-"""A trained policy that acts: the actor's network alone, without the learner around it."""
+"""A trained policy: the actor network without the learner."""
 
 from pathlib import Path
 
@@ -14,39 +14,39 @@ from legged.process.paths import relative
 
 
 class Actor:
-    """A policy in its task: observations -> actions (N, D), without noise. A recurrent one forgets, robot by robot, the
-    episodes that have ended.
+    """A policy in its task: observations -> actions (N, D), without noise. The hidden state of a recurrent policy is cleared
+    for robots whose episode has ended.
     """
 
     def __init__(self, task: BaseTask, device: torch.device | str) -> None:
-        """Build the network that the task's configuration describes, on `device`; its weights come with `load`."""
+        """Build the network of the task's configuration on `device`; `load` sets its weights."""
         self.task = task
         use_matmul(task.cfg)
         self.network = build_actor(task.cfg, task.get_observations(), task.num_actions).to(device).eval()
-        """rsl-rl's model; if it is recurrent, it keeps the hidden state of the task's robots from call to call."""
+        """Model of rsl-rl; a recurrent one keeps the hidden state of the task's robots between calls."""
 
     def __call__(self, observations: TensorDict) -> Tensor:
-        """Return the actions; to be called once for every step of the task, if the policy is recurrent."""
+        """Return the actions; a recurrent policy must be called once per step of the task."""
         if self.network.is_recurrent:
             self._forget(self.task.reset_buf)
         return self.network(observations)
 
     def _forget(self, ended: Tensor) -> None:
-        """Clear the memory of the robots in `ended` (N,)."""
+        """Clear the hidden state of the robots in the mask `ended` (N,)."""
         hidden = self.network.get_hidden_state()
         if hidden is None:
             return
-        # New tensors: the old ones may come from inference mode, and the call from outside of it.
+        # The old tensors may come from inference mode, so they are not changed in place.
         parts = hidden if isinstance(hidden, tuple) else (hidden,)
         kept = tuple(torch.where(ended.view(1, -1, 1).to(part.device), 0.0, part.detach()) for part in parts)
         self.network.reset(hidden_state=kept if isinstance(hidden, tuple) else kept[0])
 
     def load(self, checkpoint: Path) -> int:
-        """Take the weights of a checkpoint, and the progress of its curricula for the task; return how many iterations it had
-        been trained for.
+        """Load the weights of a checkpoint, and the progress of its curricula into the task; return its number of training
+        iterations.
 
         Raises:
-            ConfigError: the file is no checkpoint, or of another network.
+            ConfigError: the file is no checkpoint, or has another network.
         """
         saved = read_checkpoint(checkpoint)
         try:

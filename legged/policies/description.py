@@ -1,8 +1,10 @@
-"""What a robot's controller must know to run an exported policy, as plain data: policy.json."""
+"""The contents of policy.json: what a controller must know to run an exported policy, as plain data."""
 
 import inspect
 import math
 from typing import Any
+
+import mujoco
 
 from legged.config.actuator import MOTORS
 from legged.config.loader import to_dict
@@ -12,7 +14,6 @@ from legged.deploy.contract import CONTRACT_VERSION, need_of
 from legged.envs import BaseTask, LeggedRobot
 from legged.envs.marks import unit_of
 from legged.mdp.observations import ObservationTerm
-from legged.policies.model_description import describe_control
 from legged.robots.crouch import crouch
 
 LAWS = {
@@ -21,12 +22,27 @@ LAWS = {
     "T": "action_scale * action",
 }
 """control_type -> torque [N m] at joint angle q [rad] and velocity dq [rad/s]; action clipped at action_clip."""
+SHARED = {
+    "observation": "for each term clip(scale * value, -observation_clip, observation_clip), at its columns start to"
+    " start + size, without noise",
+    "history": "the last observation_history observations side by side, oldest first; at the start of an episode all are"
+    " the first one",
+}
+"""Conventions of all tasks."""
+MODEL_CONVENTIONS = {
+    "units": "SI: m, s, rad, N, N m; positions and velocities in MuJoCo's generalised coordinates",
+    **SHARED,
+    "action": "actions = policy(observation), then clipped at plus and minus action_clip, one for each actuator",
+    "control": "control_middle + control_reach * action, for each actuator, in the unit that it takes",
+    "time": "every control_dt: observe, run the policy, hold its controls for control_dt",
+}
+"""Conventions of tasks whose world is a model with its own actuators."""
 FRAMES = ("base frame", "yaw frame", "world frame")
 
 
 def describe(task: BaseTask, trained: TaskConfig | None = None) -> dict[str, Any]:
-    """Return observation layout with units, frames and formulas, joints, control law, time; keys are never renamed. The
-    configuration that the policy was `trained` with says which noise it knows; without one the task's does.
+    """Return the observation layout with units, frames and formulas, the joints, the control law and time steps. Keys are
+    never renamed. The noise comes from `trained`, the configuration of the training, or else from the task's.
     """
     cfg = task.cfg
     groups = describe_groups(task)
@@ -43,12 +59,12 @@ def describe(task: BaseTask, trained: TaskConfig | None = None) -> dict[str, Any
         "observation_clip": cfg.observations.clip,
         "recurrent": describe_memory(task),
         **describe_estimator(task),
-        **(describe_robot(task) if isinstance(task, LeggedRobot) else describe_control(task)),
+        **(describe_robot(task) if isinstance(task, LeggedRobot) else describe_model(task)),
     }
 
 
 def describe_robot(task: LeggedRobot) -> dict[str, Any]:
-    """Return the robot of a task, its commands and its control law."""
+    """Return the joints of a task's robot, its command ranges and its control law."""
     cfg, robot, control = task.cfg, task.robot, task.control
     low, high = task.command_sampler.full_ranges.t().tolist()
     scale, bent = control.action_scale, crouch(robot)
@@ -77,8 +93,25 @@ def describe_robot(task: LeggedRobot) -> dict[str, Any]:
     }
 
 
+def describe_model(task: BaseTask) -> dict[str, Any]:
+    """Return the conventions, actuators, control law and time steps of a task whose world is a model."""
+    model = task.physics.model
+    limited = model.actuator_ctrllimited.astype(bool)
+    low, high = model.actuator_ctrlrange.T
+    return {
+        "conventions": MODEL_CONVENTIONS,
+        "joint_names": [model.joint(i).name for i in range(model.njnt)],
+        "actuator_names": [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nu)],
+        "control_middle": [float(0.5 * (low[i] + high[i])) if limited[i] else 0.0 for i in range(model.nu)],
+        "control_reach": [float(0.5 * (high[i] - low[i])) if limited[i] else 1.0 for i in range(model.nu)],
+        "action_clip": task.cfg.control.clip_actions,
+        "control_dt": task.dt,
+        "sim_dt": task.cfg.sim.dt,
+    }
+
+
 def conventions(task: LeggedRobot) -> dict[str, str]:
-    """Return frames, orders and the way of time, in words."""
+    """Return the meaning of frames, orders and times, in words."""
     law = LAWS[task.cfg.control.control_type]
     return {
         "imu_frame": "angular velocity and gravity are those of the frame of this body, which is the base frame: what an IMU"
@@ -95,10 +128,7 @@ def conventions(task: LeggedRobot) -> dict[str, str]:
         "world frame": "z up",
         "quaternion": "(w, x, y, z), turns the base frame into the world frame",
         "units": "SI: m, s, rad, N m; numbers by joint are in the order of joint_names",
-        "observation": "for each term clip(scale * value, -observation_clip, observation_clip), at its columns start to"
-        " start + size, without noise",
-        "history": "the last observation_history observations side by side, oldest first; at the start of an episode all are"
-        " the first one",
+        **SHARED,
         "observation_groups": "group by group side by side, each at its columns start to start + history * size, with as many"
         " observations of its own terms as its history says; start of a term is where it lies in the oldest of them",
         "action": "actions = policy(observation), then clipped at plus and minus action_clip, one for each of"
@@ -110,7 +140,7 @@ def conventions(task: LeggedRobot) -> dict[str, str]:
 
 
 def describe_groups(task: BaseTask) -> list[dict[str, Any]]:
-    """Return name, first column, width of one observation and history of each group that the policy reads, in order."""
+    """Return the name, first column, width of one observation and history of each observation group of the policy."""
     groups: list[dict[str, Any]] = []
     start = 0
     for name in groups_of(task.cfg, "actor"):
@@ -158,7 +188,7 @@ def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any], 
 
 
 def describe_estimator(task: BaseTask) -> dict[str, Any]:
-    """Return what a policy with an estimator estimates inside, as `estimator`; nothing for others."""
+    """Return the outputs of a policy's estimator as `estimator`; an empty dictionary without one."""
     if ESTIMATED not in task.observation_groups:
         return {}
     targets = []
@@ -170,7 +200,7 @@ def describe_estimator(task: BaseTask) -> dict[str, Any]:
 
 
 def describe_memory(task: BaseTask) -> dict[str, Any] | None:
-    """Return how to keep the hidden state of a recurrent policy; None for one that has none."""
+    """Return the hidden state of a recurrent policy and its use; None for a policy without memory."""
     policy = task.cfg.train.policy
     if policy.rnn_type == "none":
         return None

@@ -1,4 +1,4 @@
-"""Full episodes under a policy, in a task of any kind: returns in the task's own unit, term by term, and how they ended."""
+"""Full episodes under a policy, in any task: returns in the task's unit, by term, and the ends of episodes."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,8 +18,8 @@ Policy = Callable[[TensorDict], Tensor]
 
 
 def for_episodes(policy: TrainedPolicy, episodes: int) -> tuple[TrainedPolicy, list[tuple[str, Any]]]:
-    """Return the policy with nothing randomised, and overrides for measuring so many episodes: an environment each, without
-    noise. What is logged of a rollout comes once, at the end.
+    """Return the policy without randomisation, and overrides for measuring a number of episodes, one per environment, without
+    noise. Metrics are logged once, at the end.
     """
     cfg = policy.cfg
     calm = replace(policy, cfg=cfg.trained())
@@ -32,7 +32,7 @@ def for_episodes(policy: TrainedPolicy, episodes: int) -> tuple[TrainedPolicy, l
 
 
 def unit_of(task: BaseTask) -> float:
-    """Return what a reward is divided by to be in the task's own unit, in which a term counts scale * value a step."""
+    """Return the divisor that converts rewards to the task's unit, in which a term counts scale * value per step."""
     return task.dt if task.cfg.rewards.times_dt else 1.0
 
 

@@ -1,4 +1,4 @@
-"""Export of a policy as TorchScript, ONNX and plain numbers, with what a controller must know, checked against torch."""
+"""Export of a policy as TorchScript, ONNX and plain numbers with a description, checked against torch."""
 
 import io
 import json
@@ -24,18 +24,18 @@ from legged.policies.weights_file import weights_of
 from legged.process.paths import make_folder, write_bytes, write_text
 
 EXPORTED = "exported"
-"""Folder of the files, beside a film or a checkpoint."""
+"""Folder of the exported files, inside that of a film or a checkpoint."""
 CHECKED_OBSERVATIONS = 1000
 CHECKED_SEQUENCE = (100, 3)
-"""Steps and robots on which a recurrent policy is checked."""
+"""Steps and robots of the check of a recurrent policy."""
 NEW_EPISODES = ((40, 1), (70, 0), (70, 2))
-"""Step and robot of the episodes that begin in between."""
+"""Steps and robots at which episodes begin during that check."""
 LARGEST_DIFFERENCE = 1e-4
-"""Exports that differ from the policy by more than this, in actions or as a share of the largest, are refused."""
+"""Largest allowed difference between an export and the policy, in actions or relative to the largest action."""
 
 
 class ExportError(RunError):
-    """An exported policy does not compute what the policy does."""
+    """An exported policy computes other actions than the policy."""
 
 
 def export(
@@ -45,23 +45,23 @@ def export(
     training: Mapping[str, Any] | None = None,
     trained: TaskConfig | None = None,
 ) -> dict[str, float]:
-    """Write `policy`, rsl-rl's network of the actor, as policy.pt (TorchScript), policy.onnx and policy.weights (plain
-    numbers, legged.deploy.weights) to `folder`; return the largest difference of each to it.
+    """Write `policy`, rsl-rl's actor network, to `folder` as policy.pt (TorchScript), policy.onnx and policy.weights (plain
+    numbers, legged.deploy.weights); return the largest difference of each file's actions from the policy's.
 
-    All take one flat observation (batch, width) and give actions (batch, joints), without noise: the groups that the policy
-    reads side by side, and of each with a history of H steps H times its layout, oldest step first. Of a recurrent policy
-    the TorchScript keeps the hidden state of a batch of 1 inside, until its reset(); the ONNX takes it and gives it back. The
-    metadata is in the ONNX file and beside it in policy.json, with what is said of its `training`; `trained` is the
-    configuration that it was trained with, if that is not the task's. A network of the motors is copied beside it.
+    All map a flat observation (batch, width) to actions (batch, joints), without noise. The observation has the policy's
+    groups side by side; a group with a history of H steps has H observations, oldest first. The TorchScript of a recurrent
+    policy keeps the hidden state for a batch of 1 until its reset(); the ONNX has it as inputs and outputs. The metadata,
+    with the entries of `training`, is in the ONNX file and in policy.json. `trained` is the configuration of the training if
+    it is not the task's. A network of the motors is copied to the folder.
 
     Raises:
-        ExportError: a file computes something else.
-        RunError: a file can't be written.
+        ExportError: a file computes other actions.
+        RunError: a file cannot be written.
     """
     metadata = {**describe(task, trained), **(training or {})}
     device = next(policy.parameters()).device
     widths = {name: task.observation_groups[name].buffer.shape[1] for name in policy.obs_groups}
-    # A sequence of batches; only a policy with a memory cares which comes first.
+    # A sequence of batches; its order matters only to recurrent policies.
     length, batch = CHECKED_SEQUENCE if policy.is_recurrent else (1, CHECKED_OBSERVATIONS)
     observations = torch.randn(length, batch, sum(widths.values()))
     begins = torch.zeros(length, batch, dtype=torch.bool)
@@ -69,7 +69,7 @@ def export(
     if policy.is_recurrent:
         for step, robot in NEW_EPISODES:
             begins[step, robot] = True
-    # In memory first, written once they have been read back and agree: onto a full disk torch would abort the process.
+    # Files are checked in memory before they are written; torch aborts the process when the disk is full.
     hidden = policy.get_hidden_state()
     try:
         policy.to("cpu").eval()
@@ -105,8 +105,8 @@ def export(
 
 @torch.inference_mode()
 def _run_policy(policy: Any, observations: Tensor, begins: Tensor, widths: dict[str, int]) -> np.ndarray:
-    """Return the policy's own actions (T, batch, D) for observations (T, batch, width): its groups, of these `widths`, side
-    by side. Before a step, episodes begin where `begins` (T, batch) says so.
+    """Return the policy's actions (T, batch, D) for observations (T, batch, width) of groups with these `widths`; episodes
+    begin before the steps in the mask `begins` (T, batch).
     """
     policy.reset()
     actions = []
@@ -119,7 +119,7 @@ def _run_policy(policy: Any, observations: Tensor, begins: Tensor, widths: dict[
 
 @torch.inference_mode()
 def _run_script(content: bytes, observations: Tensor, begins: Tensor) -> np.ndarray:
-    """Return those of the TorchScript file, which begins anew by its reset() where `begins` (T,) says so."""
+    """Return the actions of the TorchScript file, which is reset before the steps in the mask `begins` (T,)."""
     script = torch.jit.load(io.BytesIO(content))
     script(observations[0])
     actions = []
@@ -131,8 +131,8 @@ def _run_script(content: bytes, observations: Tensor, begins: Tensor) -> np.ndar
 
 
 def _run_onnx(content: bytes, observations: Tensor, begins: Tensor, memory: dict[str, Any] | None) -> np.ndarray:
-    """Return those of the ONNX file; a hidden state, as `memory` describes it, is handed on, and is zeros where `begins`
-    (T, batch) says that an episode does.
+    """Return the actions of the ONNX file; a hidden state, described by `memory`, is passed on and cleared before the steps
+    in the mask `begins` (T, batch).
     """
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     hidden: dict[str, np.ndarray] = {}
@@ -151,7 +151,7 @@ def _run_onnx(content: bytes, observations: Tensor, begins: Tensor, memory: dict
 
 
 def _run_weights(content: bytes, observations: Tensor, begins: Tensor) -> np.ndarray:
-    """Return those of the file of weights, which forgets where `begins` (T, batch) says that an episode does."""
+    """Return the actions of the file of weights, whose hidden state is cleared before the steps in `begins` (T, batch)."""
     network = NumpyNetwork(content)
     network.run(observations[0].numpy())
     actions = []
@@ -162,14 +162,14 @@ def _run_weights(content: bytes, observations: Tensor, begins: Tensor) -> np.nda
 
 
 def _torchscript(policy: Any) -> bytes:
-    """Return the file of the TorchScript policy."""
+    """Return the TorchScript file of a policy."""
     buffer = io.BytesIO()
     torch.jit.save(torch.jit.script(policy.as_jit().to("cpu")), buffer)
     return buffer.getvalue()
 
 
 def _onnx(policy: Any, metadata: dict[str, Any]) -> bytes:
-    """Return the file of rsl-rl's ONNX model with a free batch size and the metadata as JSON strings, one property a key."""
+    """Return the file of rsl-rl's ONNX model with a free batch size and the metadata as JSON strings, one per key."""
     module = policy.as_onnx(verbose=False).to("cpu").eval()
     buffer = io.BytesIO()
     inputs, outputs = module.input_names, module.output_names

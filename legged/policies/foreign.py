@@ -1,6 +1,10 @@
-"""Policies that others trained, as ONNX files: a YAML file says what their observation consists of."""
+"""Policies as ONNX files, from this package or other projects, with a layout that describes their observations and actions.
+
+A layout is a YAML file, or the policy.json of an export.
+"""
 
 import ast
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,12 +13,13 @@ from typing import Any
 import numpy as np
 import onnxruntime
 
+from legged.config.actuator import ActuatorConfig
 from legged.config.bounds import LARGEST, between, items, positive
 from legged.config.checks import build
 from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError, suggest
-from legged.policies.own_layout import read_description
+from legged.mdp.actuator import is_ideal
 from legged.process.paths import data_folder, exists
 from legged.robots.patterns import match_values
 from legged.robots.robot import Robot
@@ -31,18 +36,20 @@ TERMS = {
     "phase_sin": "sine of each clock's phase",
     "phase_cos": "cosine of each clock's phase",
 }
-"""What an observation may consist of."""
+"""Terms of which an observation may consist."""
+COMMANDS = ("command_xy", "command_yaw")
+"""Names in layouts for the first two columns and the third column of the term `commands` of policy.json."""
 JOINTS, STIFFNESS, DAMPING = (
     ("dof_names", "joint_names"),
     ("kp", "stiffness", "joint_stiffness"),
     ("kd", "damping", "joint_damping"),
 )
-"""Keys of an ONNX file's metadata under which its joints, their order, and gains are found."""
+"""Keys of an ONNX file's metadata for its joints in its order, and for their gains."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The schema of a layout: what a policy sees, and what its output means."""
+    """The schema of a layout: a policy's observation, and the meaning of its output."""
 
     observation: dict[str, float] = field(metadata=between(-LARGEST, LARGEST))
     """Term -> its scale, in the order of the columns."""
@@ -81,11 +88,11 @@ class Layout:
 
 
 def read_layout(name: str, where: str) -> Layout:
-    """Return the layout in the file `name`, or of that name under resources/layouts/; `where` says who asks for it. A file
-    that ends in .json is the policy.json of one of our own policies.
+    """Return the layout in the file `name`, or of that name under resources/layouts/; `where` begins the error about the
+    name. A file that ends in .json is the policy.json of an export.
 
     Raises:
-        ConfigError: there is none, or it is none.
+        ConfigError: there is no such file, or it is no layout.
     """
     folder = data_folder("resources") / "layouts"
     path = next(
@@ -105,7 +112,7 @@ def read_layout(name: str, where: str) -> Layout:
 
 
 class ForeignPolicy:
-    """A policy on one robot: D joints in the robot's order outside, the policy's own order inside."""
+    """A policy on one robot with D joints. Arguments and results have the robot's joint order; the network has its own."""
 
     def __init__(self, path: Path, layout: Layout, robot: Robot) -> None:
         """Load the ONNX file at `path`; its metadata, texts by name, are in `metadata`.
@@ -143,14 +150,14 @@ class ForeignPolicy:
         scale = layout.action_scale
         every = match_values(scale, acted, "layout: action_scale") if isinstance(scale, dict) else np.array(scale)
         self._scale = np.broadcast_to(every, (len(acted),))
-        self._check_sizes(robot)
         self.reset()
+        self._check_sizes(robot)
 
     def _gains(
         self, table: Mapping[str, float], of_robot: np.ndarray, said: Mapping[str, str], keys: Sequence[str], robot: Robot
     ) -> np.ndarray:
-        """Return gains in the robot's order, (D,): those of the layout's `table`, or else of the file's metadata under
-        `keys`, or else `of_robot`.
+        """Return gains (D,) in the robot's order: from the layout's `table`, or else from the file's metadata under `keys`,
+        or else `of_robot`.
         """
         if table:
             return match_values(table, robot.joint_names, f"layout: {keys[1]}")
@@ -168,9 +175,8 @@ class ForeignPolicy:
         if len(inputs) != 1 or len(inputs[0].shape) != 2 or len(outputs[0].shape) != 2:
             raise ConfigError(f"{self._path}: expected one input of shape (1, numbers), got {[i.shape for i in inputs]}")
         self._input = inputs[0].name
-        self.reset()
-        nothing = np.zeros(3)
-        width = len(self._observe(nothing, nothing, nothing, nothing, self.default, self.default))
+        zeros = np.zeros(3)
+        width = len(self._observe(zeros, zeros, zeros, zeros, self.default, self.default))
         if isinstance(inputs[0].shape[1], int) and inputs[0].shape[1] != width:
             raise ConfigError(f"{self._path}: takes {inputs[0].shape[1]} numbers, the layout's observation has {width}")
         count = len(self._acted)
@@ -178,7 +184,7 @@ class ForeignPolicy:
             raise ConfigError(f"{self._path}: gives {outputs[0].shape[1]} actions, '{robot.name}' has {count} joints")
 
     def reset(self) -> None:
-        """Begin an episode."""
+        """Start an episode."""
         self._actions = np.zeros(len(self._acted))
         self._phase = np.array(self.layout.phase_offsets, dtype=float)
 
@@ -212,15 +218,7 @@ class ForeignPolicy:
         targets[self._acted] += self._scale * self._actions
         return targets
 
-    def _observe(
-        self,
-        command: np.ndarray,
-        lin_vel: np.ndarray,
-        ang_vel: np.ndarray,
-        gravity: np.ndarray,
-        dof_pos: np.ndarray,
-        dof_vel: np.ndarray,
-    ) -> np.ndarray:
+    def _observe(self, command: Any, lin_vel: Any, ang_vel: Any, gravity: Any, dof_pos: Any, dof_vel: Any) -> np.ndarray:
         """Return the observation, (width,)."""
         terms = {
             "base_lin_vel": lin_vel + np.cross(ang_vel, self.layout.velocity_point),
@@ -239,10 +237,10 @@ class ForeignPolicy:
 
 
 def _listed(said: Mapping[str, str], keys: Sequence[str], where: str) -> list[Any] | None:
-    """Return the list under the first of `keys` in an ONNX file's metadata; None if there is none.
+    """Return the list under the first of `keys` in an ONNX file's metadata; None without such a key.
 
     Raises:
-        ConfigError: it is no list.
+        ConfigError: the value is no list.
     """
     key = next((key for key in keys if key in said), None)
     if key is None:
@@ -254,3 +252,76 @@ def _listed(said: Mapping[str, str], keys: Sequence[str], where: str) -> list[An
     if not isinstance(value, list | tuple) or not value:
         raise ConfigError(f"{where}: metadata {key}: expected a list")
     return list(value)
+
+
+# ---- layouts of policies that this package exported ----------------------------------------------------------------------
+
+
+def read_description(path: Path) -> dict[str, Any]:
+    """Return the entries of the layout that describes the policy of the policy.json at `path`.
+
+    Raises:
+        ConfigError: the file is no policy.json, or a layout cannot describe its policy: it has a memory, another control law,
+            or different scales within one term.
+    """
+    try:
+        said = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: is no policy.json of an export ({' '.join(str(error).split())})") from error
+    try:
+        return _entries(said, path)
+    except (KeyError, TypeError, IndexError, AttributeError) as error:
+        raise ConfigError(f"{path}: is no policy.json of an export ({type(error).__name__}: {error})") from error
+
+
+def was_trained_with_other_motors(path: Path) -> bool:
+    """Return whether the policy of the policy.json at `path` was trained with motors that no layout describes:
+    control.actuator with a torque-speed line, friction, a delay, a learned law or rotor inertia. `read_description` must
+    accept the file.
+
+    Raises:
+        ConfigError: its section about the actuator is invalid.
+    """
+    said = json.loads(path.read_text(encoding="utf-8")).get("actuator", {})
+    motors = build(ActuatorConfig, said, "", Origins(), f"{path}: actuator")
+    return not is_ideal(motors) or bool(motors.armature)
+
+
+def _entries(said: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    if said["recurrent"] is not None or any(group["history"] != 1 for group in said["observation_groups"]):
+        raise ConfigError(f"{path}: the policy has a memory; only policies that observe a single step can be played here")
+    if said["control_type"] != "P":
+        raise ConfigError(f"{path}: control_type: got {said['control_type']!r}; only 'P' can be played here")
+    joints, acted, scale = said["joint_names"], said["action_joints"], said["action_scale"]
+
+    def by_joint(key: str) -> dict[str, float]:
+        return dict(zip(joints, said[key], strict=True))
+
+    return {
+        "observation": _observation(said["observation"], path),
+        "observation_clip": said["observation_clip"],
+        "joints": joints,
+        "action_joints": acted,
+        "action_scale": dict(zip(acted, scale, strict=True)) if isinstance(scale, list) else scale,
+        "action_clip": said["action_clip"],
+        "default_joint_angles": by_joint("default_joint_angles"),
+        "stiffness": by_joint("stiffness"),
+        "damping": by_joint("damping"),
+        "torque_limits": by_joint("torque_limits"),
+        "control_dt": said["control_dt"],
+        "sim_dt": said["sim_dt"],
+    }
+
+
+def _observation(terms: list[Any], path: Path) -> dict[str, float]:
+    """Return term -> scale in the order of the columns."""
+    found: dict[str, float] = {}
+    for term in terms:
+        scales = term["scale"]
+        name = term["name"]
+        parts = dict(zip(COMMANDS, (scales[:2], scales[2:]), strict=True)) if name == "commands" else {name: scales}
+        for part, values in parts.items():
+            if any(value != values[0] for value in values):
+                raise ConfigError(f"{path}: observation: columns of '{name}' have scales of their own: {scales}")
+            found[part] = values[0]
+    return found

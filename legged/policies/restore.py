@@ -19,19 +19,19 @@ from legged.terrain import Terrain
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """A checkpoint and the configuration it was trained with."""
+    """A checkpoint and the configuration of its training."""
 
     cfg: TaskConfig
     checkpoint: Path
 
     @property
     def folder(self) -> Path:
-        """The run folder, or the shipped policy's."""
+        """Return the run folder, or the folder of the shipped policy."""
         return self.checkpoint.parent
 
     def output(self, what: str) -> Path:
-        """Return where files about it go by default: the run folder; logs/<what>/<task> for a policy that is shipped, whose
-        folder belongs to the package and may not be writable.
+        """Return the default folder for output about the policy: the run folder, or logs/<what>/<task> for a shipped policy,
+        whose folder belongs to the package and may not be writable.
         """
         return Path("logs") / what / self.folder.name if self.folder.parent.name == "policies" else self.folder
 
@@ -55,7 +55,7 @@ def policy_of(name: str, checkpoint: int | str | None = None, where: str = "POLI
 
 
 def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:
-    """Return overrides for measuring: no noise, pushes or curriculum, friction 1, nominal mass, episodes that don't end."""
+    """Return overrides for measuring: no noise, pushes or curriculum, friction 1, nominal mass, and long episodes."""
     return [
         ("env.num_envs", num_envs),
         ("env.episode_length_s", seconds + 10.0),
@@ -68,10 +68,10 @@ def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:
 
 
 def nominal(cfg: TaskConfig, changes: Iterable[tuple[str, Any]]) -> TaskConfig:
-    """Return a configuration for measuring and showing the nominal model, with nothing drawn but what `changes` ask for.
+    """Return a configuration for measurements with the nominal model, randomised only by `changes`.
 
     Raises:
-        ConfigError: the changes do not fit it.
+        ConfigError: the changes do not fit the configuration.
     """
     few_robots_do = ("train.algorithm.num_mini_batches", 1)  # nothing is trained
     cfg = override(cfg.trained(), [*changes, few_robots_do])
@@ -87,8 +87,8 @@ def restore(
     terrain: Terrain | None = None,
     make: Callable[..., Any] = make_task,
 ) -> tuple[Any, Actor]:
-    """Build the task with some settings changed, on its own terrain or on the one given, and the policy that acts in it;
-    nothing is written. `make` builds a task of a configuration, as `make_task` does.
+    """Return the policy's task with changed settings, on its own terrain or the given one, and the policy. Writes no files.
+    `make` builds a task from a configuration, as `make_task` does.
 
     Raises:
         ConfigError: the checkpoint does not fit the task.

@@ -1,4 +1,4 @@
-"""The network of an actor as policy.weights: plain numbers, which `legged.deploy.weights` and a C++ header read."""
+"""The actor network as policy.weights: plain numbers for `legged.deploy.weights` and a C++ header."""
 
 from typing import Any
 
@@ -10,8 +10,8 @@ from legged.learning.estimator import EstimatingModel
 
 
 def weights_of(policy: Any, activation: str, num_actions: int) -> bytes:
-    """Return the file of `policy`, rsl-rl's network of the actor, on the CPU, whose hidden layers have that activation (by
-    rsl-rl's name). Of outputs beside the means of the actions, such as standard deviations, nothing is kept.
+    """Return the file of `policy`, rsl-rl's actor network on the CPU, whose hidden layers have an activation of rsl-rl's
+    name. Only the outputs for the means of actions are kept.
     """
     layers: list[Layer] = []
     if policy.obs_normalization:
@@ -29,9 +29,7 @@ def weights_of(policy: Any, activation: str, num_actions: int) -> bytes:
 
 
 def _dense(mlp: nn.Sequential, activation: str, outputs: int | None = None) -> list[Layer]:
-    """Return the layers of an MLP, of the last one the first `outputs` only: where there is more than means, they come
-    first.
-    """
+    """Return the layers of an MLP; the last one is cut to its first `outputs`, which are the means."""
     layers: list[Layer] = []
     linear = [module for module in mlp if isinstance(module, nn.Linear)]
     for module in linear:

@@ -1,1 +1,1 @@
-"""What a process is before any task: imports, display, paths, cores, ranks."""
+"""Set-up of a process before any task: imports, display, paths, cores, ranks."""

@@ -1,23 +1,23 @@
-"""How many cores this process may use."""
+"""Number of cores that this process may use."""
 
 import math
 import os
 from pathlib import Path
 
 CGROUPS = Path("/sys/fs/cgroup")
-"""Where Linux says what a group of processes may use."""
+"""Folder in which Linux states the limits of groups of processes."""
 
 
 def available_cores() -> int:
-    """Count the cores that this process may use: those that it may run on, and no more than its group's share of time."""
+    """Return the number of cores that this process may use: those it may run on, limited by its group's share of CPU time."""
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     share = quota(CGROUPS, Path("/proc/self/cgroup"))
     return max(1, math.ceil(min(allowed, share)))
 
 
 def quota(root: Path, membership: Path) -> float:
-    """Return the cores' worth of time that the groups of this process may use, the smallest of theirs; infinite where nothing
-    is said. `membership` lists the groups, whose folders lie below `root`.
+    """Return the smallest CPU share of this process's groups, in cores; infinite without a limit. The file `membership` lists
+    the groups, whose folders are below `root`.
     """
     try:
         groups = [line.split(":", 2) for line in membership.read_text().splitlines()]
@@ -37,7 +37,7 @@ def quota(root: Path, membership: Path) -> float:
 
 
 def _share(folder: Path) -> float:
-    """Return the cores' worth of time that one group may use: cpu.max of cgroup v2, cpu.cfs_* of v1."""
+    """Return the CPU share of one group, in cores: cpu.max of cgroup v2, cpu.cfs_* of v1."""
     try:
         if (folder / "cpu.max").is_file():
             most, period = (folder / "cpu.max").read_text().split()

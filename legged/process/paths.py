@@ -1,5 +1,5 @@
-"""Where the files beside the code lie: in a clone at the top level, in an installed wheel inside the package; and how files
-are written: whole or not at all, after a look whether they can be.
+"""Paths of the data folders, which are at the top of a clone or inside an installed package; and functions that write files
+atomically and check in advance if they can be written.
 """
 
 import errno
@@ -16,9 +16,9 @@ from legged.errors import ConfigError, RunError
 
 DISK_FULL = "no space left on the disk"
 ABANDONED_S = 3600.0
-"""An unfinished file that nobody has written to for so long was left by a process that was killed [s]."""
+"""Age at which an unfinished file counts as left over from a killed process [s]."""
 LONGEST_NAME = 255
-"""Longest name of a file or folder on the file systems there are [bytes]."""
+"""Longest name of a file or folder on common file systems [bytes]."""
 _REASONS = {errno.ENOSPC: DISK_FULL, errno.EDQUOT: f"{DISK_FULL} (the quota is used up)"}
 _COUNTER = itertools.count()
 
@@ -33,11 +33,11 @@ def data_folder(name: str) -> Path:
     for folder in (package / name, package.parent / name):
         if folder.is_dir():
             return folder
-    raise FileNotFoundError(f"legged: the folder '{name}' is missing beside {package}; install the package again")
+    raise FileNotFoundError(f"legged: the folder '{name}' is missing next to {package}; install the package again")
 
 
 def relative(path: Path) -> str:
-    """Return `path` as it is shortest to read: below the working directory if it lies there."""
+    """Return `path` in its shortest form, relative to the working directory if it is below it."""
     try:
         return str(path.resolve().relative_to(Path.cwd()))
     except (OSError, ValueError):
@@ -45,7 +45,7 @@ def relative(path: Path) -> str:
 
 
 def exists(path: Path) -> bool:
-    """Return whether there is a file or folder; there is none under a name that no system takes."""
+    """Return True if the file or folder exists. A name that the system rejects does not exist."""
     try:
         return path.exists()
     except (OSError, ValueError):
@@ -53,12 +53,14 @@ def exists(path: Path) -> bool:
 
 
 def reason(error: OSError) -> str:
-    """Say why an operation on a file failed, in a few words."""
+    """Return why a file operation failed, in a few words."""
     return _REASONS.get(error.errno or 0) or error.strerror or str(error) or type(error).__name__
 
 
 def full_disk_in(error: BaseException) -> OSError | None:
-    """Find the error of a full disk behind `error`: a library may raise one of its own because of it."""
+    """Return the error of a full disk in the chain of causes of `error`, or None. A library may hide it behind its own
+    error.
+    """
     found: BaseException | None = error
     while found is not None:
         if isinstance(found, OSError) and found.errno in _REASONS:
@@ -69,11 +71,11 @@ def full_disk_in(error: BaseException) -> OSError | None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a file beside `path` to write to, with the same ending and a name of this process alone; it takes the place of
-    `path` if nothing fails, else it goes.
+    """Give a temporary file next to `path`, with the same ending and a name unique to this process. It replaces `path` after
+    the block, or is removed if the block fails.
 
     Raises:
-        RunError: it can't be written: the disk is full, read-only, or not this user's.
+        RunError: it can't be written: the disk is full or read-only, or belongs to another user.
     """
     part = path.with_name(f".{path.stem}.{os.getpid()}-{next(_COUNTER)}{path.suffix}")
     try:
@@ -88,7 +90,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def _remove_abandoned(path: Path) -> None:
-    """Remove unfinished files of the same name that killed processes have left."""
+    """Remove unfinished files for the same path that killed processes left."""
     prefix = f".{path.stem}."
     for other in path.parent.iterdir():
         if not (other.name.startswith(prefix) and other.suffix == path.suffix):
@@ -100,22 +102,22 @@ def _remove_abandoned(path: Path) -> None:
 
 
 def write_bytes(path: Path, data: bytes | memoryview) -> None:
-    """Write a file that is whole or not there. Raises as `replacing`."""
+    """Write a file atomically. Raises the errors of `replacing`."""
     with replacing(path) as part:
         part.write_bytes(data)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file that is whole or not there, in UTF-8. Raises as `replacing`."""
+    """Write a text file in UTF-8 atomically. Raises the errors of `replacing`."""
     write_bytes(path, text.encode("utf-8"))
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder, and those above it, where they are missing.
+    """Make a folder and its missing parents.
 
     Raises:
-        ConfigError: there is a file in its place, or its name can't be one of a folder.
-        RunError: it can't be made: the disk is full, read-only, or not this user's.
+        ConfigError: a file is in its place, or its name is not a valid folder name.
+        RunError: it can't be made: the disk is full or read-only, or belongs to another user.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -124,7 +126,9 @@ def make_folder(folder: Path) -> None:
 
 
 def not_made(folder: Path, error: OSError | ValueError) -> ConfigError | RunError:
-    """Name the folder that could not be made, and why: a wrong name is the user's mistake, a full disk is not."""
+    """Return the error for a folder that could not be made. A wrong name is the user's mistake (ConfigError), a full disk is
+    not (RunError).
+    """
     try:
         blocking = next((str(p) for p in (folder, *folder.parents) if os.path.lexists(p) and not p.is_dir()), None)
     except (OSError, ValueError):
@@ -137,12 +141,12 @@ def not_made(folder: Path, error: OSError | ValueError) -> ConfigError | RunErro
 
 
 def ready_to_write(folder: Path, megabytes: float = 1.0) -> None:
-    """Check before long work that its results will find a place: that `folder` is there or can be made, that files can be
-    written to it, and that its disk has room for so many `megabytes`. Nothing is left behind.
+    """Check, before long work, that its results can be written: that `folder` exists or can be made, that it is writable, and
+    that its disk has `megabytes` free. Nothing is left behind.
 
     Raises:
-        ConfigError: there is a file in its place, or its name can't be one of a folder.
-        RunError: it can't be written: the disk is full, read-only, or not this user's.
+        ConfigError: a file is in its place, or its name is not a valid folder name.
+        RunError: it can't be written: the disk is full or read-only, or belongs to another user.
     """
     if any("\0" in part or len(os.fsencode(part)) > LONGEST_NAME for part in folder.parts):
         raise not_made(folder, OSError(errno.ENAMETOOLONG, "no folder can have such a name"))
@@ -153,23 +157,23 @@ def ready_to_write(folder: Path, megabytes: float = 1.0) -> None:
         with tempfile.TemporaryFile(dir=here, buffering=0) as probe:
             if shutil.disk_usage(here).free < megabytes * 2**20:
                 raise OSError(errno.ENOSPC, DISK_FULL)
-            probe.write(bytes(2**16))  # a quota says no only now
+            probe.write(bytes(2**16))  # a quota takes effect only here
     except OSError as error:
         raise RunError(f"{relative(folder)}: cannot write there: {reason(error)}") from error
 
 
 def ready_to_write_file(flag: str, path: Path, megabytes: float = 1.0, endings: Sequence[str] = ()) -> None:
-    """Check as `ready_to_write` that the file `path`, which was asked for by `flag`, can be written, and that its name has
-    one of the `endings`, if any are given: what is written must be what the name says.
+    """Check as `ready_to_write` that the file `path`, the value of `flag`, can be written. If `endings` are given, its name
+    must have one of them.
 
     Raises:
-        ConfigError: it is a folder, is called something else, or can't lie where it should.
+        ConfigError: it is a folder, has another ending, or can't exist in that place.
         RunError: it can't be written there.
     """
     if "\0" in path.name or len(os.fsencode(path.name)) > LONGEST_NAME:
-        raise ConfigError(f"{flag}: no file can be called {path.name}")
+        raise ConfigError(f"{flag}: not a valid file name: {path.name}")
     if path.is_dir() or not path.name:
-        raise ConfigError(f"{flag}: {path} is a folder; the name of a file is wanted")
+        raise ConfigError(f"{flag}: {path} is a folder; expected a file")
     if endings and path.suffix not in endings:
         raise ConfigError(f"{flag}: must end in {' or '.join(endings)}, got '{path.name}'")
     ready_to_write(path.parent, megabytes)

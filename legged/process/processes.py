@@ -1,4 +1,4 @@
-"""Processes that this one starts."""
+"""Environment of child processes."""
 
 import os
 from pathlib import Path
@@ -6,12 +6,12 @@ from pathlib import Path
 from legged.process.startup import STAGES_FILE
 
 INSTALLED = ("site-packages", "dist-packages")
-"""What the folders are called in which packages are installed."""
+"""Names of folders with installed packages."""
 
 
 def child_environment() -> dict[str, str]:
-    """Return the environment in which another Python finds this package where this one did, and in which its start is not
-    taken for this one's.
+    """Return an environment in which a child Python finds this package where this process did. The child's start-up stages
+    are not reported as this one's.
     """
     environment = {name: value for name, value in os.environ.items() if name != STAGES_FILE}
     top = Path(__file__).resolve().parents[2]

@@ -1,4 +1,4 @@
-"""Which of a training's processes this one is; torchrun says so in the environment."""
+"""Rank of this process in a training on several GPUs, from the environment that torchrun sets."""
 
 import os
 from dataclasses import dataclass
@@ -8,23 +8,23 @@ from legged.errors import ConfigError
 
 @dataclass(frozen=True)
 class Ranks:
-    """The place of this process among those that train together, one for each GPU."""
+    """Rank of this process among those that train together, one for each GPU."""
 
     rank: int = 0
-    """Number of this process; number 0 logs, prints and saves."""
+    """Number of this process. Process 0 logs, prints and saves."""
     local_rank: int = 0
-    """Its number on this machine, and that of its GPU."""
+    """Number of this process on its machine, and of its GPU."""
     count: int = 1
-    """Processes in all."""
+    """Number of processes."""
     local_count: int = 1
-    """Processes on this machine."""
+    """Number of processes on this machine."""
 
     @classmethod
     def now(cls) -> "Ranks":
-        """Return what the environment says; one process, where it says nothing.
+        """Return the ranks in the environment; a single process without them.
 
         Raises:
-            ConfigError: it says something that can't be.
+            ConfigError: the environment has impossible values.
         """
         rank, local_rank = _whole("RANK", 0, 0), _whole("LOCAL_RANK", 0, 0)
         count, local_count = _whole("WORLD_SIZE", 1, 1), _whole("LOCAL_WORLD_SIZE", 1, 1)
@@ -37,20 +37,20 @@ class Ranks:
 
     @property
     def several(self) -> bool:
-        """Whether there are others."""
+        """True if there are several processes."""
         return self.count > 1
 
     @property
     def first(self) -> bool:
-        """Whether this is the process that logs, prints and saves."""
+        """True if this is the process that logs, prints and saves."""
         return self.rank == 0
 
 
 def _whole(name: str, default: int, least: int) -> int:
-    """Return a whole number in the environment; one that is empty says nothing."""
+    """Return a whole number from the environment, or `default` if it is missing or empty."""
     text = os.environ.get(name, "").strip()
     if not text:
         return default
     if not (text.isdecimal() and int(text) >= least):
-        raise ConfigError(f"{name}: the environment says '{text}'; a whole number of at least {least} is allowed, or nothing")
+        raise ConfigError(f"{name}: the environment says '{text}'; expected a whole number of at least {least}, or nothing")
     return int(text)

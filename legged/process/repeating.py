@@ -1,4 +1,4 @@
-"""What is done again and again in a thread of its own while something else is at work."""
+"""Repeated call of a function in a thread while other code runs."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -7,8 +7,8 @@ from contextlib import contextmanager
 
 @contextmanager
 def repeating(call: Callable[[], None], every_s: float, at_end: bool = False) -> Iterator[None]:
-    """Call a function every so many seconds while the block runs, and where `at_end` says so once more behind it. The block
-    is left when the last call has returned.
+    """Call a function every `every_s` seconds while the block runs, and once more after it if `at_end`. The block ends when
+    the last call has returned.
     """
     over = threading.Event()
 

@@ -1,4 +1,4 @@
-"""Imported before anything heavy: imports are most of a start."""
+"""Start of a process, imported before any large package, because imports take most of the start."""
 
 import atexit
 import gc
@@ -15,25 +15,25 @@ from types import FrameType
 from legged.process.deferred_compiler import defer_compiler
 
 STARTED_S = time.perf_counter()
-"""When this package was first imported, on the clock of `time.perf_counter` [s]."""
+"""Time at which this package was first imported, on the clock of `time.perf_counter` [s]."""
 INTERRUPTED = 128 + signal.SIGINT
 """Exit code of a command that Ctrl-C ended."""
 
-# A thread of torch's that waits for the others spins by default, which takes the core from the very thread that it waits for
-# as soon as something else runs on the machine: updates then take ten to a hundred times as long. It is asked once, by the
-# first import of torch.
+# By default, a thread of torch that waits for others spins. If anything else runs on the machine, it then takes the core from
+# the very thread for which it waits, and updates take ten to a hundred times as long. torch reads this variable once, when it
+# is first imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-# rsl-rl imports GitPython, which complains at length where there is no git; this package asks git by itself.
+# rsl-rl imports GitPython, which prints a long warning where git is missing. This package calls git itself.
 os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
 
 
 STAGES_FILE = "LEGGED_STAGES"
-"""Environment variable: a file that is told when each stage of a start has ended, for `legged benchmark startup`."""
+"""Environment variable with the file in which each finished stage of a start is reported, for `legged benchmark startup`."""
 
 
 def stage_ended(name: str) -> None:
-    """Tell who wants to know that a stage of the start has ended."""
+    """Report that a stage of the start has ended, if STAGES_FILE is set."""
     if STAGES_FILE in os.environ:
         with open(os.environ[STAGES_FILE], "a", encoding="utf-8") as file:
             file.write(f"{time.time():.6f} {name}\n")
@@ -41,8 +41,8 @@ def stage_ended(name: str) -> None:
 
 @contextmanager
 def importing() -> Iterator[None]:
-    """Import without garbage collection, or build what stays as imports do: they make a million objects, and looking through
-    them time and again takes a quarter of a start.
+    """Switch off garbage collection in the block, for imports or for objects that stay as long as imports do. They make a
+    million objects, and repeated passes over these take a quarter of a start.
     """
     enabled = gc.isenabled()
     gc.disable()
@@ -54,8 +54,8 @@ def importing() -> Iterator[None]:
 
 
 def is_a_command() -> None:
-    """Freeze garbage collection in a process that is one of our commands: imports stay, what comes to be from here on is
-    collected, and nothing at exit.
+    """Restart garbage collection in a process that is a command of this package. Imported objects are never examined again,
+    new ones are collected, and nothing is collected at exit.
     """
     gc.freeze()
     gc.enable()
@@ -63,9 +63,10 @@ def is_a_command() -> None:
 
 
 def command_of_ours() -> str | None:
-    """Return how this process was started, if as a command of this package: 'script' (train.py, play.py), 'module' (python -m
-    legged) or 'installed' (legged). A process that such a one starts by multiprocessing is no command, though Python gives it
-    the same arguments.
+    """Return how this process was started as a command of this package: 'script' (train.py, play.py), 'module' (python -m
+    legged), 'installed' (legged), or None if it is not one.
+
+    A multiprocessing child of a command is not a command, although Python gives it the same arguments.
     """
     given = sys.orig_argv
     processes = sys.modules.get("multiprocessing.process")
@@ -82,7 +83,7 @@ def command_of_ours() -> str | None:
 
 
 def program(command: str) -> list[str]:
-    """Return the words that call a command of `legged` in the way in which this process was called."""
+    """Return the words that call a command of `legged`, in the way in which this process was called."""
     how = command_of_ours()
     if how == "script" and command in ("train", "play"):
         return ["python", str(Path(sys.argv[0]).with_name(f"{command}.py"))]
@@ -90,8 +91,10 @@ def program(command: str) -> list[str]:
 
 
 def only_lists() -> bool:
-    """Return whether this process prints help or a list and needs no heavy import: `legged`, `legged --help`, `legged list`.
-    Python calls a module '-m' until it has found its file, so that another program's `-m legged` is not meant.
+    """Return True if this process prints help or a list and needs no large import: `legged`, `legged --help`, `legged list`.
+
+    `python -m legged` counts too; at this moment its sys.argv[0] is still '-m'. An argument `-m legged` of another program
+    does not count.
     """
     given = sys.orig_argv
     if sys.argv[:1] == ["-m"] and given[given.index("-m") + 1] == "legged":
@@ -104,13 +107,13 @@ def only_lists() -> bool:
 
 
 def in_main_thread() -> bool:
-    """Return whether this is the thread in which signal handlers can be set."""
+    """Return True if this is the main thread, in which signal handlers can be set."""
     return threading.current_thread() is threading.main_thread()
 
 
 def leave_at_once(_number: int, _frame: FrameType | None) -> None:
-    """End the process at Ctrl-C where there is nothing to save and Python would print a traceback: during imports, and when a
-    command has done its work.
+    """End the process at Ctrl-C without a traceback. Used where there is nothing to save: during imports, and after a
+    command's work.
     """
     with suppress(OSError):
         os.write(2, b"interrupted\n")
@@ -118,13 +121,13 @@ def leave_at_once(_number: int, _frame: FrameType | None) -> None:
 
 
 def leave_at_interrupts() -> None:
-    """Let Ctrl-C end the process at once, without a traceback; a handler that somebody else has set stays."""
+    """Let Ctrl-C end the process at once, without a traceback. A handler of other code stays."""
     if in_main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, leave_at_once)
 
 
 def raise_at_interrupts() -> None:
-    """Undo `leave_at_interrupts`: Ctrl-C raises KeyboardInterrupt again, so that what was begun is cleaned up."""
+    """Undo `leave_at_interrupts`: Ctrl-C raises KeyboardInterrupt again, so that cleanup code runs."""
     if in_main_thread() and signal.getsignal(signal.SIGINT) is leave_at_once:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -70,7 +70,7 @@ class Job:
 
 
 class WorkerPool:
-    """Runs jobs until the queue is empty. A job that fails does not end the others.
+    """Pool that runs jobs until the queue is empty. A job that fails does not end the others.
 
     Trainings start in the order of the queue. Each starts when the one before it has built its task, so that start-up
     overlaps with training and no kernel is compiled twice. Jobs of a kind in `shared` wait until every training has ended.
@@ -149,5 +149,5 @@ def why_failed(job: Job, code: int) -> str:
         return errors[-1]
     if code < 0:
         named = {number.value: number.name for number in signal.Signals}
-        return f"killed by {named.get(-code, f'signal {-code}')}" + (", maybe for want of memory" if code == -9 else "")
+        return f"killed by {named.get(-code, f'signal {-code}')}" + (", maybe out of memory" if code == -9 else "")
     return lines[-1].strip() if lines else f"exit code {code}"

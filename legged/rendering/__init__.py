@@ -1,12 +1,9 @@
 """Pictures of robots and terrain."""
 
-from legged.rendering.camera import Camera
-from legged.rendering.camera_of import camera_of
-from legged.rendering.model_camera import ModelCamera, drawn_model, follow_root
-from legged.rendering.robots_camera import RobotsCamera
-from legged.rendering.scene import add_sky, display_model, make_renderer
-from legged.rendering.size import RobotSize, size_of
-from legged.rendering.window import window_opens
+from legged.rendering.camera import Camera, make_renderer, window_opens
+from legged.rendering.framing import RobotSize, size_of
+from legged.rendering.scene import add_sky, display_model
+from legged.rendering.task_cameras import ModelCamera, RobotsCamera, camera_of, drawn_model, follow_root
 
 __all__ = [
     "Camera",

@@ -1,17 +1,31 @@
-"""What is drawn: robots on a floor or a terrain, under a sky."""
+"""Scenes that are drawn and not simulated: robots on a floor or a terrain, under a sky.
 
-import warnings
+Terrain is coloured by its height, so that steps show without shadows.
+"""
+
 from collections.abc import Sequence
 
 import mujoco
+import numpy as np
 
-from legged.errors import RunError
-from legged.process import headless
-from legged.rendering.paint import add_horizon, add_painted_terrain
-from legged.rendering.window import draw_without_window
+from legged.physics.scene.terrain_geoms import SAME, add_terrain
 from legged.robots.importing.adapted import robot_spec_of
 from legged.robots.robot import Robot
 from legged.terrain import Terrain
+
+SHOWN_DEPTH = 0.6
+"""Thickness of the drawn ground below the lowest point [m]."""
+LOW, MIDDLE, HIGH = np.array([[0.42, 0.52, 0.58], [0.80, 0.77, 0.70], [0.78, 0.58, 0.42]])
+"""Colours of the deepest, the level and the highest ground."""
+FAR = 100.0
+"""Extent of the level ground from the middle of a terrain; at least 1.2 times half the terrain's side [m]."""
+CHECKER = 0.94, 1.0
+"""Brightness of dark and of light squares."""
+SQUARE = 0.5
+"""Side of a square [m]."""
+GROUND = "terrain_checker"
+LEVEL_RANGE = 0.9
+"""Height above and below 0 up to which colours change, or more for higher ground [m]."""
 
 
 def add_sky(scene: mujoco.MjSpec) -> None:
@@ -28,7 +42,7 @@ def add_sky(scene: mujoco.MjSpec) -> None:
 
 
 def display_model(robot: Robot, count: int, width: int, height: int, terrain: Terrain | None = None) -> mujoco.MjModel:
-    """Compile `count` copies of the robot over one checkered floor, or a terrain, under a sky; it is drawn, not simulated."""
+    """Return a model of `count` copies of a robot over a checkered floor or a terrain, for pictures of that size [pixels]."""
     scene = mujoco.MjSpec()
     scene.visual.global_.offwidth, scene.visual.global_.offheight = width, height
     scene.visual.quality.shadowsize = scene.visual.quality.offsamples = 0  # ten times faster without a GPU
@@ -41,37 +55,17 @@ def display_model(robot: Robot, count: int, width: int, height: int, terrain: Te
     else:
         add_painted_terrain(scene, terrain, checkered=True)
         add_horizon(scene, terrain)
-        # Little light from the camera and much from the left behind it: treads, risers and flanks differ.
+        # Most light comes from the left behind the camera, so that treads, risers and flanks differ in brightness.
         _light(scene, [0.3, -0.35, -0.9], ambient=0.42, headlight=0.12, sun=0.62)
     add_robots(scene, robot, count)
     return scene.compile()
 
 
 def add_robots(scene: mujoco.MjSpec, robot: Robot, count: int) -> None:
-    """Add copies of the robot, whose names begin with 0/, 1/, ..."""
+    """Add copies of a robot with the name prefixes 0/, 1/, ..."""
     for i in range(count):
         frame = scene.worldbody.add_frame()
         scene.attach(robot_spec_of(robot.model_path, drawn=True), prefix=f"{i}/", frame=frame)
-
-
-def make_renderer(model: mujoco.MjModel, width: int, height: int, instead: str = "") -> mujoco.Renderer:
-    """Return what draws a model.
-
-    Raises:
-        RunError: nothing can be drawn on this machine; `instead` is what the user might do then.
-    """
-    if headless.NO_PICTURES:
-        raise RunError(f"cannot render here: {headless.NO_PICTURES}{instead}")
-    draw_without_window()
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # glfw warns, and then fails
-            return mujoco.Renderer(model, height, width, max_geom=model.ngeom + 1000)
-    except Exception as error:  # each GL library fails in its own way
-        raise RunError(
-            f"cannot render here ({error}); without a display MUJOCO_GL=egl or MUJOCO_GL=osmesa and their libraries are"
-            f" needed{instead}"
-        ) from error
 
 
 def _add_floor(scene: mujoco.MjSpec) -> None:
@@ -91,6 +85,96 @@ def _add_floor(scene: mujoco.MjSpec) -> None:
 
 
 def _light(scene: mujoco.MjSpec, direction: Sequence[float], ambient: float, headlight: float, sun: float) -> None:
-    """Add a sun that shines in a direction, and a light at the camera."""
+    """Add a sun that shines in a direction, and a headlight at the camera."""
     scene.visual.headlight.ambient, scene.visual.headlight.diffuse = [ambient] * 3, [headlight] * 3
     scene.worldbody.add_light(pos=[0, 0, 20], dir=direction, type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, diffuse=[sun] * 3)
+
+
+def add_painted_terrain(scene: mujoco.MjSpec, terrain: Terrain, checkered: bool = False) -> None:
+    """Add a terrain without collisions, coloured by height. With `checkered` level ground and slopes have squares, which show
+    the motion of a camera; steps have none, because their squares would make a picture a third slower.
+    """
+    span, lowest = LEVEL_RANGE, float(terrain.height_map.corners.min())
+    if checkered:
+        dark, light = ([grey] * 3 for grey in CHECKER)
+        builtin = mujoco.mjtBuiltin.mjBUILTIN_CHECKER
+        kind = mujoco.mjtTexture.mjTEXTURE_2D
+        scene.add_texture(name=GROUND, type=kind, builtin=builtin, rgb1=dark, rgb2=light, width=256, height=256)
+        material = scene.add_material(name=GROUND, specular=0.0, texuniform=True, texrepeat=[0.5 / SQUARE, 0.5 / SQUARE])
+        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = GROUND
+        span = max(span, float(np.abs(terrain.height_map.corners).max()))
+    for geom in add_terrain(scene, terrain, collide=False, depth=SHOWN_DEPTH):
+        _paint(scene, geom, span, lowest, terrain.height_map.cell if checkered else None)
+
+
+def add_horizon(scene: mujoco.MjSpec, terrain: Terrain) -> None:
+    """Add level ground around a checkered terrain up to the horizon."""
+    x, y = (0.5 * side for side in terrain.height_map.size)
+    far = max(FAR, 1.2 * x, 1.2 * y)
+    half = 0.5 * (far - x), 0.5 * (far - y)
+    for sign in (-1.0, 1.0):
+        for place, size in (
+            ((sign * (x + half[0]), 0.0), (half[0], far)),
+            ((0.0, sign * (y + half[1])), (x, half[1])),
+        ):
+            scene.worldbody.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                pos=[*place, -0.5 * SHOWN_DEPTH],
+                size=[*size, 0.5 * SHOWN_DEPTH],
+                rgba=[*MIDDLE, 1.0],
+                material=GROUND,
+                contype=0,
+                conaffinity=0,
+            )
+
+
+def _paint(scene: mujoco.MjSpec, geom: mujoco.MjsGeom, span: float, lowest: float, cell: float | None) -> None:
+    """Colour a geom by height, up and down to `span` [m]: one colour for a box, a texture for a height field, whose points
+    below the `lowest` ground are hidden. With the distance `cell` between the points of height fields [m], draw squares.
+    """
+    if geom.type == mujoco.mjtGeom.mjGEOM_BOX:
+        top = geom.pos[2] + geom.size[2]
+        geom.rgba = [*color(np.array(top), span), 1.0]
+        if cell is not None and abs(top) < SAME:
+            geom.material = GROUND
+        return
+    shape = scene.hfield(geom.hfieldname)
+    heights = geom.pos[2] + shape.size[2] * np.array(shape.userdata).reshape(shape.nrow, shape.ncol)
+    colors = color(_spread(heights, heights < lowest - SAME), span)
+    if cell is not None:
+        rows, columns = (np.arange(n) * cell // SQUARE for n in heights.shape)
+        colors = colors * np.where((rows[:, None] + columns) % 2 > 0, *CHECKER)[:, :, None]
+    pixels = (255 * colors).astype(np.uint8)
+    scene.add_texture(
+        name=geom.name,
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        width=shape.ncol,
+        height=shape.nrow,
+        nchannel=3,
+        data=pixels.ravel().tolist(),
+    )
+    material = scene.add_material(name=geom.name, specular=0.0)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = geom.name
+    geom.material = geom.name
+
+
+def _spread(heights: np.ndarray, sunk: np.ndarray) -> np.ndarray:
+    """Return heights (X, Y) in which each `sunk` point has the mean height of its neighbours that are not sunk, or of all
+    such points. Textures are blurred, so the colour of hidden points would otherwise show at the edge of visible ones.
+    """
+    if not sunk.any():
+        return heights
+    seen = np.pad(~sunk, 1)
+    padded = np.where(seen, np.pad(heights, 1), 0.0)
+    x, y = heights.shape
+    around = [(slice(i, i + x), slice(j, j + y)) for i in range(3) for j in range(3)]
+    count = sum(seen[at].astype(int) for at in around)
+    total = sum(padded[at] for at in around)
+    beside = np.where(count > 0, total / np.maximum(count, 1), heights[~sunk].mean())
+    return np.where(sunk, beside, heights)
+
+
+def color(heights: np.ndarray, span: float = LEVEL_RANGE) -> np.ndarray:
+    """Return colours (..., 3), 0 to 1, of heights (...) [m]; they change between -`span` and `span` [m]."""
+    t = np.clip(heights / span, -1.0, 1.0)
+    return np.stack([np.interp(t, (-1.0, 0.0, 1.0), stops) for stops in np.array([LOW, MIDDLE, HIGH]).T], axis=-1)

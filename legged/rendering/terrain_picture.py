@@ -1,37 +1,37 @@
-"""Tiles of terrain as a camera sees them, each with a robot that gives the scale."""
+"""Pictures of terrain: tiles with a robot for scale, and a map of the heights."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from legged.config import LeggedConfig
 from legged.config.schema import TerrainConfig
-from legged.rendering.camera import Camera
+from legged.figures import figure, import_matplotlib
+from legged.rendering.camera import Camera, labels
 from legged.rendering.framing import frame
-from legged.rendering.paint import SHOWN_DEPTH, add_painted_terrain
-from legged.rendering.scene import add_robots, add_sky
-from legged.rendering.text import labels
+from legged.rendering.scene import SHOWN_DEPTH, add_painted_terrain, add_robots, add_sky
 from legged.robots.robot import Robot, load_robot
 from legged.robots.stance import lowest_point
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, tile_size
 
 MARGIN = 2.0
-"""Border that is shown around the tiles [m]."""
+"""Width of the visible border around the tiles [m]."""
 AZIMUTH, ELEVATION = 14.0, -35.0
 """The camera looks along x and down, a little from the side [degrees]."""
 FILLED = 0.96
 """Share of the picture that the terrain fills."""
 SUN = np.array([0.39, -0.54, -0.75])
-"""Direction of its light: from the left, so that risers which face the camera are lit, if less than treads."""
+"""Direction of the light: from the left, so that risers that face the camera are lit, but less than treads."""
 FIELD_OF_VIEW = 30.0
-"""What the camera sees, from bottom to top [degrees]."""
+"""Vertical field of view of the camera [degrees]."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """A tile on which a robot stands, and what is written beside it."""
+    """A tile with a robot and a label."""
 
     row: int
     col: int
@@ -39,16 +39,16 @@ class Place:
 
 
 def tiles(cfg: TerrainConfig, rows: Sequence[Sequence[str]], difficulty: float, seed: int) -> Terrain:
-    """Build a terrain of the given types (R, C), all equally difficult, with a narrow border."""
+    """Return a terrain of the given types (R, C), all equally difficult, with a narrow border."""
     specs = [[TileSpec(name, tile_size(cfg, name, difficulty)) for name in row] for row in rows]
     return Terrain.of_tiles(specs, replace(cfg, border_size=MARGIN), np.random.default_rng(seed))
 
 
 def picture_of_types(cfg: LeggedConfig, types: Sequence[str], difficulty: float) -> np.ndarray:
-    """Return (height, width, 3) uint8: a tile of each type, with its name, in rows to be read from the upper left corner.
+    """Return a picture (height, width, 3) uint8 of one labelled tile per type, row by row from the upper left corner.
 
     Raises:
-        RunError: nothing can be rendered here.
+        RunError: this machine cannot render.
     """
     count = len(types)
     columns = count if count <= 3 else -(-count // 2) if count <= 8 else 4
@@ -69,12 +69,12 @@ def picture_of_types(cfg: LeggedConfig, types: Sequence[str], difficulty: float)
 
 
 def render(terrain: Terrain, places: Sequence[Place], robot: Robot, width: int = 1600) -> np.ndarray:
-    """Return (height, width, 3) uint8: the terrain seen along x from above, a robot in its default pose at each place.
+    """Return a picture (height, width, 3) uint8 of a terrain along x from above, with a robot at each place.
 
-    The height of the picture is what the terrain fills.
+    The height of the picture is that of the terrain in it.
 
     Raises:
-        RunError: nothing can be rendered here.
+        RunError: this machine cannot render.
     """
     outline = _outline(terrain)
     reach = FILLED * float(np.tan(0.5 * np.radians(FIELD_OF_VIEW)))
@@ -94,7 +94,7 @@ def render(terrain: Terrain, places: Sequence[Place], robot: Robot, width: int =
 
 
 def _model(terrain: Terrain, places: Sequence[Place], robot: Robot, width: int, height: int) -> mujoco.MjModel:
-    """Compile the scene, with the robots in the order of `places`; for drawing, not for simulating."""
+    """Return the scene, with the robots in the order of `places`."""
     scene = mujoco.MjSpec()
     add_sky(scene)
     half_x, half_y = (0.5 * side for side in terrain.height_map.size)
@@ -133,17 +133,72 @@ def _pose(model: mujoco.MjModel, data: mujoco.MjData, terrain: Terrain, places: 
 
 
 def _outline(terrain: Terrain) -> np.ndarray:
-    """Return (8, 3) the corners of the tiles and of what stands on them [m]."""
+    """Return the corners (8, 3) of the box around the tiles and the robots on them [m]."""
     x, y = (0.5 * side for side in terrain.height_map.size)
     bottom = float(terrain.height_map.corners.min()) - SHOWN_DEPTH
     return np.array([[sx * x, sy * y, z] for sx in (-1, 1) for sy in (-1, 1) for z in (bottom, 0.5)])
 
 
 def _label_at(terrain: Terrain, place: Place) -> np.ndarray:
-    """Return (3,) a place on the border behind the farthest tiles, on the near edge of the others [m]."""
+    """Return the position (3,) of a label: behind the farthest tiles, and on the near edge of the others [m]."""
     x, y, _ = terrain.origins[place.row, place.col]
     last = len(terrain.origins) - 1
     if place.row == last > 0:
         return np.array([x + 0.5 * (terrain.tile_size[0] + terrain.border), y, 0.0])
     aside = 0.5 * terrain.border if place.row == 0 else 0.0
     return np.array([x - 0.5 * terrain.tile_size[0] - aside, y, 0.0])
+
+
+def draw_map(terrain: Terrain, levels: Sequence[str], path: Path) -> None:
+    """Write a map of the heights, x upward and y to the left, with the tiles, their types and `levels` (R,), and origins."""
+    import_matplotlib()
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import AsinhNorm, LightSource
+
+    ground = terrain.height_map
+    rows, columns = terrain.origins.shape[:2]
+    length, width = terrain.tile_size
+    hidden = round(max(0.0, terrain.border - MARGIN) / ground.cell)
+    shown = slice(hidden, ground.heights.shape[0] - hidden), slice(hidden, ground.heights.shape[1] - hidden)
+    # Seen with x upward and y to the left; the light comes from the upper left.
+    heights = ground.heights[shown][::-1, ::-1]
+    largest = max(float(np.abs(heights).max()), 0.05)
+    # The scale is about linear up to 0.25 m and logarithmic above, so that low steps show next to high ones.
+    scale, colors = AsinhNorm(linear_width=0.25, vmin=-largest, vmax=largest), colormaps["RdYlBu_r"]
+    light = LightSource(azdeg=315, altdeg=45)
+    shaded = light.shade(heights, colors, blend_mode="soft", norm=scale, vert_exag=2.0, dx=ground.cell, dy=ground.cell)
+    half_x, half_y = (0.5 * n * ground.cell for n in heights.shape)
+
+    across = 11.0
+    high = min(max(across * half_x / half_y, 2.0), 12.0) + 1.2
+    with figure(path, (across, high), dpi=130, bbox_inches="tight") as (drawn, axes):
+        axis = axes[0, 0]
+        axis.imshow(shaded, extent=(half_y, -half_y, -half_x, half_x), interpolation="antialiased")
+        ends_x, ends_y = (np.arange(n + 1) * s - 0.5 * n * s for n, s in ((rows, length), (columns, width)))
+        axis.hlines(ends_x, ends_y[0], ends_y[-1], color="black", linewidth=0.5, alpha=0.5)
+        axis.vlines(ends_y, ends_x[0], ends_x[-1], color="black", linewidth=0.5, alpha=0.5)
+        axis.plot(
+            terrain.origins[..., 1].ravel(), terrain.origins[..., 0].ravel(), "k+", markersize=4, label="robots start here"
+        )
+        axis.set_xlabel("y [m]")
+        axis.set_ylabel("x [m]")
+
+        top = axis.secondary_xaxis("top")
+        groups = [[c for c in range(columns) if terrain.types[c] == name] for name in dict.fromkeys(terrain.types)]
+        middles = [0.5 * (ends_y[group[0]] + ends_y[group[-1] + 1]) for group in groups]
+        top.set_xticks(middles, [terrain.types[group[0]] for group in groups])
+        top.tick_params(length=0)
+        for label, group in zip(top.get_xticklabels(), groups, strict=True):
+            if 0.75 * across * len(group) / columns < 0.09 * len(label.get_text()):  # wider than its columns
+                label.set(rotation=30, ha="left")
+        right = axis.secondary_yaxis("right")
+        right.set_yticks(0.5 * (ends_x[1:] + ends_x[:-1]), levels)
+        right.tick_params(length=0)
+        if any(levels):
+            right.set_ylabel("difficulty")
+        axis.legend(loc="upper left", bbox_to_anchor=(0.0, -0.05), fontsize="small", frameon=False)
+        bar = drawn.colorbar(ScalarMappable(scale, colors), ax=axis, label="height [m]", shrink=0.8, aspect=30)
+        bar.set_ticks([h for h in (-2.0, -1.0, -0.5, -0.2, -0.1, 0.0, 0.1, 0.2, 0.5, 1.0, 2.0) if abs(h) <= largest])
+        bar.ax.yaxis.set_major_formatter("{x:g}")
+        bar.ax.minorticks_off()

@@ -32,12 +32,12 @@ def size_of(name: str, where: str = "robot") -> Size:
     return Size(robot.mass, robot.height)
 
 
-def growth(written_for: Size, robot: Size) -> dict[str, float]:
+def growth(reference: Size, robot: Size) -> dict[str, float]:
     """Return by what masses ("kg"), lengths ("m") and times ("s") grow from one robot to another."""
-    length = robot.height / written_for.height
-    return {"kg": robot.mass / written_for.mass, "m": length, "s": sqrt(length)}
+    length = robot.height / reference.height
+    return {"kg": robot.mass / reference.mass, "m": length, "s": sqrt(length)}
 
 
-def grown(unit: str, written_for: Size, robot: Size) -> float:
+def grown(unit: str, reference: Size, robot: Size) -> float:
     """Return by what a quantity of that unit, as "m/s" or "N^2 m^2", grows from one robot to another."""
-    return factor(unit, growth(written_for, robot))
+    return factor(unit, growth(reference, robot))

@@ -1,1 +1,1 @@
-"""A robot that is not there: C MuJoCo in real time behind UDP, as the robot's program sees one."""
+"""A simulated robot: C MuJoCo in real time, reached by UDP like a real robot."""

@@ -1,4 +1,4 @@
-"""A film of what the program did with a simulated robot."""
+"""Film of a simulated robot under the deployed program."""
 
 from pathlib import Path
 
@@ -6,8 +6,8 @@ import numpy as np
 
 from legged.play.video import write_mp4
 from legged.rendering import Camera, display_model, size_of
-from legged.rendering.follower import Follower
-from legged.rendering.text import caption
+from legged.rendering.camera import caption
+from legged.rendering.framing import Follower
 from legged.robots.robot import Robot
 from legged.terrain import Terrain
 
@@ -18,19 +18,19 @@ SIZE = (640, 360)
 AWAY = 3.45
 """Distance of the camera, in lengths of the robot."""
 GLIDE = 0.1
-"""Share of the way to a robot on a plane that the camera makes up in a picture."""
+"""Share of the distance to a robot on a plane that the camera covers per picture."""
 
 
 def make_film(robot: Robot, terrain: Terrain | None, folder: Path) -> None:
-    """Draw the poses in `folder`, with the states that its log.npz has at their times; fewer than two make no film.
+    """Write a film of the poses in `folder` with the states of its log.npz; fewer than two poses make no film.
 
     Raises:
-        RunError: nothing can be rendered here, or the film can't be written.
+        RunError: this machine cannot render, or the film cannot be written.
     """
     poses = np.load(folder / POSES)
     log = np.load(folder / "log.npz")
     if len(poses) < 2 or "times" not in log:
-        (folder / FILM).unlink(missing_ok=True)  # of another run
+        (folder / FILM).unlink(missing_ok=True)  # left by another run
         print(f"{folder}: the run was too short for a film, so there is none")
         return
     camera = Camera(display_model(robot, 1, *SIZE, terrain), *SIZE)

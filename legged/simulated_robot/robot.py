@@ -1,4 +1,4 @@
-"""One robot in C MuJoCo, with motors that follow targets and gains at every physics step, and the sensors of a robot."""
+"""One robot in C MuJoCo, with motors that are updated at every physics step, and sensors."""
 
 from collections.abc import Mapping
 
@@ -16,15 +16,15 @@ from legged.simulated_robot.motors import Motors
 from legged.terrain import Terrain
 
 OFFERS = frozenset({"base_lin_vel", "heights"})
-"""Sources beside the sensors: what a simulator knows and a robot would have to estimate."""
+"""Additional sources, known to a simulator, which a robot would have to estimate."""
 UNSTABLE = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
-"""MuJoCo's warnings after which it has begun anew at time 0, with another pose."""
+"""MuJoCo's warnings after which it has reset the state."""
 FALLEN = 1.2
-"""A base that leans further than this has fallen [rad]."""
+"""Lean of the base above which the robot has fallen [rad]."""
 
 
 class SimulatedRobot:
-    """A robot that stands in its default pose on a plane, or in the middle of the first tile of a terrain."""
+    """A robot that starts in its default pose on a plane, or in the middle of the first tile of a terrain."""
 
     def __init__(
         self,
@@ -34,8 +34,8 @@ class SimulatedRobot:
         motors: Motors | None = None,
         scan: str = SCANS[0],
     ) -> None:
-        """Build the world with the solver options of `sim`; the `motors`, ideal ones by default, have been asked for nothing
-        yet. `scan` says what a point of the heights reads (terrain.scan).
+        """Build the world with the solver options of `sim` and motors, by default ideal ones. `scan` is the setting
+        terrain.scan for the heights.
         """
         self.robot, self._terrain = robot, terrain
         self.model = RobotScene(robot, terrain).model(sim)
@@ -52,11 +52,11 @@ class SimulatedRobot:
         """(3, D) targets [rad], P gains [N m/rad], D gains [N m s/rad]."""
         self._start = self.data.qpos[:3].copy()
         self.lowest, self.highest, self.steepest = float(self._start[2]), float(self._start[2]), 0.0
-        """Height of the base, the least and the largest so far [m], and its largest lean [rad]."""
+        """Smallest and largest height of the base so far [m], and its largest lean [rad]."""
 
     @property
     def facts(self) -> RobotFacts:
-        """Return what the robot says of itself."""
+        """Return the robot's properties."""
         robot = self.robot
         return RobotFacts(
             name=robot.name,
@@ -69,10 +69,10 @@ class SimulatedRobot:
         )
 
     def step(self) -> None:
-        """Make one physics step, with the torques that the motors give now.
+        """Make one physics step with the present torques of the motors.
 
         Raises:
-            RunError: the simulation blew up.
+            RunError: the simulation became unstable.
         """
         data, before = self.data, self.data.time
         data.ctrl[:] = self._motors.torques(self.asked, data.qpos[self._qpos], data.qvel[self._qvel])
@@ -85,7 +85,7 @@ class SimulatedRobot:
         self.steepest = max(self.steepest, float(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0))))
 
     def state(self, sources: Mapping[str, np.ndarray | None]) -> RobotState:
-        """Return what is measured now, and the sources that are asked for, `heights` at its points (P, 2)."""
+        """Return the present measurements and the requested sources, `heights` at its points (P, 2)."""
         data = self.data
         return RobotState(
             time=float(data.time),
@@ -98,7 +98,7 @@ class SimulatedRobot:
         )
 
     def _source(self, name: str, points: np.ndarray | None) -> np.ndarray:
-        """Return a source as `legged.deploy.interface.Reading.sources` has it."""
+        """Return a source in the form of `legged.deploy.interface.Reading.sources`."""
         position, quaternion = self.data.qpos[:3], self.data.qpos[3:7]
         entries = np.zeros(9)
         mujoco.mju_quat2Mat(entries, quaternion)
@@ -111,13 +111,13 @@ class SimulatedRobot:
         return self._ground(position[:2] + points @ turn.T) - position[2]
 
     def _ground(self, places: np.ndarray) -> np.ndarray:
-        """Return the heights of the ground at world points (P, 2), as training measures them [m]."""
+        """Return the heights of the ground at world points (P, 2) as in training [m]."""
         if self._terrain is None or self._scan is None:
             return np.zeros(len(places))
         return self._scan[self._terrain.height_map.index(*places.T)]
 
     def report(self) -> dict[str, float | bool]:
-        """Return how far it got, in metres and radians, and whether it leaned further than one that has not fallen."""
+        """Return the distances moved [m], the largest lean [rad], and whether the robot fell."""
         moved = self.data.qpos[:3] - self._start
         return {
             "time": float(self.data.time),

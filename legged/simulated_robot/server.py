@@ -1,8 +1,10 @@
-"""The simulated robot behind UDP, in real time."""
+"""A simulated robot in real time, reached by UDP over a link with latency and losses."""
 
 import json
+import random
 import socket
 import time
+from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,31 +23,56 @@ from legged.deploy.udp_packets import (
     packet,
     unpack_command,
 )
-from legged.simulated_robot.link import Link
 from legged.simulated_robot.robot import SimulatedRobot
 
 STATE_S = 0.004
-"""States are sent after so long [s], rounded to physics steps."""
+"""Interval between states, rounded to physics steps [s]."""
 POSE_S = 0.04
-"""Poses are kept for a film after so long [s], at most `MOST_POSES` of them."""
+"""Interval between the poses that are kept for a film, at most `MOST_POSES` [s]."""
 MOST_POSES = 750
 SOURCE_S = 0.02
-"""Sources beside the sensors are sent after so long [s], rounded to states, with which they go."""
+"""Interval between the sources that are sent with states, rounded to states [s]."""
 HOLD_S = 0.2
-"""Motors that have been told nothing for so long brake with the D gains that they have [s]."""
+"""Time without a command after which motors brake with their present D gains [s]."""
 BEHIND_S = 0.1
-"""Simulated time that is further behind than this is given up [s]."""
+"""Largest delay of the simulated time that is made up for [s]."""
+
+
+class Link:
+    """One direction of a link, which delays packets by `latency_s` and loses some."""
+
+    def __init__(self, latency_s: float, loss: float, seed: int) -> None:
+        """Lose a share `loss` of the packets, drawn from `seed`."""
+        self._latency_s, self._loss = latency_s, loss
+        self._random = random.Random(seed)
+        self._waiting: deque[tuple[float, bytes]] = deque()
+        self.sent = self.lost = 0
+
+    def put(self, now: float, packet: bytes) -> None:
+        """Send a packet at the time `now` [s]."""
+        self.sent += 1
+        if self._random.random() < self._loss:
+            self.lost += 1
+        else:
+            self._waiting.append((now + self._latency_s, packet))
+
+    def take(self, now: float) -> list[bytes]:
+        """Return the packets that have arrived at the time `now` [s], in their order of sending."""
+        found = []
+        while self._waiting and self._waiting[0][0] <= now:
+            found.append(self._waiting.popleft()[1])
+        return found
 
 
 @dataclass
 class Server:
-    """Steps a robot as time goes by, sends its states, and does as it is told."""
+    """Real-time loop that steps a robot, sends its states and applies commands."""
 
     robot: SimulatedRobot
     latency_s: float = 0.0
-    """Of each direction [s]."""
+    """Latency of each direction [s]."""
     loss: float = 0.0
-    """Share of the packets that are lost, in each direction."""
+    """Share of lost packets in each direction."""
     seed: int = 1
     poses: list[np.ndarray] = field(default_factory=list)
     """Time [s] and MuJoCo's generalised positions, (1 + nq,) each."""
@@ -102,18 +129,18 @@ class Server:
         return {**self.robot.report(), **link, "skipped_s": self.skipped_s}
 
     def _listen(self, now: float) -> None:
-        """Take what has come."""
+        """Process the packets that have arrived."""
         while True:
             try:
                 data, client = self._socket.recvfrom(LARGEST)
-            except OSError:  # there is no more, or who was sent to has gone
+            except OSError:  # no more packets, or the receiver has closed
                 break
             opened = open_packet(data)
             if opened is None:
                 continue
             if opened[0] == HELLO:
                 self._greet(client, opened[2])
-            elif client == self._client and opened[0] == BYE:  # no bad link keeps a simulation alive
+            elif client == self._client and opened[0] == BYE:  # not subject to the link, so that the simulation always ends
                 self._gone = True
             elif client == self._client:
                 self._in.put(now, data)
@@ -123,7 +150,7 @@ class Server:
             self._obey(*opened)
 
     def _greet(self, client: tuple[str, int], body: bytes) -> None:
-        """Answer who wants to be sent states from now on."""
+        """Answer a greeting; its sender receives the states from now on."""
         try:
             sources = json.loads(body)["sources"]
             wanted = {name: None if p is None else np.array(p, dtype=float).reshape(-1, 2) for name, p in sources.items()}
@@ -135,7 +162,7 @@ class Server:
         self._send(packet(FACTS, 0, pack_json(facts_as_json(self.robot.facts))))
 
     def _obey(self, kind: int, sequence: int, body: bytes) -> None:
-        """Do as a packet says, unless a later one has come before it."""
+        """Apply a command packet unless a later one has arrived before."""
         if kind != COMMAND or sequence <= self._newest:
             return
         try:
@@ -148,17 +175,17 @@ class Server:
             self._told = self.robot.data.time
 
     def _brake_if_alone(self) -> None:
-        """Let go of the targets if nobody has renewed them."""
+        """Set the P gains to zero if commands have stopped."""
         if self._told is not None and self.robot.data.time - self._told > HOLD_S:
             self.robot.asked[1] = 0.0
 
     def _send_state(self, now: float, sources: dict[str, np.ndarray | None]) -> None:
-        """Send a state by the link."""
+        """Put a state into the link."""
         self._sequence += 1
         self._out.put(now, packet(STATE, self._sequence, pack_state(self.robot.state(sources))))
 
     def _deliver(self, now: float) -> None:
-        """Send what has come out of the link."""
+        """Send the packets that have passed the link."""
         for data in self._out.take(now):
             self._send(data)
 
@@ -166,5 +193,5 @@ class Server:
         if self._client is not None:
             try:
                 self._socket.sendto(data, self._client)
-            except OSError:  # nobody listens there any more
+            except OSError:  # the receiver has closed
                 return

@@ -1,1 +1,1 @@
-"""Sweeps: many trainings that differ in a few settings, chosen by what those before them have found."""
+"""Sweeps: many trainings that differ in a few settings, chosen from the results of earlier ones."""

@@ -1,4 +1,4 @@
-"""What a sweep consists of: its YAML file, checked against the task's configuration before anything is trained."""
+"""The YAML file of a sweep, checked against the task's configuration before a training begins."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
@@ -19,38 +19,40 @@ from legged.process.paths import data_folder, exists, relative
 from legged.registry import YAML_ENDINGS, register_file, task_class, task_config, task_names
 
 OWN = ("task", "env.seed", "train.runner.run_name", "train.runner.experiment_name", "train.runner.stop_at")
-"""Settings that a sweep makes itself."""
+"""Settings that the sweep sets itself."""
 EVALUATIONS = 10
-"""Evaluations of a trial, if the file does not say how many."""
+"""Default number of evaluations of a trial."""
 DIGITS = 4
-"""Significant digits of the numbers that are tried."""
+"""Significant digits of drawn numbers."""
 NUMBER = between(-FLOAT32_MAX, FLOAT32_MAX)
 
 
 @dataclass(frozen=True)
 class ParameterConfig:
-    """The values of a setting that are tried: a range, or a list of choices."""
+    """The tried values of a setting: a range or a list of choices."""
 
     low: float | None = field(default=None, metadata=NUMBER)
     """Least value."""
     high: float | None = field(default=None, metadata=NUMBER)
     """Greatest value."""
     log: bool = False
-    """Spread the tries evenly over the logarithm of the value."""
+    """Draw from the logarithm of the range."""
     choices: tuple[Any, ...] = field(default=(), metadata={**items(1000), "may_be_empty": True})
-    """The values, in place of a range."""
+    """Values to try, in place of a range."""
 
 
 @dataclass(frozen=True)
 class ObjectiveConfig:
-    """What is to be as good as possible."""
+    """The objective of a sweep."""
 
     figure: str = ""
-    """Figure of the evaluations during training; that which matters most, when empty."""
+    """Figure of the evaluations during training; the most important one when empty."""
     take: Literal["last", "best", "time", "steps"] = "last"
-    """Its last value, its best value, or the time in iterations [s] or the steps of all robots until it reaches `target`."""
+    """Value of a trial: the last or the best value of the figure, or the training time [s] or the steps of all robots until
+    it reaches `target`.
+    """
     target: float | None = field(default=None, metadata=NUMBER)
-    """The value at which a trial ends."""
+    """Value of the figure at which a trial ends."""
 
 
 @dataclass(frozen=True)
@@ -58,32 +60,32 @@ class SweepConfig:
     """The file of a sweep."""
 
     task: str = ""
-    """Task that is trained: a name, or a YAML file, relative to this one."""
+    """Task to train: a name, or a YAML file relative to this one."""
     name: str = field(default="", metadata=NAME)
-    """Folder under logs/; sweep_ and the name of the file when empty."""
+    """Folder under logs/; by default sweep_ and the name of the file."""
     trials: int = field(default=20, metadata=between(1, 1_000_000))
     """Trials in all, of all processes."""
     seeds: tuple[int, ...] = field(default=(1,), metadata={**items(100, between(0, 2**62)), "unique": True})
-    """Seeds with which each trial is trained; its value is their mean."""
+    """Seeds of each trial; its value is their mean."""
     objective: ObjectiveConfig = ObjectiveConfig()
-    """What is to be as good as possible."""
+    """The objective."""
     pruner: Literal["median", "hyperband", "none"] = "median"
-    """How trials are ended early: where they are worse than the median of those before; by successive halving; never."""
+    """Rule for ending trials early: below the median of earlier trials, by successive halving, or never."""
     startup_trials: int = field(default=10, metadata=between(1, 1_000_000))
-    """Trials that are drawn at random, before what they have found says where to look."""
+    """Number of random trials before earlier results guide the search."""
     seed: int = field(default=1, metadata=between(0, 2**31 - 1))
-    """Seed of what is drawn."""
+    """Seed of the search."""
     storage: str = ""
-    """Where trials are kept: a URL of a database, or journal:<file>; sweep.db in the sweep's folder when empty."""
+    """Storage of the trials: a URL of a database, or journal:<file>; by default sweep.db in the sweep's folder."""
     overrides: dict[str, Any] = field(default_factory=dict)
-    """Dotted path -> value, of all trials."""
+    """Dotted path -> value, for all trials."""
     parameters: dict[str, ParameterConfig] = field(default_factory=dict)
-    """Dotted path -> values that are tried."""
+    """Dotted path -> values to try."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A setting that is swept."""
+    """A swept setting."""
 
     path: str
     kind: Literal["whole", "number", "choice"]
@@ -94,7 +96,7 @@ class Parameter:
     """Values as JSON."""
 
     def value(self, drawn: Any) -> Any:
-        """Return the value of the setting for what was drawn: a number, rounded to a few digits, or the text of a choice."""
+        """Return the value of the setting from a drawn number, rounded to a few digits, or from the text of a choice."""
         if self.kind == "choice":
             return json.loads(drawn)
         if self.kind == "whole":
@@ -102,7 +104,7 @@ class Parameter:
         return min(max(float(f"{drawn:.{DIGITS}g}"), self.low), self.high)
 
     def drawn(self, value: Any) -> Any:
-        """Return what is drawn for a value of the setting; None if it is none of those that are tried."""
+        """Return the drawn number or text for a value of the setting; None if the value is not among those to try."""
         if self.kind == "choice":
             return next((text for text in self.choices if json.loads(text) == value), None)
         if isinstance(value, bool) or not isinstance(value, int | float) or not self.low <= value <= self.high:
@@ -112,47 +114,47 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Plan:
-    """A sweep that can be carried out."""
+    """A checked sweep."""
 
     name: str
     given: SweepConfig
     cfg: TaskConfig
-    """What all trials have in common."""
+    """Common configuration of all trials."""
     figure: str
     parameters: tuple[Parameter, ...]
     task: str
-    """TASK as `legged train` is given it: a name, or a YAML file."""
+    """TASK of `legged train`: a name, or a YAML file."""
 
     @property
     def own(self) -> dict[str, Any]:
-        """Dotted path -> the task's own value of each setting that is swept, which trials are to do better than."""
+        """Dotted path -> the task's own value of each swept setting."""
         task = to_dict(self.cfg)
         return {one.path: value_at(task, one.path) for one in self.parameters}
 
     @property
     def own_drawn(self) -> dict[str, Any]:
-        """Dotted path -> what is drawn for the task's own value; None where it is none of those that are tried."""
+        """Dotted path -> drawn form of the task's own value; None if it is not among the values to try."""
         own = self.own
         return {one.path: one.drawn(own[one.path]) for one in self.parameters}
 
     @property
     def folder(self) -> Path:
-        """Where the sweep's files and the run folders of its trials lie."""
+        """Folder of the sweep's files and of the run folders of its trials."""
         return Path("logs") / self.name
 
     @property
     def until_target(self) -> bool:
-        """Whether the value of a trial is how long it took to its target."""
+        """True if the value of a trial is the time or the number of steps to its target."""
         return self.given.objective.take in ("time", "steps")
 
     @property
     def minimize(self) -> bool:
-        """Whether less is better."""
+        """True if smaller values are better."""
         return self.until_target or lower_is_better(self.figure)
 
     @property
     def objective_text(self) -> str:
-        """What is to be as good as possible, in words with its unit."""
+        """Objective as text, with its unit."""
         objective = self.given.objective
         units = {"lin_vel_rmse": " [m/s]", "ang_vel_rmse": " [rad/s]"}
         if self.until_target:
@@ -162,20 +164,20 @@ class Plan:
 
     @property
     def identity(self) -> str:
-        """What must stay the same for trials to be compared, as text."""
+        """Text of all parts that must stay the same for trials to be comparable."""
         given = to_dict(self.given)
         return json.dumps(
             {name: given[name] for name in ("task", "seeds", "objective", "overrides", "parameters")}, sort_keys=True
         )
 
     def with_trials(self, trials: int) -> "Plan":
-        """Return the same with another number of trials."""
+        """Return the plan with another number of trials."""
         return replace(self, given=replace(self.given, trials=trials))
 
     @property
     def negated(self) -> bool:
-        """Whether figures are negated where they are reported on the way: less is better there, as of the times that the
-        trials end with, and of the figure itself more is.
+        """True if intermediate figures are negated when they are reported: the values of trials are times, where less is
+        better, but more of the figure is better.
         """
         return self.until_target and not lower_is_better(self.figure)
 
@@ -189,13 +191,13 @@ class Plan:
         return [*flags, *(f"{path}={json.dumps(value)}" for path, value in settings.items())]
 
     def note(self, values: Mapping[str, Any], number: int) -> str:
-        """Return what the runs of a trial say of themselves: what was drawn for it."""
+        """Return the note for the runs of a trial: its drawn values."""
         drawn = [f"{'.'.join(path.split('.')[-2:])} {json.dumps(value)}" for path, value in values.items()]
         return f"trial {number} of {self.name}: {', '.join(drawn)}"
 
     def _own_defaults(self) -> dict[str, Any]:
-        """Return what the file need not set: evaluations that make trials comparable, and neither report nor film, which take
-        longer than many a trial; `legged runs report` makes them later.
+        """Return default overrides of trials: evaluations that make them comparable, and neither report nor film, which would
+        take longer than many trials; `legged runs report` makes them later.
         """
         return {
             "train.runner.report": False,
@@ -206,10 +208,10 @@ class Plan:
 
 
 def sweep_file(text: str) -> Path:
-    """Return the file of a sweep: a path, or the name of one that comes with this package (cfg/sweeps).
+    """Return the file of a sweep: a path, or the name of one in cfg/sweeps of this package.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: there is no such file.
     """
     folder = data_folder("cfg") / "sweeps"
     for path in (Path(text), folder / f"{text}.yaml"):
@@ -223,16 +225,16 @@ def read_sweep(path: Path) -> SweepConfig:
     """Read the file of a sweep.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: the file does not describe a sweep.
     """
     return build(SweepConfig, read_yaml(path), "", Origins(), str(path))
 
 
 def plan_sweep(given: SweepConfig, path: Path, on_cpu: bool) -> Plan:
-    """Check everything that a sweep asks for, and return what it comes to.
+    """Check the file of a sweep against its task, and return the plan.
 
     Raises:
-        ConfigError: a setting is none, a value is beyond its bounds, or the objective can't be measured.
+        ConfigError: a setting is unknown, a value is out of bounds, or the objective is not measured.
     """
     name = given.name or f"sweep_{path.stem}"
     if not is_plain_name(name):
@@ -266,7 +268,7 @@ def _figure(given: SweepConfig, cfg: TaskConfig, path: Path) -> str:
     """Return the figure of the objective.
 
     Raises:
-        ConfigError: evaluations do not find it, or there is no target where one is needed.
+        ConfigError: evaluations do not measure it, or the target is missing.
     """
     figures, objective = evaluated_figures(task_class(cfg.task), cfg), given.objective
     figure = objective.figure or figures[0]
@@ -281,7 +283,7 @@ def _figure(given: SweepConfig, cfg: TaskConfig, path: Path) -> str:
 
 
 def _parameter(key: str, one: ParameterConfig, cfg: TaskConfig, path: Path) -> Parameter:
-    """Return what is tried of a setting; all ends and choices must fit the configuration by themselves.
+    """Return the swept setting; the ends of its range and all its choices must be valid values.
 
     Raises:
         ConfigError: they do not.
@@ -312,7 +314,7 @@ def _parameter(key: str, one: ParameterConfig, cfg: TaskConfig, path: Path) -> P
 
 
 def _tried(key: str, values: Iterable[Any], cfg: TaskConfig, path: Path) -> None:
-    """Lay each value over the configuration, and check what comes of it."""
+    """Check the configuration with each value."""
     with _said_in(path, "parameters"):
         for value in values:
             task_class(cfg.task).check(override(cfg, [(key, value)]))
@@ -320,7 +322,7 @@ def _tried(key: str, values: Iterable[Any], cfg: TaskConfig, path: Path) -> None
 
 @contextmanager
 def _said_in(path: Path, section: str) -> Iterator[None]:
-    """Let errors about settings name the file of the sweep, where they would say 'command line' or 'TASK'."""
+    """Make errors about settings name the file of the sweep in place of 'command line' or 'TASK'."""
     try:
         yield
     except ConfigError as error:

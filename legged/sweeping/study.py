@@ -1,4 +1,4 @@
-"""The trials of a sweep in their storage: which comes next, whose each is, and which belong to processes that have died."""
+"""The trials of a sweep in their storage: begun, handed to processes, and taken back from processes that died."""
 
 import os
 import socket
@@ -19,28 +19,28 @@ if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
 
 JOURNAL = "journal:"
-"""How a storage begins that is a file of lines."""
+"""Prefix of a storage that is a file of lines."""
 BEAT_S = 10.0
-"""A process says so often that it still works on its trial [s]."""
+"""Interval at which a process confirms that it works on its trial [s]."""
 GRACE_S = 120.0
-"""One on another machine that has not said so for this long is dead [s]."""
+"""A process on another machine without a confirmation for this long is dead [s]."""
 WAIT_S = 60
-"""A process waits for the lock of an SQLite file for so long [s]."""
+"""Longest wait for the lock of an SQLite file [s]."""
 MOST_TRIES = 5
-"""A trial that has ended so often without a value gets none."""
+"""Number of attempts after which a trial is given up."""
 OWNER, ALIVE, TRIES, WHY, RUNS = "owner", "alive", "tries", "why", "runs"
-"""What we note of a trial."""
+"""Attributes of a trial."""
 SWEEP = "sweep"
-"""What we note of the study: what must stay the same."""
+"""Attribute of the study: the parts of the sweep that must stay the same."""
 DEVICE = "device"
-"""And on what its trials are trained: cpu or cuda."""
+"""Attribute of the study: the kind of device of its trials, cpu or cuda."""
 
 
 def check_installed() -> None:
-    """Look whether Optuna is there.
+    """Check that Optuna is installed.
 
     Raises:
-        ConfigError: it is not.
+        ConfigError: it is not installed.
     """
     if find_spec("optuna") is None:
         raise ConfigError("sweep: needs the package optuna, which is not installed here: pip install optuna")
@@ -50,10 +50,10 @@ class Trials:
     """The study of a sweep, shared by all processes that take part."""
 
     def __init__(self, plan: Plan, asked: str = "", worker: int = 0) -> None:
-        """Open the storage that was `asked` for, else that of the plan, else sweep.db in the sweep's folder.
+        """Open the storage `asked`, else that of the plan, else sweep.db in the sweep's folder.
 
         Raises:
-            ConfigError: it holds another sweep of the same name, or it is none.
+            ConfigError: it holds another sweep of the same name, or its name is invalid.
             RunError: it can't be reached.
         """
         check_installed()
@@ -88,10 +88,10 @@ class Trials:
             )
 
     def keep_to(self, device: str) -> None:
-        """Note what kind of device, cpu or cuda, trials are trained on from the first one on.
+        """Store the kind of device, cpu or cuda, with the first trial.
 
         Raises:
-            ConfigError: those before were trained on the other kind.
+            ConfigError: earlier trials were trained on the other kind.
         """
         known = self.study.user_attrs.get(DEVICE)
         if known is None:
@@ -104,23 +104,23 @@ class Trials:
 
     @property
     def all(self) -> list["FrozenTrial"]:
-        """Return all trials there are."""
+        """Return all trials."""
         return self.study.get_trials(deepcopy=False)
 
     @property
     def done(self) -> int:
-        """Return how many trials have ended with a value, or were ended early."""
+        """Return the number of trials that ended with a value or were ended early."""
         return len(finished(self.all))
 
     def next(self) -> "Trial | None":
-        """Begin the next trial: one that has to be tried again, or a new one; None if there are enough. Of processes that ask
-        at the same time, no more get one than are wanted.
+        """Begin the next trial, a repeated or a new one; return None if there are enough. Processes that call this at the
+        same time do not begin more trials than planned.
         """
         self.take_back()
         wanted = self.plan.given.trials
         if len(finished(self.all)) + len(self._running()) >= wanted:
             return None
-        # Drawn anew for every trial: a process that goes on with a sweep must not draw what was drawn before.
+        # The seed depends on the number of trials, so that a process that resumes a sweep draws new values.
         begun = len(self.all)
         self.study.sampler = self._optuna.samplers.TPESampler(
             n_startup_trials=self.plan.given.startup_trials,
@@ -137,23 +137,23 @@ class Trials:
         return trial
 
     def draw(self, trial: "Trial") -> dict[str, Any]:
-        """Draw the values of a trial: dotted path -> value of the setting."""
+        """Draw the values of a trial; return dotted path -> value of the setting."""
         return {parameter.path: parameter.value(_draw(trial, parameter)) for parameter in self.plan.parameters}
 
     def take_back(self) -> list[int]:
-        """Let trials be tried again whose processes have died; return their numbers. Of several that see it, one does so."""
+        """Queue the trials of dead processes again; return their numbers. Of several processes, one does so."""
         taken = []
         for trial in self._running():
             said = trial.user_attrs.get(ALIVE)
-            if said is None and trial.datetime_start is not None:  # it has just been begun, or its process died just then
+            if said is None and trial.datetime_start is not None:  # it has just begun
                 said = trial.datetime_start.timestamp()
             if is_dead(trial.user_attrs.get(OWNER), said) and self.try_again(trial, "its process was killed"):
                 taken.append(trial.number)
         return taken
 
     def try_again(self, trial: "FrozenTrial", why: str) -> bool:
-        """End a trial that came to no value, and let its settings be tried again, if that has not been done too often; false
-        if another process has ended it.
+        """End a trial without a value, and queue its settings again unless it had too many attempts. Return False if another
+        process ended it.
         """
         state = self._optuna.trial.TrialState
         tries = int(trial.user_attrs.get(TRIES, 1))
@@ -162,14 +162,14 @@ class Trials:
         try:
             if not self._storage.set_trial_state_values(trial._trial_id, state.PRUNED if last else state.FAIL):
                 return False
-        except (RuntimeError, self._optuna.exceptions.OptunaError):  # it has ended meanwhile
+        except (RuntimeError, self._optuna.exceptions.OptunaError):  # another process ended it
             return False
         if not last and trial.params:
             self.study.enqueue_trial(trial.params, user_attrs={TRIES: tries + 1})
         return True
 
     def _put_back(self, number: int, trial_id: int, why: str) -> None:
-        """End a trial that was begun for nothing."""
+        """End a trial that is not needed."""
         self._storage.set_trial_user_attr(trial_id, WHY, why)
         self.study.tell(number, state=self._optuna.trial.TrialState.FAIL)
 
@@ -177,17 +177,17 @@ class Trials:
         return [trial for trial in self.all if trial.state.name == "RUNNING"]
 
     def alive(self, trial: "Trial") -> AbstractContextManager[None]:
-        """Return a block during which this process says now and then that it works on a trial."""
+        """Return a context in which this process confirms at intervals that it works on a trial."""
 
         def beat() -> None:
-            with suppress(Exception):  # a storage that is away for a moment
+            with suppress(Exception):  # the storage may be away for a moment
                 self._storage.set_trial_user_attr(trial._trial_id, ALIVE, time.time())
 
         return repeating(beat, BEAT_S)
 
 
 def finished(trials: list["FrozenTrial"]) -> list["FrozenTrial"]:
-    """Return those that have ended with a value, or were ended early."""
+    """Return the trials that ended with a value or were ended early."""
     return [trial for trial in trials if trial.state.name in ("COMPLETE", "PRUNED")]
 
 
@@ -203,7 +203,7 @@ def _open(asked: str, folder: Path) -> "BaseStorage":
     """Open a storage.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: its name is invalid.
         RunError: it can't be reached.
     """
     from optuna.storages import JournalStorage, RDBStorage
@@ -234,7 +234,7 @@ def _open(asked: str, folder: Path) -> "BaseStorage":
 
 
 def _without_password(url: str) -> str:
-    """Return a URL as it may be shown."""
+    """Return a URL without its password."""
     scheme, mark, rest = url.partition("://")
     return f"{scheme}{mark}***@{rest.rpartition('@')[2]}" if "@" in rest else url
 
@@ -248,18 +248,18 @@ def _pruner(plan: Plan) -> Any:
     if plan.given.pruner == "hyperband":
         most = runner.max_iterations * len(plan.given.seeds)
         return HyperbandPruner(min_resource=runner.evaluate_interval, max_resource=most, reduction_factor=3)
-    # What a trial begins with says little: it may go on for a quarter of its length.
+    # Early figures say little, so a trial may run for a quarter of its length.
     return MedianPruner(n_startup_trials=5, n_warmup_steps=runner.max_iterations // 4)
 
 
 def me() -> str:
-    """Return what tells this process from all others, on this machine and elsewhere."""
+    """Return an identifier of this process that is unique over machines."""
     return f"{_machine()} {os.getpid()} {_began(os.getpid())}"
 
 
 def is_dead(owner: str | None, said: float | None) -> bool:
-    """Return whether the process that a trial is of has died: one of this machine, if it is not there any more; another, if
-    it `said` that it lives (seconds since 1970) too long ago.
+    """Return whether the process of a trial has died: on this machine, if it does not exist; elsewhere, if its last
+    confirmation `said` (seconds since 1970) is too old.
     """
     parts = (owner or "").rsplit(" ", 2)
     if len(parts) == 3 and parts[0] == _machine() and parts[1].isdecimal():
@@ -268,7 +268,7 @@ def is_dead(owner: str | None, said: float | None) -> bool:
 
 
 def _machine() -> str:
-    """Return what tells this machine, and this container on it, from others; until it is started anew."""
+    """Return an identifier of this machine, or container, that changes when it restarts."""
     words = [socket.gethostname()]
     with suppress(OSError):
         words.append(Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip())
@@ -277,7 +277,7 @@ def _machine() -> str:
 
 
 def _began(pid: int) -> str:
-    """Return when a process of this machine began, in the system's own unit; 'gone' if there is none."""
+    """Return the start of a process of this machine, in the system's unit; 'gone' if there is no such process."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
         return "gone" if fields[0] in "ZX" else fields[19]

@@ -9,9 +9,8 @@ from helpers import POLICY, TASK, call, small_config, small_task
 
 from legged import registry
 from legged.benchmarks.iteration_times import loops_of, time_iterations
-from legged.benchmarks.report import report
-from legged.benchmarks.scale import others
-from legged.benchmarks.step_times import Driver, time_steps
+from legged.benchmarks.scale import without
+from legged.benchmarks.step_times import Driver, report, time_steps
 from legged.cli.benchmark import ground, scale, startup, step
 from legged.learning.captured import CapturedRunner
 from legged.learning.runner import Runner
@@ -239,7 +238,8 @@ def test_options_out_of_range_are_refused(option, words, command, more, capsys):
 def test_each_size_is_measured_as_the_command_line_says():
     kept = ["x", "--physics", "newton", "--solver", "kamino", "--steps=5", "sim.dt=0.01"]
     own = ["--robots", "4,8", "--out=times", "--runner", "stock"]
-    assert others([*own[:2], *kept[:3], *own[2:], *kept[3:]]) == kept
+    flags = ("--robots", "--out", "--num-envs", "--runner")
+    assert without([*own[:2], *kept[:3], *own[2:], *kept[3:]], *flags) == kept
 
 
 def test_the_engine_of_a_scale_is_the_one_asked_for(capsys, monkeypatch):

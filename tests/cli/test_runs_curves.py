@@ -9,6 +9,7 @@ from torch.utils.tensorboard import SummaryWriter
 from legged.cli.runs import curves
 from legged.errors import ConfigError
 from legged.evaluation import learning_curves
+from legged.evaluation.reports.curves import levels, outcomes
 
 
 def write_run(folder, levels):
@@ -35,15 +36,18 @@ def test_runs_are_read_and_averaged_over_common_iterations(tmp_path):
     assert values == pytest.approx([3.0, 6.0])
 
 
-def test_levels_get_panels_of_their_own(tmp_path):
+def test_levels_get_charts_of_their_own(tmp_path):
     write_run(tmp_path / "rough", 1.0)
+    log = learning_curves.Log(learning_curves.read_scalars(tmp_path / "rough"), {"terrain": {"num_rows": 5}})
+    level, up, down = levels([log, log])
+    assert level.lines[0].name == "pit"
+    assert level.lines[0].y == pytest.approx([1.0, 2.0, 3.0, 4.0, 5.0])
+    assert level.level == ("always promoted", pytest.approx(8 / 3))
+    assert [chart.lines[0].y.tolist() for chart in (up, down)] == [[0.5] * 4, [0.25] * 4]
+    assert levels([learning_curves.Log({}, {})]) == []
     write_config(tmp_path / "rough")
     assert curves.main([str(tmp_path / "rough"), "--out", str(tmp_path)]) == 0
-    runs = {"flat": {"Metrics/lin_vel_rmse": (np.arange(5), np.ones(5))}}
-    learning_curves.draw_runs(runs, tmp_path / "flat.png")
-    with Image.open(tmp_path / "learning_curve.png") as rough, Image.open(tmp_path / "flat.png") as flat:
-        assert rough.height == pytest.approx(1.5 * flat.height, rel=0.02)
-        assert np.asarray(rough.convert("L"))[-flat.height // 2 :].std() > 10.0
+    assert (tmp_path / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_folder_without_events_is_named(tmp_path):
@@ -99,15 +103,6 @@ def test_who_is_always_promoted_has_two_thirds_of_the_levels():
     assert learning_curves.always_promoted({"terrain": {"num_rows": 5}}) == pytest.approx(8 / 3)
 
 
-def test_the_line_is_that_of_the_runs_rows(tmp_path, monkeypatch):
-    write_run(tmp_path / "run", 1.0)
-    write_config(tmp_path / "run")
-    drawn = []
-    monkeypatch.setattr(curves, "draw_runs", lambda runs, path, always: drawn.append((list(runs), set(always))))
-    assert curves.main([str(tmp_path / "run"), "--out", str(tmp_path)]) == 0
-    assert drawn == [(["anymal_c, seed 3"], {8 / 3})]
-
-
 def test_one_iteration_is_drawn(tmp_path):
     writer = SummaryWriter(str(tmp_path / "run"))
     writer.add_scalar("Metrics/lin_vel_rmse", 1.0, 0)
@@ -151,13 +146,13 @@ def test_a_run_that_was_killed_while_it_logged_is_drawn(tmp_path):
     assert Image.open(tmp_path / "learning_curve.png").size[0] > 100
 
 
-def test_a_run_in_which_no_episode_ended_on_some_type_is_drawn(tmp_path):
+def test_a_run_in_which_no_episode_ended_on_some_type_has_no_share_of_it():
     """Such a run is short: it has levels, and no share of episodes yet after which robots moved."""
     iterations = np.arange(2), np.ones(2)
-    runs = {"short": {f"Terrain/level_{name}": iterations for name in ("pit", "gap")}}
-    runs["short"] |= {"Terrain/promoted_pit": iterations, "Terrain/demoted_pit": iterations}
-    learning_curves.draw_runs(runs, tmp_path / "curve.png")
-    assert Image.open(tmp_path / "curve.png").size[0] > 100
+    scalars = {f"Terrain/level_{name}": iterations for name in ("pit", "gap")} | {"Terrain/promoted_pit": iterations}
+    level, up = levels([learning_curves.Log(scalars, {})])
+    assert [len(line.x) for line in level.lines] == [2, 2]
+    assert [len(line.x) for line in up.lines] == [2, 0]
 
 
 def timed(seconds):
@@ -173,31 +168,23 @@ def timed(seconds):
     ("times", "shown"),
     [([2.0], 2.0), ([2.0, 2.08, 1.99], 2.0), ([2.0, 2.12], None), ([2.0, 1.8], None), ([None, 2.0], 2.0), ([None], None)],
 )
-def test_runs_have_an_axis_of_time_if_they_were_equally_fast(times, shown, tmp_path, monkeypatch):
+def test_runs_have_an_axis_of_time_if_they_were_equally_fast(times, shown):
     untimed = {"Metrics/lin_vel_rmse": (np.arange(3), np.ones(3))}
-    runs = {str(i): untimed if each is None else timed(each) for i, each in enumerate(times)}
-    assert learning_curves.common_time(runs.values()) == (None if shown is None else pytest.approx(shown))
-    axes = []
-    monkeypatch.setattr(learning_curves, "_time_axis", lambda axis, each: axes.append(each))
-    learning_curves.draw_runs(runs, tmp_path / "x.png")
-    assert axes == ([] if shown is None else [pytest.approx(shown)] * 4)
+    runs = [untimed if each is None else timed(each) for each in times]
+    assert learning_curves.common_time(runs) == (None if shown is None else pytest.approx(shown))
 
 
-def test_curves_are_those_of_the_kind_of_task():
+def test_charts_are_those_of_the_kind_of_task():
     values = (np.arange(3), np.ones(3))
-    other = (
-        "Train/mean_reward",
-        "Metrics/x_velocity",
-        "Metrics/falls",
-        "Metrics/contact_overflows",
-        "Metrics/episode_length",
-    )
-    following = {"Metrics/lin_vel_rmse": values, "Metrics/x_velocity": values}
-    assert learning_curves.curves_of([following]) == learning_curves.CURVES
-    assert [tag for tag, _, _ in learning_curves.curves_of([dict.fromkeys(other, values)])] == [
-        "Train/mean_reward",
-        "Metrics/episode_length",
-        "Metrics/x_velocity",
-        "Metrics/falls",
+
+    def titles(*tags):
+        return [chart.title for chart in outcomes([("", learning_curves.Log(dict.fromkeys(tags, values), {}))])]
+
+    assert titles("Metrics/lin_vel_rmse", "Metrics/contact_overflows") == ["velocity error [m/s]"]
+    tags = ("Train/mean_reward", "Metrics/x_velocity", "Metrics/falls", "Metrics/episode_length")
+    assert titles(*tags) == [
+        "return of an episode",
+        "episodes that end in a fall [%]",
+        "length of an episode [control steps]",
+        "x velocity",
     ]
-    assert [tag for tag, _, _ in learning_curves.curves_of([{"Metrics/x_velocity": values}])] == ["Metrics/x_velocity"]

@@ -175,8 +175,8 @@ POINT = ("success", "types", "pit", "points")
         ((*POINT[:-1], "unit"), 1, "success.types.pit.unit: expected a text"),
         (POINT, {}, "success.types.pit.points: expected a list"),
         (("changes",), 3, "changes: expected a mapping, got int '3'"),
-        (("rough", "grid"), {"vx": []}, "rough.grid.vx: expected a list of numbers, got list '[]'"),
-        (("rough", "grid"), {"vx": ["a"]}, "rough.grid.vx.0: expected a number, got str 'a'"),
+        (("rough", "grid"), {"vx": []}, "rough.grid.vx: expected a list with entries, got list '[]'"),
+        (("rough", "grid"), {"vx": ["a"]}, "rough.grid.vx[0]: expected a number, got str 'a'"),
         ((*POINT, 0, "share"), True, "success.types.pit.points[0].share: expected a number, got bool"),
     ],
 )

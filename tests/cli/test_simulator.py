@@ -25,9 +25,8 @@ from legged.process.headless import off_screen_library
 from legged.registry import make_task, task_config
 from legged.robots.robot import load_robot
 from legged.simulated_robot.film import make_film
-from legged.simulated_robot.link import Link
 from legged.simulated_robot.robot import SimulatedRobot
-from legged.simulated_robot.server import Server
+from legged.simulated_robot.server import Link, Server
 from legged.terrain import Terrain, TileSpec
 
 POLICIES = Path(__file__).resolve().parents[2] / "resources" / "policies"

@@ -193,7 +193,7 @@ def test_wrong_changes_end_both_commands_with_one_line(changes, says, capsys, tm
 
 def test_a_network_says_which_step_it_needs(contract, tmp_path):
     own = {"control.actuator.network": network(tmp_path, dt=0.003)}
-    with pytest.raises(ConfigError, match=r"steps of --sim-dt=0\.002 do not meet; --sim-dt must be 0\.003"):
+    with pytest.raises(ConfigError, match=r"steps of --sim-dt=0\.002; --sim-dt must be 0\.003"):
         motors_config(ROBOT, contract, False, own.items(), 0.002)
 
 

@@ -17,6 +17,7 @@ from helpers import HANG_S, call, wait_for
 
 from legged.cli.sweep import report as reporting
 from legged.cli.sweep import run as sweep
+from legged.cli.sweep import worker
 from legged.cli.sweep.worker import NoValue, Worker
 from legged.errors import ConfigError
 from legged.evaluation.reports.record import read_note
@@ -25,7 +26,7 @@ from legged.learning.run_folder import checkpoints, run_config
 from legged.learning.timing import read_timing
 from legged.process.paths import data_folder
 from legged.registry import task_names
-from legged.sweeping import study, worker
+from legged.sweeping import study
 from legged.sweeping.plan import Parameter, plan_sweep, read_sweep
 from legged.sweeping.report import importances, ranking, settings
 from legged.sweeping.study import Trials, is_dead, me
@@ -253,7 +254,7 @@ def test_a_target_that_is_not_reached_gives_no_value():
     of = Worker(plan_of(objective={"figure": "return", "take": "time", "target": 5.0}), SimpleNamespace(), [])
     with pytest.raises(NoValue, match="did not reach 5; the last was 3"):
         of._taken(history(1.0, 3.0))
-    with pytest.raises(NoValue, match="is no number"):
+    with pytest.raises(NoValue, match="return is not finite"):
         of._taken(history(math.nan))
 
 

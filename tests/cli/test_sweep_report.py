@@ -56,10 +56,10 @@ def test_the_command_of_the_best_trial_sets_what_it_was_trained_with():
     drawn = {path: json.dumps(value) for path, value in wanted.items()}
     kinds = {one.path: optuna.distributions.CategoricalDistribution(one.choices) for one in plan.parameters}
     text = table(plan, [optuna.trial.create_trial(params=drawn, distributions=kinds, value=0.5)], "own tasks.py")
-    (command,) = [line for line in text.splitlines() if line.startswith("python train.py")]
-    program, flags, settings = (shlex.split(command)[at] for at in (slice(2), slice(2, 6), slice(6, None)))
-    assert program == ["python", "train.py"]
-    assert flags == ["--import", "own tasks.py", "--task", "anymal_c_flat"]
+    (command,) = [line for line in text.splitlines() if line.startswith("legged train ")]
+    program, flags, settings = (shlex.split(command)[at] for at in (slice(2), slice(2, 5), slice(5, None)))
+    assert program == ["legged", "train"]
+    assert flags == ["--import", "own tasks.py", "anymal_c_flat"]
     assert dict(map(parse_override, settings)) == wanted
     assert "| false | 0.123456789 | relu | [16] |" in text
     assert "train.policy.activation=relu" in command
@@ -98,7 +98,7 @@ def test_a_sweep_that_was_begun_on_a_cpu_does_not_go_on_with_a_gpu_but_is_report
 
 
 def test_a_task_may_be_a_file_beside_that_of_the_sweep():
-    """As it may of train.py, whose command in the table names it, as one would from where the sweep was run."""
+    """As it may of `legged train`, whose command in the table names it, as one would from where the sweep was run."""
     runner = {"max_iterations": 2, "num_steps_per_env": 4, "evaluate_interval": 1, "evaluate_envs": 2}
     small = {"env": {"num_envs": 4, "episode_length_s": 0.5}, "sim": {"physics": "mujoco", "threads": 1}}
     task = {"extends": "half_cheetah", **small, "train": {"runner": runner}}
@@ -110,4 +110,4 @@ def test_a_task_may_be_a_file_beside_that_of_the_sweep():
     assert call(sweep.main, ["mine/search.yaml", "--sim-device", "cpu"]) == 0
     text = Path("logs/sweep_search/table.md").read_text()
     assert "`short_cheetah`, for the last return" in text
-    assert "python train.py --task mine/short_cheetah.yaml train.algorithm.gamma=0.9" in text
+    assert "legged train mine/short_cheetah.yaml train.algorithm.gamma=0.9" in text

@@ -8,7 +8,7 @@ from PIL import Image
 
 from legged.cli import terrain as command
 from legged.config.schema import TerrainConfig
-from legged.rendering.paint import HIGH, LOW, MIDDLE, add_painted_terrain, color
+from legged.rendering.scene import HIGH, LOW, MIDDLE, add_painted_terrain, color
 from legged.terrain import Terrain, TileSpec
 
 

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from legged.config import TaskConfig
-from legged.config.bounds import between, carried
+from legged.config.bounds import between, rescaled
 from legged.config.loader import from_dict, nest, to_dict
 from legged.config.reference import FieldText, bounds_of, fields
 from legged.config.schema import ForceConfig, KickConfig, LeggedConfig, TerrainConfig
@@ -81,7 +81,7 @@ def test_bounds_that_are_said_are_those_that_are_checked():
     assert bounds_of({}) == ""
 
 
-def test_units_of_fields_are_units_and_those_by_which_they_are_carried():
+def test_units_of_fields_are_units_and_those_by_which_they_are_rescaled():
     """A factor on lengths grows with the robot, and has no unit."""
     assert all(is_unit(text.unit) for text in FIELDS.values() if text.unit)
     for path, text in FIELDS.items():
@@ -92,9 +92,9 @@ def test_units_of_fields_are_units_and_those_by_which_they_are_carried():
         for section in sections:
             kind = type(getattr(kind(), section))
         metadata = {field.name: field.metadata for field in dataclasses.fields(kind)}[name]
-        if "carried" in metadata and (kind, name) != (TerrainConfig, "scale"):
+        if "rescaled" in metadata and (kind, name) != (TerrainConfig, "scale"):
             assert text.unit, path
-            assert exponents(text.unit) == exponents(metadata["carried"]), path
+            assert exponents(text.unit) == exponents(metadata["rescaled"]), path
 
 
 def test_units_for_the_reader_are_those_of_the_metadata():
@@ -106,7 +106,7 @@ def test_units_for_the_reader_are_those_of_the_metadata():
 
 @dataclasses.dataclass(frozen=True)
 class Own(TaskConfig):
-    lowest_z: float = dataclasses.field(default=0.7, metadata=carried("m", between(0.1, 2)))
+    lowest_z: float = dataclasses.field(default=0.7, metadata=rescaled("m", between(0.1, 2)))
     """Height below which the hopper
     has fallen [m]."""
     silent: bool = False

@@ -48,7 +48,7 @@ def test_a_setting_by_both_names_is_refused(old):
     for part in way:
         inner = inner.setdefault(part, {})
     inner[last] = 2
-    with pytest.raises(ConfigError, match=rf"mine: {old}: 1: this is {RENAMED[old]} now, which is set too"):
+    with pytest.raises(ConfigError, match=rf"mine: {old}: 1: renamed {RENAMED[old]}, which is set too"):
         renamed(data, "mine")
 
 
@@ -81,9 +81,9 @@ def test_two_old_knobs_are_one_now(sim, step):
 @pytest.mark.parametrize(
     ("sim", "text"),
     [
-        ({"constraint_solver": "rounds", "smooth_dynamics": "fused"}, "means sim.step=fused now, and sim.step is 'library'"),
-        ({"constraint_solver": "fast"}, "sim.step has taken its place: auto, fused or library; got 'fast'"),
-        ({"constraint_solver": ["rounds"]}, "sim.step has taken its place"),
+        ({"constraint_solver": "rounds", "smooth_dynamics": "fused"}, "now means sim.step=fused, but sim.step is 'library'"),
+        ({"constraint_solver": "fast"}, "replaced by sim.step: auto, fused or library; got 'fast'"),
+        ({"constraint_solver": ["rounds"]}, "replaced by sim.step"),
     ],
 )
 def test_old_knobs_that_contradict_each_other_or_mean_nothing_are_refused(sim, text):

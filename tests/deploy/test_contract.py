@@ -76,7 +76,7 @@ def test_a_joint_without_limits_has_none_in_the_contract_too(folder, tmp_path):
     [
         (
             {"contract_version": None},
-            r"contract_version: got none: an older version .* export the policy again \(play\.py",
+            r"contract_version: got none: an older version .* export the policy again \(legged play",
         ),
         ({"contract_version": 2}, r"contract_version: got 2; this program reads 1"),
         ({"control_type": "T"}, r"control_type: got 'T'; a robot takes joint angles"),

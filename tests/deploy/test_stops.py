@@ -11,7 +11,7 @@ from still_robot import BLIND, WALKS, Stage, exported, facts_for, spoil, tilted,
 from legged.deploy.policy import Policy
 from legged.deploy.safety import Limits, braking
 from legged.deploy.states import TRANSITIONS, Event, State, next_state
-from legged.deploy.telling import Telling
+from legged.deploy.status_messages import StatusMessages
 
 DAMPING, STAND, WALK, STOP, QUIT = Event.DAMPING, Event.STAND, Event.WALK, Event.STOP, Event.QUIT
 
@@ -225,7 +225,7 @@ def test_a_terminal_that_is_held_or_closed_holds_nothing_up():
         if line == "b":
             raise BrokenPipeError
 
-    tell = Telling(say)
+    tell = StatusMessages(say)
     for line in "abc":
         tell(line)
     assert said == []  # the terminal is held still

@@ -13,11 +13,11 @@ from legged.cli import train
 from legged.envs import LeggedRobot
 from legged.errors import RunError
 from legged.evaluation.learning_curves import read_scalars
+from legged.learning.divergence import PATIENCE, DivergenceDetector
+from legged.learning.gradient_guard import GradientGuard
 from legged.learning.ppo import DevicePPO
 from legged.learning.runner import Runner
-from legged.learning.step_guard import StepGuard
-from legged.learning.watch import PATIENCE, FaultWatch
-from legged.mdp.faults import LARGEST, LARGEST_STATE
+from legged.mdp.nan_guard import LARGEST, LARGEST_STATE
 from legged.registry import _REGISTERED, make_task, register, task_config
 
 pytestmark = pytest.mark.usefixtures("workplace")
@@ -196,7 +196,7 @@ def weights(alg) -> list[torch.Tensor]:
 def test_a_mini_batch_with_a_bad_number_is_left_out(kind, what, value):
     """One of four mini-batches holds it, in each epoch; the others are learned from."""
     alg = learner(kind)
-    guard = None if kind is DevicePPO else StepGuard(alg.optimizer)
+    guard = None if kind is DevicePPO else GradientGuard(alg.optimizer)
     before = [tensor.clone() for tensor in weights(alg)]
     fill(alg, 0)
     with torch.inference_mode():
@@ -217,7 +217,7 @@ def test_a_mini_batch_with_a_bad_number_is_left_out(kind, what, value):
 def test_where_all_is_bad_nothing_changes(kind):
     alg = learner(kind)
     if kind is PPO:
-        StepGuard(alg.optimizer)
+        GradientGuard(alg.optimizer)
     fill(alg, 0)
     alg.update()
     before = [tensor.clone() for tensor in weights(alg)]
@@ -310,16 +310,16 @@ def test_weights_that_are_no_numbers_are_not_written():
 
 
 def test_the_watch_forgets_what_mends_and_gives_up_on_what_does_not(capsys):
-    watch = FaultWatch(steps_per_iteration=100)
+    detector = DivergenceDetector(steps_per_iteration=100)
     bad = {"Faults/reward_mine": 7.0, "Metrics/non_finite_worlds": 20.0}
     for _ in range(PATIENCE - 1):
-        watch.judge(bad, 0.0)
-    watch.judge({"Metrics/non_finite_worlds": 19.0}, 0.49)
+        detector.update(bad, 0.0)
+    detector.update({"Metrics/non_finite_worlds": 19.0}, 0.49)
     for _ in range(PATIENCE - 1):
-        watch.judge(bad, 0.0)
-    assert watch.why_stop == ""
-    watch.judge({}, 0.5)
-    assert re.search(r"for 10 iterations in a row: 50 % of the mini-batches were left out", watch.why_stop)
+        detector.update(bad, 0.0)
+    assert detector.why_stop == ""
+    detector.update({}, 0.5)
+    assert re.search(r"for 10 iterations in a row: 50 % of the mini-batches were left out", detector.why_stop)
     err = capsys.readouterr().err
     assert err.count("_reward_mine of 7 robots") == 1
     assert err.count("of the mini-batches had gradients that were NaN") == 1
@@ -328,7 +328,7 @@ def test_the_watch_forgets_what_mends_and_gives_up_on_what_does_not(capsys):
 def test_the_guard_passes_over_nothing_else():
     parameter = torch.nn.Parameter(torch.ones(2))
     optimizer = torch.optim.SGD([parameter], lr=1.0)
-    guard = StepGuard(optimizer)
+    guard = GradientGuard(optimizer)
     for gradient in ([1.0, 0.0], [NAN, 0.0], [INF, 0.0], [0.0, 1e18]):
         parameter.grad = torch.tensor(gradient)
         optimizer.step()

@@ -9,7 +9,7 @@ from helpers import call, small_config
 
 from legged.cli import train
 from legged.envs import LeggedRobot
-from legged.envs.overrides import EXTENDED, HOOKS
+from legged.envs.class_checks import EXTENDED, HOOKS
 from legged.errors import ConfigError
 
 pytestmark = pytest.mark.usefixtures("workplace")

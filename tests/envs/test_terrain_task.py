@@ -92,7 +92,7 @@ def test_every_map_of_a_task_reads_what_its_configuration_says():
     """The true one, and the displaced one of a robot that drifts, on the same ground as before."""
     task = terrain_task("anymal_c", ("terrain.scan", "highest"), ("observations.height_map.shift", 0.05), NOISY)
     expected = task.terrain.height_map.scan_map("highest")
-    for scan in (task.height_scan, task.observation_terms.sensors._map._scan):
+    for scan in (task.height_scan, task.observation_terms.errors._map._scan):
         assert np.array_equal(scan._map.view(*expected.shape).numpy(), expected)
 
 

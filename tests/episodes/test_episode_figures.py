@@ -6,9 +6,11 @@ from handmade import DT, JOINTS, LIMIT, made_by_hand
 
 from legged.episodes.joint_statistics import PHASES, SETTLE_S, check_comparable, cycles_of, joint_statistics, resampled
 from legged.episodes.panels import Panels, groups_of, without_common_words
-from legged.episodes.ranking import counts_text, figures_of, heads_of, markdown_table, order_of, row_of
+from legged.episodes.ranking import counts_text, figures_of, heads_of, order_of, row_of
 from legged.episodes.statistics_report import notes_of, tables_of
 from legged.errors import ConfigError
+from legged.evaluation.reports.document import text_of
+from legged.evaluation.tables import markdown_table
 
 SETTLED = round(SETTLE_S / DT)
 
@@ -146,8 +148,8 @@ def test_two_policies_are_compared_joint_by_joint():
     one, other = made_by_hand(SETTLED + 2), made_by_hand(SETTLED + 2)
     one["torque"][:, 1], other["torque"][:, 1] = 3.0, 5.5
     both = {"A": joint_statistics(one), "B": joint_statistics(other)}
-    table = next(table for table in tables_of(both) if table.title == "torque [N m]")
-    assert table.rows[1] == ["right_hip", "3.000", "0.000", "5.500", "0.000", "+2.500"]
+    row = tables_of(both)["torque [N m]"].rows[1]
+    assert [text_of(cell) for cell in row] == ["right_hip", "3.000", "0.000", "5.500", "0.000", "+2.500"]
     other.about["joints"] = [*other.about["joints"][:3], {**other.about["joints"][3], "name": "tail"}]
     with pytest.raises(ConfigError, match=r"POLICY: the two have other joints \(right_knee, tail\)"):
         check_comparable(both["A"], joint_statistics(other))
@@ -168,7 +170,7 @@ def test_what_a_failure_costs_once_is_said_and_not_drawn():
     episodes["reward_parts"][:] = [[0.01, 0.0], [0.01, 0.0], [0.0, -2.0]]
     section = next(one for one in Panels(episodes, 0).sections() if one["title"] == "Reward parts")
     assert [line["label"] for line in section["panels"][0]["lines"]] == ["tracking"]
-    assert "What a failure costs, -2 once" in section["note"]
+    assert "-2 at the end" in section["note"]
 
 
 def test_parts_without_a_colour_of_their_own_are_drawn_as_one():

@@ -8,7 +8,7 @@ import torch
 from helpers import CALM, ENGINE, JOINTS, POLICY, small_task, stand
 
 from legged.envs import LeggedRobot
-from legged.envs.step_watchers import keep_final_step
+from legged.envs.final_observation import keep_final_step
 from legged.episodes import recorder
 from legged.episodes.quantities import joints_of, quantities_of
 from legged.episodes.recorder import record_episodes, shares_of

@@ -19,7 +19,7 @@ from legged.evaluation import crossing, following, velocity_tracking
 from legged.evaluation.tracking_report import draw_tracking, print_tracking
 from legged.evaluation.velocity_grid import Grid, axes_of, axis_values
 from legged.evaluation.velocity_tracking import measure_tracking
-from legged.play import schedule
+from legged.play import demonstrations
 from legged.policies.restore import TrainedPolicy, undisturbed
 from legged.registry import task_config
 
@@ -227,7 +227,7 @@ SHORT = ((1.1, (0.5, 0.0, 0.0)), (1.1, (9.0, 0.0, 0.0)))  # the second is outsid
 
 
 def test_play_without_video_exports_and_prints_a_table(run, capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(schedule, "SCHEDULE", SHORT)
+    monkeypatch.setattr(demonstrations, "SCHEDULE", SHORT)
     arguments = [
         "--task",
         TASK,
@@ -263,7 +263,7 @@ def test_play_records_a_short_video_where_something_can_be_drawn(run, capsys, mo
         mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
     except Exception as error:
         pytest.skip(f"nothing can be rendered here: {error}")
-    monkeypatch.setattr(schedule, "SCHEDULE", SHORT[:1])
+    monkeypatch.setattr(demonstrations, "SCHEDULE", SHORT[:1])
     arguments = [
         "--task",
         TASK,

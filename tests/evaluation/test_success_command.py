@@ -25,7 +25,7 @@ from legged.evaluation.success import (
     sizes_of,
     trained_to,
 )
-from legged.evaluation.success_report import _draw_panel, is_beyond, panels_of, with_other_engines
+from legged.evaluation.success_report import is_beyond, panels_of, with_other_engines
 from legged.evaluation.tiles import cell_for, dividing_cell, on_terrain, rough_ground, rough_side, tiles_of_sizes
 from legged.evaluation.velocity_grid import Grid
 from legged.evaluation.velocity_tracking import measure_tracking, place_to_track
@@ -331,20 +331,3 @@ def test_wrong_input(arguments, words, capsys):
     error = capsys.readouterr().err
     for word in words:
         assert word in error
-
-
-def test_a_single_size_is_drawn_with_its_interval():
-    """A band has no width there."""
-    from matplotlib import pyplot as plt
-
-    axis = plt.figure().subplots()
-    entry = {
-        "unit": "m",
-        "what": "height",
-        "trained_to": None,
-        "points": [{"size": 0.2, "share": 0.5, "low": 0.4, "high": 0.7}],
-    }
-    _draw_panel(axis, [{"physics": "mujoco", "success": {"types": {"kerbs": entry}}}], ("kerbs",))
-    (bars,) = axis.collections
-    assert bars.get_segments()[0].tolist() == [[0.2, 0.4], [0.2, 0.7]]
-    plt.close()

@@ -107,7 +107,7 @@ WRONG = {
     "iter": ("three", "its iter is str, not int"),
     "infos": ([1, 2], "its infos is list, not dict"),
     "actor_state_dict": ([], "its actor_state_dict is list, not dict"),
-    "critic_state_dict": ({"mlp.0.weight": 3}, "its critic is damaged ('mlp.0.weight' is no tensor)"),
+    "critic_state_dict": ({"mlp.0.weight": 3}, "its critic is damaged ('mlp.0.weight' is not a tensor)"),
     "optimizer_state_dict": (7, "its optimizer_state_dict is int, not dict"),
 }
 

@@ -13,7 +13,7 @@ import legged.learning.captured as captured_module
 from legged.evaluation.learning_curves import read_scalars
 from legged.graph.step_graph import ForbidHostReads
 from legged.learning.captured import CapturedRunner, Clock, copies
-from legged.learning.divergence_meter import DivergenceMeter
+from legged.learning.kl_meter import KLMeter
 from legged.learning.ppo import DevicePPO
 from legged.learning.rollout import Rollout
 from legged.learning.run_folder import run_config
@@ -54,7 +54,7 @@ def test_an_update_is_that_of_rsl_rl(device, options, monkeypatch):
     """
     rounded = options.get("use_mixed_precision", False)
     stock, ours = learner(PPO, device=device, **options), learner(DevicePPO, device=device, **options)
-    divergence = DivergenceMeter(stock.actor)
+    meter = KLMeter(stock.actor)
     assert ours.why_stock == ""
     order = torch.Generator().manual_seed(1)
     rates = []
@@ -68,7 +68,7 @@ def test_an_update_is_that_of_rsl_rl(device, options, monkeypatch):
         monkeypatch.undo()
         monkeypatch.setattr(ours, "_order", lambda _, p=permutation: p)
         found = ours.update()
-        kl, asked = found.pop("kl"), divergence.flush()
+        kl, asked = found.pop("kl"), meter.flush()
         assert asked is None or kl == pytest.approx(asked, rel=1e-3, abs=1e-6)
         assert (asked is None) == (options.get("schedule") == "fixed")
         assert found == pytest.approx(wanted, rel=1e-3 if rounded else 1e-4, abs=1e-6)

@@ -9,11 +9,11 @@ import torch
 from helpers import checkpoints, small_task, tiny_run
 
 from legged.evaluation.learning_curves import read_scalars
+from legged.learning.async_readback import AsyncReadback
 from legged.learning.captured import CapturedRunner
 from legged.learning.checkpoint import read_checkpoint
-from legged.learning.reading import Reading
+from legged.learning.divergence import Diverged
 from legged.learning.rollout import Rollout
-from legged.learning.watch import Diverged
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -108,19 +108,19 @@ def test_a_training_that_can_not_go_on_names_the_iteration_that_says_so(ahead, m
     runner = runner_of(Path("run"))
     judged = []
 
-    def judge(_values, _left_out):
+    def update(_values, _left_out):
         judged.append(1)
-        runner.logger.watch.why_stop = "all is lost" if len(judged) == 3 else ""
+        runner.logger.divergence.why_stop = "all is lost" if len(judged) == 3 else ""
 
-    monkeypatch.setattr(runner.logger.watch, "judge", judge)
+    monkeypatch.setattr(runner.logger.divergence, "update", update)
     with pytest.raises(Diverged, match=r"stopped after iteration 3: all is lost; the last checkpoint is run/model_0\.pt"):
         runner.train(9)
 
 
-def test_a_reading_has_the_numbers_of_when_it_was_asked_for():
+def test_a_readback_has_the_numbers_of_the_moment_it_was_made():
     lengths, counts = torch.tensor([1.5, 2.5]), torch.tensor([[3, 4], [5, 6]])
-    reading = Reading({"lengths": lengths, "counts": counts, "one": lengths.sum()})
+    readback = AsyncReadback({"lengths": lengths, "counts": counts, "one": lengths.sum()})
     lengths.zero_()
     counts.zero_()
-    assert reading.numbers() == {"lengths": [1.5, 2.5], "counts": [3.0, 4.0, 5.0, 6.0], "one": [4.0]}
-    assert reading.numbers()["one"] == [4.0]
+    assert readback.numbers() == {"lengths": [1.5, 2.5], "counts": [3.0, 4.0, 5.0, 6.0], "one": [4.0]}
+    assert readback.numbers()["one"] == [4.0]

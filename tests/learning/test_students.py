@@ -266,7 +266,7 @@ def test_what_a_teacher_knows_of_the_randomisation_must_be_on_its_scale(capsys):
 def test_a_policy_with_an_estimator_is_no_teacher(capsys):
     folder = tiny_run("--task", TASK, "train.policy.estimator.targets=[base_lin_vel]", iterations=1)
     assert call(train.main, [*STUDENT, "--teacher", str(folder), *TINY_TRAINING, "--sim_device", "cpu"]) == 2
-    assert "has an estimator, and no teacher can have one" in capsys.readouterr().err
+    assert "has an estimator, which a teacher can't have" in capsys.readouterr().err
 
 
 def test_observations_that_a_students_task_has_not_are_named(capsys):
@@ -282,11 +282,11 @@ def test_flags_that_do_not_go_together_are_refused(capsys):
     assert call(train.main, [*STUDENT, "--transfer", TASK, *small]) == 2
     assert "--transfer: 'anymal_c_student' learns from a teacher, and begins anew" in capsys.readouterr().err
     assert call(train.main, [*STUDENT, "--teacher", "", *small]) == 2
-    assert "error: --teacher: 'anymal_c_student' learns from a teacher, and none is named" in capsys.readouterr().err
+    assert "error: --teacher: 'anymal_c_student' learns from a teacher; name one" in capsys.readouterr().err
     folder = student()
     resume = [*STUDENT[:2], "--resume", "--load_run", str(folder), "--max_iterations", "9", *small]
     assert call(train.main, [*resume, "--teacher", "anymal_c"]) == 2
-    assert f"{TEACHER}: a resumed training keeps its own, '{TASK}'; got 'anymal_c'" in capsys.readouterr().err
+    assert f"{TEACHER}: a resumed training can't change '{TASK}'; got 'anymal_c'" in capsys.readouterr().err
 
 
 def test_a_checkpoint_without_its_teacher_is_not_resumed(capsys):
@@ -296,13 +296,13 @@ def test_a_checkpoint_without_its_teacher_is_not_resumed(capsys):
     torch.save(saved, folder / "model_1.pt")
     resume = [*STUDENT[:2], "--resume", "--load_run", str(folder), "--max_iterations", "9", "--sim_device", "cpu"]
     assert call(train.main, resume) == 2
-    assert "holds no teacher to go on learning from" in capsys.readouterr().err
+    assert "holds no teacher to continue with" in capsys.readouterr().err
 
 
 def test_a_group_of_the_students_own_keeps_its_name():
     group = {"terms": ["dof_pos"]}
     cfg = task_config("anymal_c_student", [*SMALL, ("observations.groups.teacher_actor", group)], on_cpu=True)
-    with pytest.raises(ConfigError, match=r"observations\.groups\.teacher_actor: this is what the teacher's group is called"):
+    with pytest.raises(ConfigError, match=r"observations\.groups\.teacher_actor: the teacher's group has this name"):
         find_teacher(cfg)
 
 

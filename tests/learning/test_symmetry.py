@@ -238,7 +238,7 @@ class Sideless(LeggedRobot):
 
 def test_a_task_without_mirror_images_learns_without_symmetry_only():
     task = Sideless(small_config(SYMMETRIC))
-    with pytest.raises(ConfigError, match=r"train\.algorithm\.symmetry: Sideless has no mirror images; false learns without"):
+    with pytest.raises(ConfigError, match=r"train\.algorithm\.symmetry: Sideless has no mirror images; must be false"):
         Runner(task)
     Runner(Sideless(small_config(("train.algorithm.symmetry", False))))
 

@@ -50,8 +50,8 @@ def test_what_is_written_is_read_again(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("{", "timing.json: does not say how long a training took (Expecting"),
-        ("[1]", "timing.json: does not say"),
+        ("{", "timing.json: does not hold the times of a training (Expecting"),
+        ("[1]", "timing.json: does not hold"),
         ('{"task": "walk"}', "(finished: expected bool, got None)"),
         (json.dumps(vars(TIMING) | {"loop_s": "long"}), "(loop_s: expected float, got 'long')"),
     ],

@@ -314,4 +314,4 @@ def test_a_policy_alone_is_played_but_not_trained_on(capsys):
     assert "holds a policy alone, without a value function; it can be played, not trained on" in capsys.readouterr().err
     resume = ["--task", TASK, "--resume", "--load_run", str(folder), *TINY_TRAINING, "--max_iterations", "9"]
     assert call(train.main, [*resume, "--sim_device", "cpu"]) == 2
-    assert "holds no optimiser; it can be played, not trained on" in capsys.readouterr().err
+    assert "holds no optimiser, so its training can't be resumed" in capsys.readouterr().err

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 import torch
 import zoo
+from evaluated_run import find_runs
 from helpers import TASK, TINY_TRAINING, call, run_folders, tiny_run, wait_for
 from shipping import LARGEST, ship
 
 from legged.errors import ConfigError
-from legged.evaluation.judged_run import find_runs
 from legged.learning.timing import read_timing
 
 pytestmark = pytest.mark.usefixtures("workplace")

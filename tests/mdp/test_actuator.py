@@ -16,7 +16,7 @@ from legged.errors import ConfigError
 from legged.mdp.actuator import Friction, MotorCurve, check_motor_model, is_ideal
 from legged.mdp.actuator_network import NetworkWeights
 from legged.mdp.control import Control
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.random_pool import RandomPool
 from legged.physics.warp.task_kernels import TaskKernels
 from legged.robots.robot import load_robot
 
@@ -29,7 +29,7 @@ KERNELS = pytest.mark.parametrize("kernels", [None, TaskKernels(nullcontext)], i
 
 def control(kernels=None, law="P", decimation=4, **actuator) -> Control:
     """The control of N robots with gains 100 and 2, drawn delays among them."""
-    numbers = UniformNumbers(N, torch.device("cpu"))
+    numbers = RandomPool(N, torch.device("cpu"))
     gains = {"stiffness": {"H": 100.0, "K": 100.0}, "damping": {"H": 2.0, "K": 2.0}, "action_scale": 1.0}
     cfg = LeggedControlConfig(decimation, control_type=law, actuator=ActuatorConfig(**actuator), **gains)
     made = Control(ROBOT, cfg, torch.zeros(N, D), DT, kernels, numbers)

@@ -86,7 +86,7 @@ def test_many_robots_are_simulated_in_blocks_and_few_by_the_c_engine(robot):
     [
         ({"cone": "elliptic"}, "cones are elliptic"),
         ({"step": "library"}, "sim.step=library"),
-        ({"njmax": 1000}, "1000 constraint rows .* are more than 512"),
+        ({"njmax": 1000}, "1000 constraint rows .* exceed 512"),
     ],
 )
 def test_what_does_not_fit_blocks_is_the_c_engines(robot, sim, why):

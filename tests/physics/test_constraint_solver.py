@@ -157,7 +157,7 @@ def test_a_world_that_is_no_number_ends_and_harms_no_neighbour(robot, make_physi
 
 @pytest.mark.parametrize(
     ("sim", "reason"),
-    [({"njmax": 1000}, "1000 constraint rows .* are more than 512")],
+    [({"njmax": 1000}, "1000 constraint rows .* exceed 512")],
 )
 def test_what_it_does_not_know_is_refused(make_physics, sim, reason):
     with pytest.raises(ConfigError, match=f"sim.step=fused: .*{reason}"):

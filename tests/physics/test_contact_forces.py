@@ -5,7 +5,7 @@ import torch
 import warp as wp
 from reference import heaps, roll
 
-from legged.physics.warp.exchange import MujocoWarpExchange
+from legged.physics.warp.state_io import MujocoWarpStateIO
 
 
 @pytest.mark.parametrize(
@@ -20,10 +20,10 @@ def test_sums_by_shape_are_mujoco_warps_forces(robot, make_physics, sim):
     states.write(physics)
     roll(physics, states.dof_pos, 80)  # they land
     forces, found = physics.robot_state.contact_forces, []
-    assert physics._exchange._slots == 24
+    assert physics._state_io._slots == 24
     state = (physics._m, physics._d, physics.overflowed, physics.model, robot, physics.robot_state)
     with wp.ScopedDevice("cpu"):
-        contact_by_contact = MujocoWarpExchange(*state)
+        contact_by_contact = MujocoWarpStateIO(*state)
     for _ in range(5):
         roll(physics, states.dof_pos, 4)
         found.append(forces.clone())

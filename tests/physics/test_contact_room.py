@@ -12,7 +12,7 @@ from mechanisms import FusedWorlds
 from legged.physics.fused.contact_kernel import shared_bytes, stage_constants
 from legged.physics.fused.contact_stage import ContactStage
 from legged.physics.fused.native import SOURCES
-from legged.physics.warp.exchange import LOST
+from legged.physics.warp.state_io import LOST
 
 BOX = """
 <mujoco>
@@ -42,7 +42,7 @@ def test_more_contacts_than_a_gpu_has_shared_memory_for_are_said():
         most = (48 * 1024 - 16 * (model.nv + model.njnt)) // 112
         assert ContactStage.why_not(model, m, mjw.make_data(model, nworld=2, nconmax=most, njmax=20)) == ""
         too_many = ContactStage.why_not(model, m, mjw.make_data(model, nworld=2, nconmax=most + 1, njmax=20))
-    assert too_many == f"{most + 1} contacts a world (sim.nconmax) do not fit a GPU's shared memory"
+    assert too_many == f"{most + 1} contacts per world (sim.nconmax) exceed a GPU's shared memory"
     constants = stage_constants(model, rows=20, slots=most, dim=6, frictions=True, limits=True)
     taken = 0
     for arrays in re.findall(r"LEGGED_SHARED (?:float|int) (.+?);", (SOURCES / "contact_stage.h").read_text()):

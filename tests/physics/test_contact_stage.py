@@ -13,7 +13,7 @@ from reference import heaps, random_states, roll
 
 from legged.config.schema import TerrainConfig
 from legged.physics import ModelScene, RobotScene
-from legged.physics.collider.touches import spring_of, touch_of
+from legged.physics.collider.contact_pairs import contact_pair, spring_of
 from legged.physics.fused.contact_stage import ContactStage
 from legged.terrain import Terrain, TileSpec
 
@@ -301,7 +301,7 @@ def test_a_shape_is_pushed_as_in_c_mujoco(shape):
     ("geoms", "reason"),
     [
         ('<geom name="a" type="box" size=".1 .1 .1"/>', r"shapes 'b' \(a sphere\) and 'a' \(a box\) may touch"),
-        ('<geom name="a" type="capsule" size=".1 .1" surfacevel="0 0 0 1 0 0"/>', "surfaces that move or stick"),
+        ('<geom name="a" type="capsule" size=".1 .1" surfacevel="0 0 0 1 0 0"/>', "surface velocities or adhesion"),
     ],
 )
 def test_what_it_does_not_make_is_said(geoms, reason):
@@ -324,7 +324,7 @@ def test_springs_of_two_shapes_are_mixed_as_in_c_mujoco(priority, solrefs):
     )
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    touch = touch_of(model, 0, 1)
+    touch = contact_pair(model, 0, 1)
     np.testing.assert_allclose(touch.solref, data.contact[0].solref, rtol=1e-12)
     np.testing.assert_allclose(touch.solimp, data.contact[0].solimp, rtol=1e-12)
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers import small_task
 
-from legged.physics.engine_warnings import told_once
+from legged.physics.engine_warnings import each_warning_once
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("workplace")
 def test_many_broken_worlds_are_one_line_and_no_file(capfd):
     task = small_task(num_envs=6)
     before = mujoco.get_mju_user_warning()
-    with told_once():
+    with each_warning_once():
         for value in (float("nan"), 1e30):
             task.physics._qpos[:, 2] = value
             task.step(torch.zeros(6, 12))

@@ -275,11 +275,11 @@ def test_a_shipped_robot_without_dampers_can_be_given_some(robot, engine):
     ("ranges", "error"),
     [
         ({"frictoin": (0.5, 1.0)}, r"mine.yaml: domain_rand.ranges: .*'frictoin'; did you mean 'friction'\?"),
-        ({"friction": (-0.5, 1.0)}, r"mine.yaml: domain_rand.ranges.friction: .* -0.5 .*geom_friction of -0.5"),
-        ({"added_base_mass": (-50.0, 1.0)}, r"ranges.added_base_mass: .* makes a body_mass of -4"),
-        ({"link_mass": (0.0, 1.0)}, r"ranges.link_mass: .* makes a body_mass of 0"),
-        ({"link_mass": (0.1, 1.0), "added_base_mass": (-2.0, 0.0)}, r"ranges.added_base_mass: .* makes a body_mass of"),
-        ({"joint_damping": (-1.5, 1.0)}, r"ranges.joint_damping: .* makes a dof_damping of -0.5"),
+        ({"friction": (-0.5, 1.0)}, r"mine.yaml: domain_rand.ranges.friction: .* -0.5 .*geom_friction -0.5"),
+        ({"added_base_mass": (-50.0, 1.0)}, r"ranges.added_base_mass: .* makes body_mass -4"),
+        ({"link_mass": (0.0, 1.0)}, r"ranges.link_mass: .* makes body_mass 0"),
+        ({"link_mass": (0.1, 1.0), "added_base_mass": (-2.0, 0.0)}, r"ranges.added_base_mass: .* makes body_mass "),
+        ({"joint_damping": (-1.5, 1.0)}, r"ranges.joint_damping: .* makes dof_damping -0.5"),
     ],
 )
 def test_ranges_that_leave_no_model_are_refused(ranges, error):

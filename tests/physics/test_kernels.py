@@ -89,7 +89,7 @@ def test_missing_modules_are_compiled_once_though_two_processes_start_together(t
 def test_a_dry_run_of_a_step_names_the_modules_that_a_step_loads(make_physics, monkeypatch):
     physics = make_physics("mujoco_warp", step="library")
     device = wp.get_device("cpu")
-    functions = (physics._step, physics._exchange.kinematics, physics._exchange.contact_forces)
+    functions = (physics._step, physics._state_io.kinematics, physics._state_io.contact_forces)
     before = physics.robot_state.base_pos.clone()
     noted = {build.module for build in launched(device, functions)}
     assert physics.robot_state.base_pos.equal(before)

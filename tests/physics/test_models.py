@@ -252,7 +252,7 @@ def test_a_model_that_mujoco_warp_does_not_know_is_one_line(tmp_path):
 
 def test_a_quantity_that_was_not_asked_for_is_refused(robot):
     physics = make_physics(RobotScene(robot), SimConfig(physics="mujoco", threads=1), 1, CPU, (), ["cvel"])
-    with pytest.raises(ValueError, match=r"not told of 'xpos'.*cvel"):
+    with pytest.raises(ValueError, match=r"quantity: .*'xpos'.*cvel"):
         physics.quantity("xpos")
     with pytest.raises(ValueError, match="no quantity 'cvels'; did you mean 'cvel'"):
         make_physics(RobotScene(robot), SimConfig(physics="mujoco"), 1, CPU, (), ["cvels"])
@@ -304,7 +304,7 @@ def test_newton_simulates_robots_only(robot):
         (None, "No such file|cannot read"),
         ("<mujoco", "cannot read"),
         ("<mujoco><worldbody><body mocap='true'><geom size='1'/></body></worldbody></mujoco>", "it has mocap bodies"),
-        ("<mujoco><option><flag sleep='enable'/></option></mujoco>", "it has bodies that sleep"),
+        ("<mujoco><option><flag sleep='enable'/></option></mujoco>", "sleeping bodies"),
     ],
 )
 def test_a_file_that_is_no_model_is_one_line(tmp_path, text, error):
@@ -340,8 +340,8 @@ HINGE = """<mujoco><compiler angle="radian"/><option actuatorgroupdisable="{off}
 @pytest.mark.parametrize(
     ("off", "margin", "error"),
     [
-        ("1", ".02", "it would drive the actuators of group 1 too, which the model disables"),
-        ("2", ".04", r"joint 'a' may be within the margin \(0.04\) of both of its limits, 0.05 apart"),
+        ("1", ".02", "the model disables the actuators of group 1"),
+        ("2", ".04", r"joint 'a' .*margin \(0.04\).* 0.05 apart"),
         ("2", ".02", ""),
     ],
 )

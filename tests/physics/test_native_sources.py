@@ -218,8 +218,8 @@ def test_lanes_find_what_one_thread_finds(tmp_path, name):
 
     for _ in range(2):  # makes the rows of constraints, which the solver then knows again
         fused.step()
-    assert fused.sides is not None
-    assert fused.sides.last.numpy()[:, 0].any() == solver.constants["KNOWN"]
+    assert fused.active_set is not None
+    assert fused.active_set.last.numpy()[:, 0].any() == solver.constants["KNOWN"]
     rows = fused.read("nefc")
     assert rows.min() < rows.max()
     assert name != "half cheetah" or rows.max() > 32  # a lane has two

@@ -123,20 +123,20 @@ REFUSED = {
         "<tendon><fixed name='t'><joint joint='tail' coef='1'/></fixed></tendon>"
         "<equality><tendon tendon1='t'/></equality><actuator>",
     ),
-    "compensation of gravity": ('<body name="tail"', '<body name="tail" gravcomp="1"'),
+    "gravity compensation": ('<body name="tail"', '<body name="tail" gravcomp="1"'),
     "dampers or armature of actuators": ('<motor joint="tail"', '<motor joint="tail" armature="0.1"'),
-    "not linear": ('axis="0 1 0"', 'axis="0 1 0" damping="1 2"'),
+    "nonlinear": ('axis="0 1 0"', 'axis="0 1 0" damping="1 2"'),
     "actuators with a state": ("<motor joint", '<general dyntype="filter" joint'),
-    "no motor, position or velocity servo": ("<motor joint", '<general gaintype="affine" joint'),
-    "something else than a slide or a hinge": ("<actuator>", '<actuator><adhesion body="tail" ctrlrange="0 1"/>'),
-    "tendons that pull": (
+    "neither a motor nor a position or velocity servo": ("<motor joint", '<general gaintype="affine" joint'),
+    "neither a slide nor a hinge": ("<actuator>", '<actuator><adhesion body="tail" ctrlrange="0 1"/>'),
+    "tendons with forces": (
         "<actuator>",
         '<tendon><fixed stiffness="1"><joint joint="tail" coef="1"/></fixed></tendon><actuator>',
     ),
     "mocap bodies": ("<worldbody>", '<worldbody><body mocap="true"/>'),
     "in a fluid": ("<option", '<option density="1.2"'),
     "disables spring": ("<worldbody>", '<option><flag spring="disable"/></option><worldbody>'),
-    "enables features": ("<worldbody>", '<option><flag energy="enable"/></option><worldbody>'),
+    "enables optional features": ("<worldbody>", '<option><flag energy="enable"/></option><worldbody>'),
 }
 
 

@@ -20,14 +20,14 @@ from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
+from legged.mdp.distributions import Distributions
 from legged.mdp.disturbances import Disturbances
-from legged.mdp.draws import Draws
 from legged.mdp.height_map_errors import HeightMapErrors
 from legged.mdp.height_scan import HeightScan
+from legged.mdp.random_pool import RandomPool
 from legged.mdp.randomization import Pushes, Randomization
 from legged.mdp.rewards import Rewards
 from legged.mdp.terrain_curriculum import TerrainCurriculum
-from legged.mdp.uniform_numbers import UniformNumbers
 from legged.physics.warp.task_kernels import TaskKernels
 from legged.robots.robot import load_robot
 from legged.state import state_of
@@ -189,10 +189,10 @@ def test_rewards_are_added_alike(only_positive):
         for part in parts:
             part.compute(valid)
         assert_same(parts)
-        assert parts[0].fine.equal(parts[1].fine)
+        assert parts[0].terms_finite.equal(parts[1].terms_finite)
         assert parts[0].last.equal(parts[1].last)
         torch.testing.assert_close(parts[0].total, parts[1].total, rtol=1e-6, atol=1e-6)
-    assert not parts[0].fine[3, :4].any()
+    assert not parts[0].terms_finite[3, :4].any()
 
 
 def varying(*names, when="interval"):
@@ -223,7 +223,7 @@ def test_numbers_are_drawn_again_alike(chosen):
     numbers, parts, engines = [], [], []
     for kernels in (None, TaskKernels(nullcontext)):
         torch.manual_seed(3)
-        numbers.append(UniformNumbers(N, CPU))
+        numbers.append(RandomPool(N, CPU))
         engines.append(NoPhysics(kernels))
         parts.append(Randomization(ranges, N, CPU))
         parts[-1].widen(dict.fromkeys(ranges, 3))
@@ -265,7 +265,7 @@ def test_numbers_of_all_distributions_are_made_alike():
         DrawConfig((5.0, 60.0), distribution="log_uniform"),
         DrawConfig((7.0, 8.0), distribution="gaussian", std=0.1),
     ]
-    draws = Draws(columns, [1.0, 0.0, 5.0, 7.5], CPU, 24)
+    draws = Distributions(columns, [1.0, 0.0, 5.0, 7.5], CPU, 24)
     even = draws.low + torch.rand(N, 4) * (draws.high - draws.low)
     for iteration in (0.0, 1.0, 2.5, 3.5, 20.0):
         steps, found = torch.tensor(24.0 * iteration), torch.zeros(2, N, 4)
@@ -290,7 +290,7 @@ def test_kicks_and_forces_come_and_end_alike(of):
     numbers, parts, engines = [], [], []
     for kernels in (None, TaskKernels(nullcontext)):
         torch.manual_seed(3)
-        numbers.append(UniformNumbers(N, CPU))
+        numbers.append(RandomPool(N, CPU))
         engines.append(NoPhysics(kernels))
         parts.append(Disturbances(cfg, engines[-1], DT, 24, numbers[-1]))
     kicked = 0
@@ -329,7 +329,7 @@ def test_maps_go_wrong_alike(errors):
     cfg = TerrainConfig(measured_points_x=(-0.1, 0.1, 0.3), measured_points_y=(0.0,))
     numbers, maps = [], []
     for kernels in (None, TaskKernels(nullcontext)):
-        numbers.append(UniformNumbers(N, CPU))
+        numbers.append(RandomPool(N, CPU))
         pose = (torch.zeros(N, 3), torch.zeros(N, 4))
         scan = HeightScan(cfg, None, N, CPU, kernels)
         maps.append(HeightMapErrors(HeightMapConfig(**errors), scan, pose, torch.neg, DT, numbers[-1], kernels))

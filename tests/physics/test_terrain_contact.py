@@ -328,7 +328,7 @@ def test_a_world_that_blew_up_ends_and_harms_no_neighbour(far):
         assert [c.dist for c in well] == pytest.approx([-0.001, -0.001], abs=1e-5)
 
 
-def test_shapes_that_no_probe_stands_for_are_named():
+def test_shapes_without_contact_features_are_named():
     egg = '<body><freejoint/><geom name="egg" type="ellipsoid" size="0.1 0.1 0.2" contype="1" conaffinity="2"/></body>'
     with pytest.raises(ConfigError, match=r"shape 'egg' is of type ellipsoid.*sim\.physics=mujoco"):
         Ours(egg, height_map(np.zeros((4, 4))), 1)

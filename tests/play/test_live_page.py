@@ -141,7 +141,7 @@ def test_a_browser_draws_the_robot_and_moves_it():
         window.keyboard.press("End")
         until(lambda: shown.session.command == [1.1, 0.0, 0.0])
         until(lambda: float(shown.session.task.commands[0, 0]) == pytest.approx(1.1))
-        assert window.locator("text=reward parts [1/s]").count() == 1
+        assert window.locator("text=reward terms [1/s]").count() == 1
         slider.blur()
         window.keyboard.press("p")  # a picture that stands still is drawn sooner
         until(lambda: not shown.session.running)

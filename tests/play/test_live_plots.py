@@ -1,4 +1,4 @@
-"""Live plots: what is kept of a robot, and what is drawn of it."""
+"""Live plots: the history of a robot, and the data and options that the charts in the browser get."""
 
 from types import SimpleNamespace
 from xml.etree import ElementTree
@@ -7,22 +7,8 @@ import numpy as np
 import pytest
 from helpers import small_task, zero_actions
 
-from legged.play.live import plots
 from legged.play.live.history import KEPT_S, History, Sample
-from legged.play.live.plots import (
-    LEFT,
-    RIGHT,
-    WIDTH,
-    Curve,
-    figure,
-    gait_figure,
-    reward_figure,
-    short,
-    tick_step,
-    velocity_figures,
-)
-
-SVG = "{http://www.w3.org/2000/svg}"
+from legged.play.live.plots import LARGEST, MOST_POINTS, LivePlots, gait_diagram, reward_curves, short_names
 
 
 def history_of(samples: list[Sample], terms=("speed", "torques"), feet=("LF_FOOT", "RF_FOOT"), dt: float = 0.1) -> History:
@@ -37,15 +23,6 @@ def history_of(samples: list[Sample], terms=("speed", "torques"), feet=("LF_FOOT
 
 def sample(time: float, *, contacts=(0.0, 0.0), rewards=(0.0, 0.0), speed: float = 0.0) -> Sample:
     return Sample(time, np.array([speed, 0.0, 0.0]), np.zeros(3), np.array(contacts), np.array(rewards))
-
-
-def drawn(svg: str) -> ElementTree.Element:
-    """The figure as a tree."""
-    return ElementTree.fromstring(svg)
-
-
-def texts(svg: str) -> list[str]:
-    return [text.text for text in drawn(svg).iter(f"{SVG}text")]
 
 
 def test_ten_seconds_are_kept_of_the_robot_that_is_followed():
@@ -79,9 +56,6 @@ def test_an_episode_that_ends_breaks_the_curves():
         history.add(task, 0, 0.02 * step)
     assert np.isnan(history.actual()[0]).tolist() == [False, False, False, True, False, False]
     assert np.isnan(history.rewards()[0]).tolist() == [False, False, False, True, False, False]
-    svg = figure("vx [m/s]", history.times(), [Curve("actual", history.actual()[0], "#000000")], 60.0)
-    lines = [line.get("points").split() for line in drawn(svg).iter(f"{SVG}polyline")]
-    assert [len(points) for points in lines] == [3, 2]
 
 
 def test_rewards_are_means_over_a_fifth_of_a_second():
@@ -90,66 +64,86 @@ def test_rewards_are_means_over_a_fifth_of_a_second():
     assert history.rewards()[1] == pytest.approx([1.0] * 4)
 
 
-def test_bars_stand_for_the_steps_in_which_a_foot_stood():
+def test_bars_cover_the_steps_in_which_a_foot_is_on_the_ground():
     on = [(1, 0), (1, 0), (0, 0), (0, 1), (1, 1)]
-    svg = gait_figure(history_of([sample(0.1 * k, contacts=feet) for k, feet in enumerate(on)]))
-    bars = [bar for bar in drawn(svg).iter(f"{SVG}rect") if bar.get("fill") == plots.ACTUAL]
-    second = (WIDTH - LEFT - RIGHT) / KEPT_S
-    assert [float(bar.get("width")) / second for bar in bars] == pytest.approx([0.2, 0.1, 0.2], abs=0.005)
-    ends = [float(bar.get("x")) + float(bar.get("width")) for bar in bars]
-    now = WIDTH - RIGHT
-    assert [(end - now) / second for end in ends] == pytest.approx([-0.3, 0.0, 0.0], abs=0.005)
-    assert {"LF", "RF", "time [s]", "feet on the ground"} <= set(texts(svg))
+    page = ElementTree.fromstring(gait_diagram(history_of([sample(0.1 * k, contacts=feet) for k, feet in enumerate(on)])))
+    assert [row.text for row in page.iter("span")] == ["LF", "RF"]
+    bars = [[(float(bar.get("x")), float(bar.get("width"))) for bar in svg] for svg in page.iter("svg")]
+    assert bars[0] == [pytest.approx((-0.5, 0.2)), pytest.approx((-0.1, 0.1))]  # start before now, and length [s]
+    assert bars[1] == [pytest.approx((-0.2, 0.2))]
+    assert {svg.get("viewBox") for svg in page.iter("svg")} == {f"{-KEPT_S:g} 0 {KEPT_S:g} 1"}
 
 
-def test_axes_have_units_and_the_largest_parts_of_the_reward_are_named():
+def test_the_largest_reward_terms_have_curves_and_the_others_are_summed():
     terms = tuple(f"part_{i}" for i in range(9))
     history = history_of([sample(0.1 * k, rewards=np.arange(9.0)) for k in range(5)], terms)
-    svg = reward_figure(history)
-    assert "reward parts [1/s]" in texts(svg)
-    assert [text for text in texts(svg) if "part_" in text or "others" in text] == [*terms[3:], "3 others"]
-    others = [line for line in drawn(svg).iter(f"{SVG}polyline") if line.get("stroke-dasharray")]
-    assert len(others) == 1  # 0 + 1 + 2, as high as part_3
-    third = next(iter(drawn(svg).iter(f"{SVG}polyline")))
-    assert others[0].get("points") == third.get("points")
-    history.per_second = False
-    assert "reward parts [1/step]" in texts(reward_figure(history))
-    assert len({*plots.COLORS[: plots.PARTS], plots.OTHERS}) == plots.PARTS + 1
-
-    whole = f"<div>{velocity_figures(history, True)}</div>"
-    names = [text.text for text in ElementTree.fromstring(whole).iter(f"{SVG}text")]
-    assert {"vx [m/s]", "vy [m/s]", "yaw rate [rad/s]", "commanded", "actual", "time [s]"} <= set(names)
-    assert "forward velocity [m/s]" in texts(velocity_figures(history, False))
+    names, curves = reward_curves(history)
+    assert names == [*terms[3:], "3 others"]
+    assert len(names) == LARGEST + 1
+    assert [curve[-1] for curve in curves] == pytest.approx([3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 0.0 + 1.0 + 2.0])
+    few, _ = reward_curves(history_of([], terms[:7]))
+    assert few == [*terms[:6], terms[6]]  # a single other term keeps its name
 
 
-def test_a_point_is_where_its_axis_says():
-    svg = figure("name", np.array([-10.0, -5.0, 0.0]), [Curve("a", np.array([0.0, 1.0, 2.0]), "#000000")], 100.0)
-    points = next(iter(drawn(svg).iter(f"{SVG}polyline"))).get("points").split()
-    found = [tuple(map(float, point.split(","))) for point in points]
-    assert [x for x, _ in found] == pytest.approx([LEFT, 0.5 * (LEFT + WIDTH - RIGHT), WIDTH - RIGHT])
-    ticks = {text.text: float(text.get("y")) for text in drawn(svg).iter(f"{SVG}text") if text.get("text-anchor") == "end"}
-    assert [y + 3.5 for _, y in found] == pytest.approx([ticks["0"], ticks["1"], ticks["2"]], abs=0.1)
+class Gui:
+    """Stands in for viser's server: keeps the options of the charts, and allows assignments to them."""
+
+    def __init__(self):
+        self.gui = self
+        self.charts, self.html = [], SimpleNamespace(content="")
+
+    def add_uplot(self, data, series, **options):
+        self.charts.append(SimpleNamespace(data=data, series=series, **options))
+        return self.charts[-1]
+
+    def add_html(self, content):
+        return self.html
+
+    def atomic(self):
+        return self
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *failure):
+        return None
 
 
-@pytest.mark.parametrize("values", [[], [float("nan")] * 3, [0.0] * 3, [1e-9, 0.0, 0.0], [1e6, -1e6, 0.0]])
-def test_whatever_there_is_gives_a_figure(values):
-    times = np.linspace(-1.0, 0.0, len(values))
-    svg = figure("a < b & c", times, [Curve("x", np.array(values), "#000000")], 60.0, least=0.5)
-    assert "a < b & c" in texts(svg)
-    assert "nan" not in svg
-    assert "inf" not in svg
+def test_charts_get_the_samples_of_the_robot():
+    samples = [sample(0.1 * k, rewards=(1.0, -1.0), speed=0.3, contacts=(1, 0)) for k in range(400)]
+    history, gui = history_of(samples), Gui()
+    plots = LivePlots(gui, history, has_commands=True)
+    plots.update(history)
+    assert [chart.title for chart in gui.charts] == ["vx [m/s]", "vy [m/s]", "yaw rate [rad/s]", "reward terms [1/s]"]
+    times, commanded, actual = gui.charts[0].data
+    assert times[0] == pytest.approx(-39.9)
+    assert (len(times) <= MOST_POINTS, len(times) == len(actual)) == (True, True)
+    assert (set(actual), set(commanded)) == ({0.3}, {0.0})
+    assert [line["label"] for line in gui.charts[0].series] == ["time [s]", "commanded", "actual"]
+    for chart in gui.charts:
+        assert len(chart.data) == len(chart.series)
+    assert "LF" in gui.html.content
+    assert [curve[-1] for curve in gui.charts[-1].data[1:]] == pytest.approx([1.0, -1.0])
 
 
-@pytest.mark.parametrize(
-    ("span", "most", "step"), [(1.0, 5, 0.2), (1.0, 3, 0.5), (7.0, 5, 2.0), (0.03, 3, 0.01), (2e6, 5, 5e5)]
-)
-def test_ticks_are_round(span, most, step):
-    assert tick_step(span, most) == pytest.approx(step)
+def test_reward_curves_have_new_names_when_other_terms_are_the_largest():
+    terms = tuple(f"part_{i}" for i in range(9))
+    history, gui = history_of([], terms), Gui()
+    plots = LivePlots(gui, history, has_commands=False)
+    assert [chart.title for chart in gui.charts] == ["forward velocity [m/s]", "reward terms [1/s]"]
+    history._samples = [sample(0.1 * k, rewards=np.arange(9.0)) for k in range(5)]
+    before = gui.charts[-1].series
+    plots.update(history)
+    assert [line["label"] for line in gui.charts[-1].series[1:]] == [*terms[3:], "3 others"]
+    assert gui.charts[-1].series != before
+    assert len({line["stroke"] for line in gui.charts[-1].series[1:]}) == LARGEST + 1
+    same = gui.charts[-1].series
+    plots.update(history)
+    assert gui.charts[-1].series is same  # a chart whose series are assigned is built anew in the browser
 
 
 def test_names_are_short():
-    feet = ("LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT")
-    assert [short(name, feet) for name in feet] == ["LF", "RF", "LH", "RH"]
-    assert [short(name, ("foot_left", "foot_right")) for name in ("foot_left", "foot_right")] == ["left", "right"]
-    assert short("FL_calf_contact", ("FL_calf_contact", "FR_calf_contact")) == "FL"
-    assert short("only", ("only",)) == "only"
+    assert short_names(("LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT")) == ["LF", "RF", "LH", "RH"]
+    assert short_names(("foot_left", "foot_right")) == ["left", "right"]
+    assert short_names(("FL_calf_contact", "FR_calf_contact")) == ["FL", "FR"]
+    assert short_names(("only",)) == ["only"]

@@ -1,4 +1,4 @@
-"""What a browser draws: closed bodies seen from outside, and a terrain that is the height map."""
+"""Meshes for the browser: closed bodies seen from outside, and a terrain that is the height map."""
 
 import json
 import struct
@@ -8,31 +8,14 @@ import numpy as np
 import pytest
 
 from legged.config.schema import TerrainConfig
-from legged.play.live.glb import glb, linear, normals
-from legged.play.live.shapes import bodies_of, box, capsule, cylinder, plane_shape, terrain_shape
+from legged.play.live.shapes import HALF_PLANE, PERIOD, body_meshes, plane_mesh, terrain_mesh
 from legged.terrain import Terrain, TileSpec
-
-
-def volume(triangles) -> float:
-    """Volume inside triangles that are counterclockwise as seen from outside [m^3]; negative if they are not."""
-    a, b, c = (triangles[0][triangles[1][:, k]] for k in range(3))
-    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
-
-
-def test_solids_are_closed_and_of_the_right_size():
-    assert volume(box(np.array([0.1, 0.2, 0.3]))) == pytest.approx(8 * 0.1 * 0.2 * 0.3)
-    assert volume(cylinder(0.2, 0.5)) == pytest.approx(np.pi * 0.04 * 1.0, rel=0.03)
-    assert volume(capsule(0.2, 0.5)) == pytest.approx(np.pi * 0.04 * (1.0 + 4.0 / 3.0 * 0.2), rel=0.06)
-    assert volume(capsule(0.3, 0.0)) == pytest.approx(4.0 / 3.0 * np.pi * 0.027, rel=0.06)
-    vertices, _ = capsule(0.2, 0.5)
-    assert np.abs(vertices).max(axis=0) == pytest.approx([0.2, 0.2, 0.7], rel=0.02)
-
 
 MODEL = """
 <mujoco>
   <asset>
     <mesh name="block" vertex="0 0 0  2 0 0  0 1 0  2 1 0  0 0 3  2 0 3  0 1 3  2 1 3"/>
-    <material name="paint" rgba="0 0 1 1"/>
+    <material name="paint" rgba="0 0 0.5 1"/>
   </asset>
   <worldbody>
     <geom type="plane" size="1 1 1"/>
@@ -49,22 +32,73 @@ MODEL = """
 """
 
 
+def attributes_of(mesh) -> dict[str, dict]:
+    """Accessors of the vertex attributes in the file that the browser gets, by name."""
+    data = mesh.export(file_type="glb")
+    scene = json.loads(data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])
+    return {name: scene["accessors"][i] for name, i in scene["meshes"][0]["primitives"][0]["attributes"].items()}
+
+
+def test_files_have_normals_and_colours():
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    for mesh in (*body_meshes(model).values(), plane_mesh()):
+        found = attributes_of(mesh)
+        assert {"POSITION", "NORMAL"} < set(found)
+        assert found["NORMAL"]["count"] == found["POSITION"]["count"] == len(mesh.vertices)
+    assert attributes_of(body_meshes(model)[1])["COLOR_0"]["max"] == [255, 0, 55, 255]
+
+
+def colors_of(mesh) -> np.ndarray:
+    """Colours (V, 3) that the file holds: linear intensities, 0 to 255."""
+    return mesh.visual.vertex_attributes["color"][:, :3]
+
+
 def test_bodies_look_as_their_model_says():
     model = mujoco.MjModel.from_xml_string(MODEL)
-    looks = bodies_of(model)
+    looks = body_meshes(model)
     assert sorted(looks) == [1, 2]  # not the world
     a, b = looks[1], looks[2]
-    assert a.vertices.min(axis=0) == pytest.approx([-0.5, -1.0, -3.0], abs=0.01)
-    assert a.vertices.max(axis=0) == pytest.approx([7.0, 1.0, 3.0], abs=0.01)  # the box lies along y, turned to x
+    assert a.bounds[0] == pytest.approx([-0.5, -1.0, -3.0], abs=0.02)
+    assert a.bounds[1] == pytest.approx([7.0, 1.0, 3.0], abs=0.02)  # the box lies along y, turned to x
     is_box = np.abs(a.vertices[:, 0]) > 1.0
-    assert (a.colors[is_box] == [255, 0, 0]).all()
-    assert (a.colors[~is_box] == [0, 0, 255]).all()
+    assert (colors_of(a)[is_box] == [255, 0, 0]).all()
+    assert (colors_of(a)[~is_box] == [0, 0, 55]).all()  # sRGB 0.5 is an intensity of 0.214
     # MuJoCo moves a mesh to its centre of mass, and the geom the other way.
-    assert b.vertices.min(axis=0) == pytest.approx([0, 0, 0], abs=1e-5)
-    assert b.vertices.max(axis=0) == pytest.approx([2, 1, 3], abs=1e-5)
-    assert volume((b.vertices, b.faces)) == pytest.approx(6.0, rel=1e-4)
-    outward = normals(b.vertices, b.faces)
-    assert np.abs(outward).max(axis=1) == pytest.approx(np.ones(len(outward)))  # edges of a block are sharp
+    assert b.bounds[0] == pytest.approx([0, 0, 0], abs=1e-5)
+    assert b.bounds[1] == pytest.approx([2, 1, 3], abs=1e-5)
+    assert b.volume == pytest.approx(6.0, rel=1e-4)
+    assert np.abs(b.vertex_normals).max(axis=1) == pytest.approx(np.ones(len(b.vertices)))  # edges of a block are sharp
+
+
+@pytest.mark.parametrize(
+    ("geom", "volume", "reach"),
+    [
+        ('type="box" size="0.1 0.2 0.3"', 8 * 0.1 * 0.2 * 0.3, [0.1, 0.2, 0.3]),
+        ('type="cylinder" size="0.2 0.5"', np.pi * 0.04, [0.2, 0.2, 0.5]),
+        ('type="capsule" size="0.2 0.5"', np.pi * 0.04 * (1.0 + 4.0 / 3.0 * 0.2), [0.2, 0.2, 0.7]),
+        ('type="sphere" size="0.3"', 4.0 / 3.0 * np.pi * 0.027, [0.3, 0.3, 0.3]),
+        ('type="ellipsoid" size="0.1 0.2 0.3"', 4.0 / 3.0 * np.pi * 0.006, [0.1, 0.2, 0.3]),
+    ],
+)
+def test_shapes_are_closed_and_of_the_right_size(geom, volume, reach):
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody><body><geom {geom}/></body></worldbody></mujoco>")
+    mesh = body_meshes(model)[1]
+    assert mesh.volume == pytest.approx(volume, rel=0.1)  # positive: faces are counterclockwise as seen from outside
+    assert -mesh.bounds[0] == pytest.approx(reach, rel=0.05)
+    assert mesh.bounds[1] == pytest.approx(reach, rel=0.05)
+    assert (mesh.vertex_normals * mesh.vertices).sum(axis=1).min() > 0.0
+    assert np.linalg.norm(mesh.vertex_normals, axis=1) == pytest.approx(np.ones(len(mesh.vertices)))
+
+
+def test_the_rim_of_a_cylinder_is_sharp_and_its_side_smooth():
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><geom type="cylinder" size="0.2 0.5"/></body></worldbody></mujoco>'
+    )
+    mesh = body_meshes(model)[1]
+    upward = np.abs(mesh.vertex_normals[:, 2])
+    assert ((upward < 1e-6) | (upward > 1.0 - 1e-6)).all()
+    side = mesh.vertices[upward < 1e-6]
+    assert len(np.unique(side.round(6), axis=0)) == len(side)  # faces of the side share their vertices
 
 
 def top_of(shape, x: float, y: float) -> float:
@@ -83,7 +117,7 @@ def top_of(shape, x: float, y: float) -> float:
 def test_a_terrain_is_drawn_as_it_is_simulated():
     specs = [[TileSpec("stairs_up", 0.15), TileSpec("slope_down", 15.0), TileSpec("obstacles", 0.1)]]
     terrain = Terrain.of_tiles(specs, TerrainConfig(border_size=3.0), np.random.default_rng(0))
-    shape = terrain_shape(terrain)
+    shape = terrain_mesh(terrain)
     rng = np.random.default_rng(1)
     half = 0.5 * np.array(terrain.height_map.size)
     points = rng.uniform(-half, half, (300, 2))
@@ -94,40 +128,19 @@ def test_a_terrain_is_drawn_as_it_is_simulated():
     rises = np.array([top_of(shape, x + 1e-3, -8.0) - top_of(shape, x - 1e-3, -8.0) for x in along])
     assert rises[np.abs(rises) > 1e-3] == pytest.approx(0.15, abs=1e-6)
     assert (rises > 0.1).sum() >= 4
-    assert len(shape.colors) == len(shape.vertices)
+    colors = colors_of(shape)
+    assert len(colors) == len(shape.vertices)
+    tread, riser = (np.abs(shape.vertex_normals[:, 2]) > 0.99), (np.abs(shape.vertex_normals[:, 2]) < 0.01)
+    assert colors[tread].mean() > colors[riser].mean()
 
 
-def test_a_plane_looks_the_same_two_metres_on():
-    shape = plane_shape()
-    middles, painted = shape.vertices[shape.faces].mean(axis=1).round(3), shape.colors[shape.faces[:, 0]]
-    colors = {tuple(middle): tuple(color) for middle, color in zip(middles.tolist(), painted.tolist(), strict=True)}
-    for (x, y, z), color in list(colors.items())[::37]:
-        assert colors.get((round(x + 2.0, 3), y, z), color) == color
-        assert colors.get((round(x + 1.0, 3), y, z), (0,)) != color
-
-
-def test_a_glb_file_holds_what_it_was_given():
-    vertices = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
-    data = glb(vertices, np.array([[0, 1, 2]]), np.array([[255, 0, 0], [0, 128, 0], [0, 0, 0]]))
-    magic, version, length, json_length, kind = struct.unpack_from("<4sIIII", data)
-    assert (magic, version, length, kind) == (b"glTF", 2, len(data), 0x4E4F534A)
-    assert json_length % 4 == 0
-    scene = json.loads(data[20 : 20 + json_length])
-    binary_length, kind = struct.unpack_from("<II", data, 20 + json_length)
-    start = 28 + json_length
-    assert (start + binary_length, kind) == (len(data), 0x004E4942)
-    found = {}
-    attributes = scene["meshes"][0]["primitives"][0]["attributes"]
-    for name, index in attributes.items():
-        view = scene["bufferViews"][scene["accessors"][index]["bufferView"]]
-        count = scene["accessors"][index]["count"]
-        found[name] = np.frombuffer(data, "<f4", 3 * count, start + view["byteOffset"]).reshape(-1, 3)
-    assert (found["POSITION"] == vertices).all()
-    assert found["NORMAL"] == pytest.approx(np.tile([0.0, 0.0, 1.0], (3, 1)))
-    assert found["COLOR_0"][1, 1] == pytest.approx(0.2159, abs=1e-4)  # half as bright on a screen is a fifth of the light
-    assert scene["accessors"][attributes["POSITION"]]["max"] == [2.0, 3.0, 0.0]
-
-
-def test_screens_and_light():
-    assert linear(np.array([0, 255])) == pytest.approx([0.0, 1.0])
-    assert linear(np.array([10.0])) == pytest.approx([10.0 / 255.0 / 12.92], rel=0.02)
+def test_the_squares_of_a_plane_repeat():
+    mesh = plane_mesh()
+    assert HALF_PLANE % PERIOD == 0.0  # the texture is whole at the origin
+    assert mesh.bounds.tolist() == [[-HALF_PLANE, -HALF_PLANE, 0.0], [HALF_PLANE, HALF_PLANE, 0.0]]
+    assert mesh.vertex_normals == pytest.approx(np.tile([0.0, 0.0, 1.0], (4, 1)))
+    assert mesh.visual.uv * PERIOD == pytest.approx(mesh.vertices[:, :2])
+    picture = np.asarray(mesh.visual.material.baseColorTexture)
+    half = len(picture) // 2
+    assert (picture == picture[::-1, ::-1]).all()
+    assert (picture[:half, :half] > picture[:half, half:]).all()

@@ -12,7 +12,7 @@ import legged.policies.restore
 from legged.cli import play
 from legged.envs import LeggedRobot
 from legged.errors import RunError
-from legged.play import schedule, video
+from legged.play import demonstrations, video
 from legged.policies.actor import Actor
 from legged.policies.export import export
 from legged.process.paths import DISK_FULL
@@ -36,7 +36,7 @@ class FakeCamera:
 
 @pytest.fixture
 def short(monkeypatch):
-    monkeypatch.setattr(schedule, "SCHEDULE", ((0.2, (0.5, 0.0, 0.0)),))
+    monkeypatch.setattr(demonstrations, "SCHEDULE", ((0.2, (0.5, 0.0, 0.0)),))
     monkeypatch.setattr(video, "camera_of", FakeCamera)
 
 
@@ -44,7 +44,7 @@ def test_a_command_that_is_over_before_it_is_measured_has_no_error(short):
     """One control step lasts 1.25 s, the command 0.2 s: one step, in whose first second nothing is measured."""
     task = small_task(("control.decimation", 250), num_envs=2)
     film = video.Video(task, 1, Path("film"))
-    table = schedule.follow_schedule(task, stand, film)
+    table = demonstrations.follow_schedule(task, stand, film)
     assert list(table.columns[1].cells) == ["-"]
     assert film.fps == pytest.approx(1 / task.dt)
     film.write()
@@ -62,15 +62,15 @@ def test_a_robot_that_fell_is_not_measured_until_it_has_settled_again(short, mon
 
     kept = []
 
-    class Kept(schedule.TrackingErrors):
+    class Kept(demonstrations.TrackingErrors):
         def __init__(self, *arguments):
             super().__init__(*arguments)
             kept.append(self)
 
-    monkeypatch.setattr(schedule, "SCHEDULE", ((3.0, (0.5, 0.0, 0.0)),))
-    monkeypatch.setattr(schedule, "TrackingErrors", Kept)
+    monkeypatch.setattr(demonstrations, "SCHEDULE", ((3.0, (0.5, 0.0, 0.0)),))
+    monkeypatch.setattr(demonstrations, "TrackingErrors", Kept)
     task = Falling(small_config(num_envs=2))
-    schedule.follow_schedule(task, stand, video.Video(task, 1, Path("film")))
+    demonstrations.follow_schedule(task, stand, video.Video(task, 1, Path("film")))
     assert kept[0].falls.tolist() == [2.0, 2.0]
     assert kept[0].steps.tolist() == [19.0, 19.0]
 

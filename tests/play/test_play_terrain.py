@@ -14,8 +14,8 @@ from legged.cli import play
 from legged.config import TaskConfig, override
 from legged.envs import LeggedRobot
 from legged.math import yaw_of
-from legged.play import outing, video
-from legged.play.errors import TrackingErrors
+from legged.play import demonstrations, video
+from legged.play.demonstrations import TrackingErrors
 from legged.play.playground import ROWS_NEEDED, SETTING, Playground, label
 from legged.process.paths import data_folder
 from legged.registry import make_task, task_config
@@ -180,7 +180,7 @@ def test_errors_are_root_mean_squares_of_settled_robots():
 
 @pytest.mark.parametrize("heading", [True, False])
 def test_robots_are_asked_to_walk_along_x_and_are_counted_by_type(monkeypatch, heading):
-    monkeypatch.setattr(outing, "EPISODE_S", 0.1)
+    monkeypatch.setattr(demonstrations, "EPISODE_S", 0.1)
     cfg = override(config(), [("commands.heading_command", heading), ("commands.ranges.lin_vel_x", [-1.0, 0.5])])
     ground = playground(cfg)
     task = on(ground, cfg, num_envs=9)
@@ -190,7 +190,7 @@ def test_robots_are_asked_to_walk_along_x_and_are_counted_by_type(monkeypatch, h
         seen.append(task.commands.clone())
         return torch.zeros(9, 12)
 
-    table = outing.walk_out(task, act, ground, video.Video(task, 1, None))
+    table = demonstrations.walk_out(task, act, ground, video.Video(task, 1, None))
     assert len(seen) == 2 * 5
     commands = torch.stack(seen)
     torch.testing.assert_close(commands[..., 0], torch.full((10, 9), 0.5))  # what the task was trained on
@@ -217,14 +217,14 @@ class FakeCamera:
 
 
 def test_each_episode_shows_another_robot_and_says_what_is_below_it(monkeypatch, tmp_path):
-    monkeypatch.setattr(outing, "EPISODE_S", 0.08)
-    monkeypatch.setattr(outing, "EPISODES", 3)
+    monkeypatch.setattr(demonstrations, "EPISODE_S", 0.08)
+    monkeypatch.setattr(demonstrations, "EPISODES", 3)
     monkeypatch.setattr(video, "camera_of", FakeCamera)
     monkeypatch.setattr(FakeCamera, "shots", [])
     ground = playground(config(), difficulty=0.5)
     task = on(ground, config(), num_envs=2)
     film = video.Video(task, 2, tmp_path)
-    outing.walk_out(task, lambda _: torch.zeros(2, 12), ground, film)
+    demonstrations.walk_out(task, lambda _: torch.zeros(2, 12), ground, film)
     film.write()
     up, down = (0, "stairs_up, step height 0.14 m"), (1, "stairs_down, step height 0.14 m")
     assert FakeCamera.shots == [up, up, down, down, up, up]
@@ -248,8 +248,8 @@ def run(tmp_path_factory):
 
 @pytest.fixture
 def short(monkeypatch):
-    monkeypatch.setattr(outing, "EPISODE_S", 1.2)
-    monkeypatch.setattr(outing, "EPISODES", 1)
+    monkeypatch.setattr(demonstrations, "EPISODE_S", 1.2)
+    monkeypatch.setattr(demonstrations, "EPISODES", 1)
     with kept_global_state():
         yield
 
@@ -261,7 +261,7 @@ def arguments(run: Path, out: Path, *more: str) -> list[str]:
 
 def test_play_on_the_types_of_the_task(run, short, tmp_path, capsys, monkeypatch):
     tasks = []
-    monkeypatch.setattr(play, "walk_out", lambda task, *rest: tasks.append(task) or outing.walk_out(task, *rest))
+    monkeypatch.setattr(play, "walk_out", lambda task, *rest: tasks.append(task) or demonstrations.walk_out(task, *rest))
     assert call(play.main, arguments(run, tmp_path, "--no-video", "--difficulty", "0.5")) == 0
     out = capsys.readouterr().out
     assert (tmp_path / "exported" / "policy.onnx").is_file()
@@ -282,7 +282,7 @@ def test_play_records_a_film_of_one_type(run, short, tmp_path, capsys, monkeypat
         mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
     except Exception as error:  # each GL back-end fails in its own way
         pytest.skip(f"nothing can be rendered here: {error}")
-    monkeypatch.setattr(outing, "EPISODE_S", 1.0)
+    monkeypatch.setattr(demonstrations, "EPISODE_S", 1.0)
     more = ["--headless", "--gif", "--terrain", "stairs_down", "--difficulty", "0.8", "--num_envs", "1"]
     assert call(play.main, arguments(run, tmp_path, *more)) == 0
     out = capsys.readouterr().out

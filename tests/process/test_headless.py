@@ -125,7 +125,7 @@ WITHOUT_OPENGL = """
 import sys
 sys.modules["OpenGL"] = None
 sys.argv = {argv!r}
-from legged.tools.{command} import main
+from legged.cli.{command} import main
 sys.exit(main())
 """
 TOP = Path(legged.__file__).parents[1]

@@ -143,7 +143,7 @@ def test_a_folder_that_cannot_be_is_the_users_mistake(check, name, tmp_path):
 
 @pytest.mark.parametrize("name", ["\0", "a\0b.png", "x" * 256])
 def test_a_name_that_no_file_can_have_is_refused_before_the_work(tmp_path, name):
-    with pytest.raises(ConfigError, match="--out: no file can be called"):
+    with pytest.raises(ConfigError, match="--out: not a valid file name"):
         ready_to_write_file("--out", tmp_path / name)
 
 

@@ -76,7 +76,7 @@ def test_why_a_process_failed(tmp_path):
     assert why_failed(job, 7) == "exit code 7"
     job.output.write_text("hello\nValueError: no\n\n")
     assert why_failed(job, 1) == "ValueError: no"
-    assert why_failed(job, -9) == "killed by SIGKILL, maybe for want of memory"
+    assert why_failed(job, -9) == "killed by SIGKILL, maybe out of memory"
     assert why_failed(job, -11) == "killed by SIGSEGV"
     job.output.write_text("error: --task: there is no task\nbye\n")
     assert why_failed(job, 2) == "--task: there is no task"

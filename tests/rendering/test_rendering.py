@@ -11,8 +11,8 @@ from legged.config import override
 from legged.play.playground import SETTING, Playground
 from legged.registry import make_task, task_config
 from legged.rendering import RobotsCamera, display_model, size_of
-from legged.rendering.follower import BEHIND, CUT, FLATTEST, FRONT, Follower
-from legged.rendering.paint import LOW, MIDDLE
+from legged.rendering.framing import BEHIND, CUT, FLATTEST, FRONT, Follower
+from legged.rendering.scene import LOW, MIDDLE
 from legged.terrain import HeightMap
 
 WIDTH, HEIGHT = 320, 180
@@ -292,7 +292,7 @@ def test_the_camera_comes_nearer_to_smaller_robots(task, camera, monkeypatch):
     assert camera.view.distance == pytest.approx(2.0 + 1.1 * 2**0.5, rel=0.01)  # ANYmal C's
     assert camera.offsets[1, 1] - camera.offsets[0, 1] == pytest.approx(1.9, rel=0.01)
     size = size_of(task.robot)
-    monkeypatch.setattr("legged.rendering.robots_camera.size_of", lambda _: replace(size, longest=0.5 * size.longest))
+    monkeypatch.setattr("legged.rendering.task_cameras.size_of", lambda _: replace(size, longest=0.5 * size.longest))
     near = RobotsCamera(task, count=2, width=WIDTH, height=HEIGHT)
     near.close()
     assert near.view.distance == pytest.approx(0.5 * camera.view.distance)

@@ -14,8 +14,8 @@ from legged.errors import ConfigError
 from legged.physics import RobotScene
 from legged.physics.scene.robot_scene import robot_source
 from legged.registry import make_task, task_config
+from legged.rendering.framing import size_of
 from legged.rendering.scene import display_model
-from legged.rendering.size import size_of
 from legged.robots.importing.adapted import is_plain_file, robot_spec_of
 from legged.robots.importing.guess import make_ready, read_robot
 from legged.robots.importing.mjcf import read_mjcf

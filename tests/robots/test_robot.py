@@ -327,5 +327,5 @@ def test_model_that_is_no_mjcf_is_refused_in_one_line(folder, content):
 def test_feet_at_different_depths_are_refused(folder):
     """The feet's kinematics are computed level by level, for all feet at once."""
     edit(folder / "robot.yaml", "feet: [FOOT]", "feet: [FOOT, base]")
-    with pytest.raises(ConfigError, match="all feet must hang on the same number of bodies"):
+    with pytest.raises(ConfigError, match="feet: all feet must have the same number of hinges"):
         make_physics(RobotScene(load_robot(str(folder))), SimConfig(physics="mujoco"), 1, torch.device("cpu"))

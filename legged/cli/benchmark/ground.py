@@ -6,7 +6,7 @@ The task is timed on a plane, on its terrain with this package's collider, and o
 import sys
 from typing import Any
 
-from legged.benchmarks.report import report
+from legged.benchmarks.step_times import report
 from legged.cli.benchmark.common import add_arguments, add_memory, measure, settle, write
 from legged.commandline.arguments import settle_on
 from legged.commandline.command import run_main

@@ -8,7 +8,7 @@ which raises at any synchronisation with the host.
 import sys
 
 from legged.benchmarks.kernel_times import kernel_times, table
-from legged.benchmarks.report import report
+from legged.benchmarks.step_times import report
 from legged.cli.benchmark.common import (
     add_arguments,
     add_memory,

@@ -16,17 +16,17 @@ from legged.episodes.ranking import (
     FELL,
     Figures,
     counts_text,
-    episodes_table,
     figures_of,
     heads_of,
-    markdown_table,
     order_of,
     row_of,
 )
 from legged.episodes.rollout import MOST_EPISODES, Wish
-from legged.episodes.statistics_report import screen_table, tables_of, write_statistics
+from legged.episodes.statistics_report import tables_of, write_statistics
 from legged.episodes.stored import Episodes, load_config
 from legged.errors import ConfigError, suggest
+from legged.evaluation.reports.document import text_of
+from legged.evaluation.tables import markdown_table, screen_table
 from legged.policies.restore import TrainedPolicy
 from legged.process.paths import relative, write_text
 
@@ -147,8 +147,12 @@ def show(episodes: Episodes, folder: Path, args: argparse.Namespace) -> None:
     figures = figures_of(episodes)
     order = order_of(figures, args.sort, args.ended)
     wanted = pages(args.page, len(episodes)) + order[: args.worst]
+    heads = heads_of(figures)
+    texts = [i for i, head in enumerate(heads) if head in ("ended by", "joint")]
+    rows = [row_of(figures, number) for number in order[: args.top]]
     print()
-    Console(width=130).print(episodes_table(figures, order[: args.top], f"{counts_text(figures)}; by {args.sort}"))
+    title = f"{counts_text(figures)}; by {args.sort}"
+    Console(width=130).print(screen_table(title, [head.replace(" [", "\n[") for head in heads], rows, texts))
     _write_list(folder, figures, order, args.sort)
     if args.parquet:
         write_parquet(episodes, folder)
@@ -160,7 +164,7 @@ def show(episodes: Episodes, folder: Path, args: argparse.Namespace) -> None:
 
 def _write_list(folder: Path, figures: Figures, order: list[int], by: str) -> None:
     """Write the whole list as Markdown."""
-    text = markdown_table(heads_of(figures), [row_of(figures, number) for number in order], left=(1,))
+    text = markdown_table(heads_of(figures), [row_of(figures, number) for number in order], left=(1,)) + "\n"
     write_text(folder / LIST, f"# Episodes\n\n{counts_text(figures)}. The worst come first, by {by}.\n\n{text}")
     print(f"written: {relative(folder / LIST)}")
 
@@ -174,6 +178,7 @@ def label_of(episodes: Episodes) -> str:
 def print_statistics(folder: Path, found: dict[str, JointStatistics]) -> None:
     """Print the tables of joint statistics, then write their files."""
     console = Console(width=130)
-    for table in tables_of(found):
-        console.print(screen_table(table))
+    for title, table in tables_of(found).items():
+        heads = [head.replace(", ", ",\n") for head in table.head]
+        console.print(screen_table(title, heads, [[text_of(cell) for cell in row] for row in table.rows]))
     write_statistics(folder, found, "Joint statistics" if len(found) == 1 else "Joint statistics of two policies")

@@ -21,8 +21,7 @@ from legged.errors import ConfigError
 from legged.evaluation.playback import SETTLING_S, Played, follow, play
 from legged.evaluation.velocity_grid import AXES, AXIS, Grid, axis_values, check_size
 from legged.learning.run_folder import CONFIG_FILE
-from legged.policies.foreign import ForeignPolicy, Layout, read_layout
-from legged.policies.own_layout import was_trained_with_other_motors
+from legged.policies.foreign import ForeignPolicy, Layout, read_layout, was_trained_with_other_motors
 from legged.process.command_parser import CommandParser
 from legged.process.paths import exists, make_folder, ready_to_write, relative, write_text
 from legged.robots.robot import Robot, load_robot

@@ -7,6 +7,7 @@ growing size, as `legged evaluate grid` and `legged evaluate terrain` do. Other 
 The tables are printed; evaluation_<physics>.json and pictures are written beside the checkpoint.
 """
 
+import argparse
 import sys
 
 from legged.cli.evaluate import onnx
@@ -15,6 +16,7 @@ from legged.cli.evaluate.episodes import ENVIRONMENTS
 from legged.cli.main import hint_at_sub_command
 from legged.commandline.command import run_main
 from legged.config import LeggedConfig
+from legged.errors import ConfigError
 from legged.evaluation.episodes import evaluate_episodes
 from legged.evaluation.following import evaluate_following
 from legged.evaluation.success import chosen_sizes
@@ -36,6 +38,7 @@ def build_parser() -> CommandParser:
 def _main(argv: list[str] | None) -> int:
     args = build_parser().parse_intermixed_args(argv)
     if onnx.exported_file(args.policy) is not None:
+        _check_plain(args)
         return onnx.evaluate([args.policy, *(["--out", str(args.out)] if args.out else [])])
     with hint_at_sub_command("evaluate", [args.policy]):
         setting = settle(args)
@@ -49,6 +52,21 @@ def _main(argv: list[str] | None) -> int:
     return evaluate_following(
         policy, grid, sizes, check_points(None, False), setting.asked, device, graph, folder, setting.where
     )
+
+
+def _check_plain(args: argparse.Namespace) -> None:
+    """Look for options that mean nothing for an ONNX file, which runs in C MuJoCo as it is.
+
+    Raises:
+        ConfigError: there is one.
+    """
+    if args.overrides:
+        raise ConfigError(f"{args.overrides[0]}: an ONNX file runs as it is; `legged evaluate onnx` has its options")
+    plain = vars(build_parser().parse_args([args.policy]))
+    for name, value in vars(args).items():
+        if value != plain[name] and name not in ("out", "overrides"):
+            option = f"--{'import' if name == 'module' else name.replace('_', '-')}"
+            raise ConfigError(f"{option}: means nothing for an ONNX file; `legged evaluate onnx` has its options")
 
 
 if __name__ == "__main__":

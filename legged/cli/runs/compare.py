@@ -10,8 +10,8 @@ from pathlib import Path
 from legged.commandline.command import run_main
 from legged.errors import ConfigError
 from legged.evaluation.reports.comparison import comparison_parts
+from legged.evaluation.reports.document import write_pages
 from legged.evaluation.reports.record import read_record
-from legged.evaluation.reports.run_report import write_pages
 from legged.learning.run_folder import LOGS, own_run
 from legged.process.command_parser import CommandParser, add_import_argument
 from legged.process.paths import make_folder, ready_to_write, relative

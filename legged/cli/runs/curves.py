@@ -1,6 +1,6 @@
 """Learning curves of runs as a picture: `legged runs curves anymal_c_flat`.
 
-learning_curve.png shows tracking error, return and falls over iterations, one line for each run, read from the TensorBoard
+learning_curve.png shows returns, errors, falls and metrics over iterations, one line for each run, read from the TensorBoard
 files. An axis on top shows the time, unless the runs differ by more than 5 % in the time of an iteration. For runs on terrain
 the picture also shows the mean level of each type, and the shares of episodes after which robots moved up and down.
 """
@@ -9,7 +9,10 @@ import sys
 from pathlib import Path
 
 from legged.commandline.command import run_main
-from legged.evaluation.learning_curves import always_promoted, draw_runs, labels, read_config, read_scalars
+from legged.errors import ConfigError
+from legged.evaluation.learning_curves import Log, common_time, labels, read_config, read_scalars
+from legged.evaluation.reports.charts import draw_charts
+from legged.evaluation.reports.curves import levels, outcomes
 from legged.learning.run_folder import own_run
 from legged.process.command_parser import CommandParser, add_import_argument
 from legged.process.paths import make_folder, ready_to_write, relative
@@ -43,11 +46,13 @@ def _main(argv: list[str] | None) -> int:
         import_tasks(args.module)
     folders = [own_run(name, "RUN") for name in args.runs]
     ready_to_write(args.out)
-    runs = [read_scalars(run) for run in folders]
-    configs = [read_config(run) for run in folders]
-    named = dict(zip(labels(folders, configs), runs, strict=True))
+    logs = [Log(read_scalars(run), read_config(run)) for run in folders]
+    runs = list(zip(labels(folders, [log.config for log in logs]), logs, strict=True))
+    charts = [*outcomes(runs), *levels(logs)]
+    if not charts:
+        raise ConfigError(f"{relative(folders[0])}: its TensorBoard file holds no returns, errors or metrics")
     make_folder(args.out)
-    draw_runs(named, args.out / PICTURE, {level for config in configs if (level := always_promoted(config)) is not None})
+    draw_charts(charts, args.out / PICTURE, iteration_s=common_time([log.scalars for log in logs]))
     print(f"written: {relative(args.out / PICTURE)}")
     return 0
 

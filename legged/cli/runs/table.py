@@ -9,10 +9,9 @@ from pathlib import Path
 
 from legged.cli.main import hint_at_sub_command
 from legged.commandline.command import run_main
-from legged.evaluation.judged_run import folders_in
 from legged.evaluation.reports.document import to_html, to_markdown
 from legged.evaluation.reports.experiments import TITLE, experiments_parts
-from legged.evaluation.reports.record import read_record
+from legged.evaluation.reports.record import folders_in, read_record
 from legged.learning.run_folder import LOGS
 from legged.process.command_parser import CommandParser, add_import_argument
 from legged.process.paths import exists, make_folder, ready_to_write, relative, write_text

@@ -1,4 +1,4 @@
-"""A process that makes trials, one after the other: so imports are made once, and kernels loaded once, for all of them."""
+"""A process that runs trials one after the other, so that imports and kernels are loaded once."""
 
 import gc
 import math
@@ -16,10 +16,10 @@ import torch
 from legged.cli.train import train_as_asked
 from legged.commandline.stopping import stopping_on_signals
 from legged.errors import ConfigError
+from legged.learning.divergence import Diverged
 from legged.learning.evaluations import Evaluated, reaches
 from legged.learning.run_folder import NOTE_FILE
 from legged.learning.runner import Runner
-from legged.learning.watch import Diverged
 from legged.process.paths import make_folder, relative, write_text
 from legged.sweeping.plan import Plan
 from legged.sweeping.study import RUNS, WHY, Trials
@@ -29,29 +29,29 @@ if TYPE_CHECKING:
 
 PRUNED = "ended early: others were better by then"
 SIGNALLED = 128
-"""Exit codes from here on say that a signal has ended a training."""
+"""Exit codes from here on mean that a signal ended a training."""
 MOST_FAILURES = 3
-"""Trials in a row that may fail for reasons of the program before a worker gives up."""
+"""Failed trials in a row after which a worker gives up."""
 
 
 class Stopped(Exception):
     """A training was ended by a signal."""
 
     def __init__(self, number: int) -> None:
-        """`number` is that of the signal."""
+        """Take the number of the signal."""
         super().__init__(f"signal {number}")
         self.number = number
 
 
 class NoValue(Exception):
-    """A trial that has no value counts as one that was ended early; the text says why."""
+    """A trial without a value, which counts as ended early; the text is the reason."""
 
 
 class Worker:
-    """Makes trials until there are enough."""
+    """Runner of trials."""
 
     def __init__(self, plan: Plan, trials: Trials, flags: Sequence[str]) -> None:
-        """`flags` are the options of `legged train` that say where and how it is trained."""
+        """Take the options of `legged train` for device and threads."""
         self.plan, self.trials, self._flags = plan, trials, [*flags]
         self._start = time.perf_counter()
         self._failures = 0
@@ -59,25 +59,23 @@ class Worker:
         self.stopped = False
 
     def run(self) -> list[int]:
-        """Make trials until there are enough, or until whoever started this process has died; return the signals that ended
-        this early.
-        """
+        """Run trials until there are enough, or until the parent process has died; return the signals received."""
         in_trials: list[int] = []
         with stopping_on_signals(self.stop) as stopped_by:
             while not self.stopped and os.getppid() == self._parent and (trial := self.trials.next()) is not None:
                 try:
                     self._make(trial)
-                except Stopped as signalled:  # a training takes signals itself
+                except Stopped as signalled:  # a training handles signals itself
                     self.stopped = True
                     in_trials.append(signalled.number)
         return [*stopped_by, *in_trials]
 
     def stop(self) -> None:
-        """Begin no other trial."""
+        """Begin no further trial."""
         self.stopped = True
 
     def _make(self, trial: "Trial") -> None:
-        """Make a trial, and note what has become of it."""
+        """Run a trial, and store its result."""
         values = self.trials.draw(trial)
         begun = time.perf_counter()
         try:
@@ -102,7 +100,7 @@ class Worker:
             self.trials.study.tell(trial.number, value)
             self._say(trial, begun, f"{self.plan.objective_text}: {value:.4g}")
         finally:
-            gc.collect()  # the tensors and graphs of a training lie in cycles
+            gc.collect()  # tensors and graphs of a training are in reference cycles
             if torch.cuda.is_available():
                 torch.cuda.empty_cache()
 
@@ -111,11 +109,11 @@ class Worker:
         self.trials.try_again(frozen, why)
 
     def _value(self, trial: "Trial", values: dict[str, Any]) -> float:
-        """Train with every seed; return the mean of what the objective takes.
+        """Train with every seed; return the mean value.
 
         Raises:
-            NoValue: the trial was ended early, its settings fit no configuration, or its numbers diverged.
-            Stopped: by a signal.
+            NoValue: the trial was ended early, its settings are invalid, or its numbers diverged.
+            Stopped: a signal ended it.
         """
         found: list[float] = []
         output = self.plan.folder / "output" / f"trial{trial.number:03d}.txt"
@@ -140,7 +138,7 @@ class Worker:
         until = self.plan.cfg.train.runner.max_iterations
 
         def listen(found: Evaluated) -> str:
-            """Report what was found, as the mean over the seeds so far; end the training if others were better by then."""
+            """Report the mean over the seeds so far; return a reason to end if others were better by this step."""
             now = found.figures[self.plan.figure]
             if not math.isfinite(now):
                 return ""
@@ -171,15 +169,15 @@ class Worker:
         return self._taken(evaluations.history)
 
     def _taken(self, history: Sequence[Evaluated]) -> float:
-        """Return what the objective takes of a training.
+        """Return the value of the objective for a training.
 
         Raises:
-            NoValue: it did not reach its target, or what was found is no number.
+            NoValue: it did not reach its target, or no figure is finite.
         """
         objective, figure = self.plan.given.objective, self.plan.figure
         values = [found.figures[figure] for found in history if math.isfinite(found.figures[figure])]
         if not values:
-            raise NoValue(f"its {figure} is no number")
+            raise NoValue(f"its {figure} is not finite")
         if objective.take == "last":
             return values[-1]
         if objective.take == "best":

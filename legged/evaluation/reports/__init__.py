@@ -1,1 +1,1 @@
-"""Reports on runs: one page about a training, a table of many, several side by side; as HTML and as Markdown."""
+"""Reports on runs: a page on one training, a table of many, a comparison of several; as HTML and as Markdown."""

@@ -1,4 +1,4 @@
-"""Several runs side by side: what they set otherwise, their curves over each other, their evaluations with intervals."""
+"""A comparison of runs: differing settings, curves, and evaluations with intervals."""
 
 from collections.abc import Sequence
 from math import sqrt
@@ -10,19 +10,20 @@ from legged.config.dotted import differences
 from legged.evaluation.engines import ENGINES, engine_of
 from legged.evaluation.intervals import Interval, bootstrap_mean, newcombe, normal_mean, welch, wilson
 from legged.evaluation.learning_curves import labels
+from legged.evaluation.reports.charts import curves
 from legged.evaluation.reports.curves import curves_of_runs
-from legged.evaluation.reports.differences import words
 from legged.evaluation.reports.document import Cell, Figures, Heading, Mono, Paragraph, Part, Table
-from legged.evaluation.reports.evaluation_part import BROKEN, between, falls_of, number, success_drawing, success_line
-from legged.evaluation.reports.record import Record
+from legged.evaluation.reports.evaluation_part import BROKEN, between, falls_of, number
+from legged.evaluation.reports.record import Record, words
 from legged.evaluation.result_file import changes_text, grid_text, tracking_of
+from legged.evaluation.success_report import success_chart, success_line, types_in
 
 Measured = tuple[str, Interval | None] | None
-"""A figure in words, and its interval, if there are enough values for one; None where a run lacks it."""
+"""Text of a figure and its interval, if it has one; None if a run lacks the figure."""
 
 
 def comparison_parts(records: Sequence[Record]) -> list[Part]:
-    """Return the page on some runs, the first of which the others are compared with."""
+    """Return the page on some runs, which compares all with the first."""
     common, names = apart(labels([record.folder for record in records], [record.config for record in records]))
     noted = any(record.note for record in records)
     rows: list[list[Cell]] = []
@@ -34,16 +35,14 @@ def comparison_parts(records: Sequence[Record]) -> list[Part]:
     head = ["run", "folder", "status", "", "robots", "loop [s]", "steps/s", "commit", *(["note"] if noted else [])]
     parts: list[Part] = [Paragraph(f"All runs: {common}.")] if common else []
     parts += [Table(head, rows), Heading("Settings that differ"), _settings(names, records)]
-    drawings = curves_of_runs(list(zip(names, records, strict=True)))
+    drawings = curves_of_runs([(name, record.log) for name, record in zip(names, records, strict=True)])
     if drawings:
         parts += [Heading("Curves"), Figures("curves", drawings, "learning curves of the runs")]
     return parts + _evaluations(names, records)
 
 
 def apart(names: Sequence[str]) -> tuple[str, list[str]]:
-    """Return what labels of runs have in common, and of each what tells it from the others; nothing and the labels themselves
-    where one of them would say nothing any more.
-    """
+    """Return the common parts of runs' labels, and the rest of each label; no common parts if a label would become empty."""
     parts = [name.split(", ") for name in names]
     common = [part for part in parts[0] if all(part in one for one in parts)]
     rest = [", ".join(part for part in one if part not in common) for one in parts]
@@ -60,7 +59,7 @@ def _settings(names: Sequence[str], records: Sequence[Record]) -> Part:
 
 
 def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
-    """Return tables and drawings of the engines in which at least two of the runs were judged."""
+    """Return tables and drawings of the engines in which at least two runs were evaluated."""
     by_engine = [{result["physics"]: result for result in record.results} for record in records]
     engines = dict.fromkeys(name for one in by_engine for name in one)
     parts: list[Part] = []
@@ -78,16 +77,15 @@ def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
     if not parts:
         return [Heading("Evaluation"), Paragraph("No two of the runs were evaluated in the same engine.")]
     text = (
-        "In brackets, intervals of 95 %: of shares Wilson's, of their difference Newcombe's; of errors a bootstrap over the"
-        " commands of the grid, the same commands for both in a difference; of returns by their standard deviation (Welch)."
-        " They say how sure a figure is of this one policy: another seed may differ by more. A * marks differences whose"
-        " interval leaves out 0. Of a single command or episode there is no interval."
+        "Brackets hold intervals of 95 %: Wilson's for shares, Newcombe's for their differences, a bootstrap over the"
+        " commands of the grid for errors, Welch's for returns. They describe one policy; another seed may differ by more."
+        " A * marks differences whose interval excludes 0. A single command or episode has no interval."
     )
     return [*parts, Paragraph(text)]
 
 
 def conditions_of(results: Sequence[dict[str, Any] | None]) -> list[str]:
-    """Say of each evaluation what fields were changed for it, and its grid of commands where not all have the same."""
+    """Return for each evaluation its changed fields, and its grid of commands if the grids differ."""
     found = [result or {} for result in results]
     grids = [grid_text(one) for one in found]
     told = len(set(grids) - {""}) > 1
@@ -99,7 +97,7 @@ def conditions_of(results: Sequence[dict[str, Any] | None]) -> list[str]:
 
 
 def _table(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> Table:
-    """Return one engine's figures: a line a measure, a column a run, and one for each difference from the first run."""
+    """Return the table of one engine: a line a measure, a column a run, and one for each difference from the first run."""
     rows: list[list[Cell]] = []
     for label, measure, difference in _measures(results):
         found = [measure(result) if result is not None else None for result in results]
@@ -125,7 +123,7 @@ def _with_interval(value: float, form: str, interval: Interval | None, factor: f
 
 
 def _measures(results: Sequence[dict[str, Any] | None]) -> list[tuple[str, Any, Any]]:
-    """Return what is compared: label, a run's figure, and the difference of two."""
+    """Return the compared measures: label, figure of a run, and difference of two."""
     if any(result is not None and "episodes" in result for result in results):
         return [
             ("return", *_figure(_spread, lambda mean, _std, _count: mean, normal_mean, welch, ".1f")),
@@ -139,7 +137,7 @@ def _measures(results: Sequence[dict[str, Any] | None]) -> list[tuple[str, Any, 
 
 
 def _error(name: str) -> tuple[Any, Any]:
-    """Return the mean of an error over the cells of the grid, and the difference of two on the same grid."""
+    """Return functions for the mean of an error over the grid, and for the difference of two on the same grid."""
 
     def cells(result: dict[str, Any]) -> dict[tuple[float, ...], float]:
         try:
@@ -167,8 +165,8 @@ def _error(name: str) -> tuple[Any, Any]:
 
 
 def _figure(read: Any, value: Any, interval: Any, of_difference: Any, form: str, factor: float = 1.0) -> tuple[Any, Any]:
-    """Return a figure, and the difference of two. `read` finds in a result what it follows from, or None; `value` and
-    `interval` make of that the figure and its interval, `of_difference` of two of them the interval of their difference.
+    """Return functions for a figure and for the difference of two. `read` finds values in a result, or None; `value` and
+    `interval` compute the figure and its interval from them, `of_difference` the interval of a difference.
     """
 
     def of(result: dict[str, Any]) -> Measured:
@@ -187,7 +185,7 @@ def _figure(read: Any, value: Any, interval: Any, of_difference: Any, form: str,
 
 
 def _share(counted: Any) -> tuple[Any, Any]:
-    """Return a share, and the difference of two, of what `counted` finds in a result: (how many, of how many), or None."""
+    """Return functions for a share and for the difference of two; `counted` returns (number, total) of a result, or None."""
     return _figure(counted, lambda some, of_all: some / of_all, wilson, newcombe, ".2f", 100.0)
 
 
@@ -197,8 +195,8 @@ def _failures(result: dict[str, Any]) -> tuple[int, int] | None:
 
 
 def _spread(result: dict[str, Any]) -> tuple[float, float, int] | None:
-    """Return mean and standard deviation of returns, and the number of episodes. The file has the deviation of just these
-    returns; that of a sample, from which intervals follow, is a little larger.
+    """Return mean and sample standard deviation of returns, and the number of episodes. The file holds the population's
+    standard deviation, which is a little smaller.
     """
     episodes = result.get("episodes")
     if episodes is None or int(episodes["count"]) < 1:
@@ -209,11 +207,10 @@ def _spread(result: dict[str, Any]) -> tuple[float, float, int] | None:
 
 def _success(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> list[str]:
     """Return a drawing a terrain type that at least two of the runs have crossed."""
-    entries = [(result or {}).get("success", {}).get("types", {}) for result in results]
+    entries = [types_in(result or {}) for result in results]
     found = []
     for kind in dict.fromkeys(kind for one in entries for kind in one):
-        there = [(name, one[kind]) for name, one in zip(names, entries, strict=True) if kind in one]
+        there = [(one[kind], success_line(name, one[kind])) for name, one in zip(names, entries, strict=True) if kind in one]
         if len(there) > 1:
-            lines = [success_line(name, entry) for name, entry in there]
-            found.append(success_drawing(kind.replace("_", " "), [entry for _, entry in there], lines))
+            found.append(curves(success_chart(kind.replace("_", " "), there)))
     return found

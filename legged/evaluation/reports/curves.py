@@ -1,17 +1,21 @@
-"""The curves of a report: which there are of a run or of several, and how they are drawn."""
+"""The learning curves of one run or of several as charts."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from legged.evaluation.learning_curves import LEVEL, Scalars, always_promoted, smooth
-from legged.evaluation.reports.record import Record
-from legged.evaluation.reports.svg import Axes, Line, curves, stacked
+from legged.config.dotted import value_at
+from legged.evaluation.learning_curves import Log, Scalars, always_promoted, mean_of, smooth
+from legged.evaluation.reports.charts import Chart, Line, curves, stacked
 from legged.figures import COLORS
 
 MOST_PARTS = len(COLORS) - 1
-"""Reward parts with a colour of their own; all smaller ones are one."""
-EPISODE, LENGTH = "Episode/rew_", "Metrics/episode_length"
+"""Reward parts with their own colour; the smaller ones are summed."""
+EPISODE, LENGTH, LEVEL, WATCHED = "Episode/rew_", "Metrics/episode_length", "Terrain/level_", "Evaluation/"
+"""Beginnings of tags; `WATCHED` begins those of evaluations during training."""
+Named = Sequence[tuple[str, Log]]
+"""Runs with their labels."""
 SINGLE = (
     ("Metrics/lin_vel_rmse", "velocity error [m/s]", 1.0),
     ("Metrics/ang_vel_rmse", "yaw rate error [rad/s]", 1.0),
@@ -23,15 +27,13 @@ CURRICULUM = (
     ("Metrics/command_vy", "largest commanded vy [m/s]", 1.0),
     ("Metrics/command_yaw", "largest commanded yaw rate [rad/s]", 1.0),
 )
-"""As far as a curriculum of commands has got; the same."""
+"""The same for the ranges of a curriculum of commands."""
 LEARNER = (
     ("Policy/mean_std", "standard deviation of actions (noise)", 1.0),
     ("Loss/value", "loss of the value function", 1.0),
     ("Loss/behavior", "behaviour loss: student's actions against its teacher's", 1.0),
 )
 NOT_OF_THE_TASK = (LENGTH, "Metrics/contact_overflows", "Metrics/non_finite_worlds")
-WATCHED = "Evaluation/"
-"""Section of what was measured without noise during training."""
 OF_EVALUATION = {
     "lin_vel_rmse": ("velocity RMSE [m/s]", 1.0),
     "ang_vel_rmse": ("yaw rate RMSE [rad/s]", 1.0),
@@ -39,134 +41,127 @@ OF_EVALUATION = {
     "return": ("return of an episode", 1.0),
     "episode_length": ("length of an episode [control steps]", 1.0),
 }
-"""Title and factor of its figures; others are metrics of the task, called what they are."""
+"""Titles and factors of figures of evaluations; other figures are metrics of the task."""
 
 
-def curves_of_run(record: Record) -> list[str]:
-    """Return the drawings of one run, those that it has values for."""
-    scalars = record.scalars
-    found = [*_returns(scalars, record), *_parts(scalars), *_several([("", record)])]
-    return found + _levels(record)
+def curves_of_run(log: Log) -> list[str]:
+    """Return the drawings of one run."""
+    run, parts = [("", log)], _parts(log.scalars)
+    drawings = [curves(chart) for chart in (*outcomes(run), *_learner(run), *levels([log]))]
+    return [*drawings[:1], *([parts] if parts else []), *drawings[1:]]
 
 
-def curves_of_runs(records: Sequence[tuple[str, Record]]) -> list[str]:
-    """Return the drawings of several runs laid over each other, by their labels."""
-    return [
-        *_one("Train/mean_reward", "return of an episode", records),
-        *_several(records),
-        *_one("Terrain/level", "mean terrain level", records),
-    ]
+def curves_of_runs(runs: Named) -> list[str]:
+    """Return the drawings of several runs laid over each other."""
+    charts = [*outcomes(runs), *_learner(runs), *_one("Terrain/level", "mean terrain level", runs)]
+    return [curves(chart) for chart in charts]
 
 
-def _several(records: Sequence[tuple[str, Record]]) -> list[str]:
-    """Return one drawing a quantity, one line a run."""
-    tags = dict.fromkeys(tag for _, record in records for tag in record.scalars)
+def outcomes(runs: Named) -> list[Chart]:
+    """Return charts of what robots do: returns, errors, falls and metrics of the task."""
+    found = _returns(runs) + [chart for tag, title, factor in SINGLE for chart in _one(tag, title, runs, factor)]
+    steps = {log.dt for _, log in runs}
+    dt = next(iter(steps)) if len(steps) == 1 else None
+    found += _one(LENGTH, f"length of an episode [{'control steps' if dt is None else 's'}]", runs, dt or 1.0)
     named = (*NOT_OF_THE_TASK, *(tag for tag, _, _ in SINGLE + CURRICULUM))
-    own = [tag for tag in tags if tag.startswith("Metrics/") and tag not in named]
-    found = [drawing for tag, title, factor in SINGLE for drawing in _one(tag, title, records, factor)]
-    found += _lengths(records)
-    found += [drawing for tag, title, factor in CURRICULUM for drawing in _one(tag, title, records, factor)]
-    for tag in own:
-        found += _one(tag, tag.removeprefix("Metrics/").replace("_", " "), records)
-    for tag in (tag for tag in tags if tag.startswith(WATCHED)):
-        name = tag.removeprefix(WATCHED)
-        title, factor = OF_EVALUATION.get(name, (name.replace("_", " "), 1.0))
-        found += _one(tag, f"evaluated: {title}", records, factor, markers=True)
-    found += _one("Loss/learning_rate", "learning rate", records, log=True)
-    found += [drawing for tag, title, factor in LEARNER for drawing in _one(tag, title, records, factor)]
-    wanted = {record.at("train.algorithm.desired_kl") for _, record in records} - {None}
+    for tag in _tags(runs, "Metrics/"):
+        found += [] if tag in named else _one(tag, _title(tag), runs)
+    return found
+
+
+def _learner(runs: Named) -> list[Chart]:
+    """Return charts of the curriculum of commands, of evaluations during training and of the optimiser."""
+    found = [chart for tag, title, factor in CURRICULUM for chart in _one(tag, title, runs, factor)]
+    for tag in _tags(runs, WATCHED):
+        title, factor = OF_EVALUATION.get(tag.removeprefix(WATCHED), (_title(tag), 1.0))
+        found += _one(tag, f"evaluated: {title}", runs, factor, exact=True, markers=True)
+    found += _one("Loss/learning_rate", "learning rate", runs, exact=True, log=True)
+    found += [chart for tag, title, factor in LEARNER for chart in _one(tag, title, runs, factor)]
+    wanted = {value_at(log.config, "train.algorithm.desired_kl") for _, log in runs} - {None}
     level = ("desired_kl", float(next(iter(wanted)))) if len(wanted) == 1 else None
-    return found + _one("Loss/kl", "divergence (KL) within an update [nat]", records, level=level)
+    return found + _one("Loss/kl", "divergence (KL) within an update [nat]", runs, level=level)
+
+
+def _tags(runs: Named, beginning: str) -> list[str]:
+    return list(dict.fromkeys(tag for _, log in runs for tag in log.scalars if tag.startswith(beginning)))
+
+
+def _title(tag: str) -> str:
+    return tag.partition("/")[2].replace("_", " ")
 
 
 def _one(
     tag: str,
     title: str,
-    records: Sequence[tuple[str, Record]],
+    runs: Named,
     factor: float = 1.0,
-    log: bool = False,
+    exact: bool = False,
     markers: bool = False,
+    log: bool = False,
     level: tuple[str, float] | None = None,
-) -> list[str]:
-    """Return the drawing of one quantity; none where no run has it."""
+) -> list[Chart]:
+    """Return the chart of one quantity, a line a run, as running means unless `exact`; no chart if no run logged it."""
     lines = []
-    for i, (label, record) in enumerate(records):
-        steps, values = record.scalars.get(tag, (np.array([]), np.array([])))
+    for i, (label, run) in enumerate(runs):
+        steps, values = run.scalars.get(tag, (np.array([]), np.array([])))
         if len(steps):
-            exact = log or markers
             y = factor * values if exact else smooth(factor * values)
-            lines.append(Line(label or title, steps + 1, y, markers=markers, style=i))
-    if not lines:
-        return []
-    if len(records) == 1:
-        lines = [Line("", line.x, line.y, line.band, line.markers, 0) for line in lines]
-    return [curves(Axes(title, "iteration", log=log, level=level), lines)]
+            lines.append(Line(label if len(runs) > 1 else "", steps + 1, y, markers=markers, style=i))
+    return [Chart(title, "iteration", lines, log=log, level=level)] if lines else []
 
 
-def _lengths(records: Sequence[tuple[str, Record]]) -> list[str]:
-    """Return the drawing of how long episodes are: in seconds where a run says how long a step is."""
-    dt = [record.dt for _, record in records]
-    known = [one for one in dt if one is not None]
-    if len(known) < len(dt) or len(set(known)) > 1 or not known:
-        return _one(LENGTH, "length of an episode [control steps]", records)
-    return _one(LENGTH, "length of an episode [s]", records, known[0])
+def _returns(runs: Named) -> list[Chart]:
+    """Return the chart of returns; of one run with the standard deviation over episodes as a band."""
+    charts = _one("Train/mean_reward", "return of an episode", runs)
+    std = runs[0][1].scalars.get("Train/std_reward")
+    if not charts or len(runs) > 1 or std is None:
+        return charts
+    (line,) = charts[0].lines
+    of = dict(zip(std[0] + 1, std[1], strict=True))
+    width = np.nan_to_num(smooth(np.array([of.get(step, np.nan) for step in line.x])))
+    lines = [replace(line, band=(line.y - width, line.y + width))]
+    return [replace(charts[0], title=f"{charts[0].title}, and standard deviation over episodes", lines=lines)]
 
 
-def _returns(scalars: Scalars, record: Record) -> list[str]:
-    """Return the drawing of returns, with the standard deviation over episodes as a band."""
-    if "Train/mean_reward" not in scalars:
-        return []
-    steps, values = scalars["Train/mean_reward"]
-    mean, band = smooth(values), None
-    if "Train/std_reward" in scalars:
-        of = dict(zip(*scalars["Train/std_reward"], strict=True))
-        std = smooth(np.array([of.get(step, np.nan) for step in steps]))
-        std = np.where(np.isfinite(std), std, 0.0)
-        band = (mean - std, mean + std)
-    title = "return of an episode" + (", and standard deviation over episodes" if band else "")
-    return [curves(Axes(title, "iteration"), [Line("", steps + 1, mean, band)])]
-
-
-def _parts(scalars: Scalars) -> list[str]:
-    """Return the drawing of the parts of the reward on top of each other."""
+def _parts(scalars: Scalars) -> str:
+    """Return the drawing of the parts of the reward on top of each other; an empty text if none was logged."""
     tags = [tag for tag in scalars if tag.startswith(EPISODE)]
-    if not tags:
-        return []
-    steps = sorted(set.intersection(*(set(scalars[tag][0].tolist()) for tag in tags)))
-    if not steps:
-        return []
+    steps = sorted(set.intersection(*(set(scalars[tag][0].tolist()) for tag in tags))) if tags else []
     parts = {}
     for tag in tags:
         of = dict(zip(*scalars[tag], strict=True))
         parts[tag.removeprefix(EPISODE)] = smooth(np.array([of[step] for step in steps]))
     known = np.isfinite(list(parts.values())).all(axis=0)
-    if not known.any():
-        return []
+    if not steps or not known.any():
+        return ""
     parts = {name: values[known] for name, values in parts.items()}
     order = sorted(parts, key=lambda name: -float(np.abs(parts[name]).mean()))
-    shown = {name: parts[name] for name in order[:MOST_PARTS]}
-    rest = order[MOST_PARTS:]
+    shown, rest = {name: parts[name] for name in order[:MOST_PARTS]}, order[MOST_PARTS:]
     if rest:
         shown[f"{len(rest)} more"] = np.sum([parts[name] for name in rest], axis=0)
-    return [
-        stacked(Axes("parts of the reward, per second of a full episode", "iteration"), np.array(steps)[known] + 1.0, shown)
-    ]
+    chart = Chart("parts of the reward, per second of a full episode", "iteration")
+    return stacked(chart, np.array(steps)[known] + 1.0, shown)
 
 
-def _levels(record: Record) -> list[str]:
-    """Return the drawings of terrain levels by type, and of the shares of episodes after which robots moved up."""
-    scalars = record.scalars
-    types = [tag.removeprefix(LEVEL) for tag in scalars if tag.startswith(LEVEL)]
+def levels(logs: Sequence[Log]) -> list[Chart]:
+    """Return charts of the terrain levels by type, and of the shares of episodes after which robots move up or down, as means
+    over the runs; no chart without a curriculum of terrain.
+    """
+    scalars = [log.scalars for log in logs]
+    types = [tag.removeprefix(LEVEL) for tag in _tags([("", log) for log in logs], LEVEL)]
     if not types:
         return []
-    lines, up = [], []
-    for i, name in enumerate(types):
-        steps, values = scalars[LEVEL + name]
-        lines.append(Line(name.replace("_", " "), steps + 1, values, style=i))
-        if f"Terrain/promoted_{name}" in scalars:
-            steps, values = scalars[f"Terrain/promoted_{name}"]
-            up.append(Line(name.replace("_", " "), steps + 1, smooth(values, 25), style=i))
-    always = always_promoted(record.config)
-    level = None if always is None else ("always promoted", always)
-    found = [curves(Axes("mean terrain level by type", "iteration", level=level), lines)]
-    return found + [curves(Axes("episodes after which a robot moves up", "iteration", high=1.0, percent=True), up)] * bool(up)
+    always = {always_promoted(log.config) for log in logs} - {None}
+    highest = always.pop() if len(always) == 1 else None
+
+    def lines(beginning: str, width: int) -> list[Line]:
+        means = [mean_of(scalars, beginning + name) for name in types]
+        each = enumerate(zip(types, means, strict=True))
+        return [Line(name.replace("_", " "), steps, smooth(values, width), style=i) for i, (name, (steps, values)) in each]
+
+    level = None if highest is None else ("always promoted", highest)
+    found = [Chart("mean terrain level by type", "iteration", lines(LEVEL, 1), level=level)]
+    for moved, way in (("promoted", "up"), ("demoted", "down")):
+        shares = lines(f"Terrain/{moved}_", 25)
+        found.append(Chart(f"episodes after which a robot moves {way}", "iteration", shares, high=1.0, percent=True))
+    return [chart for chart in found if any(len(line.x) for line in chart.lines)]

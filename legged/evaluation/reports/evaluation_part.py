@@ -1,37 +1,34 @@
-"""What an evaluation found, as tables and drawings: heat maps over commands, success over difficulty, returns of episodes."""
+"""The part of a report on evaluations: tables, heat maps over commands, success over difficulty, returns."""
 
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
-
 from legged.evaluation.engines import ENGINES, engine_of
 from legged.evaluation.intervals import wilson
+from legged.evaluation.reports.charts import curves, heat_map
 from legged.evaluation.reports.document import Cell, Figures, Heading, Number, Paragraph, Part, Table
-from legged.evaluation.reports.svg import Axes, Line, curves, heat_map
 from legged.evaluation.result_file import changes_text, tracking_of
-from legged.evaluation.success_report import PANELS as SUCCESS_PANELS
-from legged.evaluation.success_report import TRAINED_LABEL, panels_of
+from legged.evaluation.success_report import success_charts
 from legged.evaluation.tracking_report import PANELS, grid_means
 from legged.evaluation.velocity_grid import AXES
 
 BROKEN = (KeyError, TypeError, ValueError, IndexError, AttributeError)
-"""What a file that lacks something of an evaluation raises where it is drawn."""
+"""Errors raised by a file that lacks a part of an evaluation."""
 
 
 def number(value: float | None, form: str = ".3f", unit: str = "") -> Number:
-    """Return a number as a cell, a dash for none and for what is not finite, which can't be sorted."""
+    """Return a number as a cell; a dash, which is not sorted, for None and for values that are not finite."""
     return Number("-", None) if value is None or not math.isfinite(value) else Number(f"{value:{form}}{unit}", value)
 
 
 def between(interval: tuple[float, float], factor: float = 1.0, form: str = ".1f") -> str:
-    """Return an interval in words."""
+    """Return an interval as text."""
     return f"{factor * interval[0]:{form}} to {factor * interval[1]:{form}}"
 
 
 def falls_of(tracking: dict[str, Any]) -> tuple[int, int] | None:
-    """Return how many robots of a command grid fell, and how many there were; None where the file does not say that."""
+    """Return the number of robots of a command grid that fell, and of all; None if the file lacks them."""
     try:
         robots = len(tracking["cells"]) * int(tracking["robots_per_cell"])
         return (round(tracking["falls"] * robots), robots) if robots > 0 else None
@@ -42,8 +39,8 @@ def falls_of(tracking: dict[str, Any]) -> tuple[int, int] | None:
 def evaluation_parts(
     results: Sequence[dict[str, Any]], another_policy: Callable[[dict[str, Any]], str] = lambda _: ""
 ) -> list[Part]:
-    """Return the part of a report on evaluations, one an engine; nothing of none. `another_policy` names the checkpoint of
-    one that is not of the run's last policy.
+    """Return the part of a report on evaluations, by engine; no part without results. `another_policy` names the checkpoint
+    of an evaluation that is not of the run's last policy.
     """
     if not results:
         return []
@@ -100,7 +97,7 @@ def _following(results: Sequence[dict[str, Any]]) -> list[Part]:
     ]
     if drawings:
         parts.append(Figures("tracking", drawings, "velocity and yaw rate errors over commands"))
-    success = _success(results)
+    success = [curves(chart) for chart in success_charts(results)]
     if success:
         parts += [
             Paragraph(
@@ -113,7 +110,7 @@ def _following(results: Sequence[dict[str, Any]]) -> list[Part]:
 
 
 def _heat_maps(tracking: dict[str, Any], label: str) -> list[str]:
-    """Return maps of errors over commands; none where the file lacks the cells."""
+    """Return maps of errors over commands; none if the file lacks the cells."""
     try:
         grid, found = tracking["grid"], []
         for name, over, other, title in PANELS:
@@ -123,55 +120,6 @@ def _heat_maps(tracking: dict[str, Any], label: str) -> list[str]:
         return found
     except BROKEN:
         return []
-
-
-def _success(results: Sequence[dict[str, Any]]) -> list[str]:
-    """Return a drawing a kind of terrain: success over size, one line a type and engine."""
-    names = dict.fromkeys(name for result in results for name in result.get("success", {}).get("types", {}))
-    found = []
-    for title, types in panels_of(list(names)).items():
-        entries = [
-            (name, result["physics"], entry)
-            for name in types
-            for result in results
-            if (entry := result.get("success", {}).get("types", {}).get(name)) is not None
-        ]
-        lines = [success_line(_label(name, physics, types, results), entry) for name, physics, entry in entries]
-        panel = title if title in SUCCESS_PANELS else title.replace("_", " ")
-        found.append(success_drawing(panel, [entry for *_, entry in entries], lines))
-    return found
-
-
-def _label(name: str, physics: str, types: Sequence[str], results: Sequence[dict[str, Any]]) -> str:
-    """Return what tells a line from the others of its drawing."""
-    words = [name.replace("_", " ")] if len(types) > 1 else []
-    words += [engine_of(physics).label] if len(results) > 1 else []
-    return ", ".join(words)
-
-
-def success_line(label: str, entry: dict[str, Any]) -> Line:
-    """Return success over size of one terrain type, with its intervals where the file has them."""
-    points = sorted(entry["points"], key=lambda point: point["size"])
-    size, share = (np.array([point[key] for point in points], dtype=float) for key in ("size", "share"))
-    band = None
-    if all(isinstance(point.get(key), int | float) for point in points for key in ("low", "high")):
-        band = (np.array([point["low"] for point in points]), np.array([point["high"] for point in points]))
-    return Line(label, size, share, band, markers=True)
-
-
-def success_drawing(title: str, entries: Sequence[dict[str, Any]], lines: Sequence[Line]) -> str:
-    """Draw success over the size of a terrain type, a line an entry. Where training did not end at one size for all that were
-    trained on it, the dotted lines say whose they are.
-    """
-    ends: dict[float, list[str]] = {}
-    for entry, line in zip(entries, lines, strict=True):
-        if entry["trained_to"] is not None:
-            ends.setdefault(float(entry["trained_to"]), []).append(line.name)
-    several = len(ends) > 1
-    walls = tuple((f"{TRAINED_LABEL}: {', '.join(names)}" if several else TRAINED_LABEL, end) for end, names in ends.items())
-    what = entries[0]["what"]
-    axes = Axes(f"success: {title}", f"{what} [{entries[0]['unit']}]", unit=what, high=1.0, percent=True, walls=walls)
-    return curves(axes, lines)
 
 
 def _episodes(result: dict[str, Any]) -> list[Part]:

@@ -1,4 +1,4 @@
-"""All runs there are in one table, newest first; seeds of one training may share a row."""
+"""All runs in one table, newest first; the seeds of one training may share a row."""
 
 import itertools
 from collections.abc import Sequence
@@ -8,16 +8,15 @@ from typing import Any
 
 from legged.evaluation.engines import ENGINES
 from legged.evaluation.learning_curves import smooth
-from legged.evaluation.reports.differences import but_for_seeds, what_changed
-from legged.evaluation.reports.document import Cell, Link, Mono, Number, Paragraph, Part, Table
+from legged.evaluation.reports.document import Cell, Link, Mono, Number, Paragraph, Part, Table, text_of
 from legged.evaluation.reports.evaluation_part import number
-from legged.evaluation.reports.record import Record
+from legged.evaluation.reports.record import Record, but_for_seeds, what_changed
 from legged.evaluation.reports.run_report import REPORT
 from legged.evaluation.result_file import tracking_of
 
 TITLE = "Experiments"
 EMPTY = ("", "-")
-"""Cells that say nothing; a column of nothing else is left out."""
+"""Texts of empty cells; a column of empty cells is left out."""
 FORMS = {
     "RMSE [m/s]": ".3f",
     "yaw rate RMSE [rad/s]": ".3f",
@@ -32,15 +31,15 @@ FORMS = {
     "loop [s]": ".1f",
     "steps/s": ",.0f",
 }
-"""How the figures are written of which seeds that share a row have a mean."""
+"""Formats of the figures that rows shared by seeds average."""
 STAIRS = ("stairs_up", "stairs_down")
 PASSED = 0.9
-"""Share of the robots that get over stairs which count as crossed."""
+"""Share of robots above which stairs count as crossed."""
 
 
 def experiments_parts(records: Sequence[Record], beside: Path, ending: str, seeds_share: bool = False) -> list[Part]:
-    """Return the page on some runs. Those below the folder `beside`, where the page is written, lead to their reports of that
-    `ending`. Where `seeds_share` a row, runs that differ in nothing but their seed are one, with means.
+    """Return the page on some runs. Runs below the folder `beside`, where the page is written, link to their reports with
+    that `ending`. With `seeds_share`, runs that differ only in their seed share a row, with means.
     """
     newest = sorted(records, key=lambda record: (record.began, record.name), reverse=True)
     groups: dict[str, list[Record]] = {}
@@ -48,23 +47,23 @@ def experiments_parts(records: Sequence[Record], beside: Path, ending: str, seed
         groups.setdefault(but_for_seeds(record) if seeds_share else str(record.folder), []).append(record)
     rows = [_shared_row(group, beside, ending) for group in groups.values()]
     head = list(rows[0]) if rows else []
-    shown = [name for name in head if any(_text(row[name]) not in EMPTY for row in rows)]
+    shown = [name for name in head if any(text_of(row[name]) not in EMPTY for row in rows)]
     text = (
-        f"{len(newest)} runs, newest first, made by `legged runs`. What changed is a note to the run"
-        " (`--note`), else its own name and what it sets otherwise than its task as it is now. RMSE, falls and stairs are"
-        " those of the evaluation, without noise and pushes, by `legged evaluate`; stairs are the highest"
-        " steps that nine robots of ten got up, and nine got down. Terrain level, return and velocity error are those of the"
-        " end of training, with both. A commit with a + had changes that were not committed."
+        f"{len(newest)} runs, newest first, made by `legged runs`. The column `what changed` shows the"
+        " note of a run (`--note`), else its name and the settings that differ from its task's files. RMSE, falls and stairs"
+        " come from `legged evaluate`, without noise and pushes; stairs are the highest steps that nine of"
+        " ten robots climb, and nine of ten descend. Terrain level, return and velocity error are those at the end of"
+        " training, with noise and pushes. A + marks a commit with uncommitted changes."
     )
     if "evaluated" in shown:
-        text += " Where a checkpoint is named, the evaluation is of that one, not of the last."
+        text += " The column `evaluated` names the checkpoint of an evaluation that is not of the last one."
     if len(rows) < len(newest):
-        text += " Runs that differ in nothing but their seed share a row, with the means over them."
+        text += " Runs that differ only in their seed share a row, with their means."
     return [Paragraph(text), Table(shown, [[row[name] for name in shown] for row in rows], wide=True)]
 
 
 def _shared_row(group: Sequence[Record], beside: Path, ending: str) -> dict[str, Cell]:
-    """Return what the table says of runs that differ in their seeds, or of the only one."""
+    """Return the row of runs that differ in their seeds, or of a single one, by column."""
     rows = [_row(record, beside, ending) for record in group]
     if len(rows) == 1:
         return rows[0]
@@ -74,17 +73,13 @@ def _shared_row(group: Sequence[Record], beside: Path, ending: str) -> dict[str,
         shared[name] = number(mean(known) if known else None, form)
     seeds = [value for record in group if (value := _whole(record.at("env.seed"))) is not None]
     shared["seed"] = Number(", ".join(f"{seed:,d}" for seed in sorted(seeds)), min(seeds, default=None))
-    shared["evaluated"] = ", ".join(dict.fromkeys(text for row in rows if (text := _text(row["evaluated"]))))
+    shared["evaluated"] = ", ".join(dict.fromkeys(text for row in rows if (text := text_of(row["evaluated"]))))
     shared["what changed"] = what_changed(group[0], named=False)
     return shared
 
 
-def _text(cell: Cell) -> str:
-    return cell.text if isinstance(cell, Link | Number) else cell
-
-
 def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
-    """Return what the table says of a run, by column."""
+    """Return the row of a run, by column."""
     timing = record.timing
     steps = timing.steps if timing else None
     judged = _judged(record)
@@ -120,8 +115,8 @@ def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
 
 
 def highest_stairs(result: dict[str, Any]) -> float | None:
-    """Return the height of the highest steps that an evaluation found crossed, up and down, with all lower ones [m]; 0 where
-    the lowest were not; None where there were none both ways.
+    """Return the height of the highest steps that robots crossed up and down, with all lower ones [m]; 0 if they did not
+    cross the lowest; None without an evaluation both ways.
     """
     types = result.get("success", {}).get("types", {})
     ways = [{point["size"]: point["share"] for point in types.get(name, {"points": []})["points"]} for name in STAIRS]
@@ -149,6 +144,6 @@ def _last(record: Record, tag: str) -> float | None:
 
 
 def _judged(record: Record) -> dict[str, Any] | None:
-    """Return the evaluation that the table is of: in the first of our engines that there is."""
+    """Return the evaluation of a run in the first engine of ENGINES that has one."""
     order = [*ENGINES, *(result["physics"] for result in record.results)]
     return min(record.results, key=lambda result: order.index(result["physics"]), default=None)

@@ -1,4 +1,4 @@
-"""What a run folder holds, read for a report: whatever is damaged or missing is left out and named, and fails nothing."""
+"""The contents of a run folder, read for a report; damaged or missing parts are left out and named."""
 
 import os
 import re
@@ -11,19 +11,28 @@ from pathlib import Path
 from typing import Any
 
 from legged.config import to_dict
-from legged.config.dotted import value_at
+from legged.config.dotted import MISSING, differences, flat, value_at
+from legged.config.yaml_files import dump
 from legged.errors import ConfigError
-from legged.evaluation.learning_curves import Scalars, read_config, read_scalars
+from legged.evaluation.learning_curves import Log, Scalars, read_config, read_scalars
 from legged.evaluation.result_file import file_name, read_results
-from legged.learning.given import Given, read_given
+from legged.learning.invocation import Invocation, read_invocation
 from legged.learning.run_folder import CODE_FILE, CONFIG_FILE, NOTE_FILE, checkpoints, of_another_policy, run_config
 from legged.learning.timing import Timing, read_timing
+from legged.registry import task_config
 
 STAMP = re.compile(r"(\d{4}-\d{2}-\d{2}_\d{2}-\d{2}-\d{2})(?:_(.*))?")
 FILMS = ("film.gif", "play.gif", "play.mp4")
-"""Files that show the policy, the first that is there."""
+"""Films of the policy; the first that exists is shown."""
+NAMES = ("train.runner.run_name", "train.runner.experiment_name", "train.runner.report", "train.runner.film", "task")
+"""Settings that do not affect the policy."""
+MOST_WORDS = 4
+"""Most settings that a summary names."""
+LONGEST_VALUE = 60
+DEEPEST = 3
+"""Levels of folders in which runs are searched: logs, tasks, runs."""
 QUIET_S = 3600.0
-"""A training that has written nothing for so long is taken for ended, whatever has its process's number now [s]."""
+"""A training that has written nothing for this long has ended, even if a process has its number [s]."""
 
 
 @dataclass(frozen=True)
@@ -32,17 +41,17 @@ class Code:
 
     version: str = ""
     commit: str = ""
-    """Full hash; empty where it is not known."""
+    """Full hash; empty if not known."""
     files: int = 0
     """Files that differ from the commit."""
     added: int = 0
     removed: int = 0
     text: str = ""
-    """All that was written about it."""
+    """The whole text of the file."""
 
     @property
     def summary(self) -> str:
-        """The commit in few letters, and how much differs from it."""
+        """The short commit and the size of its difference."""
         if not self.commit:
             return "not known"
         changed = f", {self.files} file{'s' * (self.files > 1)} changed, +{self.added} -{self.removed}" if self.files else ""
@@ -51,11 +60,11 @@ class Code:
 
 @dataclass(frozen=True)
 class Record:
-    """A run, as far as its folder tells."""
+    """A run, as its folder describes it."""
 
     folder: Path
     config: dict[str, Any]
-    """The resolved configuration, by this version's names where it can still be read."""
+    """The resolved configuration, with this version's names if it can be read by it."""
     began: datetime
     timing: Timing | None
     scalars: Scalars
@@ -63,20 +72,20 @@ class Record:
     """Evaluations, one an engine."""
     code: Code
     note: str
-    """What somebody wrote about it."""
+    """Note of the user."""
     status: str
     """finished, running, interrupted, crashed or killed."""
     why: str
-    """What the status means here."""
+    """Details of the status."""
     done: int
-    """Iterations behind its last policy or log, those before it was resumed too."""
+    """Iterations of the last policy or log, with those before a resumption."""
     problems: tuple[str, ...]
-    """What could not be read."""
-    given: Given | None = None
-    """What its command line said; None of runs that do not say so."""
+    """Reasons why parts could not be read."""
+    given: Invocation | None = None
+    """Contents of the command line; None for runs that did not store it."""
 
     def at(self, path: str) -> Any:
-        """Return a setting by its dotted path; None where there is none."""
+        """Return a setting by its dotted path; None if it is absent."""
         return value_at(self.config, path)
 
     @property
@@ -86,18 +95,18 @@ class Record:
 
     @property
     def name(self) -> str:
-        """Name of the folder, below that of its experiment."""
+        """Name of the folder, after that of its experiment."""
         folder = self.folder.resolve()
         return f"{folder.parent.name}/{folder.name}"
 
     @property
     def run_name(self) -> str:
-        """Its own name, if it was given one."""
+        """Name given to the run; empty if none was given."""
         return str(self.at("train.runner.run_name") or "")
 
     @property
     def robots(self) -> int | None:
-        """Robots of all processes."""
+        """Number of robots in all processes."""
         found = self.timing.robots if self.timing else self.at("env.num_envs")
         return found if isinstance(found, int) else None
 
@@ -108,27 +117,39 @@ class Record:
         return steps * self.robots if isinstance(steps, int) and self.robots else None
 
     @property
-    def dt(self) -> float | None:
-        """Length of a control step [s]."""
-        dt, decimation = self.at("sim.dt"), self.at("control.decimation")
-        return dt * decimation if isinstance(dt, int | float) and isinstance(decimation, int) else None
+    def log(self) -> Log:
+        """Logged values and configuration."""
+        return Log(self.scalars, self.config)
 
     def another_policy(self, result: dict[str, Any] | None) -> str:
-        """Return the checkpoint that an evaluation is of; nothing where it is the last one, whose the other figures are."""
+        """Return the checkpoint of an evaluation; an empty text if it is the last one, which the other figures describe."""
         checkpoint = (result or {}).get("checkpoint")
         return str(checkpoint) if of_another_policy(self.folder, checkpoint) else ""
 
     @property
     def film(self) -> Path | None:
-        """A film of its policy, if there is one."""
+        """Film of its policy, if there is one."""
         return next((path for name in FILMS if (path := self.folder / name).is_file()), None)
+
+
+def folders_in(path: Path) -> list[Path]:
+    """Return the run folders in a folder: the folder itself, or those in logs/ or logs/<task>/.
+
+    Raises:
+        ConfigError: there is no run folder.
+    """
+    levels = [sorted(path.glob("/".join(["*"] * depth + [CONFIG_FILE]))) for depth in range(DEEPEST)]
+    folders = [file.parent for level in levels for file in level]
+    if not folders:
+        raise ConfigError(f"{path}: holds no run folder (there is no {CONFIG_FILE} in it)")
+    return folders
 
 
 def read_record(folder: Path) -> Record:
     """Read a run folder.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: the folder is no run folder.
     """
     if not (folder / CONFIG_FILE).is_file():
         raise ConfigError(f"{folder}: is no run folder (it has no {CONFIG_FILE})")
@@ -140,7 +161,7 @@ def read_record(folder: Path) -> Record:
     with _noting(problems):
         timing = read_timing(folder)
     with _noting(problems):
-        given = read_given(folder)
+        given = read_invocation(folder)
     if any(folder.glob("events.out.tfevents.*")):
         with _noting(problems):
             scalars = read_scalars(folder)
@@ -159,7 +180,7 @@ def read_record(folder: Path) -> Record:
 
 
 class _noting(suppress):  # noqa: N801  (a context, as its base)
-    """Leave out what can't be read, and note why in a list."""
+    """Suppress errors of reading, and add their texts to a list."""
 
     def __init__(self, problems: list[str]) -> None:
         super().__init__(ConfigError, OSError, ValueError)
@@ -173,7 +194,7 @@ class _noting(suppress):  # noqa: N801  (a context, as its base)
 
 
 def _began(folder: Path) -> datetime:
-    """Return when a run began, by the name of its folder, else by its configuration's file."""
+    """Return the start of a run, from the name of its folder, else from its configuration's file."""
     match = STAMP.match(folder.resolve().name)
     with suppress(ValueError):
         if match:
@@ -182,7 +203,7 @@ def _began(folder: Path) -> datetime:
 
 
 def _status(folder: Path, timing: Timing | None, until: Any, done: int, saved: int) -> tuple[str, str]:
-    """Return how a run ended, and that in words."""
+    """Return the status of a run, and its details."""
     of = f"{done:,} of {until:,} iterations" if isinstance(until, int) else f"{done:,} iterations"
     if timing is not None:
         if timing.finished:
@@ -200,8 +221,9 @@ def _status(folder: Path, timing: Timing | None, until: Any, done: int, saved: i
 
 
 def is_running(folder: Path) -> bool:
-    """Return whether the process that writes a run's log is alive: on this machine by its number, which is in the log's name
-    (events.out.tfevents.<time>.<host>.<process>.<file>), on another one by how long ago it wrote.
+    """Return whether the process that writes a run's log is alive. The log's name
+    (events.out.tfevents.<time>.<host>.<process>.<file>) holds its number on this machine; on another machine the time of its
+    last write counts.
     """
     for path in folder.glob("events.out.tfevents.*"):
         match = re.fullmatch(r"events\.out\.tfevents\.\d+\.(.*)\.(\d+)\.\d+", path.name)
@@ -213,14 +235,14 @@ def is_running(folder: Path) -> bool:
                 if silent_s < 120.0:
                     return True
             elif silent_s < QUIET_S:
-                with suppress(PermissionError):  # it is there, and somebody else's
-                    os.kill(int(match[2]), 0)  # asks whether it is there
+                with suppress(PermissionError):  # the process exists and belongs to another user
+                    os.kill(int(match[2]), 0)  # signal 0 only checks that the process exists
                 return True
     return False
 
 
 def read_code(folder: Path) -> Code:
-    """Read what a run says of the code that it was made with."""
+    """Read the version, the commit and the difference that a run was made with."""
     try:
         text = (folder / CODE_FILE).read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -234,7 +256,58 @@ def read_code(folder: Path) -> Code:
 
 
 def read_note(folder: Path) -> str:
-    """Read what somebody wrote about a run, on one line."""
+    """Read the note of a run, on one line."""
     with suppress(OSError):
         return " ".join((folder / NOTE_FILE).read_text(encoding="utf-8", errors="replace").split())
     return ""
+
+
+# ---- differences ------------------------------------------------------------------------------------------------------
+
+
+def from_task_file(record: Record) -> dict[str, list[Any]] | None:
+    """Return the settings in which a run differs from its task's files, each with both values; None if there is no such task.
+    A run without a known device is compared with the nearer of the settings for a CPU and for a GPU.
+    """
+    where = [record.timing.device == "cpu"] if record.timing else [False, True]
+    found = []
+    for on_cpu in where:
+        try:
+            found.append(differences([record.config, to_dict(task_config(record.task, on_cpu=on_cpu))]))
+        except (ConfigError, OSError):
+            return None
+    return min(found, key=len)
+
+
+def words(value: Any) -> str:
+    """Return a value as in a YAML file, on one line; a dash for a missing one."""
+    if value is MISSING:
+        return "-"
+    text = dump(value, default_flow_style=True, width=1_000_000).strip().removesuffix("...").strip()
+    return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 3] + "..."
+
+
+def what_changed(record: Record, named: bool = True) -> str:
+    """Return a summary of a run: its note, else its name (if `named`) and the settings that differ from its task's; for an
+    unknown task, the settings of its command line.
+    """
+    if record.note:
+        return record.note
+    found = from_task_file(record)
+    if found is not None:
+        changed = {path: own for path, (own, _) in found.items()}
+    else:
+        changed = dict(record.given.changes) if record.given is not None else {}
+    said = [
+        f"{'.'.join(path.split('.')[-2:])} {words(own)}" for path, own in changed.items() if path not in (*NAMES, "env.seed")
+    ]
+    if len(said) > MOST_WORDS:
+        said = [*said[:MOST_WORDS], f"{len(said) - MOST_WORDS} more settings"]
+    return ": ".join(text for text in (record.run_name if named else "", ", ".join(said)) if text)
+
+
+def but_for_seeds(record: Record) -> str:
+    """Return a text that is equal for runs which differ in nothing but their seed and names."""
+    told = {path: value for path, value in flat(record.config).items() if path not in (*NAMES[:-1], "env.seed")}
+    device = record.timing.device if record.timing else ""
+    return repr((sorted(told.items()), record.note, record.status, record.done, record.code.summary, device))

@@ -1,6 +1,10 @@
-"""The report on one run: report.html, which needs nothing else, and report.md with pictures beside it."""
+"""The report on one run: report.html, which needs no other file, and report.md with its pictures."""
 
+import os
 import shlex
+import subprocess
+import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,7 +12,6 @@ import numpy as np
 
 from legged.evaluation.learning_curves import Scalars, smooth
 from legged.evaluation.reports.curves import curves_of_run
-from legged.evaluation.reports.differences import from_task_file, words
 from legged.evaluation.reports.document import (
     Cell,
     Figures,
@@ -20,24 +23,29 @@ from legged.evaluation.reports.document import (
     Part,
     Picture,
     Table,
-    to_html,
-    to_markdown,
+    write_pages,
 )
 from legged.evaluation.reports.evaluation_part import evaluation_parts, number
-from legged.evaluation.reports.record import Record, read_record
-from legged.evaluation.reports.svg import sheet
-from legged.learning.given import Given
+from legged.evaluation.reports.record import Record, from_task_file, read_record, words
+from legged.learning.invocation import Invocation
 from legged.learning.run_folder import BEST_MODEL, CODE_FILE, checkpoints
-from legged.process.paths import relative, write_text
+from legged.process import headless
+from legged.process.paths import relative
+from legged.process.processes import child_environment
 
 REPORT = "report"
-"""What its files are called, before their ending."""
+"""Name of its files, before their ending."""
 ROWS = 10
-"""Lines of the table over training."""
+"""Rows of the table over training."""
 LARGEST_FILM = 12 * 2**20
-"""A larger film is named and not put into the page [bytes]."""
+"""A larger film is named, not shown [bytes]."""
+LOG = "film.log"
+"""File in a run folder with the output of the process that films the policy."""
+NICENESS = 10
+FILMING: list[subprocess.Popen] = []
+"""Filming processes that this process has started."""
 LONGEST_DIFF = 200_000
-"""Letters of a difference in the page; the whole one is in its file."""
+"""Most letters of a difference in the page; its file holds all of it."""
 OVER_TRAINING = (
     ("Train/mean_reward", "return", 1.0, ".2f"),
     ("Train/std_reward", "standard deviation of the return", 1.0, ".2f"),
@@ -54,26 +62,11 @@ def write_report(folder: Path) -> Path:
     """Write report.html, report.md and its pictures into a run folder; return the page.
 
     Raises:
-        ConfigError: it is no run folder.
+        ConfigError: the folder is no run folder.
         RunError: a file can't be written.
     """
     record = read_record(folder)
     return write_pages(folder / REPORT, title_of(record), report_parts(record))
-
-
-def write_pages(stem: Path, title: str, parts: Sequence[Part]) -> Path:
-    """Write a page as <stem>.html and as <stem>.md with its pictures beside it; return the first.
-
-    Raises:
-        RunError: a file can't be written.
-    """
-    page = stem.with_name(f"{stem.name}.html")
-    write_text(page, to_html(title, parts))
-    for part in parts:
-        if isinstance(part, Figures):
-            write_text(stem.with_name(f"{stem.name}_{part.name}.svg"), sheet(part.drawings))
-    write_text(stem.with_name(f"{stem.name}.md"), to_markdown(title, parts, stem.name))
-    return page
 
 
 def title_of(record: Record) -> str:
@@ -91,9 +84,9 @@ def report_parts(record: Record) -> list[Part]:
     parts += _differences(record)
     if record.scalars:
         parts += [Heading("Over training"), Paragraph("Running means over nine iterations."), over_training(record)]
-        parts += [Heading("Curves"), Figures("curves", curves_of_run(record), "learning curves")]
+        parts += [Heading("Curves"), Figures("curves", curves_of_run(record.log), "learning curves")]
     else:
-        parts += [Heading("Curves"), Paragraph("There is no TensorBoard file with values in this folder.")]
+        parts += [Heading("Curves"), Paragraph("This folder holds no TensorBoard file with values.")]
     parts += evaluation_parts(record.results, record.another_policy) or [
         Heading("Evaluation"),
         Paragraph(f"None yet: `{command_on(record, 'evaluate')}`"),
@@ -108,13 +101,13 @@ def report_parts(record: Record) -> list[Part]:
 
 
 def command_on(record: Record, command: str) -> str:
-    """Return a command on a run as it can be pasted into a shell, with the option that names its user-defined task."""
-    given = Given(record.task) if record.given is None else record.given
+    """Return a command on a run, quoted for a shell, with the option that names its user-defined task."""
+    given = Invocation(record.task) if record.given is None else record.given
     return shlex.join(["legged", *command.split(), *given.flags, relative(record.folder)])
 
 
 def _facts(record: Record) -> list[list[Cell]]:
-    """Return what there is to say of a run in one line each."""
+    """Return the facts about a run, a line each."""
     timing, code = record.timing, record.code
     found: dict[str, str | None] = {
         "began": f"{record.began:%Y-%m-%d %H:%M:%S}",
@@ -148,7 +141,7 @@ def _facts(record: Record) -> list[list[Cell]]:
 
 
 def _film(record: Record) -> list[Part]:
-    """Return the film of a policy, if there is one that a page can hold."""
+    """Return the film of a policy, if it exists and is small enough."""
     film = record.film
     if film is None:
         return []
@@ -205,7 +198,7 @@ def _at(curve: tuple[np.ndarray, np.ndarray], step: int) -> float | None:
 
 
 def _loop_time(scalars: Scalars) -> tuple[np.ndarray, np.ndarray]:
-    """Return seconds of training loop since the log began, and the iterations at whose ends they had passed."""
+    """Return the cumulated seconds of the training loop in the log, and their iterations."""
     both = [
         dict(zip(*scalars[f"Perf/{name}_time"], strict=True))
         for name in ("collection", "learning")
@@ -215,3 +208,49 @@ def _loop_time(scalars: Scalars) -> tuple[np.ndarray, np.ndarray]:
         return np.array([]), np.array([])
     steps = sorted(both[0].keys() & both[1].keys())
     return np.cumsum([both[0][step] + both[1][step] for step in steps]), np.array(steps)
+
+
+# ---- after a training --------------------------------------------------------------------------------------------------
+
+
+def report_at_end(folder: Path, film_with: Sequence[str] | None) -> None:
+    """Write the report on a run that has just ended, and print its path. Every failure is one printed line, because the run
+    itself is complete.
+
+    `film_with` holds the options by which another process finds the run's task. That process films the policy and writes the
+    report again with the film. Nothing waits for it: it outlives this process, and LOG in the run folder keeps its output. It
+    is another process because a driver that fails while it draws may end it, or never return.
+    """
+    start = time.perf_counter()
+    try:
+        page = write_report(folder)
+        film = "" if film_with is None else f"; {_film_apart(folder, film_with)}"
+    except KeyboardInterrupt:
+        print(f"{relative(folder)}: interrupted before its report was written", file=sys.stderr, flush=True)
+    except Exception as error:  # a report must not spoil a run
+        said = " ".join(str(error).split())[:300] or type(error).__name__
+        print(f"warning: {relative(folder)}: no report: {said}", file=sys.stderr, flush=True)
+    else:
+        print(f"report {relative(page)} ({time.perf_counter() - start:.1f} s{film})", flush=True)
+
+
+def _film_apart(folder: Path, options: Sequence[str]) -> str:
+    """Start another process that films the policy; return a few words about it."""
+    if headless.NO_PICTURES:
+        return "no film: nothing can be drawn"
+    command = [sys.executable, "-m", "legged", "runs", "report", str(folder), "--film", *options]
+    alone = {key: text for key, text in child_environment().items() if key not in ("RANK", "LOCAL_RANK", "WORLD_SIZE")}
+    alone["CUDA_VISIBLE_DEVICES"] = ""  # it draws on the CPU, and a GPU's memory may be full
+    alone["LP_NUM_THREADS"] = "1"  # threads of Mesa, which draws without a GPU
+    FILMING[:] = [process for process in FILMING if process.poll() is None]
+    try:
+        with (folder / LOG).open("wb") as log:
+            process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=alone, start_new_session=True
+            )
+        if hasattr(os, "setpriority"):
+            os.setpriority(os.PRIO_PROCESS, process.pid, NICENESS)
+    except OSError as error:
+        return f"no film: {error}"
+    FILMING.append(process)
+    return f"a film follows, or {LOG} says why not"

@@ -1,1 +1,1 @@
-"""What is left of a policy when robot, sensors and ground are not those of its training."""
+"""The stress test: policies on robots, sensors and ground that differ from those of the training."""

@@ -1,4 +1,4 @@
-"""The stress test: every disturbance on stairs and on the flat, ground that nobody trains on, and other solvers."""
+"""The measurements of the stress test: disturbances on stairs and on the flat, new ground, and other solvers."""
 
 import gc
 from collections.abc import Callable, Sequence
@@ -27,53 +27,52 @@ from legged.robots.similarity import size_of
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec
 
 RISER = 0.17
-"""Height of the steps on which disturbances are tried, at scale 1 [m]."""
+"""Height of the steps of the stairs, at scale 1 [m]."""
 TREAD = 0.28
-"""Their width, for a robot of any size: a house's stairs [m]."""
+"""Width of the steps, for a robot of any size: that of a house's stairs [m]."""
 STAIRS = ("stairs_up", "stairs_down")
 """Half of the robots go up, the others down."""
 GROUND = {"dense_blocks": 0.25, "kerbs": 0.17, "rubble": 0.2}
-"""Type that nobody trains on -> its size at scale 1 [m]."""
+"""Type of ground that no task is trained on -> its size at scale 1 [m]."""
 HOLD_S, SETTLE_S = 6.0, 1.0
-"""Time for which a command is held on the flat, and the part of it, from the start, that is not measured [s]."""
+"""Time for which a command is held on the flat, and the time at its start that is not measured [s]."""
 LIMIT = 0.25
-"""A robot follows its command if the root mean square of its velocity's error is no more than this, at scale 1 [m/s]."""
+"""Largest root mean square error of the velocity of a robot that follows its command, at scale 1 [m/s]."""
 COMMANDS = (
     *((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)),
     *((0.5, 0.0, 0.5), (0.5, 0.0, -0.5)),
 )
-"""Commands on the flat (vx, vy, yaw rate), in parts of the ends of the axes of the task's grid; robots take turns."""
+"""Commands on the flat (vx, vy, yaw rate), as parts of the ends of the axes of the task's grid; robots have them in turn."""
 HALF_STEP = "half the time step"
-"""The setting of the solver that not all motors have."""
+"""Name of the setting that LSTM actuators do not allow."""
 
 
 @dataclass(frozen=True)
 class Wish:
-    """What is asked for in place of the usual numbers."""
+    """Values of the command line in place of the defaults."""
 
     riser: float | None = None
-    """Height of the steps [m]; as RISER says for the robot, if nobody says."""
+    """Height of the steps [m]; RISER times the scale by default."""
     tread: float = TREAD
-    """Their width [m]."""
+    """Width of the steps [m]."""
     payload: float | None = None
-    """Mass on the base [kg]; as the table says for the robot, if nobody says."""
+    """Mass on the base [kg]; that of the table by default."""
     lines: tuple[str, ...] = ()
-    """Names of the lines that are measured; all of them, ground that nobody trains on and other solvers too, if nobody
-    says."""
+    """Names of the lines that are measured; by default all, with new ground and other solvers."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """Another solver, by what it changes in the configuration."""
+    """Another solver setting, as overrides."""
 
     name: str
     changes: tuple[tuple[str, Any], ...]
 
 
 def settings(cfg: LeggedConfig, engine: str) -> list[Setting]:
-    """Return the settings of the solver that are tried beside the task's own: those that the engine, and the motors, know."""
+    """Return the solver settings to try, besides the task's own, that engine and motors allow."""
     halved: tuple[tuple[str, Any], ...] = (("sim.dt", 0.5 * cfg.sim.dt), ("control.decimation", 2 * cfg.control.decimation))
-    if cfg.control.actuator.delay[1]:  # is counted in physics steps
+    if cfg.control.actuator.delay[1]:  # in physics steps
         halved = (*halved, ("control.actuator.delay", [2 * steps for steps in cfg.control.actuator.delay]))
     found = [Setting(HALF_STEP, halved)] if can_halve_step(cfg) else []
     if engine in ("mujoco", "mujoco_warp", "newton_mujoco"):
@@ -85,18 +84,18 @@ def settings(cfg: LeggedConfig, engine: str) -> list[Setting]:
 
 
 def can_halve_step(cfg: LeggedConfig) -> bool:
-    """Return whether a task can be simulated with half its time step: an LSTM that has learned the motors sees every step,
-    and knows no other than that of its training.
+    """Return whether a task can be simulated with half its time step. An LSTM of the motors can't, because it advances with
+    every step of the length that it was trained with.
     """
     network = cfg.control.actuator.network
     return not network or NetworkWeights.load(network).kind != "lstm"
 
 
 def check_asked(changes: Sequence[tuple[str, Any]]) -> None:
-    """Look whether the command line draws a property that robots have by their line of the table.
+    """Check that the command line randomises no property that the lines of the table set.
 
     Raises:
-        ConfigError: it does.
+        ConfigError: it randomises one.
     """
     ranges = "domain_rand.ranges"
     for key, value in changes:
@@ -107,7 +106,7 @@ def check_asked(changes: Sequence[tuple[str, Any]]) -> None:
 
 
 class Bench:
-    """A policy on the bench: builds tasks of stressed robots and measures them, one after the other."""
+    """A policy on the test bench: builds tasks of stressed robots and measures them one after the other."""
 
     def __init__(
         self,
@@ -118,10 +117,10 @@ class Bench:
         device: torch.device,
         graph: bool,
     ) -> None:
-        """Take `robots` for each line of the table; `asked` is what the command line changes of the configuration.
+        """Take `robots` for each line of the table; `asked` holds the overrides of the command line.
 
         Raises:
-            ConfigError: the robot cannot be loaded, or what is `asked` draws what the table gives.
+            ConfigError: the robot cannot be loaded, or `asked` randomises a property that the table sets.
         """
         check_asked(asked)
         assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
@@ -133,18 +132,18 @@ class Bench:
         self.riser = round(RISER * self.scale, 3) if wish.riser is None else wish.riser
         self.tread, self.robots = wish.tread, robots
         self.limit = LIMIT * sqrt(self.scale)
-        """Error up to which a robot follows its command [m/s]."""
+        """Largest error of a robot that follows its command [m/s]."""
         self.lost = 0
-        """Times that a robot lost contacts in a control step for want of memory."""
+        """Number of control steps in which a robot lost contacts for want of memory."""
         self._policy, self._asked, self._device, self._graph = policy, tuple(asked), device, graph
 
     @property
     def on_plane(self) -> bool:
-        """Whether the policy was trained on a plane, so that it is measured on the flat only."""
+        """True if the policy was trained on a plane; it is then measured on the flat only."""
         return self.cfg.terrain.mesh_type == "plane"
 
     def measure(self, rows: Sequence[Disturbance], changes: Sequence[tuple[str, Any]] = ()) -> list[dict[str, Any]]:
-        """Return the figures of some lines of the table; `changes` are those of a solver."""
+        """Return the figures of some lines of the table; `changes` choose a solver."""
         found: list[dict[str, Any]] = [{"name": row.name, "what": row.text} for row in rows]
         if not self.on_plane:
             for line, figures in zip(found, self.on_stairs(rows, changes), strict=True):
@@ -154,7 +153,7 @@ class Bench:
         return found
 
     def on_stairs(self, rows: Sequence[Disturbance], changes: Sequence[tuple[str, Any]] = ()) -> list[dict[str, Any]]:
-        """Return the success of each line, half of its robots going up."""
+        """Return the success of each line; half of its robots go up, the others down."""
         half = max(1, self.robots // 2)
         per_robot = [row for _ in STAIRS for row in rows for _ in range(half)]
         cell = ("terrain.horizontal_scale", dividing_cell(self.tread, self.cfg.terrain.horizontal_scale))
@@ -165,7 +164,7 @@ class Bench:
         return [point(self.riser, *of_row) for of_row in zip(outcomes, times, strict=True)]
 
     def on_new_ground(self) -> dict[str, Any]:
-        """Return type -> the success of robots with which nothing is wrong on ground that nobody trains on."""
+        """Return type -> the success of undisturbed robots on new ground."""
         specs = [TileSpec(name, round(size * self.scale, 6)) for name, size in GROUND.items()]
         found = self._run_out([NOMINAL] * (len(specs) * self.robots), specs)
         outcomes, times = (values.view(len(specs), self.robots) for values in found)
@@ -179,7 +178,7 @@ class Bench:
         }
 
     def on_flat(self, rows: Sequence[Disturbance], changes: Sequence[tuple[str, Any]] = ()) -> list[dict[str, Any]]:
-        """Return how each line's robots follow their commands on a plane."""
+        """Return the figures of each line's robots that follow commands on a plane."""
         per_robot = [row for row in rows for _ in range(self.robots)]
         axes = axes_of(self.cfg)
         ends = torch.tensor([[abs(axis[end]) for axis in axes.values()] for end in (0, -1)])
@@ -204,10 +203,10 @@ class Bench:
         last: Sequence[tuple[str, Any]],
         terrain: Terrain | None,
     ) -> tuple[StressedTask, Callable[[TensorDict], Tensor]]:
-        """Build a task and the policy that acts in it. What the user asks for comes after what is our `own`, but before the
-        `last` changes: another solver is another one than the user's.
+        """Build a task and its policy. Overrides apply in the order `own`, the user's, `last`: another solver replaces the
+        user's.
         """
-        gc.collect()  # the task before this one lives in a cycle of references; two need not fit on a GPU
+        gc.collect()  # the task before this one is in a reference cycle, and a GPU may not hold two
         make = partial(_make, rows)
         changes = [*own, *declared(rows), *self._asked, *last]
         return restore(self._policy, changes, self._device, self._graph, terrain, make)
@@ -218,7 +217,7 @@ class Bench:
         specs: Sequence[TileSpec],
         last: Sequence[tuple[str, Any]] = (),
     ) -> tuple[Tensor, Tensor]:
-        """Return the outcomes (N,) of robots that are shared out among tiles, and when [s]; `last` is as for `_build`."""
+        """Return the outcomes (N,) of robots that are shared out among tiles, and their times [s]; `last` as for `_build`."""
         own = to_run_out(self.cfg, len(rows))
         cfg: Any = override(self.cfg, [*own, *self._asked, *last])
         task, act = self._build(rows, own, last, tiles_apart(specs, cfg.terrain, cfg.env.seed))
@@ -228,8 +227,8 @@ class Bench:
 
     @torch.inference_mode()
     def _follow(self, task: StressedTask, act: Callable[[TensorDict], Tensor], commands: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the mean square error of each robot's velocity in its first episode (N,) [m^2/s^2], NaN for those that fell
-        before anything was measured, and who fell (N,).
+        """Return the mean square error of each robot's velocity in its first episode (N,) [m^2/s^2], NaN for robots that fell
+        before the measurement began, and flags of those that fell (N,).
         """
         task.reset()
         observations = task.hold_commands(commands.to(task.device))
@@ -257,8 +256,8 @@ def _make(
 
 
 def followed(error: Tensor, fell: Tensor, limit: float) -> dict[str, Any]:
-    """Return the figures of robots (n,) on the flat, by the mean square of their velocities' errors [m^2/s^2] and who fell. A
-    robot has followed its command if it stood and its error is no more than `limit` [m/s].
+    """Return the figures of robots (n,) on the flat, from the mean square errors of their velocities [m^2/s^2] and the flags
+    of those that fell. A robot follows its command if it stands and its error is at most `limit` [m/s].
     """
     good = ~fell & (error.sqrt() <= limit)
     trials, successes = len(fell), int(good.sum())
@@ -276,8 +275,8 @@ def followed(error: Tensor, fell: Tensor, limit: float) -> dict[str, Any]:
 
 
 def score(lines: Sequence[dict[str, Any]], ground: dict[str, Any]) -> dict[str, Any]:
-    """Return the one number: the mean of the shares of robots that came through, over all lines of the table but the nominal
-    one, on stairs and on the flat, and over all new ground; its interval of 95 %, and the means of the three parts.
+    """Return the score: the mean of the shares of successful robots, over all lines of the table but the nominal one, on
+    stairs and on the flat, and over new ground; with its interval of 95 % and the means of the three parts.
     """
     disturbed = [line for line in lines if line["name"] != NOMINAL.name]
     parts = {

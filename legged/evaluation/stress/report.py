@@ -1,19 +1,16 @@
 """The stress test as a table, a picture and a file."""
 
-import json
 import time
 from pathlib import Path
 from typing import Any
 
 import torch
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from legged.config import LeggedConfig, override
 from legged.evaluation.episodes import header
 from legged.evaluation.overflows import warn_of_overflows
-from legged.evaluation.result_file import stress_name
+from legged.evaluation.result_file import device_name, stress_name, write_result
 from legged.evaluation.stress.measuring import (
     HALF_STEP,
     HOLD_S,
@@ -26,17 +23,18 @@ from legged.evaluation.stress.measuring import (
 )
 from legged.evaluation.stress.table import NOMINAL
 from legged.evaluation.success import FORWARD, TIME_S
+from legged.evaluation.tables import screen_table
 from legged.figures import figure
 from legged.physics import engine_name
 from legged.policies.restore import TrainedPolicy
-from legged.process.paths import make_folder, relative, write_text
+from legged.process.paths import relative
 
 COLORS = {"table": "#0072B2", "combined": "#D55E00", "settings": "#009E73", "ground": "#E69F00"}
-"""Of bars, by what they are of; Okabe and Ito's, whom readers of any colour vision tell apart."""
+"""Colours of bars, by their kind; those of Okabe and Ito."""
 LABELS = {"table": "one disturbance", "combined": "several", "settings": "another solver", "ground": "new ground"}
 COMBINED = ("together", "everything")
 SETTING_LINES = ("nominal", "together")
-"""Lines of the table that are measured with each setting of the solver, if not all are."""
+"""Lines of the table that are measured with each setting of the solver without `full`."""
 
 
 def evaluate_stress(
@@ -51,9 +49,8 @@ def evaluate_stress(
     where: str = "sim.physics",
 ) -> int:
     """Run the stress test with `robots` for each line of its table; with `full`, all lines with every setting of the solver.
-    A wish for some lines leaves out ground that nobody trains on, other solvers unless `full`, and the score.
-    Print it, then write stress_<physics>.json and .png into `folder`. Return the exit code. `where` says who asks for the
-    engine.
+    A wish for some lines leaves out new ground and the score, and other solvers unless `full`. Print the result, then write
+    stress_<physics>.json and .png into `folder`. Return the exit code. `where` names the setting of the engine in errors.
 
     Raises:
         RunError: a file can't be written.
@@ -75,7 +72,7 @@ def evaluate_stress(
         print(f"{setting.name}: {len(few)} lines", flush=True)
         others[setting.name] = bench.measure(few, setting.changes)
     result = {
-        **header(policy, engine, torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu", ()),
+        **header(policy, engine, device_name(device), ()),
         "wall_s": time.perf_counter() - start,
         "changes": {key: value for key, value in asked if key != "sim.physics"},
         "definition": {
@@ -97,18 +94,15 @@ def evaluate_stress(
     }
     print_stress(result)
     warn_of_overflows("stress", bench.lost)
-    make_folder(folder)
     path = folder / stress_name(engine)
-    write_text(path, json.dumps(result, indent=1, allow_nan=False))
+    write_result(path, result)
     draw_stress(result, path.with_suffix(".png"))
     print(f"written: {relative(path)}, {relative(path.with_suffix('.png'))}")
     return 0
 
 
 def rows_of(result: dict[str, Any]) -> list[tuple[str, str, str, dict[str, Any] | None, dict[str, Any] | None]]:
-    """Return what there is to show, line by line: kind (of COLORS), name, what it is, and the figures of success and of the
-    flat, where there are any.
-    """
+    """Return the rows of the table: kind (of COLORS), name, description, and figures of success and of the flat."""
     rows = [
         ("combined" if line["name"] in COMBINED else "table", line["name"], line["what"], line.get("stairs"), line["flat"])
         for line in result["lines"]
@@ -123,7 +117,7 @@ def rows_of(result: dict[str, Any]) -> list[tuple[str, str, str, dict[str, Any] 
 
 
 def score_text(result: dict[str, Any]) -> str:
-    """Return the score in words."""
+    """Return the score as text."""
     found, rule = result["score"], result["definition"]
     if found is None:
         return f"stairs of {rule['riser_m']:g} x {rule['tread_m']:g} m" if "stairs" in result["lines"][0] else "on the flat"
@@ -134,40 +128,31 @@ def score_text(result: dict[str, Any]) -> str:
 
 
 def print_stress(result: dict[str, Any]) -> None:
-    """Print a line for each disturbance, setting and ground, then the score."""
-    limit = result["definition"]["limit"]
-    table = Table(title=escape(f"{result['task']} ({result['checkpoint']}) in {result['physics']}"), title_justify="left")
-    table.add_column("what", max_width=48)
-    for head in (
-        "success on stairs\nor new ground",
-        "fell",
-        "stuck",
-        f"on the flat, error\nbelow {limit:.3g} m/s",
-        "fell",
-        "RMSE",
-    ):
-        table.add_column(head, justify="right")
-    last = "table"
+    """Print a table with a line for each disturbance, setting and ground, then the score."""
+    limit, last = result["definition"]["limit"], "table"
+    rows: list[list[str] | None] = []
     for kind, name, what, stairs, flat in rows_of(result):
-        if kind != last:
-            table.add_section()
+        rows += [None] if kind != last else []
         last = kind
-        said = f"{name}: {what}" if kind == "table" and name != NOMINAL.name else name
-        up = [share_text(stairs), str(stairs["fell"]), str(stairs["stuck"])] if stairs else ["", "", ""]
         error = "none" if flat and flat["rmse_lin"] is None else f"{flat['rmse_lin']:.3f} m/s" if flat else ""
+        up = [share_text(stairs), str(stairs["fell"]), str(stairs["stuck"])] if stairs else ["", "", ""]
         level = [share_text(flat), str(flat["fell"]), error] if flat else ["", "", ""]
-        table.add_row(escape(said), *up, *level)
+        rows.append([f"{name}: {what}" if kind == "table" and name != NOMINAL.name else name, *up, *level])
+    heads = ["success on stairs\nor new ground", "fell", "stuck"]
+    heads += [f"on the flat, error\nbelow {limit:.3g} m/s", "fell", "RMSE"]
+    table = screen_table(f"{result['task']} ({result['checkpoint']}) in {result['physics']}", ["disturbance", *heads], rows)
+    table.columns[0].max_width = 48
     Console(width=130).print(table)
     print(score_text(result))
 
 
 def share_text(entry: dict[str, Any]) -> str:
-    """Return a share and its interval: '97 % (84 to 99)'."""
+    """Return a share with its interval as text: '97 % (84 to 99)'."""
     return f"{100 * entry['share']:.0f} % ({100 * entry['low']:.0f} to {100 * entry['high']:.0f})"
 
 
 def draw_stress(result: dict[str, Any], path: Path) -> None:
-    """Draw a bar a line, with its interval: success, commands followed on the flat, and the velocity's error there."""
+    """Draw a bar a line, with its interval: success, commands followed on the flat, and the velocity error there."""
     rows = rows_of(result)
     names = [name for _, name, *_ in rows]
     colors = [COLORS[kind] for kind, *_ in rows]

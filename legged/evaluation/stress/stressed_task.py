@@ -1,4 +1,4 @@
-"""A task whose robots each have a disturbance of their own, all in one simulation."""
+"""A task with a different disturbance for each robot, all in one simulation."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,20 +12,20 @@ from legged.evaluation.stress.table import PUSH_INTERVAL, Disturbance
 from legged.math import quat_rotate
 from legged.mdp.height_map_errors import HeightMapErrors, is_exact
 from legged.mdp.height_scan import HeightScan
-from legged.mdp.uniform_numbers import UniformNumbers
+from legged.mdp.random_pool import RandomPool
 from legged.physics import FIELDS, MODEL_FIELDS, Scene
 from legged.registry import task_class
 from legged.terrain import Terrain
 
 GIVEN = ("friction", "added_base_mass", "motor_strength", "joint_offset")
-"""Properties (domain_rand.ranges) that a robot has by its row."""
+"""Properties (domain_rand.ranges) that rows set."""
 MOST = ("push", "map_height", "map_shift", "map_holes")
-"""Disturbances of which the configuration states the largest."""
+"""Disturbances whose largest value the configuration holds."""
 
 
 def declared(rows: Sequence[Disturbance]) -> list[tuple[str, Any]]:
-    """Return overrides that a task needs for these disturbances: the fields of the configuration that they are of. What each
-    robot has of them is its row's, and is given to it once the task is built.
+    """Return overrides that enable these disturbances in a task. Each robot gets the values of its row once the task is
+    built.
     """
     given = {"friction": True, "added_base_mass": True}
     given |= {"motor_strength": any(row.motors != 1.0 for row in rows), "joint_offset": any(row.zero_offset for row in rows)}
@@ -45,7 +45,7 @@ def declared(rows: Sequence[Disturbance]) -> list[tuple[str, Any]]:
 
 
 def late(rows: Sequence[Disturbance], cfg: LeggedConfig) -> list[tuple[str, Any]]:
-    """Return overrides by which targets of a task can be as late as those of these robots, each of which keeps its delay."""
+    """Return overrides that make the delay buffer of a task long enough for these robots, each with a constant delay."""
     most = max(cfg.control.actuator.delay[1], *(round(row.delay / cfg.sim.dt) for row in rows))
     return [("control.actuator.delay", [most] * 2), ("control.actuator.delay_varies", False)] if most else []
 
@@ -53,7 +53,7 @@ def late(rows: Sequence[Disturbance], cfg: LeggedConfig) -> list[tuple[str, Any]
 def make_stressed(
     cfg: LeggedConfig, rows: Sequence[Disturbance], device: torch.device, graph: bool, terrain: Terrain | None
 ) -> LeggedRobot:
-    """Build the task of a configuration with robots of `rows`, one each (N)."""
+    """Build the task of a configuration with one robot for each of N `rows`."""
     kind: Any = task_class(cfg.task)
     own = {"rows": tuple(rows), "own_delay": cfg.control.actuator.delay, "__module__": __name__}
     stressed: Any = type(f"Stressed{kind.__name__}", (StressedTask, kind), own)
@@ -62,10 +62,10 @@ def make_stressed(
 
 
 class GivenMap(HeightMapErrors):
-    """A map of heights that is wrong by what it is given, in every episode."""
+    """A height map with given errors, the same in every episode."""
 
     given: tuple[Tensor, Tensor]
-    """As `error` and `holes`."""
+    """Values of `error` and `holes`."""
 
     def advance(self, begun: Tensor) -> None:
         for own, given in zip((self.error, self.holes), self.given, strict=True):
@@ -73,17 +73,17 @@ class GivenMap(HeightMapErrors):
 
 
 class StressedTask(LeggedRobot):
-    """What is put before a task's class, so that each robot has the disturbance of its row. Random numbers of disturbances
-    are drawn once, by a generator of their own: what the task draws stays as it is.
+    """A mix-in before a task's class that gives each robot the disturbance of its row. A separate generator draws their
+    random numbers once, so the task's own random numbers stay the same.
     """
 
     rows: tuple[Disturbance, ...] = ()
-    """One for each of the N robots."""
+    """Disturbance of each of the N robots."""
     own_delay: tuple[int, int] = (0, 0)
-    """Range of the delay, in physics steps, of robots whose row says nothing of it: the task's."""
+    """Range of the delay, in physics steps, of robots whose row has none: the task's."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        """Build the task, then give the physics what differs from robot to robot, which nothing changes afterwards."""
+        """Build the task, then give the physics the constant properties of each robot."""
         super().__init__(*args, **kwargs)
         given = {"added_base_mass": self._per_robot("payload"), "motor_strength": self._per_robot("motors")}
         given |= {"friction": self._frictions(), "joint_offset": self.zero_offset}
@@ -94,7 +94,7 @@ class StressedTask(LeggedRobot):
         self.reset()
 
     def _per_robot(self, name: str) -> Tensor:
-        """Return one number of each robot's disturbance, (N,)."""
+        """Return one field of each robot's disturbance, (N,)."""
         values = [float(getattr(row, name)) for row in self.rows]
         return torch.tensor(values, dtype=torch.float32, device=torch.device(self.device))
 
@@ -103,7 +103,7 @@ class StressedTask(LeggedRobot):
         return self._scene
 
     def _frictions(self) -> Tensor:
-        """Return the friction of each robot, (N,), or of each of its shapes if they differ by themselves, (N, shapes)."""
+        """Return the friction of each robot, (N,), or of each of its shapes if they differ nominally, (N, shapes)."""
         model = self.physics.model
         own = [float(value) for value in model.geom_friction[FIELDS["friction"].rows(self._scene, model), 0]]
         shapes = own[:1] if len(set(own)) == 1 else own
@@ -121,7 +121,7 @@ class StressedTask(LeggedRobot):
 
         self._pushed = self._per_robot("push") > 0.0
         self.zero_offset = self._per_robot("zero_offset").unsqueeze(1) * draw(self.robot.num_dof)
-        """(N, D) what encoders show beside the true angle [rad]."""
+        """(N, D) error of the encoders [rad]."""
         half, axis = 0.5 * self._per_robot("tilt"), torch.pi * draw()
         level = (half.sin() * axis.cos(), half.sin() * axis.sin())
         self._mounting = torch.stack([half.cos(), *level, torch.zeros_like(half)], dim=1)
@@ -139,14 +139,14 @@ class StressedTask(LeggedRobot):
             self.control.actuator.delay.copy_(torch.where(steps > 0.0, steps, own))
 
     def make_height_map(self) -> HeightMapErrors | None:
-        """Return a map with the errors of the rows, and none of the task's own."""
+        """Return a map with the errors of the rows, without those of the task."""
         cfg, n = self.cfg.observations.height_map, self.num_envs
         if is_exact(cfg):
             return None
         scan = self.height_scan
         if cfg.shift:
             scan = HeightScan(self.cfg.terrain, self.terrain, n, torch.device(self.device), self.physics.kernels)
-        pose, numbers = (self.base_pos, self.base_quat), UniformNumbers(n, torch.device(self.device))
+        pose, numbers = (self.base_pos, self.base_quat), RandomPool(n, torch.device(self.device))
         found = GivenMap(cfg, scan, pose, self.heights_seen, self.dt, numbers)
         found.given = self._map_error, self._map_holes
         return found

@@ -1,4 +1,4 @@
-"""The table of disturbances: what each is, for a robot of any size."""
+"""The table of disturbances, for a robot of any size."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -7,46 +7,46 @@ from typing import Any
 from legged.robots.similarity import Size, grown
 
 WRITTEN_FOR = "anymal_c"
-"""The robot whose numbers those below are; others have them as they are as large."""
+"""Robot of the numbers below; they are scaled for others."""
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """What is wrong with one robot, its sensors and its motors. Where it says "either way", a robot has the number or its
-    opposite; what a robot has, it keeps.
+    """Disturbances of one robot, its sensors and its motors, constant over time. "Either way" means the number or its
+    opposite.
     """
 
     name: str
     payload: float = 0.0
     """Mass added to the base, at its centre of mass [kg]."""
     friction: float | None = None
-    """Sliding friction of all contacts of the robot, in place of its own [1]."""
+    """Sliding friction of all contacts of the robot, in place of its nominal one [1]."""
     motors: float = 1.0
-    """Factor on the torque of every motor, and so on its limit [1]."""
+    """Factor on the torque of every motor and on its limit [1]."""
     delay: float = 0.0
-    """Time by which targets reach the motors late [s]."""
+    """Delay of the targets on the way to the motors [s]."""
     push: float = 0.0
-    """Every PUSH_INTERVAL the base's velocity along the world's x and y is set to one drawn up to this, either way [m/s]."""
+    """Every PUSH_INTERVAL the base's velocity along the world's x and y is set to random values up to this, either way [m/s].
+    """
     zero_offset: float = 0.0
-    """What encoders report too much is drawn for each joint up to this, either way; policy and motors both believe it
-    [rad]."""
+    """Largest random error of the encoders, either way; policy and motors both use the wrong angle [rad]."""
     tilt: float = 0.0
-    """By how much the inertial sensor is mounted askew, about a level axis of any direction [rad]."""
+    """Tilt of the inertial sensor about a random horizontal axis [rad]."""
     map_height: float = 0.0
-    """By how much the height map lies too high or too low, either way [m]."""
+    """Vertical error of the height map, either way [m]."""
     map_shift: float = 0.0
-    """By how much the height map is shifted to a side, in a direction of its own [m]."""
+    """Horizontal error of the height map, in a random direction [m]."""
     map_holes: float = 0.0
-    """Share of the points of the height map that no sensor sees: they read 0, as level ground does [1]."""
+    """Share of the points of the height map that are missing and read 0, like level ground [1]."""
 
     @property
     def changes(self) -> dict[str, float]:
-        """Return field -> its number, of those that are not as they should be."""
+        """Return field -> number of the fields that differ from their defaults."""
         return {one.name: getattr(self, one.name) for one in fields(self)[1:] if getattr(self, one.name) != one.default}
 
     @property
     def text(self) -> str:
-        """Return what is wrong, in words and physical units."""
+        """Return the disturbances as text, in physical units."""
         return ", ".join(TEXTS[name].format(value) for name, value in self.changes.items()) or "nothing"
 
 
@@ -64,9 +64,9 @@ TEXTS = {
     "map_shift": "height map shifted by {:g} m",
     "map_holes": "{:.0%} of the height map missing",
 }
-"""Field -> what its number means."""
+"""Field -> text of its number."""
 UNITS = {"payload": "kg", "push": "m/s", "map_height": "m", "map_shift": "m"}
-"""Fields that grow with the robot, and the units by which they do. A computer's delay does not, nor do angles and shares."""
+"""Fields that scale with the robot, and their units; delays, angles and shares do not scale."""
 NOMINAL = Disturbance("nominal")
 ALONE = (
     Disturbance("payload", payload=8.0),
@@ -81,19 +81,19 @@ ALONE = (
     Disturbance("map holes", map_holes=0.2),
     Disturbance("no map", map_holes=1.0),
 )
-"""One thing wrong at a time, of an ANYmal C."""
+"""Single disturbances, for an ANYmal C."""
 TOGETHER = ("payload", "friction", "weak motors", "delay 20 ms")
-"""What is wrong in the line `together`: what hardware differs in by itself."""
+"""Disturbances of the line `together`: common differences of hardware."""
 WORST = ("delay 40 ms", "no map")
-"""What the line `everything` does not have, for it has a smaller disturbance of the same kind."""
+"""Disturbances that the line `everything` lacks, because it has a smaller one of the same kind."""
 
 NAMES = (NOMINAL.name, *(one.name for one in ALONE), "together", "everything")
-"""Of all lines."""
+"""Names of all lines."""
 
 
 def table(robot: Size, anymal: Size, payload: float | None = None) -> tuple[Disturbance, ...]:
-    """Return all lines for a robot of that size: nothing, each alone, some together, everything. `anymal` is the size of the
-    robot that they are written for; numbers that grow have two digits. A `payload` [kg] takes the place of the table's.
+    """Return all lines for a robot of that size: no disturbance, each alone, some together, all. `anymal` is the size of the
+    robot of the numbers; scaled numbers have two digits. A `payload` [kg] replaces that of the table.
     """
     alone = [scaled(one, robot, anymal) for one in ALONE]
     if payload is not None:
@@ -104,7 +104,7 @@ def table(robot: Size, anymal: Size, payload: float | None = None) -> tuple[Dist
 
 
 def scaled(one: Disturbance, robot: Size, anymal: Size) -> Disturbance:
-    """Return a disturbance that is for one robot what `one` is for the robot that it is written for."""
+    """Return the disturbance `one`, scaled from the size `anymal` to `robot`."""
     grow: dict[str, Any] = {
         name: float(f"{getattr(one, name) * grown(unit, anymal, robot):.2g}") for name, unit in UNITS.items()
     }
@@ -112,5 +112,5 @@ def scaled(one: Disturbance, robot: Size, anymal: Size) -> Disturbance:
 
 
 def combined(name: str, parts: Sequence[Disturbance]) -> Disturbance:
-    """Return all that is wrong in any of `parts`, of which no two change the same."""
+    """Return the disturbances of all `parts`, which have no field in common."""
     return Disturbance(name, **{field: value for part in parts for field, value in part.changes.items()})

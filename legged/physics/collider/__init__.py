@@ -1,5 +1,5 @@
-"""The collider for height maps."""
+"""Collider for height maps."""
 
 from legged.physics.warp import settings
 
-__all__ = ["settings"]  # imported before anything here declares a kernel
+__all__ = ["settings"]  # before any module here declares a kernel

@@ -1,7 +1,7 @@
-"""A height map on the device, and what of it a sphere or a capsule can touch: Warp functions, geometry only.
+"""Height map on the device, and its contacts with spheres and capsules: Warp functions, geometry only.
 
-A shape is looked at as probes (probes.py). Each looks at the few cells under it: the cell's surface below, the vertical
-faces and their rims beside it.
+A shape consists of contact features (contact_features.py). Each feature checks the few cells under it: the surface of the
+cell below, and the vertical faces and rims of its neighbours.
 """
 
 import numpy as np
@@ -10,13 +10,13 @@ import warp as wp
 from legged.terrain import HeightMap
 
 FACE = wp.constant(1e-4)
-"""Neighbouring surfaces further apart than this are separated by a vertical face [m]."""
+"""Height difference above which neighbouring surfaces are separated by a vertical face [m]."""
 RIDGE = wp.constant(0.02)
-"""Drop in slope (rise over run) across a crease from which on a capsule can rest on it between its ends."""
+"""Smallest drop in slope (rise over run) across a crease on which a capsule can rest between its ends."""
 SAME = wp.constant(0.999)
-"""Cosine between the normals of neighbouring surfaces above which they count as one."""
+"""Cosine between the normals of neighbouring surfaces above which they count as one surface."""
 NOTHING = wp.constant(1e6)
-"""Distance of what is not there [m]."""
+"""Distance of a hit that does not exist [m]."""
 
 
 @wp.struct
@@ -26,33 +26,33 @@ class Ground:
     corners: wp.array2d[wp.vec4]
     """(X, Y) corner heights of each cell: at (0, 0), (1, 0), (0, 1), (1, 1) [m]."""
     ceiling: wp.array2d[float]
-    """(X, Y) the highest corner within reach of a probe's end."""
+    """(X, Y) highest corner within reach of a feature's end [m]."""
     wide_ceiling: wp.array2d[float]
-    """(X, Y) the highest corner within half the longest capsule."""
+    """(X, Y) highest corner within half the length of the longest capsule [m]."""
     x: float
-    """World x of the outer corner of cell (0, 0)."""
+    """World x of the outer corner of cell (0, 0) [m]; `y` in the same way."""
     y: float
     cell: float
     """Edge of a cell [m]."""
     reach: int
-    """Cells beyond a probe's own that the largest probe can touch."""
+    """Number of cells beyond its own that the largest feature can touch."""
 
 
 @wp.struct
 class Hit:
-    """A possible contact of a sphere around `point`."""
+    """Possible contact of a sphere around `point`."""
 
     dist: float
-    """Distance of the point to the ground, not yet less the radius [m]."""
+    """Distance of the point to the ground, before the radius is subtracted [m]."""
     normal: wp.vec3
     point: wp.vec3
     face: bool
-    """With a vertical face or its rim, not with a surface."""
+    """True if the hit is with a vertical face or its rim, not with a surface."""
 
 
 @wp.func
 def cell_of(ground: Ground, x: float, y: float) -> wp.vec2i:
-    """The cell that holds a world point; the nearest one outside the map."""
+    """Return the cell that contains a world point; outside the map, the nearest cell."""
     i = wp.int32(wp.floor((x - ground.x) / ground.cell))
     j = wp.int32(wp.floor((y - ground.y) / ground.cell))
     i = wp.clamp(i, 0, ground.corners.shape[0] - 1)
@@ -62,7 +62,7 @@ def cell_of(ground: Ground, x: float, y: float) -> wp.vec2i:
 
 @wp.func
 def corners_of(ground: Ground, i: int, j: int) -> wp.vec4:
-    """Corner heights of a cell; beyond the map, those of the cell at its border."""
+    """Return the corner heights of a cell; outside the map, those of the nearest border cell."""
     i = wp.clamp(i, 0, ground.corners.shape[0] - 1)
     j = wp.clamp(j, 0, ground.corners.shape[1] - 1)
     return ground.corners[i, j]
@@ -70,7 +70,7 @@ def corners_of(ground: Ground, i: int, j: int) -> wp.vec4:
 
 @wp.func
 def surface(ground: Ground, i: int, j: int, x: float, y: float) -> wp.vec3:
-    """(height, slope along x, slope along y) of cell (i, j)'s own surface at a world point, clamped to the cell."""
+    """Return (height, slope along x, slope along y) of the surface of cell (i, j) at a world point, clamped to the cell."""
     c = corners_of(ground, i, j)
     u = wp.clamp((x - ground.x) / ground.cell - float(i), 0.0, 1.0)
     v = wp.clamp((y - ground.y) / ground.cell - float(j), 0.0, 1.0)
@@ -82,7 +82,7 @@ def surface(ground: Ground, i: int, j: int, x: float, y: float) -> wp.vec3:
 
 @wp.func
 def on_plane(p: wp.vec3, foot: wp.vec3, s: wp.vec3) -> Hit:
-    """Distance of `p` to the tangent plane of a surface `s` at the point `foot`."""
+    """Return the hit of `p` with the tangent plane of a surface `s` at the point `foot`."""
     normal = wp.normalize(wp.vec3(-s[1], -s[2], 1.0))
     hit = Hit()
     hit.point = p
@@ -93,7 +93,9 @@ def on_plane(p: wp.vec3, foot: wp.vec3, s: wp.vec3) -> Hit:
 
 @wp.func
 def leave_sideways(ground: Ground, i: int, j: int, p: wp.vec3, top: Hit) -> Hit:
-    """For a point below its cell's surface: the shortest way out, up or through a vertical face beside it."""
+    """Return the hit with the shortest way out for a point below its cell's surface: up (`top`), or through a vertical face
+    at the side of the cell.
+    """
     best = top
     x0 = ground.x + float(i) * ground.cell
     y0 = ground.y + float(j) * ground.cell
@@ -116,14 +118,16 @@ def leave_sideways(ground: Ground, i: int, j: int, p: wp.vec3, top: Hit) -> Hit:
 
 
 @wp.func
-def beside(ground: Ground, i: int, j: int, ni: int, nj: int, p: wp.vec3) -> Hit:
-    """What of cell (ni, nj) a point over cell (i, j) can touch: its face, its rim, or its surface where it rises."""
+def hit_neighbour(ground: Ground, i: int, j: int, ni: int, nj: int, p: wp.vec3) -> Hit:
+    """Return the hit of a point over cell (i, j) with its neighbour (ni, nj): the neighbour's face, its rim, or its surface
+    where that rises.
+    """
     x0 = ground.x + float(ni) * ground.cell
     y0 = ground.y + float(nj) * ground.cell
     qx = wp.clamp(p[0], x0, x0 + ground.cell)
     qy = wp.clamp(p[1], y0, y0 + ground.cell)
     s = surface(ground, ni, nj, qx, qy)
-    # The ground just before the cell, on the point's side: what of the face is above that is in the open.
+    # Height of the ground just before the neighbour, on the point's side. The part of the face above it is exposed.
     before = -NOTHING
     if ni != i:
         before = wp.max(before, surface(ground, ni - wp.sign(ni - i), nj, qx, qy)[0])
@@ -138,10 +142,10 @@ def beside(ground: Ground, i: int, j: int, ni: int, nj: int, p: wp.vec3) -> Hit:
             to = p - wp.vec3(qx, qy, wp.min(p[2], s[0]))
             hit.dist = wp.length(to)
             hit.normal = wp.normalize(to)
-            if hit.dist < 1e-6:  # the point is on the face itself: leave towards the open side
+            if hit.dist < 1e-6:  # the point is on the face itself: push it towards the open side
                 hit.normal = wp.normalize(wp.vec3(float(i - ni), float(j - nj), 0.0))
     elif s[0] > before - FACE:
-        # One surface with a crease: a plane counts only where its nearest point is on this cell.
+        # One surface with a crease: the plane counts only if its nearest point lies on this cell.
         plane = on_plane(p, wp.vec3(qx, qy, s[0]), s)
         x = p[0] - plane.dist * plane.normal[0]
         y = p[1] - plane.dist * plane.normal[1]
@@ -152,10 +156,10 @@ def beside(ground: Ground, i: int, j: int, ni: int, nj: int, p: wp.vec3) -> Hit:
 
 @wp.func
 def rim_or_ridge(ground: Ground, a: wp.vec3, b: wp.vec3, axis: int, line: int) -> Hit:
-    """Where a segment a-b meets the `line`-th grid line across `axis` (0: x, 1: y): distance of the segment's axis to the
-    rim of a vertical face there, or to the ridge of a joined surface.
+    """Return the hit of a segment a-b with the `line`-th grid line across `axis` (0: x, 1: y). Its distance is that from the
+    segment to the rim of a vertical face there, or to the ridge of a continuous surface.
 
-    dist is NOTHING where the nearest point is an end of the segment, which is a probe of its own.
+    `dist` is NOTHING where the nearest point is an end of the segment, since each end is a feature of its own.
     """
     hit = Hit()
     hit.dist = NOTHING
@@ -177,13 +181,14 @@ def rim_or_ridge(ground: Ground, a: wp.vec3, b: wp.vec3, axis: int, line: int) -
     s_high = surface(ground, high_i, high_j, p[0], p[1])
     rise = s_high[0] - s_low[0]
     if wp.abs(rise) > FACE:
-        # In the vertical plane across the rim: the segment's point nearest to the rim, and its side of it.
+        # In the vertical plane across the rim: find the segment's point nearest to the rim, and the side of the rim that it
+        # lies on.
         rim = wp.max(s_low[0], s_high[0])
         open_side = -wp.sign(rise)
         across, up = d[axis], d[2]
         length_sq = across * across + up * up
         if length_sq < 1e-12:
-            return hit  # the segment lies along the rim; its ends do
+            return hit  # the segment lies along the rim, so its ends make the contacts
         t = ((at - a[axis]) * across + (rim - a[2]) * up) / length_sq
         if t <= 0.0 or t >= 1.0:
             return hit
@@ -192,7 +197,7 @@ def rim_or_ridge(ground: Ground, a: wp.vec3, b: wp.vec3, axis: int, line: int) -
         if normal[0] * open_side + normal[1] < 0.0:
             normal = -normal
         if normal[0] * open_side < -1e-3 or normal[1] < -1e-3:
-            return hit  # nearest is the face or the tread, not the rim
+            return hit  # the face or the tread is nearer than the rim
         p = a + t * d
         dist = (p[axis] - at) * normal[0] + (p[2] - rim) * normal[1]
         if dist > -ground.cell:
@@ -209,12 +214,14 @@ def rim_or_ridge(ground: Ground, a: wp.vec3, b: wp.vec3, axis: int, line: int) -
 
 
 MOST = wp.constant(6)
-"""Contacts of one probe at most: the surfaces and faces around a sphere in a corner."""
+"""Largest number of contacts of one feature: the surfaces and faces around a sphere in a corner."""
 
 
 @wp.struct
 class Hits:
-    """Room for MOST contacts of each probe of each world, a row for each: in registers they would crowd out all else."""
+    """Memory for MOST contacts of each feature of each world, one row per feature. In registers they would leave too little
+    room for other variables.
+    """
 
     dist: wp.array2d[float]
     normal: wp.array2d[wp.vec3]
@@ -223,7 +230,7 @@ class Hits:
 
 @wp.func
 def add(hits: Hits, row: int, count: int, hit: Hit) -> int:
-    """Add one more to the `count` of a row, if there is room; returns how many there are."""
+    """Append a hit to the `count` hits of a row if there is room. Return the new count."""
     if count >= MOST:
         return count
     hits.dist[row, count] = hit.dist
@@ -234,8 +241,8 @@ def add(hits: Hits, row: int, count: int, hit: Hit) -> int:
 
 @wp.func
 def around_point(ground: Ground, p: wp.vec3, near: float, faces_only: bool, hits: Hits, row: int) -> int:
-    """Find what the ground offers to a sphere around `p` that reaches out to `near`, or only its vertical faces with their
-    rims; returns how many hits are in the row.
+    """Find the hits of a sphere around `p` that lie within `near` [m]; with `faces_only`, those with vertical faces and their
+    rims. Return the number of hits in the row.
     """
     count = wp.int32(0)
     cell = cell_of(ground, p[0], p[1])
@@ -257,7 +264,7 @@ def around_point(ground: Ground, p: wp.vec3, near: float, faces_only: bool, hits
             y = ground.y + float(j + dj) * ground.cell
             dy = p[1] - wp.clamp(p[1], y, y + ground.cell)
             if (di != 0 or dj != 0) and dx * dx + dy * dy < near * near:
-                hit = beside(ground, i, j, i + di, j + dj, p)
+                hit = hit_neighbour(ground, i, j, i + di, j + dj, p)
                 if hit.face and hit.dist < near:
                     count = add(hits, row, count, hit)
                 elif hit.dist < crease.dist:
@@ -269,7 +276,9 @@ def around_point(ground: Ground, p: wp.vec3, near: float, faces_only: bool, hits
 
 @wp.func
 def between_ends(ground: Ground, a: wp.vec3, b: wp.vec3, near: float, hits: Hits, row: int) -> int:
-    """Find what touches a capsule a-b between its ends: the nearest rim or ridge of each half; returns how many."""
+    """Find the hits of a capsule a-b between its ends: the nearest rim or ridge of each half. Return the number of hits in
+    the row.
+    """
     middle = 0.5 * (a + b)
     cell = cell_of(ground, middle[0], middle[1])
     if wp.min(a[2], b[2]) - near > ground.wide_ceiling[cell[0], cell[1]]:
@@ -282,7 +291,7 @@ def between_ends(ground: Ground, a: wp.vec3, b: wp.vec3, near: float, hits: Hits
         start = wp.where(axis == 0, ground.x, ground.y)
         low = wp.int32(wp.floor((wp.min(a[axis], b[axis]) - near - start) / ground.cell)) + 1
         high = wp.int32(wp.floor((wp.max(a[axis], b[axis]) + near - start) / ground.cell))
-        # Within the map: a world that blew up could ask for billions of lines.
+        # The lines stay within the map: a world that diverges could request billions of them.
         last = wp.where(axis == 0, ground.corners.shape[0], ground.corners.shape[1]) - 1
         for line in range(wp.clamp(low, 1, last), wp.clamp(high, 1, last) + 1):
             hit = rim_or_ridge(ground, a, b, axis, line)
@@ -301,7 +310,7 @@ def between_ends(ground: Ground, a: wp.vec3, b: wp.vec3, near: float, hits: Hits
 
 
 def room_for_hits(rows: int) -> Hits:
-    """Return room for the contacts of so many probes, on Warp's current device."""
+    """Return memory for the contacts of `rows` features, on Warp's current device."""
     hits = Hits()
     hits.dist = wp.zeros((rows, int(MOST)), dtype=float)
     hits.normal = wp.zeros((rows, int(MOST)), dtype=wp.vec3)
@@ -310,7 +319,9 @@ def room_for_hits(rows: int) -> Hits:
 
 
 def ground_of(height_map: HeightMap, largest: float, longest: float) -> Ground:
-    """The map on Warp's current device, for probes of at most that radius and capsules of at most that length [m]."""
+    """Return the map on Warp's current device, for features of radius up to `largest` [m] and capsules of length up to
+    `longest` [m].
+    """
     reach = int(np.ceil(largest / height_map.cell - 1e-9))
     wide = int(np.ceil((0.5 * longest + largest) / height_map.cell))
     ground = Ground()

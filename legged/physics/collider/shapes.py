@@ -1,44 +1,44 @@
-"""Where simple shapes touch a plane or each other: Warp functions, geometry only.
+"""Contacts of simple shapes with a plane and with each other: Warp functions, geometry only.
 
-As C MuJoCo has it. mujoco-warp differs in two ways: it keeps also those corners of a box that lie above its centre, and the
-friction of a capsule is along its axis only while it lies more than it stands.
+The results are those of C MuJoCo. mujoco-warp differs in two ways: it also keeps the corners of a box that lie above its
+centre, and it aligns friction with a capsule's axis only while the capsule is closer to horizontal than to vertical.
 """
 
 import warp as wp
 from mujoco_warp._src.collision_primitive_core import capsule_capsule, mat23f
 from mujoco_warp._src.math import make_frame
 
-from legged.physics.collider import touches
+from legged.physics.collider import contact_pairs
 
-POINT, END, CORNER = wp.constant(touches.POINT), wp.constant(touches.END), wp.constant(touches.CORNER)
-RIM = wp.constant(touches.RIM)
+POINT, END, CORNER = wp.constant(contact_pairs.POINT), wp.constant(contact_pairs.END), wp.constant(contact_pairs.CORNER)
+RIM = wp.constant(contact_pairs.RIM)
 FAR = wp.constant(1e6)
-"""Distance of what does not touch [m]."""
+"""Distance of shapes that do not touch [m]."""
 
 
 @wp.struct
 class PlaneHit:
-    """A point of a shape and its contact with a plane."""
+    """Contact of a shape's point with a plane."""
 
     dist: float
-    """Negative in penetration [m]."""
+    """Distance [m], negative in penetration."""
     pos: wp.vec3
-    """Halfway between shape and plane."""
+    """Contact point, halfway between shape and plane [m]."""
     frame: wp.mat33
-    """Rows are the plane's normal and two tangents."""
+    """Rows: the plane's normal and two tangents."""
 
 
 @wp.func
 def rim_point(normal: wp.vec3, turn: wp.mat33, radius: float, half_length: float, k: int) -> wp.vec3:
-    """Return the k-th point, from the centre, in which a cylinder rests on a plane: the lowest of the near rim, the lowest of
-    the far rim, and two more of the near rim that make a triangle with the first.
+    """Return the k-th point in which a cylinder rests on a plane, relative to its centre: the lowest point of the near rim,
+    the lowest point of the far rim, and two more points of the near rim that form a triangle with the first.
     """
     axis = wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])
     if wp.dot(normal, axis) > 0.0:
         axis = -axis
     down = axis * wp.dot(normal, axis) - normal
     length = wp.length(down)
-    if length < 1e-6:  # it stands upright: any point of the rim is the lowest
+    if length < 1e-6:  # the cylinder stands upright: all points of the rim are equally low
         down = wp.vec3(turn[0, 0], turn[1, 0], turn[2, 0])
         length = 1.0
     down = down * (radius / length)
@@ -55,7 +55,7 @@ def rim_point(normal: wp.vec3, turn: wp.mat33, radius: float, half_length: float
 def on_plane(
     plane: wp.vec3, normal: wp.vec3, position: wp.vec3, turn: wp.mat33, kind: int, place: wp.vec3, radius: float
 ) -> PlaneHit:
-    """Return the contact of one of a shape's points (`touches.PlanePoint`) with the plane through `plane`."""
+    """Return the contact of a shape's point (`contact_pairs.PlanePoint`) with the plane through `plane`."""
     hit = PlaneHit()
     around = radius
     offset = turn * place
@@ -75,7 +75,7 @@ def on_plane(
         axis = wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])
         tangent = axis - normal * wp.dot(normal, axis)
         length = wp.length(tangent)
-        if length > 1e-6:  # else it stands upright, and no direction is its own
+        if length > 1e-6:  # otherwise the shape stands upright, and no tangent is preferred
             tangent = tangent * (1.0 / length)
             hit.frame = wp.matrix_from_rows(normal, tangent, wp.cross(normal, tangent))
     return hit
@@ -85,8 +85,8 @@ def on_plane(
 def round_shapes(
     first: wp.vec3, first_turn: wp.mat33, first_size: wp.vec2, second: wp.vec3, second_turn: wp.mat33, second_size: wp.vec2
 ) -> tuple[wp.vec2, mat23f, mat23f]:
-    """Return distances, positions and normals of the contacts of two capsules (radius, half length), or spheres of length 0:
-    one, or two where they are parallel; beyond that distances are infinite.
+    """Return distances, positions and normals of the contacts of two capsules (radius, half length); a sphere has half length
+    0. There is one contact, or two if the capsules are parallel; the distances of missing contacts are infinite.
     """
     first_axis = wp.vec3(first_turn[0, 2], first_turn[1, 2], first_turn[2, 2])
     second_axis = wp.vec3(second_turn[0, 2], second_turn[1, 2], second_turn[2, 2])

@@ -1,11 +1,11 @@
-"""Contacts of simple shapes with a height map, as one Warp kernel behind mujoco-warp's own collisions.
+"""Contacts of simple shapes with a height map, in one Warp kernel after mujoco-warp's own collisions.
 
-mujoco-warp meets a height field with a general convex solver (GJK) on triangular prisms: ten times the cost of this,
-and a riser becomes a ramp one cell wide. Here a contact is a few lookups (ground.py).
+mujoco-warp collides with a height field by a general convex solver (GJK) on triangular prisms. That costs ten times as much,
+and a riser becomes a ramp one cell wide. Here a contact needs only a few lookups (ground.py).
 
 Conventions: the normal points from the terrain (first geom) to the robot's shape; `dist` is negative in penetration; the
-contact point lies halfway between the two surfaces, as in MuJoCo. Friction directions follow from the normal alone,
-where MuJoCo turns them along a capsule on a plane; the friction cone is the same.
+contact point lies halfway between the two surfaces, as in MuJoCo. Friction directions follow from the normal alone, whereas
+MuJoCo aligns them with a capsule on a plane; the friction cone is the same.
 """
 
 from collections.abc import Iterable
@@ -17,8 +17,8 @@ from mujoco_warp._src.collision_core import contact_margin_gap, contact_material
 from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import vec5
 
+from legged.physics.collider.contact_features import contact_features, find_hits
 from legged.physics.collider.ground import Ground, Hits, ground_of, room_for_hits
-from legged.physics.collider.probes import look, probes_of
 from legged.terrain import HeightMap
 
 MODEL_FIELDS = (
@@ -40,7 +40,7 @@ MODEL_FIELDS = (
     "pair_adhesion",
     "pair_friction",
 )
-"""Of mujoco-warp's model, in the kernel's order."""
+"""Arrays of mujoco-warp's model, in the order of the kernel's arguments."""
 CONTACT_FIELDS = (
     "dist",
     "pos",
@@ -58,7 +58,7 @@ CONTACT_FIELDS = (
     "geomcollisionid",
     "adhesion",
 )
-"""Of its contacts, in the kernel's order."""
+"""Arrays of mujoco-warp's contacts, in the order of the kernel's arguments."""
 
 
 @wp.kernel
@@ -66,11 +66,11 @@ def touch_ground(
     ground: Ground,
     hits: Hits,
     terrain: int,
-    probe_geom: wp.array[int],
-    probe_kind: wp.array[int],
-    probe_start: wp.array[wp.vec3],
-    probe_end: wp.array[wp.vec3],
-    probe_radius: wp.array[float],
+    feature_geom: wp.array[int],
+    feature_kind: wp.array[int],
+    feature_start: wp.array[wp.vec3],
+    feature_end: wp.array[wp.vec3],
+    feature_radius: wp.array[float],
     geom_condim: wp.array[int],
     geom_priority: wp.array[int],
     geom_solmix: wp.array2d[float],
@@ -108,16 +108,18 @@ def touch_ground(
     contact_adhesion: wp.array[float],
     nacon: wp.array[int],
 ):
-    """One thread a world and probe: finds up to MOST hits, then appends them to the contacts."""
-    world, probe = wp.tid()
-    geom = probe_geom[probe]
-    radius = probe_radius[probe]
+    """Find up to MOST hits of a feature, and append them to the contacts. One thread per world and feature."""
+    world, feature = wp.tid()
+    geom = feature_geom[feature]
+    radius = feature_radius[feature]
     geoms = wp.vec2i(terrain, geom)
     margin, gap = contact_margin_gap(geom_margin, geom_gap, pair_margin, pair_gap, geoms, -1, world)
     near = radius + margin + gap
     position, turn = geom_xpos[world, geom], geom_xmat[world, geom]
-    row = world * probe_geom.shape[0] + probe
-    count = look(ground, probe_kind[probe], position, turn, probe_start[probe], probe_end[probe], near, hits, row)
+    row = world * feature_geom.shape[0] + feature
+    count = find_hits(
+        ground, feature_kind[feature], position, turn, feature_start[feature], feature_end[feature], near, hits, row
+    )
     if count == 0:
         return
     condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
@@ -179,39 +181,39 @@ def touch_ground(
 
 
 class TerrainContact:
-    """Appends the contacts with a height map to mujoco-warp's, at the end of its collision stage."""
+    """Appends the contacts with a height map to mujoco-warp's contacts, at the end of its collision stage."""
 
     def __init__(
         self, m: Any, d: Any, model: mujoco.MjModel, terrain: int, height_map: HeightMap, shapes: Iterable[int]
     ) -> None:
-        """`m`, `d` are mujoco-warp's model and data; `terrain` is the static geom that stands for the map, `shapes` are
-        the geoms that meet it. Call with their device as Warp's current one.
+        """Register the collider with mujoco-warp's model `m` and data `d`. `terrain` is the static geom that represents the
+        map; `shapes` are the geoms that collide with it. Warp's current device must be that of `m` and `d`.
 
         Raises:
-            ConfigError: a colliding shape that has no probes.
+            ConfigError: a colliding shape is of a type without contact features.
         """
         self.terrain = terrain
-        self.probes = probes = list(probes_of(model, shapes))
-        largest = max(probe.reach for probe in probes) + float((model.geom_margin + model.geom_gap).max())
-        longest = max(probe.length for probe in probes)
+        self.features = features = list(contact_features(model, shapes))
+        largest = max(feature.reach for feature in features) + float((model.geom_margin + model.geom_gap).max())
+        longest = max(feature.length for feature in features)
         self.ground = ground_of(height_map, largest, longest)
-        self.hits = room_for_hits(d.nworld * len(probes))
+        self.hits = room_for_hits(d.nworld * len(features))
         self._inputs = [
             self.ground,
             self.hits,
             terrain,
-            wp.array([probe.geom for probe in probes], dtype=int),
-            wp.array([probe.kind for probe in probes], dtype=int),
-            wp.array([probe.start for probe in probes], dtype=wp.vec3),
-            wp.array([probe.end for probe in probes], dtype=wp.vec3),
-            wp.array([probe.radius for probe in probes], dtype=float),
+            wp.array([feature.geom for feature in features], dtype=int),
+            wp.array([feature.kind for feature in features], dtype=int),
+            wp.array([feature.start for feature in features], dtype=wp.vec3),
+            wp.array([feature.end for feature in features], dtype=wp.vec3),
+            wp.array([feature.radius for feature in features], dtype=float),
             *(getattr(m, name) for name in MODEL_FIELDS),
             d.geom_xpos,
             d.geom_xmat,
             d.naconmax,
         ]
         self._outputs = [*(getattr(d.contact, name) for name in CONTACT_FIELDS), d.nacon]
-        self._dim = (d.nworld, len(probes))
+        self._dim = (d.nworld, len(features))
         m.callback.contactfilter = self._append
 
     def _append(self, m: Any, d: Any) -> None:

@@ -1,5 +1,5 @@
-"""Launches of our own that take the place of many of mujoco-warp's."""
+"""The fused step: kernels that each replace many of mujoco-warp's launches."""
 
 from legged.physics.warp import settings
 
-__all__ = ["settings"]  # imported before anything here declares a kernel
+__all__ = ["settings"]  # before any module here declares a kernel

@@ -1,8 +1,9 @@
-"""A physics step on a CPU: blocks of worlds, each from its state to the next one at once, on several threads.
+"""Physics step on a CPU, in blocks of worlds: each block passes through all stages of the step, and several threads work on
+blocks at the same time.
 
-What a launch of one stage for all worlds writes is out of the cache before the next stage reads it. Here a block of worlds
-goes through all stages while what it needs is in a core's own cache; and blocks are dealt out to threads, which Warp, whose
-launches on a CPU take one, lets run side by side. A world's numbers do not depend on how many threads there are.
+If a launch made one stage for all worlds, its results would be out of the cache before the next stage reads them. A block's
+data stay in the cache of one core through all stages. A Warp launch on a CPU uses one thread, so blocks are distributed over
+several threads that launch concurrently. A world's results do not depend on the number of threads.
 """
 
 from collections.abc import Callable
@@ -22,7 +23,9 @@ from legged.physics.fused.wide_solver import WIDE, wide_function
 
 
 def block_kernel(step: TorqueStep, contacts: ContactStage) -> Any:
-    """Return the kernel for what these were prepared for; launched for (blocks,), of worlds from `first` to before `end`."""
+    """Return the kernel for a prepared `step` and its `contacts`. It is launched for (blocks,), with the worlds from `first`
+    to before `end`.
+    """
     assert step.solver.wide is not None
     move_world = dynamics_function(step.dynamics.constants)
     contacts_of_world = stage_function(contacts.constants, *contacts.kinds)
@@ -60,14 +63,14 @@ def block_kernel(step: TorqueStep, contacts: ContactStage) -> Any:
 
 
 class BlockStep:
-    """Launches all of a step for the worlds of mujoco-warp's data, which are on a CPU."""
+    """Launches of a complete step for the worlds of mujoco-warp's data on a CPU."""
 
     def __init__(self, step: TorqueStep, contacts: ContactStage, threads: int) -> None:
-        """Prepare the launches of what `step` and `contacts` compute, where `fits` says so, on so many threads."""
+        """Prepare the launches of `step` and `contacts` on several `threads`, provided that `fits` returns True."""
         self._step, self._contacts = step, contacts
         self._kernel = block_kernel(step, contacts)
         solver = step.solver
-        moved = contacts.equalities  # their rows are made of poses
+        moved = contacts.equalities  # rows of equality constraints depend on poses, so these were computed before
         self._inputs = [moved, step.dynamics.arrays, *contacts.inputs, *solver.settings, solver.arrays, step.state]
         blocks = -(-step.worlds // WIDE)
         threads = min(threads, blocks)
@@ -77,7 +80,7 @@ class BlockStep:
 
     @staticmethod
     def fits(step: TorqueStep) -> bool:
-        """Whether a step's constraint forces are computed in blocks: on a CPU, of friction pyramids."""
+        """Return True if a step's constraint forces can be computed in blocks: on a CPU, with pyramidal friction cones."""
         return step.solver.wide is not None
 
     def launch(self) -> None:
@@ -99,7 +102,7 @@ class BlockStep:
         return make_step
 
     def _before_blocks(self) -> None:
-        """Launch what makes rows of equality constraints, mujoco-warp's own, for all worlds."""
+        """Launch mujoco-warp's own kernels for the rows of equality constraints of all worlds."""
         if self._contacts.equalities:
             self._step.begin()
             self._contacts.launch_equalities()

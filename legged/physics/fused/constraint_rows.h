@@ -1,23 +1,24 @@
-// The constraint rows of one world, and who holds what. Constants: NV (degrees of freedom, at most 64), ROWS (most constraint
-// rows), KEPT_ROWS (of the Jacobian in shared memory), STRIDE (from one row of a matrix to the next), ENTRIES (of the mass
-// matrix that are not zero), FRICTION (whether there may be rows of dry friction), DRY (whether they are all of degrees of
-// freedom), SPLIT (whether there are branches), ROOT (degrees of freedom before the first branch), KNOWN (whether rows are
-// known again from step to step), and the sides of row_sides.py.
+// Constraint rows of one world, and their distribution over lanes. Constants: NV (degrees of freedom, at most 64), ROWS
+// (largest number of constraint rows), KEPT_ROWS (rows of the Jacobian in shared memory), STRIDE (floats from one row of a
+// matrix to the next), ENTRIES (stored entries of the mass matrix), FRICTION (there may be rows of dry friction), DRY (all of
+// these belong to degrees of freedom), SPLIT (the tree has branches), ROOT (degrees of freedom before the first branch),
+// KNOWN (rows have keys by which their states of the last step are found), and the row states of active_set.py.
 //
-// On a GPU each lane holds what belongs to one degree of freedom or two (a row of a matrix too), in registers; what all lanes
-// read often, and what belongs to constraint rows, is in shared memory. On the CPU one thread holds everything, and the same
-// text is the serial solver.
+// On a GPU each lane holds the data of one or two degrees of freedom, including a row of each matrix, in registers. Shared
+// memory holds the data of constraint rows and the data that all lanes read often. On the CPU one thread holds everything,
+// and the same source is a serial solver.
 
 #if defined(__CUDA_ARCH__)
 #define EACH_DOF(i) UNROLLED for (int slot = 0; slot < DOFS; ++slot) if (const int i = dof_at(slot); i < NV)
-// One after the other for each lane: worlds with more than 32 rows are few, and what is short stays in the cache of
-// instructions.
+// One row after the other for each lane, not unrolled: worlds with more than 32 rows are few, and short code stays in the
+// instruction cache.
 #define EACH_ROW(r) ROLLED EACH(r, rows)
-// All lanes take part, with r beyond the last row too, as `rank` needs it.
+// All lanes take part, also with r beyond the last row, as `rank` requires.
 #define EVERY_ROW(r) ROLLED for (int first = 0; first < rows; first += 32) if (const int r = first + lane; true)
 #define OF(values, i) values[slot]
 const int DOFS = NV > 32 ? 2 : 1, KEPT = KEPT_ROWS;
-// Which degree of freedom a lane holds. Of more than 32, those of the root are second ones: they need no row of a matrix.
+// Degree of freedom in a lane's slot. With more than 32, those of the root take second slots, since they need no row of a
+// matrix.
 auto dof_at = [&](int slot) {
     if (NV <= 32) return lane;
     return slot == 0 ? ROOT + lane : lane < ROOT ? lane : 32 + lane;
@@ -30,44 +31,45 @@ auto dof_at = [&](int slot) {
 const int DOFS = NV, KEPT = 0;
 #endif
 LEGGED_SHARED float J[KEPT > 0 ? KEPT * STRIDE : 1], M[NV * STRIDE];
-LEGGED_SHARED float shown[STRIDE];  // a vector over degrees of freedom
+LEGGED_SHARED float shown[STRIDE];  // a vector over degrees of freedom that all lanes can read
 LEGGED_SHARED float D[ROWS], x[ROWS], force[ROWS], curvature[ROWS];
-float* jv = force;  // of a step, before there are new forces
-LEGGED_SHARED signed char sides[ROWS];
-LEGGED_SHARED short pushing[ROWS];  // those rows that push now
-LEGGED_SHARED bool couples[ROWS];  // whether a row moves degrees of freedom of several branches
-const int DRY_DOFS = DRY ? NV : 1;  // of each degree of freedom what its row of dry friction has, and which it is, or -1
+float* jv = force;  // J times the step, until new forces are computed
+LEGGED_SHARED signed char states[ROWS];
+LEGGED_SHARED short pushing[ROWS];  // rows that exert force or have curvature
+LEGGED_SHARED bool couples[ROWS];  // true for a row that moves degrees of freedom of several branches
+const int DRY_DOFS = DRY ? NV : 1;  // data of the dry friction row of each degree of freedom; its index, or -1
 LEGGED_SHARED float dry_D[DRY_DOFS], dry_loss[DRY_DOFS], dry_reference[DRY_DOFS], dry_curvature[DRY_DOFS];
-LEGGED_SHARED signed char dry_sides[DRY_DOFS];
+LEGGED_SHARED signed char dry_states[DRY_DOFS];
 LEGGED_SHARED short dry_row[DRY_DOFS];
 float a[DOFS], Ms[DOFS], grad[DOFS], s[DOFS];
-float rest[DOFS];  // what constraints have to push: M a - qfrc_smooth
+float rest[DOFS];  // M a - qfrc_smooth, which the constraint forces balance
 const float TINY = 1e-15f;
 
 const int ne = arrays.equalities.data[world], frictions = FRICTION ? arrays.frictions.data[world] : 0;
 const int of_all = arrays.nefc.data[world] < ROWS ? arrays.nefc.data[world] : ROWS;
-// Rows of dry friction in degrees of freedom, one each, belong to those, and are no rows in what follows.
+// Rows of dry friction that each belong to one degree of freedom are stored with it, and are not counted as rows below.
 const int dry = DRY ? (ne + frictions < of_all ? frictions : of_all > ne ? of_all - ne : 0) : 0;
 const int rows = of_all - dry, nf = ne + (DRY ? 0 : frictions);
 auto efc_row = [&](int r) { return DRY && r >= ne ? r + dry : r; };
 const int width = arrays.jacobian.shape[2];  // padded
-// A number of row r; arrays differ in how many rows they have room for.
+// Returns a number of row r. Arrays differ in the number of rows that they have room for.
 auto number_of = [&](const auto& array, int r) { return array.data[(long long)world * array.shape[1] + efc_row(r)]; };
 const float* jacobian = arrays.jacobian.data + (long long)world * arrays.jacobian.shape[1] * width;
 auto smooth = [&](int i) { return arrays.qfrc_smooth.data[world * arrays.qfrc_smooth.shape[1] + i]; };
-// Calls `use(r, row)` with `row` the Jacobian's: those in shared memory and the others, in few worlds, are read differently.
+// Calls `use(r, row)` with row r of the Jacobian. Rows in shared memory and the others, which few worlds have, are read
+// differently.
 auto with_row = [&](int r, auto use) {
     if (r < KEPT) use(r, static_cast<const float*>(J + r * STRIDE));
     else if (KEPT < ROWS) use(r, jacobian + (long long)efc_row(r) * width);
 };
-// The same of all rows that push, for all lanes.
+// Calls `use` for all rows in `pushing`, in every lane.
 int pushers = 0, near_pushers = 0;
 auto each_pushing = [&](auto use) {
     BY_TWO for (int k = 0; k < near_pushers; ++k) use(pushing[k], static_cast<const float*>(J + pushing[k] * STRIDE));
     if (KEPT < ROWS)
         ROLLED for (int k = near_pushers; k < pushers; ++k) use(pushing[k], jacobian + (long long)efc_row(pushing[k]) * width);
 };
-// A row of the Jacobian times `shown`.
+// Returns a row of the Jacobian times `shown`.
 auto along_row = [&](int r) {
     float total = 0.0f;
     if (r < KEPT) {
@@ -78,39 +80,40 @@ auto along_row = [&](int r) {
     return total;
 };
 
-// Derivative of the cost of dry friction at x. `side` tells the pieces of the cost apart: the curvature where it is quadratic.
-[[maybe_unused]] auto rub = [](float d, float loss, float at, float& side) {
-    side = d;
-    if (d * at > loss) { side = -1.0f; return loss; }
-    if (d * at < -loss) { side = -2.0f; return -loss; }
+// Returns the derivative of the dry friction cost at x. `state` becomes the curvature on the quadratic piece of the cost, and
+// -1 or -2 on the linear pieces.
+[[maybe_unused]] auto rub = [](float d, float loss, float at, float& state) {
+    state = d;
+    if (d * at > loss) { state = -1.0f; return loss; }
+    if (d * at < -loss) { state = -2.0f; return -loss; }
     return d * at;
 };
-// The same where it is on this side, or would be.
-[[maybe_unused]] auto rub_on = [](float d, float loss, float at, float& side) {
-    if (side == IDLE) return 0.0f;
-    if (side < IDLE) return side == SLIPPING ? loss : -loss;
-    side = d;
+// Returns the same derivative on the piece that `state` names, even if x lies on another piece.
+[[maybe_unused]] auto rub_on = [](float d, float loss, float at, float& state) {
+    if (state == IDLE) return 0.0f;
+    if (state < IDLE) return state == SLIPPING ? loss : -loss;
+    state = d;
     return d * at;
 };
-// The same of a row.
-auto pull = [&](int r, float at, float& side) {
+// Returns the derivative of the cost of row r, and its `state` in the same way.
+auto pull = [&](int r, float at, float& state) {
     const float d = D[r];
-    side = d;
-    if (r >= nf && at >= 0.0f) { side = 0.0f; return 0.0f; }
-    if (FRICTION && !DRY && r >= ne && r < nf) return rub(d, number_of(arrays.frictionloss, r), at, side);
+    state = d;
+    if (r >= nf && at >= 0.0f) { state = 0.0f; return 0.0f; }
+    if (FRICTION && !DRY && r >= ne && r < nf) return rub(d, number_of(arrays.frictionloss, r), at, state);
     return d * at;
 };
 
-meet();  // of the world before
+meet();  // wait until the previous world is finished
 if (DRY) EACH(i, NV) {
     dry_row[i] = -1;
     dry_D[i] = dry_loss[i] = dry_reference[i] = dry_curvature[i] = 0.0f;
-    dry_sides[i] = UNKNOWN;
+    dry_states[i] = UNKNOWN;
 }
 ROLLED EACH(k, NV * STRIDE) M[k] = 0.0f;
 #if defined(__CUDA_ARCH__)
 {
-    struct alignas(16) Four { float of[4]; };  // a row is padded to whole ones
+    struct alignas(16) Four { float of[4]; };  // a row is padded to whole vectors
     const int FOURS = (NV + 3) / 4, kept = rows < KEPT ? rows : KEPT;
     BY_FOUR EACH(k, kept * FOURS) {
         const int r = k / FOURS, c = 4 * (k % FOURS);
@@ -121,7 +124,7 @@ ROLLED EACH(k, NV * STRIDE) M[k] = 0.0f;
 EACH_ROW(r) {
     D[r] = number_of(arrays.stiffness, r);
     x[r] = -number_of(arrays.reference, r);
-    sides[r] = UNKNOWN;
+    states[r] = UNKNOWN;
 }
 EACH_DOF(i) {
     OF(a, i) = arrays.warmstart.data[world * arrays.warmstart.shape[1] + i];
@@ -151,12 +154,12 @@ EACH_DOF(i) {
     OF(rest, i) = total - smooth(i);
 }
 EACH_ROW(r) x[r] += along_row(r);
-// The sides of the last step, but after a reset, which leaves no acceleration to begin with.
+// Read the row states of the last step. After a reset there is no acceleration to start from, and they are not used.
 [[maybe_unused]] auto last_rows = [&](int k) -> int& {
     return arrays.last_rows.data[(long long)world * arrays.last_rows.shape[1] + k];
 };
 [[maybe_unused]] auto key_of = [&](int row) { return arrays.row_key.data[(long long)world * arrays.row_key.shape[1] + row]; };
-int had = 0;  // rows in the last step
+int had = 0;  // number of rows in the last step
 if (KNOWN) {
     bool moving = false;
     EACH_DOF(i) moving |= OF(a, i) != 0.0f;
@@ -164,8 +167,8 @@ if (KNOWN) {
     int* before = reinterpret_cast<int*>(force);
     EACH(k, had) before[k] = last_rows(1 + k);
     meet();
-    // Of the k-th row after equalities; it often has the place that it had.
-    auto side_of = [&](int k) {
+    // Returns the state of the k-th row after the equalities. A row often has the same place as in the last step.
+    auto state_of = [&](int k) {
         const int key = key_of(ne + k);
         int place = k;
         if (k >= had || before[k] >> 2 != key) {
@@ -178,8 +181,8 @@ if (KNOWN) {
         }
         return (before[place] & 3) - 2;
     };
-    EACH_ROW(r) if (r >= ne) sides[r] = side_of(efc_row(r) - ne);
-    if (DRY) EACH(i, NV) if (dry_row[i] >= 0) dry_sides[i] = side_of(dry_row[i] - ne);
+    EACH_ROW(r) if (r >= ne) states[r] = state_of(efc_row(r) - ne);
+    if (DRY) EACH(i, NV) if (dry_row[i] >= 0) dry_states[i] = state_of(dry_row[i] - ne);
     meet();
 }
 if (SPLIT) EACH_ROW(r) {

@@ -1,42 +1,43 @@
-// MuJoCo's Newton solver for the constraint forces of one world, after constraint_rows.h, elliptic_cones.h and elimination.h.
-// Constants: DAMPED (whether dampers are integrated implicitly), SPLIT, FRICTION, ELLIPTIC, KNOWN (as there).
+// MuJoCo's Newton solver for the constraint forces of one world. It follows constraint_rows.h, elliptic_cones.h and
+// elimination.h. Constants: DAMPED (dampers are integrated implicitly), and SPLIT, FRICTION, ELLIPTIC, KNOWN as in those
+// files.
 
 int round = 0;
 const float INFINITE = 3.0e38f, ENOUGH = 0.1f;
-float alpha = 0.0f;  // of the last step; a whole one on which no row changes sides leads to the lowest point
-[[maybe_unused]] float dragged[DOFS];  // the force of dry friction, against the motion
+float alpha = 0.0f;  // length of the last step; after a full step without changed states, the minimum is reached
+[[maybe_unused]] float dragged[DOFS];  // dry friction, as a force against the motion
 while (true) {
-    // The first step goes all the way to the lowest point of the quadratic function that the sides of the last step make.
+    // The first step goes to the minimum of the quadratic function that the states of the last step define.
     const bool guessing = KNOWN && round == 0 && had > 0;
     if (!advancing) {
-        // Forces, whether rows changed sides, and the gradient.
+        // Compute the forces, whether rows changed their states, and the gradient.
         bool changed = false;
         EACH_ROW(r) {
             if (ELLIPTIC && directions[r] < 0) continue;
-            int side;
+            int state;
             if (ELLIPTIC && directions[r] > 0) {
-                side = press(r);
-                changed |= side == 2;  // there the cost is not quadratic
+                state = press(r);
+                changed |= state == 2;  // there the cost is not quadratic
             } else {
-                float piece = sides[r];
-                const bool given = guessing && sides[r] != UNKNOWN;
+                float piece = states[r];
+                const bool given = guessing && states[r] != UNKNOWN;
                 const float loss = FRICTION && !DRY && r < nf ? number_of(arrays.frictionloss, r) : 0.0f;
                 force[r] = given ? -rub_on(D[r], loss, x[r], piece) : -pull(r, x[r], piece);
                 curvature[r] = most(piece, 0.0f);
-                side = piece > 0.0f ? 1 : (int)piece;
+                state = piece > 0.0f ? 1 : (int)piece;
             }
-            changed |= side != sides[r];
-            sides[r] = side;
+            changed |= state != states[r];
+            states[r] = state;
         }
         if (DRY) EACH_DOF(i) {
-            float piece = dry_sides[i];
-            const bool given = guessing && dry_sides[i] != UNKNOWN;
+            float piece = dry_states[i];
+            const bool given = guessing && dry_states[i] != UNKNOWN;
             const float at = OF(a, i) - dry_reference[i];
             OF(dragged, i) = given ? rub_on(dry_D[i], dry_loss[i], at, piece) : rub(dry_D[i], dry_loss[i], at, piece);
             dry_curvature[i] = most(piece, 0.0f);
-            const int side = piece > 0.0f ? 1 : (int)piece;
-            changed |= side != dry_sides[i];
-            dry_sides[i] = side;
+            const int state = piece > 0.0f ? 1 : (int)piece;
+            changed |= state != dry_states[i];
+            dry_states[i] = state;
         }
         if (ELLIPTIC) meet();
         bool coupled = false;
@@ -65,7 +66,7 @@ while (true) {
             advancing = true;
         }
     }
-    // The step s = -H^-1 grad, or the acceleration.
+    // Compute the step s = -H^-1 grad, or the acceleration with implicit dampers.
     EACH_DOF(i) shown[i] = OF(s, i) = DAMPED && advancing ? OF(rest, i) + smooth(i) - OF(grad, i) : -OF(grad, i);
     meet();
     if (SPLIT && (advancing || !several)) solve(Branches{}); else solve(Path{});
@@ -74,7 +75,7 @@ while (true) {
         break;
     }
 
-    // Along the step: derivative slope + alpha * bend of the inertial part, and of every row.
+    // Along the step, compute the derivative slope + alpha * bend of the inertial part, and J s for every row.
     float sums[4] = {};
     EACH_DOF(i) {
         float total = 0.0f;
@@ -87,7 +88,7 @@ while (true) {
     }
     sum_four(sums);
     const float slope = sums[0], bend = sums[1], length = sums[2], decrement = sums[3];
-    // Nothing to gain; also where something is not a number.
+    // Stop if the step gains too little, or if a number is NaN.
     if (!(scale * 0.5f * decrement >= (guessing ? -INFINITE : tolerance))) {
         if (!DAMPED) break;
         advancing = true;
@@ -95,11 +96,11 @@ while (true) {
     }
     EACH_ROW(r) jv[r] = along_row(r);
     if (ELLIPTIC) meet();
-    // It need not be followed to its lowest point: what is left of its slope goes in the next round.
+    // The line search need not reach the minimum: the next iteration reduces the rest of the slope.
     const float flat = most(tolerance * ls_tolerance * sqrtf(length) / scale, ENOUGH * decrement);
     alpha = 1.0f;
     float low = 0.0f, high = -1.0f;
-    // Nor does it pay to look before the second step: the sides that it goes by are mostly right.
+    // The second step needs no line search either, since the row states that it starts from are mostly right.
     const bool whole = guessing || (KNOWN && round == 1);
     ROLLED for (int k = whole ? most_searches : 0; k < most_searches; ++k) {
         float first = 0.0f, second = 0.0f;
@@ -122,7 +123,7 @@ while (true) {
         if (!(fabsf(first) > flat)) break;
         if (first < 0.0f) low = alpha; else high = alpha;
         float next = alpha - first / second;
-        if (fabsf(next - alpha) <= 1e-7f * alpha) break;  // as near as float32 gets
+        if (fabsf(next - alpha) <= 1e-7f * alpha) break;  // limit of float32
         if (high > 0.0f && (next <= low || next >= high)) next = 0.5f * (low + high);
         alpha = next;
     }
@@ -147,7 +148,7 @@ if (DRY) EACH_DOF(i) {
 }
 if (lane == 0) arrays.rounds.data[world] = round;
 if (KNOWN) {
-    EACH_ROW(r) if (r >= ne) last_rows(1 + efc_row(r) - ne) = key_of(efc_row(r)) << 2 | (sides[r] + 2);
-    if (DRY) EACH_DOF(i) if (dry_row[i] >= 0) last_rows(1 + dry_row[i] - ne) = i << 2 | (dry_sides[i] + 2);
+    EACH_ROW(r) if (r >= ne) last_rows(1 + efc_row(r) - ne) = key_of(efc_row(r)) << 2 | (states[r] + 2);
+    if (DRY) EACH_DOF(i) if (dry_row[i] >= 0) last_rows(1 + dry_row[i] - ne) = i << 2 | (dry_states[i] + 2);
     if (lane == 0) last_rows(0) = of_all - ne;
 }

@@ -1,11 +1,12 @@
-"""MuJoCo's Newton solver for constraint forces, in one launch: a warp of threads for each world, all its data on the chip.
+"""MuJoCo's Newton solver for constraint forces in one launch: one warp of threads per world, whose data stay on the chip.
 
-mujoco-warp takes about ten launches for a round of the solver and goes on until the slowest of all worlds has converged;
-here a world that is done is done. What is minimised is the same (Todorov, ICRA 2014; MuJoCo documentation, "Computation"):
-0.5 (a - a0)^T M (a - a0) + sum_r s_r(J_r a - aref_r) over accelerations a, with s_r quadratic on the side where a limit
-or an edge of a friction pyramid pushes, and Huber's function for dry friction. Newton's method on that piecewise quadratic
-function with a line search ends where no row changes sides any more. It begins with the sides of the last step
-(row_sides.py): the lowest point of the quadratic function that they make is most often the solution, or near it.
+mujoco-warp needs about ten launches per iteration of the solver, and iterates until the slowest world has converged. Here
+each world stops on its own. The objective is the same (Todorov, ICRA 2014; MuJoCo documentation, "Computation"): 0.5 (a -
+a0)^T M (a - a0) + sum_r s_r(J_r a - aref_r) over accelerations a. For a limit or an edge of a friction pyramid, s_r is
+quadratic on the side on which the constraint exerts force; for dry friction it is Huber's function. The objective is
+piecewise quadratic. Newton's method with a line search ends when no row changes its state, that is, the piece of its cost. It
+starts with the active set of the last step (active_set.py): the minimum of the quadratic function that these states define is
+usually at or near the solution.
 """
 
 from typing import Any
@@ -14,8 +15,8 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from legged.physics.fused.active_set import ROW_STATES, ActiveSet
 from legged.physics.fused.native import LANES, Constant, lanes_of, native_source
-from legged.physics.fused.row_sides import SIDES, RowSides
 from legged.physics.fused.solver_arrays import SolverArrays
 from legged.physics.fused.tree import MOST_DOFS, Tree
 from legged.physics.fused.wide_solver import WIDE, fits_wide, wide_constants, wide_kernel
@@ -24,14 +25,15 @@ SOURCE = ("constraint_rows.h", "elliptic_cones.h", "elimination.h", "constraint_
 ELLIPTIC_ROW = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)
 MOST_ROWS = 512
 KEPT_BYTES = 3600
-"""Of a Jacobian in a block's shared memory: more rows are read from elsewhere, so that more worlds are computed at once."""
+"""Size of the part of a Jacobian that a block keeps in shared memory. Further rows are read from global memory, so that more
+worlds run at once."""
 MULTIPROCESSOR_BYTES, BYTES_OF_A_BLOCK = 228 * 1024, 1024
-"""Shared memory of a multiprocessor (an H100's), and what each block takes of it for itself."""
+"""Shared memory of a multiprocessor (of an H100), and the part of it that each block reserves."""
 
 
 def row_length(nv: int) -> int:
-    """Floats from one row of a matrix in shared memory to the next: whole vectors of four, an odd number of them, so that
-    lanes that read rows side by side meet different banks.
+    """Return the number of floats between rows of a matrix in shared memory: an odd number of vectors of four, so that lanes
+    that read different rows use different banks.
     """
     return 4 * (-(-nv // 4) | 1)
 
@@ -46,9 +48,17 @@ def solver_constants(
     elliptic: bool = False,
     known: bool = False,
 ) -> dict[str, int | bool]:
-    """Return what the sources ask for, of models of a tree, with at most `rows` constraint rows and `entries` of the mass
-    matrix, with dampers to integrate implicitly or without, with rows of dry friction, all of which are `dry` degrees of
-    freedom and none tendons, with elliptic cones, and with rows that are `known` again from step to step.
+    """Return the constants of the native sources for models with one elimination tree.
+
+    Args:
+        tree: elimination tree of the degrees of freedom.
+        rows: largest number of constraint rows.
+        entries: number of stored entries of the mass matrix.
+        damped: True if dampers are integrated implicitly.
+        friction: True if there are rows of dry friction.
+        dry: True if all rows of dry friction belong to degrees of freedom, and none to tendons.
+        elliptic: True for elliptic friction cones.
+        known: True if rows have keys by which their states of the last step are found.
     """
     nv = len(tree.parent)
     sizes = {"NV": nv, "ROWS": rows, "STRIDE": row_length(nv), "ENTRIES": entries}
@@ -61,12 +71,12 @@ def solver_constants(
         "ELLIPTIC_ROW": ELLIPTIC_ROW,
         "KNOWN": known and not elliptic,
     }
-    return {**sizes, **kinds, **SIDES, **tree.constants()}
+    return {**sizes, **kinds, **ROW_STATES, **tree.constants()}
 
 
 def blocks(constants: dict[str, int | bool]) -> int:
-    """Return how many worlds a multiprocessor shall hold at least, which bounds the registers of a lane: as many as have room
-    in its shared memory, the same for each of its four schedulers.
+    """Return the number of worlds that a multiprocessor must hold at least, which limits the registers per lane: as many as
+    fit its shared memory, a multiple of its four schedulers.
     """
     nv, rows, stride = constants["NV"], constants["ROWS"], constants["STRIDE"]
     pitch, path = (4 * ((n + 4) // 4) for n in (constants["DEPTH"], nv))
@@ -77,7 +87,7 @@ def blocks(constants: dict[str, int | bool]) -> int:
 
 
 def solver_kernel(constants: dict[str, int | bool]) -> Any:
-    """Return the kernel for some `solver_constants`; launched for (worlds, lanes)."""
+    """Return the kernel for a set of `solver_constants`. It is launched for (worlds, lanes)."""
 
     @wp.func_native(native_source(SOURCE, constants))
     def solve_world(
@@ -95,33 +105,38 @@ def solver_kernel(constants: dict[str, int | bool]) -> Any:
 
 
 def ask_for_dense_rows(model: mujoco.MjModel) -> None:
-    """Let mujoco-warp keep the Jacobian's rows whole, as this solver reads them; above 32 degrees of freedom it would not."""
+    """Make mujoco-warp store dense rows of the Jacobian, which this solver reads. By default it stores sparse rows above 32
+    degrees of freedom.
+    """
     if model.nv <= MOST_DOFS:
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
 
 
 class ConstraintSolver:
-    """Constraint forces and accelerations of all worlds, from what mujoco-warp has put into its data."""
+    """Constraint forces and accelerations of all worlds, from mujoco-warp's data."""
 
     advance: wp.array2d
-    """(worlds, nv) the accelerations that integrate velocities: `qacc`, or with dampers integrated implicitly another."""
+    """(worlds, nv) accelerations that integrate velocities: `qacc`, or another array if dampers are integrated implicitly."""
 
-    def __init__(self, model: mujoco.MjModel, m: Any, d: Any, damped: bool = False, sides: RowSides | None = None) -> None:
-        """Prepare the launch for mujoco-warp's `m` and `d` of a model, of which `why_not` says nothing; with `damped`,
-        compute what integrates dampers implicitly too; with `sides`, begin with those of the last step, but with elliptic
-        cones, which have no sides where they slide. Call with their device as Warp's current one.
+    def __init__(
+        self, model: mujoco.MjModel, m: Any, d: Any, damped: bool = False, active_set: ActiveSet | None = None
+    ) -> None:
+        """Prepare the launch for mujoco-warp's `m` and `d` of a model for which `why_not` is empty. With `damped`, also
+        compute the acceleration with implicitly integrated dampers. With `active_set`, start from the states of the last
+        step; elliptic cones do not use it, since a sliding cone's cost is not quadratic. Warp's current device must be that
+        of `m` and `d`.
         """
         tree, elliptic = Tree.of(model), m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
         friction = not m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
         counts, columns = m.M_rownnz.numpy(), m.M_colind.numpy()
         dry = not model.ntendon
         rows = np.repeat(np.arange(m.nv), counts)
-        self.constants = solver_constants(tree, d.njmax, len(rows), damped, friction, dry, elliptic, sides is not None)
+        self.constants = solver_constants(tree, d.njmax, len(rows), damped, friction, dry, elliptic, active_set is not None)
         self.wide: dict[str, Constant] | None = None
-        """What wide_solver.h was asked for, where it is what solves: on a CPU."""
+        """Constants of wide_solver.h if it is the solver, which is on a CPU; None otherwise."""
         if d.qacc.device.is_cpu and not elliptic and fits_wide(m.nv, d.njmax):
             entries = rows, columns[: len(rows)]
-            self.wide = wide_constants(tree, entries, d.njmax, damped, friction, sides is not None)
+            self.wide = wide_constants(tree, entries, d.njmax, damped, friction, active_set is not None)
         self._kernel = solver_kernel(self.constants) if self.wide is None else wide_kernel(self.wide)
         self._lanes = lanes_of(d.qacc.device)
         efc, opt = d.efc, m.opt
@@ -146,24 +161,24 @@ class ConstraintSolver:
         self.advance = wp.zeros_like(d.qacc) if damped else d.qacc
         arrays.timestep, arrays.damping, arrays.advance = opt.timestep, m.dof_damping, self.advance
         nothing = wp.empty((0, 0), dtype=int)
-        arrays.row_key, arrays.last_rows = (nothing, nothing) if sides is None else (sides.key, sides.last)
+        arrays.row_key, arrays.last_rows = (nothing, nothing) if active_set is None else (active_set.key, active_set.last)
         self._worlds = d.nworld
 
     @staticmethod
     def why_not(m: Any, d: Any) -> str:
-        """Return what of a model this solver does not know; empty if nothing."""
+        """Return the reason why this solver does not support a model; empty if it does."""
         if not 1 <= m.nv <= MOST_DOFS:
-            return f"it takes 1 to {MOST_DOFS} degrees of freedom, the model has {m.nv}"
+            return f"the model has {m.nv} degrees of freedom; 1 to {MOST_DOFS} are supported"
         if m.is_sparse:
-            return "mujoco-warp keeps the model's Jacobians sparse"
+            return "mujoco-warp stores sparse Jacobians for the model"
         if d.njmax > MOST_ROWS:
-            return f"{d.njmax} constraint rows (sim.njmax) are more than {MOST_ROWS}"
+            return f"{d.njmax} constraint rows (sim.njmax) exceed {MOST_ROWS}"
         if m.opt.solver != mujoco.mjtSolver.mjSOL_NEWTON:
             return "the model's solver is not Newton"
         if m.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
             return "the model's integrator is not Euler"
         if m.opt.noslip_iterations:
-            return "the model asks for noslip iterations"
+            return "the model uses noslip iterations"
         if m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART:
             return "the model disables warm starts"
         if max(len(m.opt.tolerance), len(m.opt.ls_tolerance)) > 1:

@@ -1,4 +1,4 @@
-"""The kernel that finds contacts and makes rows of constraints, its arrays and its constants."""
+"""Kernel that finds contacts and makes constraint rows, with its arrays and constants."""
 
 from typing import Any
 
@@ -10,19 +10,21 @@ from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import ConstraintType, ContactType
 
 from legged.physics.collider import shapes
+from legged.physics.collider.contact_features import find_hits
 from legged.physics.collider.ground import Ground, Hits
-from legged.physics.collider.probes import look
 from legged.physics.fused.native import LANES, native_source
 
 SOURCE = ("contact_stage.h",)
-"""Of what the native function is put together."""
+"""Source files of the native function."""
 Vector5 = wp.types.vector(length=5, dtype=wp.float32)
 FLAGS, CONES = mujoco.mjtDisableBit, mujoco.mjtCone
 
 
 @wp.struct
 class StageArrays:
-    """Tables of our own, and what the launch reads of mujoco-warp's model and data; from `equalities` on what it writes."""
+    """Arrays of the kernel. It reads its own tables and arrays of mujoco-warp's model and data, and writes the arrays from
+    `equalities` on. Arrays `touch_*` have one row per `ContactPair`.
+    """
 
     touch_geom: wp.array[wp.vec2i]
     touch_margin: wp.array[float]
@@ -92,23 +94,25 @@ NAMES = {
     "row_type": "efc.type",
     "row_id": "efc.id",
 }
-"""What mujoco-warp's data calls them, where it is something else."""
+"""Array -> its name in mujoco-warp's data, where the names differ."""
 
 
 @wp.struct
 class Candidates:
-    """What may touch, item by item: points of shapes on planes, pairs of spheres and capsules, probes of the ground."""
+    """Candidates for contacts: points of shapes on planes, pairs of spheres and capsules, and contact features above the
+    height map. Arrays `*_touch` hold the index of the candidate's `ContactPair`.
+    """
 
     point_touch: wp.array[int]
     point_kind: wp.array[int]
     point_place: wp.array[wp.vec3]
     point_radius: wp.array[float]
     pair_touch: wp.array[int]
-    probe_touch: wp.array[int]
-    probe_kind: wp.array[int]
-    probe_start: wp.array[wp.vec3]
-    probe_end: wp.array[wp.vec3]
-    probe_radius: wp.array[float]
+    feature_touch: wp.array[int]
+    feature_kind: wp.array[int]
+    feature_start: wp.array[wp.vec3]
+    feature_end: wp.array[wp.vec3]
+    feature_radius: wp.array[float]
     geom_size: wp.array[wp.vec3]
     geom_xpos: wp.array2d[wp.vec3]
     geom_xmat: wp.array2d[wp.mat33]
@@ -126,7 +130,7 @@ def keep(
     pos: wp.vec3,
     frame: wp.mat33,
 ) -> None:
-    """Put a contact into a slot of its world, if there are so many; `mark` is by what it was found."""
+    """Write a contact into a slot of its world, if the slot exists. `mark` identifies the candidate that made the contact."""
     if slot < most:
         at = world * most + slot
         arrays.contact_touch[at] = touch
@@ -137,7 +141,9 @@ def keep(
 
 
 def stage_kernel(constants: dict[str, int | bool], planes: bool, pairs: bool, ground: bool) -> Any:
-    """Return the kernel for some `stage_constants`, of models of which these may touch; launched for (worlds, lanes)."""
+    """Return the kernel for a set of `stage_constants`. The flags tell which kinds of candidates a model has: points on
+    `planes`, `pairs` of round shapes, contact features on the `ground`. It is launched for (worlds, lanes).
+    """
     contacts_of_world = stage_function(constants, planes, pairs, ground)
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=(LANES, 32))
@@ -149,11 +155,11 @@ def stage_kernel(constants: dict[str, int | bool], planes: bool, pairs: bool, gr
 
 
 def stage_function(constants: dict[str, int | bool], planes: bool, pairs: bool, ground: bool) -> Any:
-    """Return what the kernel does for one world, by one of so many lanes."""
+    """Return the device function of the kernel, which one lane calls for one world."""
     most = int(constants["SLOTS"])
 
-    @wp.func_native(native_source(("deal.h",), {}))
-    def deal(count: int) -> int:  # type: ignore[empty-body]
+    @wp.func_native(native_source(("prefix_sum.h",), {}))
+    def prefix_sum(count: int) -> int:  # type: ignore[empty-body]
         ...
 
     @wp.func_native(native_source(SOURCE, constants))
@@ -186,10 +192,10 @@ def stage_function(constants: dict[str, int | bool], planes: bool, pairs: bool, 
                     )
                     if hit.dist < arrays.touch_margin[touch]:
                         count = 1
-                dealt = deal(count)
+                packed = prefix_sum(count)
                 if count > 0:
-                    keep(arrays, found + (dealt & 0xFFFF), most, world, touch, item, hit.dist, hit.pos, hit.frame)
-                found += dealt >> 16
+                    keep(arrays, found + (packed & 0xFFFF), most, world, touch, item, hit.dist, hit.pos, hit.frame)
+                found += packed >> 16
         if wp.static(pairs):
             for start in range(0, items.pair_touch.shape[0], lanes):
                 item = start + lane
@@ -216,54 +222,54 @@ def stage_function(constants: dict[str, int | bool], planes: bool, pairs: bool, 
                         for k in range(2):
                             if dist[k] < margin:
                                 count += 1
-                dealt = deal(count)
-                slot = found + (dealt & 0xFFFF)
+                packed = prefix_sum(count)
+                slot = found + (packed & 0xFFFF)
                 if count > 0:
                     for k in range(2):
                         if dist[k] < margin:
                             mark = items.point_touch.shape[0] + 2 * item + k
                             keep(arrays, slot, most, world, touch, mark, dist[k], pos[k], make_frame(normal[k]))
                             slot += 1
-                found += dealt >> 16
+                found += packed >> 16
         if wp.static(ground):
-            for start in range(0, items.probe_touch.shape[0], lanes):
+            for start in range(0, items.feature_touch.shape[0], lanes):
                 item = start + lane
                 touch = wp.int32(0)
                 radius = wp.float32(0.0)
-                row = world * items.probe_touch.shape[0] + item
+                row = world * items.feature_touch.shape[0] + item
                 count = wp.int32(0)
-                if item < items.probe_touch.shape[0]:
-                    touch = items.probe_touch[item]
+                if item < items.feature_touch.shape[0]:
+                    touch = items.feature_touch[item]
                     geom = arrays.touch_geom[touch][1]
-                    radius = items.probe_radius[item]
+                    radius = items.feature_radius[item]
                     near = radius + arrays.touch_margin[touch]
                     position, turn = items.geom_xpos[world, geom], items.geom_xmat[world, geom]
-                    count = look(
+                    count = find_hits(
                         cells,
-                        items.probe_kind[item],
+                        items.feature_kind[item],
                         position,
                         turn,
-                        items.probe_start[item],
-                        items.probe_end[item],
+                        items.feature_start[item],
+                        items.feature_end[item],
                         near,
                         hits,
                         row,
                     )
-                dealt = deal(count)
+                packed = prefix_sum(count)
                 for k in range(count):
                     up = hits.normal[row, k]
                     depth = hits.dist[row, k] - radius
                     middle = hits.point[row, k] - up * (radius + 0.5 * depth)
                     mark = items.point_touch.shape[0] + 2 * items.pair_touch.shape[0] + hits.dist.shape[1] * item + k
-                    keep(arrays, found + (dealt & 0xFFFF) + k, most, world, touch, mark, depth, middle, make_frame(up))
-                found += dealt >> 16
+                    keep(arrays, found + (packed & 0xFFFF) + k, most, world, touch, mark, depth, middle, make_frame(up))
+                found += packed >> 16
         make_rows(world, found, arrays)
 
     return contacts_of_world
 
 
 def shared_bytes(constants: dict[str, int | bool]) -> int:
-    """Return what contact_stage.h takes of a block's shared memory for some `stage_constants`."""
+    """Return the shared memory of a block [bytes] that contact_stage.h uses with a set of `stage_constants`."""
     return 112 * constants["SLOTS"] + 16 * constants["PLAIN"]
 
 
@@ -277,9 +283,17 @@ def stage_constants(
     bounces: bool = False,
     dense_friction: bool = True,
 ) -> dict[str, int | bool]:
-    """Return what contact_stage.h asks for, of a model with room for so many rows and contacts in each world, of at most
-    `dim` directions, with dry friction and limits or without, and with springs of contacts that differ from world to world.
-    Without `dense_friction`, dry friction has no rows of the Jacobian, only the other numbers.
+    """Return the constants of contact_stage.h.
+
+    Args:
+        model: MuJoCo's model.
+        rows: largest number of constraint rows per world.
+        slots: largest number of contacts per world.
+        dim: largest number of directions of a contact.
+        frictions: True if there are rows of dry friction.
+        limits: True if there are rows of joint limits.
+        bounces: True if the springs of contacts differ between worlds.
+        dense_friction: False if the rows of dry friction need no entries in the Jacobian.
     """
     return {
         **{"NV": model.nv, "NJ": model.njnt, "ROWS": rows, "SLOTS": slots, "DIMS": dim},

@@ -1,19 +1,21 @@
-// Rows of the constraints of one world: of dry friction, joint limits, and the `found` contacts that lie in the world's slots;
-// behind those of equalities, which are there. Constants: NV, NJ (degrees of freedom, joints), ROWS, SLOTS (most rows, most
-// contacts), PLAIN (most rows of friction and limits), DIMS (most directions of a contact), FRICTIONS, LIMITS, BALLS,
-// EQUALITIES (what there is of them), DENSE_FRICTION (whether the Jacobian's rows of dry friction are read), BOUNCES (whether
-// worlds differ in the springs of contacts), ELLIPTIC (friction cones, instead of pyramids), and MuJoCo's numbers: BALL,
-// CONSTRAINT (a type of contact), FRICTIONLESS, FRICTIONAL (types of rows), NARROWPHASE (a flag of overflow).
-// A row has a key, by which the solver knows it again: rising from row to row, first of degrees of freedom, then of joints, then
-// of what found a contact.
+// Constraint rows of one world: dry friction, joint limits, and the `found` contacts in the world's slots. They follow the
+// rows of equality constraints, which exist already. Constants: NV, NJ (degrees of freedom, joints), ROWS, SLOTS (largest
+// numbers of rows, of contacts), PLAIN (largest number of rows of friction and limits), DIMS (largest number of directions of
+// a contact), FRICTIONS, LIMITS, BALLS, EQUALITIES (the model has dry friction, joint limits, ball joints, equality
+// constraints), DENSE_FRICTION (the Jacobian's rows of dry friction are read), BOUNCES (the springs of contacts differ
+// between worlds), ELLIPTIC (friction cones instead of pyramids), and MuJoCo's numbers BALL, CONSTRAINT (a type of contact),
+// FRICTIONLESS, FRICTIONAL (types of rows), NARROWPHASE (an overflow flag). Each row has a key, by which the solver finds its
+// state of the last step. Keys ascend from row to row: first those of degrees of freedom, then of joints, then of candidates
+// for contacts.
 
-// Of a contact: its offsets from the two trees' centres of mass, its axes, friction, and what its rows are made of.
+// Record of a contact: its offsets from the centres of mass of the two trees, its axes, its friction coefficients, and the
+// parameters of its rows.
 const int OFFSET = 0, FRAME = 6, FRICTION = 15, STIFFNESS = 20, PULL = 21, DAMPING = 22, SLIDING = 23, RECORD = 24;
 const int HELD = (NV + LANES - 1) / LANES;
 const int MOST_EDGES = 2 * (DIMS > 1 ? DIMS - 1 : 1);  // rows of a contact
 LEGGED_SHARED float record[SLOTS * RECORD];
 LEGGED_SHARED int directions[SLOTS], first_row[SLOTS], bodies[2 * SLOTS];
-LEGGED_SHARED float entry[3 * PLAIN];  // up to three numbers side by side are all of a row of friction or of a limit
+LEGGED_SHARED float entry[3 * PLAIN];  // a row of friction or of a limit has up to three adjacent entries
 LEGGED_SHARED int entry_dof[PLAIN];
 const float TINY = 1e-15f, LEAST_FRICTION = 1e-5f;
 
@@ -22,8 +24,8 @@ auto row_of = [&](const auto& array, int length) {
     const int given = array.shape[0];
     return given == 1 ? data : data + (long long)(world < given ? world : world % given) * length;
 };
-// Impedance of a constraint that is violated by -pos, and what each spring holds: stiffness, damping, then how the impedance
-// goes from its least to its most.
+// Returns the impedance of a constraint with violation -pos. A spring holds stiffness, damping, and the parameters of the
+// impedance curve, from its least to its greatest value (contact_pairs.py).
 const int SPRING = 7;
 auto impedance = [](const float* spring, float pos) {
     const float least = spring[2], greatest = spring[3], middle = spring[5], power = spring[6];
@@ -39,7 +41,7 @@ auto stiffness_of = [&](float inverse_weight, float impedance) {
     return 1.0f / most(inverse_weight * (1.0f - impedance) / impedance, TINY);
 };
 const int width = arrays.jacobian.shape[2];  // padded
-// A number of this world's row `row`, in an array of them: some are padded.
+// Returns a pointer to the number of this world's row `row`; some arrays are padded.
 auto at_row = [&](const auto& array, int row) { return array.data + (long long)world * array.shape[1] + row; };
 float* jacobian = arrays.jacobian.data + (long long)world * arrays.jacobian.shape[1] * width;
 auto put = [&](int row, int key, float stiffness, float reference, float loss) {
@@ -53,7 +55,7 @@ const float* v_in = arrays.qvel.data + (long long)world * NV;
 [[maybe_unused]] const float* q_in = arrays.qpos.data + (long long)world * arrays.qpos.shape[1];
 [[maybe_unused]] const float* dof_weights = row_of(arrays.dof_invweight0, NV);
 
-meet();  // of the world before, and of those who found contacts
+meet();  // wait until the previous world is finished, and all lanes have found their contacts
 const int start = EQUALITIES ? arrays.equalities.data[world] : 0;
 int rows = start;
 if (FRICTIONS) {
@@ -66,7 +68,8 @@ if (FRICTIONS) {
         if (!is) continue;
         const float* spring = arrays.dof_spring.data + i * SPRING;
         put(start + place, i, stiffness_of(dof_weights[i], impedance(spring, 0.0f)), -spring[1] * v_in[i], losses[i]);
-        if (start + place < ROWS) *at_row(arrays.row_id, start + place) = i;  // by which the solver knows whose friction it is
+        // tells the solver which degree of freedom the friction belongs to
+        if (start + place < ROWS) *at_row(arrays.row_id, start + place) = i;
         entry_dof[place] = i;
         for (int k = 0; k < 3; ++k) entry[3 * place + k] = k == 0 ? 1.0f : 0.0f;
     }
@@ -115,7 +118,7 @@ if (LIMITS) {
 }
 const int plain = rows - start;
 
-// A lane takes what there is to know of a contact, which all will need.
+// Each lane fills the record of one contact, which all lanes read later.
 const int contacts = found < SLOTS ? found : SLOTS;
 for (int from = 0; from < contacts; from += LANES) {
     const int c = from + lane;
@@ -144,7 +147,7 @@ for (int from = 0; from < contacts; from += LANES) {
     }
     const float* frame = reinterpret_cast<const float*>(arrays.contact_frame.data) + 9 * slot;
     for (int k = 0; k < 9; ++k) out[FRAME + k] = frame[k];
-    // Sliding friction is the same along both tangents, rolling friction about both.
+    // Sliding friction is the same along both tangents, and rolling friction about both.
     const int* rough = reinterpret_cast<const int*>(arrays.touch_rough.data) + 2 * touch;
     const float* frictions_of = row_of(arrays.geom_friction, 3 * arrays.geom_friction.shape[1]);
     const int column[5] = {0, 0, 1, 2, 2};
@@ -178,7 +181,8 @@ for (int from = 0; from < contacts; from += LANES) {
     arrays.contact_type.data[slot] = CONSTRAINT;
     arrays.contact_adhesion.data[slot] = 0.0f;
     int* addresses = arrays.contact_efc_address.data + slot * arrays.contact_efc_address.shape[1];
-    // Beyond the last row: readers ask for that, but at the first one, which says whether there are any, for a negative number.
+    // Addresses may lie beyond the last row, since readers compare them with the number of rows. The first address is
+    // negative if the contact has no row, since readers test its sign.
     for (int k = 0; k < needed; ++k) addresses[k] = k > 0 || row < ROWS ? row + k : -1;
 }
 for (int c = contacts + lane; c < SLOTS; c += LANES)
@@ -189,7 +193,7 @@ if (lane == 0) {
     arrays.nefc.data[world] = rows;
     if (!EQUALITIES) arrays.equalities.data[world] = 0;
     if (found > SLOTS) arrays.overflow.data[world] |= NARROWPHASE;
-    if (world == 0) arrays.nacon.data[0] = arrays.contact_dist.shape[0];  // all slots; empty ones have no rows
+    if (world == 0) arrays.nacon.data[0] = arrays.contact_dist.shape[0];  // all slots; empty slots have no rows
 }
 meet();
 const int unread = DENSE_FRICTION ? 0 : frictions;

@@ -1,12 +1,12 @@
-"""Contacts and all rows of constraints in one launch: a warp of threads for each world.
+"""Contacts and all constraint rows in one launch: one warp of threads per world.
 
-mujoco-warp takes some ten launches for it, and keeps the contacts of all worlds in one pool, in the order in which threads
-find room there. Here each world has slots of its own in mujoco-warp's arrays of contacts, filled in the order of the shapes;
-what reads them by a row's contact, or a contact's rows, finds what it knows.
+mujoco-warp needs about ten launches, and keeps the contacts of all worlds in one pool, in the order in which threads append
+them. Here each world has its own slots in mujoco-warp's contact arrays, which are filled in the order of the shapes. Indices
+from rows to contacts and from contacts to rows stay valid, so code that reads these arrays works unchanged.
 
-First, lanes look at points of shapes on planes, at pairs of spheres and capsules, and at what the ground of cells offers;
-then (contact_stage.h) they make rows of dry friction, joint limits and those contacts. Rows of equalities are
-mujoco-warp's own.
+The lanes first test points of shapes against planes, pairs of spheres and capsules, and contact features against the height
+map. Then (contact_stage.h) they make the rows of dry friction, joint limits and contacts. The rows of equality constraints
+are mujoco-warp's own.
 """
 
 from collections.abc import Collection
@@ -17,9 +17,10 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from legged.physics.collider import touches
+from legged.physics.collider import contact_pairs
 from legged.physics.collider.ground import Ground, Hits
 from legged.physics.collider.terrain_contact import TerrainContact
+from legged.physics.fused.active_set import ActiveSet
 from legged.physics.fused.contact_kernel import (
     NAMES,
     Candidates,
@@ -30,20 +31,19 @@ from legged.physics.fused.contact_kernel import (
     stage_kernel,
 )
 from legged.physics.fused.native import SHARED_BYTES, lanes_of
-from legged.physics.fused.row_sides import RowSides
 
 FIXED = (
     *("geom_size", "geom_margin", "geom_priority", "geom_solmix", "geom_solimp", "jnt_solref", "jnt_solimp"),
     *("dof_solref", "dof_solimp", "pair_margin", "pair_friction", "pair_solref", "pair_solimp"),
 )
-"""Arrays of the model that are read once, in which worlds may not differ."""
+"""Model arrays that are read once at construction, so they must not differ between worlds."""
 OWN_ARRAYS = ("jnt_limited", "contact_touch", "contact_mark", "row_key", "impratio_invsqrt", "dof_spring", "joint_spring")
-"""Of the launch, beside those of touches, that are not mujoco-warp's under a name of NAMES."""
+"""Arrays of the kernel, apart from `touch_*`, that are not arrays of mujoco-warp."""
 FLAGS = mujoco.mjtDisableBit
 
 
 class ContactStage:
-    """The collision stage and the rows of constraints of all worlds, from poses and velocities in mujoco-warp's data."""
+    """Collision detection and constraint rows of all worlds, from poses and velocities in mujoco-warp's data."""
 
     def __init__(
         self,
@@ -53,9 +53,9 @@ class ContactStage:
         randomized: Collection[str] = (),
         on_cells: TerrainContact | None = None,
     ) -> None:
-        """Prepare the launch for mujoco-warp's `m` and `d` of a `model` of which `why_not` says nothing, in whose arrays
-        `randomized` worlds differ, with the ground of cells that it stands on, if any. Call with their device as Warp's
-        current one.
+        """Prepare the launch for mujoco-warp's `m` and `d` of a `model` for which `why_not` is empty. `randomized` names the
+        arrays in which worlds differ; `on_cells` is the height-map collider, if the model stands on a height map. Warp's
+        current device must be that of `m` and `d`.
         """
         self._m, self._d = m, d
         flags = model.opt.disableflags
@@ -64,72 +64,76 @@ class ContactStage:
         limited = np.array(model.jnt_limited, dtype=int) * (not flags & FLAGS.mjDSBL_LIMIT)
         contacts = not flags & FLAGS.mjDSBL_CONTACT
         self.equalities = model.neq > 0 and not flags & FLAGS.mjDSBL_EQUALITY
-        all_pairs = touches.pairs_of(m) if contacts else []
-        pairs = [touches.touch_of(model, *pair) for pair in all_pairs]
-        probes = on_cells.probes if on_cells is not None and contacts else []
-        met = {probe.geom: len(pairs) + k for k, probe in enumerate({p.geom: p for p in probes}.values())}
+        all_pairs = contact_pairs.pairs_of(m) if contacts else []
+        pairs = [contact_pairs.contact_pair(model, *pair) for pair in all_pairs]
+        features = on_cells.features if on_cells is not None and contacts else []
+        met = {feature.geom: len(pairs) + k for k, feature in enumerate({p.geom: p for p in features}.values())}
         assert on_cells is not None or not met
         ground = -1 if on_cells is None else on_cells.terrain
-        self.touches = [*pairs, *(touches.touch_of(model, ground, geom) for geom in met)]
+        self.contact_pairs = [*pairs, *(contact_pairs.contact_pair(model, ground, geom) for geom in met)]
         """Pairs of shapes that may touch."""
-        on_planes = [model.geom_type[touch.geoms[0]] == touches.KINDS.mjGEOM_PLANE for touch in pairs]
+        on_planes = [model.geom_type[touch.geoms[0]] == contact_pairs.KINDS.mjGEOM_PLANE for touch in pairs]
         points = [
-            point for k, touch in enumerate(pairs) if on_planes[k] for point in touches.plane_points(model, k, touch.geoms[1])
+            point
+            for k, touch in enumerate(pairs)
+            if on_planes[k]
+            for point in contact_pairs.plane_points(model, k, touch.geoms[1])
         ]
         round_pairs = [k for k in range(len(pairs)) if not on_planes[k]]
 
-        self.sides = RowSides.of(d)
-        """By what rows are known again, for the solver to begin with what it last found out about them."""
+        self.active_set = ActiveSet.of(d)
+        """Keys of the rows, with which the solver finds their states of the last step."""
         self._arrays = self._stage_arrays(model, m, d)
         self._arrays.jnt_limited = wp.array(limited, dtype=int)
-        items = self._candidates(model, d, points, round_pairs, [(met[p.geom], p) for p in probes])
+        items = self._candidates(model, d, points, round_pairs, [(met[p.geom], p) for p in features])
         ground_of = (Ground(), Hits()) if on_cells is None else (on_cells.ground, on_cells.hits)
         self.inputs = [self._arrays, items, *ground_of]
-        """What the launch takes, beside the number of lanes."""
-        dim, slots = max((touch.dim for touch in self.touches), default=1), d.naconmax // d.nworld
+        """Arguments of the launch after the number of lanes."""
+        dim, slots = max((touch.dim for touch in self.contact_pairs), default=1), d.naconmax // d.nworld
         bounces, dense_friction = "geom_solref" in randomized, d.qacc.device.is_cpu or model.ntendon > 0
         self.constants = stage_constants(model, d.njmax, slots, dim, frictions, bool(limited.any()), bounces, dense_friction)
-        """What contact_stage.h was asked for."""
-        self.kinds = bool(points), bool(round_pairs), bool(probes)
-        """Whether points on planes, pairs of round shapes and probes of the ground may touch."""
+        """Constants of contact_stage.h."""
+        self.kinds = bool(points), bool(round_pairs), bool(features)
+        """Flags for the kinds of candidates that the model has: points on planes, pairs of round shapes, and contact features
+        on the ground."""
         self._kernel = stage_kernel(self.constants, *self.kinds)
         self._lanes = lanes_of(d.qacc.device)
 
     @staticmethod
     def why_not(model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = ()) -> str:
-        """Return what of a model, and of mujoco-warp's `m` and `d` of it, has no rows here, where worlds differ in the arrays
-        `randomized`; empty if nothing.
+        """Return the reason why a model, with mujoco-warp's `m` and `d` and worlds that differ in the arrays `randomized`, is
+        not supported; empty if it is.
         """
         if drawn := [name for name in FIXED if name in randomized]:
             return f"{drawn[0]} differs between worlds"
-        if "geom_solref" in randomized and not touches.alike_springs(model, touches.pairs_of(m)):
-            return "restitution differs between worlds, and shapes that touch have springs of their own"
+        if "geom_solref" in randomized and not contact_pairs.alike_springs(model, contact_pairs.pairs_of(m)):
+            return "restitution differs between worlds, and shapes that may touch have different solref"
         if m.is_sparse:
-            return "mujoco-warp keeps Jacobians sparse"
+            return "mujoco-warp stores sparse Jacobians for the model"
         if model.nflex or np.any(model.tendon_limited) or np.any(model.tendon_frictionloss):
             return "the model has flexes, or tendons with limits or friction"
         if np.any(model.geom_surfacevel) or np.any(model.geom_adhesion) or np.any(model.pair_adhesion):
-            return "the model has surfaces that move or stick"
+            return "the model has surface velocities or adhesion"
         if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
             return "the model's integrator is not Euler"
         if model.opt.disableflags & FLAGS.mjDSBL_CONSTRAINT:
             return "the model disables constraints"
         if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
-            return "the model overrides the parameters of contacts"
+            return "the model overrides contact parameters"
         slots = d.naconmax // d.nworld
         if shared_bytes(stage_constants(model, d.njmax, slots, dim=6, frictions=True, limits=True)) > SHARED_BYTES:
-            return f"{slots} contacts a world (sim.nconmax) do not fit a GPU's shared memory"
-        return touches.why_not(model, touches.pairs_of(m))
+            return f"{slots} contacts per world (sim.nconmax) exceed a GPU's shared memory"
+        return contact_pairs.why_not(model, contact_pairs.pairs_of(m))
 
     def launch(self) -> None:
-        """Find the contacts and make the rows, of where shapes are and how they move."""
+        """Find the contacts and make the constraint rows, for the current poses and velocities."""
         if self.equalities:
             self.launch_equalities()
         inputs = [self._lanes, *self.inputs]
         wp.launch(self._kernel, dim=(self._d.nworld, self._lanes), inputs=inputs, block_dim=self._lanes)
 
     def launch_equalities(self) -> None:
-        """Make the rows of equality constraints, which come before all others."""
+        """Make the rows of equality constraints, which precede all others."""
         opt = self._m.opt
         flags = opt.disableflags
         opt.disableflags |= FLAGS.mjDSBL_FRICTIONLOSS | FLAGS.mjDSBL_LIMIT | FLAGS.mjDSBL_CONTACT
@@ -137,18 +141,18 @@ class ContactStage:
         opt.disableflags = flags
 
     def _stage_arrays(self, model: mujoco.MjModel, m: Any, d: Any) -> Any:
-        """Return what contact_stage.h reads and writes."""
-        arrays, every = StageArrays(), self.touches
-        timestep, safe = float(model.opt.timestep), touches.is_safe(model)
+        """Return the arrays that the kernel reads and writes."""
+        arrays, every = StageArrays(), self.contact_pairs
+        timestep, safe = float(model.opt.timestep), contact_pairs.is_safe(model)
 
         def spring(solref: np.ndarray, solimp: np.ndarray) -> np.ndarray:
-            return touches.spring_of(solref, solimp, timestep, safe)
+            return contact_pairs.spring_of(solref, solimp, timestep, safe)
 
         def springs(solrefs: Any, solimps: Any) -> wp.array:
             made = [spring(*pair) for pair in zip(solrefs, solimps, strict=True)]
-            return wp.array(np.reshape(made, (-1, touches.SPRING)), dtype=float)
+            return wp.array(np.reshape(made, (-1, contact_pairs.SPRING)), dtype=float)
 
-        own = [t.solreffriction.any() and not touches.is_mixed(t.solreffriction) for t in every]
+        own = [t.solreffriction.any() and not contact_pairs.is_mixed(t.solreffriction) for t in every]
         sliding = [spring(t.solreffriction if has else t.solref, t.solimp)[1] for t, has in zip(every, own, strict=True)]
         arrays.touch_geom = wp.array([t.geoms for t in every], dtype=wp.vec2i)
         arrays.touch_margin = wp.array([t.margin for t in every], dtype=float)
@@ -157,12 +161,14 @@ class ContactStage:
         arrays.touch_friction = wp.array([t.friction for t in every], dtype=Vector5)
         arrays.touch_spring = springs([t.solref for t in every], [t.solimp for t in every])
         arrays.touch_sliding = wp.array(sliding, dtype=float)
-        bounces = [(2.0 * timestep * safe, float(np.clip(t.solimp[1], touches.LEAST, touches.GREATEST))) for t in every]
+        bounces = [
+            (2.0 * timestep * safe, float(np.clip(t.solimp[1], contact_pairs.LEAST, contact_pairs.GREATEST))) for t in every
+        ]
         arrays.touch_bounce = wp.array(bounces, dtype=wp.vec2)
         arrays.dof_spring = springs(model.dof_solref, model.dof_solimp)
         arrays.joint_spring = springs(model.jnt_solref, model.jnt_solimp)
         arrays.contact_touch, arrays.contact_mark = wp.zeros(d.naconmax, dtype=int), wp.zeros(d.naconmax, dtype=int)
-        arrays.row_key = self.sides.key
+        arrays.row_key = self.active_set.key
         arrays.impratio_invsqrt = m.opt.impratio_invsqrt
         for name in StageArrays.vars:  # type: ignore[attr-defined]
             if name in OWN_ARRAYS or name.startswith("touch_"):
@@ -173,19 +179,19 @@ class ContactStage:
             setattr(arrays, name, getattr(source, field))
         return arrays
 
-    def _candidates(self, model: mujoco.MjModel, d: Any, points: list, round_pairs: list[int], probes: list) -> Any:
-        """Return what the lanes look at."""
+    def _candidates(self, model: mujoco.MjModel, d: Any, points: list, round_pairs: list[int], features: list) -> Any:
+        """Return the candidates for contacts."""
         items = Candidates()
         items.point_touch = wp.array([p.touch for p in points], dtype=int)
         items.point_kind = wp.array([p.kind for p in points], dtype=int)
         items.point_place = wp.array([p.place for p in points], dtype=wp.vec3)
         items.point_radius = wp.array([p.radius for p in points], dtype=float)
         items.pair_touch = wp.array(round_pairs, dtype=int)
-        items.probe_touch = wp.array([touch for touch, _ in probes], dtype=int)
-        items.probe_kind = wp.array([p.kind for _, p in probes], dtype=int)
-        items.probe_start = wp.array([p.start for _, p in probes], dtype=wp.vec3)
-        items.probe_end = wp.array([p.end for _, p in probes], dtype=wp.vec3)
-        items.probe_radius = wp.array([p.radius for _, p in probes], dtype=float)
+        items.feature_touch = wp.array([touch for touch, _ in features], dtype=int)
+        items.feature_kind = wp.array([p.kind for _, p in features], dtype=int)
+        items.feature_start = wp.array([p.start for _, p in features], dtype=wp.vec3)
+        items.feature_end = wp.array([p.end for _, p in features], dtype=wp.vec3)
+        items.feature_radius = wp.array([p.radius for _, p in features], dtype=float)
         items.geom_size = wp.array(model.geom_size, dtype=wp.vec3)
         items.geom_xpos, items.geom_xmat = d.geom_xpos, d.geom_xmat
         return items

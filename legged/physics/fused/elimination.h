@@ -1,9 +1,12 @@
-// One solution of a system H s = g of the degrees of freedom of a tree, by Cholesky's method from the leaves to the root
-// (Featherstone, Rigid Body Dynamics Algorithms, 2008, section 6.5). Where no constraint row couples branches, H has an entry
-// for a degree of freedom and those on its path to the root alone, so that a row of H is as short as the path, and all that
-// have the same depth are eliminated at once. Otherwise the tree is a path. Constants: ROOT (degrees of freedom that all
-// paths begin with, at most 6), DEPTH (most on one path), WIDTH (most of the same depth outside the root), SPLIT (whether there
-// are branches), TRIANGLE (of the root's entries of H, that many) and CORNER (with those of g).
+// Solution of a system H s = g over the degrees of freedom of a tree, by Cholesky's method from the leaves to the root
+// (Featherstone, Rigid Body Dynamics Algorithms, 2008, section 6.5). If no constraint row couples branches, H couples a
+// degree of freedom only with those on its path to the root. A row of H is then as short as the path, and all degrees of
+// freedom of the same depth are eliminated at once. Otherwise the tree is treated as a single path.
+//
+// The first ROOT degrees of freedom are the root. The others are called limbs. The entries of the root's block of H and of
+// its part of g are called corners. Constants: ROOT (degrees of freedom that all paths begin with, at most 6), DEPTH (largest
+// length of a path), WIDTH (largest number of limbs of the same depth), SPLIT (the tree has branches), TRIANGLE (number of
+// the root's entries of H) and CORNER (the same with those of g).
 
 #if defined(__CUDA_ARCH__)
 #define UNROLLED_ALONG _Pragma("unroll turns")
@@ -13,7 +16,7 @@
 #define EACH_CORNER(n) EVERY_CORNER(n) if (n < CORNER)
 #define OF_CORNER(values, n) values[0]
 const int LIMBS = NV > 32 && NV - ROOT > 32 ? 2 : 1, CORNERS = 1;
-// What the lane of an entry of the root has, and that of a limb.
+// Return the value in the lane of a corner, and in the lane of a limb.
 auto from_corner = [&](const float* values, int n) { return __shfl_sync(0xffffffffu, values[0], n); };
 auto from_limb = [&](const float* values, int i) {
     if (NV <= 32) return __shfl_sync(0xffffffffu, values[0], i);
@@ -39,14 +42,14 @@ LEGGED_SHARED float boards[2 * BOARD];
 struct Branches { enum { value = 1 }; };
 struct Path { enum { value = 0 }; };
 
-// Of a limb: its depth; where it is among those of the same depth; and what is at each depth of its path.
+// For each limb: its depth, its place among those of the same depth, and the degree of freedom at each depth of its path.
 int depth_of[LIMBS] = {}, place_of[LIMBS] = {}, path_of[LIMBS][CHAIN] = {};
 EACH_LIMB(i) {
     OF(depth_of, i) = SPLIT ? arrays.dof_depth.data[i] : i;
     OF(place_of, i) = SPLIT ? arrays.dof_place.data[i] : 0;
     UNROLLED for (int t = ROOT; t < DEPTH; ++t) OF(path_of, i)[t - ROOT] = SPLIT ? arrays.dof_path.data[t * NV + i] : t;
 }
-// Of an entry of the root: its row and column; the right-hand side has columns of its own.
+// For each corner: its row and its column; -1 is the column of the right-hand side.
 int row_of[CORNERS] = {}, column_of[CORNERS] = {};
 EACH_CORNER(n) {
     int i = 0;
@@ -55,19 +58,19 @@ EACH_CORNER(n) {
     OF_CORNER(column_of, n) = n < TRIANGLE ? n - i * (i + 1) / 2 : -1;
 }
 
-bool several = false;  // whether one of them couples branches
-// With dampers, what follows the last round is the solution of another system by the same lines: the acceleration that moves
-// the world on, with dampers as they act at the end of the step (MuJoCo's Euler), (M + h D) a = all forces.
+bool several = false;  // true if a row couples branches
+// With dampers, one more system is solved after the last iteration, by the same code: (M + h D) a = all forces. Its solution
+// is the acceleration that integrates the velocities, with dampers that act at the end of the step (MuJoCo's Euler).
 bool advancing = false;
-// From the right-hand side in s and `shown`, the solution there, for all lanes to see.
+// Replaces the right-hand side in s and `shown` by the solution, which all lanes can read.
 auto solve = [&](auto tree) {
     constexpr bool branches = decltype(tree)::value;
     constexpr int height = branches ? DEPTH : NV, pitch = branches ? PITCH : LONG_PITCH;
-    // Worlds in which a row couples branches are few: there loops are not unrolled, so that H is in slow memory. In registers its
-    // long rows would crowd out what every world needs.
+    // Few worlds have a row that couples branches. Their loops are not unrolled, so H is in slow memory: in registers, its
+    // long rows would displace data that every world needs.
     [[maybe_unused]] constexpr int turns = branches || !SPLIT ? height : 1;
     float H[LIMBS][height], over[LIMBS], C[CORNERS] = {};
-    // Hessian M + J^T diag(curvature) J, or M + h D.
+    // Compute the Hessian M + J^T diag(curvature) J, or M + h D.
     EACH_LIMB(i) {
         UNROLLED_ALONG for (int e = 0; e < height; ++e)
             OF(H, i)[e] = M[i * STRIDE + (branches && e >= ROOT ? OF(path_of, i)[e - ROOT] : e)];
@@ -120,11 +123,13 @@ auto solve = [&](auto tree) {
             if (i == OF_CORNER(column_of, n)) OF_CORNER(C, n) += h * damping[i];
         }
     }
-    // Limbs, from the leaves to the root: H = L^T diag(1 / over) L. A row of the board is the right-hand side, `over`, and H.
+    // Eliminate limbs from the leaves to the root: H = L^T diag(1 / over) L. A row of the board holds the right-hand side,
+    // `over`, and the row of H.
     UNROLLED_ALONG for (int t = height - 1; t >= ROOT; --t) {
         float* board = boards + (t & 1) * BOARD;
         EACH_LIMB(i) {
-            const float pivot = OF(H, i)[t];  // read by all: the compiler takes it for H[depth] else, no longer in a register
+            // every lane reads it: otherwise the compiler replaces it by H[depth], which does not stay in a register
+            const float pivot = OF(H, i)[t];
             if ((branches ? OF(depth_of, i) : i) == t) {
                 float* row = board + (branches ? OF(place_of, i) * pitch : 0);
                 row[0] = OF(s, i);
@@ -138,7 +143,7 @@ auto solve = [&](auto tree) {
             if (own < t) {
                 int from = 0, to = 1;
                 if (branches) {
-                    const int packed = arrays.below.data[t * NV + i];  // those of this depth that hang on it
+                    const int packed = arrays.below.data[t * NV + i];  // range of this depth's descendants of i
                     from = packed & 0xff, to = packed >> 8;
                 }
                 ROLLED for (int n = from; n < to; ++n) {
@@ -157,9 +162,9 @@ auto solve = [&](auto tree) {
             }
         }
     }
-    // The root, of which each lane has an entry: H = L^T diag(1 / over) L again, then its solution, which all lanes get.
+    // Factorise the root, of which each lane has one corner, by the same formula. Then compute its solution in all lanes.
     float root[ROOT > 0 ? ROOT : 1], root_over[ROOT > 0 ? ROOT : 1];
-    meet();  // `shown` was read, and is written
+    meet();  // `shown` has been read, and is written below
     UNROLLED for (int k = ROOT - 1; k >= 0; --k) {
         const int row = k * (k + 1) / 2;
         root_over[k] = inverse(most(from_corner(C, row + k), TINY));
@@ -179,7 +184,7 @@ auto solve = [&](auto tree) {
         }
         if (lane == 0) shown[k] = root[k];
     }
-    // Back from the root to the leaves.
+    // Substitute back from the root to the leaves.
     EACH_LIMB(i) {
         UNROLLED_ALONG for (int e = 0; e < ROOT; ++e) OF(s, i) -= OF(H, i)[e] * root[e];
     }

@@ -1,14 +1,17 @@
-// Elliptic friction cones (MuJoCo documentation, "Computation", and its `mj_constraintUpdate`). A contact has a row along its
-// normal, its first, and one for each direction in which it rubs; the first stands for all. With x scaled by the coefficients
-// of friction to u, and mu that of the first direction, softened by impratio: N = u_0 and T = |u_1, u_2 ...|. There is no force
-// in the dual cone N >= mu T, each row's own where mu N + T <= 0, and between them the cost is a quadratic function of
-// N - mu T. Constants: ELLIPTIC (whether there are any), ELLIPTIC_ROW (MuJoCo's number of their type).
+// Elliptic friction cones (MuJoCo documentation, "Computation", and its `mj_constraintUpdate`). The first row of a contact
+// lies along its normal, and one more row along each direction of friction; the first row represents all of them. Let u be x
+// scaled by the friction coefficients, mu the coefficient of the first direction, softened by impratio, N = u_0 and T = |u_1,
+// u_2 ...|. In the dual cone N >= mu T there is no force. Where mu N + T <= 0, each row has its own force. In the zone
+// between, the cost is a quadratic function of N - mu T. Constants: ELLIPTIC (the model uses elliptic cones), ELLIPTIC_ROW
+// (MuJoCo's number of their row type).
 
 const int CONE_ROWS = ELLIPTIC ? ROWS : 1;
-LEGGED_SHARED signed char directions[CONE_ROWS];  // of a first row how many its contact has; -1 of others; 0 of other rows
-LEGGED_SHARED float rubs[CONE_ROWS];  // what scales x
-LEGGED_SHARED float lean[CONE_ROWS];  // between the zones: u / T, scaled again, of the rows but the first
-LEGGED_SHARED float bent[CONE_ROWS];  // there: of the first row and the second, the curvature along N - mu T, and across
+// number of directions in the first row of a contact; -1 in its other rows; 0 in rows without a cone
+LEGGED_SHARED signed char directions[CONE_ROWS];
+LEGGED_SHARED float rubs[CONE_ROWS];  // factors that scale x to u
+LEGGED_SHARED float lean[CONE_ROWS];  // in the zone between: u / T, scaled again, in all rows but the first
+// in the zone between: curvature along N - mu T in the first row, and across it in the second
+LEGGED_SHARED float bent[CONE_ROWS];
 
 if (ELLIPTIC) EACH_ROW(r) {
     directions[r] = 0;
@@ -19,13 +22,13 @@ if (ELLIPTIC) EACH_ROW(r) {
         const float soften = arrays.impratio_invsqrt.data[world % arrays.impratio_invsqrt.shape[0]];
         directions[r] = k == 0 ? n : -1;
         rubs[r] = k == 0 ? friction[0] * soften : friction[k - 1];
-        if (r - k + n > rows) { directions[r] = 0; D[r] = 0.0f; }  // not all of the contact found room
+        if (r - k + n > rows) { directions[r] = 0; D[r] = 0.0f; }  // part of the contact's rows did not fit
     }
 }
 
 if (ELLIPTIC) meet();
 
-// The forces of the contact that begins with row r, for `sides` of the piece of its cost.
+// Computes the forces of the contact that begins with row r. Returns its zone, as its state.
 [[maybe_unused]] auto press = [&](int r) {
     const int n = directions[r];
     const float mu = rubs[r], N = mu * x[r];
@@ -55,7 +58,7 @@ if (ELLIPTIC) meet();
     return 2;
 };
 
-// The derivative of its cost along `jv`, at x + alpha * jv, and the second one.
+// Adds the first and second derivatives of the contact's cost along `jv`, at x + alpha * jv.
 [[maybe_unused]] auto press_along = [&](int r, float alpha, float& first, float& second) {
     const int n = directions[r];
     const float mu = rubs[r], N = mu * (x[r] + alpha * jv[r]), Nv = mu * jv[r];
@@ -79,8 +82,9 @@ if (ELLIPTIC) meet();
     second += along * (change * change + (mu * T - N) * mu * most(vv - Tv * Tv, 0.0f) / T);
 };
 
-// Of the Hessian's entry (i, j) what of a cone between the zones is not in the rows' own curvature: along N - mu T, and that
-// across does not reach the direction in which it rubs.
+// Returns a cone's contribution to the Hessian's entry (i, j) in the zone between, in addition to the curvature of its rows.
+// It adds the curvature along N - mu T. It subtracts the curvature across in the direction of sliding, where the cost has
+// none.
 [[maybe_unused]] auto bend_of = [&](int r, int i, int j) {
     float one = 0.0f, other = 0.0f, lean_i = 0.0f, lean_j = 0.0f;
     with_row(r, [&](int, const float* row) { one = row[i]; other = row[j]; });

@@ -1,20 +1,21 @@
-// What both native sources share: a world is computed by a warp of 32 threads ("lanes") on a GPU, by one thread on the CPU.
+// Code that all native sources share. On a GPU a warp of 32 threads ("lanes") computes a world; on the CPU one thread does.
 //
-// These files are bodies of a function, put together by `native_source` (native.py): constants, this file, then one of the
-// others. A macro has one meaning in all of them, so that it never needs to be undefined.
+// These files are bodies of a function, which `native_source` (native.py) concatenates: constants, this file, then others. A
+// macro has the same meaning in all of them, so it never needs to be undefined.
 
 #if defined(__CUDA_ARCH__)
-// Memory that all lanes of a world see.
+// Memory that all lanes of a world share.
 #define LEGGED_SHARED alignas(16) __shared__
 const int LANES = 32, lane = threadIdx.x & 31;
-// All lanes wait here for each other: it separates phases that write shared memory from those that read it.
+// Makes all lanes wait for each other, between writing shared memory and reading it.
 [[maybe_unused]] auto meet = []() { __syncwarp(); };
-// The sum of x over all lanes, the same to the bit in each.
+// Returns the sum of x over all lanes, bit-identical in each.
 [[maybe_unused]] auto sum = [](float x) {
     for (int apart = 16; apart > 0; apart >>= 1) x += __shfl_xor_sync(0xffffffffu, x, apart);
     return x;
 };
-// The sums of four numbers over all lanes: with each exchange a lane goes on with half as many of them, then passes its sum on.
+// Computes the sums of four numbers over all lanes. After each exchange a lane continues with half of them; at the end all
+// sums are broadcast.
 [[maybe_unused]] auto sum_four = [&](float* x) {
     const bool upper = lane & 16, odd = lane & 8;
     for (int k = 0; k < 2; ++k) {
@@ -25,16 +26,16 @@ const int LANES = 32, lane = threadIdx.x & 31;
     for (int apart = 4; apart > 0; apart >>= 1) one += __shfl_xor_sync(0xffffffffu, one, apart);
     for (int k = 0; k < 4; ++k) x[k] = __shfl_sync(0xffffffffu, one, 8 * k);
 };
-// Whether any lane says so.
+// Returns true if x is true in any lane.
 [[maybe_unused]] auto any = [](bool x) { return __any_sync(0xffffffffu, x) != 0; };
-// How many lanes before this one are `on`, after the `count` that is in a list: its place there. Counts those that are on.
+// Appends the lanes that are `on` to a list of `count` elements, and updates `count`. Returns the place of this lane.
 [[maybe_unused]] auto rank = [&](bool on, int& count) {
     const unsigned which = __ballot_sync(0xffffffffu, on);
     const int place = count + __popc(which & ((1u << lane) - 1u));
     count += __popc(which);
     return place;
 };
-// 1 / x of a normal number, but for its last bit.
+// Returns 1 / x for a normal number, accurate except for the last bit.
 [[maybe_unused]] auto inverse = [](float x) {
 #if defined(__CUDACC__)
     float y;
@@ -48,7 +49,7 @@ const int LANES = 32, lane = threadIdx.x & 31;
 #define BY_TWO _Pragma("unroll 2")
 #define BY_FOUR _Pragma("unroll 4")
 #define ROLLED _Pragma("unroll 1")
-// The sum of x over the lanes before this one.
+// Returns the sum of x over the lanes before this one.
 [[maybe_unused]] auto before = [&](float x) {
     float total = x;
     for (int apart = 1; apart < 32; apart <<= 1) {
@@ -72,12 +73,12 @@ const int LANES = 1, lane = 0;
 #define ROLLED
 [[maybe_unused]] auto before = [](float) { return 0.0f; };
 #endif
-// Deals `count` items out to the lanes.
+// Distributes `count` items over the lanes.
 #define EACH(i, count) for (int i = lane; i < (count); i += LANES)
 
 [[maybe_unused]] auto most = [](float p, float q) { return p > q ? p : q; };
 
-// Vectors are three numbers, quaternions (w, x, y, z).
+// Vectors are three numbers; quaternions are (w, x, y, z).
 [[maybe_unused]] auto cross = [](const float* u, const float* v, float* out) {
     out[0] = u[1] * v[2] - u[2] * v[1];
     out[1] = u[2] * v[0] - u[0] * v[2];

@@ -1,4 +1,4 @@
-"""Native sources of launches: constants, what all share, and the file of one of them."""
+"""Native sources of kernels: their constants, the file that all of them include, and their own files."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -6,26 +6,26 @@ from typing import Any
 
 SOURCES = Path(__file__).parent
 LANES = 32
-"""Threads that compute one world on a GPU; on the CPU it is one."""
+"""Number of threads per world on a GPU; on the CPU it is 1."""
 SHARED_BYTES = 48 * 1024
-"""Memory that a block of threads may share."""
+"""Shared memory available to a block of threads [bytes]."""
 Constant = int | bool | tuple[int, ...]
-"""What a source may be told: a number, whether something is so, or a table."""
+"""Type of a source's constants: a number, a flag, or a table."""
 
 
 def lanes_of(device: Any) -> int:
-    """Return how many threads share a world's work on a Warp device."""
+    """Return the number of threads per world on a Warp device."""
     return 1 if device.is_cpu else LANES
 
 
 def native_source(files: Iterable[str], constants: Mapping[str, Constant]) -> str:
-    """Return the body of a native function: `files` of this folder, one after the other, after `constants` and lanes.h."""
+    """Return the body of a native function: `constants`, then lanes.h, then the `files` of this folder in order."""
     prelude = "".join(_defined(name, value) for name, value in constants.items())
     return prelude + "".join((SOURCES / name).read_text() for name in ("lanes.h", *files))
 
 
 def _defined(name: str, value: Constant) -> str:
-    """Return the line that defines a constant, or a table of them."""
+    """Return the line that defines a constant or a table."""
     if isinstance(value, tuple):
         return f"static constexpr int {name}[] = {{{', '.join(map(str, value))}}};\n"
     return f"constexpr {'bool' if isinstance(value, bool) else 'int'} {name} = {int(value)};\n"

@@ -1,22 +1,25 @@
-// Poses, inertias and forces but those of constraints, of one world: trees of free, ball, slide and hinge joints in any order.
-// Constants: NB, NV, NJ, NG, NT (bodies, degrees of freedom, joints, shapes, trees), DEPTH (levels of bodies below the world),
-// OF_INERTIA, OF_MOTION, OF_BODY (from one row in shared memory to the next), BALLS, SLIDES, ONE_MOTOR, SPRINGS, BALL_SPRINGS,
-// DAMPERS, GEARS, GAINS, AFFINE_BIAS, CONTROL_LIMITS, FORCE_LIMITS, JOINT_LIMITS, PUSHED (whether forces act on bodies from
-// outside), EQUALITIES, SITES (what there is of them; the latter two: bodies and sites that equality constraints hold), FREE,
-// BALL, SLIDE, AFFINE (MuJoCo's numbers of types), and for each array of the model VARIES_<array>: whether worlds may differ in
-// it. What a model has not is left out by the compiler.
+// Poses, inertias and all forces except those of constraints, of one world with trees of free, ball, slide and hinge joints
+// in any order. Constants: NB, NV, NJ, NG, NT (bodies, degrees of freedom, joints, shapes, trees), DEPTH (levels of bodies
+// below the world), OF_INERTIA, OF_MOTION, OF_BODY (row strides in shared memory), BALLS, SLIDES, SPRINGS, BALL_SPRINGS,
+// DAMPERS, GEARS, GAINS, AFFINE_BIAS, CONTROL_LIMITS, FORCE_LIMITS, JOINT_LIMITS (the model has the feature), ONE_MOTOR (at
+// most one motor per degree of freedom), PUSHED (external forces act on bodies), EQUALITIES (equality constraints hold
+// bodies), SITES (number of sites if equality constraints hold sites, else 0), FREE, BALL, SLIDE, AFFINE (MuJoCo's numbers of
+// types), and for each array of the model VARIES_<array> (worlds may differ in it). The compiler removes the code of features
+// that a model lacks.
 
 LEGGED_SHARED float centre[NB * 3], inertia[NB * OF_INERTIA], motion[NV * OF_MOTION], speed[NV];
-// Poses make room for motions once nobody needs them any more, so that a multiprocessor holds more worlds.
+// Motions overwrite poses, which are not needed by then, so that a multiprocessor holds more worlds.
 const int POSES = 7 * NB + 6 * NJ, MOTIONS = OF_BODY * NB;
 LEGGED_SHARED float place[POSES > MOTIONS ? POSES : MOTIONS];
 float *pos = place, *quat = pos + 3 * NB, *anchor = quat + 4 * NB, *axis = anchor + 3 * NJ;
-float* of_bodies = place;  // of each body: first velocity and acceleration, then all that it carries, its inertia and forces
+// row of each body: first its velocity and acceleration, then the accumulated inertia and force of its subtree
+float* of_bodies = place;
 const int CARRIED = 0, VELOCITY = 0, ACCELERATION = 10, FORCE = 10;
-// Where a body's numbers wait until its inertia is made of them.
+// Offsets of a body's orientation, principal inertias and mass, before its inertia is computed in their place.
 const int TURN = 0, MAIN = 4, MASS = 7;
 
-// This world's row, of `length` floats, in an array of the model: mostly all worlds share one, or each has its own.
+// Returns this world's row, of `length` floats, in an array of the model. An array has one row for all worlds, or one per
+// world.
 auto row_of = [&](const auto& array, int length, bool varies) {
     const float* data = reinterpret_cast<const float*>(array.data);
     if (!varies) return data;
@@ -25,7 +28,7 @@ auto row_of = [&](const auto& array, int length, bool varies) {
 };
 #define ROW(name, length) row_of(arrays.name, length, VARIES_##name)
 auto clamped = [](float x, const float* range) { return x < range[0] ? range[0] : x > range[1] ? range[1] : x; };
-// Momentum of a spatial inertia in motion.
+// Computes the momentum of a spatial inertia with velocity v.
 auto momentum = [&](const float* body, const float* v, float* out) {
     float turned[3], carried_along[3];
     cross(body + 6, v + 3, turned);
@@ -38,8 +41,9 @@ auto momentum = [&](const float* body, const float* v, float* out) {
 
 const float* q_in = arrays.qpos.data + (long long)world * arrays.qpos.shape[1];
 const float* v_in = arrays.qvel.data + (long long)world * arrays.qvel.shape[1];
-const int* subtree = arrays.body_subtree.data;  // how many bodies a body carries, itself included: those that follow it
-// What is packed into a number of a body, and of a joint.
+// number of bodies that a body carries, itself included; they have consecutive indices
+const int* subtree = arrays.body_subtree.data;
+// Unpack the integers that describe a body, and a joint.
 auto parent_of = [](int packed) { return packed & 0xff; };
 auto first_of = [](int packed) { return (packed >> 8) & 0xff; };
 auto count_of = [](int packed) { return (packed >> 16) & 0xf; };
@@ -48,8 +52,9 @@ auto type_of = [](int packed) { return packed & 0xf; };
 auto address_of = [](int packed) { return (packed >> 4) & 0xfff; };
 auto dof_of = [](int packed) { return packed >> 16; };
 
-meet();  // of the world before
-// All that is far away is asked for at once, and all joints turn at once: below, what one body waits for all others wait for.
+meet();  // wait until the previous world is finished
+// Load all data from global memory at once, and compute the rotations of all joints at once: in the loop over levels below,
+// all bodies wait for the slowest.
 EACH(b, NB) {
     for (int k = 0; k < 3; ++k) centre[b * 3 + k] = ROW(body_ipos, NB * 3)[b * 3 + k];
     for (int k = 0; k < 4; ++k) inertia[b * OF_INERTIA + TURN + k] = ROW(body_iquat, NB * 4)[b * 4 + k];
@@ -87,7 +92,7 @@ for (int level = 1; level <= DEPTH; ++level) {
         }
         for (int j = floats ? last : first; j < last; ++j) {
             [[maybe_unused]] const int packed = j == first ? of_first : arrays.joint_packed.data[j], type = type_of(packed);
-            // How far it slid, or of half the angle.
+            // Displacement of a slide, or cosine and sine of half the angle of a hinge.
             [[maybe_unused]] const float path = anchor[j * 3], cosine = path, sine = anchor[j * 3 + 1];
             const float* at_body = ROW(jnt_pos, NJ * 3) + j * 3;
             const float* about = ROW(jnt_axis, NJ * 3) + j * 3;
@@ -126,7 +131,7 @@ EACH(g, NG) {
     multiply(quat + b * 4, ROW(geom_quat, NG * 4) + g * 4, q);
     to_matrix(q, reinterpret_cast<float*>(arrays.geom_xmat.data) + at * 9);
 }
-// What equality constraints are made of.
+// Poses that equality constraints need.
 if (EQUALITIES) EACH(b, NB) {
     const long long at = (long long)world * NB + b;
     for (int k = 0; k < 3; ++k) reinterpret_cast<float*>(arrays.xpos.data)[at * 3 + k] = pos[b * 3 + k];
@@ -140,7 +145,7 @@ EACH(n, SITES) {
     rotate(quat + b * 4, ROW(site_pos, SITES * 3) + n * 3, moved);
     for (int k = 0; k < 3; ++k) out[k] = pos[b * 3 + k] + moved[k];
 }
-// Centres of mass, of bodies and of trees.
+// Centres of mass of bodies and of trees.
 EACH(b, NB) {
     float moved[3];
     rotate(quat + b * 4, centre + b * 3, moved);
@@ -149,7 +154,7 @@ EACH(b, NB) {
 float coms[NT * 3];
 for (int t = 0; t < NT; ++t) {
     const int root = arrays.tree_root.data[t];
-    float total[4] = {0.0f, 0.0f, 0.0f, 0.0f};  // mass times place, and mass
+    float total[4] = {0.0f, 0.0f, 0.0f, 0.0f};  // mass times position, and mass
     EACH(b, NB) if (b >= root && b < root + subtree[root]) {
         const float m = inertia[b * OF_INERTIA + MASS];
         for (int k = 0; k < 3; ++k) total[k] += m * centre[b * 3 + k];
@@ -163,7 +168,7 @@ for (int t = 0; t < NT; ++t) {
     }
 }
 auto com_of = [&](int b) { return coms + (NT == 1 ? 0 : 3 * arrays.body_tree.data[b]); };
-// Inertias about it.
+// Inertias about the tree's centre of mass.
 EACH(b, NB) {
     float* out = inertia + b * OF_INERTIA;
     float q[4], R[9], I[6];
@@ -181,12 +186,13 @@ EACH(b, NB) {
     out[3] = I[3] - m * x * y; out[4] = I[4] - m * x * z; out[5] = I[5] - m * y * z;
     out[6] = m * x; out[7] = m * y; out[8] = m * z; out[9] = m;
 }
-// How each degree of freedom moves the bodies that it carries.
+// Motion that each degree of freedom causes in the bodies that it moves.
 EACH(i, NV) {
     float* out = motion + i * OF_MOTION;
     const int packed = arrays.dof_packed.data[i];  // one look-up instead of a chain of them
     const int b = packed & 0xff, j = (packed >> 8) & 0xff, type = (packed >> 16) & 0xf, of_joint = packed >> 20;
-    const int turning = type == FREE ? of_joint - 3 : of_joint;  // about which axis of the body, of a free or ball joint
+    // axis of rotation in the body's frame, for a free or ball joint
+    const int turning = type == FREE ? of_joint - 3 : of_joint;
     if (turning < 0) {
         for (int k = 0; k < 6; ++k) out[k] = k == 3 + of_joint ? 1.0f : 0.0f;
     } else if (SLIDES && type == SLIDE) {
@@ -207,9 +213,9 @@ EACH(i, NV) {
     for (int k = 0; k < 6; ++k) shown[k] = out[k];
 }
 meet();
-// How fast axes of motion turn, which equality constraints take into account.
+// Rates of change of the motion axes, which equality constraints need.
 [[maybe_unused]] float* turning_axes = reinterpret_cast<float*>(arrays.cdof_dot.data) + (long long)world * NV * 6;
-// Velocities, and accelerations as if no joint accelerated, level by level.
+// Velocities, and accelerations with zero joint accelerations, level by level.
 EACH(b, NB) if (level_of(arrays.body_packed.data[b]) == 0) {
     const float* gravity = ROW(gravity, 3);
     for (int k = 0; k < 6; ++k) of_bodies[b * OF_BODY + VELOCITY + k] = 0.0f;
@@ -230,7 +236,7 @@ for (int level = 1; level <= DEPTH; ++level) {
                 if (EQUALITIES) for (int k = 0; k < 18; ++k) turning_axes[from * 6 + k] = 0.0f;
                 from += 3;
             }
-            const int to = from + (type == FREE || (BALLS && type == BALL) ? 3 : 1);  // three turn at once
+            const int to = from + (type == FREE || (BALLS && type == BALL) ? 3 : 1);  // three axes turn at once
             for (int k = 0; k < 6; ++k) now[k] = v[k];
             for (int i = from; i < to; ++i) {
                 const float* s = motion + i * OF_MOTION;
@@ -264,7 +270,7 @@ EACH(b, NB) {
     for (int k = 0; k < 3; ++k) f[k] = along[k] + c[k] + d[k];
     cross(v, p + 3, c);
     for (int k = 0; k < 3; ++k) f[3 + k] = along[3 + k] + c[k];
-    if (PUSHED) {  // at its centre of mass: force, then torque
+    if (PUSHED) {  // force, then torque, at the body's centre of mass
         const float* push = reinterpret_cast<const float*>(arrays.xfrc_applied.data) + ((long long)world * NB + b) * 6;
         const float* com = com_of(b);
         float arm[3];
@@ -277,7 +283,7 @@ EACH(b, NB) {
     for (int k = 0; k < 6; ++k) own[FORCE + k] = f[k];
 }
 meet();
-// Towards the world, bodies pass on what they carry; a lane has one of the sixteen numbers.
+// Add the inertia and force of each body to its parent's, towards the world. Each lane adds one of the sixteen numbers.
 EACH(k, 16)
     for (int b = NB - 1; b > 0; --b)
         if (const int parent = parent_of(arrays.body_packed.data[b]); parent > 0)
@@ -301,9 +307,9 @@ EACH(i, NV) {
     const long long out = (long long)world * NV + i;
     float total = 0.0f;
     for (int k = 0; k < 6; ++k) total -= motion[i * OF_MOTION + k] * of_bodies[b * OF_BODY + FORCE + k];
-    // Motors, all of them on slides and hinges.
+    // Motors, all of which act on slides and hinges.
     float driven = 0.0f;
-    // Mostly a degree of freedom has one motor at most, and a motor one control, in the same order.
+    // Usually a degree of freedom has at most one motor, and a motor has the control with its own index.
     const int from = ONE_MOTOR ? 0 : arrays.motor_start.data[i];
     const int only = ONE_MOTOR ? arrays.motor_of_dof.data[i] : -1, to = ONE_MOTOR ? only >= 0 : arrays.motor_start.data[i + 1];
     for (int n = from; n < to; ++n) {
@@ -331,7 +337,7 @@ EACH(i, NV) {
             const float* rest = ROW(qpos_spring, arrays.qpos0.shape[1]) + at;
             const int of_joint = packed >> 20, turning = type == FREE ? of_joint - 3 : type == BALL ? of_joint : -1;
             float bent = q_in[at + (type == FREE && turning < 0 ? of_joint : 0)] - rest[type == FREE && turning < 0 ? of_joint : 0];
-            if (BALL_SPRINGS && turning >= 0) {  // the rotation vector from rest, in the frame of the body
+            if (BALL_SPRINGS && turning >= 0) {  // rotation vector from the rest orientation, in the body's frame
                 const int first = type == FREE ? 3 : 0;
                 float now[4], back[4], turn[4];
                 for (int k = 0; k < 4; ++k) { now[k] = q_in[at + first + k]; back[k] = k == 0 ? rest[first] : -rest[first + k]; }

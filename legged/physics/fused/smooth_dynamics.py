@@ -1,11 +1,13 @@
-"""Everything of a physics step that joints, masses and motors decide, in one launch: poses, inertias, forces.
+"""All parts of a physics step except contacts and constraints, in one launch: poses, inertias, and the forces of motors,
+springs and gravity.
 
-mujoco-warp takes some twenty launches for it, and at 4096 worlds each costs microseconds however little it computes. Here a
-warp of threads has a world, and what passes from body to body stays on the chip. Recursive Newton-Euler and composite rigid
-bodies (Featherstone, Rigid Body Dynamics Algorithms, 2008), in MuJoCo's coordinates: spatial vectors are (angular, linear)
-in world axes about a tree's centre of mass; inertias are (xx, yy, zz, xy, xz, yz, m * offset, m).
+mujoco-warp needs about twenty launches for this, and at 4096 worlds each launch costs microseconds however little it
+computes. Here each world has one warp of threads, and the quantities that bodies pass to their parents and children stay on
+the chip. The algorithms are recursive Newton-Euler and composite rigid bodies (Featherstone, Rigid Body Dynamics Algorithms,
+2008), in MuJoCo's coordinates: spatial vectors are (angular, linear) in world axes about a tree's centre of mass; inertias
+are (xx, yy, zz, xy, xz, yz, m * offset, m).
 
-Numbers of the model are read from mujoco-warp's own arrays, in which worlds may differ.
+The numbers of the model are read from mujoco-warp's own arrays, in which worlds may differ.
 """
 
 from collections.abc import Collection
@@ -22,11 +24,11 @@ FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for n
 AFFINE = int(mujoco.mjtBias.mjBIAS_AFFINE)
 SOURCE = ("smooth_dynamics.h",)
 UNKNOWN = {
-    "compensation of gravity": ("body_gravcomp",),
-    "springs that are not linear": ("jnt_stiffnesspoly", "jnt_springyield"),
-    "dampers that are not linear": ("dof_dampingpoly",),
+    "gravity compensation": ("body_gravcomp",),
+    "nonlinear springs": ("jnt_stiffnesspoly", "jnt_springyield"),
+    "nonlinear dampers": ("dof_dampingpoly",),
     "dampers or armature of actuators": ("actuator_damping", "actuator_dampingpoly", "actuator_armature"),
-    "tendons that pull": (
+    "tendons with forces or limits": (
         "tendon_stiffness",
         "tendon_stiffnesspoly",
         "tendon_damping",
@@ -38,31 +40,32 @@ UNKNOWN = {
     "adhesion": ("geom_adhesion",),
     "delayed controls": ("actuator_delay",),
 }
-"""What the launch does not compute, by the arrays of a model in which there is none of it if they are zero."""
+"""Unsupported feature -> arrays of the model that are all zero without it."""
 COUNTED = {
     "nflex": "flexes",
     "nmocap": "mocap bodies",
     "na": "actuators with a state",
     "nplugin": "plugins",
 }
-"""What else it does not compute, by the counts of a model."""
+"""Count of the model -> further unsupported feature, which is absent if the count is zero."""
 NEEDED_STAGES = ("ACTUATION", "CLAMPCTRL", "DAMPER", "EULERDAMP", "GRAVITY", "SPRING", "WARMSTART")
-"""Stages that a model may ask to leave out, and that are not left out here."""
+"""Stages that a model may disable in MuJoCo, but that are always computed here."""
 PUSHED = "xfrc_applied"
-"""What forces that act from outside are called among the arrays in which worlds differ."""
+"""Name of external forces among the arrays in which worlds differ."""
 ROW_LENGTHS = {"OF_INERTIA": 11, "OF_MOTION": 7, "OF_BODY": 17}
-"""Numbers of an inertia, of an axis of motion, and of what a body passes on, and one more: an odd number of them, so that
-lanes that read one each meet different banks of shared memory."""
+"""Row strides in shared memory for inertias, motion axes, and the quantities of bodies. Each is the number of entries made
+odd, so that lanes that read one row each use different banks."""
 MOST_BLOCKS = 32
-"""Blocks that a multiprocessor holds at most: with few enough registers for so many, 4096 worlds run at once on an H100."""
+"""Largest number of blocks per multiprocessor. It limits the registers per lane, so that 4096 worlds run at once on an
+H100."""
 
 Vector10 = wp.types.vector(length=10, dtype=wp.float32)
 
 
 @wp.struct
 class DynamicsArrays:
-    """Tables of our own; what the launch reads of mujoco-warp's model and data, under the names it has there; and from
-    `geom_xpos` on what it writes.
+    """Arrays of the kernel. It reads its own tables and arrays of mujoco-warp's model and data under their names there, and
+    writes the arrays from `geom_xpos` on.
     """
 
     body_packed: wp.array[int]
@@ -133,11 +136,11 @@ OF_MODEL = (
     *("jnt_pos", "jnt_axis", "jnt_stiffness", "jnt_actfrcrange", "actuator_gear", "actuator_gainprm", "actuator_biasprm"),
     *("actuator_ctrlrange", "actuator_forcerange"),
 )
-"""Arrays of the model that may have a row for each world."""
+"""Arrays of the model that may have one row per world."""
 
 
 def dynamics_constants(model: mujoco.MjModel, randomized: Collection[str] = ()) -> dict[str, int | bool]:
-    """Return what smooth_dynamics.h asks for, of a model in whose arrays `randomized` worlds differ."""
+    """Return the constants of smooth_dynamics.h for a model in whose arrays `randomized` worlds differ."""
     trees = _trees(model)
     return {
         **{"NB": model.nbody, "NV": model.nv, "NJ": model.njnt, "NG": model.ngeom},
@@ -165,14 +168,14 @@ def dynamics_constants(model: mujoco.MjModel, randomized: Collection[str] = ()) 
 
 
 def shared_bytes(model: mujoco.MjModel) -> int:
-    """Return what smooth_dynamics.h takes of a block's shared memory."""
+    """Return the shared memory of a block [bytes] that smooth_dynamics.h uses."""
     bodies, joints, dofs = model.nbody, model.njnt, model.nv
     place = max(7 * bodies + 6 * joints, ROW_LENGTHS["OF_BODY"] * bodies)
     return 4 * ((3 + ROW_LENGTHS["OF_INERTIA"]) * bodies + (1 + ROW_LENGTHS["OF_MOTION"]) * dofs + place)
 
 
 def dynamics_kernel(constants: dict[str, int | bool]) -> Any:
-    """Return the kernel for some `dynamics_constants`; launched for (worlds, lanes)."""
+    """Return the kernel for a set of `dynamics_constants`. It is launched for (worlds, lanes)."""
     move_world = dynamics_function(constants)
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=(LANES, MOST_BLOCKS))
@@ -184,7 +187,7 @@ def dynamics_kernel(constants: dict[str, int | bool]) -> Any:
 
 
 def dynamics_function(constants: dict[str, int | bool]) -> Any:
-    """Return what the kernel does for one world."""
+    """Return the device function of the kernel, which computes one world."""
 
     @wp.func_native(native_source(SOURCE, constants))
     def move_world(world: int, arrays: DynamicsArrays) -> None: ...
@@ -193,18 +196,18 @@ def dynamics_function(constants: dict[str, int | bool]) -> Any:
 
 
 def has_dampers(model: mujoco.MjModel, randomized: Collection[str] = ()) -> bool:
-    """Whether a joint of the model is damped, or of some world's when `dof_damping` is among the arrays that are drawn."""
+    """Return True if a joint of the model is damped, or may be, since `dof_damping` is in `randomized`."""
     return bool(np.any(model.dof_damping)) or "dof_damping" in randomized
 
 
 class SmoothDynamics:
-    """From joint positions, velocities and controls: poses of shapes, centres of mass, motion axes, the mass matrix, and
-    all forces but those of constraints.
+    """Poses of shapes, centres of mass, motion axes, the mass matrix, and all forces except those of constraints, from joint
+    positions, velocities and controls.
     """
 
     def __init__(self, model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = ()) -> None:
-        """Prepare the launch for mujoco-warp's `m` and `d` of a `model` of which `why_not` says nothing, in whose arrays
-        `randomized` worlds differ. Call with their device as Warp's current one.
+        """Prepare the launch for mujoco-warp's `m` and `d` of a `model` for which `why_not` is empty. `randomized` names the
+        arrays in which worlds differ. Warp's current device must be that of `m` and `d`.
         """
         arrays = self.arrays = DynamicsArrays()
         tables = _trees(model) | _motors(model) | _joints(model)
@@ -215,15 +218,15 @@ class SmoothDynamics:
                 value = getattr(m.opt if name == "gravity" else m if hasattr(m, name) else d, name)
             setattr(arrays, name, value)
         self.constants = dynamics_constants(model, randomized)
-        """What smooth_dynamics.h was asked for."""
+        """Constants of smooth_dynamics.h."""
         self._kernel = dynamics_kernel(self.constants)
         self._lanes = lanes_of(d.qacc.device)
         self._worlds = d.nworld
 
     @staticmethod
     def why_not(model: mujoco.MjModel, randomized: Collection[str] = ()) -> str:
-        """Return what of a model the launch does not compute, where worlds differ in the arrays `randomized`, by the names
-        that MuJoCo gives them; empty if nothing.
+        """Return the reason why a model is not supported if worlds differ in the arrays `randomized` (MuJoCo's names); empty
+        if it is.
         """
         for words, names in UNKNOWN.items():
             if drawn := [name for name in names if name in randomized]:
@@ -234,53 +237,55 @@ class SmoothDynamics:
             if getattr(model, count):
                 return f"the model has {words}"
         if np.any(model.opt.wind) or model.opt.density or model.opt.viscosity:
-            return "the model is in a fluid"
+            return "the model is in a fluid (density, viscosity or wind)"
         if off := [
             name for name in NEEDED_STAGES if model.opt.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")
         ]:
             return f"the model disables {off[0].lower()}"
         if model.opt.enableflags or model.opt.disableactuator:
-            return "the model enables features, or disables groups of actuators"
+            return "the model enables optional features, or disables groups of actuators"
         if not model.nv:
             return "the model has no joints"
         if max(model.nbody, model.njnt) > 255:
-            return f"it has {model.nbody} bodies and {model.njnt} joints"
+            return f"the model has {model.nbody} bodies and {model.njnt} joints; at most 255 of each are supported"
         if shared_bytes(model) > SHARED_BYTES:
-            return f"{model.nbody} bodies do not fit a GPU's shared memory"
+            return f"the data of {model.nbody} bodies exceed a GPU's shared memory"
         if not np.isin(model.eq_type, (CONNECT, WELD, JOINT)).all():
             return "the model has equality constraints of tendons or flexes"
         return _why_not_motors(model, _scalar(model))
 
     def launch(self) -> None:
-        """Compute all that comes before collisions, once a step."""
+        """Compute everything that precedes collision detection in a step."""
         dim = (self._worlds, self._lanes)
         wp.launch(self._kernel, dim=dim, inputs=[self.arrays], block_dim=self._lanes)
 
 
 def _scalar(model: mujoco.MjModel) -> np.ndarray:
-    """Return (njnt,) which joints slide or hinge."""
+    """Return a mask (njnt,) of the slides and hinges."""
     return (model.jnt_type == SLIDE) | (model.jnt_type == HINGE)
 
 
 def _why_not_motors(model: mujoco.MjModel, scalar: np.ndarray) -> str:
-    """Return what of the actuators is not computed, where `scalar` says of each joint whether it slides or hinges."""
+    """Return the reason why the actuators are not supported; empty if they are. `scalar` (njnt,) marks slides and hinges."""
     on_joint = np.isin(model.actuator_trntype, (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     if not on_joint.all() or not scalar[model.actuator_trnid[:, 0]].all():
-        return "an actuator acts on something else than a slide or a hinge"
+        return "an actuator acts on neither a slide nor a hinge"
     plain = (
         (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
         & np.isin(model.actuator_biastype, (mujoco.mjtBias.mjBIAS_NONE, AFFINE))
         & (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE)
         & (model.actuator_ctrlnum == 1)
     )
-    return "" if plain.all() else "an actuator is no motor, position or velocity servo"
+    return "" if plain.all() else "an actuator is neither a motor nor a position or velocity servo"
 
 
 def _trees(model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """Return of each body how many bodies it carries (itself included), the index of its tree, and, packed into one number,
-    its parent, its first joint, how many joints it has and how many levels it is below the world; and of each tree its first
-    body. A tree hangs from the world; one without joints is left out, and its bodies say 0. `why_not` admits fewer than 256
-    bodies and joints.
+    """Return tables of the kinematic trees.
+
+    `body_subtree` is the number of bodies that a body carries, itself included. `body_tree` is the index of its tree.
+    `body_packed` packs its parent, its first joint, its number of joints and its level below the world into one integer.
+    `tree_root` is the first body of each tree. A tree is a child of the world; trees without joints are left out, and
+    `body_tree` of their bodies is 0. `why_not` rejects models with more than 255 bodies or joints.
     """
     parent = model.body_parentid
     level, subtree = np.zeros(model.nbody, dtype=int), np.ones(model.nbody, dtype=int)
@@ -302,8 +307,8 @@ def _trees(model: mujoco.MjModel) -> dict[str, np.ndarray]:
 
 
 def _motors(model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """Return the motors sorted by the degree of freedom that they drive; of each of those its first in that order, and its
-    last or -1.
+    """Return the motors sorted by degree of freedom (`motor`), the first of each degree of freedom in that order
+    (`motor_start`), and its last motor or -1 (`motor_of_dof`).
     """
     dof = model.jnt_dofadr[model.actuator_trnid[:, 0]]
     start = np.searchsorted(np.sort(dof), np.arange(model.nv + 1))
@@ -313,14 +318,14 @@ def _motors(model: mujoco.MjModel) -> dict[str, np.ndarray]:
 
 
 def _one_motor(model: mujoco.MjModel) -> bool:
-    """Whether a degree of freedom has one motor at most, and each motor the control of its own number."""
+    """Return True if each degree of freedom has at most one motor, and each motor the control with its own index."""
     joints = model.actuator_trnid[:, 0]
     return len(set(joints.tolist())) == model.nu and bool((model.actuator_ctrladr == np.arange(model.nu)).all())
 
 
 def _joints(model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """Return of each joint its type, where its position begins and which degree of freedom is its first; and of each degree
-    of freedom its body, its joint, the joint's type and its place in the joint, packed into one number each.
+    """Return tables that pack several indices into one integer: for each joint its type, the start of its position and its
+    first degree of freedom; for each degree of freedom its body, its joint, the joint's type and its index within the joint.
     """
     joint = model.dof_jntid
     place = np.arange(model.nv) - model.jnt_dofadr[joint]

@@ -1,4 +1,4 @@
-"""What the constraint solver reads and writes."""
+"""Arrays of the constraint solver."""
 
 import warp as wp
 
@@ -7,8 +7,9 @@ Vector5 = wp.types.vector(length=5, dtype=wp.float32)
 
 @wp.struct
 class SolverArrays:
-    """Tables of our own; what the solver reads of mujoco-warp's model and data; and what it writes: from `qacc` to `rounds`,
-    where there are dampers `advance`, and of rows that have a `row_key` which side they end on, in `last_rows`.
+    """Arrays of the solver. It reads its own tables and arrays of mujoco-warp's model and data. It writes the arrays from
+    `qacc` to `rounds`, `advance` if dampers are integrated implicitly, and in `last_rows` the final states of rows with a
+    `row_key`.
     """
 
     dof_depth: wp.array[int]

@@ -1,9 +1,9 @@
 """A physics step in few launches: one before contacts, one for constraint forces, one for integration.
 
-mujoco-warp launches a stage for everything that a model might have: gravity compensation, external forces, muscles with
-lengths and activations, fluids, tendons. At 4096 worlds a launch costs microseconds whether it finds anything or not;
-together these are a fifth of a step. Here are trees of joints with springs and dampers, moved by motors; `why_not` says what
-else a model has. Forces on bodies from outside (`xfrc_applied`) are there if they were asked for; `qfrc_applied`,
+mujoco-warp launches a stage for every feature that a model might have: gravity compensation, external forces, muscles with
+lengths and activations, fluids, tendons. At 4096 worlds each launch costs microseconds even if it computes nothing; together
+these are a fifth of a step. This step supports trees of joints with springs and dampers that motors drive; `why_not` names
+other features of a model. External forces on bodies (`xfrc_applied`) are applied if they were requested. `qfrc_applied`,
 sensors, and the poses of bodies, sites and cameras are not computed.
 """
 
@@ -14,8 +14,8 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
+from legged.physics.fused.active_set import ActiveSet
 from legged.physics.fused.constraint_solver import ConstraintSolver
-from legged.physics.fused.row_sides import RowSides
 from legged.physics.fused.smooth_dynamics import BALL, FREE, SmoothDynamics, has_dampers
 
 NEFC, BROADPHASE, NARROWPHASE = (int(getattr(mjw.OverflowType, n)) for n in ("NEFC", "BROADPHASE", "NARROWPHASE"))
@@ -26,7 +26,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def turned_by(quat: wp.vec4, rotation: wp.vec3) -> wp.vec4:
-    """Return a unit quaternion (w, x, y, z) after turning by a rotation vector [rad] in its own frame."""
+    """Return a unit quaternion (w, x, y, z) rotated by a rotation vector [rad] in its own frame."""
     angle = wp.length(rotation)
     w, xyz = wp.cos(0.5 * angle), wp.sin(0.5 * angle) * wp.normalize(rotation)
     old = wp.vec3(quat[1], quat[2], quat[3])
@@ -36,7 +36,7 @@ def turned_by(quat: wp.vec4, rotation: wp.vec3) -> wp.vec4:
 
 @wp.struct
 class StateArrays:
-    """What integration reads of mujoco-warp's model and data, and from `qpos` on what it writes."""
+    """Arrays of the integration. It reads arrays of mujoco-warp's model and data, and writes those from `qpos` on."""
 
     timestep: wp.array[float]
     jnt_type: wp.array[int]
@@ -57,20 +57,20 @@ class StateArrays:
 
 @wp.func
 def three(of: wp.array2d[float], world: int, at: int) -> wp.vec3:
-    """Return three numbers of a world's row, from `at` on."""
+    """Return three numbers of a world's row, starting at `at`."""
     return wp.vec3(of[world, at], of[world, at + 1], of[world, at + 2])
 
 
 @wp.func
 def put_three(to: wp.array2d[float], world: int, at: int, numbers: wp.vec3) -> None:
-    """Write three numbers into a world's row, from `at` on."""
+    """Write three numbers into a world's row, starting at `at`."""
     for k in range(3):
         to[world, at + k] = numbers[k]
 
 
 @wp.func
 def turn_joint(world: int, at: int, dof: int, h: float, of: StateArrays) -> None:
-    """Move on what of a joint is a quaternion, which is at `at` in qpos, with three degrees of freedom."""
+    """Integrate the quaternion of a joint, which starts at `at` in qpos, and its three degrees of freedom."""
     velocity, gain = three(of.qvel, world, dof), three(of.advance, world, dof)
     acceleration = three(of.qacc, world, dof)
     quat = wp.vec4(of.qpos[world, at], of.qpos[world, at + 1], of.qpos[world, at + 2], of.qpos[world, at + 3])
@@ -84,10 +84,10 @@ def turn_joint(world: int, at: int, dof: int, h: float, of: StateArrays) -> None
 
 @wp.func
 def integrate_joint(world: int, joint: int, of: StateArrays) -> None:
-    """Move one joint on by semi-implicit Euler; with a world's first, set the flags of what found no room.
+    """Integrate one joint by semi-implicit Euler. The world's first joint also sets the overflow flags.
 
-    All is read before anything is written, of a free joint once for its place and once for its turn: a compiler lets no read
-    pass a write, and each would be waited for.
+    All reads precede all writes, for a free joint separately in its position and its orientation: the compiler moves no read
+    ahead of a write, so each read would wait for memory by itself.
     """
     h = of.timestep[world % of.timestep.shape[0]]
     at, dof = of.jnt_qposadr[joint], of.jnt_dofadr[joint]
@@ -121,23 +121,25 @@ def integrate_joint(world: int, joint: int, of: StateArrays) -> None:
 
 @wp.kernel
 def integrate(of: StateArrays):
-    """One thread a world and joint."""
+    """Integrate all joints. One thread per world and joint."""
     world, joint = wp.tid()
     integrate_joint(world, joint, of)
 
 
 class TorqueStep:
-    """Launches on mujoco-warp's arrays all of a step but contacts and constraint rows, which are made in between."""
+    """Launches, on mujoco-warp's arrays, of all parts of a step except contacts and constraint rows, which are made between
+    `begin` and `finish`.
+    """
 
     def __init__(
-        self, model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = (), sides: RowSides | None = None
+        self, model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = (), active_set: ActiveSet | None = None
     ) -> None:
-        """Prepare the launches for mujoco-warp's `m` and `d` of a `model` of which neither `why_not` nor that of
-        `ConstraintSolver` says anything, in whose arrays `randomized` worlds differ, with what makes rows known again, if
-        there is such. Call with their device as Warp's current one.
+        """Prepare the launches for mujoco-warp's `m` and `d` of a `model` for which `why_not` and `ConstraintSolver.why_not`
+        are empty. `randomized` names the arrays in which worlds differ; `active_set` holds the rows' states of the last step,
+        if they have keys. Warp's current device must be that of `m` and `d`.
         """
         self.dynamics = SmoothDynamics(model, m, d, randomized)
-        self.solver = ConstraintSolver(model, m, d, damped=has_dampers(model, randomized), sides=sides)
+        self.solver = ConstraintSolver(model, m, d, damped=has_dampers(model, randomized), active_set=active_set)
         of = self.state = StateArrays()
         of.timestep, of.jnt_type, of.jnt_qposadr, of.jnt_dofadr = m.opt.timestep, m.jnt_type, m.jnt_qposadr, m.jnt_dofadr
         of.advance, of.qacc = self.solver.advance, d.qacc
@@ -147,18 +149,20 @@ class TorqueStep:
 
     @staticmethod
     def why_not(model: mujoco.MjModel, randomized: Collection[str] = ()) -> str:
-        """Return what of a model this does not step, where worlds differ in the arrays `randomized`, by the names that
-        MuJoCo gives them; empty if nothing.
+        """Return the reason why a model is not supported if worlds differ in the arrays `randomized` (MuJoCo's names); empty
+        if it is.
         """
         if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
             return "the model's integrator is not Euler"
         return SmoothDynamics.why_not(model, randomized)
 
     def begin(self) -> None:
-        """Compute from qpos, qvel and ctrl where shapes are, what contacts need to know, and all other forces."""
+        """Compute the poses of shapes, the inputs of contacts, and all forces except constraint forces from qpos, qvel and
+        ctrl.
+        """
         self.dynamics.launch()
 
     def finish(self) -> None:
-        """Compute, with the rows of constraints made, their forces, the next state and warm start, and overflow flags."""
+        """Compute constraint forces from the constraint rows, then the next state, the warm start and the overflow flags."""
         self.solver.solve()
         wp.launch(integrate, dim=(self.worlds, self.joints), inputs=[self.state])

@@ -1,4 +1,6 @@
-"""The order in which a system of the degrees of freedom of a tree is solved, and what may be solved at once."""
+"""Elimination tree of the degrees of freedom: the order in which a linear system is solved, and the parts that can be solved
+in parallel.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -9,24 +11,25 @@ import numpy as np
 CONNECT, WELD, JOINT = (int(getattr(mujoco.mjtEq, f"mjEQ_{name}")) for name in ("CONNECT", "WELD", "JOINT"))
 SITE = int(mujoco.mjtObj.mjOBJ_SITE)
 MOST_ROOT = 6
-"""Degrees of freedom of the root that each lane solves for by itself: their entries must find room in its registers, and
-with the right-hand side those of a triangle of 6 are no more than there are lanes."""
+"""Largest number of degrees of freedom in the root, for which every lane solves. Its entries must fit a lane's registers. The
+triangle of 6, with the right-hand side, has no more entries than there are lanes."""
 MOST_DOFS = 60
-"""mujoco-warp keeps the rows of a Jacobian whole up to so many; a lane of a GPU can have two, which would be 64."""
+"""Largest number of degrees of freedom for which mujoco-warp keeps dense Jacobian rows. A GPU lane can hold two, which would
+allow 64."""
 
 
 @dataclass(frozen=True)
 class Tree:
-    """Of each degree of freedom the one above it, all of which come before it."""
+    """Parent of each degree of freedom in the elimination tree. Parents precede their children."""
 
     parent: np.ndarray
-    """(nv,) -1 where there is none."""
+    """(nv,) index of the parent; -1 for roots."""
 
     @classmethod
     def of(cls, model: mujoco.MjModel) -> "Tree":
-        """Return the elimination tree of the mass matrix and of the model's equality constraints: a matrix that has their
-        entries has, eliminated from the last degree of freedom to the first, no entry but between one and those above it
-        (Davis, Direct Methods for Sparse Linear Systems, 2006, section 4.1).
+        """Return the elimination tree of the mass matrix with the model's equality constraints. When a matrix with their
+        entries is eliminated from the last degree of freedom to the first, its only non-zero entries couple a degree of
+        freedom with its ancestors (Davis, Direct Methods for Sparse Linear Systems, 2006, section 4.1).
         """
         above: list[set[int]] = [set(_chain(model, i)) - {i} for i in range(model.nv)]
         for clique in _coupled(model):
@@ -41,7 +44,7 @@ class Tree:
 
     @property
     def depth(self) -> np.ndarray:
-        """(nv,) how many are above."""
+        """(nv,) number of ancestors."""
         depth = np.zeros(len(self.parent), dtype=int)
         for i, parent in enumerate(self.parent):
             depth[i] = depth[parent] + 1 if parent >= 0 else 0
@@ -49,7 +52,7 @@ class Tree:
 
     @property
     def root(self) -> int:
-        """How many of the first ones, up to `MOST_ROOT`, are above all that come after them."""
+        """Number of leading degrees of freedom, up to `MOST_ROOT`, that are ancestors of all later ones."""
         most = min(MOST_ROOT, len(self.parent))
         for count in range(most, 0, -1):
             if (self.parent[:count] == np.arange(count) - 1).all() and (self.parent[count:] >= count - 1).all():
@@ -57,14 +60,14 @@ class Tree:
         return 0
 
     def path(self, i: int) -> list[int]:
-        """Return those above `i`, from the first, and itself."""
+        """Return the path to `i`: its ancestors from the root, then `i` itself."""
         path = [i]
         while self.parent[path[-1]] >= 0:
             path.append(int(self.parent[path[-1]]))
         return path[::-1]
 
     def constants(self) -> dict[str, int | bool]:
-        """Return what elimination.h asks for."""
+        """Return the constants of elimination.h."""
         depth, root = self.depth, self.root
         triangle = root * (root + 1) // 2
         return {
@@ -77,15 +80,17 @@ class Tree:
         }
 
     def tables(self) -> dict[str, np.ndarray]:
-        """Return of each degree of freedom its depth, its place among those of the same depth, and the set of those on its
-        path as bits of a number; of each depth how many have it; and of each depth and degree of freedom, (depths * nv,),
-        what is there on its path, and which of that depth hang on it, from the lowest byte on: the place of the first, and
-        that after the last.
+        """Return the tables of elimination.h.
+
+        For each degree of freedom: `dof_depth`, its depth; `dof_place`, its place among those of the same depth; `path`, its
+        path as a bit mask. For each depth: `depth_width`, the number of degrees of freedom. For each depth and degree of
+        freedom, (depths * nv,): `dof_path`, the element of its path at that depth; `below`, the range of places of its
+        descendants at that depth, with the first place in the lowest byte and the end in the next.
         """
         nv, depth = len(self.parent), self.depth
         paths = [self.path(i) for i in range(nv)]
         at_depth = [np.flatnonzero(depth == t) for t in range(depth.max() + 1)]
-        # Those that hang on one are side by side when sorted by their paths.
+        # Sorting by path makes the descendants of each degree of freedom adjacent.
         at_depth = [np.array(sorted(those, key=lambda i: paths[i])) for those in at_depth]
         place, of_path, below = (
             np.zeros(nv, dtype=int),
@@ -110,7 +115,7 @@ class Tree:
 
 
 def _chain(model: mujoco.MjModel, dof: int) -> list[int]:
-    """Return a degree of freedom and those above it in the mechanism."""
+    """Return a degree of freedom and its ancestors in the mechanism."""
     chain = []
     while dof >= 0:
         chain.append(int(dof))
@@ -126,7 +131,7 @@ def _of_body(model: mujoco.MjModel, body: int) -> list[int]:
 
 
 def _coupled(model: mujoco.MjModel) -> Iterable[set[int]]:
-    """Yield the degrees of freedom that rows of each equality constraint of bodies, sites or joints move."""
+    """Yield the sets of degrees of freedom that the rows of each equality constraint of bodies, sites or joints couple."""
     for kind, of, *pair in zip(model.eq_type, model.eq_objtype, model.eq_obj1id, model.eq_obj2id, strict=True):
         if kind in (CONNECT, WELD):
             bodies = [model.site_bodyid[one] if of == SITE else one for one in pair]

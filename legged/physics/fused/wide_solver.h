@@ -1,13 +1,13 @@
-// MuJoCo's Newton solver for the constraint forces of WIDE worlds at once, for a CPU: constraint_solver.h with the numbers of all
-// worlds side by side in vector registers, of friction pyramids. Worlds with fewer rows than others have empty ones, and those
-// that are done wait for the others of their block. The block's worlds are those from `start` on, before `end`. Constants: WIDE,
-// NV (degrees of freedom), ROWS (most constraint rows), ENTRIES (of the mass matrix that are not zero), DAMPED (whether dampers
-// are integrated implicitly), KNOWN (whether rows are known again from step to step), FRICTION (whether there may be rows of dry
-// friction), COUPLED (whether a row may move degrees of freedom of several branches). And of the tree: PATH_START and PATH_LENGTH
-// (NV each), where the path of a degree of freedom from the root to itself begins in PATHS, and how long it is; ENTRY_PLACE
-// (ENTRIES), where an entry of the mass matrix is among those of all paths.
+// MuJoCo's Newton solver for the constraint forces of WIDE worlds at once on a CPU: the solver of constraint_solver.h, for
+// friction pyramids, with the numbers of all worlds in vector registers. Worlds with fewer rows than others have empty rows,
+// and worlds that have converged wait for the others of their block. A block has the worlds from `start` to before `end`, at
+// most WIDE. Constants: WIDE, NV (degrees of freedom), ROWS (largest number of constraint rows), ENTRIES (stored entries of
+// the mass matrix), DAMPED (dampers are integrated implicitly), KNOWN (rows have keys by which their states of the last step
+// are found), FRICTION (there may be rows of dry friction), COUPLED (a row may move degrees of freedom of several branches).
+// Tables of the tree: PATH_START and PATH_LENGTH (NV each), the start and length in PATHS of each degree of freedom's path
+// from the root to itself; ENTRY_PLACE (ENTRIES), the place of each entry of the mass matrix among the entries of all paths.
 
-// Numbers of all worlds; and masks, all of whose bits are set where something is so.
+// One number per world, and one mask per world, in which all bits are set for true.
 typedef float Wide __attribute__((vector_size(4 * WIDE), may_alias));
 typedef int Mask __attribute__((vector_size(4 * WIDE), may_alias));
 const Wide ZERO = Wide{};
@@ -21,9 +21,10 @@ auto any_of = [](const Mask& mask) {
     return some != 0;
 };
 
-int at[WIDE];  // which worlds; the last one again where there are too few
+int at[WIDE];  // indices of the worlds; the last world is repeated if there are too few
 int rows = 0;
-Mask own_rows, equalities, plain;  // rows of equalities, and those with dry friction too, come first
+// numbers of rows, of equality rows, and of equality and dry friction rows, which come first
+Mask own_rows, equalities, plain;
 for (int w = 0; w < WIDE; ++w) {
     at[w] = start + w < end ? start + w : end - 1;
     const int own = arrays.nefc.data[at[w]] < ROWS ? arrays.nefc.data[at[w]] : ROWS;
@@ -33,10 +34,10 @@ for (int w = 0; w < WIDE; ++w) {
     plain[w] = equalities[w] + (FRICTION ? arrays.frictions.data[at[w]] : 0);
 }
 
-// One world's number among those of all: written as one, not as a register that is read and written back.
+// Returns one world's number among those of all, as a reference, so that writing it does not read and write a whole register.
 auto of = [&](Wide& all, int w) -> float& { return reinterpret_cast<float*>(&all)[w]; };
 Wide J[ROWS][NV], D[ROWS], x[ROWS], force[ROWS], curvature[ROWS], jv[ROWS], least[ROWS], greatest[ROWS];
-Mask sides[ROWS];
+Mask states[ROWS];
 bool couples[ROWS];
 Wide M[SPARSE], H[COUPLED ? DENSE : SPARSE];
 Wide a[NV], Ma[NV], Ms[NV], smooth[NV], pushed[NV], grad[NV], s[NV], over[NV];
@@ -80,7 +81,7 @@ Wide trace = ZERO;
 for (int i = 0; i < NV; ++i) trace += M[PATH_START[i] + PATH_LENGTH[i] - 1];
 const Wide scale = 1.0f / (trace > TINY ? trace : ZERO + TINY);
 
-// out = M v.
+// Computes out = M v.
 auto times_inertia = [&](const Wide* v, Wide* out) {
     for (int i = 0; i < NV; ++i) {
         const Wide* row = M + PATH_START[i];
@@ -90,7 +91,7 @@ auto times_inertia = [&](const Wide* v, Wide* out) {
             total += row[t] * v[path[t]];
             out[path[t]] += row[t] * v[i];
         }
-        out[i] = total;  // those below it come later
+        out[i] = total;  // rows below i add to it later
     }
 };
 auto along_row = [&](int r, const Wide* v) {
@@ -102,13 +103,14 @@ auto along_row = [&](int r, const Wide* v) {
 times_inertia(a, Ma);
 for (int r = 0; r < rows; ++r) {
     x[r] += along_row(r, a);
-    sides[r] = Mask{} + UNKNOWN;
+    states[r] = Mask{} + UNKNOWN;
 }
-// The sides of the last step, but after a reset, which leaves no acceleration to begin with. Here 0 is what has curvature, -1
-// the least force, 2 the greatest; both lists are in the order of their keys.
+// Read the row states of the last step. After a reset there is no acceleration to start from, and they are not used. In this
+// file a state is 0 on the quadratic piece of the cost, -1 at the least force and 2 at the greatest. Both lists are ordered
+// by key.
 auto last_rows = [&](int w) { return arrays.last_rows.data + (long long)at[w] * arrays.last_rows.shape[1]; };
 auto row_keys = [&](int w) { return arrays.row_key.data + (long long)at[w] * arrays.row_key.shape[1]; };
-Mask guess = Mask{};  // worlds of which there are any
+Mask guess = Mask{};  // worlds with states of the last step
 for (int w = 0; KNOWN && w < WIDE; ++w) {
     bool moving = false;
     for (int i = 0; i < NV; ++i) moving |= a[i][w] != 0.0f;
@@ -119,13 +121,13 @@ for (int w = 0; KNOWN && w < WIDE; ++w) {
         const int key = row_keys(w)[r];
         while (k < had && last[1 + k] >> 2 < key) ++k;
         if (k == had || last[1 + k] >> 2 != key) continue;
-        const int side = (last[1 + k] & 3) - 2;
-        sides[r][w] = side == HOLDING ? 0 : side == SLIPPING_BACK ? 2 : -1;
+        const int state = (last[1 + k] & 3) - 2;
+        states[r][w] = state == HOLDING ? 0 : state == SLIPPING_BACK ? 2 : -1;
     }
 }
 
-// Of the system H s = g of a tree in which row i has entries for its path alone, from g in s the solution there; of each row
-// where it begins, and how long it is. H = L^T diag(1 / over) L, from the leaves to the root.
+// Solves H s = g for a tree in which row i of H has entries for the path of i only; s holds g at first. The arguments return
+// the start, the length and the elements of a row. H = L^T diag(1 / over) L, from the leaves to the root.
 auto solve = [&](auto start_of, auto length_of, auto path_of) {
     for (int k = NV - 1; k >= 0; --k) {
         const int last = length_of(k) - 1;
@@ -148,7 +150,7 @@ auto solve = [&](auto start_of, auto length_of, auto path_of) {
     }
 };
 int pushing[ROWS], pushers = 0;
-// Entries t to t + columns of the rows of H from i on, so many side by side: what rows that push add to them.
+// Adds the rows in `pushing` to a tile of H: the entries t to t + columns of consecutive rows of H from i on.
 struct One { enum { value = 1 }; };
 struct Two { enum { value = 2 }; };
 struct Three { enum { value = 3 }; };
@@ -168,7 +170,8 @@ auto add_tile = [&](auto tile_rows, auto tile_columns, const Wide (*of_rows)[ROW
     for (int q = 0; q < tall; ++q)
         for (int c = 0; c < broad; ++c) H[start_of(i + q) + t + c] = total[q][c];
 };
-// The rows that push, times their curvature, added to H: of three degrees of freedom at once where they follow each other.
+// Adds the rows in `pushing`, times their curvature, to H. Three degrees of freedom are processed at once if they follow each
+// other on a path.
 auto add_rows = [&](auto start_of, auto length_of, auto path_of) {
     auto add_entries = [&](auto tall, const Wide (*of_rows)[ROWS], int i, int from, int to) {
         int t = from;
@@ -194,11 +197,11 @@ auto sparse_path = [](int i, int t) { return PATHS[PATH_START[i] + t]; };
 [[maybe_unused]] auto dense_path = [](int, int t) { return t; };
 
 Mask active = Mask{} - 1, rounds = Mask{};
-Wide alpha = ZERO;  // of the last step; a whole one on which no row changes sides leads to the lowest point
+Wide alpha = ZERO;  // length of the last step; after a full step without changed states, the minimum is reached
 for (int round = 0;; ++round) {
-    // The first step goes all the way to the lowest point of the quadratic function that the sides of the last step make.
+    // The first step goes to the minimum of the quadratic function that the states of the last step define.
     const bool guessing = KNOWN && round == 0 && any_of(guess);
-    // Forces, whether rows changed sides, and the gradient.
+    // Compute the forces, whether rows changed their states, and the gradient.
     Mask changed = Mask{};
     bool coupled = false;
     pushers = 0;
@@ -207,15 +210,15 @@ for (int round = 0;; ++round) {
         const Wide pull = -D[r] * x[r];
         Mask low = pull <= least[r], high = pull >= greatest[r];
         if (guessing) {
-            const Mask known = guess & (sides[r] != UNKNOWN);
-            low = known ? sides[r] == -1 : low;
-            high = known ? sides[r] == 2 : high;
+            const Mask known = guess & (states[r] != UNKNOWN);
+            low = known ? states[r] == -1 : low;
+            high = known ? states[r] == 2 : high;
         }
         force[r] = low ? least[r] : high ? greatest[r] : pull;
         curvature[r] = low | high ? ZERO : D[r];
-        const Mask side = low - 2 * high;  // a mask that is set is -1
-        changed |= side != sides[r];
-        sides[r] = side;
+        const Mask state = low - 2 * high;  // a mask that is true is -1
+        changed |= state != states[r];
+        states[r] = state;
         if (!any_of((force[r] != 0.0f) | (curvature[r] != 0.0f))) continue;
         pushing[pushers++] = r;
         coupled |= COUPLED && couples[r];
@@ -228,11 +231,11 @@ for (int round = 0;; ++round) {
         s[i] = -grad[i];
     }
     if (round == most_rounds) break;
-    const Mask whole = guessing ? guess : Mask{};  // worlds that go all the way
+    const Mask whole = guessing ? guess : Mask{};  // worlds that take a full step
     active &= whole | ~(scale * scale * squares < tolerance * tolerance);
     active &= changed | (alpha != ONE);
     if (!any_of(active)) break;
-    // The step s = -H^-1 grad.
+    // Compute the step s = -H^-1 grad.
     if (COUPLED && coupled) {
         for (int k = 0; k < DENSE; ++k) H[COUPLED ? k : 0] = ZERO;
         for (int i = 0; i < NV; ++i)
@@ -244,7 +247,7 @@ for (int round = 0;; ++round) {
         add_rows(sparse_start, sparse_length, sparse_path);
         solve(sparse_start, sparse_length, sparse_path);
     }
-    // Along the step: derivative slope + alpha * bend of the inertial part, and of every row.
+    // Along the step, compute the derivative slope + alpha * bend of the inertial part, and J s for every row.
     times_inertia(s, Ms);
     Wide slope = ZERO, bend = ZERO, length = ZERO, decrement = ZERO;
     for (int i = 0; i < NV; ++i) {
@@ -253,17 +256,17 @@ for (int round = 0;; ++round) {
         length += s[i] * s[i];
         decrement -= s[i] * grad[i];
     }
-    // Else there is nothing to gain; also where something is not a number.
+    // Continue only where the step gains enough, which is false for NaN.
     active &= scale * 0.5f * decrement >= (whole ? ZERO - INFINITE : ZERO + tolerance);
     if (!any_of(active)) break;
     for (int r = 0; r < rows; ++r) jv[r] = along_row(r, s);
-    // It need not be followed to its lowest point: what is left of its slope goes in the next round. Squared:
+    // The line search need not reach the minimum: the next iteration reduces the rest of the slope. These are squares:
     const Wide least_slope = tolerance * tolerance * ls_tolerance * ls_tolerance * length / (scale * scale);
     const Wide slope_left = ENOUGH * ENOUGH * decrement * decrement;
     const Wide flat = least_slope > slope_left ? least_slope : slope_left;
     alpha = ONE;
     Wide low = ZERO, high = -ONE;
-    // Nor does it pay to look before the second step: the sides that it goes by are mostly right.
+    // The second step needs no line search either, since the row states that it starts from are mostly right.
     Mask searching = KNOWN && round == 1 ? Mask{} : active & ~whole;
     for (int k = 0; k < most_searches && any_of(searching); ++k) {
         Wide first = slope + alpha * bend, second = bend;
@@ -278,7 +281,7 @@ for (int round = 0;; ++round) {
         low = (searching & (first < 0.0f)) ? alpha : low;
         high = (searching & ~(first < 0.0f)) ? alpha : high;
         const Wide next = alpha - first / second, change = next - alpha;
-        searching &= ~((change < 0.0f ? -change : change) <= 1e-7f * alpha);  // as near as float32 gets
+        searching &= ~((change < 0.0f ? -change : change) <= 1e-7f * alpha);  // limit of float32
         const Mask outside = (high > 0.0f) & ((next <= low) | (next >= high));
         alpha = searching ? (outside ? 0.5f * (low + high) : next) : alpha;
     }
@@ -290,7 +293,7 @@ for (int round = 0;; ++round) {
     rounds -= active;
 }
 
-if (DAMPED) {  // (M + h D) s = all forces: dampers as they act at the end of the step
+if (DAMPED) {  // (M + h D) s = all forces: dampers act at the end of the step
     for (int k = 0; k < SPARSE; ++k) H[k] = M[k];
     for (int i = 0; i < NV; ++i) {
         s[i] = smooth[i] + pushed[i];
@@ -314,8 +317,8 @@ for (int w = 0; w < WIDE && start + w < end; ++w) {
         int* last = last_rows(w);
         last[0] = own_rows[w] - equalities[w];
         for (int r = equalities[w]; r < own_rows[w]; ++r) {
-            const int side = sides[r][w] == 0 ? HOLDING : sides[r][w] == 2 ? SLIPPING_BACK : r < plain[w] ? SLIPPING : IDLE;
-            last[1 + r - equalities[w]] = row_keys(w)[r] << 2 | (side + 2);
+            const int state = states[r][w] == 0 ? HOLDING : states[r][w] == 2 ? SLIPPING_BACK : r < plain[w] ? SLIPPING : IDLE;
+            last[1 + r - equalities[w]] = row_keys(w)[r] << 2 | (state + 2);
         }
     }
 }

@@ -1,8 +1,8 @@
-"""The constraint solver for a CPU: many worlds at once, one in each place of its vector registers.
+"""Constraint solver for a CPU that computes several worlds at once, one in each lane of its vector registers.
 
-What one thread computes for one world is a chain of short loops that a compiler hardly vectorises. Side by side, worlds take
-the same instructions; those that need fewer rounds, or fewer rows, wait for the others of their block. Each world's numbers
-are the same in whatever company it is computed.
+For a single world the solver is a chain of short loops, which a compiler hardly vectorises. Worlds in different lanes execute
+the same instructions; worlds with fewer iterations or fewer rows wait for the others of their block. A world's results do not
+depend on the other worlds of its block.
 """
 
 from typing import Any
@@ -10,24 +10,31 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from legged.physics.fused.active_set import ROW_STATES
 from legged.physics.fused.native import Constant, native_source
-from legged.physics.fused.row_sides import SIDES
 from legged.physics.fused.solver_arrays import SolverArrays
 from legged.physics.fused.tree import Tree
 
 SOURCE = ("wide_solver.h",)
 WIDE = 16
-"""Worlds of a block: the floats of AVX-512's registers. A compiler takes two or four registers where they are smaller."""
+"""Number of worlds per block: the number of floats in a register of AVX-512. Where registers are smaller, the compiler uses
+two or four."""
 STACK_BYTES = 2 * 1024 * 1024
-"""What a block's numbers may take of a thread's stack, of which there are 8 MB on Linux."""
+"""Largest size of a block's data on a thread's stack [bytes]; Linux gives a stack 8 MB."""
 
 
 def wide_constants(
     tree: Tree, entries: tuple[np.ndarray, np.ndarray], rows: int, damped: bool, friction: bool, known: bool = False
 ) -> dict[str, Constant]:
-    """Return what wide_solver.h asks for, of models of a tree whose mass matrix has `entries` in these rows and columns, with
-    at most `rows` constraint rows, dampers to integrate implicitly or none, rows of dry friction or none, and rows that are
-    `known` again from step to step or not.
+    """Return the constants of wide_solver.h for models with one elimination tree.
+
+    Args:
+        tree: elimination tree of the degrees of freedom.
+        entries: rows and columns of the stored entries of the mass matrix.
+        rows: largest number of constraint rows.
+        damped: True if dampers are integrated implicitly.
+        friction: True if there are rows of dry friction.
+        known: True if rows have keys by which their states of the last step are found.
     """
     nv = len(tree.parent)
     paths = [tree.path(i) for i in range(nv)]
@@ -36,7 +43,7 @@ def wide_constants(
     return {
         **{"WIDE": WIDE, "NV": nv, "ROWS": rows, "ENTRIES": len(lower), "DAMPED": damped, "FRICTION": friction},
         "KNOWN": known,
-        **SIDES,
+        **ROW_STATES,
         "COUPLED": bool(tree.constants()["SPLIT"]),
         "PATH_START": tuple(starts[:-1].tolist()),
         "PATH_LENGTH": tuple(map(len, paths)),
@@ -46,12 +53,14 @@ def wide_constants(
 
 
 def fits_wide(nv: int, rows: int) -> bool:
-    """Whether a block of models with so many degrees of freedom and constraint rows has room on a stack."""
+    """Return True if the data of a block with `nv` degrees of freedom and `rows` constraint rows fit a thread's stack."""
     return 4 * WIDE * (rows * (nv + 9) + 2 * nv * nv) <= STACK_BYTES
 
 
 def wide_function(constants: dict[str, Constant]) -> Any:
-    """Return what the kernel does for one block: of worlds from `start` on, before `end`."""
+    """Return the device function of the kernel, which computes one block: the worlds from `start` to before `end`, at most
+    `WIDE`.
+    """
 
     @wp.func_native(native_source(SOURCE, constants))
     def solve_block(
@@ -68,7 +77,9 @@ def wide_function(constants: dict[str, Constant]) -> Any:
 
 
 def wide_kernel(constants: dict[str, Constant]) -> Any:
-    """Return the kernel for some `wide_constants`; launched for (blocks,), of worlds from `first` to before `end`."""
+    """Return the kernel for a set of `wide_constants`. It is launched for (blocks,), with the worlds from `first` to before
+    `end`.
+    """
     solve_block = wide_function(constants)
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -1,5 +1,5 @@
-"""Newton's solvers behind the interface."""
+"""Newton's solvers behind the `Physics` interface."""
 
 from legged.physics.warp import settings
 
-__all__ = ["settings"]  # imported before anything here declares a kernel
+__all__ = ["settings"]  # before any module here declares a kernel

@@ -1,7 +1,8 @@
-"""What is randomised in Newton's MuJoCo solver, by writing into the arrays of the mujoco-warp model that it has inside.
+"""Randomisation in Newton's MuJoCo solver, by writing into the arrays of its internal mujoco-warp model.
 
-Newton's own arrays know of friction and masses only, and to tell the solver of a change is no matter of a step. The solver's
-arrays have a row for each world, under MuJoCo's names. Motors are not part of it: their torques are applied to joints.
+Newton's own arrays contain only friction and masses, and notifying the solver of a change is not possible within a captured
+step. The solver's internal arrays have one row per world, under MuJoCo's names. Motors are not part of the solver: their
+torques are applied to joints.
 """
 
 from collections.abc import Collection, Mapping
@@ -18,16 +19,17 @@ from legged.physics.fields import DERIVED, FIELDS, GRAVITY, changed_arrays
 from legged.physics.newton.simulation import Simulation
 from legged.physics.randomized_model import RandomizedModel
 from legged.physics.scene import Scene
-from legged.physics.warp.redraws import Redraws, Variants
+from legged.physics.warp.randomize_kernels import Redraws, Variants
 
 MOTORS = ("motor_strength", "actuator_gain", "torque_limit")
-"""Fields of what makes torques of controls, which is not the solver's."""
+"""Fields of the motors, which convert controls to torques outside the solver."""
 CENTRES, BASE_CENTRE = "body_com", "base_com"
-"""Newton's own centres of mass, and the base's in what converts velocities: they follow the solver's `body_ipos`."""
+"""Newton's own centres of mass, and the base's centre of mass that converts velocities. Both follow the solver's
+`body_ipos`."""
 
 
 class _SolversScene(Scene):
-    """What the solver's model consists of, in its own order of shapes."""
+    """Scene of the solver's internal model, with its own order of shapes."""
 
     def __init__(self, name: str, solvers: mujoco.MjModel) -> None:
         self.name, self._solvers = name, solvers
@@ -40,13 +42,13 @@ class _SolversScene(Scene):
 
 
 class SolverFields:
-    """The arrays of the solver, and those of motors, that fields change."""
+    """Arrays of the solver and of the motors that fields change."""
 
     def __init__(
         self, scene: Scene, model: mujoco.MjModel, simulation: Simulation, base_com: Tensor, fields: Collection[str]
     ) -> None:
-        """Prepare for `fields` of the robot that `model` is of in MuJoCo; `base_com` (N, 3) is what converts velocities of
-        the base. Call with the device as Warp's current one.
+        """Prepare for `fields` of the robot whose MuJoCo model is `model`. `base_com` (N, 3) is the centre of mass that
+        converts the base's velocities. Warp's current device must be that of the simulation.
         """
         solver: Any = simulation.solver
         self._m, self._d, worlds, device = solver.mjw_model, solver.mjw_data, len(base_com), base_com.device
@@ -57,14 +59,14 @@ class SolverFields:
             True: RandomizedModel(scene, model, motors, torch.float32, device),
             False: RandomizedModel(inside, solver.mj_model, others, torch.float32, device),
         }
-        """Whether a field is of motors -> the model that it is of."""
+        """Models that fields change: True -> the motors', False -> the solver's."""
         self.gains, self.limits = (
             torch.tensor(own, dtype=torch.float32, device=device).repeat(worlds, 1, 1)
             for own in (model.actuator_gainprm, model.actuator_forcerange)
         )
-        """(N, D, 10) and (N, D, 2): in their first column gains, and the least and greatest torques [N m]."""
+        """(N, D, 10) gains in the first column, and (N, D, 2) least and greatest torques [N m]."""
         self.motors = bool(motors)
-        """Whether torques are other than what was asked for."""
+        """True if motors change the requested torques."""
         bodies = solver.mjc_body_to_newton.numpy()[0]
         self._body_order = [int(np.flatnonzero(bodies == k)[0]) for k in range(simulation.layout.bodies)]
         self._base = self._body_order[simulation.layout.base]
@@ -84,7 +86,7 @@ class SolverFields:
         self._variants: Variants | None = None
 
     def give(self, field: str, values: Tensor) -> None:
-        """Let worlds have `values` of a field, at start-up; constants are derived anew where they must be."""
+        """Set the `values` of a field at start-up. Derived constants are computed again if necessary."""
         made = self._models[field in MOTORS].give(field, values)
         for name, array in self._with_centres(made).items():
             self._arrays[name].copy_(array.view_as(self._arrays[name]))
@@ -92,14 +94,14 @@ class SolverFields:
             mjw.set_const(self._m, self._d)
 
     def _with_centres(self, made: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return arrays, and what follows from centres of mass if they are among them."""
+        """Return the arrays `made`, and, if bodies' centres of mass are among them, the arrays that follow them."""
         if "body_ipos" not in made:
             return dict(made)
         centres = made["body_ipos"]
         return {**made, CENTRES: centres[:, self._body_order], BASE_CENTRE: centres[:, self._base]}
 
     def prepare(self, drawn: Tensor, columns: Mapping[str, slice], fields: Collection[str]) -> None:
-        """Prepare what `redraw` launches."""
+        """Prepare the launches of `redraw`."""
         self._redraws = []
         for of_motors, model in self._models.items():
             names = changed_arrays([name for name in fields if (name in MOTORS) == of_motors])
@@ -107,12 +109,12 @@ class SolverFields:
                 self._redraws.append(Redraws(model, drawn, columns, {name: self._arrays[name] for name in names}))
 
     def redraw(self, mask: Tensor) -> None:
-        """Write what was drawn for the worlds of `mask` (N,)."""
+        """Copy the current random values into the worlds of `mask` (N,)."""
         for launch in self._redraws:
             launch.launch(mask)
 
     def set_variants(self, values: Mapping[str, Tensor]) -> None:
-        """Derive the constants of models to choose from."""
+        """Derive the constants of the model variants."""
         made = self._with_centres(self._models[False].variants(values))
         if self._variants is None:
             self._variants = Variants({name: (array, self._arrays[name]) for name, array in made.items()})
@@ -120,6 +122,6 @@ class SolverFields:
             self._variants.replace(made)
 
     def choose(self, mask: Tensor, chosen: Tensor) -> None:
-        """Let the worlds of `mask` (N,) have the models `chosen` (N,)."""
+        """Copy the variants `chosen` (N,) into the worlds of `mask` (N,)."""
         if self._variants is not None:
             self._variants.launch(mask, chosen)

@@ -1,4 +1,4 @@
-"""Robot and ground -> a Newton model of N worlds, and where the robot's parts are in it."""
+"""Newton model of N worlds, and the indices of the robot's parts in it."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,28 +18,28 @@ from legged.terrain import Terrain
 
 @dataclass(frozen=True)
 class Layout:
-    """Indices within one world. Newton names bodies, joints and shapes by their path in the MJCF, in its own order."""
+    """Indices within one world. Newton names bodies, joints and shapes by their path in the MJCF, and has its own order."""
 
     bodies: int
     coords: int
     dofs: int
     num_shapes: int
     base: int
-    """The floating body."""
+    """Index of the floating body."""
     shapes: np.ndarray
-    """(S,) collision shapes, in the robot's order."""
+    """(S,) indices of the collision shapes, in the robot's order."""
     root_q: int
-    """First of the free joint's coordinates: position, then orientation (x, y, z, w)."""
+    """First coordinate of the free joint: position, then orientation (x, y, z, w)."""
     root_qd: int
-    """First of its velocities: of the base's centre of mass, then angular, both in the world frame."""
+    """First velocity of the free joint: linear, of the base's centre of mass, then angular, both in the world frame."""
     dof_q: np.ndarray
-    """(D,) coordinates of the joints, in the robot's order."""
+    """(D,) indices of the joints' coordinates, in the robot's order."""
     dof_qd: np.ndarray
-    """(D,) velocities of the joints."""
+    """(D,) indices of the joints' velocities."""
 
     @classmethod
     def of(cls, world: newton.ModelBuilder, robot: Robot) -> "Layout":
-        """The layout of a builder that holds one robot and nothing else."""
+        """Return the layout of a builder that holds one robot and nothing else."""
         bodies, joints, shapes = (
             {label.rpartition("/")[2]: i for i, label in enumerate(labels)}
             for labels in (world.body_label, world.joint_label, world.shape_label)
@@ -63,15 +63,15 @@ class Layout:
 def build_newton_model(
     robot: Robot, setup: SolverSetup, sim: SimConfig, num_envs: int, terrain: Terrain | None, device: Any
 ) -> tuple[newton.Model, Layout]:
-    """N robots from the robot's MJCF on one ground that all of them share: a plane, or the height map as one field of
-    points, where steps are ramps one cell wide. Where our collider takes its place (`meets_cells`), a plane far below
-    stands for it. `device` is Warp's.
+    """Return a model of N robots from the robot's MJCF, and its layout. All robots share one ground: a plane, or the height
+    map as one height field whose steps are ramps one cell wide. Where the height-map collider replaces it
+    (`uses_cell_collider`), a plane far below is its placeholder. `device` is a Warp device.
 
     Raises:
-        ConfigError: the robot has meshes, which Newton cannot read here.
+        ConfigError: the robot has meshes, and a package that Newton needs to read them is not installed.
     """
     world = _builder(setup)
-    # Which shapes may touch is written in the model, and Newton reads it when it reads the model.
+    # Collision types are written in the model, and Newton interprets them when it reads the model.
     source = robot_source(robot, sim.self_collisions)
     try:
         world.add_mjcf(source, enable_self_collisions=sim.self_collisions, parse_visuals=False, parse_sites=False)
@@ -85,13 +85,13 @@ def build_newton_model(
     layout = Layout.of(world, robot)
     scene = _builder(setup)
     scene.replicate(world, num_envs)
-    # The ground is no part of a world: within one MJCF without self-collisions nothing would touch it.
+    # The ground is not part of a world: within one MJCF without self-collisions, nothing would collide with it.
     ground = newton.ModelBuilder.ShapeConfig(gap=setup.gap, mu=0.0 if setup.averages_friction else 1.0)
     if setup.springs is not None:
         ground.ke, ground.kd, ground.kf = setup.springs
     if terrain is None:
         scene.add_ground_plane(cfg=ground, label=FLOOR)
-    elif meets_cells(setup, sim):
+    elif uses_cell_collider(setup, sim):
         scene.add_ground_plane(height=float(terrain.height_map.corners.min()) - DEPTH, cfg=ground, label=FLOOR)
     else:
         _add_height_field(scene, terrain, ground)
@@ -101,13 +101,13 @@ def build_newton_model(
     return model, layout
 
 
-def meets_cells(setup: SolverSetup, sim: SimConfig) -> bool:
-    """Whether a height map is met by our own collider, which appends to mujoco-warp's contacts."""
+def uses_cell_collider(setup: SolverSetup, sim: SimConfig) -> bool:
+    """Return True if the height-map collider, which appends to mujoco-warp's contacts, replaces Newton's height field."""
     return setup.own_contacts and sim.terrain_collider == "cells"
 
 
 def _builder(setup: SolverSetup) -> newton.ModelBuilder:
-    """An empty builder that knows the solver's own attributes, and MuJoCo's, which the MJCF fills."""
+    """Return an empty builder with the solver's own attributes, and MuJoCo's, which the MJCF fills."""
     builder = newton.ModelBuilder()
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     if setup.register is not None:

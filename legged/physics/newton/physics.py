@@ -1,4 +1,4 @@
-"""Newton's solvers behind the interface: on a GPU, or on Warp's CPU device."""
+"""Newton's solvers behind the `Physics` interface, on a GPU or on Warp's CPU device."""
 
 from collections.abc import Collection, Mapping
 
@@ -10,9 +10,9 @@ from torch import Tensor
 from legged.config.schema import SimConfig
 from legged.errors import suggest
 from legged.physics.fields import NEWTONS_FIELDS
-from legged.physics.newton.exchange import NewtonExchange
 from legged.physics.newton.fields import SolverFields
 from legged.physics.newton.simulation import Simulation
+from legged.physics.newton.state_io import NewtonStateIO
 from legged.physics.robot_state import robot_state
 from legged.physics.scene import RobotScene
 from legged.physics.warp.compile import compile_ahead
@@ -20,11 +20,11 @@ from legged.physics.warp.physics import WarpPhysics
 
 
 class NewtonPhysics(WarpPhysics):
-    """N worlds in one of Newton's solvers (`sim.solver`). The state that the task sees is a copy in its own conventions,
-    made after every step and written back by resets and pushes.
+    """N worlds in one of Newton's solvers (`sim.solver`). The task's state is a copy in the task's conventions: it is read
+    after every step, and written back by resets and pushes.
     """
 
-    _exchange: NewtonExchange
+    _state_io: NewtonStateIO
 
     def __init__(
         self,
@@ -35,7 +35,11 @@ class NewtonPhysics(WarpPhysics):
         randomized: Collection[str] = (),
         pushed: bool = False,
     ) -> None:
-        """Build the scene on `device` and place all robots at the model's initial state; compiles on first use."""
+        """Build the scene on `device` and set all robots to the model's initial state. Kernels are compiled on first use.
+
+        Raises:
+            ConfigError: the robot has meshes, and a package that Newton needs to read them is not installed.
+        """
         super().__init__(num_envs, sim.dt, device)
         robot = scene.robot
         self.model = scene.model(sim, "none")
@@ -46,26 +50,27 @@ class NewtonPhysics(WarpPhysics):
         self._quantities = {}
         self._randomized, self._scene = tuple(randomized), scene
         self._fields: SolverFields | None = None
-        """What is randomised beside friction and the base's mass, or within steps; the MuJoCo solver's."""
+        """Arrays of the MuJoCo solver that fields change. None if only friction and the base's mass are randomised, and only
+        at start-up."""
         self.forces = torch.zeros(num_envs, self.model.nbody, 6, device=device) if pushed else None
-        # Newton's masks have one place more than there are worlds: for what is in none of them.
+        # Newton's masks have N + 1 entries; the last is for objects outside all worlds.
         self._mask = torch.zeros(num_envs + 1, dtype=torch.bool, device=device)
         self._wp_mask = wp.from_torch(self._mask)
         with wp.ScopedDevice(self._wp_device):
             self._simulation = Simulation(robot, sim, num_envs, scene.terrain, self._wp_device)
             task = tuple(wp.from_torch(tensor) for tensor in (self.qpos, self.qvel, self.ctrl))
-            self._exchange = NewtonExchange(self._simulation, task, self.overflowed, self.model, robot, self.robot_state)
+            self._state_io = NewtonStateIO(self._simulation, task, self.overflowed, self.model, robot, self.robot_state)
             if set(randomized) - set(NEWTONS_FIELDS):
-                self._exchange.motors = self._solvers_fields()
+                self._state_io.motors = self._solvers_fields()
             if self.forces is not None:
                 self._simulation.push_with(self.forces, self.model)
-            self._exchange.read()
+            self._state_io.read()
             start = self.qpos.clone()
-        exchanges = (self._exchange.kinematics, self._exchange.contact_forces, self.kernels.name_module)
-        self.compiled = compile_ahead(self._wp_device, (self._step, self._put, self._forget, *exchanges))
+        launches = (self._state_io.kinematics, self._state_io.contact_forces, self.kernels.name_module)
+        self.compiled = compile_ahead(self._wp_device, (self._step, self._put, self._forget, *launches))
         if self._wp_device.is_cpu:
             self._advance = self._record_step()
-        with wp.ScopedDevice(self._wp_device):  # what was tried left its traces
+        with wp.ScopedDevice(self._wp_device):  # restore the initial state after the trial launches
             self.qpos.copy_(start)
             self.qvel.zero_()
             self._mask[:-1].fill_(True)
@@ -74,31 +79,31 @@ class NewtonPhysics(WarpPhysics):
         self.refresh()
 
     def _step(self) -> None:
-        self._exchange.apply_torques()
+        self._state_io.apply_torques()
         self._simulation.step(self.dt)
-        self._exchange.note_lost_contacts()
-        self._exchange.read()
+        self._state_io.note_lost_contacts()
+        self._state_io.read()
 
     def _forget(self) -> None:
-        """Clear what the worlds of `_mask` would carry over a step."""
+        """Clear the solver's memory of earlier steps in the worlds of `_mask`."""
         self._simulation.forget(self._wp_mask)
 
     def _put(self) -> None:
-        """The task's state of the worlds of `_mask` into Newton's joints and bodies."""
-        self._exchange.put(self._wp_mask)
+        """Copy the task's state of the worlds of `_mask` to Newton's joints and bodies."""
+        self._state_io.put(self._wp_mask)
         self._simulation.place_bodies(self._wp_mask)
 
     def write(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         with self._on_device():
             self._mask[:-1].copy_(mask)
             self._forget()
-            self._exchange.write(mask, qpos, qvel)
+            self._state_io.write(mask, qpos, qvel)
             self._put()
         if self.forces is not None:
             self.forces.masked_fill_(mask.view(-1, 1, 1), 0.0)
 
     def load_state(self, saved: Mapping[str, Tensor]) -> None:
-        """As every engine, but a solver's own memory (warm starts, matched contacts) begins anew."""
+        """Load a state as in `Physics`, except that the solver's own memory (warm starts, matched contacts) is cleared."""
         super().load_state(saved)
         with self._on_device():
             self._mask[:-1].fill_(True)
@@ -114,8 +119,8 @@ class NewtonPhysics(WarpPhysics):
 
     def randomize(self, field: str, values: Tensor) -> None:
         if field not in self._randomized:
-            told = suggest(field, self._randomized, "those are")
-            raise ValueError(f"randomize: '{field}' is none of the fields that make_physics was told of{told}")
+            hint = suggest(field, self._randomized, "it was made for")
+            raise ValueError(f"randomize: the physics was not made for the field '{field}'{hint}")
         if self._fields is None:
             {"friction": self._set_friction, "added_base_mass": self._add_base_mass}[field](values.to(self.device))
             return
@@ -139,9 +144,9 @@ class NewtonPhysics(WarpPhysics):
             self._solvers_fields().choose(mask, chosen)
 
     def _solvers_fields(self) -> SolverFields:
-        """Return the arrays of the solver that fields change, which are made when they are first asked for."""
+        """Return the arrays of the solver that fields change; create them on the first call."""
         if self._fields is None:
-            base_com, robot = self._exchange.base_com, self._scene
+            base_com, robot = self._state_io.base_com, self._scene
             self._fields = SolverFields(robot, self.model, self._simulation, base_com, self._randomized)
         return self._fields
 
@@ -160,6 +165,6 @@ class NewtonPhysics(WarpPhysics):
         self._notify(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
 
     def _notify(self, changed: newton.ModelFlags) -> None:
-        """Tell the solver what has changed."""
+        """Notify the solver of changed model arrays."""
         with self._on_device():
             self._simulation.solver.notify_model_changed(changed)

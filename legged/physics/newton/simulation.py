@@ -1,4 +1,4 @@
-"""One of Newton's solvers with all that a step of it needs: states, contacts, substeps."""
+"""A Newton solver with everything that one of its steps needs: states, contacts, substeps."""
 
 import warnings
 from typing import Any
@@ -12,10 +12,10 @@ from newton.solvers import SolverBase, SolverMuJoCo, SolverSteel
 
 from legged.config.schema import SimConfig
 from legged.physics.collider.terrain_contact import TerrainContact
-from legged.physics.newton.model import build_newton_model, meets_cells
+from legged.physics.newton.model import build_newton_model, uses_cell_collider
 from legged.physics.newton.solvers import SOLVERS
 from legged.physics.newton.springs import launch_spring_forces
-from legged.physics.warp.exchange import LOST
+from legged.physics.warp.state_io import LOST
 from legged.robots.robot import Robot
 from legged.robots.robot_model import FLOOR
 from legged.terrain import Terrain
@@ -23,7 +23,7 @@ from legged.terrain import Terrain
 
 @wp.kernel
 def push_bodies(forces: wp.array3d[float], bodies: wp.array[int], count: int, body_f: wp.array[wp.spatial_vector]) -> None:
-    """One thread a world and body: MuJoCo's order and names -> Newton's."""
+    """Copy external forces from MuJoCo's order of bodies to Newton's. One thread per world and body."""
     world, body = wp.tid()  # type: ignore[misc]
     if bodies[body] >= 0:
         force = wp.vec3(forces[world, body, 0], forces[world, body, 1], forces[world, body, 2])
@@ -32,10 +32,14 @@ def push_bodies(forces: wp.array3d[float], bodies: wp.array[int], count: int, bo
 
 
 class Simulation:
-    """N worlds, in Newton's own conventions. A step is Warp launches on fixed arrays only, so that a capture can hold it."""
+    """N worlds in Newton's own conventions. A step is Warp launches on fixed arrays, so that a graph can capture it."""
 
     def __init__(self, robot: Robot, sim: SimConfig, num_envs: int, terrain: Terrain | None, device: Any) -> None:
-        """Build the scene and its solver; `device` is Warp's, and must be its current one."""
+        """Build the scene and its solver. `device` is a Warp device, and must be Warp's current one.
+
+        Raises:
+            ConfigError: as `build_newton_model`.
+        """
         self.setup = setup = SOLVERS[sim.solver]
         self.model, self.layout = build_newton_model(robot, setup, sim, num_envs, terrain, device)
         self.state, self._next = self.model.state(), self.model.state()
@@ -47,31 +51,32 @@ class Simulation:
                 self.model, broad_phase="explicit", rigid_contact_max=capacity, **setup.pipeline
             )
         with warnings.catch_warnings():
-            # Newton names MuJoCo 3.17; the contract is tested with the one that we use.
+            # Newton warns about any MuJoCo version but 3.17; the engine tests run with the installed version.
             warnings.filterwarnings("ignore", "MuJoCo dependency version mismatch", newton.NewtonWarning)
             self.solver = setup.make(self.model, sim)
-        if terrain is not None and meets_cells(setup, sim):
-            self._meet_cells(terrain)
+        if terrain is not None and uses_cell_collider(setup, sim):
+            self._add_cell_collider(terrain)
         if self._pipeline is None:
             capacity = self.solver.get_max_contact_count()
             self.contacts = newton.Contacts(capacity, 0, device=device)
         else:
             self.contacts = self._pipeline.contacts()
         self.lost: wp.array | None = None
-        """(N,) or longer: the solver's flags of contacts or constraint rows that were dropped, if it has any."""
+        """(N,) or longer: the solver's flags for dropped contacts or constraint rows; None if it has no such flags."""
         self.lost_bits = 1
-        """Those bits of `lost` that mean this."""
+        """Bits of `lost` that mean that contacts or rows were dropped."""
         self._pushes: list[Any] | None = None
-        """Forces on bodies from outside, if there are any, and what tells which bodies these are."""
+        """External forces on bodies, the indices of the bodies, and the number of bodies per world; None without external
+        forces."""
         self._observables = self._request()
         if self._observables is None or setup.springs is not None:
             self.force = wp.zeros(capacity, dtype=wp.spatial_vector)
         else:
             self.force = self._observables.contact_f
-        """Force on the first shape of each contact in the last substep, world frame [N]."""
+        """(contacts,) force on the first shape of each contact in the last substep, world frame [N]."""
 
-    def _meet_cells(self, terrain: Terrain) -> None:
-        """Give Newton's MuJoCo solver the collider that mujoco_warp has, with vertical faces."""
+    def _add_cell_collider(self, terrain: Terrain) -> None:
+        """Register mujoco_warp's height-map collider, with vertical faces, in Newton's MuJoCo solver."""
         solver = self.solver
         assert isinstance(solver, SolverMuJoCo)
         model = solver.mj_model
@@ -81,7 +86,7 @@ class Simulation:
         TerrainContact(solver.mjw_model, solver.mjw_data, model, int(floor), terrain.height_map, shapes)
 
     def _request(self) -> SolverBase.Observables | None:
-        """What the solver is to report of a step beside the state."""
+        """Return the observables that the solver reports for each step in addition to the state."""
         solver, kinds = self.solver, set()
         if self.setup.springs is None:
             kinds.add(solver.ObservableKind.CONTACT_F)
@@ -96,8 +101,8 @@ class Simulation:
         return observables
 
     def push_with(self, forces: torch.Tensor, model: mujoco.MjModel) -> None:
-        """Let `forces` (N, B, 6), forces and torques at centres of mass in the world frame, act on the bodies that have the
-        names of those of `model`.
+        """Apply `forces` (N, B, 6), forces [N] and torques [N m] at centres of mass in the world frame, in every step. They
+        act on the bodies with the same names as those of `model`.
         """
         labels = [label.rpartition("/")[2] for label in self.model.body_label[: self.layout.bodies]]
         number = {name: k for k, name in enumerate(labels)}
@@ -118,18 +123,20 @@ class Simulation:
                 launch_spring_forces(self.model, before, self.contacts, setup.springs, self.force)
             self.solver.step(before, after, self.control, self.contacts, dt / setup.substeps, **extra)
             before, after = after, before
-        if before is not self.state:  # whose addresses others know
+        if before is not self.state:  # other objects hold the addresses of `self.state`
             self.state.assign(before)
         if setup.maximal:
             newton.eval_ik(self.model, self.state, self.state.joint_q, self.state.joint_qd)
 
     def forget(self, mask: wp.array) -> None:
-        """Clear what the worlds of `mask` (N + 1,) would carry over a step; their state becomes the model's default."""
+        """Clear the solver's memory of earlier steps in the worlds of `mask` (N + 1,), and set their state to the model's
+        default.
+        """
         self.solver.reset(self.state, mask)
         if self._pipeline is not None:
             self._pipeline.reset_contact_matching(mask)
 
     def place_bodies(self, mask: wp.array) -> None:
-        """Bodies of the worlds of `mask` (N + 1,) to where their joints say."""
+        """Compute the poses of the bodies in the worlds of `mask` (N + 1,) from their joint coordinates."""
         worlds = mask[: self.model.world_count]
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state, mask=worlds)

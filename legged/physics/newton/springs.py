@@ -1,4 +1,4 @@
-"""Forces of contacts that are springs: what Newton's solvers with such contacts apply, but do not report."""
+"""Forces of contacts that are springs. Newton's solvers with such contacts apply these forces, but do not report them."""
 
 import newton
 import warp as wp
@@ -12,7 +12,9 @@ def point_motion(
     body_qd: wp.array[wp.spatial_vector],
     body_com: wp.array[wp.vec3],
 ):
-    """World position and velocity of a contact point given in its body, or in the world if it has none."""
+    """Return the world position and velocity of a contact point, which is given in the frame of its body, or in the world
+    frame if `body` is negative.
+    """
     if body < 0:
         return point, wp.vec3(0.0)
     at = wp.transform_point(body_q[body], point)
@@ -40,10 +42,11 @@ def spring_forces(
     slope: float,
     force: wp.array[wp.spatial_vector],
 ):
-    """One thread a contact: the force on its first shape by the law of Newton's solvers with springs in contacts.
+    """Compute the force on the first shape of each contact, by the contact law of Newton's solvers with springs. One thread
+    per contact.
 
-    The spring pushes in proportion to depth, the damper against approach; friction opposes sliding in proportion to its
-    speed, up to Coulomb's limit of the mean coefficient.
+    The spring force is proportional to depth, and the damper acts against approach. Friction opposes sliding in proportion to
+    its speed, up to Coulomb's limit with the mean friction coefficient.
     """
     i = wp.tid()
     if i >= count[0]:
@@ -71,8 +74,8 @@ def launch_spring_forces(
     springs: tuple[float, float, float],
     force: wp.array,
 ) -> None:
-    """Write `force`, one a contact on its first shape, world frame [N], of bodies where `state` has them; `springs` are
-    stiffness [N/m], damping [N s/m] and slope of friction [N s/m].
+    """Write `force`, the force on the first shape of each contact, world frame [N], for the body poses and velocities of
+    `state`. `springs` are stiffness [N/m], damping [N s/m] and friction slope [N s/m].
     """
     wp.launch(
         spring_forces,

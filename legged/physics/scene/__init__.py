@@ -1,4 +1,4 @@
-"""What a world consists of, as one MuJoCo model."""
+"""Contents of a world, as one MuJoCo model."""
 
 from legged.physics.scene.model_scene import ModelScene
 from legged.physics.scene.robot_scene import RobotScene

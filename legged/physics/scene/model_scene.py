@@ -1,4 +1,4 @@
-"""A world from any MJCF file that brings its own floor."""
+"""A world from an MJCF file that includes its own floor."""
 
 import warnings
 from pathlib import Path
@@ -12,18 +12,23 @@ from legged.physics.scene.scene import GroundShapes, Scene, set_options
 
 
 class ModelScene(Scene):
-    """A model as its file describes it, contacts included; only the solver's options are ours."""
+    """A model as its file describes it, contacts included; only the solver options come from the configuration."""
 
     def __init__(self, path: Path | str) -> None:
-        """Take the MJCF file at `path`; it is read when the model is built."""
+        """Use the MJCF file at `path`, which is read when the model is built."""
         self.path = Path(path)
         self.name = str(path)
 
     def model(self, sim: SimConfig, ground: GroundShapes = "exact", contact_sensors: bool = False) -> mujoco.MjModel:
-        """Return the file's model; its ground is its own, and it has no tracked shapes."""
+        """Return the file's model. It has its own ground and no tracked shapes, so `ground` and `contact_sensors` have no
+        effect.
+
+        Raises:
+            ConfigError: MuJoCo cannot read the file, or it has state that the engines do not keep per world.
+        """
         try:
             with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", ".* is deprecated")  # whoever simulates a file can change nothing about it
+                warnings.filterwarnings("ignore", ".* is deprecated")  # the user of a file cannot change what it contains
                 spec = mujoco.MjSpec.from_file(str(self.path))
                 set_options(spec.option, sim)
                 model = spec.compile()
@@ -34,11 +39,11 @@ class ModelScene(Scene):
             "delays": model.nhistory,
             "plugins": model.nplugin,
             "mocap bodies": model.nmocap,
-            "bodies that sleep": sleeps,
+            "sleeping bodies": sleeps,
         }
         for kind, count in kinds.items():
             if count:
-                raise ConfigError(f"{self.name}: it has {kind}, whose state the engines here do not keep per world")
+                raise ConfigError(f"{self.name}: it has {kind}, whose state the engines do not keep per world")
         return model
 
     def shapes(self, model: mujoco.MjModel) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A robot on a plane or a terrain: its shapes, the ground, and sensors of contact."""
+"""A robot on a plane or a terrain: its shapes, the ground, and contact sensors."""
 
 import mujoco
 import numpy as np
@@ -12,15 +12,15 @@ from legged.robots.robot_model import FLOOR
 from legged.terrain import Terrain
 
 UNTOUCHED = 1 << 30
-"""A collision type that nothing collides with, of a shape that is no mere decoration."""
+"""Collision type of a geom that collides with nothing, and yet is not removed as decoration."""
 ROBOT, GROUND = 1, 2
-"""Collision types: a bit each of MuJoCo's contype and conaffinity."""
+"""Collision types: one bit each in MuJoCo's contype and conaffinity."""
 
 
 def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
-    """The robot alone. Whatever its file says, its shapes meet the ground, and each other only with `self_collisions`, except
-    those of neighbouring bodies; contacts take the friction of the robot, which is what randomisation changes; and its motors
-    have the rotors of `robot`.
+    """Return the robot alone. Whatever its file says, its shapes collide with the ground. They collide with each other only
+    with `self_collisions`, and never with those of neighbouring bodies. Contacts use the robot's friction, which
+    randomisation changes, and its motors have the rotor inertias of `robot`.
     """
     spec = robot_spec_of(robot.model_path)
     for name, armature in zip(robot.joint_names, robot.armature, strict=True):
@@ -28,17 +28,19 @@ def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
     for geom in spec.geoms:
         if geom.name in robot.shape_names:
             geom.contype, geom.conaffinity = ROBOT, GROUND | ROBOT if self_collisions else GROUND
-            if geom.priority < 1:  # else MuJoCo takes the larger friction of the two shapes
+            if geom.priority < 1:  # otherwise MuJoCo takes the larger friction of the two shapes
                 geom.priority, geom.condim = 1, max(geom.condim, 3)
     if not self_collisions:
-        for pair in list(spec.pairs):  # they touch whatever their types are
+        for pair in list(spec.pairs):  # explicit pairs collide whatever their types are
             spec.delete(pair)
     spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
     return spec
 
 
 def robot_source(robot: Robot, self_collisions: bool) -> str:
-    """The robot as MJCF for an engine that reads it by itself: the file, or a text where `robot_spec` changes it."""
+    """Return the robot as MJCF for an engine that reads it itself: the path of its file, or a text if `robot_spec` changes
+    the file.
+    """
     own = robot_spec_of(robot.model_path)
     before = _settings(own, robot)
     spec = robot_spec(robot, self_collisions)
@@ -51,18 +53,22 @@ def robot_source(robot: Robot, self_collisions: bool) -> str:
 
 
 def body_names(robot: Robot) -> list[str]:
-    """Return the names of a robot's bodies, as in its model."""
+    """Return the names of a robot's bodies as in its model."""
     return [body.name for body in robot_spec_of(robot.model_path).bodies if body.name and body.name != "world"]
 
 
 def _settings(spec: mujoco.MjSpec, robot: Robot) -> tuple[dict[str, tuple[int, int, int, int]], list[float]]:
-    """Return what `robot_spec` may change: how each shape meets others, and the rotors of the robot's joints."""
+    """Return the settings that `robot_spec` may change: the collision settings of each shape, and the rotor inertias of the
+    joints.
+    """
     shapes = {geom.name: (geom.contype, geom.conaffinity, geom.priority, geom.condim) for geom in spec.geoms}
     return shapes, [float(spec.joint(name).armature) for name in robot.joint_names]
 
 
 def contact_sensor_columns(model: mujoco.MjModel, robot: Robot) -> tuple[int, int]:
-    """First and past-the-last column of the contact sensors in sensordata; they lie side by side, 3 a shape."""
+    """Return the first column, and the column after the last, of the contact sensors in sensordata. They are contiguous, 3
+    per shape.
+    """
     start = int(model.sensor(f"contact_{robot.shape_names[0]}").adr[0])
     return start, start + 3 * len(robot.shape_names)
 
@@ -79,9 +85,10 @@ class RobotScene(Scene):
     def model(self, sim: SimConfig, ground: GroundShapes = "exact", contact_sensors: bool = False) -> mujoco.MjModel:
         robot, terrain = self.robot, self.terrain
         spec = robot_spec(robot, sim.self_collisions)
-        spec.compiler.discardvisual = True  # pictures have a model of their own
+        spec.compiler.discardvisual = True  # images are rendered from a model of their own
         set_options(spec.option, sim)
-        # Contacts with the ground need no condim above the robot's own 3; friction is the robot's (its shapes have priority).
+        # Contacts with the ground need no larger condim than the robot's own 3. Friction is the robot's, since its shapes
+        # have priority.
         if terrain is None or ground == "none":
             touches = terrain is None
             spec.worldbody.add_geom(
@@ -107,5 +114,5 @@ class RobotScene(Scene):
         return spec.compile()
 
     def shapes(self, model: mujoco.MjModel) -> np.ndarray:
-        """Return the robot's collision shapes, in its order: their friction is that of its contacts with the ground."""
+        """Return the robot's collision shapes, in its order, (S,). Their friction is that of its contacts with the ground."""
         return np.array([model.geom(name).id for name in self.robot.shape_names])

@@ -1,4 +1,4 @@
-"""What one world consists of, before any engine: a robot on a ground, or a model from a file that brings its own floor."""
+"""Contents of one world, independent of the engine: a robot on a ground, or a file's model with its own floor."""
 
 from abc import ABC, abstractmethod
 from typing import Literal
@@ -14,26 +14,26 @@ GroundShapes = Literal["exact", "height_field", "none"]
 
 
 class Scene(ABC):
-    """What one world consists of."""
+    """Contents of one world."""
 
     name: str
-    """How errors call it: a folder or a file."""
+    """Name in error messages: a folder or a file."""
     robot: Robot | None = None
-    """The robot with a floating base and feet, where there is one."""
+    """Robot with a floating base and feet; None without such a robot."""
     terrain: Terrain | None = None
-    """The ground, where it is no plane."""
+    """Terrain; None for a plane."""
 
     @abstractmethod
     def model(self, sim: SimConfig, ground: GroundShapes = "exact", contact_sensors: bool = False) -> mujoco.MjModel:
         """Return the world as one MuJoCo model, with the solver options of `sim`.
 
-        A terrain is made of height fields and boxes that are exactly its height map (`exact`), of one height field whose
-        steps are ramps (`height_field`), or of a placeholder for a collider of our own (`none`). With `contact_sensors`,
-        every collision shape of the robot gets a sensor `contact_<shape>`, the net force that the shape exerts, world frame
-        [N].
+        `ground` chooses the geometry of a terrain: height fields and boxes that match its height map exactly (`exact`), one
+        height field whose steps are ramps (`height_field`), or a placeholder for the height-map collider (`none`). With
+        `contact_sensors`, every collision shape of the robot gets a sensor `contact_<shape>`: the net force that the shape
+        exerts, world frame [N].
 
         Raises:
-            ConfigError: there is no such model, or it is none that the engines can simulate.
+            ConfigError: the model does not exist, or the engines cannot simulate it.
         """
 
     @abstractmethod
@@ -42,10 +42,10 @@ class Scene(ABC):
 
 
 def set_options(option: mujoco.MjOption, sim: SimConfig) -> None:
-    """Lay the solver options of `sim` over those of a model.
+    """Overwrite the solver options of a model with those of `sim`.
 
-    The integrator is semi-implicit Euler: with torques from an explicit PD law it needs nothing better, and it is what
-    makes a step split exactly into torque and dynamics.
+    The integrator is semi-implicit Euler. It is sufficient for torques from an explicit PD law, and it splits a step exactly
+    into torque and dynamics.
     """
     option.timestep = sim.dt
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER

@@ -1,4 +1,4 @@
-"""The terrain as static geoms: what the C engine collides with and what pictures show."""
+"""The terrain as static geoms, for the C engine's collisions and for rendering."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -11,17 +11,18 @@ from legged.terrain.height_map import CORNERS, HeightMap
 from legged.terrain.terrain import Terrain
 
 DEPTH = 20.0
-"""How far all geoms reach below the lowest point of the map [m]: nothing slips between two of them, and the flanks of a
-height field sunk to there lean by less than 1 mm for each 0.2 m of a face."""
+"""Depth of all geoms below the lowest point of the map [m]. It is so large that nothing slips between two geoms. A height
+field's points that are sunk to this depth lean its flanks by less than 1 mm for each 0.2 m of a face."""
 SKIN = 0.05
-"""Height fields that collide lie so much below the ground, measured along its normal, and are felt so much above themselves
-(MuJoCo's margin) [m].
+"""Distance by which colliding height fields lie below the ground, measured along its normal; MuJoCo's margin makes them
+collide at the same distance above themselves [m].
 
-MuJoCo sees a height field as prisms side by side, each solid down to its foot. A foot that sinks below their tops at an
-impact, as small ones do, is pushed out of a prism sideways, into the next: it is wedged in. So it must not get there.
+MuJoCo treats a height field as adjacent prisms, each of which is solid down to its base. A small foot that sinks below their
+tops at an impact is pushed out of one prism sideways into the next, and gets stuck. The margin keeps the foot above the
+prisms.
 """
 SAME = 1e-6
-"""Heights closer than this are the same [m]."""
+"""Heights that differ by less than this are treated as equal [m]."""
 
 
 def add_terrain(
@@ -33,20 +34,27 @@ def add_terrain(
     collide: bool = True,
     depth: float = DEPTH,
 ) -> list[mujoco.MjsGeom]:
-    """Add a terrain to the world body: boxes where it is made of steps, one height field a tile where it is smooth.
+    """Add a terrain to the world body: boxes where it consists of steps, and one height field per tile where it is smooth.
+    Return the geoms, which are named terrain_<number>.
 
-    The surface is that of the height map, but for two triangles in place of a bilinear patch in cells that are twisted; to
-    those that collide with a height field it appears `SKIN` above the geom, with edges as round as that.
-    `rows` and `cols`, all by default, must be without gaps; the border comes along on those sides that they reach.
-    Geoms are named terrain_<number>. `material` is the name of one in `spec`. Without `collide`, they are for the eye
-    only. `depth` [m] is how far they reach below the lowest point.
+    The surface is that of the height map, except that a twisted cell becomes two triangles instead of a bilinear patch. A
+    shape that collides with a height field meets a surface `SKIN` above the geom, with edges of that radius.
+
+    Args:
+        spec: model that the geoms are added to.
+        terrain: the terrain.
+        rows: rows of tiles, without gaps; all by default. The border is included on the sides that they reach.
+        cols: columns of tiles, in the same way.
+        material: name of a material in `spec`.
+        collide: False for geoms that are only rendered.
+        depth: distance from the lowest point of the map to the bottom of all geoms [m].
     """
     ground = terrain.height_map
     skin = SKIN if collide else 0.0
     add = _Geoms(spec, ground, float(ground.corners.min()) - depth, _attributes(material, collide), skin, collide)
     length, width, border = (round(x / ground.cell) for x in (*terrain.tile_size, terrain.border))
     count = terrain.origins.shape[:2]
-    # A slope may be joined to the border, whose next cells then slope too: the outer tiles take these along.
+    # A slope may be joined to the border, whose first cells then slope too. The outer tiles include these cells.
     x_edges, y_edges = (_edges(n, side, border) for n, side in zip(count, (length, width), strict=True))
     chosen = [range(n) if picked is None else picked for n, picked in zip(count, (rows, cols), strict=True)]
     for r in chosen[0]:
@@ -71,9 +79,10 @@ def add_terrain(
 def add_height_field(
     spec: mujoco.MjSpec, ground: HeightMap, material: str | None = None, collide: bool = True, depth: float = DEPTH
 ) -> mujoco.MjsGeom:
-    """Add the whole map to the world body as one height field, `terrain_0`: faces become slopes one cell wide or more.
+    """Add the whole map to the world body as one height field, `terrain_0`. Its vertical faces become slopes one cell wide or
+    more.
 
-    Where corners of neighbouring cells disagree, its point lies at their mean.
+    Where corners of neighbouring cells differ in height, the height field's point lies at their mean.
     """
     add = _Geoms(spec, ground, float(ground.corners.min()) - depth, _attributes(material, collide))
     add.surface(0, 0, lattice_heights(ground))
@@ -81,33 +90,33 @@ def add_height_field(
 
 
 def lattice_heights(ground: HeightMap) -> np.ndarray:
-    """(X + 1, Y + 1) heights at the corners of all cells [m]; where neighbours disagree, their mean."""
+    """Return (X + 1, Y + 1) heights at the corners of all cells [m]: their mean where neighbouring cells differ."""
     return _lattice(ground.corners)[0]
 
 
 @dataclass
 class _Geoms:
-    """Adds geoms that are given in cells of the map."""
+    """Adds geoms whose positions are given in cells of the map."""
 
     spec: mujoco.MjSpec
     ground: HeightMap
     floor: float
-    """Height down to which all of them reach [m]."""
+    """Height of the bottom of all geoms [m]."""
     attributes: dict[str, Any]
     skin: float = 0.0
-    """How far smooth ground is felt above its geom [m]."""
+    """Distance above a height field's geom at which it collides [m]."""
     overlap: bool = False
-    """Whether boxes of one height overlap, so that level ground has few seams."""
+    """True if boxes of equal height overlap, so that level ground has few seams."""
     added: list[mujoco.MjsGeom] = field(default_factory=list)
 
     def box(self, x: slice, y: slice, top: float) -> None:
-        """A box over those cells."""
+        """Add a box with height `top` [m] over the cells `x`, `y`."""
         half = [0.5 * (s.stop - s.start) * self.ground.cell for s in (x, y)] + [0.5 * (top - self.floor)]
         self._add(x.start, y.start, half, top - half[2], type=mujoco.mjtGeom.mjGEOM_BOX, size=half)
 
     def surface(self, x: int, y: int, heights: np.ndarray, skin: float = 0.0) -> None:
-        """A height field with points `heights` (X + 1, Y + 1) [m], the first of them at the outer corner of cell x, y, that
-        is felt at a distance of `skin` [m].
+        """Add a height field with points `heights` (X + 1, Y + 1) [m], which collides at a distance of `skin` [m]. The first
+        point lies at the outer corner of cell x, y.
         """
         half = [0.5 * (n - 1) * self.ground.cell for n in heights.shape]
         low, high = float(heights.min()), float(heights.max())
@@ -134,13 +143,13 @@ class _Geoms:
 
 
 def _attributes(material: str | None, collide: bool) -> dict[str, Any]:
-    """What all geoms of a terrain have in common: bits that meet the robot's shapes but not each other."""
+    """Return the attributes of all geoms of a terrain. Their collision bits match the robot's shapes but not each other."""
     bits = {"contype": 2, "conaffinity": 1} if collide else {"contype": 0, "conaffinity": 0}
     return {**bits, "group": 0} | ({"material": material} if material else {})
 
 
 def _edges(count: int, side: int, border: int) -> list[int]:
-    """First cells of `count` tiles and the end of the last, where the outer ones reach one cell into the border."""
+    """Return the first cells of `count` tiles, and the end of the last. The outer tiles reach one cell into the border."""
     edges = [border + i * side for i in range(count + 1)]
     edges[0] -= min(border, 1)
     edges[-1] += min(border, 1)
@@ -148,7 +157,7 @@ def _edges(count: int, side: int, border: int) -> list[int]:
 
 
 def _add_patch(add: _Geoms, x: slice, y: slice) -> None:
-    """Cells x, y as boxes, as a height field, or as both."""
+    """Add the cells x, y as boxes, as a height field, or as both."""
     corners = add.ground.corners[x, y]
     low, high = corners.min(axis=2), corners.max(axis=2)
     flat = high - low < SAME
@@ -161,24 +170,24 @@ def _add_patch(add: _Geoms, x: slice, y: slice) -> None:
     for i, j, top in _rectangles(low, flat, add.overlap):
         add.box(slice(x.start + i.start, x.start + i.stop), slice(y.start + j.start, y.start + j.stop), top)
     for sloped in _layers(corners, ~flat):
-        # Slopes among the steps, without a skin, which would stand out beside their faces. Points that no slope uses are
-        # sunk: what hangs down to them is inside the boxes.
+        # Slopes among steps have no skin, since it would stick out beside vertical faces. Points that no slope uses are sunk
+        # to the floor: the surface that hangs down to them lies inside the boxes.
         i, j = (slice(int(at.min()), int(at.max()) + 1) for at in np.nonzero(sloped))
         points = _lattice(corners[i, j], sloped[i, j])[0]
         add.surface(x.start + i.start, y.start + j.start, np.where(np.isnan(points), add.floor, points))
 
 
 def _layers(corners: np.ndarray, sloped: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield sets of cells (X, Y), together those that are `sloped`, each of which one height field can hold: its cells agree
-    where they share a point, and between them it stands out over no other cell.
+    """Yield sets of cells (X, Y) that together are the `sloped` cells. One height field can hold each set: its cells agree in
+    the points that they share, and the field does not stick out above any other cell.
 
-    The first set leaves out all cells around some points: those at which slopes disagree, and those above a lower cell of
-    which the field would hold three corners or more, as of one that slopes go around. Those cells are dealt out to further
-    sets in which two cells lie between any two.
+    The first set leaves out all cells around two kinds of points: those at which slopes disagree, and those above a lower
+    cell of which the field would contain three corners or more, such as a cell that slopes surround. These cells are
+    distributed over further sets, in which any two cells are separated by two others.
     """
     points, bad = _lattice(corners, sloped)
     used = [~np.isnan(own) for own in _at_corners(points)]
-    covers = ~sloped & ((used[0] & used[3]) | (used[1] & used[2]))  # three corners, or two on a diagonal
+    covers = ~sloped & ((used[0] & used[3]) | (used[1] & used[2]))  # three corners, or two diagonally opposite ones
     for k, (top, is_bad) in enumerate(zip(_at_corners(points), _at_corners(bad), strict=True)):
         is_bad |= covers & (top > corners[:, :, k] + SAME)
     alone = sloped & np.any(_at_corners(bad), axis=0)
@@ -189,15 +198,18 @@ def _layers(corners: np.ndarray, sloped: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _at_corners(points: np.ndarray) -> list[np.ndarray]:
-    """Lattice points (X + 1, Y + 1) -> views of those at each corner of the cells, (X, Y) each, in the order of CORNERS."""
+    """Return four views (X, Y) of lattice points (X + 1, Y + 1): the points at each corner of the cells, in the order of
+    CORNERS.
+    """
     x, y = (n - 1 for n in points.shape)
     return [points[right : right + x, up : up + y] for right, up in CORNERS]
 
 
 def _lattice(corners: np.ndarray, used: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (X, Y, 4) of cells -> mean (X + 1, Y + 1) at each lattice point [m], and whether they disagree there.
+    """Return the mean (X + 1, Y + 1) of the corners (X, Y, 4) of cells at each lattice point [m], and a mask of the points at
+    which they differ.
 
-    With `used` (X, Y), of those cells only; where there are none the mean is NaN.
+    With `used` (X, Y), only those cells count. The mean is NaN at points without such cells.
     """
     shape = (corners.shape[0] + 1, corners.shape[1] + 1)
     total, number = np.zeros(shape), np.zeros(shape)
@@ -215,19 +227,19 @@ def _lattice(corners: np.ndarray, used: np.ndarray | None = None) -> tuple[np.nd
 
 
 def _steepness(corners: np.ndarray, cell: float) -> np.ndarray:
-    """Corners (X, Y, 4) of cells -> (X, Y) their surface over the area below it: 1 where it is level."""
+    """Return for the corners (X, Y, 4) of cells the ratio (X, Y) of surface area to horizontal area: 1 for level cells."""
     signs = 2.0 * np.array(CORNERS) - 1.0
     slopes = corners.astype(np.float64) @ signs / (2.0 * cell)
     return np.sqrt(1.0 + (slopes**2).sum(axis=2))
 
 
 def _rectangles(low: np.ndarray, flat: np.ndarray, overlap: bool) -> Iterator[tuple[slice, slice, float]]:
-    """Rectangles, and their heights, that together make up all flat cells of heights `low` (X, Y) [m].
+    """Yield rectangles and their heights [m] that together cover all flat cells of heights `low` (X, Y) [m].
 
-    Boxes are solid, so one may run below cells that are higher than itself: a pyramid is a pile of plates. Where they
-    are seen they do not overlap; where they are touched, those of one height do (`overlap`), for at a seam a foot that
-    sinks in would be pushed out sideways, into the next box. Greedy: the lowest cell that is still open takes the better
-    of two rectangles, grown along x or along y first.
+    Boxes are solid, so a box may extend below higher cells: a pyramid becomes a stack of plates. Boxes that are only rendered
+    do not overlap. Boxes that collide overlap those of equal height (`overlap`): at a seam between boxes, a foot that sinks
+    in would be pushed sideways into the next box. The method is greedy: the lowest cell that is still uncovered takes the
+    larger of two rectangles, one grown along x first and one along y first.
     """
     open_cells = flat.copy()
     while open_cells.any():
@@ -245,7 +257,7 @@ def _rectangles(low: np.ndarray, flat: np.ndarray, overlap: bool) -> Iterator[tu
 
 
 def _run(allowed: np.ndarray, start: int) -> slice:
-    """The longest stretch around `start` in which all of `allowed` (N,) holds."""
+    """Return the longest run around `start` in which all of `allowed` (N,) are true."""
     ends = np.flatnonzero(~allowed)
     after = int(np.searchsorted(ends, start))
     return slice(int(ends[after - 1]) + 1 if after else 0, int(ends[after]) if after < len(ends) else len(allowed))

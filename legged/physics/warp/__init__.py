@@ -1,5 +1,5 @@
-"""mujoco-warp behind the interface, and what all engines on Warp share."""
+"""mujoco-warp behind the `Physics` interface, and the code that all engines on Warp share."""
 
 from legged.physics.warp import settings
 
-__all__ = ["settings"]  # imported before anything here declares a kernel
+__all__ = ["settings"]  # before any module here declares a kernel

@@ -1,6 +1,7 @@
-"""Motors that are not ideal, in one launch; legged/mdp/actuator.py has the same formulas in torch, and their sources.
+"""Kernel of actuators with friction, delay and a torque-speed curve; legged/mdp/actuator.py has the same formulas in torch,
+and their sources.
 
-A module of its own: who has ideal motors never compiles it.
+The kernel has a module of its own, so that it is not compiled for trainings with ideal motors.
 """
 
 import warp as wp
@@ -10,13 +11,13 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def below(value: float, limit: float) -> float:
-    """Return the lesser of both, or the value if it is no number."""
+    """Return the smaller of `value` and `limit`; NaN stays NaN."""
     return wp.where(value > limit, limit, value)
 
 
 @wp.func
 def above(value: float, limit: float) -> float:
-    """Return the greater of both, or the value if it is no number."""
+    """Return the larger of `value` and `limit`; NaN stays NaN."""
     return wp.where(value < limit, limit, value)
 
 
@@ -41,7 +42,7 @@ def drive_joints(
     has_friction: bool,
     torques: wp.array2d[float],
 ):
-    """One thread a robot and joint: a torque that is no number stays none."""
+    """Compute the torques of all joints. One thread per robot and joint. NaN stays NaN."""
     robot, joint = wp.tid()
     late = wp.max(delay[robot] - step, 0)
     age = wp.min((late + decimation - 1) // decimation, targets.shape[0] - 1)

@@ -1,11 +1,11 @@
-"""Compiles the Warp kernels that a model launches before any of them is: those that the cache lacks, on all cores.
+"""Compilation of a model's Warp kernels before their first launch: all modules that the cache lacks, on all CPU cores.
 
-Left alone, Warp compiles a module at the first launch of one of its kernels, one after the other. Here a dry run, in which
-launches are noted instead of made, tells which modules a model needs. Forked processes then compile the missing ones into
-Warp's cache: within one process NVRTC compiles one program at a time, whatever the number of threads. Who comes second, the
-other ranks of a training on several GPUs for instance, waits for the first instead of compiling the same.
+By itself, Warp compiles a module when one of its kernels is first launched, so modules are compiled one after the other. Here
+a dry run records launches instead of making them, which yields the modules that a model needs. Forked processes then compile
+the missing modules into Warp's cache. Threads would not help: within one process NVRTC compiles one program at a time. A lock
+lets one process compile while others, such as further ranks of a multi-GPU training, wait for its results.
 
-All of this only saves time: a module that is missing afterwards is compiled by Warp when it is launched.
+This only saves time: Warp compiles a module that is still missing when it is launched.
 """
 
 import gc
@@ -29,41 +29,42 @@ from filelock import lock_descriptor, unlock_descriptor
 POLL_S = 0.1
 PLAIN_LINES_EVERY_S = 5.0
 STALLED_S = 300.0
-"""Without a module finished for this long, compiling processes are ended [s]."""
+"""Time without a finished module after which compiling processes are ended [s]."""
 MOST_PROCESSES = 16
 TILED_COSTS = 20
-"""Kernels on tiles may need linear algebra of CUDA's libraries, which takes as long as so many others."""
+"""Number of ordinary kernels that take as long to compile as a tiled kernel, which may need CUDA's linear algebra
+libraries."""
 CUDA_BLOCK_DIM, CPU_BLOCK_DIM = 256, 1
-"""Threads per block that Warp takes where a launch does not say; each block size is compiled by itself."""
+"""Threads per block that Warp uses by default. Each block size is compiled separately."""
 
 
 def cache_folder() -> Path:
-    """Where Warp keeps what it has compiled, for its version."""
+    """Return the folder in which this version of Warp keeps compiled kernels."""
     return Path(wp.config.kernel_cache_dir)
 
 
 @dataclass(frozen=True)
 class Build:
-    """A Warp module for one block size: what is compiled as one."""
+    """A Warp module for one block size: the unit of compilation."""
 
     module: Any
     block_dim: int
 
     def cached(self, device: Any) -> bool:
-        """Whether Warp's cache holds it for the device's architecture."""
+        """Return True if Warp's cache holds the module for the device's architecture."""
         folder = cache_folder() / self.module.get_module_identifier(self.block_dim)
         pattern = "*.o" if device.is_cpu else f"*.sm{device.get_cuda_compile_arch()}*"
         return any(folder.glob(pattern))
 
     def compile(self, device: Any) -> None:
-        """Into the cache; unlike `wp.load_module` without loading, which a forked process must not do."""
+        """Compile the module into the cache. `wp.load_module` would also load it, which a forked process must not do."""
         self.module._compile(device, options=self.module.resolve_options(wp.config, block_dim=self.block_dim))
 
 
 def compile_ahead(device: Any, functions: Iterable[Callable[[], object]]) -> int:
-    """Compile what `functions` launch on a Warp device and the cache lacks; returns how many modules that were.
+    """Compile the modules that `functions` launch on a Warp device and that the cache lacks. Return their number.
 
-    The functions are called with kernels left out, so that what they read holds numbers without meaning.
+    The functions are called without launching kernels, so the arrays that they read hold meaningless numbers.
     """
     missing = [build for build in launched(device, functions) if not build.cached(device)]
     if not missing or sys.platform != "linux":  # forking is safe on Linux only
@@ -83,12 +84,12 @@ def compile_ahead(device: Any, functions: Iterable[Callable[[], object]]) -> int
 
 
 def launched(device: Any, functions: Iterable[Callable[[], object]]) -> list[Build]:
-    """What `functions` launch on a device, the slowest to compile first."""
+    """Return the modules that `functions` launch on a device, slowest to compile first."""
     found: dict[Build, int] = {}
 
     def note(kernel: Any, dim: Any = 0, *_: Any, block_dim: int | None = None, tiled: bool = False, **__: Any) -> None:
         if kernel.is_generic or math.prod(dim if isinstance(dim, list | tuple) else (dim,)) == 0:
-            return  # a generic kernel becomes one when it is given its arguments
+            return  # a generic kernel is compiled as another kernel, for its argument types
         size = CPU_BLOCK_DIM if device.is_cpu else block_dim or CUDA_BLOCK_DIM
         found[Build(kernel.module, size)] = TILED_COSTS * tiled + len(kernel.module.kernels)
 
@@ -110,7 +111,7 @@ def launched(device: Any, functions: Iterable[Callable[[], object]]) -> list[Bui
 
 @contextmanager
 def _instead(**functions: Callable[..., None]) -> Iterator[None]:
-    """Warp with some of its functions replaced."""
+    """Replace functions of Warp within the block."""
     before = {name: getattr(wp, name) for name in functions}
     for name, function in functions.items():
         setattr(wp, name, function)
@@ -122,8 +123,8 @@ def _instead(**functions: Callable[..., None]) -> Iterator[None]:
 
 
 def _compile_all(builds: list[Build], device: Any, show: Callable[[int], None]) -> None:
-    """Compile in forked processes, which take their work from a pipe, and show how many modules are done; returns when all
-    processes have ended.
+    """Compile in forked processes, which take their work from a pipe, and show the number of finished modules. Return when
+    all processes have ended.
     """
     work, give = os.pipe()
     os.write(give, b"".join(struct.pack("=H", i) for i in range(len(builds))))
@@ -150,26 +151,28 @@ def _compile_all(builds: list[Build], device: Any, show: Callable[[int], None]) 
 
 
 def _fork(work: int, builds: list[Build], device: Any, scratch: str) -> int:
-    """A process that compiles what it reads from `work`, with temporary files in `scratch`; returns its id."""
+    """Fork a process that compiles the modules whose indices it reads from `work`, with temporary files in `scratch`. Return
+    its id.
+    """
     parent = os.getpid()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Python warns of threads; the child needs none of them and no lock of theirs
+        warnings.simplefilter("ignore")  # Python warns about threads; the child uses neither threads nor their locks
         child = os.fork()
     if child:
         return child
     try:
-        # What the parent left to the garbage collector is not ours: objects with threads of their own, such as onnxruntime's
-        # sessions, would wait for ever for threads that no fork takes along.
+        # The child must not collect the parent's garbage. Objects with threads of their own, such as onnxruntime's sessions,
+        # would wait for ever for threads that a fork does not copy.
         gc.disable()
         tempfile.tempdir = scratch
         while (item := os.read(work, 2)) and os.getppid() == parent:
             builds[struct.unpack("=H", item)[0]].compile(device)
     finally:
-        os._exit(0)  # none of the parent's clean-up; an error comes again where Warp compiles the module itself
+        os._exit(0)  # skip the parent's clean-up; an error occurs again when Warp compiles the module itself
 
 
 class _Lock:
-    """Held by the process that compiles into a cache."""
+    """File lock of the process that compiles into a cache."""
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -192,7 +195,7 @@ class _Lock:
 
 
 class Line:
-    """Progress, on one line of a terminal; elsewhere as plain lines, now and then."""
+    """Progress on one line of a terminal. Without a terminal, plain lines at intervals."""
 
     def __init__(self, total: int) -> None:
         self._total, self._start, self._shown = total, time.monotonic(), -math.inf
@@ -207,15 +210,15 @@ class Line:
             print(flush=True)
 
     def show(self, before: int, more: int = 0) -> None:
-        """`before` and `more` modules are compiled."""
+        """Show that `before` plus `more` modules are compiled."""
         now = time.monotonic()
         if self._terminal or now - self._shown >= PLAIN_LINES_EVERY_S:
             self._shown = now
             self._print(f"compiling {min(before + more + 1, self._total)} of {self._total} kernel modules ...")
 
     def end(self, done: int) -> None:
-        """`done` modules were compiled; those that were not are left to Warp, with its errors if there are any."""
-        rest = "" if done == self._total else f" of {self._total}, the others follow one by one"
+        """Show that `done` modules were compiled. Warp compiles the others at their launch, and reports their errors."""
+        rest = "" if done == self._total else f" of {self._total}; the others are compiled when they are launched"
         self._print(f"compiled {done} kernel modules in {time.monotonic() - self._start:.1f} s{rest}")
 
     def _print(self, text: str) -> None:

@@ -1,4 +1,4 @@
-"""Forces on a robot's shapes: sums of what mujoco-warp's contacts push with."""
+"""Kernels that sum mujoco-warp's contact forces on each shape of a robot."""
 
 import warp as wp
 
@@ -16,7 +16,9 @@ def add_contact_forces(
     contact_of_geom: wp.array[int],
     contact_forces: wp.array2d[wp.vec3],
 ):
-    """One thread a contact: its force on the second shape, and the reaction on the first, world frame [N]."""
+    """Add the force of each contact to its second shape, and the reaction to its first, world frame [N]. One thread per
+    contact.
+    """
     i = wp.tid()
     if i >= nacon[0]:
         return
@@ -33,19 +35,19 @@ ON_GPU = "#if defined(__CUDA_ARCH__)\nreturn {};\n#else\nreturn {};\n#endif\n"
 
 @wp.func_native(ON_GPU.format("__shfl_sync(0xffffffffu, x, lane)", "x"))
 def from_lane(x: float, lane: int) -> float:  # type: ignore[empty-body]
-    """Return the `x` of another lane of this warp; on the CPU there is one lane."""
+    """Return the value of `x` in another lane of this warp. On the CPU there is one lane."""
     ...
 
 
 @wp.func_native(ON_GPU.format("__shfl_sync(0xffffffffu, x, lane)", "x"))
 def whole_from_lane(x: int, lane: int) -> int:  # type: ignore[empty-body]
-    """The same of a whole number."""
+    """Return the integer `x` of another lane of this warp. On the CPU there is one lane."""
     ...
 
 
 @wp.func_native(ON_GPU.format("__popc(__ballot_sync(0xffffffffu, on))", "on ? 1 : 0"))
 def lanes_with(on: bool) -> int:  # type: ignore[empty-body]
-    """Return in how many lanes of this warp `on` holds."""
+    """Return the number of lanes of this warp in which `on` is true."""
     ...
 
 
@@ -64,11 +66,11 @@ def sum_contact_forces(
     contact_of_geom: wp.array[int],
     contact_forces: wp.array2d[wp.vec3],
 ):
-    """The same in one launch, where each world has its contacts in `slots` of its own: so many threads a world, of which each
-    finds the force of a contact, and then adds up those on a shape.
+    """Sum the contact forces on each shape in one launch, for worlds that have `slots` contacts of their own. `lanes` threads
+    per world: each computes the force of one contact, and then the sum on one shape.
 
-    Of a cone the rows have the force along its axes; of a pyramid its edges', each of them the normal plus or minus friction
-    times a tangent.
+    With elliptic cones, rows hold the force along the axes of the contact frame. With pyramids, they hold the forces along
+    the edges, each of which is the normal plus or minus friction times a tangent.
     """
     world, lane = wp.tid()
     shapes = contact_forces.shape[1]
@@ -97,7 +99,7 @@ def sum_contact_forces(
                         if k < 2:
                             force[k + 1] = (up - down) * friction[c][k]
                 on_second = force @ frame[c]
-            count = lanes_with(row >= 0)  # the first ones, since none that follows one without a row has any
+            count = lanes_with(row >= 0)  # contacts with rows come first
             for k in range(count):
                 first, second = whole_from_lane(shapes_of[0], k), whole_from_lane(shapes_of[1], k)
                 push = wp.vec3(from_lane(on_second[0], k), from_lane(on_second[1], k), from_lane(on_second[2], k))

@@ -1,4 +1,4 @@
-"""Launches of Warp kernels on torch's tensors."""
+"""Launches of Warp kernels on torch tensors."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -8,24 +8,25 @@ import warp as wp
 from torch import Tensor
 
 MOST_PREPARED = 200
-"""Launches that are kept for one task."""
+"""Largest number of recorded launches per task."""
 
 
 class Launcher:
-    """Launches kernels on an engine's device, on the stream that torch uses now."""
+    """Launches kernels on an engine's device, on torch's current stream."""
 
     def __init__(self, on_device: Callable[[], AbstractContextManager[Any]]) -> None:
-        """Launch within `on_device`."""
+        """Make all launches within the context that `on_device` returns."""
         self._on_device = on_device
         self._prepared: dict[tuple[Any, ...], Any] = {}
-        """Launches on a CPU by what they are of, ready to be made again."""
+        """Recorded CPU launches by kernel, dimension and arguments."""
 
     def launch(
         self, kernel: Any, dim: int | tuple[int, ...], arguments: tuple[Tensor | float, ...], vectors: int = 0
     ) -> None:
-        """Launch a kernel, of whose arguments the first `vectors` are arrays of vectors (..., 3).
+        """Launch a kernel. The first `vectors` of its arguments are arrays of vectors (..., 3).
 
-        On a CPU the launch is kept for the next step, whose tensors are the same: to prepare it takes longer than to make it.
+        On a CPU the launch is recorded for the next step, whose tensors are the same: preparing a launch takes longer than
+        running it.
         """
         with self._on_device():
             key = None
@@ -37,20 +38,21 @@ class Launcher:
             inputs = [_of_torch(argument, k < vectors) for k, argument in enumerate(arguments)]
             wp.launch(kernel, dim=dim, inputs=inputs)
             if key is not None and (prepared := wp.launch(kernel, dim=dim, inputs=inputs, record_cmd=True)):
-                if len(self._prepared) >= MOST_PREPARED:  # of tensors that are made anew in each step
+                # the recorded launches belong to tensors that each step creates anew
+                if len(self._prepared) >= MOST_PREPARED:
                     self._prepared.clear()
                 self._prepared[key] = prepared
 
 
 def _identity(argument: Tensor | float) -> Any:
-    """Return by what a kernel would know an argument."""
+    """Return the properties of an argument by which a kernel distinguishes it from others."""
     if isinstance(argument, Tensor):
         return argument.data_ptr(), argument.shape, argument.stride(), argument.dtype
     return argument
 
 
 def _of_torch(argument: Tensor | float, vectors: bool) -> Any:
-    """Return what a kernel takes of an argument."""
+    """Return the kernel argument for a torch tensor or a number."""
     if not isinstance(argument, Tensor):
         return argument
     return wp.from_torch(argument, dtype=wp.vec3) if vectors else wp.from_torch(argument)

@@ -1,4 +1,4 @@
-"""Batched MuJoCo on a GPU by mujoco-warp; also on Warp's CPU device, for tests and for comparison."""
+"""Batched MuJoCo on a GPU by mujoco-warp, or on Warp's CPU device."""
 
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
@@ -12,8 +12,8 @@ from torch import Tensor
 
 from legged.config.schema import SimConfig
 from legged.errors import ConfigError
+from legged.physics.collider.contact_pairs import DEFAULT_SOLREF, is_mixed
 from legged.physics.collider.terrain_contact import TerrainContact
-from legged.physics.collider.touches import DEFAULT_SOLREF, is_mixed
 from legged.physics.fields import DERIVED, FIELDS, GRAVITY, changed_arrays
 from legged.physics.fused.block_step import BlockStep
 from legged.physics.fused.constraint_solver import ConstraintSolver, ask_for_dense_rows
@@ -25,20 +25,20 @@ from legged.physics.randomized_model import RandomizedModel, keep_centres_apart
 from legged.physics.robot_state import DrivenJoints, robot_state
 from legged.physics.scene import Scene
 from legged.physics.warp.compile import compile_ahead
-from legged.physics.warp.exchange import MujocoWarpExchange, StateExchange, arrays_of
 from legged.physics.warp.physics import WarpPhysics
-from legged.physics.warp.redraws import Redraws, Variants
+from legged.physics.warp.randomize_kernels import Redraws, Variants
+from legged.physics.warp.state_io import MujocoWarpStateIO, StateIO, arrays_of
 from legged.process.cores import available_cores
 from legged.process.ranks import Ranks
 from legged.robots.robot_model import FLOOR, disabled_groups
 
 PER_WORLD = ("geom_friction", "body_mass", *DERIVED)
-"""Arrays of the model that always differ per world, beside those of the fields that are randomised."""
+"""Arrays of the model that always have one row per world; the arrays of randomised fields have one too."""
 
 
 def absent_stages(model: mujoco.MjModel, randomized: Collection[str] = ()) -> int:
-    """Return the flags of the stages that have nothing to do in `model`, not even once the arrays `randomized` have other
-    values: mujoco-warp would still launch them.
+    """Return the disable flags of stages that have no effect in `model`, whatever values the arrays `randomized` take.
+    mujoco-warp would launch these stages anyway.
     """
     bits, flags = mujoco.mjtDisableBit, 0
 
@@ -46,16 +46,16 @@ def absent_stages(model: mujoco.MjModel, randomized: Collection[str] = ()) -> in
         return not any(name in randomized or getattr(model, name).any() for name in arrays)
 
     if without("dof_damping", "dof_dampingpoly", "actuator_damping", "actuator_dampingpoly"):
-        flags |= bits.mjDSBL_EULERDAMP  # no damping to integrate implicitly
+        flags |= bits.mjDSBL_EULERDAMP  # there is no damping to integrate implicitly
     if without("dof_frictionloss", "tendon_frictionloss"):
         flags |= bits.mjDSBL_FRICTIONLOSS
     return flags
 
 
 def ignored(model: mujoco.MjModel) -> str:
-    """Return what of a model mujoco-warp passes over without a word; empty if nothing."""
+    """Return the first feature of a model that mujoco-warp ignores silently; empty without such a feature."""
     for group in disabled_groups(model):
-        return f"it would drive the actuators of group {group} too, which the model disables"
+        return f"it would ignore that the model disables the actuators of group {group}"
     scalar = np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE))
     for kind, limited, span, margin in (
         ("joint", (model.jnt_limited != 0) & scalar, np.diff(model.jnt_range)[:, 0], model.jnt_margin),
@@ -63,14 +63,14 @@ def ignored(model: mujoco.MjModel) -> str:
     ):
         for i in np.flatnonzero(limited & (span < 2.0 * margin)):
             return (
-                f"{kind} '{getattr(model, kind)(i).name}' may be within the margin ({margin[i]:g}) of both of its limits,"
-                f" {span[i]:g} apart, and would feel the nearer one only"
+                f"{kind} '{getattr(model, kind)(i).name}' can be within the margin ({margin[i]:g}) of both its limits, which"
+                f" are {span[i]:g} apart, and only the nearer limit would exert force"
             )
     return ""
 
 
 class NoBlocks(Exception):
-    """A model's step is not made in blocks of worlds, which alone is faster on a CPU than the C engine."""
+    """A model's step cannot run in blocks of worlds. Only the block step is faster on a CPU than the C engine."""
 
 
 class MujocoWarpPhysics(WarpPhysics):
@@ -87,12 +87,12 @@ class MujocoWarpPhysics(WarpPhysics):
         only_blocks: bool = False,
         pushed: bool = False,
     ) -> None:
-        """Build the scene on `device` and place all worlds at the model's initial state; compiles on first use, for
-        `randomized` fields too.
+        """Build the scene on `device` and set all worlds to the model's initial state. Kernels are compiled on first use,
+        including those that `randomized` fields need.
 
         Raises:
-            ConfigError: mujoco-warp cannot simulate the model, or `sim.step` asks for what does not fit it.
-            NoBlocks: with `only_blocks`, a step is not made in blocks on several threads.
+            ConfigError: mujoco-warp cannot simulate the model, or the model does not support the requested `sim.step`.
+            NoBlocks: `only_blocks` is set, and the step cannot run in blocks of worlds.
         """
         super().__init__(num_envs, sim.dt, device)
         terrain = scene.terrain
@@ -101,13 +101,13 @@ class MujocoWarpPhysics(WarpPhysics):
         if sim.step != "library":
             ask_for_dense_rows(self.model)
         for solrefs in (self.model.eq_solref, self.model.jnt_solref, self.model.dof_solref):
-            solrefs[is_mixed(solrefs)] = DEFAULT_SOLREF  # as C MuJoCo does in each step, and mujoco-warp does not
+            solrefs[is_mixed(solrefs)] = DEFAULT_SOLREF  # C MuJoCo does this in each step; mujoco-warp does not
         keep_centres_apart(self.model, randomized)
         self._randomized = RandomizedModel(scene, self.model, randomized, torch.float32, device)
         self._redraws: Redraws | None = None
         self._variants: Variants | None = None
         self._per_world = changed_arrays(randomized)
-        """Names of the model's arrays that are given per world."""
+        """Names of the model arrays with one row per world."""
         with wp.ScopedDevice(self._wp_device):
             self._m = self._put_model(scene.name)
             self._m.opt.warn_overflow = 0  # counted in refresh instead of printed by each thread
@@ -130,16 +130,16 @@ class MujocoWarpPhysics(WarpPhysics):
             if only_blocks and (self._blocks is None or quantities):
                 raise NoBlocks(self._why_no_blocks(quantities))
             if scene.robot is None:
-                self._exchange = StateExchange(arrays_of(d), self.overflowed)
+                self._state_io = StateIO(arrays_of(d), self.overflowed)
             else:
                 self.robot_state = robot_state(self.qpos, self.qvel, scene.robot)
                 self._joints = DrivenJoints(self.qpos, self.qvel, self.robot_state, scene.robot)
                 slots = 0 if self._contacts is None else int(self._contacts.constants["SLOTS"])
                 of = (self.model, scene.robot, self.robot_state)
-                self._exchange = MujocoWarpExchange(self._m, d, self.overflowed, *of, slots)
-        exchanges = (self._exchange.kinematics, self._exchange.contact_forces, self.kernels.name_module)
+                self._state_io = MujocoWarpStateIO(self._m, d, self.overflowed, *of, slots)
+        launches = (self._state_io.kinematics, self._state_io.contact_forces, self.kernels.name_module)
         constants = (self._set_constants,) if any(FIELDS[name].derived for name in randomized) else ()
-        self.compiled = compile_ahead(self._wp_device, (self._step, self._update_quantities, *exchanges, *constants))
+        self.compiled = compile_ahead(self._wp_device, (self._step, self._update_quantities, *launches, *constants))
         self.library_step = self._library_step
         if self._blocks is not None:
             with self._on_device():
@@ -149,14 +149,20 @@ class MujocoWarpPhysics(WarpPhysics):
         self.refresh()
 
     def _put_model(self, scene: str) -> Any:
-        """Return mujoco-warp's model, with room for what differs per world."""
+        """Return mujoco-warp's model, with one row per world in the arrays that may differ between worlds.
+
+        Raises:
+            ConfigError: mujoco-warp cannot simulate the model.
+        """
         if reason := ignored(self.model):
-            raise ConfigError(f"sim.physics: mujoco_warp cannot simulate {scene}, mujoco might: {reason}")
+            raise ConfigError(f"sim.physics: mujoco_warp cannot simulate {scene} (try sim.physics=mujoco): {reason}")
         names = [name for name in (*PER_WORLD, *self._per_world) if name != GRAVITY and getattr(self.model, name).size]
         try:
             m = mjw.put_model(self.model, batch_sizes=dict.fromkeys(names, self.num_envs))
         except NotImplementedError as error:
-            raise ConfigError(f"sim.physics: mujoco_warp cannot simulate {scene}, mujoco might: {error}") from error
+            raise ConfigError(
+                f"sim.physics: mujoco_warp cannot simulate {scene} (try sim.physics=mujoco): {error}"
+            ) from error
         if GRAVITY in self._per_world:
             m.opt.gravity = wp.array(np.tile(self.model.opt.gravity, (self.num_envs, 1)), dtype=wp.vec3)
         return m
@@ -168,7 +174,7 @@ class MujocoWarpPhysics(WarpPhysics):
                 self._update_quantities()
 
     def _update_quantities(self) -> None:
-        """Launch what the quantities that were asked for depend on."""
+        """Launch the stages that compute the requested quantities."""
         stage = stage_of(self._quantities)
         if stage >= int(mujoco.mjtStage.mjSTAGE_POS):
             mjw.kinematics(self._m, self._d)
@@ -184,7 +190,7 @@ class MujocoWarpPhysics(WarpPhysics):
             self.forces.masked_fill_(mask.view(-1, 1, 1), 0.0)
 
     def _of_last_step(self) -> dict[str, Tensor]:
-        """Return those quantities that only a step computes."""
+        """Return the requested quantities that only a step computes."""
         return {name: self._quantities[name] for name in LAST_STEP if name in self._quantities}
 
     def _step(self) -> None:
@@ -210,8 +216,11 @@ class MujocoWarpPhysics(WarpPhysics):
             mjw.step(m, d)
 
     def _choose_step(self, step: str, threads: int) -> None:
-        """Prepare what `sim.step` asks for: our launches for the whole step, our constraint solver within mujoco-warp's
-        launches, or nothing, which leaves the step to mujoco-warp. Raises ConfigError where the model keeps `fused` off.
+        """Prepare the step that `sim.step` requests: the fused step, the fused constraint solver within mujoco-warp's step,
+        or mujoco-warp's step alone.
+
+        Raises:
+            ConfigError: `fused` was requested, and the model does not support it.
         """
         self._fused_step: TorqueStep | None = None
         self._contacts: ContactStage | None = None
@@ -224,36 +233,36 @@ class MujocoWarpPhysics(WarpPhysics):
         no_solver = ConstraintSolver.why_not(self._m, self._d)
         self.why_library = no_solver or TorqueStep.why_not(self.model, per_world)
         if step == "fused" and self.why_library:
-            raise ConfigError(f"sim.step=fused: {self.why_library}; sim.step=auto takes what fits")
+            raise ConfigError(f"sim.step=fused: {self.why_library}; sim.step=auto uses the parts that support the model")
         if no_solver:
             return
-        self._m.opt.run_qacc_smooth = False  # our solver does not start from it
+        self._m.opt.run_qacc_smooth = False  # the fused solver does not start from it
         if self.why_library:
             self._solver = ConstraintSolver(self.model, self._m, self._d)
         else:
             no_contacts = ContactStage.why_not(self.model, self._m, self._d, per_world)
             if no_contacts:
-                self.why_library = f"for contacts alone, {no_contacts}"
+                self.why_library = f"(contacts only) {no_contacts}"
             else:
                 self._contacts = ContactStage(self.model, self._m, self._d, per_world, self._on_cells)
-            sides = None if self._contacts is None else self._contacts.sides
-            self._fused_step = TorqueStep(self.model, self._m, self._d, per_world, sides)
+            active_set = None if self._contacts is None else self._contacts.active_set
+            self._fused_step = TorqueStep(self.model, self._m, self._d, per_world, active_set)
             if self._contacts is not None and BlockStep.fits(self._fused_step):
                 self._blocks = BlockStep(self._fused_step, self._contacts, threads)
 
     def _why_no_blocks(self, quantities: Collection[str]) -> str:
-        """Return what keeps a step from being made in blocks of worlds, or what would take longer than it gains."""
+        """Return the reason why the step cannot run in blocks of worlds, or would be slower than the C engine."""
         if self.why_library:
             return self.why_library
         if quantities:
             return f"mujoco-warp's own launches compute {', '.join(quantities)}"
-        return "its constraint rows take more than a thread's stack, or friction cones are elliptic"
+        return "the constraint rows exceed a thread's stack, or friction cones are elliptic"
 
     def _library_step(self) -> None:
-        """Make a physics step as mujoco-warp does by itself."""
+        """Make a physics step of mujoco-warp's library."""
         with self._on_device():
             asked = self._m.opt.run_qacc_smooth
-            self._m.opt.run_qacc_smooth = True  # its solver starts from it
+            self._m.opt.run_qacc_smooth = True  # mujoco-warp's solver starts from it
             mjw.step(self._m, self._d)
             self._m.opt.run_qacc_smooth = asked
 
@@ -261,7 +270,7 @@ class MujocoWarpPhysics(WarpPhysics):
         mjw.set_const(self._m, self._d)
 
     def _captured_step(self) -> Callable[[], Any]:
-        """The recorded step, and the state as before it."""
+        """Record a step, and restore the state from before it. Return the function that replays it."""
         start = [tensor.clone() for tensor in (self.qpos, self.qvel)]
         recorded = self._record_step()
         for tensor, value in zip((self.qpos, self.qvel), start, strict=True):
@@ -274,12 +283,13 @@ class MujocoWarpPhysics(WarpPhysics):
     def state_tensors(self) -> dict[str, Tensor]:
         own = {"act": wp.to_torch(self._d.act), "warmstart": wp.to_torch(self._d.qacc_warmstart)}
         if self._contacts is not None:
-            own["last_rows"] = wp.to_torch(self._contacts.sides.last)
+            own["last_rows"] = wp.to_torch(self._contacts.active_set.last)
         return {**super().state_tensors(), **own, **self._of_last_step()}
 
     def load_state(self, saved: Mapping[str, Tensor]) -> None:
-        if self._contacts is not None and "last_rows" not in saved:  # of a run from before the solver kept them
-            saved = {**saved, "last_rows": torch.zeros_like(wp.to_torch(self._contacts.sides.last))}
+        # the state comes from a version whose solver did not keep the active set
+        if self._contacts is not None and "last_rows" not in saved:
+            saved = {**saved, "last_rows": torch.zeros_like(wp.to_torch(self._contacts.active_set.last))}
         super().load_state(saved)
 
     def randomize(self, field: str, values: Tensor) -> None:
@@ -290,7 +300,7 @@ class MujocoWarpPhysics(WarpPhysics):
                 self._set_constants()
 
     def _array(self, name: str) -> Tensor:
-        """Return an array of the model, (N, ...), that worlds have for themselves."""
+        """Return an array of the model with one row per world, (N, ...)."""
         return wp.to_torch(self._m.opt.gravity if name == GRAVITY else getattr(self._m, name))
 
     def prepare_redraws(self, drawn: Tensor, columns: Mapping[str, slice], fields: Collection[str]) -> None:

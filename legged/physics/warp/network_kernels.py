@@ -1,7 +1,7 @@
-"""Learned actuators in one launch a physics step; legged/mdp/actuator_network.py has the same in torch, and says what they
-are.
+"""Learned actuators in one launch per physics step; legged/mdp/actuator_network.py has the same in torch, and describes them.
 
-A thread has one joint of one robot, and its units in columns of `scratch`, which neighbours read side by side.
+Each thread computes one joint of one robot. Its units lie in a column of `scratch`, so that neighbouring threads read
+adjacent numbers.
 """
 
 import warp as wp
@@ -30,7 +30,7 @@ def run_mlp(
     scratch: wp.array3d[float],
     torques: wp.array2d[float],
 ):
-    """One thread a robot and joint; of each layer the weights (out, in) come first, then the biases."""
+    """Run the MLP. One thread per robot and joint. The weights (out, in) of each layer precede its biases."""
     robot, joint = wp.tid()
     row = robot * error.shape[1] + joint
     for back in range(1, state.shape[1]):
@@ -72,8 +72,9 @@ def run_lstm(
     scratch: wp.array3d[float],
     torques: wp.array2d[float],
 ):
-    """One thread a robot and joint; of each cell the weights of inputs (4 out, in) come first, then those of hidden units
-    (4 out, out), then the biases, for the gates i, f, g, o; hidden states are the even rows of `state`, cell states the odd.
+    """Run the LSTM. One thread per robot and joint. Each cell has the weights of inputs (4 out, in), then those of hidden
+    units (4 out, out), then the biases, for the gates i, f, g, o. Hidden states are the even rows of `state`, cell states the
+    odd rows.
     """
     robot, joint = wp.tid()
     row = robot * error.shape[1] + joint

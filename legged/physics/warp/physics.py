@@ -1,4 +1,4 @@
-"""What the engines on Warp share: writing and reading, streams, and capture on the CPU."""
+"""Common base of the engines on Warp: writing and reading states, streams, and capture on the CPU."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -14,40 +14,40 @@ from torch import Tensor
 from legged.graph.step_graph import Branch
 from legged.physics.base import Physics
 from legged.physics.robot_state import DrivenJoints
-from legged.physics.warp.exchange import StateExchange
+from legged.physics.warp.state_io import StateIO
 from legged.physics.warp.task_kernels import TaskKernels
 
 
 class WarpPhysics(Physics):
-    """N worlds in an engine written in Warp. All tensors live on one device, at fixed addresses, so that a step can be
-    captured; on the CPU the step is captured here, by Warp.
+    """N worlds in an engine written in Warp. All tensors are on one device, at fixed addresses, so that a step can be
+    captured. On the CPU, this class captures the step by Warp.
 
-    A subclass sets `model`, `qpos`, `qvel`, `ctrl`, `robot_state` and `_exchange`, and implements `_step` with Warp launches
+    A subclass sets `model`, `qpos`, `qvel`, `ctrl`, `robot_state` and `_state_io`, and implements `_step` with Warp launches
     only.
     """
 
     capturable = True
     kernels: TaskKernels
-    _exchange: StateExchange
+    _state_io: StateIO
     _joints: DrivenJoints | None = None
 
     def __init__(self, num_envs: int, dt: float, device: torch.device) -> None:
-        """Prepare the part that needs no engine."""
+        """Prepare the attributes that do not depend on the engine."""
         self.num_envs, self.dt, self.device = num_envs, dt, device
         self.overflowed = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._wp_device = wp.device_from_torch(device)
         self.kernels = TaskKernels(self._on_device)
         self._forces_read = False
-        self._beside = Branch(device)
+        self._forces_stream = Branch(device)
         self._advance: Callable[[], Any] = self._step
 
     @abstractmethod
     def _step(self) -> None:
-        """One physics step, as launches."""
+        """Launch one physics step."""
 
     def _record_step(self) -> Callable[[], Any]:
-        """The step as a Warp graph on the CPU: the same arithmetic without the cost of launching from Python. Runs it
-        once, to compile; recording does not execute.
+        """Return a function that replays the step as a Warp graph on the CPU: the same arithmetic without the cost of
+        launching from Python. This runs the step once, which compiles it; recording does not execute it.
         """
         with wp.ScopedDevice(self._wp_device):
             self._step()
@@ -56,14 +56,14 @@ class WarpPhysics(Physics):
         return lambda: wp.capture_launch(capture.graph)
 
     def _on_device(self) -> AbstractContextManager[Any]:
-        """Warp launches on our device, and on the stream torch uses now, so that both stay in order, also while
-        capturing.
+        """Return a context in which Warp launches on this engine's device and on torch's current stream, so that launches of
+        both stay in order, also during a capture.
         """
         stack = ExitStack()
         stack.enter_context(wp.ScopedDevice(self._wp_device))
         if not self._wp_device.is_cpu:
             stream = torch.cuda.current_stream(self.device)
-            # A second Warp object for the same stream would not know of the capture on it.
+            # A second Warp object for the same stream would not know of the stream's capture.
             if self._wp_device.stream.cuda_stream != stream.cuda_stream:
                 stack.enter_context(wp.ScopedStream(wp.stream_from_torch(stream), sync_enter=False))
         return stack
@@ -77,23 +77,23 @@ class WarpPhysics(Physics):
 
     def refresh(self) -> None:
         forces_read, self._forces_read = self._forces_read, True
-        if not forces_read:  # once a step: a reset in between has cleared its worlds' forces
-            with self._beside.fork(), self._on_device():
-                self._exchange.contact_forces()
+        if not forces_read:  # read forces once per step, since a reset after that has cleared those of its worlds
+            with self._forces_stream.fork(), self._on_device():
+                self._state_io.contact_forces()
         with self._on_device():
             if self._joints is not None:
                 self._joints.read()
-            self._exchange.kinematics()
+            self._state_io.kinematics()
         if not forces_read:
-            self._beside.join()
+            self._forces_stream.join()
 
     def write(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         with self._on_device():
-            self._exchange.write(mask, qpos, qvel)
+            self._state_io.write(mask, qpos, qvel)
 
     def push(self, mask: Tensor, delta: Tensor) -> None:
         with self._on_device():
-            self._exchange.push(mask, delta, self.qvel)
+            self._state_io.push(mask, delta, self.qvel)
 
     def state_tensors(self) -> dict[str, Tensor]:
         state = {"qpos": self.qpos, "qvel": self.qvel}

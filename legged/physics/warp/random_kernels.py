@@ -1,7 +1,7 @@
-"""What is drawn again within a step, kicks, forces and errors of maps, in a launch or two each; legged/mdp has the same in
-torch.
+"""Kernels that resample randomised values within a step, push robots, and change height-map errors; legged/mdp has the same
+in torch.
 
-A module of its own: who randomises nothing never compiles it.
+The kernels have a module of their own, so that it is not compiled for trainings without randomisation.
 """
 
 import warp as wp
@@ -22,8 +22,8 @@ def find_moments(
     chosen: wp.array[wp.int64],
     chosen_due: wp.array[wp.bool],
 ):
-    """One thread a robot. The first moment is never, the second a reset, the others are intervals. At moment `chosen_at`
-    another variant is chosen, never if it is 0.
+    """Find the values that must be resampled now. One thread per robot. Column 0 of `due` means never, column 1 a reset, and
+    the others the ends of intervals. At `chosen_at` another model variant is chosen; 0 means never.
     """
     robot = wp.tid()
     something = wp.bool(reset[robot])
@@ -48,7 +48,7 @@ def find_moments(
 
 @wp.func
 def drawn_value(even: float, column: int, table: wp.array2d[float], steps: float) -> float:
-    """Return a number of a column of `Draws.table` from an even one."""
+    """Return the random value of a column of `Draws.table` for a uniform number."""
     value = even
     kind = table[column, 0]
     if kind > 0.0:
@@ -69,7 +69,7 @@ def make_draws(
     steps: wp.array[float],
     drawn: wp.array2d[float],
 ):
-    """One thread a robot and column."""
+    """Compute random values from uniform numbers. One thread per robot and column."""
     robot, column = wp.tid()
     drawn[robot, column] = drawn_value(even[robot, int(source[column])], column, table, steps[0])
 
@@ -86,7 +86,9 @@ def make_fresh(
     chosen: wp.array[wp.int64],
     fresh: wp.array2d[float],
 ):
-    """One thread a robot and column of what is drawn; places beyond those of the table are columns of the variants."""
+    """Compute new random values, and choose model variants. One thread per robot and column. Columns with a `place` beyond
+    the table take their values from the chosen variant.
+    """
     robot, column = wp.tid()
     variant = wp.clamp(int(choice[robot, 0]), 0, variants.shape[0] - 1)
     if column == 0:
@@ -100,7 +102,7 @@ def make_fresh(
 
 @wp.kernel
 def take_fresh(due: wp.array2d[wp.bool], moment: wp.array[wp.int64], fresh: wp.array2d[float], drawn: wp.array2d[float]):
-    """One thread a robot and number."""
+    """Copy new random values to the robots for which they are due. One thread per robot and column."""
     robot, column = wp.tid()
     if due[robot, wp.int32(moment[column])]:
         drawn[robot, column] = fresh[robot, column]
@@ -119,9 +121,11 @@ def vary_control(
     lowest: wp.array2d[float],
     zero: wp.array2d[float],
 ):
-    """One thread a robot and joint; `nominal` has stiffness, damping, torque limit and default angle, by joint."""
+    """Compute randomised gains, torque limits and joint offsets. One thread per robot and joint. `nominal` holds stiffness,
+    damping, torque limit and default angle of each joint.
+    """
     robot, joint = wp.tid()
-    # All is read before anything is written: a compiler lets no read pass a write, and each would be waited for.
+    # All reads precede all writes: the compiler moves no read ahead of a write, so each read would wait for memory by itself.
     p = nominal[0, joint] * p_gain[robot, joint]
     d = nominal[1, joint] * d_gain[robot, joint]
     most = nominal[2, joint] * torque_limit[robot, joint]
@@ -148,8 +152,9 @@ def disturb(
     velocity: wp.array2d[float],
     total: wp.array3d[float],
 ):
-    """One thread a robot and body, of which the first, the world, has the kicks. Of each kick seven numbers are drawn, the
-    velocity's six and the interval; then of each push five, the force's three, the interval and how long it lasts.
+    """Update kicks and external forces. One thread per robot and body; the thread of body 0, the world, updates the kicks.
+    `drawn` holds seven numbers per kick (six of the velocity, then the interval), then five per push (three of the force, the
+    interval, the duration).
     """
     robot, body = wp.tid()
     goes_on = wp.bool(mask[robot])
@@ -176,7 +181,7 @@ def disturb(
     pushed = wp.vec3()
     for k in range(bodies.shape[0]):
         if bodies[k] == body:
-            # All is read before anything is written, as above.
+            # All reads precede all writes, as in `vary_control`.
             at = 7 * kicks + 5 * k
             lasting, pause = left[robot, 2 * k] - dt, left[robot, 2 * k + 1] - dt
             now = wp.vec3(force[robot, 3 * k], force[robot, 3 * k + 1], force[robot, 3 * k + 2])
@@ -209,7 +214,9 @@ def advance_map(
     rate: wp.array2d[float],
     holes: wp.array2d[wp.bool],
 ):
-    """One thread a robot and point of its map, or a robot alone where maps have no holes. The last chance is the map's."""
+    """Update the errors of height maps. One thread per robot and map point, or per robot if maps have no holes. The last
+    column of `chances` decides if the whole map is lost.
+    """
     robot, point = wp.tid()
     fresh = wp.bool(begun[robot])
     if point < holes.shape[1] and fresh:

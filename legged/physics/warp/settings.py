@@ -1,7 +1,7 @@
-"""Settings of Warp: every package here with kernels imports them before anything else."""
+"""Settings of Warp, which every package with kernels imports first."""
 
 import warp as wp
 
 wp.config.log_level = wp.LOG_WARNING
-wp.config.enable_backward = False  # nothing here is differentiated, and adjoints double the time to compile
+wp.config.enable_backward = False  # kernels here are not differentiated, and adjoint code doubles the compilation time
 wp.init()

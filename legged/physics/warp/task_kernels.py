@@ -1,6 +1,6 @@
-"""The parts of a task whose formula is fixed, in one launch each where torch takes six to twenty.
+"""Kernels of those parts of a task whose formula is fixed. Each replaces 6 to 20 torch operations by one launch.
 
-Each stands beside the same formula in torch, in `legged/mdp/`, which the C engine runs; a test compares both bit by bit.
+The C engine runs the same formulas in torch, in `legged/mdp/`; a test checks that both are bit-identical.
 """
 
 import torch
@@ -33,7 +33,7 @@ def hold_joints(
     limit: wp.array2d[float],
     torques: wp.array2d[float],
 ):
-    """One thread a robot and joint: a torque that is no number stays none."""
+    """Compute the torques of PD control. One thread per robot and joint. NaN stays NaN."""
     robot, joint = wp.tid()
     spring = stiffness[robot, joint] * (target[robot, joint] - dof_pos[robot, joint])
     torque = spring - damping[robot, joint] * dof_vel[robot, joint]
@@ -56,7 +56,7 @@ def advance_feet(
     air_time: wp.array2d[float],
     last_air_time: wp.array2d[float],
 ):
-    """One thread a robot and foot."""
+    """Update the feet's contacts and air times. One thread per robot and foot."""
     robot, foot = wp.tid()
     touching = forces[robot, foot][2] > threshold
     contact = touching or touched[robot, foot]
@@ -92,7 +92,7 @@ def renew_commands(
     time_left: wp.array[float],
     is_moving: wp.array[wp.bool],
 ):
-    """One thread a robot; with a gain of 0 headings are not followed."""
+    """Resample commands, and steer towards headings unless `heading_gain` is 0. One thread per robot."""
     robot = wp.tid()
     left = time_left[robot] - dt
     if (reset[robot] or left <= last_moment) and not held[robot]:
@@ -123,7 +123,7 @@ def find_pushes(
     due: wp.array[wp.bool],
     delta: wp.array2d[float],
 ):
-    """One thread a robot."""
+    """Find the robots that are pushed now, and their changes of velocity. One thread per robot."""
     robot = wp.tid()
     left = time_left[robot] - dt
     now = left <= last_moment and mask[robot]
@@ -145,7 +145,7 @@ def follow_commands(
     share: wp.array[float],
     reached: wp.array3d[float],
 ):
-    """One thread a robot and axis: what of a command counts, and what of it was reached."""
+    """Compute the size of each command that counts, and the velocity in its direction. One thread per robot and axis."""
     robot, axis = wp.tid()
     command = commands[robot, axis]
     size = wp.abs(command)
@@ -170,7 +170,7 @@ def widen_commands(
     steps: wp.array[float],
     share: wp.array[float],
 ):
-    """One thread for all three axes: they share a clock."""
+    """Widen the ranges of commands. One thread for all three axes, since they share a counter of steps."""
     count = steps[0] + 1.0
     due = count >= window_steps
     for axis in range(3):
@@ -202,7 +202,9 @@ def scan_heights(
     heights: wp.array2d[float],
     ground: wp.array[float],
 ):
-    """One thread a robot and point; the last point is the base's own place."""
+    """Read the heights of the points around each robot. One thread per robot and point; the last point is the base's
+    position.
+    """
     robot, point = wp.tid()
     w, x, y, z = base_quat[robot, 0], base_quat[robot, 1], base_quat[robot, 2], base_quat[robot, 3]
     yaw = wp.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
@@ -240,7 +242,7 @@ def move_levels(
     origins: wp.array2d[float],
     judged: wp.array2d[float],
 ):
-    """One thread a robot."""
+    """Move robots between terrain levels. One thread per robot."""
     robot = wp.tid()
     over_x, over_y = base_pos[robot, 0] - origins[robot, 0], base_pos[robot, 1] - origins[robot, 1]
     walked = wp.sqrt(over_x * over_x + over_y * over_y)
@@ -272,8 +274,8 @@ def add_rewards(
     sums: wp.array2d[float],
     total: wp.array[float],
 ):
-    """One thread a robot; rows are terms. Of four terms all is read before anything is written: a compiler lets no read pass
-    a write, and each would be waited for.
+    """Add up rewards. One thread per robot; rows are terms. Terms are processed in groups of four, so that all reads of a
+    group precede its writes: the compiler moves no read ahead of a write, so each read would wait for memory by itself.
     """
     robot = wp.tid()
     clipped, whole = wp.float32(0.0), wp.float32(0.0)
@@ -303,86 +305,88 @@ def add_rewards(
 
 
 class TaskKernels(Launcher):
-    """Launches them on an engine's device, on the stream that torch uses now. All arguments are torch's tensors."""
+    """Launches of task kernels on an engine's device, on torch's current stream. All array arguments are torch tensors."""
 
     def name_module(self) -> None:
-        """Launch one of them, for a dry run that asks which modules are needed: they are all in one."""
+        """Launch one kernel of this module. A dry run calls it to find the modules that are needed; all kernels here are in
+        one.
+        """
         wp.launch(hold_joints, dim=1)
 
     def hold_joints(self, dim: tuple[int, ...], *arguments: Tensor) -> None:
-        """As `Control.compute` of joints that are held by P gains: the last argument is written."""
+        """Launch the kernel of `Control.compute` for joints under PD control. The last argument is written."""
         self.launch(hold_joints, dim, arguments)
 
     def drive_joints(self, dim: tuple[int, ...], *arguments: Tensor | float) -> None:
-        """As `Actuator.drive` of joints with P gains: the last argument is written."""
+        """Launch the kernel of `Actuator.drive` for joints under PD control. The last argument is written."""
         self.launch(drive_joints, dim, arguments)
 
     def run_mlp(self, error: Tensor, *arguments: Tensor | float) -> None:
-        """As `ActuatorNetwork.torques` of an MLP: the last argument is written."""
+        """Launch the kernel of `ActuatorNetwork.torques` of an MLP. The last argument is written."""
         self.launch(run_mlp, tuple(error.shape), (error, *arguments))
 
     def run_lstm(self, error: Tensor, *arguments: Tensor | float) -> None:
-        """The same of an LSTM."""
+        """Launch the kernel of `ActuatorNetwork.torques` of an LSTM. The last argument is written."""
         self.launch(run_lstm, tuple(error.shape), (error, *arguments))
 
     def advance_feet(self, forces: Tensor, *arguments: Tensor | float) -> None:
-        """As `FeetContacts.update`."""
+        """Launch the kernel of `FeetContacts.update`."""
         self.launch(advance_feet, tuple(forces.shape[:2]), (forces, *arguments), vectors=1)
 
     def renew_commands(self, *arguments: Tensor | float) -> None:
-        """As `Commands.update`."""
+        """Launch the kernel of `Commands.update`."""
         self.launch(renew_commands, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def find_pushes(self, *arguments: Tensor | float) -> None:
-        """As the first half of `Pushes.push`."""
+        """Launch the kernel of the first half of `Pushes.push`."""
         self.launch(find_pushes, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def make_draws(self, *arguments: Tensor) -> None:
-        """As `Draws.values`: the last argument is written."""
+        """Launch the kernel of `Draws.values`. The last argument is written."""
         self.launch(make_draws, tuple(arguments[-1].shape), arguments)
 
     def make_fresh(self, *arguments: Tensor) -> None:
-        """As `Randomization.draw`: the last two arguments are written."""
+        """Launch the kernel of `Randomization.draw`. The last two arguments are written."""
         self.launch(make_fresh, tuple(arguments[-1].shape), arguments)
 
     def find_moments(self, *arguments: Tensor | float) -> None:
-        """As the first half of `Randomization.redraw`."""
+        """Launch the kernel of the first half of `Randomization.redraw`."""
         self.launch(find_moments, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def take_fresh(self, *arguments: Tensor) -> None:
-        """As its second half: the last argument is written."""
+        """Launch the kernel of the second half of `Randomization.redraw`. The last argument is written."""
         self.launch(take_fresh, tuple(arguments[-1].shape), arguments)
 
     def vary_control(self, *arguments: Tensor) -> None:
-        """As `Control.vary`."""
+        """Launch the kernel of `Control.vary`."""
         self.launch(vary_control, tuple(arguments[-1].shape), arguments)
 
     def disturb(self, *arguments: Tensor | float) -> None:
-        """As `Disturbances.act`, but for the kicks themselves; the last argument (N, bodies, 6) has the forces."""
+        """Launch the kernel of `Disturbances.act` without the kicks. The last argument (N, bodies, 6) gets the forces."""
         total: Tensor = arguments[-1]  # type: ignore[assignment]
         self.launch(disturb, (len(total), max(total.shape[1], 1)), arguments)
 
     def advance_map(self, holes: Tensor, *arguments: Tensor | float) -> None:
-        """As `HeightMapErrors.advance`: `holes` (N, P) and the last two arguments are written."""
+        """Launch the kernel of `HeightMapErrors.advance`. `holes` (N, P) and the last two arguments are written."""
         self.launch(advance_map, (len(holes), max(holes.shape[1], 1)), (*arguments, holes))
 
     def follow_commands(self, commands: Tensor, *arguments: Tensor) -> None:
-        """As the first half of `CommandCurriculum.update`."""
+        """Launch the kernel of the first half of `CommandCurriculum.update`."""
         self.launch(follow_commands, tuple(commands.shape), (commands, *arguments))
 
     def widen_commands(self, *arguments: Tensor | float) -> None:
-        """As its second half."""
+        """Launch the kernel of the second half of `CommandCurriculum.update`."""
         self.launch(widen_commands, 1, arguments)
 
     def scan_heights(self, base_pos: Tensor, base_quat: Tensor, points_x: Tensor, *arguments: Tensor | float) -> None:
-        """As `HeightScan.update`."""
+        """Launch the kernel of `HeightScan.update`."""
         dim = (len(base_pos), len(points_x))
         self.launch(scan_heights, dim, (base_pos, base_quat, points_x, *arguments))
 
     def move_levels(self, *arguments: Tensor | float) -> None:
-        """As `TerrainCurriculum.update`, but for the sums over robots."""
+        """Launch the kernel of `TerrainCurriculum.update`, except the sums over robots."""
         self.launch(move_levels, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def add_rewards(self, values: Tensor, *arguments: Tensor | float) -> None:
-        """As `Rewards.compute`, once the terms are known."""
+        """Launch the kernel of `Rewards.compute` for known values of the terms."""
         self.launch(add_rewards, values.shape[1], (values, *arguments))

@@ -1,1 +1,1 @@
-"""A policy on show in a browser: what is simulated (`session`), which policy acts (`source`), and the page that shows it."""
+"""Live view of a policy in a browser: the simulation (`session`), the checkpoint (`source`) and the web page (`page`)."""

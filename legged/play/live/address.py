@@ -1,4 +1,4 @@
-"""Where a page is served: a port that is free, and a word where others could reach it."""
+"""Address of the page: host, free port and URL."""
 
 import ipaddress
 import socket
@@ -6,16 +6,16 @@ import socket
 from legged.errors import ConfigError
 
 HOST, PORT = "127.0.0.1", 8470
-"""This machine alone; and where the page is, if that is free."""
+"""Default host, which only this machine reaches, and the first port that is tried."""
 TRIES = 50
-"""How many ports after the first are tried."""
+"""Number of ports that are tried."""
 
 
 def check_port(port: int) -> int:
-    """Return a port that --port names.
+    """Return the port of --port.
 
     Raises:
-        ConfigError: there is no such port.
+        ConfigError: the number is no port.
     """
     if not 0 <= port <= 65535:
         raise ConfigError(f"--port: must be from 0 to 65535, got {port}")
@@ -23,10 +23,10 @@ def check_port(port: int) -> int:
 
 
 def free_port(host: str, port: int | None) -> int:
-    """Return `port` if it is free on `host`, any that is for 0; without one, PORT or the first after it that is free.
+    """Return `port` if it is free on `host`, or any free port for 0. Without `port`, return the first free one from PORT on.
 
     Raises:
-        ConfigError: the host is none of this machine, or the port is taken.
+        ConfigError: the host is no address of this machine, or the port is taken.
     """
     try:
         family = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][0]
@@ -52,7 +52,7 @@ def free_port(host: str, port: int | None) -> int:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine reaches an address."""
+    """Return whether only this machine reaches a host."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -60,6 +60,6 @@ def is_loopback(host: str) -> bool:
 
 
 def url(host: str, port: int) -> str:
-    """Return the address of the page as a browser on this machine takes it."""
+    """Return the URL of the page for a browser on this machine."""
     shown = "127.0.0.1" if host == "0.0.0.0" else "[::1]" if host == "::" else f"[{host}]" if ":" in host else host
     return f"http://{shown}:{port}"

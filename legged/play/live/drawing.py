@@ -1,51 +1,47 @@
-"""What the page draws: the robots, their velocities and the ground, in viser's scene, which keeps the followed robot in its
-middle.
-"""
+"""Robots, their velocities and the ground in viser's scene."""
 
 from typing import Any
 
 import mujoco
 import numpy as np
 import torch
+from trimesh.visual.color import srgb_to_linear
 
 from legged.envs import LeggedRobot
-from legged.play.live.glb import glb, linear
 from legged.play.live.plots import ACTUAL, COMMANDED
 from legged.play.live.session import Session
-from legged.play.live.shapes import bodies_of, plane_shape, terrain_shape
-from legged.rendering.robots_camera import ABOVE, APART, SPACING
-from legged.rendering.size import size_of, size_of_model
+from legged.play.live.shapes import PERIOD, body_meshes, plane_mesh, terrain_mesh
+from legged.rendering.framing import side_by_side, size_of, size_of_model
+from legged.rendering.task_cameras import ABOVE, APART, SPACING
 from legged.robots.importing.adapted import robot_spec_of
 
 GLIDE = np.array([0.25, 0.25, 0.06])
-"""Share of the way to the followed robot that the camera makes up in a picture, along x, y and z: steps must not shake it."""
+"""Share of the distance to the followed robot that the view covers per picture, along x, y, z: steps then shake it less."""
 CUT = 2.0
-"""From farther away than this it does not glide, it is there at once: the robot has been put somewhere else [m]."""
+"""Distance above which the view jumps to the robot at once, because the robot was put somewhere else [m]."""
 ARROW = 0.6
 """Length of an arrow for 1 m/s [m]."""
 ARROWS_EVERY = 3
-"""Arrows move along in every picture, and change their length in one of so many."""
+"""Arrows move along in every picture; their lengths change in one of so many."""
 SLOWEST_SHOWN = 0.03
 """Slower robots have no arrow [m/s]."""
 VIEW = np.array([-1.75, -2.1, 1.15])
-"""From where one looks at first, in lengths of a robot."""
+"""First position of the browser's camera relative to the robot, in lengths of a robot."""
 AMBIENT = 0.35
-"""Brightness of the light from all around, beside viser's own: with more, light colours are white."""
+"""Brightness of the ambient light; with more, light colours turn white."""
 FOG, SKY = (25.0, 55.0), (255, 255, 255)
-"""Distances between which the ground goes over into the background [m], and its colour."""
+"""Distances between which the ground fades into the background [m], and the background's colour."""
 HIDDEN = -1000.0
-"""Height of what is not to be seen [m]."""
+"""Height of hidden arrows [m]."""
 NARROW = 700
-"""Screens that are narrower have the controls below the picture, not beside it [pixels]."""
+"""Screens below this width have the controls below the picture instead of next to it [pixels]."""
 FARTHER, LOWER = 1.3, 1.0
-"""There one looks from so many times as far away, at a point so far below the robot, in its lengths."""
-SQUARE = 2.0
-"""Length after which the squares of a plane look the same: they are moved along by multiples of it [m]."""
+"""On narrow screens the camera is so many times as far away and looks at a point so far below the robot, in its lengths."""
 
 
 class Drawing:
-    """Robots and ground of a session in a viser scene. Everything hangs on one frame, `/world`, which moves the other way
-    when the camera follows a robot: so the view stays the user's to turn.
+    """Robots and ground of a session in a viser scene. Everything is a child of the frame `/world`, which moves against the
+    followed robot. The robot so stays in the middle, and the user's view of it is kept.
     """
 
     def __init__(self, server: Any, session: Session) -> None:
@@ -63,16 +59,16 @@ class Drawing:
         self.build()
         server.initial_camera.position = tuple(VIEW * self.length)
         server.initial_camera.look_at = (0.0, 0.0, -0.1 * self.length)
-        server.on_client_connect(self._suit)
+        server.on_client_connect(self._fit_view)
 
-    def _suit(self, client: Any) -> None:
-        """Let a narrow screen, whose lower half has the controls, show the robot in its upper one."""
+    def _fit_view(self, client: Any) -> None:
+        """Move the robot to the upper half of a narrow screen, whose lower half has the controls."""
         if client.camera.image_width < NARROW:
             client.camera.position = tuple(FARTHER * VIEW * self.length)
             client.camera.look_at = (0.0, 0.0, -LOWER * self.length)
 
     def build(self) -> None:
-        """Draw everything anew: the task is another one."""
+        """Replace everything drawn by the session's current task."""
         for handle in self._handles:
             handle.remove()
         session, scene = self.session, self.server.scene
@@ -83,12 +79,12 @@ class Drawing:
         self._offsets = self._side_by_side(task.num_envs)
         terrain = getattr(task, "terrain", None)
         self._plane = terrain is None
-        ground = plane_shape() if terrain is None else terrain_shape(terrain)
-        self._ground = scene.add_glb("/world/ground", glb(ground.vertices, ground.faces, ground.colors), cast_shadow=False)
-        shown = {body: glb(look.vertices, look.faces, look.colors) for body, look in bodies_of(model).items()}
-        self._bodies = list(shown)
+        ground = plane_mesh() if terrain is None else terrain_mesh(terrain)
+        self._ground = scene.add_mesh_trimesh("/world/ground", ground, cast_shadow=False)
+        meshes = body_meshes(model)
+        self._bodies = list(meshes)
         self._nodes = [
-            [scene.add_glb(f"/world/bodies/{robot}/{body}", data) for body, data in shown.items()]
+            [scene.add_mesh_trimesh(f"/world/bodies/{robot}/{body}", mesh) for body, mesh in meshes.items()]
             for robot in range(task.num_envs)
         ]
         self._handles = [self._ground, *(node for nodes in self._nodes for node in nodes)]
@@ -96,13 +92,13 @@ class Drawing:
         self._arrows: list[Any] = []
         if isinstance(task, LeggedRobot):
             self._add_arrows(task.num_envs)
-        self._jump()
+        self._middle = self._base(session.followed)
         self.draw()
 
     def _add_arrows(self, count: int) -> None:
-        """Add arrows above robots, in frames that turn about the vertical axis with them."""
+        """Add arrows above robots, in frames that share the robots' heading."""
         scene, thick = self.server.scene, 0.022 * self.length
-        colors = np.array([_rgb(COMMANDED), _rgb(ACTUAL)], dtype=np.uint8)
+        colors = np.array([_light(COMMANDED), _light(ACTUAL)], dtype=np.uint8)
         for robot in range(count):
             self._above.append(scene.add_frame(f"/world/above/{robot}", show_axes=False))
             self._arrows.append(
@@ -118,7 +114,7 @@ class Drawing:
         self._handles += self._above
 
     def _model(self) -> tuple[mujoco.MjModel, Any]:
-        """Return the model whose bodies are drawn, and how large they are."""
+        """Return the model whose bodies are drawn, and its size."""
         task = self._task
         if isinstance(task, LeggedRobot):
             return robot_spec_of(task.robot.model_path, drawn=True).compile(), size_of(task.robot)
@@ -126,27 +122,21 @@ class Drawing:
         return model, size_of_model(model, model.qpos0)
 
     def _side_by_side(self, count: int) -> np.ndarray:
-        """Return how far robots are drawn from where they are, (N, 3) [m]: on a plane all of them start in one place."""
-        offsets = np.zeros((count, 3))
-        if getattr(self._task, "terrain", None) is None:
-            columns = int(np.ceil(count**0.5)) if isinstance(self._task, LeggedRobot) else count
-            grid = np.array([[-(i // columns), i % columns] for i in range(count)], dtype=float)
-            offsets[:, :2] = SPACING * self.length * (grid - grid.mean(axis=0))
-        return offsets
-
-    def _jump(self) -> None:
-        """Look at the followed robot at once."""
-        self._middle = self._base(self.session.followed)
+        """Return offsets (N, 3) between where robots are and where they are drawn [m]; on a plane all start in one place."""
+        if getattr(self._task, "terrain", None) is not None:
+            return np.zeros((count, 3))
+        columns = int(np.ceil(count**0.5)) if isinstance(self._task, LeggedRobot) else count
+        return SPACING * self.length * side_by_side(count, columns)
 
     def _base(self, robot: int) -> np.ndarray:
-        """Return where a robot is drawn (3,), world frame [m]."""
+        """Return the drawn position (3,) of a robot's base, world frame [m]; sets the poses of all its bodies."""
         qpos = np.nan_to_num(self._task.physics.qpos[robot].cpu().numpy().astype(float))
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model_drawn, self._data)
         return np.asarray(self._data.xpos[1]) + self._offsets[robot]
 
     def draw(self) -> None:
-        """Show where the robots are now; draw anew where the task is another one."""
+        """Update the poses; build the scene anew if the session has another task."""
         if self._task is not self.session.task:
             self.build()
             return
@@ -163,7 +153,7 @@ class Drawing:
         with self.server.atomic():
             self._world.position = tuple(-self._middle)
             if self._plane:
-                self._ground.position = (*(SQUARE * np.round(self._middle[:2] / SQUARE)), 0.0)
+                self._ground.position = (*(PERIOD * np.round(self._middle[:2] / PERIOD)), 0.0)
             for nodes, (positions, turns) in zip(self._nodes, poses, strict=True):
                 for node, position, turn in zip(nodes, positions, turns, strict=True):
                     node.position, node.wxyz = position, turn
@@ -171,7 +161,7 @@ class Drawing:
                 self._draw_velocities(bases)
 
     def _draw_velocities(self, bases: np.ndarray) -> None:
-        """Put arrows above robots at `bases` (N, 3) [m]: the commanded velocity, and above it the actual one."""
+        """Draw two arrows above each of `bases` (N, 3) [m]: the commanded velocity, and above it the actual one."""
         task = self._task
         w, x, y, z = np.nan_to_num(task.base_quat.cpu().numpy().astype(float)).T
         half_yaw = 0.5 * np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
@@ -191,6 +181,6 @@ class Drawing:
                 arrows.points = points
 
 
-def _rgb(color: str) -> tuple[int, ...]:
-    """Return a colour such as '#0072B2' as the light of arrows, 0 to 255: they take it for that, and not for a screen's."""
-    return tuple(round(255.0 * float(linear(np.array(int(color[i : i + 2], 16))))) for i in (1, 3, 5))
+def _light(color: str) -> np.ndarray:
+    """Return a colour such as '#0072B2' as linear intensities (3,), 0 to 255, which arrows take instead of sRGB."""
+    return np.round(255.0 * srgb_to_linear(np.array(list(bytes.fromhex(color[1:]))) / 255.0))

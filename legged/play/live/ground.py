@@ -1,4 +1,4 @@
-"""The task that a live view simulates: a few undisturbed robots, on the ground that somebody chose."""
+"""The task that a live view simulates: a few undisturbed robots on the chosen ground."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,26 +15,26 @@ from legged.registry import make_task, task_class
 from legged.terrain import TERRAIN_TYPES
 
 OWN, PLANE = "the task's own", "plane"
-"""What robots stand on if nobody chose a type of terrain: some of each type of the task, or a plane."""
+"""Grounds without a chosen type: tiles of each type of the task, or a plane."""
 HOURS_S = 36000.0
-"""Length of an episode of robots that follow commands: nobody waits for its end [s]."""
+"""Length of an episode of robots that follow commands, so long that it does not end [s]."""
 APART = 1.0
-"""Robots that share a tile start up to so far from its middle, times the scale of the terrain [m]."""
+"""Largest distance from the middle of a tile at which robots that share it start, times the scale of the terrain [m]."""
 
 
 @dataclass(frozen=True)
 class ChosenGround:
-    """What robots stand on."""
+    """A chosen ground."""
 
     kind: str
     """OWN, PLANE or a type of terrain."""
     difficulty: float | None = None
-    """Of all tiles, 0 to 1; without one, as easy and as hard as `play` shows them."""
+    """Difficulty of all tiles, 0 to 1; None for the difficulties of `play`."""
 
 
 def grounds_of(cfg: TaskConfig) -> list[str]:
-    """Return the kinds of ground that can be chosen, the task's own first; one alone where there is nothing to choose: for
-    a model that brings its floor, and a task whose terrain is a single tile.
+    """Return the kinds of ground that can be chosen, the task's own first. A model with its own floor and a task whose
+    terrain is a single tile have only one.
     """
     if not isinstance(cfg, LeggedConfig):
         return [OWN]
@@ -45,10 +45,10 @@ def grounds_of(cfg: TaskConfig) -> list[str]:
 
 
 def check_ground(cfg: TaskConfig, kind: str | None, difficulty: float | None) -> ChosenGround:
-    """Return the ground that --terrain and --difficulty ask for.
+    """Return the ground of --terrain and --difficulty.
 
     Raises:
-        ConfigError: there is none such, or the task has nothing to choose.
+        ConfigError: the type or the difficulty does not exist, or the task has a single ground.
     """
     kinds = grounds_of(cfg)
     if len(kinds) == 1:
@@ -62,7 +62,7 @@ def check_ground(cfg: TaskConfig, kind: str | None, difficulty: float | None) ->
 
 
 def changes_for(cfg: TaskConfig, num_envs: int, asked: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
-    """Return overrides for that many robots, undisturbed but for what `asked` says."""
+    """Return overrides for that many robots, undisturbed except for the overrides in `asked`."""
     if isinstance(cfg, LeggedConfig):
         keep_length = len(grounds_of(cfg)) == 1  # it ends at the edge of the tile, or a little before
         seconds = cfg.env.episode_length_s - 10.0 if keep_length else HOURS_S
@@ -77,11 +77,11 @@ def build(
     device: torch.device,
     graph: bool = False,
 ) -> tuple[BaseTask, Playground | None]:
-    """Build the task of configuration `cfg` with `changes` on a ground; with it comes the playground that has the robots'
-    tiles, if the ground has any.
+    """Build the task of configuration `cfg` with `changes` on a ground. Return it with the playground that assigns the
+    robots' tiles, or None if the ground has no tiles.
 
     Raises:
-        ConfigError: the configuration can't be built, or tiles are too small.
+        ConfigError: the configuration cannot be built, or tiles are too small.
     """
     nominal = cfg.trained()
     few_robots_do = ("train.algorithm.num_mini_batches", 1)  # nothing is trained

@@ -1,4 +1,4 @@
-"""The last seconds of one robot: what it was asked, how fast it was, which feet stood, what it was paid for."""
+"""The last seconds of one robot: commands, velocities, foot contacts and reward terms."""
 
 from dataclasses import dataclass
 
@@ -8,11 +8,11 @@ from legged.envs import BaseTask, LeggedRobot
 from legged.policies.episodes import unit_of
 
 KEPT_S = 10.0
-"""How much is kept [s]."""
+"""Length of the history [s]."""
 SMOOTHED_S = 0.2
-"""Rewards are shown as means over so long: a touch-down is paid in a single step [s]."""
+"""Window over which rewards are averaged, because some terms occur in single steps, such as touch-downs [s]."""
 AXES, UNITS = ("vx", "vy", "yaw rate"), ("m/s", "m/s", "rad/s")
-"""Of a command."""
+"""Names and units of the components of a command."""
 
 
 @dataclass(frozen=True)
@@ -20,13 +20,13 @@ class Sample:
     """A robot at the end of a control step."""
 
     time: float
-    """Since the session began, as simulated [s]."""
+    """Simulated time since the start of the session [s]."""
     actual: np.ndarray
-    """(3,) vx, vy [m/s] and yaw rate [rad/s], base frame; of a task without commands vx alone is known, world frame."""
+    """(3,) vx, vy [m/s] and yaw rate [rad/s], base frame; in tasks without commands only vx, world frame, the rest NaN."""
     commanded: np.ndarray
-    """(3,) the same as asked; NaN of a task without commands."""
+    """(3,) commanded vx, vy [m/s] and yaw rate [rad/s]; NaN in tasks without commands."""
     contacts: np.ndarray
-    """(F,) 1 where a foot is on the ground, else 0."""
+    """(F,) 1 for feet on the ground, 0 for others."""
     rewards: np.ndarray
     """(terms,) each scaled reward term, in the task's own unit."""
 
@@ -39,7 +39,7 @@ class History:
         self.terms = task.rewards.names
         self.feet = task.robot.feet_names if isinstance(task, LeggedRobot) else ()
         self.per_second = task.cfg.rewards.times_dt
-        """Whether rewards are counted by the second, not by the step."""
+        """Rewards are counted per second, not per step."""
         self.dt = task.dt
         self.length = max(2, round(KEPT_S / task.dt))
         self._samples: list[Sample] = []
@@ -48,11 +48,11 @@ class History:
         return len(self._samples)
 
     def clear(self) -> None:
-        """Forget everything: another robot is followed."""
+        """Remove all samples."""
         self._samples.clear()
 
     def add(self, task: BaseTask, robot: int, time: float) -> None:
-        """Take in a control step of a task's robot. Where an episode ended, curves are broken."""
+        """Add the last control step of a task's robot; a step that ended an episode is NaN."""
         if bool(task.reset_buf[robot]):
             nothing = np.full(3, np.nan)
             feet, terms = np.full(len(self.feet), np.nan), np.full(len(self.terms), np.nan)
@@ -63,24 +63,24 @@ class History:
         del self._samples[: -self.length]
 
     def times(self) -> np.ndarray:
-        """Return (K,) when the samples were taken, from now [s]: at most 0."""
+        """Return the times (K,) of the samples relative to the newest one [s]."""
         times = np.array([sample.time for sample in self._samples])
         return times - times[-1] if len(times) else times
 
     def commanded(self) -> np.ndarray:
-        """Return (3, K) what was asked, `Sample.commanded`."""
+        """Return `Sample.commanded` as (3, K)."""
         return np.array([sample.commanded for sample in self._samples]).reshape(-1, 3).T
 
     def actual(self) -> np.ndarray:
-        """Return (3, K) what was done, `Sample.actual`."""
+        """Return `Sample.actual` as (3, K)."""
         return np.array([sample.actual for sample in self._samples]).reshape(-1, 3).T
 
     def contacts(self) -> np.ndarray:
-        """Return (F, K) which feet stood."""
+        """Return `Sample.contacts` as (F, K)."""
         return np.array([sample.contacts for sample in self._samples]).reshape(-1, len(self.feet)).T
 
     def rewards(self) -> np.ndarray:
-        """Return (terms, K) rewards, as means over SMOOTHED_S before each sample."""
+        """Return the rewards as (terms, K), averaged over the SMOOTHED_S before each sample."""
         values = np.array([sample.rewards for sample in self._samples]).reshape(-1, len(self.terms)).T
         width = max(1, round(SMOOTHED_S / self.dt))
         counted = np.cumsum(np.isfinite(values), axis=1, dtype=float)
@@ -92,7 +92,7 @@ class History:
 
 
 def sample_of(task: BaseTask, robot: int, time: float, feet: int) -> Sample:
-    """Return what there is to know of a robot now."""
+    """Return a sample of a robot's present state."""
     rewards = (task.rewards.last[:, robot] / unit_of(task)).cpu().numpy().astype(float)
     unknown = np.full(3, np.nan)
     if not isinstance(task, LeggedRobot):

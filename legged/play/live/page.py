@@ -1,4 +1,4 @@
-"""The page in the browser: viser's server, what it shows, and what its controls tell the session."""
+"""The web page: viser's server with its scene, plots and controls."""
 
 import contextlib
 import io
@@ -10,32 +10,31 @@ from typing import Any
 
 from legged.errors import ConfigError
 from legged.learning.run_folder import BEST
-from legged.play.live.drawing import Drawing
 from legged.play.live.history import AXES, UNITS
-from legged.play.live.plots import gait_figure, reward_figure, velocity_figures
+from legged.play.live.plots import LivePlots
 from legged.play.live.session import FASTEST, HARDEST_PUSH, SLOWEST, Session
 from legged.play.live.source import NEWEST
 
 INSTALL = "pip install 'legged[watch]'"
 PICTURES_S, PLOTS_S, LOOK_S = 1.0 / 30.0, 0.25, 1.0
-"""Time between two pictures, two plots, and two looks for a newer checkpoint [s]."""
+"""Time between two pictures, two updates of the plots, and two checks for a newer checkpoint [s]."""
 IDLE_S = 0.1
-"""Time between two looks for somebody who connects, while nobody is: nothing is simulated then [s]."""
+"""Time between two checks for visitors while the page has none and the simulation rests [s]."""
 SLOW = 0.9
-"""A slower pace is said."""
+"""The page warns when the pace is below this."""
 STEPS = (0.1, 0.1, 0.2)
 """Change of vx, vy [m/s] and yaw rate [rad/s] by one key press."""
 KEYS = (("I", 0, 1), ("K", 0, -1), ("U", 1, 1), ("O", 1, -1), ("J", 2, 1), ("L", 2, -1))
-"""Letters that change the command: which axis, and in which direction. Others, and the arrows, move viser's camera."""
+"""Letters that change the command: axis and direction. Viser's camera uses other letters and the arrows."""
 DIRECTIONS = {"forwards": 0.0, "left": 90.0, "backwards": 180.0, "right": -90.0}
-"""Of a push, to the left of where the robot looks [degrees]."""
+"""Directions of a push, from the robot's heading to the left [degrees]."""
 
 
 def load_viser() -> Any:
     """Return the module viser.
 
     Raises:
-        ConfigError: it is not installed.
+        ConfigError: viser is not installed.
     """
     try:
         import viser
@@ -45,23 +44,25 @@ def load_viser() -> Any:
 
 
 class Page:
-    """Shows a session and passes on what its visitors ask for. Callbacks come in viser's threads and only queue what is to
-    be done; `run` and `do_what_was_asked` do it in the thread that calls them.
+    """A web page that shows and controls a session. Viser calls callbacks from its own threads; they only queue actions,
+    which `run` and `do_what_was_asked` execute in the thread of their caller.
     """
 
     def __init__(self, session: Session, host: str, port: int) -> None:
-        """Serve at an address; see `legged.play.live.address` for one that is free."""
+        """Start the server; `legged.play.live.address.free_port` finds a free port."""
         viser = load_viser()
+        from legged.play.live.drawing import Drawing  # imports trimesh, which comes with viser
+
         self.session = session
         self._asked: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
-        with contextlib.redirect_stdout(io.StringIO()):  # it announces itself at length
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
             self.server: Any = viser.ViserServer(host=host, port=port, label=session.cfg.task, verbose=False)
-        # Nobody may send this machine's page to the public through somebody's tunnel, which any visitor could ask for.
+        # Viser lets any visitor publish the page through a public tunnel; that is switched off.
         self.server.request_share_url = lambda verbose=True: None
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self.drawing = Drawing(self.server, session)
         self.sliders: list[tuple[int, Any]] = []
-        """Axis of the command, and its slider."""
+        """Axis of the command and its slider."""
         self._add_controls()
         self._add_plots()
         self._add_keys()
@@ -69,23 +70,23 @@ class Page:
 
     @property
     def port(self) -> int:
-        """Return the port at which it is served."""
+        """Return the port of the server."""
         return int(self.server.get_port())
 
     @property
     def visitors(self) -> int:
-        """Return how many browsers show the page."""
+        """Return the number of connected browsers."""
         return len(self.server.get_clients())
 
     def close(self) -> None:
-        """End the server."""
+        """Stop the server."""
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
     # ---- controls ----------------------------------------------------------------------------------------------------
 
     def _later(self, what: Callable[[], object]) -> None:
-        """Let `run` do something."""
+        """Queue an action for `run`."""
         self._asked.put(what)
 
     def _add_controls(self) -> None:
@@ -129,7 +130,7 @@ class Page:
         self._show_command()
 
     def _show_command(self) -> None:
-        """Move the sliders to where the command is."""
+        """Move the sliders to the present command."""
         for axis, slider in self.sliders:
             slider.value = round(self.session.command[axis], 3)
 
@@ -173,7 +174,7 @@ class Page:
         gui.add_button("push").on_click(lambda _: self._later(push))
 
     def _add_keys(self) -> None:
-        """Let keys do what buttons do; viser lists them in its palette."""
+        """Add keys for the buttons' actions; viser lists them in its palette."""
         gui, session = self.server.gui, self.session
 
         def key(letter: str, name: str, what: Callable[[], object]) -> None:
@@ -194,23 +195,21 @@ class Page:
             key(letter, name, partial(change, axis, sign))
         key("space", "stand still", self._stand)
 
-    # ---- what is shown -----------------------------------------------------------------------------------------------
+    # ---- display ----------------------------------------------------------------------------------------------------
 
     def _add_plots(self) -> None:
         gui = self.server.gui
         panel = gui.add_panel()
         with panel.add_tab("Live"):
-            self._velocities = gui.add_html("")
-            self._gait = gui.add_html("") if self.session.history.feet else None
-            self._rewards = gui.add_html("")
+            self.plots = LivePlots(self.server, self.session.history, self.session.has_commands)
         panel.dock_right()
         panel.set_width(360)
         gui.main_panel.dock_left()
         gui.main_panel.set_width(300)
 
     def refresh(self) -> None:
-        """Bring words and plots up to date."""
-        session, history = self.session, self.session.history
+        """Update the status text and the plots."""
+        session = self.session
         lines = [f"**{session.title()}**"]
         place = session.place()
         state = f"{session.time:.1f}\u00a0s" if session.running else f"paused at {session.time:.1f}\u00a0s"
@@ -223,13 +222,10 @@ class Page:
             self.status.content = text
         if self.choice.visible != session.follower.has_best:
             self.choice.visible = session.follower.has_best
-        self._velocities.content = velocity_figures(history, session.has_commands)
-        self._rewards.content = reward_figure(history)
-        if self._gait is not None:
-            self._gait.content = gait_figure(history)
+        self.plots.update(session.history)
 
     def do_what_was_asked(self) -> None:
-        """Do what visitors have asked for since the last call."""
+        """Execute the actions that visitors requested since the last call."""
         while True:
             try:
                 what = self._asked.get_nowait()
@@ -238,7 +234,7 @@ class Page:
             what()
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Simulate in real time while somebody looks, and rest while nobody does; ends when `until` says so, or at Ctrl-C."""
+        """Simulate in real time while the page has visitors; end when `until` returns True, or at Ctrl-C."""
         last = drawn = plotted = looked = time.perf_counter()
         while not until():
             self.do_what_was_asked()

@@ -1,4 +1,4 @@
-"""What a live view shows and can be told, without the page: a few robots, their policy, and how time passes for them."""
+"""The simulation behind a live view: a few robots, their policy, and the pace of time."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,21 +18,21 @@ from legged.policies.actor import Actor
 from legged.process.paths import relative
 
 MOST_ROBOTS = 16
-"""So many are shown at most."""
+"""Largest number of robots."""
 SLOWEST, FASTEST = 0.1, 4.0
-"""Speeds of time, as multiples of the real one."""
+"""Limits of the speed, as multiples of real time."""
 HARDEST_PUSH = 3.0
 """Largest change of a robot's velocity by one push [m/s]."""
 BEHIND_S = 0.2
-"""More time than this is never made up for: the machine is too slow, or was busy [s]."""
+"""Largest delay that is made up for; longer ones mean that the machine is too slow or was busy [s]."""
 PACE_S = 2.0
-"""How long the pace is measured [s]."""
+"""Time over which the pace is measured [s]."""
 FREE_JOINT = 0
-"""MuJoCo's number of the type of joint that lets a base float."""
+"""MuJoCo's joint type of a floating base."""
 
 
 class Session:
-    """A few robots under a policy. All calls come from one thread."""
+    """A few robots under a policy; not thread-safe."""
 
     def __init__(
         self,
@@ -42,30 +42,30 @@ class Session:
         device: torch.device | str = "cpu",
         graph: bool = False,
     ) -> None:
-        """Build the task of the watched policy's configuration with `changes` on `ground`, and take the policy that there is.
+        """Build the task of the watched policy's configuration with `changes` on `ground`, and load the present checkpoint.
 
         Raises:
-            ConfigError: the task can't be built, or the policy does not fit it.
+            ConfigError: the task cannot be built, or the policy does not fit it.
         """
         self.watched, self.changes, self.ground = watched, list(changes), ground
         self.device, self._graph = torch.device(device), graph
         self.follower = CheckpointFollower(watched)
         self.iteration: int | None = None
-        """How many iterations the policy on show was trained for; none while there is no checkpoint."""
+        """Training iterations of the loaded policy; None without a checkpoint."""
         self.checkpoint = self.follower.wanted()
-        """The file that it comes from."""
+        """File of the loaded policy."""
         self.problem = ""
-        """Why a newer checkpoint, or another ground, could not be taken; empty where nothing is wrong."""
+        """Reason why a newer checkpoint or another ground was refused; empty if none was."""
         self.running = True
         self.speed = 1.0
         self.time = 0.0
-        """Since the session began, as simulated [s]."""
+        """Simulated time since the start of the session [s]."""
         self.followed = 0
-        """The robot that is followed and plotted."""
+        """Number of the robot that the camera follows and the plots show."""
         self.command = [0.0, 0.0, 0.0]
-        """What all robots are asked: vx, vy [m/s], yaw rate [rad/s]."""
+        """Command of all robots: vx, vy [m/s], yaw rate [rad/s]."""
         self.pace = 1.0
-        """Share of the steps that were due lately which could be made: less than 1 where the machine is too slow."""
+        """Share of the recently due steps that were made: below 1 if the machine is too slow."""
         self._due = self._wanted = self._made = 0.0
         if self.checkpoint is not None:  # before anything is built
             self._check(self.checkpoint)
@@ -76,32 +76,32 @@ class Session:
         if self.problem:
             raise ConfigError(self.problem)
 
-    # ---- what there is -----------------------------------------------------------------------------------------------
+    # ---- state ------------------------------------------------------------------------------------------------------
 
     @property
     def cfg(self) -> TaskConfig:
-        """Return the configuration of the task on show."""
+        """Return the configuration of the present task."""
         return self.task.cfg
 
     @property
     def has_commands(self) -> bool:
-        """Whether robots are told how fast to go."""
+        """Return whether the robots follow velocity commands."""
         return isinstance(self.task, LeggedRobot)
 
     @property
     def can_be_pushed(self) -> bool:
-        """Whether the robots' base floats, so that a push has a direction."""
+        """Return whether the base floats, as a push requires."""
         joints = self.task.physics.model.jnt_type
         return len(joints) > 0 and int(joints[0]) == FREE_JOINT
 
     @property
     def grounds(self) -> list[str]:
-        """Return the kinds of ground that can be chosen; one alone where there is nothing to choose."""
+        """Return the kinds of ground that can be chosen; a single one means that there is no choice."""
         return grounds_of(self.watched.cfg)
 
     @property
     def ranges(self) -> list[tuple[float, float]]:
-        """Return the lowest and the highest vx, vy [m/s] and yaw rate [rad/s] that was trained; nothing without commands."""
+        """Return the ranges of vx, vy [m/s] and yaw rate [rad/s] in training; empty for tasks without commands."""
         if not isinstance(self.task, LeggedRobot):
             return []
         return [(low, high) for low, high in self.task.command_sampler.full_ranges.tolist()]
@@ -109,15 +109,15 @@ class Session:
     # ---- the policy --------------------------------------------------------------------------------------------------
 
     def follow(self, choice: str) -> None:
-        """Show the newest checkpoint from now on, or the best."""
+        """Show the newest or the best checkpoint from now on."""
         if choice not in (NEWEST, BEST):
             raise ValueError(f"there is no checkpoint '{choice}'")
         self.follower.choice = choice
         self.look()
 
     def look(self) -> bool:
-        """Take the checkpoint that is to be shown, if it is another one; return whether it was. One that can't be taken is
-        named in `problem`, and the policy before stays.
+        """Load the checkpoint to show if it has changed; return whether a policy was loaded. If loading fails, `problem` has
+        the reason and the present policy stays.
         """
         path = self.follower.changed()
         if path is None:
@@ -135,7 +135,7 @@ class Session:
         check_fits(path, read_checkpoint(path), self.watched.cfg)
 
     def title(self) -> str:
-        """Say in a line which policy is on show."""
+        """Return a line about the loaded policy."""
         if self.checkpoint is None or self.iteration is None:
             return f"{self.cfg.task}: no checkpoint yet in {relative(self.watched.folder)}; robots keep their default pose"
         name = relative(self.checkpoint)
@@ -146,7 +146,7 @@ class Session:
     # ---- time --------------------------------------------------------------------------------------------------------
 
     def pass_time(self, seconds: float) -> int:
-        """Let so much of the real time pass [s]: make the control steps that are due by it, and return how many."""
+        """Make the control steps that are due after some real time [s]; return their number."""
         if not self.running:
             self._due = 0.0
             return 0
@@ -177,31 +177,31 @@ class Session:
 
     @torch.inference_mode()
     def reset(self) -> None:
-        """Put all robots back to where they start."""
+        """Reset all robots."""
         self.observations = self.task.reset()
         self.history.clear()
 
     def set_speed(self, speed: float) -> None:
-        """Let time pass so many times as fast as it does."""
+        """Set the speed of the simulation as a multiple of real time."""
         self.speed = min(max(float(speed), SLOWEST), FASTEST)
 
-    # ---- what the robots are told ------------------------------------------------------------------------------------
+    # ---- commands, pushes and ground ---------------------------------------------------------------------------------
 
     def clipped(self, command: Sequence[float]) -> list[float]:
-        """Return the nearest command to vx, vy [m/s], yaw rate [rad/s] that was trained."""
+        """Return a command of vx, vy [m/s] and yaw rate [rad/s], clipped to the ranges of the training."""
         ranges = self.ranges
         if not ranges:
             return [0.0, 0.0, 0.0]
         return [min(max(float(value), low), high) for value, (low, high) in zip(command, ranges, strict=True)]
 
     def ask(self, axis: int, value: float) -> None:
-        """Ask all robots for a velocity along an axis: 0 vx, 1 vy [m/s], 2 yaw rate [rad/s]."""
+        """Set one component of the command: 0 vx, 1 vy [m/s], 2 yaw rate [rad/s]."""
         wanted = [*self.command]
         wanted[axis] = value
         self.command = self.clipped(wanted)
 
     def stand(self) -> None:
-        """Ask all robots to stand, or to go as slowly as they were trained to."""
+        """Set the command to zero, or to the slowest one of the training."""
         self.command = self.clipped([0.0, 0.0, 0.0])
 
     def select(self, robot: int) -> None:
@@ -211,8 +211,8 @@ class Session:
 
     @torch.inference_mode()
     def push(self, degrees: float, strength: float, everybody: bool = False) -> None:
-        """Change the velocity of the followed robot's base, or of all, by `strength` [m/s], towards so many degrees to the
-        left of where it looks.
+        """Change the velocity of the followed robot's base, or of all bases with `everybody`, by `strength` [m/s], in a
+        direction that is `degrees` to the left of the heading.
         """
         if not self.can_be_pushed:
             return
@@ -227,8 +227,8 @@ class Session:
         self.task.sense()
 
     def go_to(self, kind: str, difficulty: float | None) -> None:
-        """Put the robots on tiles of a type and a difficulty, 0 to 1; or on the task's own ground, or a plane. What can't be
-        built is named in `problem`, and the ground before stays.
+        """Move the robots to tiles of a type and a difficulty, 0 to 1, to the task's own ground, or to a plane. If it cannot
+        be built, `problem` has the reason and the present ground stays.
         """
         if kind not in self.grounds:
             raise ValueError(f"there is no ground '{kind}' for {self.cfg.task}")
@@ -243,14 +243,14 @@ class Session:
         self.look()
 
     def place(self) -> str:
-        """Name the ground below the followed robot: 'stairs_up, step height 0.194 m'."""
+        """Return a description of the ground below the followed robot: 'stairs_up, step height 0.194 m'."""
         terrain = getattr(self.task, "terrain", None)
         if self.playground is None or terrain is None:
             return PLANE if self.ground.kind == PLANE else ""
         return self.playground.label(terrain, self.task.base_pos[self.followed].tolist())
 
     def _build(self, ground: ChosenGround) -> None:
-        """Build the task on a ground; the robots have not been reset."""
+        """Build the task on a ground, without a reset."""
         task, playground = build(self.watched.cfg, self.changes, ground, self.device, self._graph)
         assert isinstance(task, BaseTask)
         self.task: Any = task
@@ -263,7 +263,7 @@ class Session:
 
 
 def ago(seconds: float) -> str:
-    """Say how long ago something was: '12 s ago', '3 min ago', '2 h ago', '5 days ago'."""
+    """Return a duration as '12 s ago', '3 min ago', '2 h ago' or '5 days ago'."""
     for unit, length, until in (("s", 1.0, 120.0), ("min", 60.0, 7200.0), ("h", 3600.0, 172800.0)):
         if seconds < until:
             return f"{seconds / length:.0f} {unit} ago"

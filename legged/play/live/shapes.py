@@ -1,199 +1,146 @@
-"""What a model and a terrain look like, as coloured triangles."""
+"""Triangle meshes of a model's bodies and of a terrain, with a normal and a colour per vertex, for viser's scene."""
 
-from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
+import trimesh
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.color import srgb_to_linear
+from trimesh.visual.material import PBRMaterial
 
-from legged.physics.scene.terrain_geoms import add_terrain
 from legged.rendering.camera import COLLISION_SHAPES
-from legged.rendering.paint import CHECKER, LEVEL_RANGE, MIDDLE, SHOWN_DEPTH, SQUARE, color
+from legged.rendering.scene import add_horizon, add_painted_terrain
 from legged.terrain import Terrain
 
-AROUND, ALONG = 16, 5
-"""Sides of what is round, and rings of its caps: coarse, since a browser may draw without a GPU."""
+SEGMENTS = 16
+"""Segments of round shapes along their circumference: few, because a browser may draw without a GPU."""
 FLANK = 0.85
-"""Brightness of vertical faces of a terrain, beside that of treads."""
+"""Brightness of the vertical faces of a terrain relative to its treads."""
 SHARP = 30.0
-"""Faces of a mesh that meet at more than this keep their edge [degrees]."""
-MARGIN = 30.0
-"""Level ground that is drawn around a terrain [m]."""
-TILES = 40
-"""Squares of 1 m on each side of the middle of a plane."""
-
-Triangles = tuple[np.ndarray, np.ndarray]
-"""(V, 3) vertices [m] and (F, 3) faces that name them, counterclockwise as seen from outside."""
+"""Faces of a body that meet at a larger angle keep their edge [degrees]."""
+MATT = {"metallicFactor": 0.0, "roughnessFactor": 0.85}
+PERIOD, HALF_PLANE = 2.0, 40.0
+"""Distance after which the squares of a plane repeat, and half the side of the drawn part, a multiple of it [m]."""
 
 
-@dataclass(frozen=True)
-class Painted:
-    """Triangles with a colour at each vertex."""
-
-    vertices: np.ndarray
-    """(V, 3) in the frame of a body, or of the world [m]."""
-    faces: np.ndarray
-    """(F, 3) of the vertices."""
-    colors: np.ndarray
-    """(V, 3) red, green and blue, 0 to 255."""
-
-
-def bodies_of(model: mujoco.MjModel) -> dict[int, Painted]:
-    """Return what can be seen of each body of a model but the world, without shapes that are only touched."""
-    found: dict[int, list[tuple[Triangles, np.ndarray]]] = {}
+def body_meshes(model: mujoco.MjModel) -> dict[int, trimesh.Trimesh]:
+    """Return the visible shapes of each body of a model except the world, in the frame of the body [m]."""
+    meshes: dict[int, list[trimesh.Trimesh]] = {}
+    colors: dict[int, list[np.ndarray]] = {}
     for geom in range(model.ngeom):
-        body, rgba, triangles = int(model.geom_bodyid[geom]), rgba_of(model, geom), triangles_of(model, geom)
-        if triangles is None or body == 0 or rgba[3] == 0.0 or model.geom_group[geom] >= COLLISION_SHAPES:
+        body, rgba = int(model.geom_bodyid[geom]), rgba_of(model, geom)
+        if body == 0 or rgba[3] == 0.0 or model.geom_group[geom] >= COLLISION_SHAPES:
             continue
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-        placed = triangles[0] @ turn.reshape(3, 3).T + model.geom_pos[geom], triangles[1]
-        found.setdefault(body, []).append((placed, np.tile(255.0 * rgba[:3], (len(placed[0]), 1))))
-    return {
-        body: Painted(*joined([triangles for triangles, _ in parts]), np.concatenate([colors for _, colors in parts]))
-        for body, parts in found.items()
-    }
+        mesh = geom_mesh(model, geom)
+        if mesh is not None:
+            meshes.setdefault(body, []).append(mesh)
+            colors.setdefault(body, []).append(np.tile(rgba[:3], (len(mesh.vertices), 1)))
+    joined: dict[int, Any] = {body: trimesh.util.concatenate(parts) for body, parts in meshes.items()}
+    return {body: _coloured(mesh.vertices, mesh.faces, np.concatenate(colors[body])) for body, mesh in joined.items()}
 
 
 def rgba_of(model: mujoco.MjModel, geom: int) -> np.ndarray:
     """Return the colour (4,) of a geom, 0 to 1: its own, or else that of its material."""
     material = int(model.geom_matid[geom])
     own = np.asarray(model.geom_rgba[geom])
-    if material >= 0 and np.allclose(own, (0.5, 0.5, 0.5, 1.0)):  # MuJoCo's default, which no file asked for
+    if material >= 0 and np.allclose(own, (0.5, 0.5, 0.5, 1.0)):  # MuJoCo's default: the file sets no colour
         return np.asarray(model.mat_rgba[material])
     return own
 
 
-def joined(parts: list[Triangles]) -> Triangles:
-    """Return several sets of triangles as one."""
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])[:-1]
-    faces = [faces + start for (_, faces), start in zip(parts, starts, strict=True)]
-    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
+def geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
+    """Return a geom as a closed mesh in the frame of its body [m]; None for planes, height fields and lines."""
+    size, types = model.geom_size[geom], mujoco.mjtGeom
+    round_shape, edges = (SEGMENTS // 2, SEGMENTS), np.full(3, 1.0 / np.radians(SHARP))
+    match model.geom_type[geom]:
+        case types.mjGEOM_MESH:
+            mesh = _mesh_asset(model, model.geom_dataid[geom])
+        case types.mjGEOM_BOX:
+            mesh = trimesh.creation.box(extents=2.0 * size)
+        case types.mjGEOM_SPHERE | types.mjGEOM_ELLIPSOID as kind:
+            mesh, edges = trimesh.creation.uv_sphere(count=round_shape), np.zeros(3)
+            mesh.apply_scale(size if kind == types.mjGEOM_ELLIPSOID else size[0])
+        case types.mjGEOM_CAPSULE:
+            mesh, edges = trimesh.creation.capsule(2.0 * size[1], size[0], count=round_shape), np.zeros(3)
+        case types.mjGEOM_CYLINDER:
+            mesh, edges = trimesh.creation.cylinder(size[0], 2.0 * size[1], sections=SEGMENTS), np.array([0.0, 0.0, 1.0])
+        case _:
+            return None
+    pose = trimesh.transformations.quaternion_matrix(model.geom_quat[geom])
+    pose[:3, 3] = model.geom_pos[geom]
+    return _split(mesh, edges).apply_transform(pose)
 
 
-def triangles_of(model: mujoco.MjModel, geom: int) -> Triangles | None:
-    """Return a geom as triangles in its own frame; None of what is no solid."""
-    kind, size = int(model.geom_type[geom]), model.geom_size[geom]
-    types = mujoco.mjtGeom
-    if kind == types.mjGEOM_MESH:
-        return _mesh(model, int(model.geom_dataid[geom]))
-    if kind == types.mjGEOM_BOX:
-        return box(size)
-    if kind == types.mjGEOM_SPHERE:
-        return capsule(float(size[0]), 0.0)
-    if kind == types.mjGEOM_ELLIPSOID:
-        vertices, faces = capsule(1.0, 0.0)
-        return vertices * size, faces
-    if kind == types.mjGEOM_CAPSULE:
-        return capsule(float(size[0]), float(size[1]))
-    if kind == types.mjGEOM_CYLINDER:
-        return cylinder(float(size[0]), float(size[1]))
-    return None
+def _mesh_asset(model: mujoco.MjModel, mesh: int) -> trimesh.Trimesh:
+    """Return a mesh asset of a model in its own frame [m]."""
+    vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
+    faces = model.mesh_face[model.mesh_faceadr[mesh] :][: model.mesh_facenum[mesh]]
+    return trimesh.Trimesh(vertices, faces, process=False)
 
 
-def box(half: np.ndarray) -> Triangles:
-    """Return a box of half sides (3,) [m], whose faces share no vertex: its edges are sharp."""
-    vertices: list[list[np.ndarray]] = []
-    faces: list[np.ndarray] = []
-    for axis in range(3):
-        u, v = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
-        for sign in (-1.0, 1.0):
-            out = sign * np.eye(3)[axis]
-            corners = [out - u - v, out + u - v, out + u + v, out - u + v]
-            quad = 4 * len(faces) + np.array([[0, 1, 2], [0, 2, 3]])
-            vertices.append(corners if sign > 0.0 else corners[::-1])
-            faces.append(quad)
-    return np.concatenate(vertices) * half, np.concatenate(faces)
-
-
-def capsule(radius: float, half: float) -> Triangles:
-    """Return a capsule along z whose middle part has the half length `half`; a sphere where that is 0 [m]."""
-    angles = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 2 * ALONG)
-    rings = [(radius * np.cos(a), radius * np.sin(a) + np.copysign(half, a)) for a in angles]
-    return _turned(rings)
-
-
-def cylinder(radius: float, half: float) -> Triangles:
-    """Return a cylinder along z of half length `half` [m]; its rims are sharp."""
-    parts = [_turned([(radius, -half), (radius, half)])]
-    parts += [_turned([(0.0, -half), (radius, -half)]), _turned([(radius, half), (0.0, half)])]
-    return joined(parts)
-
-
-def _turned(rings: list[tuple[float, float]]) -> Triangles:
-    """Return what a line of (radius, z) [m], from below upwards, becomes when it is turned around the z axis."""
-    angles = np.linspace(0.0, 2.0 * np.pi, AROUND, endpoint=False)
-    around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    vertices = np.concatenate([np.column_stack([r * around, np.full(AROUND, z)]) for r, z in rings])
-    here = np.arange(AROUND)
-    right = (here + 1) % AROUND
-    faces = []
-    for ring in range(len(rings) - 1):
-        low, high = ring * AROUND, (ring + 1) * AROUND
-        faces.append(np.stack([low + here, low + right, high + right], axis=1))
-        faces.append(np.stack([low + here, high + right, high + here], axis=1))
-    return vertices, np.concatenate(faces)
-
-
-def _mesh(model: mujoco.MjModel, mesh: int) -> Triangles:
-    """Return a mesh of the model. Vertices on sharp edges are told apart, so that these are drawn sharp."""
-    start, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
-    first, number = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
-    vertices = np.array(model.mesh_vert[start : start + count], dtype=float)
-    faces = np.array(model.mesh_face[first : first + number], dtype=int)
-    sides = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
-    normals = sides / np.maximum(np.linalg.norm(sides, axis=1, keepdims=True), 1e-12)
-    # Faces around a vertex that look nearly the same way share it: their normals, in coarse steps, are the same.
-    coarse = np.round(normals / np.radians(SHARP)).astype(int)
-    keys = np.column_stack([faces.reshape(-1), np.repeat(coarse, 3, axis=0)])
+def _split(mesh: trimesh.Trimesh, edges: np.ndarray) -> trimesh.Trimesh:
+    """Return a mesh with sharp edges: faces share a vertex only where their normals, in `edges` (3,) steps per unit length,
+    round to the same numbers. With zeros all faces share their vertices, so the surface is smooth.
+    """
+    keys = np.column_stack([mesh.faces.reshape(-1), np.repeat(np.round(mesh.face_normals * edges), 3, axis=0)])
     kept, which = np.unique(keys, axis=0, return_inverse=True)
-    return vertices[kept[:, 0]], which.reshape(-1, 3)
+    return trimesh.Trimesh(mesh.vertices[kept[:, 0].astype(int)], which.reshape(-1, 3), process=False)
 
 
-# ---- ground ------------------------------------------------------------------------------------------------------------
+def _with_visual(vertices: np.ndarray, faces: np.ndarray, visual: TextureVisuals) -> trimesh.Trimesh:
+    """Return a mesh whose normal at a vertex is the mean of the normals of its faces, weighted by their area."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    sides, normals = np.cross(b - a, c - a), np.zeros(vertices.shape)  # without scipy trimesh needs a slow loop
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], sides)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    return trimesh.Trimesh(vertices, faces, vertex_normals=normals, visual=visual, process=False)
 
 
-def terrain_shape(terrain: Terrain) -> Painted:
-    """Return a terrain as the C engine collides with it, coloured by height: the tops and vertical faces of its steps, and
-    its smooth tiles; with level ground around.
+def _coloured(vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> trimesh.Trimesh:
+    """Return a mesh with sRGB colours (V, 3), 0 to 1; files hold them as linear intensities, as glTF wants."""
+    visual = TextureVisuals(material=PBRMaterial(**MATT))
+    light = np.column_stack([srgb_to_linear(colors), np.ones(len(colors))])
+    visual.vertex_attributes["color"] = np.round(255.0 * light).astype(np.uint8)
+    return _with_visual(vertices, faces, visual)
+
+
+def terrain_mesh(terrain: Terrain) -> trimesh.Trimesh:
+    """Return a terrain as the C engine collides with it, world frame [m], with the colours of films and level ground around:
+    the tops and vertical faces of its steps, and the surface of its smooth tiles.
     """
     scene = mujoco.MjSpec()
-    add_terrain(scene, terrain, collide=False, depth=SHOWN_DEPTH)
+    add_painted_terrain(scene, terrain, checkered=True)
+    add_horizon(scene, terrain)
     model = scene.compile()
-    span = max(LEVEL_RANGE, float(np.abs(terrain.height_map.corners).max()))
-    parts, colors = [], []
-    for geom in range(model.ngeom):
-        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
-            vertices, faces = box(model.geom_size[geom])
-            vertices = vertices + model.geom_pos[geom]
-            top = float(vertices[:, 2].max())
-            flank = np.repeat(np.array([FLANK] * 5 + [1.0]), 4)  # the upper face is the last one
-            shade = flank[:, None] * color(np.array(top), span)
-        else:
-            vertices, faces = _surface(model, geom)
-            dark = ((vertices[:, 0] // SQUARE + vertices[:, 1] // SQUARE) % 2 > 0)[:, None]
-            shade = color(vertices[:, 2], span) * np.where(dark, *CHECKER)
-        parts.append((vertices, faces))
-        colors.append(shade)
-    x, y = (0.5 * side for side in terrain.height_map.size)
-    for low, high in (
-        ((-x - MARGIN, -y - MARGIN), (-x, y + MARGIN)),
-        ((x, -y - MARGIN), (x + MARGIN, y + MARGIN)),
-        ((-x, -y - MARGIN), (x, -y)),
-        ((-x, y), (x, y + MARGIN)),
-    ):
-        parts.append(_level(low, high))
-        colors.append(np.tile(MIDDLE, (4, 1)))
-    vertices, faces = joined(parts)
-    return Painted(vertices, faces, 255.0 * np.concatenate(colors))
+    boxes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_BOX)
+    box = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
+    corners = box.vertices[box.faces].reshape(-1, 3)
+    brightness = np.repeat(np.where(box.face_normals[:, 2] > 0.5, 1.0, FLANK), 3)
+    vertices = [(model.geom_pos[boxes, None] + model.geom_size[boxes, None] * corners).reshape(-1, 3)]
+    faces = [np.arange(len(vertices[0])).reshape(-1, 3)]
+    colors = [(model.geom_rgba[boxes, None, :3] * brightness[:, None]).reshape(-1, 3)]
+    start = len(vertices[0])
+    for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD):
+        points, triangles = _surface(model, int(geom))
+        texture = model.mat_texid[model.geom_matid[geom], mujoco.mjtTextureRole.mjTEXROLE_RGB]
+        vertices.append(points)
+        faces.append(triangles + start)
+        colors.append(model.tex_data[model.tex_adr[texture] :][: 3 * len(points)].reshape(-1, 3) / 255.0)
+        start += len(points)
+    return _coloured(np.concatenate(vertices), np.concatenate(faces), np.concatenate(colors))
 
 
-def _surface(model: mujoco.MjModel, geom: int) -> Triangles:
-    """Return the upper side of a height field, world frame, split into triangles as MuJoCo splits it."""
+def _surface(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the upper side of a height field as vertices (V, 3), world frame [m], and faces (F, 3), split into triangles as
+    MuJoCo splits it.
+    """
     field = int(model.geom_dataid[geom])
     rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
-    start = int(model.hfield_adr[field])
     half_x, half_y, high, _ = model.hfield_size[field]
-    heights = high * np.array(model.hfield_data[start : start + rows * columns])
+    heights = high * model.hfield_data[model.hfield_adr[field] :][: rows * columns].astype(float)
     x, y = np.meshgrid(np.linspace(-half_x, half_x, columns), np.linspace(-half_y, half_y, rows))
     vertices = np.column_stack([x.ravel(), y.ravel(), heights]) + model.geom_pos[geom]
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
@@ -202,20 +149,11 @@ def _surface(model: mujoco.MjModel, geom: int) -> Triangles:
     return vertices, np.concatenate([one, other])
 
 
-def _level(low: tuple[float, float], high: tuple[float, float]) -> Triangles:
-    """Return a rectangle at height 0 between two corners, world frame [m]."""
-    vertices = np.array([[*low, 0.0], [high[0], low[1], 0.0], [*high, 0.0], [low[0], high[1], 0.0]])
-    return vertices, np.array([[0, 1, 2], [0, 2, 3]])
-
-
-def plane_shape() -> Painted:
-    """Return squares of 1 m around the origin, dark and light in turn, that show a plane moving by."""
-    cells = np.arange(-TILES, TILES)
-    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    x, y = (grid.ravel() for grid in np.meshgrid(cells, cells, indexing="ij"))
-    vertices = (np.stack([x, y], axis=1)[:, None] + corners).reshape(-1, 2).astype(float)
-    first = 4 * np.arange(len(x))[:, None]
-    faces = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
-    shade = np.where((x + y) % 2 > 0, 0.94, 1.0)[:, None] * np.array([0.82, 0.84, 0.86])
-    colors = np.repeat(255.0 * shade, 4, axis=0)
-    return Painted(np.column_stack([vertices, np.zeros(len(vertices))]), faces, colors)
+def plane_mesh() -> trimesh.Trimesh:
+    """Return a square of the ground around the origin, with dark and light squares of half the PERIOD, which show motion."""
+    light = np.array([209.0, 214.0, 219.0])
+    squares = np.kron([[1.0, 0.94], [0.94, 1.0]], np.ones((128, 128)))[:, :, None] * light
+    corners = HALF_PLANE * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    material = PBRMaterial(baseColorTexture=Image.fromarray(squares.astype(np.uint8)), **MATT)
+    visual = TextureVisuals(uv=corners[:, :2] / PERIOD, material=material)
+    return _with_visual(corners, np.array([[0, 1, 2], [0, 2, 3]]), visual)

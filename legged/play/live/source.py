@@ -1,4 +1,4 @@
-"""Which policy is on show: a run folder, of which the newest checkpoint counts, or the best, also while it is trained."""
+"""The watched policy: a run folder, also of a running training, and which of its checkpoints is shown."""
 
 import time
 from dataclasses import dataclass
@@ -8,19 +8,19 @@ from legged.config import TaskConfig
 from legged.learning.run_folder import BEST, BEST_MODEL, checkpoints, find_checkpoint, newest_run, run_config, run_named
 
 NEWEST = "newest"
-"""The checkpoint that is followed, unless it is the BEST, which a training keeps where it evaluates its policy."""
+"""Choice of the newest checkpoint. The alternative, BEST, exists if the training evaluates its policy."""
 
 
 @dataclass(frozen=True)
 class Watched:
-    """A run, or a policy that comes with this package."""
+    """A run folder or a shipped policy."""
 
     cfg: TaskConfig
     folder: Path
     checkpoint: int | None = None
-    """The iteration that is shown whatever comes after it; none to follow the training."""
+    """Iteration that is shown; None follows the training."""
     choice: str = NEWEST
-    """Which checkpoint of the training is followed at first: NEWEST or BEST."""
+    """Checkpoint that is followed at first: NEWEST or BEST."""
 
 
 def find_watched(name: str | None, checkpoint: int | str | None) -> Watched:
@@ -39,22 +39,22 @@ def find_watched(name: str | None, checkpoint: int | str | None) -> Watched:
 
 
 class CheckpointFollower:
-    """Looks into a run folder for the checkpoint to be shown, and says when it is another one."""
+    """Finder of the checkpoint to show in a run folder, which notices when it changes."""
 
     def __init__(self, watched: Watched) -> None:
-        """Follow the checkpoint that is asked for; nothing has been shown yet."""
+        """Follow the checkpoint of `watched`; nothing has been shown yet."""
         self.watched = watched
         self.choice = watched.choice
-        """NEWEST or BEST; of no account where one checkpoint was asked for."""
+        """NEWEST or BEST; without effect if `watched` names a checkpoint."""
         self._shown: tuple[Path, int, int] | None = None
 
     @property
     def has_best(self) -> bool:
-        """Whether there is a best checkpoint to choose."""
+        """Return whether BEST can be chosen."""
         return self.watched.checkpoint is None and (self.watched.folder / BEST_MODEL).is_file()
 
     def wanted(self) -> Path | None:
-        """Return the checkpoint that is to be shown now; None as long as there is none."""
+        """Return the checkpoint to show; None if there is none yet."""
         found = checkpoints(self.watched.folder)
         if self.watched.checkpoint is not None:
             return found.get(self.watched.checkpoint)
@@ -63,13 +63,13 @@ class CheckpointFollower:
         return found[max(found)] if found else None
 
     def changed(self) -> Path | None:
-        """Return the checkpoint to be shown if it is another file than at the last call, or was written anew."""
+        """Return the checkpoint to show if it is another file than at the last call or was rewritten, else None."""
         path = self.wanted()
         if path is None:
             return None
         try:
             stat = path.stat()
-        except OSError:  # a newer one has taken its place
+        except OSError:  # replaced by a newer one
             return None
         mark = (path, stat.st_mtime_ns, stat.st_size)
         if mark == self._shown:
@@ -78,7 +78,7 @@ class CheckpointFollower:
         return path
 
     def forget(self) -> None:
-        """Let the next call of `changed` return the checkpoint again, for a task that was built anew."""
+        """Make the next call of `changed` return the checkpoint again, for a new task."""
         self._shown = None
 
 

@@ -16,8 +16,7 @@ from legged.cli import train
 from legged.config import to_dict
 from legged.config.dotted import MISSING
 from legged.errors import ConfigError
-from legged.evaluation.reports.differences import from_task_file, what_changed, words
-from legged.evaluation.reports.record import is_running, read_code, read_record
+from legged.evaluation.reports.record import from_task_file, is_running, read_code, read_record, what_changed, words
 from legged.learning.captured import CapturedRunner
 from legged.learning.timing import TIMING_FILE, Timing, read_timing, write_timing
 from legged.registry import task_config
@@ -45,7 +44,7 @@ def test_a_run_that_came_to_its_end():
     record = read_record(tiny_run("train.runner.run_name=short", iterations=3))
     assert (record.status, record.why, record.done) == ("finished", "3 of 3 iterations", 3)
     assert (record.task, record.run_name, record.robots, record.steps_per_iteration) == (TASK, "short", 8, 32)
-    assert record.dt == pytest.approx(0.02)
+    assert record.log.dt == pytest.approx(0.02)
     assert record.problems == ()
     assert abs(record.began.timestamp() - time.time()) < 300
 

@@ -165,7 +165,7 @@ def move(task, by):
 
 def seen(task):
     """Heights of the ground as the robots' maps have them (N, P) [m]; on these stairs no limit cuts them."""
-    found = task.observation_terms.sensors._map
+    found = task.observation_terms.errors._map
     found.advance(torch.zeros(task.num_envs, dtype=torch.bool))
     observed = found.read()
     found.cut_holes(observed)

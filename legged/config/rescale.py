@@ -1,0 +1,68 @@
+"""Rescaling of a configuration's numbers from its reference robot to another robot, by dynamic similarity.
+
+The fields define the unit of each number. `rescaled` (bounds.py) gives a field its unit. Scales and noise of a term follow
+from the unit that `@unit` declares for it. Sizes of terrain types and ranges of randomised properties follow from the unit of
+each entry.
+"""
+
+import dataclasses
+import typing
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from legged.config.checks import hints_of
+
+Factor = Callable[[str], float]
+"""Function: unit -> factor by which a quantity of that unit grows from one robot to the other."""
+UnitOf = Callable[[str], str]
+"""Function: name of a term's method, such as "_reward_torques", or dotted path of an entry, such as "terrain.sizes.step" ->
+its unit."""
+DIGITS = 6
+"""Significant digits of a rescaled number, few enough to read."""
+
+
+def rescale(data: Mapping[str, Any], schema: type, factor: Factor, unit_of: UnitOf) -> dict[str, Any]:
+    """Return the nested values `data`, which fit `schema`, with all numbers that have a unit rescaled."""
+    fields = {f.name: f for f in dataclasses.fields(schema)}
+    hints = hints_of(schema)
+    rescaled: dict[str, Any] = {}
+    for key, value in data.items():
+        meta = fields[key].metadata
+        if dataclasses.is_dataclass(hints[key]):
+            rescaled[key] = rescale(value, hints[key], factor, unit_of)  # type: ignore[arg-type]
+        elif "rescaled" in meta:
+            rescaled[key] = times(value, factor(meta["rescaled"]))
+        elif "unit_of" in meta:
+            prefix, power = meta["unit_of"]
+            rescaled[key] = {
+                term: _times_entry(number, factor(unit_of(prefix + term)) ** power) for term, number in value.items()
+            }
+        elif _of_sections(hints[key]):
+            kind = typing.get_args(hints[key])[1]
+            rescaled[key] = {name: rescale(section, kind, factor, unit_of) for name, section in value.items()}
+        else:
+            rescaled[key] = value
+    return rescaled
+
+
+def _of_sections(hint: Any) -> bool:
+    """Return True if a field is a map of sections."""
+    return typing.get_origin(hint) is dict and dataclasses.is_dataclass(typing.get_args(hint)[1])
+
+
+def _times_entry(value: Any, by: float) -> Any:
+    """Return an entry of a map times a factor. In an entry that is a section, only the values in the entry's unit change."""
+    if not isinstance(value, Mapping):
+        return times(value, by)
+    return {key: times(item, by) if key in ("range", "std") else item for key, item in value.items()}
+
+
+def times(value: Any, by: float) -> Any:
+    """Return a number, or all numbers in a list or map, times a factor. A factor of 1 keeps them exactly as written."""
+    if by == 1.0:
+        return value
+    if isinstance(value, Mapping):
+        return {key: times(item, by) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [times(item, by) for item in value]
+    return float(f"{value * by:.{DIGITS}g}")

@@ -1,0 +1,221 @@
+"""Checks of user-defined task classes: methods that are never called, overrides without super(), and terms that are not
+methods.
+"""
+
+import inspect
+from pathlib import Path
+from types import CodeType
+from typing import Any
+
+from legged.config.networks import groups_in, path_of_terms
+from legged.config.origins import Origins
+from legged.config.schema import TaskConfig
+from legged.errors import ConfigError, suggest
+from legged.process.paths import relative
+
+_OBSERVE = "write a method _obs_<name> for each part and list the names in observations.groups.actor.terms and .critic.terms"
+_STEP = "override one of the hooks that _step() calls, and call super()'s in it: advance, compute_reward, remember, ..."
+_START = (
+    "init_state.dof_pos_factor, init_state.yaw and init_state.base_velocity set the initial states; for more, override"
+    " reset_idx(mask) and call self.physics.write(mask, qpos, qvel) after super().reset_idx(mask)"
+)
+_BUILD = "the robot is its MJCF (robot: in the task's YAML), the ground is terrain: or what make_terrain() returns"
+_DRAWING = "nothing is drawn while training; play.py makes pictures (legged/rendering)"
+_TORQUES = "control.control_type, control.stiffness and control.damping set the law; other laws go into legged/mdp/control.py"
+_RANDOM = "domain_rand.ranges names the properties that are randomised (docs/randomisation.md)"
+
+HOOKS = {
+    # legged_gym and its forks
+    "_parse_cfg": "the configuration is complete when __init__() gets it; numbers of your own go under custom: in the YAML",
+    "_prepare_reward_function": "rewards.scales in the YAML names the _reward_<name> methods that run; self.rewards has them",
+    "post_physics_step": _STEP,
+    "_post_physics_step_callback": _STEP,
+    "compute_observations": _OBSERVE,
+    "get_privileged_observations": "observations.groups.critic.terms lists the _obs_<name> methods that the critic sees",
+    "_get_noise_scale_vec": "observations.noise in the YAML gives each term's noise; observations.add_noise, noise_level",
+    "_resample_commands": "commands.ranges, commands.resampling_time_s, standing_share and single_axis_share set the"
+    " sampling; another way of sampling goes into legged/mdp/commands.py",
+    "_compute_torques": _TORQUES,
+    "_reset_dofs": _START,
+    "_reset_root_states": _START,
+    "_push_robots": "domain_rand.push_robots, push_interval_s and max_push_vel_xy set the pushes",
+    "_update_terrain_curriculum": "terrain.curriculum switches it; another one goes into legged/mdp/terrain_curriculum.py",
+    "update_command_curriculum": "commands.curriculum sets it; another one goes into legged/mdp/command_curriculum.py",
+    "_get_heights": "self.measured_heights (N, P) has them after every step; terrain.measured_points_x and _y set the points",
+    "_init_height_points": "terrain.measured_points_x and terrain.measured_points_y set the points of the height scan",
+    "_process_rigid_shape_props": "domain_rand.randomize_friction and friction_range randomise; the MJCF has the rest",
+    "_process_dof_props": "joint limits and efforts are the MJCF's, velocity limits robot.yaml's; rewards.soft_* shrink them",
+    "_process_rigid_body_props": "domain_rand.randomize_base_mass and added_mass_range randomise; the MJCF has the rest",
+    "_create_envs": _BUILD,
+    "_create_ground_plane": _BUILD,
+    "_create_heightfield": _BUILD,
+    "_create_trimesh": _BUILD,
+    "_get_env_origins": "self.env_origins (N, 3) are the terrain's; terrain.spawn_range scatters robots around them",
+    "create_sim": _BUILD,
+    "_reset_buffers": _STEP,
+    "_init_foot": "self.feet_pos and self.feet_vel (N, F, 3) exist already; allocate your own buffers in _init_buffers()",
+    "update_feet_state": "self.feet_pos and self.feet_vel (N, F, 3) are current after every step",
+    "compute_self_observations": _OBSERVE,
+    "compute_termination_observations": "keep_final_step(task) keeps the final observations of episodes"
+    " (legged/envs/final_observation.py)",
+    "_disturbance_robots": "domain_rand.forces and kicks push robots; for other disturbances override disturb(mask), with"
+    " self.physics.push",
+    "_step_contact_targets": "override advance(), call super().advance() and write your own tensors in place",
+    "_call_train_eval": _STEP,
+    "_randomize_dof_props": _RANDOM,
+    "_randomize_rigid_body_props": _RANDOM,
+    "_randomize_gravity": "domain_rand.ranges.gravity_x, _y and _z are added to it (docs/randomisation.md)",
+    "refresh_actor_rigid_shape_props": _RANDOM,
+    "_draw_debug_vis": _DRAWING,
+    "render": _DRAWING,
+    "set_camera": _DRAWING,
+    # Isaac Lab
+    "_setup_scene": _BUILD,
+    "_pre_physics_step": _TORQUES,
+    "_apply_action": _TORQUES,
+    "_get_observations": _OBSERVE,
+    "_get_rewards": "write a method _reward_<name> for each part and name its scale in rewards.scales",
+    "_get_dones": "write a method _terminate_<name> and list the name in terminations.failures or terminations.time_outs",
+    "_reset_idx": "override reset_idx(mask), with one bool per robot",
+}
+"""Hook of another framework -> its replacement here."""
+OUTSIDE = {
+    "step": "training runs _step() as a CUDA graph, without it; override the hooks of _step(), and call super()'s in them",
+    "get_observations": "training reads the groups' buffers, without it; " + _OBSERVE,
+}
+"""Method of a task that only play and evaluation call -> methods to override instead."""
+
+EXTENDED = {
+    "advance": "otherwise episode_length_buf and self.contacts would stand still",
+    "check_termination": "otherwise falls would not be counted, and robots whose physics has diverged would not be reset;"
+    " write a method _terminate_<name> and list it in terminations.failures or terminations.time_outs",
+    "compute_reward": "otherwise every reward would be 0; write a method _reward_<name>, with its scale in rewards.scales",
+    "draw": "otherwise all episodes would begin in the same state, under the same commands",
+    "remember": "otherwise last_actions and last_dof_vel would keep their initial values",
+    "reset_idx": "otherwise no episode would begin",
+}
+"""Hook that must call super()'s -> effect of a missing call."""
+
+
+def check_overrides(cls: type) -> None:
+    """Check the methods of a task class, and those of its parents up to a class of this package.
+
+    Raises:
+        ConfigError: a method has the name of another framework's hook, or of a method that training does not call, and
+            OWN_HELPERS does not list it; an override does not call super()'s method; or a constructor takes other arguments
+            than (self, cfg, device, graph).
+    """
+    base = next(part for part in cls.__mro__ if part.__module__.startswith("legged."))
+    between = [part for part in cls.__mro__ if part not in base.__mro__]
+    helpers: set[str] = set()
+    for part in between:
+        own = vars(part).get("OWN_HELPERS", ())
+        helpers |= {own} if isinstance(own, str) else set(own)
+    for part in between:
+        for name in vars(part):
+            if name in helpers or not (name in OUTSIDE or (name in HOOKS and not hasattr(base, name))):
+                continue
+            vain = f"would not act: {OUTSIDE[name]}" if name in OUTSIDE else f"would never be called: {HOOKS[name]}"
+            raise ConfigError(
+                f"{place(part, vars(part)[name])}: {part.__name__}.{name} {vain}"
+                f" (if your own code calls it: OWN_HELPERS = ('{name}',) in the class)"
+            )
+        for name in EXTENDED:
+            code = getattr(inspect.unwrap(vars(part).get(name, check_overrides)), "__code__", None)
+            if name in vars(part) and code is not None and name not in _names_in(code):
+                raise ConfigError(
+                    f"{place(part, vars(part)[name])}: {part.__name__}.{name} must call super().{name}(): {EXTENDED[name]}"
+                )
+        if "__init__" in vars(part):
+            _check_constructor(part)
+
+
+def _names_in(code: CodeType) -> set[str]:
+    """Return the attributes and globals that a function, or a function within it, names."""
+    within = [constant for constant in code.co_consts if isinstance(constant, CodeType)]
+    return set(code.co_names).union(*(_names_in(constant) for constant in within))
+
+
+def _check_constructor(part: type) -> None:
+    """Check that the constructor of a class takes the arguments that the registry passes.
+
+    Raises:
+        ConfigError: it does not.
+    """
+    constructor = vars(part)["__init__"]
+    try:
+        inspect.signature(constructor).bind(None, None, "cpu", True)
+    except TypeError as error:
+        raise ConfigError(
+            f"{place(part, constructor)}: {part.__name__}.__init__ must take (self, cfg, device, graph), as tasks here do"
+            f" ({error}); there are no arguments of Isaac Gym, and buffers are allocated in _init_buffers()"
+        ) from error
+    except ValueError:  # the constructor has no signature
+        return
+
+
+KINDS = {"_reward_": "reward", "_obs_": "observation", "_terminate_": "termination"}
+"""Prefix of a term's method -> word for it in errors."""
+
+
+def named_terms(cfg: TaskConfig) -> list[tuple[str, str, str]]:
+    """Return the terms that a configuration names, each with the prefix of its method and the dotted path of its name."""
+    named = [("_reward_", name, f"rewards.scales.{name}") for name in cfg.rewards.scales]
+    for group, content in groups_in(cfg).items():
+        named += [("_obs_", name, path_of_terms(cfg, group)) for name in content.terms]
+    for part in ("scales", "noise", "bias", "delay", "dropped"):
+        named += [("_obs_", name, f"observations.{part}.{name}") for name in getattr(cfg.observations, part)]
+    for part in ("failures", "time_outs"):
+        named += [("_terminate_", name, f"terminations.{part}") for name in getattr(cfg.terminations, part)]
+    return named
+
+
+def check_terms(cls: Any, cfg: TaskConfig) -> None:
+    """Check that the terms that a configuration names exist and can be called.
+
+    Raises:
+        ConfigError: a term is missing, is not a method, or takes arguments; or a group has no observations.
+    """
+    groups = cfg.observations.groups
+    for group in groups or ("actor",):
+        if not groups or not groups[group].terms:
+            where = cfg.origins.where(f"observations.groups.{group}.terms")
+            raise ConfigError(f"{where}: must not be empty{suggest('', cls.terms('_obs_'), 'observations')}")
+    for prefix, name, path in named_terms(cfg):
+        known = cls.terms(prefix)
+        if name not in known:
+            kind = KINDS[prefix]
+            raise ConfigError(f"{cfg.origins.where(path)}: {cls.__name__} has no {kind} '{name}'{suggest(name, known)}")
+        _check_term(cls, prefix + name, path, cfg.origins)
+
+
+def _check_term(cls: type, name: str, path: str, origins: Origins) -> None:
+    """Check the method `name` of a term that the setting at `path` names.
+
+    Raises:
+        ConfigError: it is not a method, or takes arguments.
+    """
+    found = inspect.getattr_static(cls, name)
+    where = f"{origins.where(path)}: {cls.__name__}.{name}"
+    if isinstance(found, property) or not callable(getattr(cls, name)):
+        raise ConfigError(f"{where} is not a method but a {type(found).__name__}; a term is a method without arguments")
+    # Python passes `self` to a plain method, and nothing to a static method; the class of a classmethod is bound already.
+    bound = isinstance(found, classmethod | staticmethod)
+    parameters = list(inspect.signature(getattr(cls, name)).parameters.values())
+    needed = [p.name for p in parameters if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    takes_self = bool(parameters) and parameters[0].kind is not parameters[0].KEYWORD_ONLY
+    if not bound and not takes_self:
+        raise ConfigError(f"{where} takes no self; a term is a method without other arguments")
+    if needed[0 if bound else 1 :]:
+        listed = ", ".join(needed[0 if bound else 1 :])
+        raise ConfigError(f"{where} takes arguments ({listed}); a term takes only self, and reads the task's tensors")
+
+
+def place(cls: type, attribute: Any) -> str:
+    """Return file and line of an attribute of a class; only the file, or the module, if Python knows no more."""
+    function = inspect.unwrap(getattr(attribute, "fget", None) or getattr(attribute, "__func__", attribute))
+    code = getattr(function, "__code__", None)
+    if code is not None:
+        return f"{relative(Path(code.co_filename))}:{code.co_firstlineno}"
+    module = inspect.getmodule(cls)
+    return relative(Path(module.__file__)) if module is not None and module.__file__ else cls.__module__

@@ -1,0 +1,62 @@
+"""Final observations of episodes: watchers copy the end of each step before episodes are reset."""
+
+from typing import TYPE_CHECKING, Protocol, TypeVar
+
+import torch
+
+from legged.mdp.observations import ObservationGroup, ObservationTerms
+from legged.physics import Physics
+
+if TYPE_CHECKING:
+    from legged.envs.base_task import BaseTask
+
+
+class StepWatcher(Protocol):
+    """Watcher of a task, which is called in each step when rewards are computed, before any environment is reset, pushed or
+    given a new command.
+    """
+
+    def take(self) -> None:
+        """Copy tensors of the task. Runs within the captured step, so without reads by the host or new addresses."""
+
+
+Watcher = TypeVar("Watcher", bound=StepWatcher)
+
+
+class FinalStep:
+    """Observations and state of every environment at the end of the last step, when rewards were computed, before any
+    environment was reset, pushed or given a new command.
+    """
+
+    def __init__(self, terms: ObservationTerms, groups: dict[str, ObservationGroup], physics: Physics) -> None:
+        """Allocate copies for the observation groups of a task and its physics."""
+        self._terms, self._groups, self._physics = terms, groups, physics
+        self.observations = {name: torch.zeros_like(group.buffer) for name, group in groups.items()}
+        """Group -> final observation, (N, history * width)."""
+        self.qpos, self.qvel = torch.zeros_like(physics.qpos), torch.zeros_like(physics.qvel)
+        """(N, nq) and (N, nv) generalised positions and velocities."""
+
+    def take(self) -> None:
+        """Copy observations and state now, in the middle of a step. The terms are evaluated once more for it."""
+        self._terms.evaluate()
+        for name, group in self._groups.items():
+            group.preview(self.observations[name])
+        self.qpos.copy_(self._physics.qpos)
+        self.qvel.copy_(self._physics.qvel)
+
+
+def keep_final_step(task: "BaseTask", graph: bool = True) -> FinalStep:
+    """Attach a `FinalStep` to a task and return it. Everything else is as for `watch_steps`."""
+    return watch_steps(task, FinalStep(task.observation_terms, task.observation_groups, task.physics), graph)
+
+
+def watch_steps(task: "BaseTask", watcher: Watcher, graph: bool = True) -> Watcher:
+    """Attach `watcher` to a task and return it. It is called in every step from now on. All episodes and curricula are reset.
+    With `graph` the step is captured on a GPU (again, if the task was built with a graph), or checked on the CPU.
+
+    Raises:
+        TermError: the step cannot be captured.
+    """
+    task.step_watcher = watcher
+    task._build_graph(graph and (task.physics.capturable or task.physics.device.type == "cpu"))
+    return watcher

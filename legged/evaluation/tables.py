@@ -1,0 +1,28 @@
+"""Tables for Markdown and for the screen."""
+
+from collections.abc import Collection, Sequence
+
+from rich.markup import escape
+from rich.table import Table
+
+
+def markdown_table(heads: Sequence[object], rows: Sequence[Sequence[object]], left: Collection[int] = (0,)) -> str:
+    """Return a table in Markdown, which ends without a line break; columns in `left` hold texts, the others numbers."""
+    marks = ["---" if i in left else "---:" for i in range(len(heads))]
+    lines = [[" ".join(str(cell).replace("|", "\\|").split()) for cell in line] for line in (heads, *rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in (lines[0], marks, *lines[1:]))
+
+
+def screen_table(
+    title: str, heads: Sequence[str], rows: Sequence[Sequence[str] | None], left: Collection[int] = (0,)
+) -> Table:
+    """Return a table for the screen; columns in `left` hold texts, the others numbers. None among the rows is a rule."""
+    table = Table(title=escape(title), title_justify="left")
+    for i, head in enumerate(heads):
+        table.add_column(escape(head), justify="left" if i in left else "right")
+    for row in rows:
+        if row is None:
+            table.add_section()
+        else:
+            table.add_row(*map(escape, row))
+    return table

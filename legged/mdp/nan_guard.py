@@ -1,0 +1,78 @@
+"""Handling of numbers that are NaN, infinite or larger than any robot's could be.
+
+One such number in a sample would reach every weight of the networks. Therefore such a reward or observation counts as 0, the
+robot's episode ends at the next step, and robots are counted by the term at fault. None of this waits for the host.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from legged.mdp.observations import ObservationTerms
+
+LARGEST = 1e10
+"""Rewards and observations beyond this count as infinite: the squares of sums of them must fit a float32."""
+LARGEST_STATE = 1e4
+"""Bound on positions [m], velocities [m/s], angles [rad] and rates [rad/s]. Beyond it the physics has diverged."""
+
+
+class NanGuard:
+    """Record of the robots, out of N, that had a non-finite number since the last `flush`, by the term at fault. Numbers
+    beyond LARGEST or LARGEST_STATE count as non-finite.
+    """
+
+    STATE = ("sound",)
+
+    def __init__(self, rewards: Sequence[str], observations: ObservationTerms, num_envs: int, device: torch.device) -> None:
+        """Watch the reward terms named `rewards`, in the order of their rows, and the terms of `observations`."""
+        self.outputs_finite = torch.ones(num_envs, dtype=torch.bool, device=device)
+        """(N,) True for robots whose rewards and observations of the last step were finite. The episodes of the others end at
+        the next step."""
+        self.sound = self.outputs_finite
+        """The same tensor, under the name that it has in saved states."""
+        self._terms = observations
+        self._names = ("physics", "action", *(f"reward_{n}" for n in rewards), *(f"obs_{n}" for n in observations.columns))
+        self._now = torch.zeros(2, num_envs, dtype=torch.bool, device=device)  # physics, action
+        self._seen = torch.zeros_like(self._now)
+        self._rewards_finite = torch.ones(len(rewards), num_envs, dtype=torch.bool, device=device)
+        # The largest size of each observation column, which costs two launches a step. `flush` counts the robots.
+        self._largest = torch.zeros_like(observations.values)
+
+    def check_state(self, in_bounds: Tensor, clipped_actions: Tensor) -> None:
+        """Record faults of physics and actions. `in_bounds` (N,) is True for robots whose state and actions are finite;
+        `clipped_actions` (N, D) are finite or NaN.
+        """
+        physics, action = self._now
+        torch.any(clipped_actions != clipped_actions, dim=1, out=action)
+        torch.eq(in_bounds, action, out=physics)  # both False: a NaN action, too, puts a robot out of bounds
+        self._seen.logical_or_(self._now)
+
+    def check_rewards(self, rewards_finite: Tensor, valid: Tensor) -> None:
+        """Record faults of rewards. `rewards_finite` (terms, N) is True for finite rewards. Robots outside `valid` (N,) are
+        left out: their episodes end in this step anyway.
+        """
+        finite = rewards_finite >= valid  # finite, or not valid
+        torch.all(finite, dim=0, out=self.outputs_finite)
+        self._rewards_finite.logical_and_(finite)
+
+    def check_observations(self, begun: Tensor) -> None:
+        """Record faults of observation terms, before they are scaled and clipped. Call it after `check_rewards`. Robots of
+        `begun` (N,) have new episodes; faulty rewards of their old episodes do not end the new ones.
+        """
+        size = self._terms.raw.abs()
+        self.outputs_finite.logical_or_(begun)
+        self.outputs_finite.logical_and_(size.amax(dim=1) < LARGEST)  # a NaN becomes the maximum, and NaN < LARGEST is False
+        torch.maximum(self._largest, size, out=self._largest)
+
+    def flush(self) -> dict[str, Tensor]:
+        """Return the number of robots with each fault as fresh 0-dimensional tensors, by name in TensorBoard, then clear the
+        record. A fault without robots has NaN.
+        """
+        broken = [~(self._largest[:, columns].amax(dim=1) < LARGEST) for columns in self._terms.columns.values()]
+        counts = torch.cat([self._seen, ~self._rewards_finite, torch.stack(broken)]).sum(dim=1).float()
+        self._seen.zero_()
+        self._rewards_finite.fill_(True)
+        self._largest.zero_()
+        counts = torch.where(counts > 0.0, counts, torch.nan)  # NaN means "no value" and is not logged
+        return {f"Faults/{name}": count for name, count in zip(self._names, counts.unbind(), strict=True)}

@@ -1,0 +1,149 @@
+"""Contact features of shapes, which are tested against a height map: points with a radius, segments of capsules, rim points
+and end discs of cylinders.
+
+A sphere has one point. A capsule has its two ends and the segment between them. A box has its corners. A cylinder touches a
+surface in points of its rims: those in which it would rest on a plane with the slope of the ground under its centre. Vertical
+faces and their rims meet the discs at its two ends, and the segment between the ends, as for a capsule.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from legged.errors import ConfigError
+from legged.physics.collider.contact_pairs import kind_of
+from legged.physics.collider.ground import NOTHING, Ground, Hits, around_point, between_ends, cell_of, surface
+from legged.physics.collider.shapes import rim_point
+
+AT, BETWEEN, RIM, DISC = (wp.constant(k) for k in range(4))
+"""Kinds of features. AT: a sphere at `start`. BETWEEN: the segment between `start` and `end`, without its ends. RIM: the
+`end[0]`-th rim point of a cylinder of radius `start[0]` and half length `start[1]`. DISC: a disc at `start` of radius
+`end[0]`, perpendicular to the shape's z axis."""
+
+LENGTHWISE = wp.constant(0.1)
+"""Smallest cosine between a rim of the terrain and a cylinder's axis at which the rim may pass through an end disc of the
+cylinder."""
+
+
+@dataclass(frozen=True)
+class ContactFeature:
+    """Part of a geom that is tested against the height map, in the geom's frame [m]."""
+
+    geom: int
+    kind: int
+    start: np.ndarray
+    end: np.ndarray
+    radius: float
+    """Radius around the feature; 0 for corners, rim points and discs."""
+
+    @property
+    def reach(self) -> float:
+        """Largest distance from the feature's centre to ground that it can touch [m]."""
+        return float(self.end[0]) if self.kind == DISC else self.radius
+
+    @property
+    def length(self) -> float:
+        """Distance between the ends [m]; 0 for points and discs."""
+        return float(np.linalg.norm(self.end - self.start)) if self.kind == BETWEEN else 0.0
+
+
+def contact_features(model: mujoco.MjModel, shapes: Iterable[int]) -> Iterator[ContactFeature]:
+    """Yield the contact features of the geoms `shapes`.
+
+    Raises:
+        ConfigError: a shape is of a type without contact features.
+    """
+    kinds = mujoco.mjtGeom
+    for i in shapes:
+        kind, size = model.geom_type[i], model.geom_size[i]
+        centre, end = np.zeros(3), np.array([0.0, 0.0, size[1]])
+        if kind == kinds.mjGEOM_SPHERE:
+            yield ContactFeature(i, AT, centre, centre, size[0])
+        elif kind == kinds.mjGEOM_CAPSULE:
+            yield ContactFeature(i, AT, -end, -end, size[0])
+            yield ContactFeature(i, AT, end, end, size[0])
+            yield ContactFeature(i, BETWEEN, -end, end, size[0])
+        elif kind == kinds.mjGEOM_BOX:
+            for signs in product((-1.0, 1.0), repeat=3):
+                yield ContactFeature(i, AT, size * signs, size * signs, 0.0)
+        elif kind == kinds.mjGEOM_CYLINDER:
+            for k in range(4):
+                yield ContactFeature(i, RIM, np.array([size[0], size[1], 0.0]), np.array([float(k), 0.0, 0.0]), 0.0)
+            for centre in (-end, end):
+                yield ContactFeature(i, DISC, centre, np.array([size[0], 0.0, 0.0]), 0.0)
+            yield ContactFeature(i, BETWEEN, -end, end, size[0])
+        else:
+            raise ConfigError(
+                f"terrain: shape '{model.geom(i).name}' is of type {kind_of(model, i)}; sim.terrain_collider=cells"
+                " supports spheres, capsules, cylinders, boxes; use them, sim.terrain_collider=convex or sim.physics=mujoco"
+            )
+
+
+@wp.func
+def around_disc(ground: Ground, centre: wp.vec3, axis: wp.vec3, radius: float, margin: float, hits: Hits, row: int) -> int:
+    """Find the hits of a thin disc with vertical faces and their rims. Return the number of hits in the row."""
+    found = around_point(ground, centre, radius + margin, True, hits, row)
+    count = wp.int32(0)
+    for k in range(found):
+        normal = hits.normal[row, k]
+        across = normal - axis * wp.dot(normal, axis)
+        wide = wp.length(across)
+        point = centre
+        if wide > 1e-6:
+            point = centre - across * (radius / wide)
+        dist = hits.dist[row, k] - radius * wide
+        if normal[2] > 0.0 and (normal[0] == 0.0 or normal[1] == 0.0):
+            # A rim along x or y: find the point where it passes through the disc's plane.
+            along = wp.where(normal[0] == 0.0, axis[0], axis[1])
+            to = -normal * hits.dist[row, k]
+            shift = -wp.dot(to, axis) / along
+            if normal[0] == 0.0:
+                to[0] = to[0] + shift
+            else:
+                to[1] = to[1] + shift
+            away = wp.length(to)
+            dist = NOTHING
+            # a rim across the axis meets the cylinder between its ends, or no disc
+            if wp.abs(along) > LENGTHWISE and away > 1e-6:
+                normal = -to / away
+                point = centre - normal * radius
+                dist = away - radius
+        if dist < margin:
+            hits.dist[row, count] = dist
+            hits.normal[row, count] = normal
+            hits.point[row, count] = point
+            count += 1
+    return count
+
+
+@wp.func
+def find_hits(
+    ground: Ground,
+    kind: int,
+    position: wp.vec3,
+    turn: wp.mat33,
+    start: wp.vec3,
+    end: wp.vec3,
+    near: float,
+    hits: Hits,
+    row: int,
+) -> int:
+    """Find the hits of a geom's feature within `near` [m], the sum of its radius and the contact margin. Return the number of
+    hits in the row. A hit's distance is that of its point, before the radius is subtracted.
+    """
+    if kind == BETWEEN:
+        return between_ends(ground, position + turn * start, position + turn * end, near, hits, row)
+    if kind == RIM:
+        cell = cell_of(ground, position[0], position[1])
+        slope = surface(ground, cell[0], cell[1], position[0], position[1])
+        up = wp.normalize(wp.vec3(-slope[1], -slope[2], 1.0))
+        offset = rim_point(up, turn, start[0], start[1], wp.int32(end[0]))
+        return around_point(ground, position + offset, near, False, hits, row)
+    if kind == DISC:
+        axis = wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])
+        return around_disc(ground, position + turn * start, axis, end[0], near, hits, row)
+    return around_point(ground, position + turn * start, near, False, hits, row)
