@@ -229,4 +229,4 @@ def test_a_step_is_timed(capsys):
 
 def test_a_run_is_drawn(run, tmp_path):
     assert call(curves.main, [str(run), "--out", str(tmp_path)]) == 0
-    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
