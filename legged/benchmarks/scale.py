@@ -37,12 +37,12 @@ class Scale:
 
     found: dict[str, Any]
     code: int
-    """Exit code: 1 if a size failed for another reason than want of memory."""
+    """Exit code: 1 if a size failed for another reason than too little memory."""
 
 
 def scale(sizes: Sequence[int], loop: str, given: Sequence[str], cfg: TaskConfig, device: torch.device) -> Scale:
-    """Print a row for each number of robots in `sizes`, and return all figures. `given` is the command line, which holds for
-    each size. A size that fails has a row that says why.
+    """Print a row for each number of robots in `sizes`, and return all figures. `given` is the command line of every size. A
+    size that fails has a row with the reason.
 
     Raises:
         ConfigError: the configuration does not allow that many robots.
@@ -59,10 +59,10 @@ def scale(sizes: Sequence[int], loop: str, given: Sequence[str], cfg: TaskConfig
 
 
 def numbers(text: str) -> list[int]:
-    """Read '1024,4096' as [1024, 4096].
+    """Return the numbers of a list: '1024,4096' -> [1024, 4096].
 
     Raises:
-        ConfigError: not a list of numbers above 0.
+        ConfigError: the text is not a list of numbers above 0.
     """
     parts = [part.strip().replace("_", "") for part in text.split(",")]
     if not all(part.isdecimal() and int(part) > 0 for part in parts):
@@ -71,7 +71,7 @@ def numbers(text: str) -> list[int]:
 
 
 def measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, Any]:
-    """Return the benchmark's results for `size` robots with these arguments; `failed` has the reason if there are none.
+    """Return the benchmark's results for `size` robots with these arguments; `failed` has the reason if they are missing.
 
     Raises:
         ConfigError: the configuration does not allow so many robots.

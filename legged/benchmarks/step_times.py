@@ -17,44 +17,44 @@ Turn = tuple[Callable[[], object], Callable[[], object]]
 
 
 class Driver:
-    """Decides what robots do: at random, or as a policy does, which is not timed."""
+    """Source of the robots' actions, random or from a policy; its time is not measured."""
 
     def __init__(self, task: BaseTask, act: Callable[[TensorDict], Tensor] | None) -> None:
-        """Take a policy `act`, observations -> actions, or none."""
+        """Use the policy `act`, observations -> actions, or random actions without one."""
         self._task, self._act = task, act
         self._table = 0.3 * torch.randn(32, task.num_envs, task.num_actions, device=torch.device(task.device))
         self._made = 0
         self._kept: dict[str, Tensor] = {}
         self.actions = torch.zeros_like(self._table[0])
-        """(N, D) of the next control step."""
+        """(N, D) actions of the next control step."""
 
     def decide(self) -> None:
-        """Choose `actions`."""
+        """Choose the `actions` of the next control step."""
         self.put_back()
         random = self._table[self._made % len(self._table)]
         self.actions.copy_(random if self._act is None else self._act(self._task.get_observations()))
         self._made += 1
 
     def keep(self) -> None:
-        """Remember the physics' state, if a policy acts: it would not know what robots did without it."""
+        """Store the physics' state if a policy acts: the policy must not meet motion that it did not command."""
         if self._act is not None:
             self._kept = {name: tensor.clone() for name, tensor in self._task.physics.state_tensors().items()}
 
     def put_back(self) -> None:
-        """Let robots be where they were at the last `keep`."""
+        """Restore the state of the last `keep`."""
         if self._kept:
             self._task.physics.load_state(self._kept)
 
 
 @torch.inference_mode()
 def time_steps(task: BaseTask, steps: int, repeats: int, act: Callable[[TensorDict], Tensor] | None = None) -> dict[str, Any]:
-    """Return milliseconds per control step: the task's step, and the physics in it alone, under random actions or those of a
+    """Return milliseconds per control step: of the task's step, and of its physics alone, under random actions or those of a
     policy `act`, observations -> actions.
 
-    Physics alone is `decimation` engine steps of the same model under the torques of the moment; on a GPU it is one
-    graph too, and so are as many of mujoco-warp's own steps, where ours are made of its parts. All are timed in turns,
-    step by step, so that they meet the states, contacts and clock rates of a rollout: run by itself, physics without a
-    controller or resets would soon simulate heaps of fallen robots.
+    Physics alone is `decimation` engine steps of the same model under the present torques. On a GPU it is one graph too. If
+    the task's step consists of mujoco-warp's parts, as many of mujoco-warp's own steps are timed as well. All are timed in
+    turns, step by step, so that they meet the states, contacts and clock rates of a rollout: without a controller or resets,
+    the physics would soon simulate heaps of fallen robots.
     """
     device = torch.device(task.device)
     driver = Driver(task, act)
@@ -63,7 +63,7 @@ def time_steps(task: BaseTask, steps: int, repeats: int, act: Callable[[TensorDi
         task.step(driver.actions)
     steps_of = {"physics": task.physics.step}
     library = task.physics.library_step
-    if library is not None and (device.type == "cuda" or task.cfg.sim.physics != "auto"):  # on a CPU it takes minutes
+    if library is not None and (device.type == "cuda" or task.cfg.sim.physics != "auto"):  # it takes minutes on a CPU
         steps_of["library"] = library
     alone = {name: _control_period(task, step) for name, step in steps_of.items()}
     turns: list[Turn] = [(driver.decide, lambda: task.step(driver.actions))]
@@ -88,7 +88,7 @@ def time_steps(task: BaseTask, steps: int, repeats: int, act: Callable[[TensorDi
 
 
 def _control_period(task: BaseTask, step: Callable[[], None]) -> Callable[[], None]:
-    """Return the engine steps of one control step, as a graph where the task's step is one."""
+    """Return a function that makes the engine steps of one control step; it is a CUDA graph if the task's step is one."""
 
     def run() -> None:
         for _ in range(task.cfg.control.decimation):
@@ -98,7 +98,7 @@ def _control_period(task: BaseTask, step: Callable[[], None]) -> Callable[[], No
 
 
 def _time_in_turns(turns: Sequence[Turn], steps: int, device: torch.device) -> list[float]:
-    """Return mean milliseconds per call of what each turn times; on a GPU, waiting for the host raises."""
+    """Return mean milliseconds per call of each turn's timed function. On a GPU, waiting for the host raises an error."""
     totals = [0.0] * len(turns)
     if device.type != "cuda":
         for _ in range(steps):
@@ -128,7 +128,7 @@ def _time_in_turns(turns: Sequence[Turn], steps: int, device: torch.device) -> l
 
 
 def synchronize(device: torch.device) -> None:
-    """Wait until a GPU has done all that it was asked for."""
+    """Wait until a GPU has finished its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
@@ -145,7 +145,7 @@ def report(task: BaseTask, result: dict[str, Any]) -> str:
         f"  physics alone {result['physics_ms']:.3f} ms  (control step = {result['ratio']:.3f} x physics)",
         *([f"  mujoco_warp.step alone {result['library_ms']:.3f} ms"] if "library_ms" in result else []),
         *([f"  mujoco-warp's own launches: {task.physics.why_library}"] if task.physics.why_library else []),
-        f"  steps of a robot that lost contacts for want of memory: {result['overflows']:.0f}",
+        f"  steps of a robot that lost contacts because memory was too small: {result['overflows']:.0f}",
         f"  build, with kernel compilation where not cached: {result['build_s']:.1f} s",
     ]
     for loop, times in result.get("iterations", {}).items():

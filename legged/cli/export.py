@@ -22,7 +22,7 @@ from legged.process.command_parser import CommandParser
 from legged.process.paths import ready_to_write, relative
 
 MEGABYTES = 5.0
-"""What the files of one policy need at most [MiB]."""
+"""Largest size of the files of one policy [MiB]."""
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -27,7 +27,7 @@ from legged.process.command_parser import CommandParser
 from legged.process.paths import make_folder, ready_to_write, relative, write_text
 
 UPDATES = {"mlp": 2000, "lstm": 3000}
-"""Updates of a network, unless told otherwise."""
+"""Default number of updates of a network."""
 HIDDEN = {"mlp": (32, 32, 32), "lstm": (8, 8)}
 
 
@@ -82,7 +82,7 @@ def _main(argv: list[str] | None) -> int:
     _tell(log)
     drive = fit_drive(log, args.longest_delay)
     _tell_drive(drive, log)
-    from legged.fitting.training import predict, train_network  # torch takes a while; a wrong log fails without it
+    from legged.fitting.training import predict, train_network  # torch imports slowly; a wrong log fails before
 
     weights = train_network(at_steps, args.kind, hidden, args.samples, spacing, updates, args.seed)
     fits = [Fit("parametric", log, drive.predict(log)), Fit("network", at_steps, predict(weights, at_steps))]
@@ -114,7 +114,7 @@ def _widths(text: str) -> list[int]:
 
 
 def _tell(log: ActuatorLog) -> None:
-    """Say what the log holds."""
+    """Print the contents of the log."""
     seconds, held = len(log.run) * log.dt, float(log.held_out.mean())
     runs = len(np.unique(log.run))
     names = ", ".join(log.joint_names[:4]) + (", ..." if len(log.joint_names) > 4 else "")
@@ -124,7 +124,7 @@ def _tell(log: ActuatorLog) -> None:
 
 
 def _tell_drive(drive: Drive, log: ActuatorLog) -> None:
-    """Say what was fitted, and what the log does not show."""
+    """Print the fitted parameters, and those that the log does not determine."""
     known = log.stiffness is not None and log.damping is not None
     print(f"gains: {drive.stiffness:.4g} N m/rad, {drive.damping:.4g} N m s/rad ({'given' if known else 'fitted'})")
     print(f"delay: {1e3 * drive.delay:.3g} ms")
@@ -141,7 +141,7 @@ def _tell_drive(drive: Drive, log: ActuatorLog) -> None:
 
 
 def _write(folder: Path, log: ActuatorLog, drive: Drive, judged: dict[str, dict[str, float]]) -> None:
-    """Write the numbers.
+    """Write the results.
 
     Raises:
         RunError: the files can't be written.

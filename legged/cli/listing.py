@@ -1,6 +1,6 @@
 """Tasks and robots of this installation: `legged list`.
 
-They are read from their files, so that a list takes no time.
+The lists are read from the files' comments, which is fast.
 """
 
 import sys

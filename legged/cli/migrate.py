@@ -59,7 +59,7 @@ def _main(argv: list[str] | None) -> int:
     result = map_settings(choice.environment, choice.learner)
     robot = _robot(args.robot, result)
     entries = map_robot(result, robot)
-    # Notes of files that nobody knows of would be noise: a loop beside the classes is none of their settings.
+    # Notes about files without a configuration are left out: a loop there concerns no setting.
     lost = [*(Lost(place, text, "", "") for place, text in tree.notes), *result.lost]
     path = args.out / f"{task}.yaml"
     folder = args.out / "robots" / task
@@ -76,7 +76,7 @@ def _main(argv: list[str] | None) -> int:
         write_text(folder / "robot.yaml", _robot_text(robot, entries, folder, args.file))
     head = [f"Written by legged migrate from {relative(args.file)}, {_described(choice, tree)}."]
     if robot is None and entries:
-        head += ["The robot of this task is not here yet. These entries of its robot.yaml are the configuration's:"]
+        head += ["The robot of this task does not exist here yet. The configuration gives these entries of its robot.yaml:"]
         head += [f"  {line}" for line in robot_yaml([], entries).splitlines()]
     write_text(path, task_yaml(head, result.settings, result.comments, lost))
     _report(args, path, result, lost, robot)
@@ -84,7 +84,7 @@ def _main(argv: list[str] | None) -> int:
 
 
 def _task_name(name: str) -> str:
-    """Return a name that no task of this package has."""
+    """Return a task name that this package does not use."""
     if not is_plain_name(name):
         raise ConfigError(f"--task: the name of a task must be {PLAIN}; got {shown(name)}")
     return f"my_{name}" if exists(data_folder("cfg") / f"{name}.yaml") else name
@@ -100,7 +100,7 @@ def _described(choice: Choice, tree: Tree) -> str:
 
 
 def _robot(asked: str | None, result: Translation) -> Robot | None:
-    """Return the robot that was asked for, or one of this package that is called as the asset is."""
+    """Return the robot `asked`, or the robot of this package with the name of the asset."""
     if asked is not None:
         return load_robot(asked, "--robot")
     robots = data_folder("resources") / "robots"
@@ -120,7 +120,7 @@ def _robot_setting(robot: Robot | None, with_folder: bool, task: str, result: Tr
 
 
 def _robot_text(robot: Robot, entries: dict[str, Any], folder: Path, source: Path) -> str:
-    """Return the robot.yaml of a robot that is another one's model, posed and touched as the configuration says."""
+    """Return a robot.yaml that uses another robot's model, with the pose and contacts of the configuration."""
     data = read_yaml(robot.folder / "robot.yaml") | entries
     data["model"] = os.path.relpath(robot.model_path, folder.resolve())
     changed = ", ".join(entries)
@@ -128,7 +128,7 @@ def _robot_text(robot: Robot, entries: dict[str, Any], folder: Path, source: Pat
 
 
 def _asset(file: Path, result: Translation) -> str:
-    """Return the path of the robot's file, as far as it is found above a configuration; else as that names it."""
+    """Return the path of the robot's file if it exists above the configuration; else as the configuration states it."""
     asset = asset_of(result)
     found = (relative(folder / asset) for folder in file.resolve().parents if asset and exists(folder / asset))
     return next(found, asset or "FILE.urdf")
@@ -144,7 +144,7 @@ def _report(args: argparse.Namespace, path: Path, result: Translation, lost: lis
         again = ["migrate", str(args.file), "--robot", str(folder), "--out", str(args.out), "--force"]
         again += ["--task", args.task] if args.task else []
         print(
-            "the robot is still missing:",
+            "the robot is missing; add it:",
             *(f"  legged {shlex.join(words)}" for words in (add, again)),
             sep="\n",
         )

@@ -41,11 +41,11 @@ from legged.registry import task_config
 from legged.rendering import window_opens
 
 ROOM_MB = 24.0
-"""What the disk must have room for: the film and the exported policy [MiB]."""
+"""Disk space for the film and the exported policy [MiB]."""
 MOST_SHOWN = 9
-"""Robots in the picture on a plane."""
+"""Largest number of robots in the picture on a plane."""
 SHOWN_ON_A_PLANE = 4
-"""Robots there are, if nobody says how many."""
+"""Default number of robots."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -122,7 +122,7 @@ def _main(argv: list[str] | None) -> int:
 
 
 def _named(args: argparse.Namespace) -> str:
-    """Return the policy's name as POLICY; legged_gym's options say which of the task's runs it is.
+    """Return the policy's name as POLICY; legged_gym's options choose a run of the task.
 
     Raises:
         ConfigError: there is no such run, or it is of another task.
@@ -145,7 +145,7 @@ def _on_ground(
     graph: bool,
     folder: Path,
 ) -> tuple[Playground | None, LeggedRobot, Actor]:
-    """Build a task of legged robots on the ground that the command line asks for, if it asks for one."""
+    """Build a task of legged robots, on tiles if the command line chooses terrain."""
     wanted: LeggedConfig = override(policy.cfg, asked)  # type: ignore[assignment]
     playground = Playground.of(wanted, args.terrain, args.difficulty)
     count = args.num_envs if args.num_envs is not None else len(playground.order) if playground else SHOWN_ON_A_PLANE
@@ -160,7 +160,9 @@ def _on_ground(
 
 
 def _video(task: BaseTask, count: int, folder: Path | None, gif: bool) -> tuple[Video, RunError | None]:
-    """Return what films the robots; where nothing can be rendered, what films nothing, and why: they are measured still."""
+    """Return a `Video` of the robots, and None. If this machine cannot render, return a `Video` that only measures, and the
+    error.
+    """
     try:
         return Video(task, count, folder, gif), None
     except RunError as error:

@@ -55,7 +55,7 @@ from legged.process.startup import STARTED_S, program, stage_ended
 from legged.registry import make_task, task_config
 
 ROOM_MB = 16.0
-"""What the disk must have room for before a training begins: its first checkpoints [MiB]."""
+"""Disk space that must be free before a training begins, for its first checkpoints [MiB]."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -64,7 +64,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 Prepared = Callable[[Runner], None]
-"""What is told of the runner, once it is built and before it trains."""
+"""Function that receives the runner after it is built and before it trains."""
 
 
 def build_parser() -> CommandParser:
@@ -97,7 +97,7 @@ def build_parser() -> CommandParser:
 
 
 def train_as_asked(argv: list[str], prepared: Prepared) -> int:
-    """Train as a command line asks, within another command; return the exit code. Errors are raised.
+    """Run a training with the arguments `argv` inside another command; return the exit code. Errors are raised.
 
     Raises:
         ConfigError: the command line or the configuration is wrong.
@@ -107,7 +107,7 @@ def train_as_asked(argv: list[str], prepared: Prepared) -> int:
 
 
 def _main(argv: list[str] | None, prepared: Prepared | None = None) -> int:
-    start = STARTED_S if argv is None else time.perf_counter()  # as a command, imports are part of it
+    start = STARTED_S if argv is None else time.perf_counter()  # the time of a command includes its imports
     stage_ended("imports")
     args = build_parser().parse_intermixed_args(argv)
 
@@ -156,7 +156,7 @@ def _train(
     prepared: Prepared | None,
     neighbours: Neighbours | None,
 ) -> int:
-    """Build and train; returns the exit code. Of several processes the first one has a run folder and a display."""
+    """Build the task and train; return the exit code. Of several processes only the first has a run folder and a display."""
     first = Ranks.now().first
     check_reachable(Ranks.now())
     if first:
@@ -213,16 +213,16 @@ def _train(
         runner.logger.hand_over(runner.current_learning_iteration)
     if finished:
         return 0
-    # Without a signal of its own it is the output that went away, or another process that was asked to stop.
+    # No signal of this process: its output was lost, or another process was told to stop.
     return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
 
 
 def teacher_of(cfg: TaskConfig, checkpoint: Path | None, args: argparse.Namespace) -> Teacher | None:
-    """Return the teacher of a task that learns from one: of a training that is resumed the one in its `checkpoint`, else the
-    one that the configuration names.
+    """Return the teacher of a task that imitates one: for a resumed training the teacher in its `checkpoint`, else the one in
+    the configuration.
 
     Raises:
-        ConfigError: there is none, it does not fit, or one is named for a task that learns from none.
+        ConfigError: the teacher is missing or does not fit, or one is named for a task that imitates none.
     """
     if not learns_from_teacher(cfg):
         if args.teacher is not None:
@@ -233,7 +233,7 @@ def teacher_of(cfg: TaskConfig, checkpoint: Path | None, args: argparse.Namespac
 
 
 def _evaluate_during(runner: Runner, resumed_from: Path | None) -> None:
-    """Let the first process evaluate the policy while it is trained."""
+    """Set up evaluations of the policy during the training, in the first process."""
     evaluations = None
     if Ranks.now().first:
         evaluations = Evaluations(runner.env.cfg, TrainingEvaluation(runner.env))
@@ -250,9 +250,10 @@ def _learn(
     timing: Callable[[bool, str], Timing],
     goes_on_from: Path | None,
 ) -> tuple[Path | None, bool]:
-    """Train into a new run folder; gives the folder, none where another process has it, and whether training got to its end.
-    A training that fails before its first checkpoint leaves no folder; one that fails later says so there, with its times.
-    `goes_on_from` is the checkpoint of a resumed one.
+    """Train into a new run folder; return the folder (None if another process has it) and True if training reached its end.
+
+    A training that fails before its first checkpoint leaves no folder. One that fails later writes the error and its times
+    into the folder. `goes_on_from` is the checkpoint of a resumed training.
 
     Raises:
         RunError: the folder can't be written.
@@ -280,24 +281,26 @@ def _learn(
         if folder.is_dir():
             _leave_word(folder, error, cfg, timing)
         full = full_disk_in(error)
-        if full is not None and not isinstance(error, RunError):  # TensorBoard's writer does not say which file
+        if full is not None and not isinstance(error, RunError):  # TensorBoard's writer does not name the file
             raise RunError(f"{relative(folder)}: {reason(full)}") from error
         raise
 
 
 def _leave_word(folder: Path, error: BaseException, cfg: TaskConfig, timing: Callable[[bool, str], Timing]) -> None:
-    """Write into the folder of a training that failed what ended it, and the report on it; on a full disk nothing can be."""
+    """Write the error and the report into the folder of a failed training; a full disk may prevent that."""
     said = "" if isinstance(error, KeyboardInterrupt) else " ".join(f"{type(error).__name__}: {error}".split())[:500]
-    with contextlib.suppress(RunError, RuntimeError):  # a broken CUDA device can't be asked for its name
+    with contextlib.suppress(RunError, RuntimeError):  # the name of a broken CUDA device can't be read
         write_timing(folder, timing(False, said))
         _report(folder, cfg, None)
 
 
 def _report(folder: Path, cfg: TaskConfig, args: argparse.Namespace | None) -> None:
-    """Write the report on a training that has ended, unless it asks for none; with a film, if that can be told its task."""
+    """Write the report on a training that has ended, unless its configuration switches reports off. The film needs the
+    arguments with which the task is found again, so without `args` there is no film.
+    """
     if not cfg.train.runner.report:
         return
-    from legged.evaluation.reports.run_report import report_at_end  # a start does without what it imports
+    from legged.evaluation.reports.run_report import report_at_end  # imported late, because a start does not need it
 
     film_with = None
     if args is not None and cfg.train.runner.film:
@@ -306,7 +309,7 @@ def _report(folder: Path, cfg: TaskConfig, args: argparse.Namespace | None) -> N
 
 
 def describe(cfg: TaskConfig, device: torch.device) -> str:
-    """One line on what is about to run where."""
+    """Return one line about the task, the number of iterations and the device."""
     if device.type == "cpu":
         cores = _counted(cfg.sim.threads or available_cores(), "core")
         engines = {"mujoco_warp": f"mujoco-warp on {cores}", "mujoco": f"C MuJoCo on {cores}"}
@@ -328,7 +331,7 @@ def _counted(count: int, noun: str) -> str:
 
 
 def play_command(args: argparse.Namespace, cfg: TaskConfig, folder: Path) -> str:
-    """Return the command that shows the policy of a run, as it can be pasted into the shell that this was started from."""
+    """Return the command that shows the policy of a run, ready to paste into the shell that started this process."""
     newest = False
     if not cfg.train.runner.experiment_name:
         with contextlib.suppress(ConfigError, OSError):
@@ -340,12 +343,12 @@ def play_command(args: argparse.Namespace, cfg: TaskConfig, folder: Path) -> str
 
 
 def _name_of(device: torch.device) -> str:
-    """Return the name of a device among all of the machine's."""
+    """Return the name of a device that is unique on this machine."""
     return f"gpu-{torch.cuda.get_device_properties(device).uuid}" if device.type == "cuda" else "cpu"
 
 
 def _timing(runner: Runner, device: torch.device, start_up_s: float, wall_s: float, finished: bool, resumed: bool) -> Timing:
-    """Return how long the training took, and what."""
+    """Return the times of the training and its number of steps."""
     steps, neighbours = runner.logger.tot_timesteps, runner.logger.neighbours
     if neighbours is not None:
         neighbours.look()

@@ -29,9 +29,9 @@ from legged.process.command_parser import CommandParser
 from legged.process.cores import available_cores
 
 ROBOTS = 4
-"""Robots there are, if nobody says how many."""
+"""Default number of robots."""
 ROBOTS_A_THREAD = 4
-"""Robots that one core simulates in real time."""
+"""Number of robots that one core simulates in real time."""
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""Command-line arguments that several commands share, and the configuration that they make."""
+"""Command-line arguments that several commands share, and the configuration that they describe."""
 
 import argparse
 import re
@@ -18,7 +18,7 @@ from legged.registry import YAML_ENDINGS, import_tasks, register_file
 
 TASK_HELP = "a task, e.g. anymal_c_flat, or its YAML file"
 OVERRIDE = re.compile(r"[\w.]+=")
-"""The beginning of a `key=value`; what has a slash before the equals sign is a path."""
+"""The beginning of a `key=value`; a text with a slash before the equals sign is a path."""
 POLICY_HELP = "a task (its newest run, else the shipped policy), its YAML file, a run, or a run's folder"
 
 
@@ -29,7 +29,7 @@ def add_task_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_policy_arguments(parser: argparse.ArgumentParser, what: str = POLICY_HELP) -> None:
-    """Add the positional argument POLICY, --checkpoint, and what `add_build_arguments` adds."""
+    """Add the positional argument POLICY, --checkpoint, and the arguments of `add_build_arguments`."""
     parser.add_argument("policy", metavar="POLICY", help=what)
     add_checkpoint_argument(parser)
     add_build_arguments(parser)
@@ -41,8 +41,8 @@ def add_checkpoint_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def add_legged_gym_arguments(parser: argparse.ArgumentParser, name: str) -> None:
-    """Add what `train` and `play` share with legged_gym: --task in place of the positional argument `name`, and the options
-    that name one of the task's runs.
+    """Add the options of `train` and `play` that legged_gym has too: --task in place of the positional argument `name`, and
+    the options that name one of the task's runs.
     """
     parser.add_argument(name, nargs="?", metavar=name.upper(), help=TASK_HELP if name == "task" else POLICY_HELP)
     parser.add_argument("--task", dest="task_option", metavar="TASK", help=f"the same as {name.upper()}, as in legged_gym")
@@ -53,7 +53,7 @@ def add_legged_gym_arguments(parser: argparse.ArgumentParser, name: str) -> None
 
 
 def add_build_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add --import, engine, devices, and `key=value` overrides: all that says how a task is built."""
+    """Add the arguments that determine how a task is built: --import, engine, devices, and `key=value` overrides."""
     add_import_argument(parser)
     parser.add_argument("--num-envs", type=int, help="number of robots (env.num_envs)")
     parser.add_argument("--seed", type=int, help="random seed (env.seed)")
@@ -65,16 +65,18 @@ def add_build_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def settle_name(args: argparse.Namespace, name: str) -> None:
-    """Let `args.<name>` be what the positional argument or legged_gym's --task names. A `key=value` that stands in the place
-    of the positional argument is an override.
+    """Set `args.<name>` to the value of the positional argument or of legged_gym's --task. A `key=value` in the place of the
+    positional argument becomes an override.
 
     Raises:
-        ConfigError: neither or both name something.
+        ConfigError: both or neither are given.
     """
     override_is_no_name(args, name)
     given = getattr(args, name)
     if given is not None and args.task_option not in (None, given):
-        raise ConfigError(f"--task: '{args.task_option}' is given beside {name.upper()} '{given}'; leave one of them out")
+        raise ConfigError(
+            f"--task: '{args.task_option}' is given together with {name.upper()} '{given}'; leave one of them out"
+        )
     found = given if given is not None else args.task_option
     if found is None:
         raise ConfigError(
@@ -84,7 +86,7 @@ def settle_name(args: argparse.Namespace, name: str) -> None:
 
 
 def override_is_no_name(args: argparse.Namespace, name: str) -> None:
-    """Move a `key=value` in the place of the positional argument `name`, which may be left out, to the overrides."""
+    """Move a `key=value` in the place of the optional positional argument `name` to the overrides."""
     given = getattr(args, name)
     if given is not None and OVERRIDE.match(given):
         args.overrides.insert(0, given)
@@ -92,7 +94,11 @@ def override_is_no_name(args: argparse.Namespace, name: str) -> None:
 
 
 def _iteration(text: str) -> int | str:
-    """Read the iteration of a checkpoint, or `best`; argparse says what is wrong with anything else."""
+    """Return the iteration of a checkpoint, or `best`.
+
+    Raises:
+        ArgumentTypeError: the text is neither; argparse reports it.
+    """
     if text == "best":
         return text
     try:
@@ -105,7 +111,7 @@ def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
     """Return all overrides of a command line; flags come after `key=value`s.
 
     Raises:
-        ConfigError: not of the form `key=value`, or --solver without the engine whose it is.
+        ConfigError: a text is not of the form `key=value`, or --solver is given for an engine that has none.
     """
     flags = {
         "num_envs": "env.num_envs",
@@ -125,12 +131,12 @@ def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
             found.append((key, value))
     engine = dict(found).get("sim.physics")
     if args.solver is not None and engine != "newton":
-        raise ConfigError(f"--solver: '{args.solver}' would be a solver of newton; add --physics newton (got {engine})")
+        raise ConfigError(f"--solver: '{args.solver}' is an option of newton; add --physics newton (got {engine})")
     return found
 
 
 def policy_overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
-    """Return all overrides but the experiment name, which says what run a policy is of.
+    """Return all overrides except the experiment name, which chooses the run of a policy.
 
     Raises:
         ConfigError: as `overrides`.
@@ -139,10 +145,10 @@ def policy_overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
 
 
 def pick_device(name: str | None, flag: str = "--sim-device") -> torch.device:
-    """Return the device that was asked for, else the GPU if there is one; under torchrun the GPU of this process's number.
+    """Return the requested device, or the GPU if there is one; under torchrun, the GPU with this process's number.
 
     Raises:
-        ConfigError: no such device, no GPU here, or under torchrun another one than its own.
+        ConfigError: there is no such device, there is no GPU, or under torchrun another GPU is requested than the process's.
     """
     ranks = Ranks.now()
     own = f"cuda:{ranks.local_rank}"
@@ -175,29 +181,29 @@ def pick_device(name: str | None, flag: str = "--sim-device") -> torch.device:
 
 
 def settle_on(device: torch.device) -> None:
-    """Set torch up for a command that runs on `device`."""
+    """Configure torch for a command that runs on `device`."""
     if device.type == "cpu":
-        # The C engine takes the cores; torch's small tensors are slower when its own threads compete for them.
+        # The C engine uses the cores; torch's small tensors are slower when its own threads compete for them.
         torch.set_num_threads(1)
     else:
-        torch.cuda.set_device(device)  # what names no device must not end up on the first GPU
+        torch.cuda.set_device(device)  # operations without a device must not run on the first GPU
 
 
 def watch_command(args: argparse.Namespace, folder: Path) -> str:
-    """Return the command that shows the policy of a run folder in a browser, also while it is trained. `args` are those of
-    the running command.
+    """Return the command that shows the policy of a run folder in a browser, also during the training. `args` are the
+    arguments of the running command.
     """
     return shlex.join([*program("watch"), *given_import(args), relative(folder)])
 
 
 def given_import(args: argparse.Namespace) -> list[str]:
-    """Return the option by which another command finds the user-defined tasks of this one."""
+    """Return the --import option with which another command finds the user-defined tasks of this command."""
     files = [file for file in (args.module, args.task_file) if file]
     return ["--import", ",".join(files)] if files else []
 
 
 def register_given(args: argparse.Namespace, name: str) -> None:
-    """Register the user-defined tasks of --import; a YAML file given as `args.<name>` becomes a task."""
+    """Register the user-defined tasks of --import; a YAML file in `args.<name>` becomes a task."""
     if args.module:
         import_tasks(args.module)
     given = getattr(args, name)

@@ -1,4 +1,4 @@
-"""A command as a process: how it ends, with which exit code, and with which one line."""
+"""Execution of a command: its exit code, and its error message in one line."""
 
 import errno
 import re
@@ -22,14 +22,15 @@ EXIT_FAILED = 1
 EXIT_WRONG_INPUT = 2
 NO_MEMORY = "out of memory; fewer robots (--num-envs) need less"
 LACKS_MEMORY = re.compile(r"(?i)out of memory|can't allocate memory|failed to allocate|bad_?alloc|unable to allocate")
-"""What torch, Warp, NumPy and C++ say of it."""
+"""Pattern in the messages of torch, Warp, NumPy and C++ about too little memory."""
 
 
 def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = None) -> int:
-    """Run a command, of this process if it has no `argv` of its own; returns its exit code: 0 done, 1 it could not go on, 2
-    wrong input, 130 interrupted. What ends it says so in one line; only a fault of the program leaves a traceback.
+    """Run a command, with the arguments of this process if `argv` is None; return its exit code.
 
-    A standard output that goes away ends nothing: what is measured is written to files all the same. The code is 1 then.
+    The codes are 0 for success, 1 for a command that could not go on, 2 for wrong input, and 130 after Ctrl-C. The reason is
+    printed in one line; only a fault of the program prints a traceback. If standard output is lost, the command goes on and
+    still writes its files, and the code is 1.
     """
     if argv is None:
         is_a_command()
@@ -38,7 +39,7 @@ def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = N
         leaves = None
         try:
             code = _guarded(main, argv)
-        except SystemExit as stop:  # argparse, after --help or a wrong flag
+        except SystemExit as stop:  # from argparse, after --help or a wrong flag
             leaves, code = stop, stop.code if isinstance(stop.code, int) else 0
         output.flush()
         if output.lost is not None:
@@ -47,12 +48,12 @@ def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = N
         elif leaves is not None:
             raise leaves
     if argv is None:
-        leave_at_interrupts()  # Python still has to end
+        leave_at_interrupts()  # until Python itself has ended
     return code
 
 
 def _guarded(main: Callable[[list[str] | None], int], argv: list[str] | None) -> int:
-    """Run a command; its exit code, whichever way it ends."""
+    """Run a command; return its exit code, however it ends."""
     try:
         return main(argv)
     except ConfigError as error:
@@ -68,7 +69,7 @@ def _guarded(main: Callable[[list[str] | None], int], argv: list[str] | None) ->
         return INTERRUPTED
     except MemoryError as error:
         _say(f"out of memory: {error}" if str(error) else NO_MEMORY)
-    except Exception as error:  # what libraries make of a full disk, of too little memory and of Ctrl-C
+    except Exception as error:  # libraries report a full disk, too little memory and Ctrl-C by classes of their own
         if isinstance(error.__context__, KeyboardInterrupt):
             print("interrupted", file=sys.stderr, flush=True)
             return INTERRUPTED
@@ -83,7 +84,7 @@ def _guarded(main: Callable[[list[str] | None], int], argv: list[str] | None) ->
 
 
 def line_of_user(error: BaseException) -> str:
-    """Say ' (file, line n)' of the innermost line behind `error` that is neither ours nor a library's."""
+    """Return ' (file, line n)' of the innermost line of user code in the traceback of `error`."""
     found = ""
     behind: BaseException | None = error
     while behind is not None:
@@ -95,7 +96,7 @@ def line_of_user(error: BaseException) -> str:
 
 
 def _file_of(error: BaseException) -> str:
-    """Return the file in which an error came up; of a name that an object has not, where the name was used."""
+    """Return the file in which an error was raised; for a missing attribute, the file that uses it."""
     frames = traceback.extract_tb(error.__traceback__)
     while len(frames) > 1 and frames[-1].name == "__getattr__":
         frames.pop()
@@ -103,15 +104,15 @@ def _file_of(error: BaseException) -> str:
 
 
 def _is_of_user(frame: traceback.FrameSummary) -> bool:
-    """Return whether a line is neither ours, nor a library's, nor Python's."""
+    """Return True if a line belongs neither to this package, nor to a library, nor to Python."""
     file = Path(frame.filename)
     libraries = {"site-packages", "dist-packages"} & {*file.parts} or file.is_relative_to(sysconfig.get_path("stdlib"))
     return not libraries and not file.is_relative_to(Path(legged.errors.__file__).parent) and file.is_file()
 
 
 def known_failure(error: BaseException) -> str | None:
-    """Return one line on a full disk, a file that can't be written or too little memory, whichever library met it; None for
-    all other errors.
+    """Return one line about a full disk, a file that can't be written or too little memory, whatever library reported it;
+    None for all other errors.
     """
     full = full_disk_in(error)
     if full is not None:
@@ -124,9 +125,9 @@ def known_failure(error: BaseException) -> str | None:
 
 
 def _say(text: str) -> None:
-    """Tell why the command ends."""
+    """Print the reason why the command ends."""
     try:
         rank = f"rank {Ranks.now().rank}: " if Ranks.now().several else ""
-    except ConfigError:  # that is the error
+    except ConfigError:  # the number of the process is itself wrong, which is the error
         rank = ""
     print(f"{rank}error: {text}", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""Answers that need no heavy import: help and lists."""
+"""Commands without heavy imports: help and lists."""
 
 import sys
 from collections.abc import Callable, Mapping
@@ -11,7 +11,7 @@ FAILED, WRONG_INPUT = 1, 2
 
 
 def answer(say: Callable[[], None]) -> int:
-    """Call `say`, which prints; return the exit code."""
+    """Call `say`, which prints the answer; return the exit code."""
     with forgiving_output() as output:
         try:
             say()
@@ -25,7 +25,7 @@ def answer(say: Callable[[], None]) -> int:
 
 
 def print_rows(title: str, rows: Mapping[str, str], width: int = 0) -> None:
-    """Print a title, and names with a text each, in two columns, the first of at least `width` letters."""
+    """Print a title and two columns, names and texts; the first column has at least `width` letters."""
     width = max([width, *map(len, rows)])
     print(f"{title}:")
     for name, summary in rows.items():

@@ -1,4 +1,4 @@
-"""Standard output that may go away: a closed pipe, a full disk, a terminal that was hung up. A command goes on without it."""
+"""Standard output that may be lost: a closed pipe, a full disk, a closed terminal. The command goes on without it."""
 
 import errno
 import os
@@ -11,30 +11,30 @@ from legged.process.paths import DISK_FULL, reason
 
 
 class Output:
-    """A text stream that takes what is written to it and, once it can't be written any more, drops it."""
+    """A text stream that discards text once it can't be written any more."""
 
     def __init__(self, stream: TextIO | None) -> None:
-        """Take `stream`, which is None in a process that was started without one."""
+        """Wrap `stream`, which is None in a process that was started without one."""
         self._stream = open(os.devnull, "w") if stream is None else stream  # noqa: SIM115  (as long as the process)
         self.lost: str | None = None
-        """Why nothing more can be written; None while it can."""
+        """Reason why nothing more can be written; None while writing works."""
         self._when_lost: list[Callable[[], object]] = []
 
     def write(self, text: str) -> int:
-        """Write, or drop what can't be written; return the number of characters."""
+        """Write a text, or discard it if it can't be written; return the number of characters."""
         if self.lost is None:
             with self._watched():
                 self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
-        """Flush what was written."""
+        """Flush the stream."""
         if self.lost is None:
             with self._watched():
                 self._stream.flush()
 
     def when_lost(self, do: Callable[[], object]) -> None:
-        """Call `do` as soon as nothing can be written any more; at once, if that is so."""
+        """Call `do` as soon as nothing can be written any more; at once, if that is already so."""
         if self.lost is not None:
             do()
         self._when_lost.append(do)
@@ -43,11 +43,11 @@ class Output:
     def _watched(self) -> Iterator[None]:
         try:
             yield
-        except UnicodeError:  # a name that this terminal's encoding does not have
+        except UnicodeError:  # the terminal's encoding lacks a character
             raise
-        except (OSError, ValueError) as error:  # ValueError: somebody has closed it
+        except (OSError, ValueError) as error:  # ValueError: the stream was closed
             self.lost = _why(error)
-            if self._stream in (sys.__stdout__, sys.__stderr__):  # what Python still holds must not fail at exit
+            if self._stream in (sys.__stdout__, sys.__stderr__):  # text in Python's buffer must not fail at exit
                 with suppress(OSError, ValueError):
                     nowhere = os.open(os.devnull, os.O_WRONLY)
                     os.dup2(nowhere, self._stream.fileno())
@@ -56,7 +56,7 @@ class Output:
                 do()
 
     def __getattr__(self, name: str) -> Any:
-        """Return whatever else a text stream has."""
+        """Return any other attribute of the text stream."""
         return getattr(self._stream, name)
 
 
@@ -71,14 +71,14 @@ _OUTPUTS: list[Output] = []
 
 
 def when_output_is_lost(do: Callable[[], object]) -> None:
-    """Call `do` once nothing can be written to standard output any more. Outside of a command it never is."""
+    """Call `do` once nothing can be written to standard output any more. Outside of a command it is never called."""
     if _OUTPUTS:
         _OUTPUTS[-1].when_lost(do)
 
 
 @contextmanager
 def forgiving_output() -> Iterator[Output]:
-    """Let standard output and standard error of this process go away without an exception; gives the first."""
+    """Make losses of standard output and standard error of this process silent; yield the wrapped standard output."""
     streams = sys.stdout, sys.stderr
     output = Output(sys.stdout)
     sys.stdout, sys.stderr = output, Output(sys.stderr)  # type: ignore[assignment]

@@ -1,4 +1,4 @@
-"""What a configuration comes to: terms with their columns, actions and joints, for `--show`."""
+"""Summary of a configuration for `--show`: terms with their columns, actions and joints."""
 
 import inspect
 from collections.abc import Iterator, Sequence
@@ -18,12 +18,12 @@ from legged.registry import make_task
 from legged.robots.similarity import Size, growth, size_of
 
 ALONE = [("env.num_envs", 1), ("sim.physics", "mujoco"), ("sim.threads", 1), ("train.algorithm.num_mini_batches", 1)]
-"""What is changed to build a task of one robot on any machine."""
+"""Overrides with which a task of one robot can be built on any machine."""
 
 
 def summary(cfg: TaskConfig) -> list[str]:
-    """Return lines about a task that is built for it, with one robot on the C engine; each begins with '#', so that they may
-    follow a configuration in YAML.
+    """Return lines about a task, which is built with one robot on the C engine. Each line begins with '#', so that the lines
+    may follow a configuration in YAML.
 
     Raises:
         ConfigError: the task cannot be built.
@@ -43,7 +43,7 @@ def _says(task: BaseTask, method: str) -> str:
 
 
 def _table(title: str, rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
-    """Yield a title and rows in columns, the last of any width."""
+    """Yield a title and rows in columns; the last column has any width."""
     yield ""
     yield title
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)][:-1]
@@ -80,9 +80,9 @@ def _observations(task: BaseTask) -> Iterator[str]:
             scales = term.scale.tolist()
             scales = scales[:1] if len(set(scales)) == 1 else scales
             noise = f"+-{_number(term.noise)}" if term.noise else "-"
-            sensors = task.observation_terms.errors if groups_in(task.cfg)[name].noise else None
-            if sensors is not None and term.name in sensors.names:
-                noise = sensors.describe(term.name)
+            errors = task.observation_terms.errors if groups_in(task.cfg)[name].noise else None
+            if errors is not None and term.name in errors.names:
+                noise = errors.describe(term.name)
             columns = f"{term.columns.start}:{term.columns.stop}"
             rows.append((columns, term.name, ", ".join(map(_number, scales)), noise, _says(task, f"_obs_{term.name}")))
         steps = f" x {group.history} steps, oldest first" if group.history > 1 else ""
@@ -105,12 +105,12 @@ def _terminations(task: BaseTask) -> Iterator[str]:
     for kind, names in (("failure", failures), ("time-out", time_outs)):
         rows += [(name, kind, _says(task, f"_terminate_{name}")) for name in names]
     rows.append(("(time)", "time-out", f"{task.max_episode_length} control steps, {task.cfg.env.episode_length_s:g} s"))
-    rows.append(("(numbers)", "failure", "a number of the physics, a reward or an observation is none"))
+    rows.append(("(numbers)", "failure", "a number of the physics, a reward or an observation is not finite"))
     yield from _table("terminations", rows)
 
 
 def _randomisation(task: BaseTask) -> Iterator[str]:
-    """Yield what differs from robot to robot, by legged_gym's names too, and what disturbs them."""
+    """Yield the properties that differ from robot to robot, including those with legged_gym's names, and the disturbances."""
     rows = []
     for name, draw in task.randomization.draws.items():
         drawn_from, distribution, moments = _drawn(draw, FIELDS[name].unit)
@@ -122,14 +122,14 @@ def _randomisation(task: BaseTask) -> Iterator[str]:
             rows.insert(0, (name, *_drawn(DrawConfig(range=span), FIELDS[name].unit), FIELDS[name].meaning))
     if rows:
         header = ("property", "range", "distribution", "drawn", "what it is")
-        yield from _table("randomised; play and evaluation have none of it, unless asked", [header, *rows])
+        yield from _table("randomised; play and evaluation switch it off unless told otherwise", [header, *rows])
     pushes = list(_pushes(rand)) if isinstance(rand, LeggedDomainRandConfig) else []
     if pushes:
         yield from _table("disturbances", [("name", "how much", "when"), *pushes])
 
 
 def _of_legged_gym(rand: LeggedDomainRandConfig) -> Iterator[tuple[str, bool, tuple[float, float]]]:
-    """Yield property, whether it is drawn, and its range."""
+    """Yield property, True if it is randomised, and range."""
     yield "added_base_mass", rand.randomize_base_mass, rand.added_mass_range
     yield "friction", rand.randomize_friction, rand.friction_range
 
@@ -140,7 +140,7 @@ def _span(span: tuple[float, float], unit: str) -> str:
 
 
 def _drawn(draw: DrawConfig, unit: str) -> tuple[str, str, str]:
-    """Return range, distribution and moments of a property, as texts."""
+    """Return range, distribution and times of a randomised property, as texts."""
     sigma = f", sigma {_number(standard_deviation(draw))}" if draw.distribution == "gaussian" else ""
     moment = {"start": "once", "reset": "each episode", "interval": f"every {_number(draw.interval_s)} s"}[draw.when]
     return _span(draw.range, unit), draw.distribution + sigma, moment + _grown(draw.grow)
@@ -151,7 +151,7 @@ def _grown(grow: tuple[float, float]) -> str:
 
 
 def _pushes(rand: LeggedDomainRandConfig) -> Iterator[tuple[str, str, str]]:
-    """Yield name, size and moments of what disturbs robots."""
+    """Yield name, size and times of each disturbance."""
     if rand.push_robots:
         size = f"sets the base's horizontal velocity, x and y +-{_number(rand.max_push_vel_xy)} m/s"
         yield "push_robots", size, f"every {_number(rand.push_interval_s)} s"
@@ -175,12 +175,13 @@ def _actions(task: BaseTask) -> Iterator[str]:
 
 
 def _effect(task: BaseTask, i: int) -> str:
-    """Say what actuator `i` does."""
+    """Return the effect of actuator `i` as text."""
     model = task.physics.model
     on_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
     gains = model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
     bias = model.actuator_biastype[i] != mujoco.mjtBias.mjBIAS_NONE
-    if not on_joint or not gains or bias:  # a servo, a muscle, a tendon's motor: what it makes of its control is its own
+    # a servo, a muscle or a motor of a tendon: its force is not a plain multiple of its control
+    if not on_joint or not gains or bias:
         return f"control {float(task.control_middle[i]):g} + {float(task.control_reach[i]):g} a"
     number = int(model.actuator_trnid[i, 0])
     joint = model.joint(number).name or f"({number})"
@@ -221,4 +222,4 @@ def _joints(task: BaseTask) -> Iterator[str]:
 
 
 PARTS = (_robot, _observations, _rewards, _terminations, _randomisation, _actions, _joints)
-"""What is said of a task, in this order."""
+"""Parts of the summary, in this order."""

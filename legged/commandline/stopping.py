@@ -1,4 +1,4 @@
-"""What may stop a training from outside, and how it then ends: signals, and writers that fail in threads of their own."""
+"""Ends of a training from outside: signals, and writer threads that fail."""
 
 import signal
 import sys
@@ -11,17 +11,17 @@ from legged.process.ranks import Ranks
 from legged.process.startup import in_main_thread
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
-"""Ctrl-C, what a scheduler sends, and what a terminal sends that is closed."""
+"""Signals from Ctrl-C, from a scheduler, and from a terminal that is closed."""
 
 
 @contextmanager
 def stopping_on_signals(stop: Callable[[], object]) -> Iterator[list[int]]:
-    """Let a first signal call `stop`, which ends the training after the iteration, and a second one raise KeyboardInterrupt.
-    Gives a list that gets the signals; what handled them before does so again afterwards.
+    """Call `stop` at the first signal, which ends the training after the iteration; raise KeyboardInterrupt at the second.
+    Yield a list that collects the signals. The earlier handlers are restored afterwards.
 
-    Of several processes all stop as soon as one is asked to. There a second signal changes nothing: torchrun passes on what
-    the terminal has sent already, and kills who takes more than half a minute. In another thread than the main one no signal
-    can be handled, and none is.
+    With several processes, all stop as soon as one is told to. There a second signal has no effect: torchrun passes on the
+    signals that the terminal has already sent, and kills processes that take more than half a minute. Outside the main thread
+    Python can't handle signals, so none are handled.
     """
     received: list[int] = []
     ranks = Ranks.now()
@@ -32,11 +32,11 @@ def stopping_on_signals(stop: Callable[[], object]) -> Iterator[list[int]]:
             raise KeyboardInterrupt
         if len(received) == 1 and ranks.first:
             once_more = "" if ranks.several else "; once more to stop at once"
-            with suppress(RuntimeError):  # the signal came while something else was being written there
+            with suppress(RuntimeError):  # the signal came during another write to the same stream
                 print(f"stopping after this iteration, with a checkpoint{once_more}", file=sys.stderr, flush=True)
         stop()
 
-    # What nohup has set must stay: the training is to outlive its terminal.
+    # A signal that nohup ignores stays ignored: the training is to outlive its terminal.
     numbers = [n for n in SIGNALS if n == signal.SIGINT or signal.getsignal(n) != signal.SIG_IGN] if in_main_thread() else []
     before = {number: signal.signal(number, handler) for number in numbers}
     try:
@@ -48,8 +48,8 @@ def stopping_on_signals(stop: Callable[[], object]) -> Iterator[list[int]]:
 
 @contextmanager
 def quiet_writers() -> Iterator[None]:
-    """Keep threads that could not write a file from printing a traceback: TensorBoard's raises the same error once more where
-    it is used.
+    """Keep writer threads from printing a traceback when they cannot write a file; TensorBoard's writer raises the same error
+    again in the caller.
     """
     before = threading.excepthook
 

@@ -55,7 +55,7 @@ class Watch:
         self._fast_s = np.maximum(0.0, self._fast_s + np.where(fast, passed, -0.25 * passed))
 
     def reason(self, reading: Reading | None, now: float, missed: int) -> str | None:
-        """Return the reason to stop the robot in one line; None if there is none.
+        """Return the reason to stop the robot in one line, or None if it may go on.
 
         `reading` is the newest one, `now` the time by `time.perf_counter` [s], `missed` the deadlines missed in a row.
         """

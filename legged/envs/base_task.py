@@ -346,7 +346,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
         """Make one control step of all environments under `actions` (N, D): a tensor on any device, an array or a list of
-        real numbers. The step is never differentiated, even if the caller records gradients.
+        real numbers. The step records no gradients, even if the caller does.
 
         Returns observations, rewards (N,), dones (N,) bool, and extras with `time_outs` (N,) bool and, once per rollout,
         `log`:

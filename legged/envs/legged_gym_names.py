@@ -94,8 +94,8 @@ def _obs_scales(task: Any) -> SimpleNamespace:
 
 
 def _noise_scale_vec(task: Any) -> Tensor:
-    sensors, noisy = task.observation_terms.errors, task.cfg.observations.groups["actor"].noise
-    measured = sensors.noise if sensors is not None and noisy else {}  # noise that is added with the other errors
+    errors, noisy = task.observation_terms.errors, task.cfg.observations.groups["actor"].noise
+    measured = errors.noise if errors is not None and noisy else {}  # noise that is added with the other errors
     return torch.cat([term.scale * measured.get(term.name, term.noise) for term in task.observation_groups["actor"].terms])
 
 

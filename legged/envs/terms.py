@@ -93,9 +93,8 @@ class Terms:
     `termination_indices` select shapes."""
     feet_indices: Tensor
     _feet_shapes: slice | Tensor
-    """Feet among the shapes, like `_terminating_shapes`: a slice if the indices are evenly spaced, since a slice costs no
-    launch.
-    """
+    """Feet among the shapes. It is a slice if the indices are evenly spaced, since a slice costs no launch; so is
+    `_terminating_shapes`."""
     _terminating_shapes: slice | Tensor
     penalised_indices: Tensor
     posture_joints: Tensor

@@ -275,8 +275,8 @@ def motor_numbers(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str]
 
 
 def with_rotors(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str) -> Robot:
-    """Return the robot with the rotor inertias of the configuration (control.actuator.armature), or the same robot if there
-    are none. `where` is as for `modelled_joints`.
+    """Return the robot with the rotor inertias of the configuration (control.actuator.armature); without them, the same
+    robot. `where` is as for `modelled_joints`.
 
     Raises:
         ConfigError: a pattern matches no joint.

@@ -45,7 +45,7 @@ class NanGuard:
         """
         physics, action = self._now
         torch.any(clipped_actions != clipped_actions, dim=1, out=action)
-        torch.eq(in_bounds, action, out=physics)  # both False: a NaN action, too, puts a robot out of bounds
+        torch.eq(in_bounds, action, out=physics)  # out of bounds with finite actions: the physics is at fault
         self._seen.logical_or_(self._now)
 
     def check_rewards(self, rewards_finite: Tensor, valid: Tensor) -> None:

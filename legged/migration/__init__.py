@@ -1,1 +1,1 @@
-"""Configuration classes of legged_gym and its forks -> tasks here. Their files are read, never run."""
+"""Migration of configuration classes of legged_gym and its forks to tasks. Their files are parsed, never run."""

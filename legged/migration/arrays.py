@@ -1,4 +1,4 @@
-"""Arrays of numpy in files that are not run: lists whose arithmetic is numpy's, item by item."""
+"""NumPy arrays in files that are not run: lists with NumPy's element-wise arithmetic."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 
 MOST_ITEMS = 10_000
-"""Items of a list that an expression makes."""
+"""Largest number of items of a list that an expression makes."""
 NUMERIC = "biuf"
-"""Kinds of what arithmetic is done with: truths, integers, floats."""
+"""NumPy kinds of booleans, integers and floats, which arithmetic is defined for."""
 
 
 def _made(value: np.ndarray) -> Any:
-    """Return an array of numpy as one of these, and a number as Python's."""
+    """Return a NumPy array as an `Array`, and a NumPy number as a Python number."""
     items = value.tolist()
     return Array(items) if isinstance(items, list) else items
 
@@ -20,12 +20,12 @@ def _made(value: np.ndarray) -> Any:
 def _numeric(value: Any) -> np.ndarray:
     array = np.asarray(value)
     if array.dtype.kind not in NUMERIC:
-        raise TypeError("arithmetic with an array of something else than numbers")
+        raise TypeError("arithmetic with an array that holds other things than numbers")
     return array
 
 
 def _by_item(function: np.ufunc, swapped: bool = False) -> Callable[["Array", Any], Any]:
-    """Return the method of an operator between an array and what is on its other side."""
+    """Return the method of an operator between an array and its other operand."""
 
     def method(self: "Array", other: Any) -> Any:
         one, two = _numeric(self), _numeric(other)
@@ -38,18 +38,18 @@ def _by_item(function: np.ufunc, swapped: bool = False) -> Callable[["Array", An
 
 
 class Array(list[Any]):
-    """An array of numpy. To whoever does no arithmetic with it, it is a list of numbers, or of such lists."""
+    """A NumPy array as a list of numbers, or of nested lists; only its arithmetic is NumPy's."""
 
     def __init__(self, items: Iterable[Any]) -> None:
-        """Take the items; lists among them are rows."""
+        """Store the items; nested lists are rows."""
         super().__init__(Array(item) if isinstance(item, list | tuple) else item for item in items)
 
     def copy(self) -> "Array":
-        """Return an array of the same items."""
+        """Return an array with the same items."""
         return Array(self)
 
     def tolist(self) -> list[Any]:
-        """Return a list of Python's."""
+        """Return the items as Python lists."""
         return [item.tolist() if isinstance(item, Array) else item for item in self]
 
     def __getitem__(self, key: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Which classes of a file are meant: an environment's configuration, its learner's, and the name of the task."""
+"""Choice of the classes in a file: the environment's configuration, its learner's, and the name of the task."""
 
 import ast
 import re
@@ -26,12 +26,12 @@ SECTIONS = {
 }
 LEARNER_SECTIONS = {"policy", "algorithm", "runner"}
 PACKAGES_ABOVE = 5
-"""Folders above a file in whose __init__.py its task may be registered."""
+"""Number of folders above a file whose __init__.py may register its task."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What is migrated."""
+    """The classes and the task name to migrate."""
 
     task: str
     """Name of the task."""
@@ -50,11 +50,11 @@ class _Registration:
 
 
 def choose(tree: Tree, path: Path, asked: str | None) -> Choice:
-    """Return the classes that the file at `path` means; `asked` is a class of it, a task that is registered beside it, or how
-    the new task is to be called.
+    """Return the classes to migrate from the file at `path`. `asked` is a class of the file, a task registered next to it, or
+    the name of the new task.
 
     Raises:
-        ConfigError: the file has no configuration, or several of which none was asked for.
+        ConfigError: the file has no configuration, or several and `asked` chooses none of them.
     """
     module = tree.read(path)
     assert module is not None
@@ -105,7 +105,7 @@ def _has(cls: type, sections: set[str]) -> bool:
 
 
 def _learner(module: Module, environment: str) -> type | None:
-    """Return the learner's configuration that belongs to an environment's by its name, or is the only one."""
+    """Return the learner's configuration that belongs to an environment's by its name, or the only one."""
     classes = _classes(module)
     learners = {name: cls for name, cls in classes.items() if _has(cls, LEARNER_SECTIONS) and not _has(cls, SECTIONS)}
     for name in (f"{environment}PPO", environment.replace("Cfg", "CfgPPO"), environment.replace("Config", "ConfigPPO")):
@@ -115,7 +115,7 @@ def _learner(module: Module, environment: str) -> type | None:
 
 
 def _registrations(path: Path) -> list[_Registration]:
-    """Return what is registered in the file, and in the packages that it lies in."""
+    """Return the registrations in the file, and in the packages above it."""
     path = path.resolve()
     files = [path, *(folder / "__init__.py" for folder in list(path.parents)[:PACKAGES_ABOVE])]
     found: list[_Registration] = []
@@ -133,7 +133,7 @@ def _registrations(path: Path) -> list[_Registration]:
 
 
 def _registration(call: ast.Call) -> list[_Registration]:
-    """Return what a call `register("name", Env, EnvCfg(), LearnerCfg())` says, if it is one."""
+    """Return the content of a call `register("name", Env, EnvCfg(), LearnerCfg())`; empty for another call."""
     if len(call.args) < 3 or not isinstance(call.args[0], ast.Constant) or not isinstance(call.args[0].value, str):
         return []
     names = []
@@ -144,7 +144,7 @@ def _registration(call: ast.Call) -> list[_Registration]:
 
 
 def _snake(name: str) -> str:
-    """Return the name of a task for a class: 'GO2RoughCfg' -> 'go2_rough'."""
+    """Return a task name for a class: 'GO2RoughCfg' -> 'go2_rough'."""
     name = re.sub(r"(Cfg|Config)$", "", name) or name
     name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name)
     name = re.sub(r"(?<=[A-Z])(?=[A-Z][a-z])", "_", name)

@@ -1,4 +1,4 @@
-"""Values of Python expressions in files that are not run: literals, arithmetic, numbers of math and numpy, earlier names."""
+"""Evaluator of Python expressions in files that are not run: literals, arithmetic, members of math and numpy, known names."""
 
 import ast
 import math
@@ -10,15 +10,15 @@ from legged.migration.arrays import MOST_ITEMS, Array
 
 LARGEST_EXPONENT = 1000
 ROOT = "LEGGED_GYM_ROOT_DIR"
-"""Name of the folder that legged_gym lies in; unknown here, so it stays a name in braces."""
+"""Name of legged_gym's root folder. Its path is unknown here, so it stays a name in braces."""
 
 
 class CannotEvaluateError(Exception):
-    """An expression whose value cannot be told without running the file; the text says why."""
+    """An expression that has no value without running the file; the text states the reason."""
 
 
 class Numbers:
-    """The modules math and numpy, as far as configurations use them."""
+    """The members of math and numpy that configurations use."""
 
     VALUES = {"pi": math.pi, "e": math.e, "inf": math.inf, "tau": math.tau}
     ONE_TO_ONE = ("sqrt", "sin", "cos", "tan", "exp", "log", "floor", "ceil", "radians", "degrees", "fabs")
@@ -28,7 +28,7 @@ class Numbers:
         """Return a number, or a function of numbers.
 
         Raises:
-            CannotEvaluateError: it is another member of the modules.
+            CannotEvaluateError: the modules' member `name` is not supported.
         """
         if name in self.VALUES:
             return self.VALUES[name]
@@ -44,11 +44,11 @@ class Numbers:
         }
         if name in functions:
             return functions[name]
-        raise CannotEvaluateError(f"uses {name} of a library, which is not run")
+        raise CannotEvaluateError(f"uses {name} of a library; libraries are not run")
 
 
 def _array(value: Any, **_: Any) -> Any:
-    """Return an array of a list, and a number as it is."""
+    """Return an array for a list, and a number unchanged."""
     return Array(value) if isinstance(value, list | tuple) else value
 
 
@@ -138,7 +138,7 @@ COMPARE: dict[type, Callable[[Any, Any], bool]] = {
 
 
 class Evaluator:
-    """Evaluates expressions; `lookup` gives the value of a name, `member` that of `object.name`."""
+    """Evaluator of expressions; `lookup` returns the value of a name, `member` that of `object.name`."""
 
     def __init__(self, lookup: Callable[[str], Any], member: Callable[[Any, str], Any]) -> None:
         self._lookup, self._member = lookup, member
@@ -148,7 +148,7 @@ class Evaluator:
         """Return the value of an expression.
 
         Raises:
-            CannotEvaluateError: says why it has none here.
+            CannotEvaluateError: it has no value here; the text states the reason.
         """
         try:
             method = getattr(self, f"_{type(node).__name__.lower()}", None)
@@ -261,7 +261,7 @@ class Evaluator:
         return function(*self._items(node.args), **keywords)
 
     def _formatted(self, text: str, node: ast.Call) -> str:
-        """Return what `text.format(...)` makes. A folder that is not known here stays a name in braces."""
+        """Return the result of `text.format(...)`. A folder that is unknown here stays a name in braces."""
         named: dict[str, Any] = {}
         for word in node.keywords:
             if word.arg is None:
@@ -274,11 +274,11 @@ class Evaluator:
                 named[word.arg] = f"{{{word.arg}}}"
         given = self._items(node.args)
         if not all(isinstance(value, str | int | float) for value in (*given, *named.values())):
-            raise CannotEvaluateError("formats something else than texts and numbers")
+            raise CannotEvaluateError("formats other values than texts and numbers")
         return text.format(*given, **named)
 
     def _field(self, node: ast.Call) -> Any:
-        """Return the default of a dataclass's field."""
+        """Return the default of a dataclass field."""
         for word in node.keywords:
             if word.arg == "default":
                 return self(word.value)
@@ -296,7 +296,7 @@ class Evaluator:
         return {self(node.key): self(node.value) for _ in self._each(node.generators)}
 
     def _each(self, generators: list[ast.comprehension]) -> Any:
-        """Yield once for each turn of nested loops, with their names bound."""
+        """Yield once per iteration of nested loops, with their names bound."""
         if not generators:
             yield
             return

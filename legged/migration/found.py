@@ -1,11 +1,11 @@
-"""What was found in configuration files: values and classes, each with its place."""
+"""Values and classes found in configuration files, each with its place."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 MEMBER_OF = "__found_at__"
-"""Attribute of a class that was read: where it stands."""
+"""Attribute of a class that was read: its place."""
 
 
 @dataclass(frozen=True)
@@ -24,14 +24,14 @@ class Found:
     """A value that a class or a module sets."""
 
     value: Any
-    """What it is; None where it is not known."""
+    """The value; None if it is unknown."""
     place: Place
     why_unknown: str = ""
-    """Why it is not known; empty where it is."""
+    """Reason why the value is unknown; empty if it is known."""
 
 
 def members(owner: type) -> Iterator[tuple[str, Any]]:
-    """Yield what a class sets itself or inherits: name and `Found` or class, the bases' first."""
+    """Yield name and `Found` or class of each member of a class, inherited ones first."""
     merged: dict[str, Any] = {}
     for part in reversed(owner.__mro__[:-1]):
         merged.update({name: value for name, value in vars(part).items() if isinstance(value, Found | type)})
@@ -39,5 +39,5 @@ def members(owner: type) -> Iterator[tuple[str, Any]]:
 
 
 def place_of(owner: type) -> Place:
-    """Return where a class stands."""
+    """Return the place of a class definition."""
     return getattr(owner, MEMBER_OF, Place("legged_gym", 0))

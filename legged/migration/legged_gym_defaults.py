@@ -1,4 +1,4 @@
-"""What the configuration classes of legged_gym (v1.0.2) set, so that files which extend them can be read without it."""
+"""Values of legged_gym's configuration classes (v1.0.2), so that files which extend them can be read without legged_gym."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -155,7 +155,7 @@ ENVIRONMENT: dict[str, Any] = {
         },
     },
 }
-"""LeggedRobotCfg."""
+"""Values of LeggedRobotCfg."""
 
 LEARNING: dict[str, Any] = {
     "seed": 1,
@@ -194,7 +194,7 @@ LEARNING: dict[str, Any] = {
         "resume_path": None,
     },
 }
-"""LeggedRobotCfgPPO."""
+"""Values of LeggedRobotCfgPPO."""
 
 LEFT_OUT: dict[str, dict[str, Any]] = {
     "policy": {
@@ -218,11 +218,11 @@ LEFT_OUT: dict[str, dict[str, Any]] = {
         "max_grad_norm": 1.0,
     },
 }
-"""What rsl_rl (v1.0.2) takes where a section extends nothing and leaves a setting out."""
+"""Defaults of rsl_rl (v1.0.2) for settings that are missing in a section without base class."""
 
 
 def _angles(haa: float, front_hfe: float) -> dict[str, float]:
-    """Return ANYmal's default pose, whose hind legs mirror the front ones [rad]."""
+    """Return ANYmal's default pose, in which the hind legs mirror the front ones [rad]."""
     legs = (("LF", 1), ("LH", -1), ("RF", 1), ("RH", -1))
     joints = (("HAA", haa, False), ("HFE", front_hfe, True), ("KFE", -2.0 * front_hfe, True))
     return {f"{leg}_{joint}": angle * (sign if turns else 1) for joint, angle, turns in joints for leg, sign in legs}
@@ -284,12 +284,12 @@ KNOWN: dict[str, tuple[str, Mapping[str, Any]]] = {
     ),
     "A1RoughCfgPPO": ("LeggedRobotCfgPPO", {"runner": {"experiment_name": "rough_a1"}}),
 }
-"""Class -> the class that it extends, and what it sets over that one's."""
+"""Class -> its base class, and the values that it changes."""
 
 
 def known_class(name: str, made: dict[str, type]) -> type | None:
-    """Return a class of legged_gym by its name, with nested classes for sections; None for one that is not known here. Those
-    that were `made` before are taken from there.
+    """Return a class of legged_gym by its name, with nested classes for sections; None for an unknown name. Classes in `made`
+    are reused.
     """
     if name not in KNOWN:
         return None
@@ -302,7 +302,7 @@ def known_class(name: str, made: dict[str, type]) -> type | None:
 def _as_class(name: str, data: Mapping[str, Any], parent: Any, place: Place) -> type:
     own: dict[str, Any] = {MEMBER_OF: place}
     for key, value in data.items():
-        # A table of names is a value; what legged_gym has as a class in the class is a section.
+        # A table of names is a value; a nested class of legged_gym is a section.
         if isinstance(value, Mapping) and key not in ("default_joint_angles", "stiffness", "damping"):
             own[key] = _as_class(key, value, getattr(parent, key, None), place)
         else:

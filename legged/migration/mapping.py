@@ -1,4 +1,4 @@
-"""Configuration classes of legged_gym -> a task here."""
+"""Mapping of legged_gym's configuration classes to a task."""
 
 import difflib
 from collections.abc import Iterable, Mapping
@@ -25,9 +25,9 @@ from legged.migration.translation import DEFAULTS, Translation, flat, is_number
 from legged.terrain import TERRAIN_TYPES
 
 LONGEST_HISTORY = 20
-"""Steps of observations that are looked for."""
+"""Largest number of steps of an observation history that is tried."""
 BLIND_TERMS = STATE_TERMS[1:]
-"""The usual observations of a robot that does not know its velocity."""
+"""Usual observations of a robot that does not measure its velocity."""
 
 
 def map_settings(environment: type, learner: type | None) -> Translation:
@@ -36,7 +36,7 @@ def map_settings(environment: type, learner: type | None) -> Translation:
     learning = {} if learner is None else flat(learner)
     for section, values in LEFT_OUT.items():
         named = {path for path in learning if path.startswith(f"{section}.")}
-        if named:  # a section that extends nothing leaves the rest to rsl_rl
+        if named:  # a section without base class leaves missing settings to rsl_rl
             place = next(learning[path].place for path in sorted(named))
             learning |= {
                 f"{section}.{name}": Found(value, Place(f"rsl_rl's default; {place}", 0))
@@ -59,7 +59,7 @@ def map_settings(environment: type, learner: type | None) -> Translation:
 
 
 def _base_mass(result: Translation) -> None:
-    """Leave out the range of a mass that is not drawn."""
+    """Remove the range of the base's mass if the mass is not randomised."""
     drawn = result.settings.get("domain_rand.randomize_base_mass", False)
     if not drawn:
         result.settings.pop("domain_rand.added_mass_range", None)
@@ -90,7 +90,9 @@ def _terrain(result: Translation) -> None:
         shares = _shares(result, result.numbers("terrain.terrain_proportions", []))
     total = sum(shares.values())
     if not total:
-        result.put("terrain.proportions", {"flat": 1.0}, "terrain.terrain_proportions", "nothing of theirs has a type here")
+        result.put(
+            "terrain.proportions", {"flat": 1.0}, "terrain.terrain_proportions", "none of the file's types exists here"
+        )
         return
     comment = "" if abs(total - 1.0) < 1e-6 else f"theirs sum to {total:g}"
     columns = max(1, int(result.number("terrain.num_cols", 20)))
@@ -101,7 +103,7 @@ def _terrain(result: Translation) -> None:
 
 
 def _shares(result: Translation, proportions: list[Any]) -> dict[str, float]:
-    """Return terrain type -> share, of a list in legged_gym's order."""
+    """Return terrain type -> share, from a list in legged_gym's order."""
     shares: dict[str, float] = {}
     for share, types in zip(proportions, TERRAINS, strict=False):
         for name, part in types.items() if share > 0.0 else ():
@@ -110,13 +112,15 @@ def _shares(result: Translation, proportions: list[Any]) -> dict[str, float]:
     if more:
         result.lose(
             "terrain.terrain_proportions",
-            f"legged_gym has {len(TERRAINS)} types; what the entries after them mean is the fork's, and they are left out",
+            f"legged_gym has {len(TERRAINS)} types; later entries have a meaning of the fork's, and are left out",
         )
     return shares
 
 
 def _of_whole_columns(shares: dict[str, float], columns: int) -> tuple[dict[str, float], list[str]]:
-    """Return shares of at least one column each, rounded, and the types that were left out for it."""
+    """Return shares rounded to whole columns, at least one each, and the types that have less than one column and are left
+    out.
+    """
     out: list[str] = []
     while len(shares) > 1 and min(shares.values()) * columns < 1.0 - 1e-9:
         name = min(shares, key=lambda key: shares[key])
@@ -183,12 +187,15 @@ def _rewards(result: Translation) -> None:
             if found.value or ours in DEFAULTS["rewards"]["scales"]:
                 result.put(f"rewards.scales.{ours}", float(found.value or 0.0), path)
             if found.value and ours not in SAME_REWARDS:
-                result.lose(path, f"is ours of that name, whose formula may be another; yours is a method _reward_{name}")
+                result.lose(
+                    path,
+                    f"is the reward of that name here, whose formula may differ; for yours write a method _reward_{name}",
+                )
         elif found.value:
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
             hint = f"; the nearest is {near[0]}" if near else ""
             own = f"a method _reward_{name} and rewards.scales.{name}: {found.value}"
-            result.lose(path, f"no reward here is called so{hint}; write {own} (docs/migrating.md)")
+            result.lose(path, f"there is no reward of that name here{hint}; write {own} (docs/migrating.md)")
         result.done.add(path)
     for name in DEFAULTS["rewards"]["scales"]:
         if name not in {REWARDS.get(other, other) for other in scales}:
@@ -196,7 +203,7 @@ def _rewards(result: Translation) -> None:
 
 
 def _observations(result: Translation) -> None:
-    """Tell from the numbers of observations which terms they are."""
+    """Infer the observation terms from the number of observations."""
     joints = int(result.number("env.num_actions", 12))
     points = len(result.numbers("terrain.measured_points_x", [])) * len(result.numbers("terrain.measured_points_y", []))
     measured = bool(result.get("terrain.measure_heights", False)) and points > 0
@@ -210,7 +217,9 @@ def _observations(result: Translation) -> None:
 
 
 def _terms(result: Translation, number: Any, joints: int, points: int, theirs: str) -> tuple[list[str], int]:
-    """Return the usual terms that are so many numbers, and of how many steps; where none are, the most that fit in."""
+    """Return the usual terms with exactly this many numbers, and their number of steps; if no group has it, the largest group
+    that fits.
+    """
     groups = {12 + 3 * joints: list(STATE_TERMS), 9 + 3 * joints: list(BLIND_TERMS)}
     if points:
         groups = {size + points: [*terms, "heights"] for size, terms in groups.items()} | groups
@@ -238,7 +247,7 @@ def _group(result: Translation, group: str, terms: list[str], history: int, thei
 
 def _learning(result: Translation) -> None:
     result.take(OF_LEARNING)
-    if result.settings.get("train.runner.experiment_name") == "test":  # legged_gym's own default
+    if result.settings.get("train.runner.experiment_name") == "test":  # legged_gym's default
         del result.settings["train.runner.experiment_name"]
     kind = result.get("runner.policy_class_name", "ActorCritic")
     if "Recurrent" in str(kind):
@@ -264,11 +273,13 @@ RANDOM_MODEL = (
     ("gains", "damping_multiplier", ("d_gain",)),
     ("motor_offset", "motor_offset", ("joint_offset",)),
 )
-"""What forks draw of the model: randomize_<first> switches on <second>_range; and the properties here with that meaning."""
+"""Randomised properties of forks: randomize_<first> switches on <second>_range; the third is the property here with that
+meaning.
+"""
 
 
 def _random_model(result: Translation) -> None:
-    """Map what forks draw of the model, as far as it means the same; leave out what they have switched off."""
+    """Map the randomised properties of forks that have the same meaning here; leave out those that are switched off."""
     prefix = "domain_rand."
     mapped, waiting = set(), set()
     for name_of_switch, name, fields in RANDOM_MODEL:
@@ -280,7 +291,7 @@ def _random_model(result: Translation) -> None:
                 result.put(f"domain_rand.ranges.{field_of_model}", list(values), path)
         elif on is not False:
             waiting |= {switch, path} if on else {path}
-    # What is not known to be off, and means nothing that is known, is listed with the rest.
+    # Properties that may be switched on and have no meaning here are listed with the rest.
     result.done -= waiting - mapped - {entry.setting for entry in result.lost}
     angles = result.get(f"{prefix}initial_joint_pos_range")
     if result.get(f"{prefix}randomize_initial_joint_pos", False) and angles is not None:
@@ -291,7 +302,7 @@ def _random_model(result: Translation) -> None:
 
 
 def _rest(result: Translation) -> None:
-    """List what nobody has looked at, where their files set it."""
+    """List the settings of the file that no other function handled."""
     for path in [path for path in result.theirs if path not in result.done and path not in OF_THE_ROBOT]:
         if not result.given(path):
             continue
@@ -312,7 +323,7 @@ def _is_plain(value: Any) -> bool:
 
 
 def _near(path: str) -> str:
-    """Return a hint at the setting here whose name is nearest."""
+    """Return a hint at the setting with the nearest name."""
     names = {name.rpartition(".")[2]: name for name in _paths(DEFAULTS)}
     near = difflib.get_close_matches(path.rpartition(".")[2], names, n=1, cutoff=0.75)
     return f"; the nearest name is {names[near[0]]}" if near else ""

@@ -1,4 +1,4 @@
-"""Python files of a configuration tree as classes, without running them: their inheritance is Python's own."""
+"""Python files of a configuration tree as classes, without running them; inheritance works as in Python."""
 
 import ast
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ from legged.process.paths import exists, relative
 MOST_BYTES = 2_000_000
 NUMERIC = ("math", "numpy")
 EMPTY_BASES = ("object", "BaseConfig", "ABC", "PrefixProto", "ParamsProto", "Proto", "NamedTuple", "Enum")
-"""Bases that bring no settings."""
+"""Base classes without settings."""
 
 
 @dataclass(frozen=True)
 class _Import:
-    """A name that an import binds, looked up when it is used."""
+    """A name bound by an import, resolved when it is used."""
 
     module: str
     name: str
-    """Empty for the module itself."""
+    """Name in the module; empty for the module itself."""
     level: int
 
 
@@ -34,7 +34,7 @@ class Module:
         """Read the file at `path`.
 
         Raises:
-            ConfigError: it can't be read, or is no Python.
+            ConfigError: the file can't be read, or is not Python.
         """
         self.path, self.tree = path, tree
         self.names: dict[str, Any] = {}
@@ -46,14 +46,14 @@ class Module:
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             line = f":{error.lineno}" if isinstance(error, SyntaxError) and error.lineno else ""
             why = error.msg if isinstance(error, SyntaxError) else type(error).__name__
-            raise ConfigError(f"{relative(path)}{line}: is no Python file that can be read ({why})") from error
+            raise ConfigError(f"{relative(path)}{line}: is not a readable Python file ({why})") from error
         self._run(parsed.body, self.names)
 
     def get(self, name: str) -> Any:
-        """Return what a name means here: a `Found`, a class, a module, `Numbers`.
+        """Return the meaning of a name in this file: a `Found`, a class, a module, `Numbers`.
 
         Raises:
-            CannotEvaluateError: nothing that is known.
+            CannotEvaluateError: the name is unknown.
         """
         if name in self.names:
             bound = self.names[name]
@@ -99,7 +99,7 @@ class Module:
         if known is not None:
             return known
         where = "." * bound.level + bound.module
-        raise CannotEvaluateError(f"uses {bound.name or where} of {where}, which is no file of this tree")
+        raise CannotEvaluateError(f"uses {bound.name or where} of {where}, which is not a file of this tree")
 
     # ---- statements ------------------------------------------------------------------------------------------------------
 
@@ -107,7 +107,7 @@ class Module:
         return Place(relative(self.path), node.lineno)
 
     def _run(self, body: list[ast.stmt], scope: dict[str, Any]) -> None:
-        """Take in statements, in order; `scope` is the module's or a class's."""
+        """Read statements in order; `scope` is the module's or a class's."""
         for node in body:
             if isinstance(node, ast.ClassDef):
                 scope[node.name] = self._class(node, scope)
@@ -147,7 +147,7 @@ class Module:
             try:
                 base = self._evaluator(scope)(expression)
                 if not isinstance(base, type):
-                    raise CannotEvaluateError("is no class")
+                    raise CannotEvaluateError("is not a class")
                 bases.append(base)
             except CannotEvaluateError as error:
                 name = ast.unparse(expression).split(".")[-1].split("[")[0]
@@ -214,7 +214,7 @@ class Module:
         def lookup(name: str) -> Any:
             if name in scope and not isinstance(scope[name], _Import):
                 return value_of(scope[name])
-            return value_of(self.get(name))  # as in Python, a class's body does not see that of the class around it
+            return value_of(self.get(name))  # as in Python, a class body does not see the names of the class around it
 
         def member(owner: Any, name: str) -> Any:
             if isinstance(owner, Module):
@@ -229,17 +229,17 @@ class Module:
 
 
 class Tree:
-    """All files that a configuration is made of, each read once, when something of it is wanted."""
+    """All files of a configuration, each read once, when a name of it is needed."""
 
     def __init__(self) -> None:
         self._modules: dict[Path, Module | None] = {}
         self.notes: list[tuple[Place, str]] = []
-        """Statements that are not followed, and why."""
+        """Statements that are not supported, and the reasons."""
         self.built_in: dict[str, type] = {}
-        """Classes of legged_gym that no file of the tree has, as this package knows them."""
+        """Classes of legged_gym that no file of the tree defines, with the values known to this package."""
 
     def note(self, place: Place, text: str) -> None:
-        """Keep a statement that is not followed for the report."""
+        """Store an unsupported statement for the report."""
         self.notes.append((place, text))
 
     def read(self, path: Path) -> Module | None:
@@ -251,7 +251,7 @@ class Tree:
         return self._modules[path]
 
     def module(self, name: str, level: int, importer: Path) -> Module | None:
-        """Return the module that an import in the file `importer` means; None if it is no file of the tree."""
+        """Return the module that an import in the file `importer` names; None if it is not a file of the tree."""
         parts = [part for part in name.split(".") if part]
         if level:
             folders = [importer.parents[level - 1]] if level <= len(importer.parents) else []
@@ -266,7 +266,7 @@ class Tree:
 
 
 def _loaded(target: ast.expr) -> ast.expr:
-    """Return what an augmented assignment reads."""
+    """Return the expression that an augmented assignment reads."""
     return ast.parse(ast.unparse(target), mode="eval").body
 
 
@@ -276,5 +276,5 @@ def _text(path: Path) -> str:
     except OSError as error:
         raise ConfigError(f"{relative(path)}: cannot be read ({error.strerror or error})") from error
     if len(content) > MOST_BYTES:
-        raise ConfigError(f"{relative(path)}: is no configuration: it is larger than {MOST_BYTES:,} bytes")
+        raise ConfigError(f"{relative(path)}: is not a configuration: it is larger than {MOST_BYTES:,} bytes")
     return content.decode("utf-8-sig", errors="replace")

@@ -1,4 +1,4 @@
-"""What a configuration of legged_gym says of its robot -> control tables of a task, and entries of robot.yaml."""
+"""Robot settings of a legged_gym configuration -> control tables of a task, and entries of robot.yaml."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,20 +15,22 @@ POSE, POSITION, ROTATION = "init_state.default_joint_angles", "init_state.pos", 
 
 
 def asset_of(result: Translation) -> str:
-    """Return the file that a configuration has its robot from, without legged_gym's folder."""
+    """Return the path of the robot's file in a configuration, without legged_gym's folder."""
     file = str(result.get("asset.file", "") or "")
     return file.replace("{LEGGED_GYM_ROOT_DIR}/", "").replace("{LEGGED_GYM_ROOT_DIR}", "")
 
 
 def names_of(result: Translation) -> list[str]:
-    """Return what the robot may be called here: the actor's name, its file's, and the folder's above that."""
+    """Return possible names of the robot here: the actor's name, the file's, and the folder's above the file."""
     path = Path(asset_of(result))
     folders = [part for part in path.parts[:-1] if part not in ("resources", "robots", "urdf", "xml", "mjcf", "..", ".")]
     return [name for name in (str(result.get("asset.name", "")), path.stem, *folders[::-1]) if name]
 
 
 def map_robot(result: Translation, robot: Robot | None) -> dict[str, Any]:
-    """Put gains into the task, and return entries of robot.yaml: those that differ from `robot`'s, and without one, all."""
+    """Set the task's gains, and return entries of robot.yaml: those that differ from the entries of `robot`, or all without
+    one.
+    """
     entries: dict[str, Any] = {}
     if robot is None:
         _without_robot(result, entries)
@@ -40,12 +42,12 @@ def map_robot(result: Translation, robot: Robot | None) -> dict[str, Any]:
 
 
 def _has_network(result: Translation) -> bool:
-    """Return whether torques come from an actuator network, so that gains mean nothing."""
+    """Return True if torques come from an actuator network, so that gains have no meaning."""
     return bool(result.get("control.use_actuator_network", False))
 
 
 def _without_robot(result: Translation, entries: dict[str, Any]) -> None:
-    """Keep what can be said of a robot that is not here yet."""
+    """Fill the entries for a robot that does not exist here yet."""
     for name in ("stiffness", "damping"):
         table = result.table(f"control.{name}")
         if table and not _has_network(result):
@@ -62,14 +64,14 @@ def _without_robot(result: Translation, entries: dict[str, Any]) -> None:
 
 
 def _patterns(result: Translation, path: str) -> list[str]:
-    """Return parts of names; a fork may give one alone."""
+    """Return a list of name patterns; a fork may give a single one as text."""
     value = result.get(path)
     found = [value] if isinstance(value, str) else [str(item) for item in value] if isinstance(value, list | tuple) else []
     return [name for name in found if name and name != "None"]
 
 
 def _gains(result: Translation, robot: Robot) -> None:
-    """Put gains into the task where they are not the robot's, a number for each joint as legged_gym would find it."""
+    """Set the task's gains where they differ from the robot's, one value per joint by legged_gym's rule."""
     if _has_network(result):
         return
     for name in ("stiffness", "damping"):
@@ -94,7 +96,7 @@ def _gains(result: Translation, robot: Robot) -> None:
 
 
 def _last_match(table: dict[str, float], joint: str) -> float | None:
-    """Return the value of the last pattern that is part of a joint's name: legged_gym goes through all of them."""
+    """Return the value of the last pattern that is part of a joint's name, because legged_gym tries all in order."""
     found = None
     for pattern, value in table.items():
         if pattern in joint:
@@ -127,7 +129,7 @@ def _pose(result: Translation, robot: Robot, entries: dict[str, Any]) -> None:
 
 
 def _contacts(result: Translation, robot: Robot, entries: dict[str, Any]) -> None:
-    """Find the shapes that lists of bodies mean."""
+    """Find the shapes of the bodies in the contact lists."""
     bodies = _bodies_of_shapes(robot)
     for theirs, ours, indices in (
         (FOOT, "feet", robot.feet_indices),
@@ -142,7 +144,7 @@ def _contacts(result: Translation, robot: Robot, entries: dict[str, Any]) -> Non
         for pattern in patterns:
             named = [i for i, name in enumerate(robot.contact_names) if pattern in name]
             shapes = [i for i, body in enumerate(bodies) if pattern in body]
-            if ours != "feet":  # a foot on a shank is not the shank
+            if ours != "feet":  # the shape of a foot on a shank does not belong to the shank
                 shapes = [i for i in shapes if i not in robot.feet_indices]
             if not shapes and not named:
                 result.lose(theirs, f"'{pattern}' is part of no body or shape of {robot.name} that collides")
@@ -158,6 +160,6 @@ def _contacts(result: Translation, robot: Robot, entries: dict[str, Any]) -> Non
 
 
 def _bodies_of_shapes(robot: Robot) -> Sequence[str]:
-    """Return the body that each collision shape is on."""
+    """Return the body of each collision shape."""
     model = mujoco.MjModel.from_xml_path(str(robot.model_path))
     return [model.body(int(model.geom(name).bodyid[0])).name for name in robot.contact_names]

@@ -1,4 +1,4 @@
-"""Settings of legged_gym -> settings here: where each goes, and what it is there."""
+"""Settings of legged_gym -> settings here, with conversions of their values."""
 
 SAME: dict[str, str] = {
     "env.num_envs": "env.num_envs",
@@ -59,9 +59,9 @@ OF_TERRAIN: dict[str, str] = {
         "num_cols",
     )
 }
-"""The same, for ground that is no plane."""
+"""More such settings, for ground that is not a plane."""
 OF_HEIGHTS = {f"terrain.{name}": f"terrain.{name}" for name in ("measured_points_x", "measured_points_y")}
-"""The same, where heights are measured."""
+"""More such settings, if heights are measured."""
 
 OF_LEARNING: dict[str, str] = {
     "seed": "env.seed",
@@ -97,7 +97,7 @@ OF_RECURRENT = {
     "policy.rnn_hidden_size": "train.policy.rnn_hidden_dim",
     "policy.rnn_num_layers": "train.policy.rnn_num_layers",
 }
-"""The same, where `runner.policy_class_name` is recurrent."""
+"""More such settings, if `runner.policy_class_name` is recurrent."""
 
 TERRAINS: tuple[dict[str, float], ...] = (
     {"slope_up": 0.5, "slope_down": 0.5},
@@ -109,16 +109,16 @@ TERRAINS: tuple[dict[str, float], ...] = (
     {"gap": 1.0},
     {"pit": 1.0},
 )
-"""What each entry of `terrain_proportions` stands for: terrain type here -> its part of that entry."""
+"""Meaning of each entry of `terrain_proportions`: terrain type here -> its part of that entry."""
 
 REWARDS = {"feet_stumble": "stumble"}
-"""Scale of legged_gym whose reward has another name here (and there: the scale acts on no method)."""
+"""Reward of legged_gym -> its name here. In legged_gym the scale of that name has no method, so it has no effect."""
 SAME_REWARDS = {
     *("action_rate", "ang_vel_xy", "base_height", "collision", "dof_acc", "dof_pos_limits", "dof_vel", "dof_vel_limits"),
     *("feet_air_time", "feet_contact_forces", "lin_vel_z", "no_fly", "orientation", "stand_still", "stumble", "termination"),
     *("torque_limits", "torques", "tracking_ang_vel", "tracking_lin_vel"),
 }
-"""Rewards of legged_gym (v1.0.2) that are here; a fork's reward of another name is a formula of the fork's own."""
+"""Rewards of legged_gym (v1.0.2) that exist here; a reward of another name has a formula of the fork's own."""
 
 _DRAWING = "play.py and its window have a camera of their own"
 _PHYSX = "PhysX's own; the contact solver's settings here are sim.iterations, sim.cone, sim.impratio and the like"
@@ -162,13 +162,13 @@ ELSEWHERE: dict[str, str] = {
     "runner.checkpoint": _FLAGS,
     "runner.resume_path": _FLAGS,
 }
-"""Setting that no setting here takes the place of -> why."""
+"""Setting without counterpart here -> the reason."""
 SECTIONS_ELSEWHERE = {
     "viewer.": _DRAWING,
     "sim.physx.": _PHYSX,
     "domain_rand.": "domain_rand.ranges draws of the model what docs/randomisation.md lists",
 }
-"""The same, for all that begin so."""
+"""Sections without counterpart here -> the reason, for all settings whose path begins so."""
 
 OF_THE_ROBOT = (
     "init_state.pos",
@@ -183,4 +183,4 @@ OF_THE_ROBOT = (
     "asset.penalize_contacts_on",
     "asset.terminate_after_contacts_on",
 )
-"""What goes into robot.yaml, or into the task's control tables."""
+"""Settings that go into robot.yaml, or into the task's control tables."""

@@ -1,4 +1,4 @@
-"""A task that a configuration of legged_gym becomes: settings, what is said beside them, and what is lost."""
+"""A task made from a legged_gym configuration: settings, comments on them, and lost settings."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -16,14 +16,14 @@ from legged.migration.legged_gym_defaults import ENVIRONMENT, LEARNING
 
 DEFAULTS = to_dict(LeggedConfig())
 LARGEST_NUMBER = 1e12
-"""What nobody means who writes a larger one."""
+"""Largest number that a setting can plausibly have."""
 PI = 3.14
-"""What legged_gym writes for half a turn."""
+"""legged_gym's value for half a turn."""
 
 
 @dataclass(frozen=True)
 class Lost:
-    """A setting that has no place here, or another meaning."""
+    """A setting that has no counterpart here, or another meaning."""
 
     place: Place
     setting: str
@@ -36,7 +36,7 @@ class Lost:
 
 
 def flat(owner: type, prefix: str = "") -> dict[str, Found]:
-    """Return the settings of a configuration class and of the classes in it, by dotted path."""
+    """Return the settings of a configuration class and of its nested classes, by dotted path."""
     found: dict[str, Found] = {}
     for name, value in members(owner):
         if isinstance(value, Found):
@@ -51,17 +51,19 @@ class Translation:
     """The task that a configuration becomes."""
 
     theirs: dict[str, Found]
-    """Settings of the environment, and of the learner."""
+    """Settings of the environment and of the learner, by dotted path."""
     settings: dict[str, Any] = field(default_factory=dict)
     """Dotted path here -> value, where it differs from the default."""
     comments: dict[str, str] = field(default_factory=dict)
-    """Dotted path here -> what is said beside it."""
+    """Dotted path here -> comment."""
     lost: list[Lost] = field(default_factory=list)
     done: set[str] = field(default_factory=set)
-    """Settings of theirs that were looked at."""
+    """Dotted paths of the file's settings that were handled."""
 
     def get(self, path: str, default: Any = None) -> Any:
-        """Return one of their values, for what is made of several; `default` where it is not set or not known."""
+        """Return a value of the file; `default` if it is not set or unknown. For settings that are computed from several
+        values.
+        """
         self.done.add(path)
         found = self.theirs.get(path)
         if found is not None and found.why_unknown:
@@ -69,15 +71,15 @@ class Translation:
         return default if found is None or found.why_unknown else found.value
 
     def number(self, path: str, default: float) -> float:
-        """Return one of their values that must be a number."""
+        """Return a value of the file that must be a number."""
         return self._of_kind(path, default, is_number, "a number")
 
     def numbers(self, path: str, default: list[float]) -> list[float]:
-        """Return one of their values that must be a list of numbers."""
+        """Return a value of the file that must be a list of numbers."""
         return list(self._of_kind(path, default, _are_numbers, "a list of numbers"))
 
     def table(self, path: str) -> dict[str, float]:
-        """Return one of their values that must be a table of names and numbers."""
+        """Return a value of the file that must be a table of names and numbers."""
         found = self._of_kind(path, {}, _is_table, "names and their numbers")
         return {name: float(value) for name, value in found.items()}
 
@@ -89,7 +91,7 @@ class Translation:
         return value
 
     def given(self, path: str) -> bool:
-        """Return whether their files set it to something else than legged_gym does."""
+        """Return True if the file sets it to another value than legged_gym does."""
         found = self.theirs.get(path)
         if found is None:
             return False
@@ -97,7 +99,7 @@ class Translation:
         return bool(found.why_unknown) or plain(found.value) != plain(known)
 
     def lose(self, path: str, reason: str) -> None:
-        """List a setting of theirs as lost."""
+        """Record a setting of the file as lost."""
         self.done.add(path)
         found = self.theirs[path]
         if any(entry.setting == path and entry.place == found.place and entry.reason == reason for entry in self.lost):
@@ -105,7 +107,7 @@ class Translation:
         self.lost.append(Lost(found.place, path, "" if found.why_unknown else shown(found.value), reason))
 
     def put(self, path: str, value: Any, theirs: str, comment: str = "") -> None:
-        """Set `path` here, unless it is the default; a value that the schema refuses is lost."""
+        """Set `path` here, unless the value is the default; a value that the schema refuses is recorded as lost."""
         self.done.add(theirs)
         value = plain(value)
         try:
@@ -116,14 +118,14 @@ class Translation:
             return
         default = value_at(DEFAULTS, path)
         if _same(value, 1.0 if default is None and path.startswith("observations.scales.") else default):
-            self.settings.pop(path, None)  # what another name of theirs set before
+            self.settings.pop(path, None)  # remove the value from another setting of the file
             return
         self.settings[path] = value
         if comment:
             self.comments[path] = comment
 
     def take(self, table: Mapping[str, str]) -> None:
-        """Take over the settings of a table that are set."""
+        """Map the settings of a table that the file sets."""
         for theirs, ours in table.items():
             found = self.theirs.get(theirs)
             if found is None:
@@ -135,7 +137,7 @@ class Translation:
 
 
 def is_number(value: Any) -> bool:
-    """Return whether a value is a finite number, and no bool."""
+    """Return True if a value is a finite number and not a bool."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST_NUMBER
 
 
@@ -148,7 +150,7 @@ def _is_table(value: Any) -> bool:
 
 
 def plain(value: Any) -> Any:
-    """Return lists for tuples, and no negative zeros, so that values can be compared and written."""
+    """Return a value that can be compared and written: lists for tuples, no negative zeros."""
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     if isinstance(value, dict):
@@ -157,7 +159,7 @@ def plain(value: Any) -> Any:
 
 
 def _same(value: Any, default: Any) -> bool:
-    """Return whether a value is the default, half a turn being 3.14 in legged_gym."""
+    """Return True if a value is the default; half a turn is 3.14 in legged_gym."""
     if isinstance(value, list) and isinstance(default, list | tuple) and len(value) == len(default):
         return all(_same(a, b) for a, b in zip(value, default, strict=True))
     if isinstance(value, int | float) and isinstance(default, int | float) and not isinstance(value, bool):

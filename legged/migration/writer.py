@@ -1,4 +1,4 @@
-"""A task that was mapped -> YAML, with what is said beside its settings, and what is lost at its end."""
+"""YAML text of a mapped task, with comments on its settings and the lost settings at its end."""
 
 import dataclasses
 import textwrap
@@ -12,12 +12,12 @@ from legged.migration.translation import DEFAULTS, Lost
 WIDTH = 120
 FIRST = ("robot", "env", "terrain", "commands", "init_state", "control")
 ORDER = [*FIRST, *(field.name for field in dataclasses.fields(LeggedConfig) if field.name not in FIRST)]
-"""Sections of a task, as they are written."""
+"""Sections of a task, in the order of the file."""
 
 
 def task_yaml(head: Sequence[str], settings: Mapping[str, Any], comments: Mapping[str, str], lost: Sequence[Lost]) -> str:
-    """Return the file of a task: a head, whose lines are wrapped where they begin with no space, its sections, and what was
-    lost, as comments.
+    """Return the file of a task: a head, its sections, and the lost settings as comments. Lines of the head are wrapped
+    unless they begin with a space.
     """
     sections: dict[str, Any] = {}
     for path, value in settings.items():
@@ -33,14 +33,14 @@ def task_yaml(head: Sequence[str], settings: Mapping[str, Any], comments: Mappin
             lines.append("")
         lines += _lines(key, sections[key], key, comments, 0)
     if lost:
-        lines += ["", "# What of the configuration is not in this task:"]
+        lines += ["", "# Settings of the configuration that are not in this task:"]
         for entry in lost:
             lines += textwrap.wrap(str(entry), WIDTH, initial_indent="# - ", subsequent_indent="#   ")
     return "\n".join(lines) + "\n"
 
 
 def _in_order(section: Any, schema: Any) -> Any:
-    """Return a section whose settings are in the schema's order; those that it does not know come last."""
+    """Return a section with its settings in the schema's order; unknown ones come last."""
     if not isinstance(section, dict) or not isinstance(schema, dict):
         return section
     names = sorted(section, key=lambda name: [*schema, name].index(name))
@@ -70,7 +70,7 @@ def _lines(key: str, value: Any, path: str, comments: Mapping[str, str], indent:
 
 
 def _with_comment(line: str, comment: str, indent: int) -> Iterator[str]:
-    """Yield a line with its comment behind it, or before it where both are too long."""
+    """Yield a line with its comment behind it, or before it if both together are too long."""
     if len(line) + len(comment) > WIDTH and comment:
         yield f"{' ' * indent}{comment.strip()}"
         yield line

@@ -14,7 +14,7 @@ from legged.deploy.contract import CONTRACT_VERSION, need_of
 from legged.envs import BaseTask, LeggedRobot
 from legged.envs.marks import unit_of
 from legged.mdp.observations import ObservationTerm
-from legged.robots.crouch import crouch
+from legged.robots.crouched_pose import crouch
 
 LAWS = {
     "P": "stiffness * (action_scale * action + default_joint_angles - q) - damping * dq",

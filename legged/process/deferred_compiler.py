@@ -1,9 +1,9 @@
-"""torch's compiler, imported when somebody compiles and not before.
+"""Deferred import of torch's compiler, until a function is compiled.
 
-`torch._dynamo` and what it imports (sympy, torch._inductor, parts of torch.distributed) are a third of all modules of a
-training and a third of its start, and nothing here compiles. But it is imported in passing: tensordict marks some of its
-functions for it, torch's optimisers and dispatch modes switch it off around themselves. Until somebody wants more of it than
-that, a module stands in its place which notes these marks; then the real one is imported, and is given them.
+`torch._dynamo` and its imports (sympy, torch._inductor, parts of torch.distributed) are a third of all modules of a training
+and a third of its start-up time, and nothing here compiles. But other modules import it in passing: tensordict marks some of
+its functions for it, and torch's optimisers and dispatch modes switch it off around themselves. A stand-in module records
+these marks. At the first use of another member it imports the real module and passes the marks on.
 """
 
 import importlib
@@ -18,30 +18,32 @@ from typing import Any
 
 NAME = "torch._dynamo"
 KNOWN = ("2.13.",)
-"""Versions of torch whose use of its compiler the stand-in knows; under any other the real one is imported, as ever."""
+"""Versions of torch whose use of the compiler the stand-in supports; under any other version the real module is imported as
+usual.
+"""
 
 
 class DeferredCompiler(ModuleType):
-    """What stands in for `torch._dynamo`: the four functions that are called by code that does not compile. Anything else is
-    asked of the real one, and so is a module inside it.
+    """Stand-in for `torch._dynamo` with the four functions that are called by code that does not compile. Any other
+    attribute, and any submodule, comes from the real module.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Stand in for the package in `folder`."""
+        """Create the stand-in for the package in `folder`."""
         super().__init__(NAME, "A stand-in for torch's compiler.")
         spec = importlib.util.spec_from_file_location(NAME, folder / "__init__.py", submodule_search_locations=[str(folder)])
-        # Who looks through all modules, for a file for instance, shall not cause an import.
+        # Code that reads an attribute of all modules, such as the file, must not cause the import.
         self.__spec__, self.__file__, self.__path__ = spec, str(folder / "__init__.py"), [str(folder)]
         self.__package__ = NAME
         self._marks: list[tuple[str, Any]] = []
         self._not_disabled: list[Any] = []
 
     def allow_in_graph(self, function: Any) -> Any:
-        """Note that a function is to be traced as one piece."""
+        """Record that a function is to be traced as one piece."""
         return self._mark("allow_in_graph", function)
 
     def assume_constant_result(self, function: Any) -> Any:
-        """Note that a function gives the same in all calls."""
+        """Record that a function returns the same value in all calls."""
         return self._mark("assume_constant_result", function)
 
     def _mark(self, name: str, function: Any) -> Any:
@@ -51,8 +53,8 @@ class DeferredCompiler(ModuleType):
         return function
 
     def disable(self, function: Any = None, *args: Any, **kwargs: Any) -> Any:
-        """Leave a function as it is for torch's own wrapper, which asks when it is called first and keeps what it is given;
-        nobody else is served before the compiler is there.
+        """Return the function unchanged to torch's own wrapper, which asks at its first call and keeps the result. For any
+        other caller the real module answers.
         """
         if self.stands and sys._getframe(1).f_globals.get("__name__") == "torch._compile":
             self._not_disabled.append(function)
@@ -60,7 +62,7 @@ class DeferredCompiler(ModuleType):
         return self.real().disable(function, *args, **kwargs)
 
     def graph_break(self, *args: Any, **kwargs: Any) -> None:
-        """Do nothing: outside of what is being compiled, the real one does nothing either."""
+        """Do nothing, as the real function outside of compiled code."""
         if not self.stands:
             self.real().graph_break(*args, **kwargs)
 
@@ -70,7 +72,7 @@ class DeferredCompiler(ModuleType):
         return getattr(self.real(), name)
 
     def real(self) -> ModuleType:
-        """Return the real module, imported by the first who asks, and told of the marks."""
+        """Return the real module; the first call imports it and passes the recorded marks on."""
         if not self.stands:
             return importlib.import_module(NAME)
         del sys.modules[NAME]
@@ -83,18 +85,18 @@ class DeferredCompiler(ModuleType):
 
     @property
     def stands(self) -> bool:
-        """Whether nobody has wanted the real module yet."""
+        """True until the real module is imported."""
         return sys.modules.get(NAME) is self
 
 
 class _Submodules:
-    """Finds the modules inside the compiler by importing it first, which imports most of them."""
+    """Finder of the compiler's submodules, which imports the compiler first, since that imports most of them."""
 
     def __init__(self, stand_in: DeferredCompiler) -> None:
         self._stand_in = stand_in
 
     def find_spec(self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
-        """Find a module that has just been imported in passing; all others are left to Python."""
+        """Return the spec of a submodule that the compiler's import has just loaded; None for all others."""
         if not self._stand_in.stands or not name.startswith(f"{NAME}."):
             return None
         self._stand_in.real()
@@ -103,7 +105,7 @@ class _Submodules:
 
 
 class _Imported:
-    """Gives Python a module that there is, in place of a second one."""
+    """Loader that gives Python an already imported module in place of a second copy."""
 
     def __init__(self, module: ModuleType) -> None:
         self._module, self._spec = module, module.__spec__
@@ -116,8 +118,8 @@ class _Imported:
 
 
 def defer_compiler() -> None:
-    """Put the stand-in where the compiler would be, unless it or torch has been imported, or torch is missing or of a version
-    that is not known.
+    """Install the stand-in for the compiler, unless the compiler or torch is already imported, or torch is missing or of an
+    unknown version.
     """
     torch = importlib.util.find_spec("torch") if "torch" not in sys.modules else None
     if torch is None or torch.origin is None or NAME in sys.modules or not _version().startswith(KNOWN):
@@ -128,7 +130,7 @@ def defer_compiler() -> None:
 
 
 def _version() -> str:
-    """Return the version of torch that is installed, without importing it; nothing if its package does not say."""
+    """Return the version of the installed torch without importing it; empty if its package does not state one."""
     try:
         return importlib.metadata.version("torch")
     except importlib.metadata.PackageNotFoundError:

@@ -1,4 +1,6 @@
-"""Imported before MuJoCo: on a Linux machine without a display it must be told how to render, if it can at all."""
+"""Choice of MuJoCo's library for drawing on a Linux machine without a display; imported before MuJoCo, which reads it at
+import.
+"""
 
 import ctypes
 import ctypes.util
@@ -12,9 +14,9 @@ from legged.errors import ConfigError, suggest
 from legged.process.startup import command_of_ours
 
 NO_PICTURES = ""
-"""Why nothing can be drawn in this process, once MuJoCo was found not to draw by the library that MUJOCO_GL names."""
+"""Reason why nothing can be drawn in this process, if MuJoCo failed to draw with the library that MUJOCO_GL names."""
 ANSWER_S = 0.5
-"""A display that does not answer for so long is taken for gone [s]."""
+"""Time after which a display that does not answer counts as missing [s]."""
 OFF = ("disable", "disabled", "off", "false", "0")
 ALLOWED = ("egl", "osmesa", "glfw", "glx") if sys.platform == "linux" else ("cgl", "glfw", "wgl")
 """Values of MUJOCO_GL; `OFF` and words for on are allowed too."""
@@ -24,7 +26,7 @@ ON = ("", "enable", "enabled", "on", "true", "1")
 
 
 def display_answers() -> bool:
-    """Return whether there is a display on this machine that takes connections; DISPLAY may name one that has gone."""
+    """Return True if a display of this machine accepts connections; DISPLAY may name one that no longer exists."""
     if sys.platform != "linux":
         return True
     wayland = os.environ.get("WAYLAND_DISPLAY")
@@ -36,8 +38,8 @@ def display_answers() -> bool:
 
 
 def _x_answers(name: str) -> bool:
-    """Return whether an X server listens at a display's name, 'host:number.screen'; no host or 'unix' is this machine."""
-    if name.startswith("/"):  # a socket by its path, as on macOS
+    """Return True if an X server listens at a display's name, 'host:number.screen'; no host or 'unix' is this machine."""
+    if name.startswith("/"):  # the path of a socket, as on macOS
         return _connects(socket.AF_UNIX, name) or _connects(socket.AF_UNIX, name.rpartition(".")[0])
     match = re.fullmatch(r"(?:[a-z]+/)?(.*):(\d+)(?:\.\d+)?", name)
     if match is None:
@@ -50,7 +52,7 @@ def _x_answers(name: str) -> bool:
 
 
 def _connects(family: socket.AddressFamily, address: str | tuple[str, int]) -> bool:
-    """Return whether something takes a connection there."""
+    """Return True if a server accepts a connection at the address."""
     try:
         if isinstance(address, tuple):
             socket.create_connection(address, timeout=ANSWER_S).close()
@@ -64,9 +66,9 @@ def _connects(family: socket.AddressFamily, address: str | tuple[str, int]) -> b
 
 
 def off_screen_library() -> str | None:
-    """Return the value of MUJOCO_GL that works here: 'egl', 'osmesa' or none.
+    """Return the value of MUJOCO_GL that works on this machine: 'egl' or 'osmesa'; None if neither does.
 
-    MuJoCo fails at import if it names a library that is missing, so a machine that only trains must not set it.
+    MuJoCo fails at import if MUJOCO_GL names a missing library, so a machine that only trains must not set it.
     """
     for name, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
         path = ctypes.util.find_library(library)
@@ -81,11 +83,11 @@ def off_screen_library() -> str | None:
 
 
 def choose() -> None:
-    """Set MUJOCO_GL where there is no display, if the user has not; check it, if the user has. MuJoCo cannot be imported
-    under a library that is missing: then pictures are off, and a line says so, because most commands draw nothing.
+    """Set MUJOCO_GL on a machine without a display, unless the user has set it; check the user's value. MuJoCo cannot be
+    imported with a missing library. Then pictures are switched off with a warning, because most commands draw nothing.
 
     Raises:
-        ConfigError: MUJOCO_GL has a value that MuJoCo does not know.
+        ConfigError: MuJoCo does not know the value of MUJOCO_GL.
     """
     global NO_PICTURES
     given = os.environ.get("MUJOCO_GL")
@@ -100,7 +102,7 @@ def choose() -> None:
     try:
         context = import_module(CONTEXT)
         if value not in OFF and context.GLContext.__module__ == CONTEXT:
-            context.GLContext()  # MuJoCo's placeholder for a library that is missing: it says which
+            context.GLContext()  # MuJoCo's placeholder for a missing library raises an error that names it
     except Exception as error:  # each library fails in its own way
         if isinstance(error, ModuleNotFoundError) and error.name == "mujoco":
             return  # a robot's computer, which draws nothing
@@ -110,14 +112,14 @@ def choose() -> None:
 
 
 def _does_not_work(given: str, error: Exception) -> str:
-    """Say that MuJoCo does not draw by the library that was asked for, why, and which one is there."""
+    """Return the message that MuJoCo does not draw with the requested library, with the reason and a library that works."""
     works = off_screen_library()
     instead = f"{works} may" if works and works != given.lower().strip() else "no other library for drawing was found"
     return f"MUJOCO_GL: '{given}' does not work on this machine ({' '.join(str(error).split())}); {instead}"
 
 
 HEADLESS = not display_answers()
-"""Whether no window can be opened."""
+"""True if no window can be opened."""
 
 try:
     choose()

@@ -1,4 +1,6 @@
-"""Trainings that share a device: each holds a lock that the others see, so that its times can say how many there were."""
+"""Counting of trainings that share a device: each holds a file lock that the others see, so that its report can state their
+number.
+"""
 
 import contextlib
 import os
@@ -10,32 +12,32 @@ from typing import IO
 from filelock import lock_descriptor
 
 FOLDER = "legged-trainings"
-"""Folder in the machine's one for temporary files: in it one for each device, in that a file for each training."""
+"""Folder in the machine's temporary folder; it has one folder for each device, with one file for each training."""
 ENDING = ".training"
 TURN = "looking"
-"""File that a process locks while it looks: the locks that it tries then would be taken for those of trainings."""
+"""File that a process locks while it counts; otherwise its attempts on the locks would look like trainings."""
 PAUSE_S = 1.0
-"""How much time lies between two looks during a training [s]."""
+"""Least interval between two counts during a training [s]."""
 
 
 class Neighbours:
-    """The other trainings on one device, of any user and started in any way; a context in which this one is among them.
+    """The other trainings on one device, of any user and however started; a context in which this training is one of them.
 
     A lock ends with the process that holds it, however that ends. Trainings of another machine, or of a container with
-    temporary files of its own, are not seen.
+    separate temporary files, are not seen.
     """
 
     def __init__(self, device: str) -> None:
-        """`device` is its name among all of the machine's, whatever numbers processes give them: such as a GPU's UUID."""
+        """`device` is its unique name on the machine, such as a GPU's UUID, whatever numbers processes give to devices."""
         self.most = 0
-        """The most others that were seen at one time."""
+        """Largest number of others seen at one time."""
         self._folder = Path(tempfile.gettempdir()) / FOLDER / device
         self._path: Path | None = None
         self._lock: IO[bytes] | None = None
         self._looked_s = 0.0
 
     def __enter__(self) -> "Neighbours":
-        with contextlib.suppress(OSError):  # where nobody may write, others do not see this one
+        with contextlib.suppress(OSError):  # in a folder that can't be written, others do not see this training
             self._join()
         self.look()
         return self
@@ -50,22 +52,22 @@ class Neighbours:
         for folder in (self._folder.parent, self._folder):
             with contextlib.suppress(FileExistsError):
                 folder.mkdir()
-                folder.chmod(0o1777)  # for every user, as the folder around it is
+                folder.chmod(0o1777)  # for every user, as the folder around it
         if not (self._folder / TURN).exists():
             (self._folder / TURN).touch(0o644)
         descriptor, name = tempfile.mkstemp(prefix=f"{os.getpid()}.", dir=self._folder)
         self._lock = os.fdopen(descriptor, "wb")
         os.chmod(name, 0o644)
         lock_descriptor(descriptor, blocking=False)
-        self._path = Path(name).rename(f"{name}{ENDING}")  # locked before another process looks at it
+        self._path = Path(name).rename(f"{name}{ENDING}")  # locked before another process sees it
 
     def glance(self) -> None:
-        """Look, unless that was done a moment ago."""
+        """Count the others, unless the last count was a moment ago."""
         if time.monotonic() - self._looked_s >= PAUSE_S:
             self.look()
 
     def look(self) -> None:
-        """Count the others, and remove what trainings that were killed have left; not while another process does so."""
+        """Count the others, and delete the files of trainings that were killed. Only one process does so at a time."""
         self._looked_s = time.monotonic()
         with contextlib.suppress(OSError), (self._folder / TURN).open("rb") as turn:
             if lock_descriptor(turn.fileno(), blocking=False):
@@ -76,7 +78,7 @@ class Neighbours:
 
 
 def _is_of_a_training(path: Path) -> bool:
-    """Return whether a process holds a file's lock; remove the file if no process does."""
+    """Return True if a process holds a file's lock; delete the file otherwise."""
     with contextlib.suppress(OSError), path.open("rb") as file:
         if not lock_descriptor(file.fileno(), blocking=False):
             return True

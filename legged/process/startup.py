@@ -19,9 +19,9 @@ STARTED_S = time.perf_counter()
 INTERRUPTED = 128 + signal.SIGINT
 """Exit code of a command that Ctrl-C ended."""
 
-# By default, a thread of torch that waits for others spins. If anything else runs on the machine, it then takes the core from
-# the very thread for which it waits, and updates take ten to a hundred times as long. torch reads this variable once, when it
-# is first imported.
+# A waiting thread of torch spins by default. If anything else runs on the machine, it then takes the core from the very
+# thread for which it waits, and updates take ten to a hundred times as long. torch reads this variable once, when it is first
+# imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 # rsl-rl imports GitPython, which prints a long warning where git is missing. This package calls git itself.

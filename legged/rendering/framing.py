@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from legged.robots.importing.adapted import robot_spec_of
+from legged.robots.importing.convert import robot_spec_of
 from legged.robots.robot import Robot
 from legged.terrain import HeightMap
 

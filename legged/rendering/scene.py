@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from legged.physics.scene.terrain_geoms import SAME, add_terrain
-from legged.robots.importing.adapted import robot_spec_of
+from legged.robots.importing.convert import robot_spec_of
 from legged.robots.robot import Robot
 from legged.terrain import Terrain
 

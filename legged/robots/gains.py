@@ -1,11 +1,15 @@
-"""Gains of a robot that states none: from the inertia that each joint sees, and from the weight that it carries.
+"""Rule for the gains of a robot whose file states none: from the inertia that each joint sees, and the weight that it
+carries.
 
-Two inertias matter. With the robot in the air a joint moves what hangs on it, against the rest; with its feet on the ground
-the same joint moves the base as well. P gains come from the first, at a natural frequency that is the same for all robots in
-units of their own time sqrt(h / g), but so that no joint gives way under the robot's weight; D gains come from the geometric
-mean of both, at one damping ratio. Both are kept so small that an explicit control law is stable at steps of 5 ms. For ANYmal
-C and Go2 this gives their makers' P gains within a factor of two, and D gains that are 0.7 to 2.4 and 1.9 to 3.7 times
-theirs.
+Two inertias matter. With the robot in the air, a joint moves the links behind it against the rest of the robot. With the feet
+on the ground, the same joint moves the base as well.
+
+P gains come from the first inertia, at a natural frequency that is the same for all robots in units of their own time sqrt(h
+/ g). They are raised until no joint gives way under the robot's weight. D gains come from the geometric mean of both
+inertias, at one damping ratio. Both gains are limited so that an explicit control law is stable at steps of 5 ms.
+
+For ANYmal C and Go2 the rule gives the makers' P gains within a factor of two, and D gains that are 0.7 to 2.4 and 1.9 to 3.7
+times the makers'.
 """
 
 from collections.abc import Sequence
@@ -18,18 +22,19 @@ FREQUENCY = 6.0
 RATIO = 0.5
 """Damping ratio [1]."""
 SAG = 0.25
-"""How far a joint may give way under the robot's weight [rad]."""
+"""Largest deflection of a joint under the robot's weight [rad]."""
 SHIFT = 0.1
-"""Least P gain of a leg's joint, in units of m g h: with less, an ankle could not shift the robot's weight [1/rad]."""
+"""Least P gain of a leg's joint, in units of m g h; with a smaller one, an ankle could not shift the robot's weight [1/rad].
+"""
 LARGEST_TARGET = 0.3
-"""A target this far away must not ask for more than the motor's whole effort [rad]."""
+"""Target offset at which a joint demands its motor's whole effort [rad]; smaller offsets demand less."""
 TIME_STEP = 0.005
 """Physics step in which an explicit control law has to be stable [s]."""
 MARGIN = 1.0
 """Largest eigenvalue of TIME_STEP M^-1 D and of TIME_STEP^2 M^-1 K; from 2 on the explicit law diverges."""
 
 VELOCITY_LIMIT = 30.0
-"""Largest speed of the joints of a robot that states none, as geared motors of legged robots have it [rad/s]."""
+"""Largest joint speed of a robot whose file states none, typical of geared motors of legged robots [rad/s]."""
 
 
 def gains(
@@ -37,8 +42,8 @@ def gains(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return stiffness [N m/rad] and damping [N m s/rad] (D,) of the hinges `joints` (ids).
 
-    `qpos` is the pose in which the robot stands, `feet` are the shapes (ids) that it stands on, `effort` (D,) the limits of
-    its motors [N m], and `height` is that of its base above the ground [m].
+    `qpos` is the pose in which the robot stands, `feet` are the shapes (ids) that it stands on, `effort` (D,) the motors'
+    torque limits [N m], and `height` the base's height above the ground [m].
     """
     data, inverse = _inverse_inertia(model, qpos)
     dofs = model.jnt_dofadr[list(joints)]
@@ -52,7 +57,7 @@ def gains(
     leg = np.abs(jacobian[:, dofs]).max(axis=0) > 0.0
     least = np.maximum(weight / SAG, SHIFT * model.body_mass.sum() * gravity * height * leg)
     stiffness = np.minimum(np.maximum(in_air * FREQUENCY**2 * gravity / height, least), effort / LARGEST_TARGET)
-    # By Gershgorin's circles no eigenvalue of TIME_STEP^2 M^-1 K is larger: what is light, as toes are, is held more softly.
+    # By Gershgorin's circles no eigenvalue of TIME_STEP^2 M^-1 K is larger; light links, such as toes, get smaller gains.
     stiffness = np.minimum(stiffness, MARGIN / (TIME_STEP**2 * np.abs(inverse[np.ix_(dofs, dofs)]).sum(axis=0)))
     damping = 2.0 * RATIO * np.sqrt(stiffness * np.sqrt(in_air * on_feet))
     damping = np.minimum(damping, MARGIN * in_air / TIME_STEP)
@@ -62,15 +67,15 @@ def gains(
 
 def inertia_in_air(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int]) -> np.ndarray:
     """Return the inertia (D,) that the motor of each of the hinges `joints` (ids) turns with the robot in the air in the pose
-    `qpos`, where all other joints move freely [kg m^2].
+    `qpos` [kg m^2]. All other joints move freely.
     """
     dofs = model.jnt_dofadr[list(joints)]
     return np.asarray(1.0 / _inverse_inertia(model, qpos)[1][dofs, dofs])
 
 
 def standing_torques(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int], feet: Sequence[int]) -> np.ndarray:
-    """Return the torques (D,) of the hinges `joints` (ids) that hold the robot at rest in the pose `qpos` [N m], where its
-    `feet`, shapes (ids), carry the base with the smallest forces that do.
+    """Return the torques (D,) of the hinges `joints` (ids) that hold the robot at rest in the pose `qpos` [N m]. The shapes
+    `feet` (ids) carry the base with the smallest sufficient forces.
     """
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
@@ -80,7 +85,7 @@ def standing_torques(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[i
 
 
 def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Return the joint-space inertia, (V, V) for V degrees of freedom, of a state whose positions were computed."""
+    """Return the joint-space inertia (V, V), for V degrees of freedom, of a state whose positions are computed."""
     columns = np.zeros((model.nv, model.nv))
     for i, unit in enumerate(np.eye(model.nv)):
         mujoco.mj_mulM(model, data, columns[i], unit)
@@ -88,7 +93,7 @@ def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 
 def _inverse_inertia(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[mujoco.MjData, np.ndarray]:
-    """Return the state at rest in the pose `qpos`, and the inverse of its joint-space inertia, (V, V)."""
+    """Return the state at rest in the pose `qpos`, and the inverse (V, V) of its joint-space inertia."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
@@ -96,13 +101,15 @@ def _inverse_inertia(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[mujoco.Mj
 
 
 def _jacobian(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
-    """Return (3, V) how the centre of a shape moves with the joints."""
+    """Return the Jacobian (3, V) of the centre of a shape."""
     found = np.zeros((3, model.nv))
     mujoco.mj_jac(model, data, found, None, data.geom_xpos[geom], model.geom_bodyid[geom])
     return found
 
 
 def _static_torques(data: mujoco.MjData, jacobian: np.ndarray) -> np.ndarray:
-    """Return (V,) the forces that hold the robot at rest, where feet carry the base with the smallest forces that do."""
+    """Return the generalised forces (V,) that hold the robot at rest, with the smallest forces of the feet that carry the
+    base.
+    """
     forces = np.linalg.lstsq(jacobian[:, :6].T, data.qfrc_bias[:6], rcond=None)[0]
     return np.asarray(data.qfrc_bias - jacobian.T @ forces)

@@ -1,4 +1,4 @@
-"""The left-right symmetry of a robot, found in its model."""
+"""Left-right symmetry of a robot, found in its model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,31 +9,33 @@ import numpy as np
 FLIP = np.array([1.0, -1.0, 1.0])
 """Reflection in the base's xz plane."""
 APART = 0.01
-"""How far a joint or foot may be from where its partner is mirrored to [m]."""
+"""Largest distance of a joint or foot from the mirror image of its partner [m]."""
 TURNED = 0.01
-"""How far the angle of a joint may be from that of its partner in the mirror [rad]."""
+"""Largest difference between a joint's angle and the mirrored angle of its partner [rad]."""
 
 
 @dataclass(frozen=True)
 class Mirror:
-    """Partners on the other side, of D joints and F feet; what lies in the middle is its own partner."""
+    """Left and right partners of D joints and F feet; a joint or foot in the middle is its own partner."""
 
     joints: tuple[int, ...]
-    """(D,) for each joint, the one whose angle it takes over in the mirrored robot."""
+    """(D,) for each joint, the joint whose angle it takes in the mirrored robot."""
     signs: tuple[float, ...]
-    """(D,) 1 or -1: that angle's sign."""
+    """(D,) sign of that angle, 1 or -1."""
     feet: tuple[int, ...]
-    """(F,) for each foot, the one whose place it takes over."""
+    """(F,) for each foot, the foot whose place it takes."""
     passive: tuple[int, ...] = ()
-    """(P,) and (P,) signs: the same of passive hinges and slides; both empty if some have no partner."""
+    """(P,) partners of passive hinges and slides, and (P,) their signs; both empty if some have no partner."""
     passive_signs: tuple[float, ...] = ()
 
     @classmethod
     def of(
         cls, model: mujoco.MjModel, joints: Sequence[int], feet: Sequence[Sequence[str]], passive: Sequence[int] = ()
     ) -> "Mirror | None":
-        """Return the symmetry of a robot with the hinges `joints`, `feet` of those shapes, and the hinges and slides
-        `passive` (ids), by where they are at zero angles; None if some joints or feet have no partner.
+        """Return the symmetry of a robot, found from the positions of its parts at zero angles.
+
+        The robot has the hinges `joints` (ids), feet that consist of the shapes `feet`, and the passive hinges and slides
+        `passive` (ids). Return None if some joints or feet have no partner.
         """
         data = mujoco.MjData(model)
         data.qpos[:] = 0.0
@@ -49,8 +51,8 @@ class Mirror:
         return cls(tuple(partners), signs, tuple(foot_partners), tuple(others or ()), their_signs)
 
     def uneven_joint(self, angles: np.ndarray) -> int | None:
-        """Return the first joint whose angle is not that of its partner seen in the mirror, of `angles` (D,) [rad]; None if
-        the pose is its own mirror image.
+        """Return the first joint whose angle differs from the mirrored angle of its partner, given `angles` (D,) [rad]; None
+        if the pose is its own mirror image.
         """
         image = np.asarray(self.signs) * angles[list(self.joints)]
         apart = np.flatnonzero(np.abs(image - angles) > TURNED)
@@ -60,20 +62,22 @@ class Mirror:
 def _joint_partners(
     model: mujoco.MjModel, data: mujoco.MjData, joints: Sequence[int]
 ) -> tuple[list[int] | None, tuple[float, ...]]:
-    """Return for each hinge or slide the one that lies where it is mirrored to, and the signs; None if one has none."""
+    """Return the partner and the sign of each hinge or slide; None if one has no partner."""
     anchors, axes = data.xanchor[list(joints)], data.xaxis[list(joints)]
-    # Joints of a hip may share a point; a reflection keeps the sizes of an axis' components, which tells them apart.
+    # Joints of a hip may share a point; a reflection keeps the absolute values of an axis' components, which tells them
+    # apart.
     partners = _partners(np.hstack([anchors, np.abs(axes)]), np.hstack([anchors * FLIP, np.abs(axes)]))
     if partners is None:
         return None, ()
-    # A hinge's axis is a pseudo-vector: the reflection keeps its y and turns x and z around; a slide's is none.
+    # A hinge's axis is a pseudo-vector: the reflection keeps its y and reverses x and z. A slide's axis is an ordinary
+    # vector.
     hinge = model.jnt_type[list(joints)] == mujoco.mjtJoint.mjJNT_HINGE
     signs = np.sign((np.where(hinge[:, None], -FLIP, FLIP) * axes * axes[partners]).sum(axis=1))
     return partners, tuple(float(sign) for sign in signs)
 
 
 def _partners(places: np.ndarray, reflected: np.ndarray) -> list[int] | None:
-    """Return for each row of `places` the row of `reflected` that lies there; None if one has none."""
+    """Return for each row of `places` the nearest row of `reflected`; None if one is farther than APART from all."""
     distance = np.linalg.norm(places[:, None] - reflected[None], axis=2)
     if distance.size == 0 or (distance.min(axis=1) > APART).any():
         return None

@@ -1,4 +1,4 @@
-"""Joints that no motor drives: where springs and closed loops put them, for given angles of the joints that have one."""
+"""Joints without a motor: their positions under springs and closed loops, for given angles of the driven joints."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,22 +9,24 @@ import numpy as np
 from legged.errors import ConfigError
 
 STEPS = 8
-"""Parts in which driven joints are moved, so that loops are never far from closed."""
+"""Number of steps in which driven joints are moved, so that loops stay nearly closed."""
 ITERATIONS = 30
-"""Newton's method per part."""
+"""Iterations of Newton's method in each step."""
 LARGEST_STEP = 0.3
-"""Of a coordinate in one iteration [rad] or [m]."""
+"""Largest change of a coordinate in one iteration [rad] or [m]."""
 CLOSED = 1e-6
-"""How far a closed loop may be open [m] or [rad]."""
+"""Largest error of a closed loop [m] or [rad]."""
 LEAST_STIFFNESS = 1e-3
-"""Of joints without a spring, as a share of the stiffest: they stay near where they were, if nothing says otherwise."""
+"""Stiffness of joints without a spring, as a share of the stiffest spring's; it keeps them near their place if no loop moves
+them.
+"""
 TRIES = 20
-"""Poses tried for each that is wanted."""
+"""Number of poses drawn for each pose that is needed."""
 
 
 @dataclass(frozen=True)
 class PassiveJoints:
-    """The passive joints of a robot with D driven ones; P of them are hinges and slides, the others balls."""
+    """Passive joints of a robot with D driven joints; P of them are hinges and slides, the others are balls."""
 
     model: mujoco.MjModel
     driven: tuple[int, ...]
@@ -34,12 +36,12 @@ class PassiveJoints:
     names: tuple[str, ...]
     """(P,) their names."""
     qpos_columns: tuple[int, ...]
-    """(P,) where they are in the generalised positions; `qvel_columns` in the velocities."""
+    """(P,) columns in the generalised positions; `qvel_columns` in the velocities."""
     qvel_columns: tuple[int, ...]
 
     @classmethod
     def of(cls, model: mujoco.MjModel, driven: Sequence[int], passive: Sequence[int]) -> "PassiveJoints":
-        """Return those of a model whose joints `driven` and `passive` (ids) are all but the base's."""
+        """Return the passive joints of a model whose joints are the base's, `driven` and `passive` (ids)."""
         simple = [i for i in passive if model.jnt_type[i] != mujoco.mjtJoint.mjJNT_BALL]
         return cls(
             model=model,
@@ -51,11 +53,12 @@ class PassiveJoints:
         )
 
     def settle(self, angles: np.ndarray, start: np.ndarray) -> np.ndarray | None:
-        """Return generalised positions (nq,) with the driven joints at `angles` (D,), all loops closed, and the least energy
-        in springs, near `start` (nq,), from which joints are moved there; None if the loops do not close there.
+        """Return generalised positions (nq,) near `start` (nq,) with the driven joints at `angles` (D,), all loops closed and
+        the least spring energy; None if the loops do not close there.
 
-        Springs and constraints are solved as one: of K the stiffness, g its forces, J and c the constraints' Jacobian and
-        errors, [K J'; J 0] [dq; l] = [-g; -c] is repeated. Gravity is left out.
+        The joints are moved from `start` in steps. Springs and constraints are solved together: with K the stiffness, g the
+        spring forces, J and c the Jacobian and errors of the constraints, [K J'; J 0] [dq; l] = [-g; -c] is iterated. Gravity
+        is left out.
         """
         model, data = self.model, mujoco.MjData(self.model)
         columns = model.jnt_qposadr[list(self.driven)]
@@ -83,11 +86,11 @@ class PassiveJoints:
         return qpos if np.abs(errors).max(initial=0.0) < CLOSED else None
 
     def _loops(self, data: mujoco.MjData, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return by how much each equality constraint is violated, (rows,), and the Jacobian (rows, nv)."""
+        """Return the errors (rows,) of the equality constraints, and their Jacobian (rows, nv)."""
         data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_comPos(self.model, data)
-        mujoco.mj_makeConstraint(self.model, data)  # of contacts there are none: nobody has looked for them
+        mujoco.mj_makeConstraint(self.model, data)  # collisions were not computed, so there are no contacts
         rows = np.flatnonzero(np.asarray(data.efc_type) == mujoco.mjtConstraint.mjCNSTR_EQUALITY)
         jacobian = np.zeros((data.nefc, self.model.nv))
         if len(rows):
@@ -104,7 +107,7 @@ class PassiveJoints:
         return dense
 
     def beyond(self, qpos: np.ndarray) -> list[str]:
-        """Return the names of the passive hinges and slides that are beyond their ranges at `qpos` (nq,)."""
+        """Return the names of the passive hinges and slides that are outside their ranges at `qpos` (nq,)."""
         model = self.model
         found = []
         for number, column, name in zip(self.numbers, self.qpos_columns, self.names, strict=True):
@@ -114,11 +117,11 @@ class PassiveJoints:
         return found
 
     def draw(self, default: np.ndarray, factor: tuple[float, float], count: int, seed: int, where: str) -> np.ndarray:
-        """Return (count, nq) poses with driven joints at the angles of `default` (nq,) times numbers drawn from `factor`, and
-        loops closed. A pose that they do not allow, or in which a passive joint is beyond its range, is drawn again.
+        """Return (count, nq) poses: driven joints at the angles of `default` (nq,) times random numbers from `factor`, loops
+        closed. Poses that the loops or the ranges of passive joints do not allow are replaced by new ones.
 
         Raises:
-            ConfigError: there are too few; `where` says whose `factor` it is.
+            ConfigError: too few poses are possible; `where` is the place of `factor` in the configuration.
         """
         random, columns = np.random.default_rng(seed), self.model.jnt_qposadr[list(self.driven)]
         poses: list[np.ndarray] = []
@@ -134,18 +137,18 @@ class PassiveJoints:
 def default_qpos(
     model: mujoco.MjModel, driven: Sequence[int], angles: np.ndarray, passive: PassiveJoints | None, where: str
 ) -> np.ndarray:
-    """Return generalised positions (nq,): the base level at the origin, the joints `driven` (ids) at `angles`, and passive
-    ones where springs and loops put them.
+    """Return generalised positions (nq,): the base level at the origin, the joints `driven` (ids) at `angles`, passive joints
+    as springs and loops place them.
 
     Raises:
-        ConfigError: the loops do not close at those angles; `where` says whose they are.
+        ConfigError: the loops do not close at those angles; `where` is the place of the angles in the configuration.
     """
     qpos = model.qpos0.copy()
     qpos[:7] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
     if passive is None:
         qpos[model.jnt_qposadr[list(driven)]] = angles
         return qpos
-    for i in (*driven, *passive.numbers):  # a linkage may have two ways to close; ranges tell which one is meant
+    for i in (*driven, *passive.numbers):  # a linkage may close in two ways; the ranges tell which one is meant
         if model.jnt_limited[i]:
             qpos[model.jnt_qposadr[i]] = np.clip(qpos[model.jnt_qposadr[i]], *model.jnt_range[i])
     settled = passive.settle(angles, qpos)

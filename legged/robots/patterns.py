@@ -1,4 +1,4 @@
-"""Patterns of robot.yaml and of tasks: parts of names."""
+"""Patterns of robot.yaml and of tasks, which match parts of names."""
 
 from collections.abc import Mapping, Sequence
 
@@ -8,7 +8,11 @@ from legged.errors import ConfigError, suggest
 
 
 def match_names(patterns: Sequence[str], names: Sequence[str], where: str) -> tuple[int, ...]:
-    """Return the indices of the names that contain any of the patterns, in the order of `names`."""
+    """Return the indices of the names that contain any of the patterns, in the order of `names`.
+
+    Raises:
+        ConfigError: a pattern is empty or matches no name; `where` is the place of the patterns.
+    """
     for pattern in patterns:
         if not pattern:
             raise ConfigError(f"{where}: an empty pattern would match everything{suggest(pattern, names, 'names')}")
@@ -18,10 +22,10 @@ def match_names(patterns: Sequence[str], names: Sequence[str], where: str) -> tu
 
 
 def match_values(table: Mapping[str, float], names: Sequence[str], where: str) -> np.ndarray:
-    """Return the value of the longest pattern that each name contains, (len(names),).
+    """Return for each name the value of the longest pattern that it contains, (len(names),).
 
     Raises:
-        ConfigError: a pattern that no name contains, or a name without pattern.
+        ConfigError: a pattern matches no name, or no pattern matches a name.
     """
     match_names(tuple(table), names, where)
     values = np.zeros(len(names))

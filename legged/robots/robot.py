@@ -1,4 +1,4 @@
-"""A robot folder (robot.yaml and MJCF) -> names, indices, limits and gains."""
+"""Robots: names, indices, limits and gains, read from a robot folder (robot.yaml and MJCF)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -13,7 +13,7 @@ from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, exists
 from legged.robots.gains import VELOCITY_LIMIT, gains, inertia_in_air
-from legged.robots.importing.adapted import adaptations
+from legged.robots.importing.convert import adaptations
 from legged.robots.mirror import Mirror
 from legged.robots.passive_joints import PassiveJoints, default_qpos
 from legged.robots.patterns import match_values
@@ -35,27 +35,27 @@ class RobotFile:
     default_joint_angles: dict[str, float] = field(metadata=between(-100, 100))
     """Joint-name pattern -> angle at action 0 [rad]."""
     feet: tuple[str, ...] = field(metadata=NAMES)
-    """Patterns of the shapes that are feet; those of one body are one foot."""
+    """Patterns of the shapes of the feet; all shapes of one body are one foot."""
     stiffness: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
-    """Joint-name pattern -> P gain [N m/rad]; without any, gains follow from inertia and weight (gains.py)."""
+    """Joint-name pattern -> P gain [N m/rad]; an empty table leaves the gains to a rule by inertia and weight (gains.py)."""
     damping: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
-    """Joint-name pattern -> D gain [N m s/rad]; likewise."""
+    """Joint-name pattern -> D gain [N m s/rad]; an empty table, as for `stiffness`."""
     velocity_limit: dict[str, float] = field(default_factory=dict, metadata=positive(LARGEST))
-    """Joint-name pattern -> largest joint speed [rad/s]; without any, 30."""
+    """Joint-name pattern -> largest joint speed [rad/s]; an empty table means 30 for all joints."""
     penalize_contacts_on: tuple[str, ...] = ()
-    """Patterns of the shapes whose contact the `collision` reward counts."""
+    """Patterns of the shapes whose contacts the `collision` reward counts."""
     terminate_after_contacts_on: tuple[str, ...] = ()
     """Patterns of the shapes whose contact ends the episode."""
     passive_joints: tuple[str, ...] = field(default=(), metadata=TERMS)
-    """Patterns of the joints that no motor drives: springs, rods, whatever closes a loop. They may be slides and balls."""
+    """Patterns of the joints without a motor: springs, rods, parts of closed loops. Slides and balls are allowed."""
 
 
 @dataclass(frozen=True)
 class Robot:
-    """What the task needs to know of a robot. D joints with a motor, in the order of the model, P passive hinges and slides,
-    S collision shapes, F feet, B contacts. Where nothing else is said, a joint is one with a motor.
+    """A robot as a task needs it: D joints with a motor, in the order of the model, P passive hinges and slides, S collision
+    shapes, F feet, B contacts. "Joint" means a joint with a motor unless stated otherwise.
 
-    A contact is what a contact force is stated for: a collision shape, or all shapes of a foot together.
+    A contact is the unit for which a contact force is computed: one collision shape, or all shapes of a foot together.
     """
 
     name: str
@@ -74,31 +74,34 @@ class Robot:
     """(D,) P gains [N m/rad], and D gains [N m s/rad]."""
     damping: np.ndarray
     armature: np.ndarray
-    """(D,) inertia of rotor and gear as the joint turns them [kg m^2]."""
+    """(D,) inertia of rotor and gear, as seen at the joint [kg m^2]."""
     inertia: np.ndarray
-    """(D,) what the motor of each joint turns with the robot in the air in its default pose [kg m^2]."""
+    """(D,) inertia that the motor of each joint turns with the robot in the air in its default pose [kg m^2]."""
     swings: np.ndarray
-    """(D,) whether a joint swings a leg forward and back, in the default pose."""
+    """(D,) True if the joint swings a leg forward and back in the default pose."""
     height: float
     """Base above the ground when the robot stands level in its default pose [m]."""
     qpos_columns: tuple[int, ...]
-    """(D,) where each joint's angle is in MuJoCo's generalised positions; `qvel_columns` in the velocities."""
+    """(D,) column of each joint's angle in MuJoCo's generalised positions; `qvel_columns` in the velocities."""
     qvel_columns: tuple[int, ...]
     passive: PassiveJoints | None
-    """Joints that no motor drives; none if every joint has one."""
+    """Joints without a motor; None if every joint has one."""
     default_qpos: np.ndarray
-    """(nq,) MuJoCo's generalised positions at action 0: the base level at the origin, passive joints where springs and loops
-    put them."""
+    """(nq,) MuJoCo's generalised positions at action 0: the base level at the origin, passive joints at rest between springs
+    and loops.
+    """
     shape_names: tuple[str, ...]
     """Names of the S collision shapes, in the order of the model."""
     contact_of_shape: tuple[int, ...]
-    """(S,) which of the contacts each shape belongs to."""
+    """(S,) index of the contact that each shape belongs to."""
     contact_names: tuple[str, ...]
-    """Names of the B contacts: a shape's own, or that of a foot of several shapes: how their names begin."""
+    """Names of the B contacts: the name of the shape; for a foot of several shapes, the common beginning of their names."""
     feet_shapes: tuple[tuple[str, ...], ...]
     """The shapes of each of the F feet."""
     feet_indices: tuple[int, ...]
-    """(F,) the feet among the contacts; likewise what is penalised, and what ends an episode."""
+    """(F,) indices of the feet among the contacts; the next two are those of the penalised contacts, and of those that end an
+    episode.
+    """
     penalised_indices: tuple[int, ...]
     termination_indices: tuple[int, ...]
     mass: float
@@ -106,9 +109,9 @@ class Robot:
     base_mass: float
     """Mass of the floating body [kg]."""
     adaptations: tuple[str, ...]
-    """What was done to the file of the model so that engines can rely on it, a line each."""
+    """One line for each change that was made to the model's file for the engines."""
     mirror: Mirror | None
-    """Which joints and feet are each other's left and right; None if the robot is not symmetric."""
+    """Left and right partners of joints and feet; None if the robot is not symmetric."""
 
     @property
     def num_dof(self) -> int:
@@ -123,23 +126,26 @@ class Robot:
         return self.folder / self.file.model
 
     def gains(self, table: Mapping[str, float], where: str) -> np.ndarray:
-        """Return the values (D,) of a pattern table; raise ConfigError for a pattern without joint or a joint without
-        pattern.
+        """Return the values (D,) of a pattern table.
+
+        Raises:
+            ConfigError: a pattern matches no joint, or no pattern matches a joint.
         """
         return match_values(table, self.joint_names, where)
 
     def with_armature(self, armature: np.ndarray) -> "Robot":
-        """Return the same robot with other rotors, (D,) [kg m^2]. Its `inertia` then is that in which none but a joint's own
-        rotor has changed: the true one is a little larger where others have become heavier.
+        """Return the same robot with other rotor inertias `armature` (D,) [kg m^2]. Each joint's `inertia` counts only the
+        change of its own rotor; the true one is a little larger where other rotors have become heavier.
         """
         return replace(self, armature=armature, inertia=self.inertia + armature - self.armature)
 
 
 def load_robot(name: str, where: str = "robot") -> Robot:
-    """Return the robot of that name under resources/robots/, or in the folder `name`; `where` says who asks for it.
+    """Return the robot of that name under resources/robots/, or in the folder `name`; `where` is the place of the name in the
+    configuration, for errors.
 
     Raises:
-        ConfigError: no such robot, or robot.yaml and model do not fit together.
+        ConfigError: there is no such robot, or robot.yaml and the model contradict each other.
     """
     folder = _folder(name, where)
     path = folder / "robot.yaml"
@@ -211,9 +217,9 @@ def _folder(name: str, where: str) -> Path:
     for folder in (robots / name, Path(name)):
         if exists(folder / "robot.yaml"):
             return folder.resolve()
-    if len(Path(name).parts) > 1:  # of a run that was brought from another machine, its configuration names the folder there
+    if len(Path(name).parts) > 1:  # the configuration of a run from another machine names the folder on that machine
         raise ConfigError(
             f"{where}: there is no robot {shown(name)}: that folder has no robot.yaml. "
-            "If the robot was moved, say where it lies now, as in robot=FOLDER"
+            "If the robot was moved, give its new folder: robot=FOLDER"
         )
     raise ConfigError(f"{where}: there is no robot {shown(name)}{known}")

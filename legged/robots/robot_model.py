@@ -1,4 +1,4 @@
-"""A robot's MJCF: read, and held against what engines rely on."""
+"""Reading of a robot's MJCF, and checks of the conditions that engines rely on."""
 
 import contextlib
 import re
@@ -10,28 +10,24 @@ import numpy as np
 
 from legged.errors import ConfigError, suggest
 from legged.process.paths import exists
+from legged.robots.importing.convert import robot_spec_of
 from legged.robots.patterns import match_names
+from legged.robots.reserved_names import RESERVED
 
-FLOOR = "floor"
-"""Name of the ground's geom, where it is a plane or stands for a height map; no geom of a robot may have it."""
-TAKEN = {"geom": r"floor|terrain_\d+", "sensor": "contact_.*"}
-"""Kind of element -> names that the scene gives to its own."""
 GROUPS = 31
-"""Groups of actuators that a model may disable, from 0."""
+"""Number of actuator groups that a model can disable; they are numbered from 0."""
 LARGEST_NUMBER = 1e12
-"""Largest number of a model: beyond it float32, in which GPUs compute, overflows."""
+"""Largest number of a model; with larger ones float32, which GPUs compute in, overflows."""
 NUMBERS = ("qpos0", "qpos_spring", "body_", "jnt_", "dof_", "geom_", "site_", "actuator_", "mesh_", "eq_", "tendon_")
-"""How the names of a model's arrays of numbers begin."""
+"""Prefixes of the names of a model's arrays of numbers."""
 
 
 def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
-    """Return the model in `file` in `folder`; `where` says who names it.
+    """Return the model in `file` in `folder`; `where` is the place of its name in the configuration, for errors.
 
     Raises:
         ConfigError: there is no such file, MuJoCo refuses it, or it holds numbers that are not finite.
     """
-    from legged.robots.importing.adapted import robot_spec_of  # which needs the names above
-
     path = folder / file
     if not exists(path) or not path.is_file():
         raise ConfigError(f"{where}: model: there is no file '{file}' in {folder}")
@@ -42,7 +38,7 @@ def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
             model = robot_spec_of(path).compile()
     except ConfigError as error:
         raise ConfigError(f"{where}: model: {error}") from error
-    except Exception as error:  # its errors have no class of their own
+    except Exception as error:  # MuJoCo's errors have no class of their own
         raise ConfigError(f"{at}: MuJoCo refuses it: {' '.join(str(error).split())}") from error
     if warnings:
         raise ConfigError(f"{at}: MuJoCo warns: {' '.join(warnings[0].split())}")
@@ -66,14 +62,14 @@ def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
 
 
 def disabled_groups(model: mujoco.MjModel) -> list[int]:
-    """Return the groups of actuators that a model has and disables."""
+    """Return the actuator groups that a model uses and disables."""
     groups = sorted({int(group) for group in model.actuator_group if 0 <= group < GROUPS})
     return [group for group in groups if model.opt.disableactuator >> group & 1]
 
 
 @contextlib.contextmanager
 def _warnings_to(warnings: list[str]) -> Iterator[None]:
-    """Collect MuJoCo's warnings, which it would print, and write to a file in the working directory."""
+    """Collect MuJoCo's warnings, which MuJoCo would print and write to a file in the working directory."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(warnings.append)
     try:
@@ -83,11 +79,11 @@ def _warnings_to(warnings: list[str]) -> Iterator[None]:
 
 
 def check_model(model: mujoco.MjModel, base: str, where: str, passive: Sequence[str] = ()) -> None:
-    """Check what engines rely on: one free base, then the joints; one motor for each that is not named by the patterns
-    `passive`, in the same order, and these are hinges; named shapes.
+    """Check the conditions that engines rely on: one free base, then the joints; one motor for each joint that no pattern of
+    `passive` names, in the same order; hinges as the joints with a motor; named collision shapes.
 
     Raises:
-        ConfigError: `where` and what is not so.
+        ConfigError: a condition is not met; the message begins with `where`.
     """
     undriven = passive_joints(model, passive, where)
     _check_tree(model, base, undriven, where)
@@ -103,8 +99,8 @@ def check_model(model: mujoco.MjModel, base: str, where: str, passive: Sequence[
             raise ConfigError(f"{where}: model: every collision geom needs a name; one of body '{body.name}' has none")
     for kind, count in (("geom", model.ngeom), ("sensor", model.nsensor)):
         for name in (getattr(model, kind)(i).name for i in range(count)):
-            if re.fullmatch(TAKEN[kind], name):
-                raise ConfigError(f"{where}: model: {kind} '{name}': the scene has one of that name; choose another")
+            if re.fullmatch(RESERVED[kind], name):
+                raise ConfigError(f"{where}: model: {kind} '{name}': the scene needs this name; choose another")
     if base_mass(model, base) <= 0.0:
         raise ConfigError(f"{where}: base: body '{base}' has no mass")
 
@@ -115,17 +111,17 @@ def base_mass(model: mujoco.MjModel, base: str) -> float:
 
 
 def passive_joints(model: mujoco.MjModel, patterns: Sequence[str], where: str) -> list[int]:
-    """Return the ids of the joints that the patterns name, which no motor drives; never that of the base.
+    """Return the ids of the passive joints, which the patterns name; never the base's.
 
     Raises:
-        ConfigError: a pattern is in no joint's name; `where` says whose it is.
+        ConfigError: a pattern is in no joint's name; `where` is the file of the patterns.
     """
     names = [model.joint(i).name for i in range(1, model.njnt)]
     return [1 + i for i in match_names(patterns, names, f"{where}: passive_joints")]
 
 
 def driven_joints(model: mujoco.MjModel, passive: Collection[int]) -> list[int]:
-    """Return the ids of the joints but the base's and `passive`."""
+    """Return the ids of all joints except the base's and `passive`."""
     return [i for i in range(1, model.njnt) if i not in passive]
 
 
@@ -149,7 +145,7 @@ def _check_tree(model: mujoco.MjModel, base: str, passive: Collection[int], wher
 
 
 def _check_motors(model: mujoco.MjModel, passive: Collection[int], where: str) -> None:
-    """Check that actuators pass on torques as they are, because the task computes those of the joints."""
+    """Check that actuators apply their controls as torques, because the task computes the joints' torques."""
     names = tuple(model.joint(i).name for i in driven_joints(model, passive))
     on_joints = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
     driven = tuple(model.joint(model.actuator_trnid[i, 0]).name if on_joints[i] else "no joint" for i in range(model.nu))
@@ -164,7 +160,7 @@ def _check_motors(model: mujoco.MjModel, passive: Collection[int], where: str) -
 
 
 def _why_no_torque_motor(model: mujoco.MjModel, i: int) -> str:
-    """Return why an actuator does not pass on a torque as it is; '' if it does."""
+    """Return the reason why an actuator does not apply its control as a torque; '' if it does."""
     gain, bias, dynamics = model.actuator_gaintype[i], model.actuator_biastype[i], model.actuator_dyntype[i]
     if (
         gain != mujoco.mjtGain.mjGAIN_FIXED
@@ -172,19 +168,19 @@ def _why_no_torque_motor(model: mujoco.MjModel, i: int) -> str:
         or bias != mujoco.mjtBias.mjBIAS_NONE
         or dynamics != mujoco.mjtDyn.mjDYN_NONE
     ):
-        return "is no torque motor: the task computes torques and needs <motor>, not <position>, <velocity> or the like"
+        return "is not a torque motor: the task computes torques and needs <motor>, not <position>, <velocity> or the like"
     if _first(model.actuator_gear[i]) != 1.0:
         return f"has a gear of {model.actuator_gear[i, 0]:g}; torques are those of the joints, so it must be 1"
     return ""
 
 
 def _first(values: Sequence[float]) -> float:
-    """Return the first of some numbers, if the others are 0; else NaN."""
+    """Return the first number if all others are 0, else NaN."""
     return float(values[0]) if not np.any(values[1:]) else float("nan")
 
 
 def _why_no_torque_limit(model: mujoco.MjModel, i: int) -> str:
-    """Return why an actuator's range of forces is no torque limit; '' if it is one."""
+    """Return the reason why an actuator's range of forces is not a torque limit; '' if it is one."""
     low, high = model.actuator_forcerange[i]
     if not model.actuator_forcelimited[i]:
         return "has no limit: every motor needs a forcerange (the torque limit)"

@@ -1,4 +1,4 @@
-"""A robot's collision shapes: which of them are a foot, and which contact force each adds to."""
+"""Collision shapes of a robot: those of each foot, and the contact that each shape belongs to."""
 
 import itertools
 from collections.abc import Sequence
@@ -11,35 +11,35 @@ from legged.robots.patterns import match_names
 
 @dataclass(frozen=True)
 class Shapes:
-    """S collision shapes in the order of the model, and B contacts that their forces are added to: a foot's shapes have one
-    together, every other shape has its own. Contacts are in the order of their first shapes.
+    """S collision shapes in the order of the model, and B contacts, each with one contact force. All shapes of a foot share
+    one contact, and every other shape has its own. Contacts are in the order of their first shapes.
     """
 
     names: tuple[str, ...]
-    """(S,)"""
+    """(S,) names."""
     bodies: tuple[str, ...]
-    """(S,) the body of each."""
+    """(S,) name of the body of each shape."""
     contact: tuple[int, ...]
-    """(S,) the contact of each."""
+    """(S,) index of the contact of each shape."""
     contact_names: tuple[str, ...]
-    """(B,)"""
+    """(B,) names."""
     feet_shapes: tuple[tuple[str, ...], ...]
-    """(F,) the shapes of each foot."""
+    """(F,) names of the shapes of each foot."""
     feet: tuple[int, ...]
-    """(F,) the contact of each foot."""
+    """(F,) index of the contact of each foot."""
 
     @classmethod
     def of(cls, model: mujoco.MjModel, feet: Sequence[str], where: str) -> "Shapes":
-        """Return those of a model whose feet are named by the patterns `feet`; shapes of one body are one foot.
+        """Return the shapes of a model whose feet the patterns `feet` name; shapes of one body are one foot.
 
         Raises:
-            ConfigError: a pattern matches neither shape nor body; `where` says whose it is.
+            ConfigError: a pattern matches neither shape nor body; `where` is the place of the patterns.
         """
         geoms = [model.geom(i) for i in range(model.ngeom) if model.geom_contype[i] or model.geom_conaffinity[i]]
         names = tuple(geom.name for geom in geoms)
         bodies = tuple(model.body(geom.bodyid[0]).name for geom in geoms)
         of_foot = set(match_shapes(feet, names, bodies, where))
-        members: dict[tuple[str, int], list[int]] = {}  # a foot by its body, any other shape by itself
+        members: dict[tuple[str, int], list[int]] = {}  # the key of a foot is its body, that of any other shape its index
         for i, body in enumerate(bodies):
             members.setdefault((body, -1) if i in of_foot else ("", i), []).append(i)
         contact = [0] * len(names)
@@ -56,16 +56,16 @@ class Shapes:
         )
 
     def contacts(self, patterns: Sequence[str], where: str) -> tuple[int, ...]:
-        """Return the contacts that the shapes of those patterns belong to, each once. Raises as `of`."""
+        """Return the indices of the contacts of the shapes that the patterns name, each once. Raises as `of`."""
         return tuple(sorted({self.contact[i] for i in match_shapes(patterns, self.names, self.bodies, where)}))
 
 
 def match_shapes(patterns: Sequence[str], names: Sequence[str], bodies: Sequence[str], where: str) -> tuple[int, ...]:
-    """Return the indices of the shapes that any of the patterns names, in their order: those whose names contain it, or where
-    no shape's does, all shapes of the bodies whose names contain it.
+    """Return the indices of the shapes that any of the patterns names, in their order. A pattern names the shapes whose names
+    contain it; if no shape's name does, it names all shapes of the bodies whose names contain it.
 
     Raises:
-        ConfigError: a pattern is in no name; `where` says whose it is.
+        ConfigError: a pattern is in no name; `where` is the place of the patterns.
     """
     found: set[int] = set()
     for pattern in patterns:
@@ -75,7 +75,9 @@ def match_shapes(patterns: Sequence[str], names: Sequence[str], bodies: Sequence
 
 
 def _common_name(names: Sequence[str], body: str) -> str:
-    """Return what several shapes of a body are called: how all their names begin, without separators; else as the body."""
+    """Return the name of a contact of several shapes: the common beginning of their names without separators, else the body's
+    name.
+    """
     if len(names) == 1:
         return names[0]
     together = itertools.takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))

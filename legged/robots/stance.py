@@ -1,4 +1,4 @@
-"""A robot in its default pose: how high it stands, and which joints swing its legs forward."""
+"""Geometry of a robot in its default pose: its height, and the joints that swing its legs forward."""
 
 from collections.abc import Sequence
 
@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 
 ALONG = 0.7
-"""Least component along the base's y axis of the axis of a joint that swings a leg forward: within 45 degrees."""
+"""Least y component, in the base's frame, of the axis of a joint that swings a leg forward: within 45 degrees."""
 
 
 def stance(model: mujoco.MjModel, qpos: np.ndarray) -> mujoco.MjData:
-    """Return the model at the generalised positions `qpos`, poses computed."""
+    """Return MuJoCo's data at the generalised positions `qpos`, with poses computed."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
@@ -20,7 +20,7 @@ def stance(model: mujoco.MjModel, qpos: np.ndarray) -> mujoco.MjData:
 def lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
     """Return the height of the lowest point of a shape, world frame [m]."""
     size, kind = model.geom_size[geom], model.geom_type[geom]
-    down = data.geom_xmat[geom].reshape(3, 3)[2]  # the world's vertical in the frame of the shape
+    down = data.geom_xmat[geom].reshape(3, 3)[2]  # the world's vertical axis in the shape's frame
     types = mujoco.mjtGeom
     if kind == types.mjGEOM_SPHERE:
         below = size[0]
@@ -34,21 +34,24 @@ def lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float
         mesh = model.geom_dataid[geom]
         first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
         below = -float((model.mesh_vert[first : first + count] @ down).min())
-    else:  # a box, and what is enclosed by one
+    else:  # a box, or the bounding box of another shape
         below = np.abs(down) @ size
     return float(data.geom_xpos[geom, 2] - below)
 
 
 def standing_height(model: mujoco.MjModel, base: str, qpos: np.ndarray) -> float:
-    """Return how far the base is above the lowest point of the collision shapes [m], at `qpos`, where it is level."""
+    """Return the height of the base above the lowest point of the collision shapes at `qpos`, where the base is level [m]."""
     data = stance(model, qpos)
     shapes = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
     return float(data.body(base).xpos[2] - min(lowest_point(model, data, int(i)) for i in shapes))
 
 
 def swinging_joints(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int], feet: Sequence[int]) -> np.ndarray:
-    """Return (D,) which of the hinges `joints` (ids) swing a leg forward and back: those between the base and one of the
-    shapes `feet` (ids) whose axes point sideways at `qpos`, the base being level: hip pitch, knee and ankle pitch.
+    """Return (D,) True for each of the hinges `joints` (ids) that swings a leg forward and back: hip pitch, knee and ankle
+    pitch.
+
+    These are the hinges between the base and one of the shapes `feet` (ids) whose axes point sideways at `qpos`, with the
+    base level.
     """
     data = stance(model, qpos)
     on_leg = set()

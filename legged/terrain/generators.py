@@ -1,10 +1,10 @@
-"""Tiles of terrain: one small function a type, numpy only. Names and sizes are legged_gym's (arXiv 2109.11978).
+"""Tiles of terrain, made by one small NumPy function per type. Names and sizes are legged_gym's (arXiv 2109.11978).
 
-Every generator takes a `Tile` of zeros and the size of its difficulty, in metres or degrees, and fills in the heights of
-the cells [m]. Robots start in the middle and walk outward, so `stairs_up` has its platform at the bottom.
+Every generator takes a `Tile` of zeros and the size of its difficulty, in metres or degrees, and fills in the heights of the
+cells [m]. Robots start in the middle and walk outward, so `stairs_up` has its platform at the bottom.
 
-All other lengths here (treads, platforms, bumps, blocks) are for a robot that stands half a metre high; a tile of another
-`scale` has them times that.
+All other lengths here (treads, platforms, bumps, blocks) are for a robot that stands half a metre high. A tile of another
+`scale` has them multiplied by the scale.
 """
 
 from collections.abc import Callable
@@ -24,15 +24,15 @@ SMALLEST_BLOCK = 1.0
 JOINT = 0.1
 """Gap between two stepping stones [m]."""
 WAVE = 2.0
-"""Length of a wave [m]."""
+"""Wavelength of waves [m]."""
 BUMPS = 0.05
 """Largest height and depth of the bumps of rough ground [m]."""
 LEDGE = 1.0
-"""How far a single step goes on before it goes down again [m]."""
+"""Width of the top of a single step, from its rise to its fall [m]."""
 NARROW_TREAD = 0.28
-"""Width of a step of narrow stairs, such as those of a house [m]."""
+"""Width of a step of narrow stairs, such as stairs in a house [m]."""
 KERB, KERB_SPACING = 0.2, 1.0
-"""Width of a kerb, and from where one begins to where the next one does [m]."""
+"""Width of a kerb, and distance between the beginnings of two kerbs [m]."""
 BLOCK_SIDES = (0.3, 0.8)
 """Shortest and longest side of the blocks of dense ground [m]."""
 GRID = 0.45
@@ -40,7 +40,7 @@ GRID = 0.45
 STONE_SIDES = (0.2, 0.5)
 """Shortest and longest side of a stone of rubble [m]."""
 NARROWEST_DITCH = 0.5
-"""Cells must not be larger than this for a ditch whose width grows to 1 m [m]."""
+"""Largest cell for a ditch whose width grows to 1 m [m]."""
 
 
 @dataclass(frozen=True)
@@ -53,13 +53,13 @@ class Tile:
     rng: np.random.Generator
     """Source of all randomness of the tile."""
     scale: float = 1.0
-    """Factor on the lengths that its type is made of."""
+    """Factor on the lengths of the type."""
     tread: float | None = None
-    """Width of a step of its stairs, where it is not that of the type [m]; the scale is no factor on it."""
+    """Width of a step of stairs [m]; None for the type's own. The scale does not multiply it."""
 
     def cells(self, metres: float) -> int:
-        """Return a length, times the tile's scale, in whole cells. Scales and cells have six digits, so that a hair of a cell
-        may be missing.
+        """Return a length, times the tile's scale, in whole cells. Scales and cells have six digits, so a length may fall
+        short of a whole cell by a rounding error, which is ignored.
         """
         return int(metres * self.scale / self.cell + 1e-3)
 
@@ -69,7 +69,7 @@ class Tile:
         return np.maximum(x[:, None], y[None, :])
 
     def middle(self, side: float) -> tuple[slice, slice]:
-        """Return the cells of a square of that side [m], times the scale, in the middle, or what of it is on the tile."""
+        """Return the cells of a centred square with side `side` [m] times the scale, or its part on the tile."""
         spans = []
         for n in self.heights.shape:
             first = max(0, (n - self.cells(side)) // 2)
@@ -85,13 +85,15 @@ def slope(tile: Tile, degrees_up: float, platform: float = 3.0) -> None:
 
 
 def rough_slope(tile: Tile, degrees_up: float, platform: float = 3.0) -> None:
-    """Make a pyramid with bumps, in steps of 5 mm, drawn every 0.2 m and joined by straight lines."""
+    """Make a pyramid with bumps: heights in multiples of 5 mm at points 0.2 m apart, linear in between."""
     slope(tile, degrees_up, platform)
     tile.heights[:] += bumps(tile, BUMPS)
 
 
 def bumps(tile: Tile, amplitude: float, step: float = 0.005, spacing: float = 0.2) -> np.ndarray:
-    """Return (length, width) heights of rough ground: U(-amplitude, amplitude) on a coarse lattice, linear in between."""
+    """Return (length, width) heights of rough ground: U(-amplitude, amplitude) at the points of a coarse lattice, linear in
+    between.
+    """
     levels = tile.scale * np.arange(-amplitude, amplitude + 0.5 * step, step)
     every = max(1, tile.cells(spacing))
     counts = [n // every + 2 for n in tile.heights.shape]
@@ -102,8 +104,8 @@ def bumps(tile: Tile, amplitude: float, step: float = 0.005, spacing: float = 0.
 
 
 def stairs(tile: Tile, riser: float, platform: float = 3.0, tread: float = TREAD) -> None:
-    """Make rings of steps up to a platform in the middle (down, for a negative riser). The tread, that of the tile or else
-    `tread`, is cut to whole cells.
+    """Make rings of steps up to a platform in the middle (down, for a negative riser). The tread is the tile's, or else
+    `tread`, cut to whole cells.
     """
     width = max(1, tile.cells(tread if tile.tread is None else tile.tread / tile.scale))
     across = tile.cells(platform)
@@ -114,7 +116,7 @@ def stairs(tile: Tile, riser: float, platform: float = 3.0, tread: float = TREAD
 
 
 def step(tile: Tile, height: float, platform: float = 3.0, ledge: float = LEDGE) -> None:
-    """Make one step up, all around the platform, and one down behind it."""
+    """Make one step up around the platform, and one step down behind it."""
     along = max(1, tile.cells(ledge)) * tile.cell / tile.scale  # in whole cells
     outer, inner = tile.middle(platform + 2.0 * along), tile.middle(platform)
     tile.heights[outer] = height
@@ -122,7 +124,9 @@ def step(tile: Tile, height: float, platform: float = 3.0, ledge: float = LEDGE)
 
 
 def obstacles(tile: Tile, height: float, platform: float = 3.0, count: int = 20) -> None:
-    """Make rectangular blocks and pits of 1 to 2 m, as high or deep as `height` or half of it, anywhere but in the middle."""
+    """Make rectangular blocks and pits of 1 to 2 m, with a height or depth of `height` or half of it, anywhere but in the
+    middle.
+    """
     rows, columns = tile.heights.shape
     sides = [max(1, tile.cells(0.1 * tenths)) for tenths in range(10, 20, 4)]
     for _ in range(count):
@@ -134,7 +138,7 @@ def obstacles(tile: Tile, height: float, platform: float = 3.0, count: int = 20)
 
 
 def stepping_stones(tile: Tile, stone: float, platform: float = 4.0, gap: float = JOINT) -> None:
-    """Make square stones of side `stone`, in rows shifted against each other, with gaps around them."""
+    """Make square stones of side `stone` in rows shifted against each other, with gaps around them."""
     side, between = max(1, tile.cells(stone / tile.scale)), max(1, tile.cells(gap))
     rows, columns = tile.heights.shape
     tile.heights[:] = -HOLE_DEPTH * tile.scale
@@ -166,9 +170,11 @@ def waves(tile: Tile, amplitude: float, length: float = WAVE) -> None:
 
 
 def dense_blocks(tile: Tile, height: float, platform: float = 2.0, cover: float = 1.2) -> None:
-    """Lay blocks on each other, all over the tile but in the middle. Sides are drawn from BLOCK_SIDES, tops are at 0 to
-    `height` in quarters of it, and a later block hides what lies below it; their areas together are `cover` times that of the
-    tile. So every few steps there is a face, of up to `height`, and hardly any ground is level for as long as a robot.
+    """Stack overlapping blocks on the whole tile except its middle.
+
+    Sides are drawn from BLOCK_SIDES. Tops are at 0 to `height` in quarters of it, and a later block hides the ground below
+    it. The sum of the blocks' areas is `cover` times the tile's. So a robot meets a face of up to `height` every few steps,
+    and level ground as long as the robot is rare.
     """
     rows, columns = tile.heights.shape
     left = cover * rows * columns
@@ -182,7 +188,7 @@ def dense_blocks(tile: Tile, height: float, platform: float = 2.0, cover: float 
 
 def random_grid(tile: Tile, height: float, platform: float = 2.0, side: float = GRID) -> None:
     """Cover the tile with squares, each at a quarter of the height between -height / 2 and height / 2, after Isaac Lab's
-    boxes. Up and down follow each other closer than on stairs and obstacles, and no edge says what comes next.
+    boxes. Steps up and down follow each other more closely than on stairs and obstacles, in no regular order.
     """
     across = max(1, tile.cells(side))
     rows, columns = (-(-n // across) for n in tile.heights.shape)
@@ -192,20 +198,22 @@ def random_grid(tile: Tile, height: float, platform: float = 2.0, side: float = 
 
 
 def kerbs(tile: Tile, height: float, platform: float = 2.0, width: float = KERB, spacing: float = KERB_SPACING) -> None:
-    """Make rings of kerbs that stand out of level ground, all around the platform, one every `spacing`."""
+    """Make rings of kerbs on level ground around the platform, one every `spacing`."""
     across, every, inner = max(1, tile.cells(width)), max(2, tile.cells(spacing)), tile.cells(platform)
     rows, columns = tile.heights.shape
     innermost = max(0, (min(rows, columns) - inner) // 2) - across
-    for first in sorted(range(innermost, -1, -every)):  # from the edge inward: each clears what is inside of it
+    for first in sorted(range(innermost, -1, -every)):  # from the edge inward: each ring clears the ground inside it
         last = first + across
         tile.heights[first : rows - first, first : columns - first] = height
         tile.heights[last : rows - last, last : columns - last] = 0.0
 
 
 def rubble(tile: Tile, height: float, platform: float = 2.0, cover: float = 2.0) -> None:
-    """Heap up slabs of stone all over the tile but in the middle. Sides are drawn from STONE_SIDES, edges lie at any angle,
-    tops are at quarters of `height` up to it, and of two stones in one place the higher one is seen; their areas together are
-    `cover` times that of the tile. So faces come at any angle, ragged by the cells, and few tops hold a whole foot's step.
+    """Cover the tile except its middle with slabs of stone.
+
+    Sides are drawn from STONE_SIDES, edges lie at any angle, and tops are at quarters of `height` up to it. Where stones
+    overlap, the higher one counts. The sum of the stones' areas is `cover` times the tile's. So faces come at any angle,
+    ragged by the cells, and few tops are large enough for a whole foot.
     """
     rows, columns = tile.heights.shape
     step = tile.cell / tile.scale
@@ -222,52 +230,56 @@ def rubble(tile: Tile, height: float, platform: float = 2.0, cover: float = 2.0)
 
 
 def flat(tile: Tile, size: float = 0.0) -> None:
-    """Leave the ground level, however difficult."""
+    """Leave the ground level at every difficulty."""
 
 
 @dataclass(frozen=True)
 class TerrainType:
-    """A kind of tile: how it is made, and how large its difficulty is."""
+    """A type of tile: its generator and the size of its difficulty."""
 
     generate: Callable[[Tile, float], None]
-    """Fills a tile; its second argument is the size below."""
+    """Generator; its second argument is the size below."""
     size: Callable[[float], float]
-    """Difficulty (0 is the easiest of training, 1 one row beyond its hardest) -> size at scale 1, in `unit`."""
+    """Difficulty (0 is the easiest of training, 1 is one row beyond the hardest) -> size at scale 1, in `unit`."""
     unit: str
     what: str
-    """What the size measures."""
+    """Name of the size."""
     stepped: bool
-    """Made of steps with vertical faces, not of slopes."""
+    """True if the type consists of steps with vertical faces instead of slopes."""
     regular: bool = True
-    """All tiles of a size are the same: nothing in them is drawn at random."""
+    """True if all tiles of a size are the same, with no random part."""
     platform: float = 3.0
     """Side of the level square in the middle at scale 1 [m]."""
     finest: tuple[float, str] | None = None
-    """Length of the smallest part that a tile of scale 1 is made of [m], and its name; cells must not be larger."""
+    """Length of the smallest part of a tile of scale 1 [m], and its name; cells must not be larger."""
     exact: bool = False
-    """Whether cells that do not divide that part make another ground of it: where the type is measured, they do."""
+    """True if that part must be a whole number of cells, since another cell would change the ground. It matters for
+    evaluations.
+    """
 
     def sized(self, difficulty: float, scale: float) -> float:
-        """Return the size at that difficulty on tiles of that scale, in `unit`: lengths grow, angles do not."""
+        """Return the size at a difficulty on tiles of a scale, in `unit`: lengths are multiplied by the scale, angles are
+        not.
+        """
         return self.size(difficulty) * (scale if self.unit == METRES else 1.0)
 
     @property
     def largest(self) -> float:
-        """Return the largest size that may be asked for, in `unit`."""
+        """Largest allowed size, in `unit`."""
         return STEEPEST if self.unit == DEGREES else LARGEST
 
     def text(self, *sizes: float) -> str:
-        """Return sizes in words, to three digits and whole degrees: '0.194 m', '11 to 18 degrees'."""
+        """Return sizes as text, with three digits or in whole degrees: '0.194 m', '11 to 18 degrees'."""
         return f"{' to '.join(f'{size:.0f}' if self.unit == DEGREES else f'{size:.3g}' for size in sizes)} {self.unit}"
 
 
 METRES, DEGREES = "m", "degrees"
 LARGEST, STEEPEST = 100.0, 80.0
-"""Sizes are at most so large [m], and so steep [degrees]: at 90 a slope is a wall without end, and beyond it falls."""
+"""Largest size [m] and largest angle [degrees]; a slope of 90 degrees would be an endless wall."""
 
 
 def _angle(difficulty: float) -> float:
-    """Return the angle of a rise over run of 0.4 * difficulty [degrees]."""
+    """Return the angle of the slope 0.4 * difficulty (rise over run) [degrees]."""
     return degrees(atan(0.4 * difficulty))
 
 
@@ -285,7 +297,7 @@ OF_DITCH = (NARROWEST_DITCH, "width of a ditch")
 
 
 def narrow_stairs(up: float) -> TerrainType:
-    """Return stairs with the treads of a house, around a platform at their top, or with `up` of -1 at their bottom."""
+    """Return stairs with the treads of a house, around a platform at their top, or at their bottom if `up` is -1."""
     return TerrainType(
         lambda tile, size: stairs(tile, up * size, tread=NARROW_TREAD),
         _riser,
@@ -342,14 +354,14 @@ TERRAIN_TYPES: dict[str, TerrainType] = {
     "gap": TerrainType(gap, lambda d: 1.0 * d, METRES, "width", stepped=True, finest=OF_DITCH),
     "pit": TerrainType(pit, lambda d: 1.0 * d, METRES, "depth", stepped=True, platform=4.0),
 }
-"""Every type, by the name under which `terrain.proportions` asks for it."""
+"""Every type by its name in `terrain.proportions`."""
 
 
 def terrain_type(name: str, where: str) -> TerrainType:
-    """Return the type of that name; `where` says who asks for it, in the error.
+    """Return the type of that name; `where` is the place of the name, for the error.
 
     Raises:
-        ConfigError: there is none of that name.
+        ConfigError: there is no type of that name.
     """
     if name not in TERRAIN_TYPES:
         raise ConfigError(f"{where}: there is no terrain type '{name}'{suggest(name, TERRAIN_TYPES)}")
@@ -357,10 +369,10 @@ def terrain_type(name: str, where: str) -> TerrainType:
 
 
 def terrain_types(flag: str, text: str) -> list[str]:
-    """Return the names in a comma-separated list that was given to `flag`: 'gap, pit' -> ['gap', 'pit'].
+    """Return the names in a comma-separated list, the value of `flag`: 'gap, pit' -> ['gap', 'pit'].
 
     Raises:
-        ConfigError: one of them is no type, or comes twice.
+        ConfigError: a name is not a type, or is given twice.
     """
     names = [name.strip() for name in text.split(",")]
     for name in names:

@@ -1,4 +1,4 @@
-"""One height map for all worlds: square cells with their own corners, so that faces between cells can be vertical."""
+"""One height map for all worlds: square cells with separate corners, so that faces between cells can be vertical."""
 
 from dataclasses import dataclass
 
@@ -10,8 +10,8 @@ CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
 
 @dataclass(frozen=True)
 class HeightMap:
-    """Terrain of X x Y cells. Within a cell the height is bilinear in its four corners; where neighbours' corners differ
-    there is a vertical face. Outside, the cells at the border go on.
+    """Terrain of X x Y cells. Within a cell the height is bilinear in its four corners; where corners of neighbours differ,
+    there is a vertical face. Outside the map the cells at the border continue.
     """
 
     heights: np.ndarray
@@ -25,21 +25,21 @@ class HeightMap:
 
     @classmethod
     def of(cls, heights: np.ndarray, cell: float, origin: tuple[float, float], steepest: np.ndarray) -> "HeightMap":
-        """Join the cells of `heights` (X, Y) where they are to be joined.
+        """Return the height map of the cell heights `heights` (X, Y), with cells joined where no face is between them.
 
-        `steepest` (X, Y) is the largest slope (rise over run) that is still a slope: between two cells with a steeper
-        difference, by the smaller of their values, there is a vertical face. legged_gym makes such faces from a triangle
-        mesh by one threshold for all types.
+        `steepest` (X, Y) is the largest slope (rise over run) that stays a slope. Between two cells with a larger difference,
+        by the smaller of their two values, there is a vertical face. legged_gym makes such faces from a triangle mesh by one
+        threshold for all types.
         """
         return cls(heights, join(heights, cell * steepest), cell, origin)
 
     @property
     def size(self) -> tuple[float, float]:
-        """Return the extent along x and y [m]."""
+        """Extent along x and y [m]."""
         return self.heights.shape[0] * self.cell, self.heights.shape[1] * self.cell
 
     def index(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the cells that hold the world points, the nearest ones for points outside."""
+        """Return the indices of the cells that hold the world points; for points outside the map, of the nearest cells."""
         i = np.floor((np.asarray(x) - self.origin[0]) / self.cell).astype(int)
         j = np.floor((np.asarray(y) - self.origin[1]) / self.cell).astype(int)
         return np.clip(i, 0, self.heights.shape[0] - 1), np.clip(j, 0, self.heights.shape[1] - 1)
@@ -55,7 +55,7 @@ class HeightMap:
         return low * (1.0 - v) + high * v
 
     def ceiling(self, reach: int) -> np.ndarray:
-        """Return (X, Y) float32: the highest corner among the cells at most `reach` away in x and y."""
+        """Return (X, Y) float32: the highest corner among the cells within `reach` in x and y."""
         top = self.corners.max(axis=2)
         for axis in (0, 1):
             padded = np.pad(top, [(reach, reach) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
@@ -64,8 +64,8 @@ class HeightMap:
         return top.astype(np.float32)
 
     def scan_map(self, scan: str) -> np.ndarray:
-        """Return (X, Y) float32: what a measured point in each cell reads, by `scan` (terrain.scan). "lowest" of the cell and
-        its next neighbours in x and y is what legged_gym's height measurements return at a vertical face.
+        """Return (X, Y) float32: the measured height of a point in each cell, by `scan` (terrain.scan). "lowest" takes the
+        lowest of the cell and its next neighbours in x and y, as legged_gym's height measurements do at a vertical face.
         """
         if scan == "own":
             return self.heights.astype(np.float32)
@@ -75,10 +75,10 @@ class HeightMap:
 
 
 def join(heights: np.ndarray, rise: np.ndarray) -> np.ndarray:
-    """Return (X, Y, 4) corners: at each lattice point, cells around it that are joined share the mean of their heights.
+    """Return (X, Y, 4) corners: at each lattice point, joined cells around it share the mean of their heights.
 
-    Two neighbours are joined if they differ by no more than the smaller of their `rise` [m]; around a point, being
-    joined passes on from neighbour to neighbour.
+    Two neighbours are joined if they differ by at most the smaller of their `rise` [m]. Cells that are joined through a
+    common neighbour around the point count as joined too.
     """
     h = np.pad(heights, 1, mode="edge")
     r = np.pad(rise, 1, mode="edge")

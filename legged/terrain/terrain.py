@@ -1,4 +1,4 @@
-"""The ground of a task: tiles of many types and difficulties in one height map."""
+"""Ground of a task: tiles of many types and difficulties in one height map."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,27 +13,26 @@ from legged.terrain.generators import TERRAIN_TYPES, Tile, terrain_type
 from legged.terrain.height_map import HeightMap
 
 SPAWN_SQUARE = 2.0
-"""Robots start at the height of the highest point in a square of this side, times the scale, in the middle of their tile
-[m]."""
+"""Side of the square in the middle of a tile, at scale 1, whose highest point is the height at which robots start [m]."""
 EDGE = 1.0
-"""Robots closer than this to the end of the map have left it [m]."""
+"""Distance from the end of the map at which a robot has left it [m]."""
 WITHOUT_CURRICULUM = (0.5, 0.75, 0.9)
-"""Difficulties of which each row of a terrain without a curriculum has one: those of the upper rows of ten."""
+"""Difficulties of a terrain without a curriculum, one per row: those of the upper rows of ten."""
 MOST_TILES = 10_000
-"""Largest number of tiles: each is made and laid out by itself."""
+"""Largest number of tiles; each is generated separately."""
 MOST_CELLS = 2**24
-"""Largest number of cells: as many as float32 can number, which the height scan does."""
+"""Largest number of cells; the height scan numbers them in float32, which is exact up to this number."""
 
 
 @dataclass(frozen=True)
 class TileSpec:
-    """What is asked of one tile."""
+    """Type and size of one tile."""
 
     type: str
     size: float
-    """In the unit of the type [m or degrees]."""
+    """Size in the unit of the type [m or degrees]."""
     tread: float | None = None
-    """Width of a step of stairs, where it is not that of the type [m]."""
+    """Width of a step of stairs [m]; None for the type's own."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ class Terrain:
     types: tuple[str, ...]
     """(C,) type of each column."""
     origins: np.ndarray
-    """(R, C, 3) middle of each tile, at the height at which robots stand there, world frame [m]."""
+    """(R, C, 3) middle of each tile at the height at which robots stand there, world frame [m]."""
     tile_size: tuple[float, float]
     """Extent of a tile along x and y [m]."""
     border: float
@@ -52,7 +51,7 @@ class Terrain:
 
     @classmethod
     def build(cls, cfg: TerrainConfig, seed: int) -> "Terrain":
-        """Build the terrain of a training: columns are types by their shares, rows get harder."""
+        """Return the terrain of a training: columns are types by their shares, and rows get harder."""
         columns = column_types(cfg.proportions, cfg.num_cols)
         rng = np.random.default_rng(seed)
         rows = []
@@ -63,7 +62,7 @@ class Terrain:
 
     @classmethod
     def of_tiles(cls, rows: Sequence[Sequence[TileSpec]], cfg: TerrainConfig, rng: np.random.Generator) -> "Terrain":
-        """Build a terrain of the given tiles; of `cfg` only lengths, the scale and the slope threshold count."""
+        """Return a terrain of the given tiles; of `cfg` only lengths, the scale and the slope threshold are used."""
         cell = cfg.horizontal_scale
         length, width, border = (round(x / cell) for x in (cfg.terrain_length, cfg.terrain_width, cfg.border_size))
         count = (len(rows), len(rows[0]))
@@ -96,12 +95,12 @@ class Terrain:
 
     @cached_property
     def type_names(self) -> tuple[str, ...]:
-        """Return the types there are, each once, in the order of the columns."""
+        """Types, each once, in the order of the columns."""
         return tuple(dict.fromkeys(self.types))
 
     @property
     def reach(self) -> tuple[float, float]:
-        """Return |x| and |y| beyond which a robot has left the map [m]."""
+        """|x| and |y| beyond which a robot has left the map [m]."""
         x, y = self.height_map.size
         return 0.5 * x - EDGE, 0.5 * y - EDGE
 
@@ -113,18 +112,18 @@ def tile_size(cfg: TerrainConfig, name: str, difficulty: float) -> float:
         return kind.sized(difficulty, cfg.scale)
     if not isinstance(asked, tuple):
         return asked
-    gets_smaller = kind.sized(1.0, cfg.scale) < kind.sized(0.0, cfg.scale)  # as stones do to step on
+    gets_smaller = kind.sized(1.0, cfg.scale) < kind.sized(0.0, cfg.scale)  # stepping stones get smaller with difficulty
     easier, harder = asked[::-1] if gets_smaller else asked
     return easier + (harder - easier) * difficulty
 
 
 def hardest_difficulty(cfg: TerrainConfig) -> float:
-    """Return the difficulty of the hardest row that `Terrain.build` makes, 0 to 1."""
+    """Return the difficulty of the hardest row that `Terrain.build` makes, from 0 to 1."""
     return (cfg.num_rows - 1) / cfg.num_rows if cfg.curriculum else max(WITHOUT_CURRICULUM)
 
 
 def column_types(proportions: dict[str, float], num_cols: int) -> list[str]:
-    """Return the type of each column: the one whose share of the unit interval holds the column's middle."""
+    """Return the type of each column: the type whose share of the unit interval holds the column's middle."""
     names = [name for name, share in proportions.items() if share > 0.0]
     ends = np.cumsum([proportions[name] for name in names])
     middles = (np.arange(num_cols) + 0.5) / num_cols
@@ -132,10 +131,11 @@ def column_types(proportions: dict[str, float], num_cols: int) -> list[str]:
 
 
 def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
-    """Look for everything that can be wrong with a terrain's configuration.
+    """Check all values of a terrain's configuration.
 
     Raises:
-        ConfigError: names the field, and who set it and what it does not fit, by the `origins` of the task's configuration.
+        ConfigError: a value is wrong. The text names the field, the contradicting value, and the origin of each from
+            `origins`.
     """
     if cfg.mesh_type == "plane":
         return

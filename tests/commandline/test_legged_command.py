@@ -230,7 +230,7 @@ def test_a_task_is_named_by_its_place_or_by_the_option_of_legged_gym(capsys):
 @pytest.mark.parametrize(("command", "name"), [("train", "TASK"), ("play", "POLICY")])
 def test_two_names_or_none_are_refused(command, name, capsys):
     assert call(main, [command, TASK, "--task", "go2_flat"]) == 2
-    assert f"--task: 'go2_flat' is given beside {name} '{TASK}'" in capsys.readouterr().err
+    assert f"--task: 'go2_flat' is given together with {name} '{TASK}'" in capsys.readouterr().err
     for words in ([], ["env.seed=3"]):
         assert call(main, [command, *words]) == 2
         assert f"error: {name}: is missing" in capsys.readouterr().err

@@ -216,9 +216,9 @@ def with_term(member: object, prefix: str = "_reward_") -> None:
 @pytest.mark.parametrize(
     ("member", "text"),
     [
-        (3.0, "is no method but a float"),
-        ("text", "is no method but a str"),
-        (property(lambda self: self.rew_buf), "is no method but a property"),
+        (3.0, "is not a method but a float"),
+        ("text", "is not a method but a str"),
+        (property(lambda self: self.rew_buf), "is not a method but a property"),
         (lambda self, env_ids: None, r"takes arguments \(env_ids\)"),
         (lambda self, scale, *, power: None, r"takes arguments \(scale, power\)"),
         (staticmethod(lambda task: None), r"takes arguments \(task\)"),

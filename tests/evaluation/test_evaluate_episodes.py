@@ -168,7 +168,7 @@ def test_a_policy_for_something_else_is_refused(changes, name, words, tmp_path):
     [
         (grid, [TASK, "--vx=0"], f"POLICY: '{TASK}' has no velocity commands; legged evaluate episodes"),
         (checkpoints, [TASK], f"POLICY: '{TASK}' has no velocity commands; legged evaluate episodes"),
-        (episodes, [TASK, "--num-envs", "3"], "--num-envs: the evaluation itself says how many robots"),
+        (episodes, [TASK, "--num-envs", "3"], "--num-envs: the evaluation chooses the number of robots"),
         (episodes, [TASK, "--episodes", "0"], "--episodes: must be at least 1, got 0"),
         (in_gymnasium, [TASK, "--episodes", "100000"], "--episodes: must be at most 65,536, got 100,000"),
         (episodes, [TASK, "--physics", "all"], "sim.physics: unknown value 'all'"),

@@ -30,8 +30,8 @@ class Bench:
         self.clock = torch.zeros(())
         self.terms = ObservationTerms({"a": self.a, "b": self.b})
         self.numbers = RandomPool(N, torch.device("cpu"))
-        self.sensors = ObservationErrors(self.terms, names, bias or {}, delay or {}, dropped or {}, noise or {}, self.numbers)
-        self.terms.sensors = self.sensors
+        self.errors = ObservationErrors(self.terms, names, bias or {}, delay or {}, dropped or {}, noise or {}, self.numbers)
+        self.terms.errors = self.errors
         self.numbers.allocate()
 
     def a(self):
@@ -45,7 +45,7 @@ class Bench:
         self.clock += 1.0
         self.numbers.draw()
         self.terms.evaluate(begun)
-        return self.sensors.values[:, :2].clone(), self.sensors.values[:, 2:].clone()
+        return self.errors.values[:, :2].clone(), self.errors.values[:, 2:].clone()
 
 
 def test_a_delay_of_two_steps_shows_what_was_two_steps_ago():
@@ -60,13 +60,13 @@ def test_delays_are_those_of_each_robot_and_change_with_the_episode():
     bench.step(EVERYBODY)
     delays = []
     for k in range(60):
-        before = bench.sensors.delay.clone()
+        before = bench.errors.delay.clone()
         begun = EVERYBODY if k % 6 == 5 else NOBODY
         a, _ = bench.step(begun)
         if k % 6 in (3, 4):  # the episode is old enough
-            assert a[:, 0].tolist() == (bench.clock - bench.sensors.delay[:, 0]).tolist()
-        assert k % 6 == 5 or torch.equal(before, bench.sensors.delay)
-        delays.append(bench.sensors.delay.clone())
+            assert a[:, 0].tolist() == (bench.clock - bench.errors.delay[:, 0]).tolist()
+        assert k % 6 == 5 or torch.equal(before, bench.errors.delay)
+        delays.append(bench.errors.delay.clone())
     assert torch.stack(delays).unique().tolist() == [0, 1, 2, 3]
 
 
@@ -119,15 +119,15 @@ def test_a_preview_shows_the_next_step_and_changes_nothing():
     for _ in range(30):
         bench.clock += 1.0
         bench.numbers.draw()
-        kept = {name: getattr(bench.sensors, name).clone() for name in bench.sensors.STATE}
+        kept = {name: getattr(bench.errors, name).clone() for name in bench.errors.STATE}
         bench.terms.evaluate()
-        shown = bench.sensors.values.clone()
+        shown = bench.errors.values.clone()
         for name, value in kept.items():
-            assert torch.equal(getattr(bench.sensors, name), value), name
+            assert torch.equal(getattr(bench.errors, name), value), name
         bench.terms.evaluate(NOBODY)
-        torch.testing.assert_close(bench.sensors.values, shown)
+        torch.testing.assert_close(bench.errors.values, shown)
         bench.terms.evaluate(NOBODY, again=True)
-        torch.testing.assert_close(bench.sensors.values, shown)
+        torch.testing.assert_close(bench.errors.values, shown)
 
 
 def test_the_actor_is_misled_and_the_critic_is_not():

@@ -98,10 +98,10 @@ WITHOUT = {
     "np.arange(3) + np.arange(2)": "fails: ",
     "np.arange(3) / 0": "fails: ",
     "np.arange(200) * np.array([[i] for i in np.arange(200)])": "more than 10000 items",
-    "np.array(['a']) * 2": "something else than numbers",
+    "np.array(['a']) * 2": "other things than numbers",
     "np.arange(3) > 1": "compares arrays",
     "'{}_{}'.format('a')": "fails: ",
-    "'{}'.format(A)": "something else than texts and numbers",
+    "'{}'.format(A)": "other values than texts",
     "'{}'.format(unknown_thing)": "uses unknown_thing",
     "'{a}'.format(**B)": "not followed",
     "str(n)(3)": "calls str\\(n\\)",
@@ -261,9 +261,9 @@ def test_names_of_arrays_are_arrays():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("class A(:\n    pass\n", r"a\.py:1: is no Python file"),
-        ("x = 1\n  y = 2\n", r"a\.py:2: is no Python file"),
-        ("a\0b", r"a\.py.*: is no Python file"),
+        ("class A(:\n    pass\n", r"a\.py:1: is not a readable Python file"),
+        ("x = 1\n  y = 2\n", r"a\.py:2: is not a readable Python file"),
+        ("a\0b", r"a\.py.*: is not a readable Python file"),
         ("class A: pass\nclass B(A, A): pass\n", r"a\.py:2: class B: duplicate base class"),
     ],
 )

@@ -58,7 +58,7 @@ def test_a_reward_of_the_forks_own_is_not_taken_for_ours_of_that_name(migrated):
     )
     assert found.data["rewards"]["scales"]["feet_clearance"] == -2.0
     (line,) = found.lost
-    assert "rewards.scales.feet_clearance = -2.0: is ours of that name" in line
+    assert "rewards.scales.feet_clearance = -2.0: is the reward of that name here" in line
     assert "_reward_feet_clearance" in line
 
 

@@ -207,7 +207,7 @@ def test_files_are_not_written_over_unless_asked_to(migrated, refused):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("class A(:\n", "fork_config.py:1: is no Python file that can be read"),
+        ("class A(:\n", "fork_config.py:1: is not a readable Python file"),
         ("x = 1\n", "fork_config.py: has no configuration of an environment"),
         (BASE + "class P(LeggedRobotCfgPPO):\n    pass\n", "has no configuration of an environment"),
     ],

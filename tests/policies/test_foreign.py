@@ -148,7 +148,7 @@ HERE = ["{policy}", "--robot", "anymal_c"]
             "--robot: there is no robot 'anymal_cc'; did you mean 'anymal_c'?",
         ),
         (["{policy}", "--layout", "holosoma"], "--robot: is missing; the layout 'holosoma' names none"),
-        (["{policy}", "--robot", "anymal_c"], "policy.json lies beside it; --layout says"),
+        (["{policy}", "--robot", "anymal_c"], "policy.json lies beside it"),
         (["{policy}", "--robot", "g1", "--layout", "holosoma"], "takes 49 numbers, the layout's observation has 100"),
         ([*HERE, "--layout", "holosomo"], "--layout: there is no layout 'holosomo'"),
         ([*HERE, "--layout", "{other}"], "observation: there is no term 'base_linvel'; did you mean"),

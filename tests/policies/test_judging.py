@@ -188,7 +188,7 @@ def test_the_first_that_follows(standing, tmp_path, capsys):
     [
         (["--rmse", "0.2"], "--rmse: is a limit of a grid"),
         (["--vx=0", "--rmse", "-1"], "--rmse: must be above 0"),
-        (["--vx=0", "--command", "0,0,0"], "--command: is no part of a grid"),
+        (["--vx=0", "--command", "0,0,0"], "--command: is not part of a grid"),
         (["--vx=1:0:0.5"], "--vx: '1:0:0.5' is not of the form"),
         (["--vx=0", "--seconds", "1"], "--seconds: must be above 1"),
         (["--vx=-1:1:0.01", "--vy=-1:1:0.01"], "commands; at most 10,000"),

@@ -7,12 +7,12 @@ from importing_fixtures import LEG_MASS, LEGS, TRUNK, urdf
 
 from legged.errors import ConfigError
 from legged.robots.gains import standing_torques
-from legged.robots.importing.guess import make_ready, read_robot
+from legged.robots.importing.infer import make_ready, read_robot
 from legged.robots.importing.legs import Poser
-from legged.robots.importing.mend import mend
 from legged.robots.importing.mjcf import read_mjcf
+from legged.robots.importing.mjcf_writer import mjcf_of
+from legged.robots.importing.repair import repair
 from legged.robots.importing.shapes import fit_meshes, name_shapes
-from legged.robots.importing.text import mjcf_of
 from legged.robots.importing.tree import Tree
 from legged.robots.importing.urdf import read_urdf
 
@@ -30,7 +30,7 @@ def read(tmp_path):
         path.write_text(text)
         tree = read_urdf(path, **how)
         fit_meshes(tree)
-        mend(tree)
+        repair(tree)
         name_shapes(tree)
         return tree
 
@@ -353,7 +353,7 @@ def test_what_is_written_is_what_was_read(read, tmp_path):
     path = tmp_path / "again.xml"
     path.write_text(mjcf_of(tree))
     again = read_mjcf(path)
-    mend(again)
+    repair(again)
     one, two = model_of(tree), model_of(again)
     for name in (
         "body_mass",

@@ -27,12 +27,14 @@ RESULT = "benchmark.json"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the task, the number of measurements, and --out."""
     add_task_arguments(parser)
-    parser.add_argument("--repeats", type=int, default=5, help="measurements, of which the median counts; 5 by default")
+    parser.add_argument(
+        "--repeats", type=int, default=5, help="number of measurements; the result is their median; 5 by default"
+    )
     parser.add_argument("--out", type=Path, help=f"folder for {RESULT}; without it nothing is written")
 
 
 def add_step_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say which steps and iterations are timed."""
+    """Add the options that choose the timed steps and iterations."""
     parser.add_argument("--steps", type=int, default=200, help="control steps a measurement; 200 by default")
     parser.add_argument("--iterations", type=int, help="of each training loop; 20 by default, 3 on the CPU, 0 for none")
     parser.add_argument("--runner", choices=list(LOOPS), help="time this training loop only (train.runner.loop)")
@@ -40,10 +42,10 @@ def add_step_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def settle(args: argparse.Namespace) -> tuple[TaskConfig, torch.device]:
-    """Return the configuration and the device that a command line asks for.
+    """Return the configuration and the device of a command line.
 
     Raises:
-        ConfigError: something in it is wrong.
+        ConfigError: an argument is wrong.
     """
     register_given(args, "task")
     device = pick_device(args.sim_device)
@@ -58,10 +60,10 @@ def settle(args: argparse.Namespace) -> tuple[TaskConfig, torch.device]:
 
 
 def policy_in(args: argparse.Namespace, cfg: TaskConfig) -> Path | None:
-    """Return the checkpoint of --policy, None without it.
+    """Return the checkpoint of --policy, or None without --policy.
 
     Raises:
-        ConfigError: there is none, or it does not fit the task.
+        ConfigError: there is no such policy, or it does not fit the task.
     """
     if args.policy is None:
         return None
@@ -79,7 +81,7 @@ def taught(cfg: TaskConfig, iterations: int) -> tuple[TaskConfig, Teacher | None
 def measure(
     cfg: TaskConfig, device: torch.device, args: argparse.Namespace, policy: Path | None
 ) -> tuple[Any, dict[str, Any]]:
-    """Build a task and time its steps; return it and the figures."""
+    """Build a task and time its steps; return the task and the figures."""
     start = time.perf_counter()
     task = make_task(cfg, device, graph=not args.no_graph)
     synchronize(device)
@@ -93,7 +95,7 @@ def measure(
 
 
 def add_memory(result: dict[str, Any], device: torch.device) -> None:
-    """Add the memory of the GPU that is in use to a result."""
+    """Add the GPU memory in use to a result."""
     if device.type == "cuda":
         free, whole = torch.cuda.mem_get_info(device)
         result["gpu_memory_gib"] = (whole - free) / 2**30

@@ -26,7 +26,7 @@ from legged.errors import ConfigError
 from legged.process.command_parser import CommandParser
 
 KERNEL_STEPS = 20
-"""Control steps whose kernels --kernels times."""
+"""Number of control steps whose kernels --kernels times."""
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -29,12 +29,12 @@ from legged.simulated_robot.server import Server
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, terrain_type
 
 LISTENING = "listening at "
-"""What the line with the address begins with."""
+"""Beginning of the line with the address."""
 REPORT = "report.json"
 PRIORITY = 10
-"""Below that of the program."""
+"""Priority below the program's."""
 BORDER = 10.0
-"""Level ground around the tile [m]."""
+"""Width of the level ground around the tile [m]."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -76,7 +76,7 @@ def _main(argv: list[str] | None) -> int:
     contract = None if args.contract is None else read_contract(args.contract)
     (robot, motors), scan = motors_of(args, robot, contract), scan_of(contract)
     server = Server(SimulatedRobot(robot, terrain_of(args), sim, motors, scan), args.latency, args.loss, args.seed)
-    take_priority(PRIORITY)  # motors and sensors of a robot do not wait for other processes either
+    take_priority(PRIORITY)  # motors and sensors of a real robot do not wait for other processes either
     print(f"{LISTENING}127.0.0.1:{server.port}", flush=True)
     report = server.run(args.seconds)
     if args.out is not None:
@@ -88,7 +88,7 @@ def _main(argv: list[str] | None) -> int:
 
 
 def add_simulation_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the flags that say what is simulated."""
+    """Add the flags of the simulation."""
     parser.add_argument("--terrain", metavar="TYPE", help="type of the tile it starts on, e.g. stairs_up; a plane by default")
     parser.add_argument("--size", type=float, help="of the tile's type, in its unit, e.g. the height of a step [m]")
     parser.add_argument(
@@ -105,10 +105,10 @@ def add_simulation_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check_simulation(args: argparse.Namespace) -> None:
-    """Look for numbers that make no sense.
+    """Check the numbers of the simulation's flags.
 
     Raises:
-        ConfigError: there is one.
+        ConfigError: a number makes no sense.
     """
     largest = 0.0
     if args.terrain is not None:
@@ -127,8 +127,8 @@ def check_simulation(args: argparse.Namespace) -> None:
 
 
 def motors_of(args: argparse.Namespace, robot: Robot, contract: Contract | None) -> tuple[Robot, Motors]:
-    """Return the robot with the motors that the flags ask for, their rotors and their laws: those of the training of the
-    policy in `contract`, unless told otherwise.
+    """Return the robot with the motors, rotors and control laws that the flags choose; by default those of the training of
+    the policy in `contract`.
 
     Raises:
         ConfigError: as `motors_config`.
@@ -139,13 +139,13 @@ def motors_of(args: argparse.Namespace, robot: Robot, contract: Contract | None)
 
 
 def scan_of(contract: Contract | None) -> str:
-    """Return what a point of the heights reads for the policy in `contract`."""
+    """Return the rule of height measurements (terrain.scan) for the policy in `contract`."""
     term = None if contract is None else contract.sources.get("heights")
     return SCANS[0] if term is None else term.scan
 
 
 def terrain_of(args: argparse.Namespace) -> Terrain | None:
-    """Return the ground that the flags ask for: one tile, and level ground around it."""
+    """Return the terrain that the flags choose: one tile with level ground around it; None for a plane."""
     if args.terrain is None:
         return None
     cfg = TerrainConfig(mesh_type="height_map", border_size=BORDER, horizontal_scale=args.cell)

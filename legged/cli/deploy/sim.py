@@ -32,11 +32,11 @@ from legged.robots.robot import Robot, load_robot
 from legged.simulated_robot.film import make_film
 
 ROOM_MB = 16.0
-"""What the disk must have room for: the exported policy and the log [MiB]."""
+"""Disk space for the exported policy and the log [MiB]."""
 END_S = 20.0
-"""A process that was asked to end must do so within so long [s]."""
+"""Longest time for a process to end after it was told to [s]."""
 DID_NOT_RUN = (EXIT_WRONG_INPUT, INTERRUPTED)
-"""Exit codes of a program that has moved no robot."""
+"""Exit codes of a program that did not move the robot."""
 SIMULATED = ("terrain", "size", "cell", "sim_dt", "latency", "loss", "seed")
 PASSED_ON = ("input", "gamepad", "commands", "seconds", "stand_seconds", "max_tilt", "max_age", "max_missed")
 
@@ -90,11 +90,11 @@ def _main(argv: list[str] | None) -> int:
 
 
 def _exported(name: str) -> Path:
-    """Return the folder with the export that `name` means; one is made of a run, where its newest checkpoint has none yet, or
-    of a shipped policy.
+    """Return the folder of the exported policy `name`. A run whose newest checkpoint was not exported is exported first, and
+    so is a shipped policy.
 
     Raises:
-        ConfigError: there is none of that name, or it is of a task without commands.
+        ConfigError: there is no policy of that name, or its task has no commands.
     """
     given = Path(name).parent if name.endswith(".onnx") else Path(name)
     if exists(given / "policy.onnx"):
@@ -113,21 +113,21 @@ def _exported(name: str) -> Path:
 
 
 def _outdated(run: Path) -> bool:
-    """Return whether the export in a run folder is older than the run's newest checkpoint: the training has gone on."""
+    """Return True if the export in a run folder is older than the run's newest checkpoint."""
     saved = checkpoints(run)
     return bool(saved) and saved[max(saved)].stat().st_mtime > (run / EXPORTED / "policy.onnx").stat().st_mtime
 
 
 def _simulated(given: str | None, exported: Path, contract: Contract) -> Robot:
-    """Return the robot that is simulated: the one `given`, else the policy's. Of a robot of one's own a contract has the name
-    alone; its folder is known to the configuration of the run that the export lies in.
+    """Return the simulated robot: the one `given`, else the policy's. A contract names a user-defined robot without its
+    folder, which is in the configuration of the run that contains the export.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: the robot is not found.
     """
     if given is not None:
         return load_robot(given, "--robot")
-    for folder in exported.absolute().parents[:2]:  # of an export of one checkpoint, and of those of all
+    for folder in exported.absolute().parents[:2]:  # the run of an exported single checkpoint, or of the export of all
         if exists(folder / CONFIG_FILE):
             cfg = run_config(folder)
             if isinstance(cfg, LeggedConfig) and Path(cfg.robot).name == contract.robot:
@@ -136,18 +136,18 @@ def _simulated(given: str | None, exported: Path, contract: Contract) -> Robot:
         return load_robot(contract.robot)
     except ConfigError as error:
         said = f"{relative(contract.path)}: robot: '{contract.robot}' does not come with this package"
-        raise ConfigError(f"{said}; --robot FOLDER says where it lies") from error
+        raise ConfigError(f"{said}; give its folder with --robot FOLDER") from error
 
 
 def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path) -> tuple[int, dict[str, Any] | None]:
-    """Run the simulated robot and the program to their ends; return the program's exit code and the robot's report, None if
-    the program did not run.
+    """Run the simulated robot and the program until both end; return the program's exit code and the robot's report. The
+    report is None if the program did not run.
 
     Raises:
         RunError: the simulated robot does not start, fails, or does not end.
     """
     report = folder / REPORT
-    report.unlink(missing_ok=True)  # of another run
+    report.unlink(missing_ok=True)  # the report of another run
     simulator = subprocess.Popen(
         [
             *(sys.executable, "-m", "legged", "deploy", "robot", robot, "--out", str(folder)),
@@ -157,10 +157,10 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         text=True,
-        start_new_session=True,  # Ctrl-C is for the program, which brakes the robot first
+        start_new_session=True,  # Ctrl-C is for the program, which stops the robot safely first
     )
     program = None
-    if in_main_thread():  # who ends this process means all three
+    if in_main_thread():  # a signal to this process is meant for all three
         signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         assert simulator.stdout is not None
@@ -175,7 +175,7 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
             ]
         )
         code = _wait(program)
-        if code in DID_NOT_RUN:  # it has said why
+        if code in DID_NOT_RUN:  # the program has printed the reason
             return code, None
         try:
             simulator.communicate(timeout=END_S)
@@ -195,7 +195,7 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
 
 
 def _wait(program: subprocess.Popen) -> int:
-    """Wait for the program, which a Ctrl-C of the terminal reaches by itself; return its exit code."""
+    """Wait for the program, which receives the terminal's Ctrl-C itself; return its exit code."""
     while True:
         try:
             return program.wait()
@@ -204,7 +204,7 @@ def _wait(program: subprocess.Popen) -> int:
 
 
 def _flags(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
-    """Return the flags of those names that were given, or have a default."""
+    """Return the given and default values of the named options as flags."""
     given = {name: getattr(args, name) for name in names}
     return [
         word for name, value in given.items() if value is not None for word in (f"--{name.replace('_', '-')}", str(value))
@@ -212,7 +212,7 @@ def _flags(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
 
 
 def _told(report: dict[str, Any]) -> str:
-    """Say in one line what became of the robot."""
+    """Return a summary of the robot's report in one line."""
     lost = report["lost"] / max(1, report["sent"] + report["received"])
     lean, share = report["largest_lean"], 100.0 * lost
     return (

@@ -31,14 +31,14 @@ from legged.policies.restore import TrainedPolicy
 from legged.process.paths import relative, write_text
 
 EPISODES, MOST_ROBOTS = 50, 256
-"""Default number of episodes, and largest default number of robots that run them."""
+"""Default number of episodes, and largest default number of robots for them."""
 TOP = 10
-"""Default number of episodes that are listed."""
+"""Default number of listed episodes."""
 LIST = "episodes.md"
 
 
 def add_recording_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say how episodes are run."""
+    """Add the options of the recording."""
     add_build_arguments(parser)
     parser.add_argument("--episodes", type=int, default=EPISODES, help=f"how many; {EPISODES} by default")
     parser.add_argument("--as-trained", action="store_true", help="with noise, pushes, randomisation and curricula")
@@ -48,7 +48,7 @@ def add_recording_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_listing_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say which episodes are listed and shown."""
+    """Add the options of the list of episodes and their pages."""
     known = f"{FELL}, {', '.join(column.name for column in COLUMNS)}"
     parser.add_argument("--sort", default=FELL, help=f"{known}; the worst first")
     parser.add_argument("--ended", metavar="TERM", help="only episodes that this termination ended")
@@ -59,7 +59,7 @@ def add_listing_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def wish_of(args: argparse.Namespace) -> Wish:
-    """Return how episodes are run.
+    """Return the settings of the recording.
 
     Raises:
         ConfigError: a number is out of bounds, or the command is malformed.
@@ -92,10 +92,10 @@ def _command(text: str) -> tuple[float, float, float]:
 
 
 def check_listing(args: argparse.Namespace) -> None:
-    """Look whether the options of `add_listing_arguments` make sense, before anything is built.
+    """Check the options of `add_listing_arguments` before a task is built.
 
     Raises:
-        ConfigError: one does not.
+        ConfigError: an option is wrong.
     """
     for option, value in (("top", args.top), ("worst", args.worst)):
         if value < 0:
@@ -143,7 +143,7 @@ def folder_of(policy: TrainedPolicy) -> Path:
 
 
 def show(episodes: Episodes, folder: Path, args: argparse.Namespace) -> None:
-    """Print the list of episodes and write it into `folder`, with the pages and the table that the options ask for."""
+    """Print the list of episodes, and write it with the chosen pages and table into `folder`."""
     figures = figures_of(episodes)
     order = order_of(figures, args.sort, args.ended)
     wanted = pages(args.page, len(episodes)) + order[: args.worst]

@@ -30,7 +30,7 @@ from legged.process.command_parser import CommandParser
 from legged.process.paths import ready_to_write, relative
 
 STEP_BYTES = 1200
-"""Largest room that a control step of a robot takes on the disk [bytes]."""
+"""Largest disk space for a control step of a robot [bytes]."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -63,13 +63,13 @@ def _main(argv: list[str] | None) -> int:
 
 
 def _recorded(args: argparse.Namespace) -> tuple[Episodes, Path]:
-    """Record episodes of the policy that the command line names; return them and the folder where they are stored."""
+    """Record episodes of the policy on the command line; return them and the folder where they are stored."""
     register_given(args, "policy")
     wish = wish_of(args)
     device = device_of(args)
     policy = policy_of(args.policy, args.checkpoint)
     pages(args.page, wish.episodes)
-    if args.ended is not None:  # before the recording replaces an older one
+    if args.ended is not None:  # checked before the recording replaces an older one
         terms = policy.cfg.terminations
         check_ended(args.ended, [*terms.failures, *terms.time_outs, TIME_UP, NO_NUMBERS])
     check_wish(policy, wish)

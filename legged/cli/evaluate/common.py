@@ -19,14 +19,14 @@ from legged.process.command_parser import CommandParser
 from legged.process.paths import ready_to_write
 
 ROBOTS = 16
-"""Default number of robots a cell of the grid."""
+"""Default number of robots for each cell of the grid."""
 MOST_SIZES = 16
 """Largest number of sizes of a terrain type that are measured at the same time."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A policy that is measured, and where and how."""
+    """A policy to measure, with its overrides and its folder."""
 
     policy: TrainedPolicy
     device: torch.device
@@ -70,7 +70,7 @@ def add_grid_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_points_arguments(parser: argparse.ArgumentParser, full: str) -> None:
-    """Add the options that say how many robots there are for each size of a terrain type; `full` is the help of --full."""
+    """Add the options for the number of robots at each size of a terrain type; `full` is the help of --full."""
     parser.add_argument("--full", action="store_true", help=f"{full}, and 256 robots each")
     parser.add_argument("--robots-per-point", type=int, help="robots for each size of a type; 32, or 256 with --full")
 
@@ -81,14 +81,14 @@ def add_types_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def settle(args: argparse.Namespace) -> Setting:
-    """Return the setting that a command line asks for.
+    """Return the setting of a command line.
 
     Raises:
-        ConfigError: there is no such policy or device, or nothing can be written into the folder.
+        ConfigError: there is no such policy or device, or the folder cannot be written.
     """
     register_given(args, "policy")
     if args.num_envs is not None:
-        raise ConfigError("--num-envs: the evaluation itself says how many robots there are; leave it out")
+        raise ConfigError("--num-envs: the evaluation chooses the number of robots; leave it out")
     device = torch.device("cpu") if args.physics == "mujoco" and args.sim_device is None else pick_device(args.sim_device)
     settle_on(device)
     policy = policy_of(args.policy, getattr(args, "checkpoint", None))
@@ -100,7 +100,7 @@ def settle(args: argparse.Namespace) -> Setting:
 
 
 def ready(setting: Setting) -> None:
-    """Look whether the result can be written.
+    """Check that the result can be written.
 
     Raises:
         ConfigError: it cannot.
@@ -109,10 +109,10 @@ def ready(setting: Setting) -> None:
 
 
 def check_follows_commands(policy: TrainedPolicy) -> None:
-    """Look whether a policy is of a task with velocity commands.
+    """Check that a policy's task has velocity commands.
 
     Raises:
-        ConfigError: it is not.
+        ConfigError: it has none.
     """
     if not isinstance(policy.cfg, LeggedConfig):
         task = policy.cfg.task
@@ -120,7 +120,7 @@ def check_follows_commands(policy: TrainedPolicy) -> None:
 
 
 def grid_of(setting: Setting, args: argparse.Namespace | None = None) -> Grid:
-    """Return the grid of commands that the options ask for, or else the configuration.
+    """Return the grid of commands from the options, or from the configuration for options that are not given.
 
     Raises:
         ConfigError: an axis is malformed, or the grid is too large.
@@ -137,7 +137,7 @@ def grid_of(setting: Setting, args: argparse.Namespace | None = None) -> Grid:
 
 
 def check_points(given: int | None, full: bool) -> int:
-    """Return the robots for each size of a terrain type: those `given` by --robots-per-point, or the usual number.
+    """Return the number of robots for each size of a terrain type: `given` by --robots-per-point, or the default.
 
     Raises:
         ConfigError: the number is below 1, or larger than any machine can hold.

@@ -35,10 +35,10 @@ def build_parser() -> CommandParser:
 
 
 def check_episodes(count: int) -> None:
-    """Look whether a number of episodes can be run.
+    """Check the number of episodes.
 
     Raises:
-        ConfigError: it cannot.
+        ConfigError: it is out of bounds.
     """
     if not 1 <= count <= MOST_EPISODES:
         limit = "at least 1" if count < 1 else f"at most {MOST_EPISODES:,}"

@@ -1,10 +1,11 @@
 """ONNX policies in plain MuJoCo, foreign ones too: `legged evaluate onnx exported/policy.onnx`.
 
-One robot on a plane follows commands in C MuJoCo, and the velocities that it reaches are printed. They show whether model,
-frames, joint order and gains are those of the training. For an exported policy of this package, the policy.json beside it
-says which robot it controls and how; for a foreign one, --robot and --layout do. With --vx, --vy or --yaw a grid of commands
-is measured as by `legged evaluate grid`; with --rmse also which of several files, such as the checkpoints of a training, is
-the first that follows it.
+One robot on a plane follows commands in C MuJoCo, and the reached velocities are printed. They show whether model, frames,
+joint order and gains are those of the training. An exported policy of this package has a policy.json next to it, which
+describes robot and control; for a foreign policy give --robot and --layout.
+
+With --vx, --vy or --yaw a grid of commands is measured as by `legged evaluate grid`. With --rmse too, the command prints the
+first of several files, such as the checkpoints of a training, that follows the grid.
 """
 
 import argparse
@@ -27,14 +28,14 @@ from legged.process.paths import exists, make_folder, ready_to_write, relative, 
 from legged.robots.robot import Robot, load_robot
 
 COMMANDS = ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.8), (-0.5, 0.0, 0.0))
-"""vx, vy [m/s], yaw rate [rad/s]."""
+"""Default commands: vx, vy [m/s], yaw rate [rad/s]."""
 SECONDS, HOLD_S = 8.0, Grid.hold_s
-"""Default length of a single command, and of one of a grid [s]."""
+"""Default length of a single command, and of a command of a grid [s]."""
 MOST_CELLS = 10_000
-"""Largest number of commands of a grid: each takes seconds of one robot."""
+"""Largest number of commands of a grid; one robot takes seconds for each."""
 RESULT = "onnx.json"
 EXPORTED = ("policy.onnx", "policy.json")
-"""Files of an exported folder: the network, and what it expects of a robot."""
+"""Files of an exported folder: the network, and its description."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -43,7 +44,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def exported_file(name: str) -> Path | None:
-    """Return the ONNX file that POLICY names, itself or by its exported folder; None if it names something else."""
+    """Return the ONNX file that POLICY names directly or by its exported folder; None if POLICY names something else."""
     path = Path(name)
     if path.suffix == ".onnx":
         return path
@@ -78,7 +79,7 @@ def build_parser() -> CommandParser:
 
 
 def evaluate(argv: list[str] | None) -> int:
-    """Evaluate the policies that the arguments name; return the exit code.
+    """Evaluate the policies of a command line; return the exit code.
 
     Raises:
         ConfigError: an argument or a file is wrong.
@@ -127,7 +128,7 @@ def _file(name: str) -> Path:
     """Return the ONNX file that POLICY names.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: there is no such file.
     """
     path = exported_file(name)
     if path is None or not exists(path) or not path.is_file():
@@ -136,14 +137,14 @@ def _file(name: str) -> Path:
 
 
 def _description(files: list[Path]) -> Path:
-    """Return the policy.json beside the first file.
+    """Return the policy.json next to the first file.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: the file is missing.
     """
     path = files[0].with_name(EXPORTED[1])
     if not exists(path):
-        raise ConfigError(f"{files[0]}: no {EXPORTED[1]} lies beside it; --layout says what its observation is made of")
+        raise ConfigError(f"{files[0]}: no {EXPORTED[1]} lies beside it; give the contents of its observation with --layout")
     return path
 
 
@@ -174,17 +175,17 @@ def _command(text: str) -> tuple[float, ...]:
 
 
 def _grid(args: argparse.Namespace) -> Grid | None:
-    """Return the grid that the command line asks for; None without --vx, --vy and --yaw.
+    """Return the grid of the command line; None without --vx, --vy and --yaw.
 
     Raises:
-        ConfigError: it is malformed, or single commands are asked for too.
+        ConfigError: the grid is malformed, or single commands are given too.
     """
     if all(getattr(args, axis) is None for axis in AXES):
         if args.rmse is not None:
             raise ConfigError("--rmse: is a limit of a grid of commands; add --vx, --vy or --yaw")
         return None
     if args.command:
-        raise ConfigError("--command: is no part of a grid; leave out either it or --vx, --vy and --yaw")
+        raise ConfigError("--command: is not part of a grid; leave out either it or --vx, --vy and --yaw")
     if args.rmse is not None and not 0.0 < args.rmse <= 100.0:
         raise ConfigError(f"--rmse: must be above 0 and at most 100, got {args.rmse}")
     given = {axis: AXIS if getattr(args, axis) is None else getattr(args, axis) for axis in AXES}
@@ -204,8 +205,8 @@ def _follow_all(
     args: argparse.Namespace,
     grid: Grid,
 ) -> dict[str, Any]:
-    """Measure every policy on the grid, print a line on each, and return all figures; of policies that say after how many
-    seconds of training they were written, the earliest comes first.
+    """Measure every policy on the grid, print a line about each, and return all figures. Policies that state their training
+    time come in its order.
     """
     marks = [_marks(policy) for policy in policies]
     order = sorted(range(len(policies)), key=lambda i: marks[i].get("wall_s", 0.0))
@@ -243,7 +244,7 @@ def _follows(row: dict[str, Any], rmse: float) -> bool:
 
 
 def _marks(policy: ForeignPolicy) -> dict[str, float]:
-    """Return what the file says of its training: seconds and iterations, as far as they are numbers."""
+    """Return the seconds and iterations of training from the file's metadata, as far as they are numbers."""
     found = {}
     for name in ("wall_s", "iterations"):
         try:
@@ -254,7 +255,7 @@ def _marks(policy: ForeignPolicy) -> dict[str, float]:
 
 
 def _row(row: Played) -> dict[str, Any]:
-    """Return a command's figures for JSON: what is not defined is null."""
+    """Return a command's figures for JSON, with null for undefined ones."""
     velocity = None if row.fell_after is not None else list(row.velocity)
     height = None if velocity is None else row.height
     return {"command": list(row.command), "velocity": velocity, "lowest_base": height, "fell_after": row.fell_after}

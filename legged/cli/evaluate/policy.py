@@ -55,10 +55,10 @@ def _main(argv: list[str] | None) -> int:
 
 
 def _check_plain(args: argparse.Namespace) -> None:
-    """Look for options that mean nothing for an ONNX file, which runs in C MuJoCo as it is.
+    """Check that no option is given that has no effect on an ONNX file, which runs in C MuJoCo unchanged.
 
     Raises:
-        ConfigError: there is one.
+        ConfigError: there is such an option.
     """
     if args.overrides:
         raise ConfigError(f"{args.overrides[0]}: an ONNX file runs as it is; `legged evaluate onnx` has its options")

@@ -16,14 +16,14 @@ from legged.process.command_parser import CommandParser
 from legged.process.paths import data_folder, exists, make_folder, ready_to_write, relative, write_text
 from legged.registry import register_file, task_config
 from legged.robots.importing.folder import Guesses, called, task_yaml, write_folder
-from legged.robots.importing.guess import make_ready, read_robot
+from legged.robots.importing.infer import make_ready, read_robot
 from legged.robots.importing.menagerie import PREFIX, menagerie_model
-from legged.robots.importing.mend import plain
+from legged.robots.importing.repair import plain
 from legged.robots.importing.tree import Tree
 from legged.robots.robot import load_robot
 
 ROOM_MB = 100.0
-"""What the disk must have room for [MiB]."""
+"""Disk space for the files [MiB]."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -97,7 +97,7 @@ def _gains(args: argparse.Namespace) -> tuple[float, float] | None:
 
 
 def _source(given: str) -> tuple[Path, str, str]:
-    """Return the file, what it is called in PROVENANCE.md, and its licence as far as it is known."""
+    """Return the file, its name in PROVENANCE.md, and its licence as far as it is known."""
     if given.startswith(PREFIX):
         path, licence = menagerie_model(given.removeprefix(PREFIX))
         return path, f"MuJoCo Menagerie, {given.removeprefix(PREFIX)}/{path.name}", licence
@@ -109,7 +109,7 @@ def _source(given: str) -> tuple[Path, str, str]:
 
 
 def _check_apart(source: Path, folder: Path) -> None:
-    """Look whether a file that is read lies outside the folder that is written, where it could be written over."""
+    """Check that no file that is read lies in the folder that is written, where it could be overwritten."""
     if source.resolve().is_relative_to(folder.resolve()):
         raise ConfigError(
             f"{relative(source)}: lies in {relative(folder)}, the folder that the robot goes to; another --name or --out"
@@ -117,7 +117,7 @@ def _check_apart(source: Path, folder: Path) -> None:
 
 
 def _check_task(name: str, beside: Path) -> None:
-    """Look whether there is a task that the new one, in the file `beside` it, can extend."""
+    """Check that the task exists that the new one, in the file `beside` it, extends."""
     folders = (data_folder("cfg"), beside.parent)
     if not any(exists(folder / f"{name.removesuffix('.yaml')}.yaml") for folder in folders):
         names = {path.relative_to(folders[0]).with_suffix("").as_posix() for path in folders[0].rglob("*.yaml")}
@@ -125,8 +125,8 @@ def _check_task(name: str, beside: Path) -> None:
 
 
 def _places(name: str, out: Path | None, extends: str | None) -> tuple[Path, Path]:
-    """Return the robot's folder and its task's file. As the tasks in cfg/, one that extends a `..._flat` or a `..._real` ends
-    like it, and one on rough ground is called like its robot; without `extends` it is a flat one.
+    """Return the robot's folder and its task's file. The name of a task that extends a `..._flat` or a `..._real` gets the
+    same ending, as in cfg/; a task on rough ground has the robot's name. Without `extends` the task is flat.
     """
     like = "_flat" if extends is None else extends.removesuffix(".yaml")
     file = name + next((ending for ending in ("_flat", "_real") if like.endswith(ending)), "") + ".yaml"
@@ -134,12 +134,12 @@ def _places(name: str, out: Path | None, extends: str | None) -> tuple[Path, Pat
         return out / name, out / file
     robots, tasks = data_folder("resources") / "robots", data_folder("cfg")
     if robots.resolve().is_relative_to(Path(sys.modules["legged"].__file__ or ".").resolve().parent):
-        return Path(name), Path(file)  # an installed package is no place for robots
+        return Path(name), Path(file)  # robots are not written into an installed package
     return robots / name, tasks / file
 
 
 def _report(tree: Tree, guesses: Guesses, folder: Path, task: Path, megabytes: float) -> None:
-    """Print what was found, changed and guessed."""
+    """Print what was read, changed and guessed."""
     driven = sum(hinge.driven for hinge in tree.hinges)
     mass = sum(link.mass for link in tree.links)
     counts = f"{len(tree.hinges)} hinges, {driven} motors, {len(tree.shapes)} shapes"

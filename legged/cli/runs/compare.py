@@ -18,7 +18,7 @@ from legged.process.paths import make_folder, ready_to_write, relative
 from legged.registry import import_tasks
 
 MOST_COMPARED = 8
-"""Largest number of runs: there are as many colours."""
+"""Largest number of runs, which is the number of colours."""
 
 
 def main(argv: list[str] | None = None) -> int:

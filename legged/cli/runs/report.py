@@ -27,7 +27,7 @@ from legged.registry import import_tasks
 SIDE = 320
 """Width and height of the film [pixels]."""
 LONGEST_FILM_S = 900.0
-"""Filming that takes longer hangs, and ends the process [s]."""
+"""Longest time for filming; a longer one hangs, and the process is ended [s]."""
 LONGEST_NOTE = 1000
 
 
@@ -64,7 +64,7 @@ def _main(argv: list[str] | None) -> int:
     for folder in folders:
         ready_to_write(folder, 4.0)
         if args.film:
-            if argv is None:  # a library that draws may hang where no exception reaches it
+            if argv is None:  # a drawing library may hang where exceptions do not reach it
                 faulthandler.dump_traceback_later(LONGEST_FILM_S, exit=True, file=2)
             why = _film(folder, args.checkpoint)
             faulthandler.cancel_dump_traceback_later()
@@ -77,8 +77,8 @@ def write_note(folders: list[Path], text: str) -> None:
     """Write a sentence into run folders.
 
     Raises:
-        ConfigError: it is empty or too long.
-        RunError: it can't be written.
+        ConfigError: the sentence is empty or too long.
+        RunError: a file can't be written.
     """
     if not text.strip() or len(text) > LONGEST_NOTE:
         raise ConfigError(f"--note: expected a sentence of at most {LONGEST_NOTE} letters, got {len(text.strip())}")
@@ -87,7 +87,7 @@ def write_note(folders: list[Path], text: str) -> None:
 
 
 def _film(folder: Path, checkpoint: int | str | None) -> str:
-    """Film the policy of a run; return why that is impossible, or an empty text."""
+    """Film the policy of a run; return the reason if that is impossible, else an empty text."""
     try:
         cfg = run_config(folder)
         if not isinstance(cfg, LeggedConfig):

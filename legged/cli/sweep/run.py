@@ -31,9 +31,9 @@ from legged.sweeping.report import write_report
 from legged.sweeping.study import WHY, Trials, check_installed, finished
 
 TELL_S = 1.0
-"""What other processes have done is looked at so often [s]."""
+"""Interval at which the trials of other processes are read [s]."""
 MOST_STARTS = 10
-"""Times that each worker may be started anew, if its process ends before the sweep does."""
+"""Largest number of restarts of a worker whose process ends before the sweep does."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -57,7 +57,7 @@ def build_parser() -> CommandParser:
 
 
 def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that say which sweep is meant."""
+    """Add the arguments that choose a sweep."""
     parser.add_argument("file", metavar="FILE", help="YAML file of the sweep, or the name of one in cfg/sweeps")
     parser.add_argument("--sim-device", help="cpu, cuda, or a list with commas, from which the jobs take theirs")
     parser.add_argument("--storage", help="URL of a database that several machines share, or journal:<file>")
@@ -80,7 +80,7 @@ def plan_of(args: argparse.Namespace, on_cpu: bool) -> Plan:
     """Return the plan of the sweep's file.
 
     Raises:
-        ConfigError: optuna is missing, or something in the file is wrong.
+        ConfigError: optuna is missing, or the file is wrong.
     """
     check_installed()
     if args.module:
@@ -132,20 +132,20 @@ def _main(argv: list[str] | None) -> int:
 
 
 def _work(args: argparse.Namespace, plan: Plan, device: str) -> int:
-    """Make trials as one of several processes; return the exit code."""
+    """Run trials as one of several processes; return the exit code."""
     trials = Trials(plan, args.storage or "", args.worker)
     stopped_by = Worker(plan, trials, _flags(args, device, device == "cpu", args.jobs or 1)).run()
     return 128 + stopped_by[0] if stopped_by else 0
 
 
 def _flags(args: argparse.Namespace, device: str, on_cpu: bool, jobs: int) -> list[str]:
-    """Return the flags of train.py that say where a trial is trained."""
+    """Return the flags of train.py for the device and threads of a trial."""
     flags = ["--sim-device", device, *(["--import", args.module] if args.module else [])]
     return [*flags, f"sim.threads={max(1, available_cores() // jobs)}"] if on_cpu and jobs > 1 else flags
 
 
 def _pool(args: argparse.Namespace, trials: Trials, path: Path, devices: list[str], jobs: int) -> list[int]:
-    """Let several processes make trials; return the signals that ended them early."""
+    """Run trials in several processes; return the signals that ended processes early."""
     plan = trials.plan
     start, starts = time.perf_counter(), [0] * jobs
     pool = WorkerPool({Kind.TRAINING: jobs}, ())
@@ -174,7 +174,7 @@ def _pool(args: argparse.Namespace, trials: Trials, path: Path, devices: list[st
 
 
 def _teller(trials: Trials, start: float) -> Callable[[], None]:
-    """Return what prints, whenever it is called, what has become of trials since, which other processes make."""
+    """Return a function that prints, at each call, the trials of other processes that have ended since the last call."""
     told = {trial.number for trial in finished(trials.all)}
 
     def tell() -> None:

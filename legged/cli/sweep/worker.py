@@ -27,7 +27,7 @@ from legged.sweeping.study import RUNS, WHY, Trials
 if TYPE_CHECKING:
     from optuna import Trial
 
-PRUNED = "ended early: others were better by then"
+PRUNED = "ended early: others were better at that step"
 SIGNALLED = 128
 """Exit codes from here on mean that a signal ended a training."""
 MOST_FAILURES = 3
@@ -38,7 +38,7 @@ class Stopped(Exception):
     """A training was ended by a signal."""
 
     def __init__(self, number: int) -> None:
-        """Take the number of the signal."""
+        """Store the number of the signal."""
         super().__init__(f"signal {number}")
         self.number = number
 
@@ -51,7 +51,7 @@ class Worker:
     """Runner of trials."""
 
     def __init__(self, plan: Plan, trials: Trials, flags: Sequence[str]) -> None:
-        """Take the options of `legged train` for device and threads."""
+        """Store the options of `legged train` for device and threads."""
         self.plan, self.trials, self._flags = plan, trials, [*flags]
         self._start = time.perf_counter()
         self._failures = 0

@@ -23,7 +23,7 @@ namespace legged {
 
 class Policy {
 public:
-    // Throws std::runtime_error if the file cannot be read, or is none.
+    // Throws std::runtime_error if the file cannot be read or is not a weights file.
     explicit Policy(const std::string& path) {
         std::ifstream file(path, std::ios::binary);
         if (!file) throw std::runtime_error(path + ": cannot be read");
@@ -147,7 +147,7 @@ private:
         switch (which) {
             case 0: return x > 0.0 ? x : std::expm1(x);
             case 1: return 1.0507009873554805 * (x > 0.0 ? x : 1.6732632423543772 * std::expm1(x));
-            case 2: return x < 0.0 ? 0.0 : x;  // what is no number stays none
+            case 2: return x < 0.0 ? 0.0 : x;  // NaN stays NaN
             case 3: return x > 0.0 ? x : 0.01 * x;
             case 4: return std::tanh(x);
             case 5: return sigmoid(x);

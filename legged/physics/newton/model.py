@@ -11,8 +11,8 @@ from legged.errors import ConfigError
 from legged.physics.newton.solvers import SolverSetup
 from legged.physics.scene.robot_scene import robot_source
 from legged.physics.scene.terrain_geoms import DEPTH, lattice_heights
+from legged.robots.reserved_names import FLOOR
 from legged.robots.robot import Robot
-from legged.robots.robot_model import FLOOR
 from legged.terrain import Terrain
 
 

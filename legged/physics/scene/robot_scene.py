@@ -6,9 +6,9 @@ import numpy as np
 from legged.config.schema import SimConfig
 from legged.physics.scene.scene import GroundShapes, Scene, set_options
 from legged.physics.scene.terrain_geoms import add_height_field, add_terrain
-from legged.robots.importing.adapted import is_plain_file, robot_spec_of
+from legged.robots.importing.convert import is_plain_file, robot_spec_of
+from legged.robots.reserved_names import FLOOR
 from legged.robots.robot import Robot
-from legged.robots.robot_model import FLOOR
 from legged.terrain import Terrain
 
 UNTOUCHED = 1 << 30

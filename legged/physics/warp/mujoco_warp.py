@@ -30,7 +30,8 @@ from legged.physics.warp.randomize_kernels import Redraws, Variants
 from legged.physics.warp.state_io import MujocoWarpStateIO, StateIO, arrays_of
 from legged.process.cores import available_cores
 from legged.process.ranks import Ranks
-from legged.robots.robot_model import FLOOR, disabled_groups
+from legged.robots.reserved_names import FLOOR
+from legged.robots.robot_model import disabled_groups
 
 PER_WORLD = ("geom_friction", "body_mass", *DERIVED)
 """Arrays of the model that always have one row per world; the arrays of randomised fields have one too."""

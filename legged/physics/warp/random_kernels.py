@@ -48,7 +48,7 @@ def find_moments(
 
 @wp.func
 def drawn_value(even: float, column: int, table: wp.array2d[float], steps: float) -> float:
-    """Return the random value of a column of `Draws.table` for a uniform number."""
+    """Return the random value of a column of `Distributions.table` for a uniform number."""
     value = even
     kind = table[column, 0]
     if kind > 0.0:

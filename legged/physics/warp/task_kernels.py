@@ -342,7 +342,7 @@ class TaskKernels(Launcher):
         self.launch(find_pushes, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def make_draws(self, *arguments: Tensor) -> None:
-        """Launch the kernel of `Draws.values`. The last argument is written."""
+        """Launch the kernel of `Distributions.values`. The last argument is written."""
         self.launch(make_draws, tuple(arguments[-1].shape), arguments)
 
     def make_fresh(self, *arguments: Tensor) -> None:

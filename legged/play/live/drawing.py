@@ -13,7 +13,7 @@ from legged.play.live.session import Session
 from legged.play.live.shapes import PERIOD, body_meshes, plane_mesh, terrain_mesh
 from legged.rendering.framing import side_by_side, size_of, size_of_model
 from legged.rendering.task_cameras import ABOVE, APART, SPACING
-from legged.robots.importing.adapted import robot_spec_of
+from legged.robots.importing.convert import robot_spec_of
 
 GLIDE = np.array([0.25, 0.25, 0.06])
 """Share of the distance to the followed robot that the view covers per picture, along x, y, z: steps then shake it less."""

@@ -54,7 +54,7 @@ class CheckpointFollower:
         return self.watched.checkpoint is None and (self.watched.folder / BEST_MODEL).is_file()
 
     def wanted(self) -> Path | None:
-        """Return the checkpoint to show; None if there is none yet."""
+        """Return the checkpoint to show; None before the first one is written."""
         found = checkpoints(self.watched.folder)
         if self.watched.checkpoint is not None:
             return found.get(self.watched.checkpoint)

@@ -1,1 +1,1 @@
-"""Models of others (URDF, MJCF of any kind) -> a tree of links that hang on hinges, and MJCF as the engines rely on it."""
+"""Import of robot models from URDF and any MJCF: a tree of links and hinges, and MJCF in the form that the engines need."""

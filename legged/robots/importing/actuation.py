@@ -1,4 +1,4 @@
-"""Torque limits and gains that a file states, and whether they hold here: the law of the joints is an explicit one."""
+"""Torque limits and gains from a robot's file, with a check that the gains are stable in the explicit control law."""
 
 from collections.abc import Sequence
 
@@ -10,15 +10,15 @@ from legged.robots.importing.legs import Leg, Poser
 from legged.robots.importing.tree import Tree
 
 SHARE, ELSEWHERE = 0.4, 0.1
-"""Guess of a torque limit, in weight times height of the base: of a leg, of other joints."""
+"""Guessed torque limits of leg joints and of other joints, as shares of weight times base height."""
 GRAVITY = 9.81
 SAG = 1.0
-"""Gains of a file under which a joint gives way by more than this are none to stand with [rad]."""
+"""Largest deflection under the robot's weight with the file's gains [rad]; with a larger one the gains are left out."""
 
 
 def guess_efforts(tree: Tree, legs: list[Leg], height: float) -> None:
-    """Give motors without a torque limit one, by weight and height [m] of the robot; a hinge that the file limits to another
-    value keeps it.
+    """Guess the missing torque limits of motors from the weight and height [m] of the robot. A hinge that the file limits to
+    another value keeps it.
     """
     weight = sum(link.mass for link in tree.links) * GRAVITY * height
     of_legs = {name for leg in legs for name in leg.hinges}
@@ -30,8 +30,8 @@ def guess_efforts(tree: Tree, legs: list[Leg], height: float) -> None:
 
 
 def speed_limits(tree: Tree) -> dict[str, float]:
-    """Return the speed limits of all hinges with a motor [rad/s], where the file states any; what it leaves out is as
-    elsewhere.
+    """Return the speed limits of all hinges with a motor [rad/s] if the file states any, with a default for missing ones;
+    else an empty table.
     """
     driven = [hinge for hinge in tree.hinges if hinge.driven]
     if not any(hinge.velocity for hinge in driven):
@@ -43,9 +43,11 @@ def speed_limits(tree: Tree) -> dict[str, float]:
 
 
 def take_gains(tree: Tree, angles: dict[str, float], feet: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
-    """Return P and D gains [N m/rad], [N m s/rad] of the file's position actuators by hinge; the damping of a hinge whose
-    actuator has none is its D gain, and leaves the hinge. Empty, where the file has none, nothing is damped, or
-    they would not hold the robot up on the shapes `feet` in the pose at `angles` [rad].
+    """Return P and D gains [N m/rad], [N m s/rad] by hinge, from the file's position actuators.
+
+    For a hinge whose actuator has no D gain, the damping of the joint becomes the D gain and is removed from the joint. The
+    tables are empty if the file has no gains, if nothing is damped, or if the gains would not hold the robot up on the shapes
+    `feet` in the pose at `angles` [rad].
     """
     driven = [hinge for hinge in tree.hinges if hinge.driven]
     stated = [hinge for hinge in driven if hinge.stiffness]
@@ -58,7 +60,7 @@ def take_gains(tree: Tree, angles: dict[str, float], feet: Sequence[str]) -> tup
         return {}, {}
     stiffness = {hinge.name: float(hinge.stiffness or 0.0) for hinge in driven}
     damping = {hinge.name: float(hinge.damping or hinge.passive.get("damping", 0.0)) for hinge in driven}
-    if not any(damping.values()):  # on the verge of growth, to either side of which rounding puts it
+    if not any(damping.values()):  # without damping the motion is on the edge of instability, and rounding errors decide
         tree.say("gains of the file's position actuators are left out: neither actuators nor joints have any damping")
         return {}, {}
     growth = _growth(tree, angles, stiffness, damping)
@@ -85,7 +87,7 @@ def take_gains(tree: Tree, angles: dict[str, float], feet: Sequence[str]) -> tup
 
 
 def _sags(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], feet: Sequence[str]) -> dict[str, float]:
-    """Return how far each joint gives way under the robot's weight [rad], with the base level on its feet."""
+    """Return the deflection of each joint under the robot's weight [rad], with the base level on its feet."""
     poser = Poser(tree)
     data = poser.pose(angles)
     shapes = [int(poser.model.geom(name).id) for name in feet]
@@ -95,7 +97,7 @@ def _sags(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], fee
 
 def _growth(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], damping: dict[str, float]) -> float:
     """Return the largest factor by which a deviation grows in a step of semi-implicit Euler with explicit torques -K q - D v,
-    the base free, in the pose at `angles`; damping and armature of the joints count.
+    for a free base and the pose at `angles`. The damping and armature of the joints count.
     """
     poser = Poser(tree)
     data = poser.pose(angles)

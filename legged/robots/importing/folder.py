@@ -1,4 +1,4 @@
-"""A robot folder out of a Tree: MJCF, meshes, robot.yaml, PROVENANCE.md, and a task that trains it."""
+"""Robot folders written from a Tree: MJCF, meshes, robot.yaml, PROVENANCE.md, and a task for training."""
 
 import shutil
 from collections.abc import Sequence
@@ -8,23 +8,23 @@ from pathlib import Path
 from legged.config.yaml_files import dump
 from legged.process.paths import make_folder, write_text
 from legged.robots.importing import meshes
-from legged.robots.importing.mend import plain
+from legged.robots.importing.mjcf_writer import mjcf_of
+from legged.robots.importing.repair import plain
 from legged.robots.importing.shapes import free_name
-from legged.robots.importing.text import mjcf_of
 from legged.robots.importing.tree import Mesh, Tree
 
 
 @dataclass
 class Guesses:
-    """What robot.yaml says beside the model."""
+    """Entries of robot.yaml that are not in the model."""
 
     base: str
     spawn_height: float
     """[m]"""
     angles: dict[str, float]
-    """Of the hinges that have a motor [rad]."""
+    """Angles of the driven hinges in the default pose [rad]."""
     angles_from: str
-    """Where they come from, for a comment."""
+    """Source of the angles, for a comment."""
     passive: Sequence[str]
     """Hinges without a motor."""
     feet: Sequence[str]
@@ -37,7 +37,7 @@ class Guesses:
 
 
 def called(legs: int) -> str:
-    """Return what a robot with so many legs is called."""
+    """Return the word for a robot with so many legs."""
     return {2: "biped", 4: "quadruped"}.get(legs, f"robot with {legs} legs")
 
 
@@ -45,8 +45,8 @@ def write_folder(folder: Path, tree: Tree, guesses: Guesses, source: str, licenc
     """Write model, meshes, robot.yaml and PROVENANCE.md; return the size of the meshes [MiB].
 
     Raises:
-        ConfigError: there is a file in place of the folder.
-        RunError: it can't be written.
+        ConfigError: a file is in place of the folder.
+        RunError: the folder can't be written.
     """
     make_folder(folder)
     files = _write_meshes(folder / "meshes", tree)
@@ -59,7 +59,7 @@ def write_folder(folder: Path, tree: Tree, guesses: Guesses, source: str, licenc
 
 
 def _write_meshes(folder: Path, tree: Tree) -> dict[str, Path]:
-    """Give the drawn meshes names of their own and write their files; return those by the names."""
+    """Give the visual meshes unique names and write their files; return the files by name."""
     known: dict[object, Mesh] = {}
     taken: set[str] = set()
     for link in tree.links:
@@ -86,7 +86,7 @@ def _write_meshes(folder: Path, tree: Tree) -> dict[str, Path]:
 
 
 def robot_yaml(tree: Tree, guesses: Guesses) -> str:
-    """Return the text of robot.yaml, with what was guessed in comments."""
+    """Return the text of robot.yaml, with comments that mark guesses."""
     g = guesses
     lines = [
         f"# {tree.name}: how the task uses {tree.name}.xml. Written by legged robot add; sources: PROVENANCE.md.",
@@ -95,7 +95,7 @@ def robot_yaml(tree: Tree, guesses: Guesses) -> str:
         f"model: {_name(f'{tree.name}.xml')}",
         f"base: {_name(g.base)}",
         f"spawn_height: {g.spawn_height:g}  # m; guess: the lowest point of the default pose, and a little more",
-        *([f"passive_joints: {_list(g.passive)}  # no motor; where they are follows"] if g.passive else []),
+        *([f"passive_joints: {_list(g.passive)}  # no motor; springs and loops place them"] if g.passive else []),
         f"default_joint_angles:  # rad; {g.angles_from}",
         *(f"  {_name(name)}: {angle:g}" for name, angle in _compact(g.angles).items()),
     ]
@@ -119,7 +119,9 @@ def _table(key: str, values: dict[str, float], unit: str) -> list[str]:
 
 
 def _compact(values: dict[str, float]) -> dict[str, float]:
-    """Return a table by what the names of several joints share after their first part, where that says the same."""
+    """Return a table with shorter patterns: names without their first part, if the table then gives all joints the same
+    values.
+    """
     parts = {name: name.partition("_")[2] or name for name in values}
     table = {parts[name]: value for name, value in values.items()}
     for name, value in values.items():
@@ -130,7 +132,7 @@ def _compact(values: dict[str, float]) -> dict[str, float]:
 
 
 def _name(text: str) -> str:
-    """Return a text as YAML, in quotes where it would be something else without."""
+    """Return a text as YAML, quoted if it would not be read as text otherwise."""
     return dump(text, default_flow_style=True, width=10_000, allow_unicode=True).split("\n", 1)[0]
 
 
@@ -146,7 +148,7 @@ def _provenance(tree: Tree, source: str, licence: str) -> str:
             f"# Where the numbers of {tree.name} come from",
             "",
             f"`{tree.name}.xml` and the meshes were written by `legged robot add` from `{source}`.",
-            f"Licence: {licence}. What was done to the numbers:",
+            f"Licence: {licence}. Changes to the numbers:",
             "",
             *(f"- {line}" for line in tree.said),
             "",

@@ -1,5 +1,5 @@
-"""A stance found by inverse kinematics: base level, feet under the hips, knees bent, within all limits, the same left and
-right, and the centre of mass over the feet.
+"""A stance by inverse kinematics: base level, feet under the hips, knees bent, all joints within their limits, left and right
+alike, and the centre of mass above the feet.
 """
 
 from collections.abc import Callable
@@ -12,58 +12,58 @@ from legged.robots.importing.legs import ANKLE, SAMPLES, Leg, Poser
 from legged.robots.importing.tree import Tree, Vector
 
 STRETCH, UPRIGHT = 0.8, 0.96
-"""Distance from hip to foot of three legs or more, and of two, in that of a stretched leg."""
+"""Distance from hip to foot as a share of the stretched leg's length, for three legs or more, and for two."""
 OUTWARD = 0.5
-"""A foot stands at most so far to the side of its hip, in the length of a stretched leg."""
+"""Largest sideways distance of a foot from its hip, as a share of the stretched leg's length."""
 MARGIN = 0.05
-"""Part of a joint's range that is kept free at each end."""
+"""Share of a joint's range that stays free at each end."""
 TRIES, ROUNDS = 24, 60
 STEP = 1e-5
-"""For derivatives [rad]."""
+"""Step of the finite differences [rad]."""
 GOOD = 0.05
-"""Largest distance of a foot from where it should stand, in the length of a leg."""
+"""Largest distance of a foot from its goal, as a share of the leg's length."""
 KNEES = 0.002
-"""What a knee to the wrong side costs, in squared errors: less than turning joints farther than needed."""
+"""Cost of a knee on the wrong side, in squared errors; smaller than the cost of joints that turn farther than needed."""
 LATERAL = 0.7
-"""A hinge bends a leg forward if its axis points so much along y."""
+"""Least y component of the axis of a hinge that bends a leg forward."""
 
 
 @dataclass
 class _Limb:
-    """A leg, and its partner on the other side."""
+    """A leg and its partner on the other side."""
 
     leg: Leg
     partner: Leg | None
     signs: Vector
-    """Of the partner's angles."""
+    """(hinges,) signs of the partner's angles."""
     ranges: Vector
-    """(hinges, 2) where its angles may be, and with their signs the partner's [rad]."""
+    """(hinges, 2) ranges of the leg's angles [rad]; with `signs` they are within the partner's ranges too."""
     hip_name: str
-    """The first hinge that bends it forward."""
+    """First hinge that bends the leg forward."""
     hip: Vector
-    """(3,) where that is at zero angles [m]."""
+    """(3,) position of that hinge at zero angles [m]."""
     side: float
-    """Where its foot should stand, along y: as at zero angles, if it can [m]."""
+    """Goal of the foot along y: its place at zero angles, if the leg can stand there [m]."""
     knee: int
-    """Index among the links of the next one."""
+    """Index of the link of the next such hinge."""
     length: float
-    """From there to the foot, stretched [m]."""
+    """Distance from the hip to the foot of the stretched leg [m]."""
     level: Vector
-    """(3,) the direction in the foot's frame that is up at zero angles."""
+    """(3,) direction in the foot's frame that points up at zero angles."""
 
 
 def standing_angles(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], float]:
-    """Return joint angles [rad] by the names of the hinges, and how far the worst foot is from where it should be, in the
-    length of a leg.
+    """Return joint angles [rad] by the names of the hinges, and the largest distance of a foot from its goal, as a share of
+    the leg's length.
     """
     poser = Poser(tree)
     limbs = _limbs(tree, legs, poser)
     free = [(limb, k) for limb in limbs for k in range(len(limb.leg.hinges))]
     lows, highs = np.array([limb.ranges[k] for limb, k in free]).T
     rest = {hinge.name: float(np.clip(0.0, *_kept(poser, hinge.name))) for hinge in tree.hinges}
-    biped = len(legs) == 2  # three legs stand like four, each to its own side
+    biped = len(legs) == 2  # three legs stand like four, each on its own side
     stretch = UPRIGHT if biped else STRETCH
-    ground = max(float(limb.hip[2]) - stretch * limb.length for limb in limbs)  # where the shortest leg stands
+    ground = max(float(limb.hip[2]) - stretch * limb.length for limb in limbs)  # the height at which the shortest leg stands
 
     def angles(x: Vector) -> dict[str, float]:
         found = dict(rest)
@@ -113,7 +113,7 @@ def _miss(poser: Poser, limb: _Limb, ground: float) -> float:
 
 
 def _solved(errors: Callable[[Vector], Vector], x: Vector, lows: Vector, highs: Vector) -> Vector:
-    """Return the angles (n,) nearest to `x` where the sum of squared errors is least, by damped Gauss-Newton steps."""
+    """Return angles (n,) near `x` at a minimum of the sum of squared errors, found by damped Gauss-Newton steps."""
     damping, before = 1e-2, errors(x)
     for _ in range(ROUNDS):
         slopes = np.stack([(errors(x + step) - before) / STEP for step in STEP * np.eye(len(x))], axis=1)
@@ -133,7 +133,9 @@ def _solved(errors: Callable[[Vector], Vector], x: Vector, lows: Vector, highs: 
 
 
 def _wrong_knees(poser: Poser, limbs: list[_Limb], forward: bool) -> float:
-    """Return a cost for knees that bend like nobody's: those of four legs point backward, those of two forward."""
+    """Return a cost for knees that bend the unusual way: four-legged robots' knees point backward, two-legged robots'
+    forward.
+    """
     cost = 0.0
     for limb in limbs:
         body = poser.ids[limb.knee]
@@ -149,7 +151,7 @@ def _kept(poser: Poser, name: str) -> tuple[float, float]:
 
 
 def _limbs(tree: Tree, legs: list[Leg], poser: Poser) -> list[_Limb]:
-    """Return one of each pair of legs, with what is mirrored in the other; a leg without partner stands for itself."""
+    """Return one limb for each pair of legs, with the mirrored leg as its partner, and one for each leg without partner."""
     poser.pose({})
     data = poser.data
     joints = {name: int(poser.model.joint(name).id) for name in poser.places}
@@ -171,7 +173,7 @@ def _limbs(tree: Tree, legs: list[Leg], poser: Poser) -> list[_Limb]:
             mirrored = np.sign((axes * [-1.0, 1.0, -1.0] * theirs).sum(axis=1))
             mapped = np.sort(mirrored[:, None] * [_kept(poser, name) for name in legs[partner].hinges], axis=1)
             both = np.stack([np.maximum(ranges, mapped)[:, 0], np.minimum(ranges, mapped)[:, 1]], axis=1)
-            if (both[:, 0] <= both[:, 1]).all():  # else no pose suits both, and each leg stands for itself
+            if (both[:, 0] <= both[:, 1]).all():  # else no pose suits both, and each leg is a limb of its own
                 other, signs, ranges = legs[partner], mirrored, both
                 taken.add(int(partner))
         bends = [k for k, axis in enumerate(axes) if abs(axis[1]) > LATERAL] or list(range(len(axes)))
@@ -184,13 +186,13 @@ def _limbs(tree: Tree, legs: list[Leg], poser: Poser) -> list[_Limb]:
         limbs.append(_Limb(leg, other, signs, ranges, hip_name, hip, side, knee, 1.0, level))
     for limb in limbs:
         limb.length = _stretched(poser, limb)
-        out = OUTWARD * limb.length  # legs that are drawn stretched to the side reach no further, as low as they stand
+        out = OUTWARD * limb.length  # a leg that points sideways at zero angles stands closer to its hip
         limb.side = float(np.clip(limb.side, limb.hip[1] - out, limb.hip[1] + out))
     return limbs
 
 
 def _stretched(poser: Poser, limb: _Limb) -> float:
-    """Return how far the foot gets from the hip [m], by random angles within the limits."""
+    """Return the largest distance of the foot from the hip [m], over random angles within the limits."""
     random = np.random.default_rng(1)
     lows, highs = limb.ranges.T
     hip = int(poser.model.joint(limb.hip_name).id)

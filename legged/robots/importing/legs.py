@@ -1,4 +1,4 @@
-"""Guesses about a robot: which way it looks, which links are its feet, and which parts are its thighs and shanks."""
+"""Guesses about a robot: its forward direction, its feet, and its legs."""
 
 import re
 from dataclasses import dataclass
@@ -7,23 +7,23 @@ import mujoco
 import numpy as np
 
 from legged.errors import ConfigError
-from legged.robots.importing.mend import half_lengths
 from legged.robots.importing.meshes import refitted, rounded
-from legged.robots.importing.text import model_of
+from legged.robots.importing.mjcf_writer import model_of
+from legged.robots.importing.repair import half_lengths
 from legged.robots.importing.tree import IDENTITY, Shape, Tree, Vector, matrix, quat_about, rotate
 
 FOOT = re.compile(r"foot|feet|toe|sole|heel|ankle|shank|calf|tarsus|lower_?leg|wheel", re.IGNORECASE)
-"""In the names of links and shapes that may be at the end of a leg."""
+"""Pattern in the names of links and shapes that may be the end of a leg."""
 TIP = re.compile(r"foot|feet|toe|sole|heel|contact|wheel|rail", re.IGNORECASE)
-"""In the names of shapes that stand on the ground."""
+"""Pattern in the names of shapes that touch the ground."""
 HAND = re.compile(r"hand|wrist|finger|thumb|gripper|elbow|arm|shoulder|head|neck|camera|tail|palm", re.IGNORECASE)
 LEFT = ("l", "left", "fl", "hl", "bl", "lf", "lh", "lb")
 RIGHT = ("r", "right", "fr", "hr", "br", "rf", "rh", "rb")
 ANKLE = 4
-"""A leg of at least so many hinges has an ankle, and a sole."""
+"""Number of hinges from which a leg has an ankle and a sole."""
 SAMPLES = 300
 NEARLY = 0.7
-"""Feet reach at least so far down, in what the lowest one does."""
+"""Least depth to which a foot reaches, as a share of the depth of the lowest foot."""
 
 
 @dataclass
@@ -35,9 +35,9 @@ class Leg:
     hinges: list[str]
     """Names of the hinges along them."""
     tip: Vector
-    """(3,) where it stands, in the frame of its last link."""
+    """(3,) lowest point of the leg, in the frame of its last link."""
     feet: list[Shape]
-    """Shapes of its last link that stand on the ground."""
+    """Shapes of its last link that touch the ground."""
 
     @property
     def end(self) -> int:
@@ -45,10 +45,14 @@ class Leg:
 
 
 class Poser:
-    """Poses a tree at joint angles, with the base level at the origin."""
+    """Poses of a tree at given joint angles, with the base level at the origin."""
 
     def __init__(self, tree: Tree) -> None:
-        """Compile the tree; raises ConfigError where MuJoCo refuses it."""
+        """Compile the tree.
+
+        Raises:
+            ConfigError: MuJoCo refuses it.
+        """
         self.tree = tree
         self.model = model_of(tree)
         self.data = mujoco.MjData(self.model)
@@ -56,7 +60,7 @@ class Poser:
         self.ids = [int(self.model.body(link.name).id) for link in tree.links]
 
     def pose(self, angles: dict[str, float]) -> mujoco.MjData:
-        """Return the data at joint `angles` [rad]; hinges that are not named are at 0."""
+        """Return MuJoCo's data at joint `angles` [rad]; hinges that are not named are at 0."""
         self.data.qpos[:] = 0.0
         self.data.qpos[3] = 1.0
         for name, angle in angles.items():
@@ -65,12 +69,12 @@ class Poser:
         return self.data
 
     def point(self, link: int, point: Vector) -> Vector:
-        """Return where a point (3,) of a link is now, in the frame of the base [m]."""
+        """Return the position (3,) in the frame of the base [m] of a point (3,) in the frame of a link."""
         body = self.ids[link]
         return self.data.xpos[body] + self.data.xmat[body].reshape(3, 3) @ point
 
     def limits(self, name: str) -> tuple[float, float]:
-        """Return the range of a hinge [rad]; a turn for one without end."""
+        """Return the range of a hinge [rad]; -pi to pi for one without limits."""
         hinge = next(hinge for hinge in self.tree.hinges if hinge.name == name)
         return hinge.range or (-np.pi, np.pi)
 
@@ -84,7 +88,7 @@ def face_forward(tree: Tree) -> None:
     if len(tips) >= 2:
         mean = tips.mean(axis=0)
         axis = int(np.abs(mean).argmax())
-        if axis == 1 and abs(mean[1]) > 3.0 * abs(mean[2]):  # it stands along y
+        if axis == 1 and abs(mean[1]) > 3.0 * abs(mean[2]):  # the robot stands along y
             turn = quat_about(np.array([1.0, 0.0, 0.0]), -np.sign(mean[1]) * np.pi / 2.0)
             tree.turn(turn)
             tree.say("the file's vertical axis is y: the robot is turned upright")
@@ -99,7 +103,7 @@ def face_forward(tree: Tree) -> None:
 
 
 def side_of(name: str) -> int:
-    """Return 1 if a name says left, -1 for right, 0 if it says neither, or both."""
+    """Return 1 if a name says left, -1 for right, 0 if it says neither or both."""
     words = [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)]
     joined = name.lower()
     left = "left" in joined or any(word in LEFT for word in words)
@@ -108,11 +112,10 @@ def side_of(name: str) -> int:
 
 
 def find_legs(tree: Tree) -> list[Leg]:
-    """Return the legs, the foremost left one first as the file has them: chains whose ends reach lowest, by their names if
-    these tell.
+    """Return the legs, in the order of the file: chains whose ends reach lowest, chosen by their names if these tell.
 
     Raises:
-        ConfigError: nothing, or only one of them, reaches below the base.
+        ConfigError: no chain, or only one, reaches below the base.
     """
     poser = Poser(tree)
     ends = [i for i in range(1, len(tree.links)) if not tree.children(i)]
@@ -138,7 +141,7 @@ def find_legs(tree: Tree) -> list[Leg]:
         shapes = len(tree.links[leg.end].shapes)
         leg.feet = _feet(tree, leg, flat=len(legs) == 2 and len(leg.hinges) >= ANKLE)
         leg.tip = np.mean([shape.pos for shape in leg.feet], axis=0) if leg.feet else leg.tip
-        if len(tree.links[leg.end].shapes) == shapes:  # else the ball was added, and the rod is drawn back
+        if len(tree.links[leg.end].shapes) == shapes:  # else the ball was added, and the rod is shortened
             _uncover(tree, leg)
     return legs
 
@@ -152,7 +155,7 @@ def _chain(tree: Tree, end: int) -> list[int]:
 
 
 def _reach(poser: Poser, ends: list[int]) -> dict[int, float]:
-    """Return how far each end gets below the base within the limits [m], by random poses."""
+    """Return the largest depth of each end below the base over random poses within the limits [m]."""
     random = np.random.default_rng(0)
     lows, highs = np.array([poser.limits(name) for name in poser.places]).T
     deepest = dict.fromkeys(ends, -np.inf)
@@ -166,8 +169,8 @@ def _reach(poser: Poser, ends: list[int]) -> dict[int, float]:
 
 
 def _tip(tree: Tree, i: int) -> Vector:
-    """Return the point (3,) of a link that is farthest from its hinge, along the middle of its shapes; its centre of mass
-    where it has none.
+    """Return the point (3,) of a link that is farthest from its hinge, along the middle of its shapes; its centre of mass if
+    it has no shapes.
     """
     link = tree.links[i]
     anchor = link.hinges[0].anchor if link.hinges else np.zeros(3)
@@ -178,7 +181,7 @@ def _tip(tree: Tree, i: int) -> Vector:
 
 
 def _ends(shape: Shape) -> list[Vector]:
-    """Return the middle of a shape, and for a long one those of its ends."""
+    """Return the centre of a shape; for a long shape, the centres of its two ends."""
     half = half_lengths(shape)
     if half is None or shape.kind == "sphere":
         return [shape.pos]
@@ -189,14 +192,12 @@ def _ends(shape: Shape) -> list[Vector]:
 
 
 def _feet(tree: Tree, leg: Leg, flat: bool) -> list[Shape]:
-    """Return the shapes of a leg's last link that stand on the ground; for a leg that ends in a rod, a ball at its end, which
-    is added.
-    """
+    """Return the shapes of a leg's last link that touch the ground. A leg that ends in a rod gets a ball at its end."""
     link = tree.links[leg.end]
     shapes = [shape for shape in link.shapes if shape.collides]
     for i, shape in enumerate(link.shapes):
         if flat and shape.fits and _is_low(shape, leg, shapes):
-            link.shapes[i] = refitted(shape, "box")  # two feet stand on their soles
+            link.shapes[i] = refitted(shape, "box")  # robots with two feet stand on their soles
         elif shape.fits and TIP.search(f"{shape.link} {shape.name}"):
             link.shapes[i] = rounded(shape)
     shapes = [shape for shape in link.shapes if shape.collides]
@@ -212,9 +213,9 @@ def _feet(tree: Tree, leg: Leg, flat: bool) -> list[Shape]:
 
 
 def _uncover(tree: Tree, leg: Leg) -> None:
-    """Draw back what was fitted to the mesh of a shank and reaches around its foot, a ball, or else the shank would touch the
-    ground before the foot does. It ends above the middle of the foot by its own half width, so that a leg can lean by 45
-    degrees.
+    """Shorten the shape that was fitted to the mesh of a shank and reaches around its foot, a ball; else the shank would
+    touch the ground before the foot. The shape then ends above the centre of the foot by its own half width, so that a leg
+    can lean by 45 degrees.
     """
     if len(leg.feet) != 1 or leg.feet[0].kind != "sphere":
         return
@@ -224,15 +225,15 @@ def _uncover(tree: Tree, leg: Leg) -> None:
             continue
         down, slot = _long_side(shape, leg.tip)
         excess = float(down @ (shape.pos - leg.tip)) + float(half.max()) + float(np.sort(half)[1])
-        if 0.0 < excess < shape.size[slot]:  # more than half of it stays
+        if 0.0 < excess < shape.size[slot]:  # more than half of the shape remains
             _draw_back(shape, leg.tip, excess)
             shape.fits = {}
             tree.say("shapes fitted to a mesh that has the foot in it end above the foot", shape.link)
 
 
 def _long_side(shape: Shape, tip: Vector) -> tuple[Vector, int]:
-    """Return the direction (3,) of a shape's longest side towards a point (3,) of its link, and which of its sizes is half
-    that side; of a capsule it is that of the part between its ends.
+    """Return the direction (3,) of a shape's longest side towards a point (3,) of its link, and the index of the size that is
+    half that side (for a capsule, half the part between its ends).
     """
     half = half_lengths(shape)
     assert half is not None
@@ -242,7 +243,7 @@ def _long_side(shape: Shape, tip: Vector) -> tuple[Vector, int]:
 
 
 def _draw_back(shape: Shape, tip: Vector, length: float) -> None:
-    """Make a shape shorter by so much [m] at the end that is nearer to a point (3,) of its link, in place."""
+    """Shorten a shape in place by `length` [m], at the end that is nearer to the point `tip` (3,) of its link."""
     along, slot = _long_side(shape, tip)
     shape.size = shape.size.copy()
     shape.size[slot] -= length / 2.0
@@ -250,14 +251,14 @@ def _draw_back(shape: Shape, tip: Vector, length: float) -> None:
 
 
 def _is_low(shape: Shape, leg: Leg, shapes: list[Shape]) -> bool:
-    """Return whether a shape is at the tip of a leg as much as any other one is."""
+    """Return True if a shape is at the tip of a leg: at most 3 cm farther from it than the nearest shape."""
     nearest = min(float(np.linalg.norm(point - leg.tip)) for other in shapes for point in _ends(other))
     own = min(float(np.linalg.norm(point - leg.tip)) for point in _ends(shape))
     return own <= nearest + 0.03
 
 
 def _add_ball(tree: Tree, leg: Leg, shapes: list[Shape]) -> Shape:
-    """Add a ball to the end of a leg that is a rod, whose end is drawn back by as much."""
+    """Add a ball to the end of a leg that is a rod, and shorten the rod by the ball's radius."""
     link = tree.links[leg.end]
     radius = 0.02 * float(np.linalg.norm(leg.tip)) + 1e-3
     for shape in shapes:

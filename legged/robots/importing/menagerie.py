@@ -1,4 +1,4 @@
-"""Models of MuJoCo Menagerie, through its own package, which downloads each on first use and keeps it."""
+"""Robots of MuJoCo Menagerie, from its Python package, which downloads each model on first use and keeps it."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ PREFIX = "menagerie:"
 
 
 def menagerie_model(name: str) -> tuple[Path, str]:
-    """Return the MJCF file of the robot `name`, without a scene around it, and its licence.
+    """Return the MJCF file of the robot `name`, without a scene, and its licence.
 
     Raises:
         ConfigError: the package is missing, or has no such robot.
@@ -17,7 +17,7 @@ def menagerie_model(name: str) -> tuple[Path, str]:
     try:
         import mujoco_menagerie
     except ImportError as error:
-        raise ConfigError(f"{PREFIX}{name}: needs a package of MuJoCo's: pip install mujoco-menagerie") from error
+        raise ConfigError(f"{PREFIX}{name}: needs a package: pip install mujoco-menagerie") from error
     names = mujoco_menagerie.names()
     if name not in names:
         raise ConfigError(f"{PREFIX}{name}: Menagerie has no such robot{suggest(name[:100], names, 'robots')}")

@@ -1,4 +1,4 @@
-"""Mesh files: found where a URDF means them, read or converted, and the primitive that fits each best."""
+"""Mesh files: search for the file that a URDF names, reading, conversion, and the primitive that fits a mesh best."""
 
 import re
 from collections.abc import Sequence
@@ -15,36 +15,37 @@ import numpy as np
 from legged.robots.importing.tree import Mesh, Shape, Vector, quat_product, rotate
 
 READ = (".stl", ".obj", ".msh")
-"""Files that MuJoCo reads."""
+"""Suffixes of files that MuJoCo reads."""
 MOST_FACES = 200_000
-"""Of an STL file, by MuJoCo's decoder."""
+"""Largest number of faces of an STL file that MuJoCo's decoder takes."""
 ENOUGH_FACES = 50_000
-"""Of one that had too many."""
+"""Largest number of faces after a mesh with too many was simplified."""
 FINEST = 600
-"""Cells along the longest side of a mesh that is thinned, at first."""
+"""Number of cells along the longest side of a mesh at the first attempt to simplify it."""
 STL_HEADER, STL_FACE = 84, 50
-"""[bytes]"""
+"""Sizes of the header and of a face in a binary STL file [bytes]."""
 
 
 class MeshProblem(Exception):
-    """A mesh can't be used; its text says why."""
+    """A mesh that can't be used; the text states the reason."""
 
 
 class MeshMissing(MeshProblem):
-    """There is no such file."""
+    """A mesh whose file does not exist."""
 
 
 def find(name: str, folder: Path, roots: Sequence[Path]) -> Path:
-    """Return the file that a URDF in `folder` means by `name`: a path, `file://` or `package://`; a package is looked for in
-    the folders above, and in `roots`.
+    """Return the file that a URDF in `folder` calls `name`: a path, `file://` or `package://`. Packages are searched in the
+    folders above and in `roots`.
 
     Raises:
-        MeshMissing: there is none.
+        MeshMissing: there is no such file.
     """
     path = re.sub(r"^(package|file|model):/*", lambda m: "/" if m[1] == "file" else "", unquote(name.strip()))
     parts = [part for part in Path(path).parts if part not in ("/", "\\")]
     places = [folder, *folder.parents, *roots]
-    tails = [parts[i:] for i in range(len(parts))]  # the last ones drop the package, or somebody's home
+    # shorter tails leave out the package, or the home folder of another machine
+    tails = [parts[i:] for i in range(len(parts))]
     options = [Path(path)] if Path(path).is_absolute() else [folder / path]
     options += [place.joinpath(*tail) for tail in tails[:2] for place in places]
     options += [place.joinpath(*tail) for tail in tails[2:] for place in places[:3]]
@@ -55,10 +56,11 @@ def find(name: str, folder: Path, roots: Sequence[Path]) -> Path:
 
 
 def find_by_name(name: str, folder: Path) -> Path:
-    """Return the one file that is called as `name` ends, in folders within `folder` or beside it: paths may be wrong.
+    """Return the only file with the file name of `name` in folders within `folder` or next to it, for files whose paths are
+    wrong.
 
     Raises:
-        MeshMissing: there is none, or there are several.
+        MeshMissing: there is no such file, or there are several.
     """
     last = escape(Path(unquote(name.strip())).name)
     patterns = [(folder, f"{deep}{last}") for deep in ("*/", "*/*/")] + [(folder.parent, f"*/{last}")]
@@ -69,10 +71,10 @@ def find_by_name(name: str, folder: Path) -> Path:
 
 
 def read(path: Path, scale: Vector) -> list[tuple[Mesh, Vector | None]]:
-    """Return the meshes that MuJoCo can be given for a file, each with its colour (4,) or None.
+    """Return the meshes of a file in a form that MuJoCo reads, each with its colour (4,) or None.
 
     Raises:
-        MeshProblem: MuJoCo does not read it, and it can't be converted.
+        MeshProblem: MuJoCo does not read the file, and it can't be converted.
     """
     if path.suffix.lower() == ".stl":
         with path.open("rb") as file:
@@ -87,8 +89,8 @@ def read(path: Path, scale: Vector) -> list[tuple[Mesh, Vector | None]]:
 
 
 def _thinned(vertices: Vector, faces: Vector) -> tuple[Vector, Vector]:
-    """Return vertices (V, 3) and faces (T, 3) of a mesh that MuJoCo reads: of one with too many faces, vertices that are near
-    each other become one.
+    """Return vertices (V, 3) and faces (T, 3) of a mesh with few enough faces for MuJoCo; in a mesh with too many, vertices
+    near each other are merged.
     """
     cells = FINEST
     low, extent = vertices.min(axis=0), max(float(np.ptp(vertices, axis=0).max()), 1e-9)
@@ -106,7 +108,7 @@ def _thinned(vertices: Vector, faces: Vector) -> tuple[Vector, Vector]:
 
 @cache
 def _converted(path: Path) -> list[tuple[Vector, Vector, Vector | None]]:
-    """Return vertices (V, 3), faces (T, 3) and colour of each part of a file, through trimesh."""
+    """Return vertices (V, 3), faces (T, 3) and colour of each part of a file, read by trimesh."""
     try:
         import trimesh
     except ImportError as error:
@@ -114,7 +116,7 @@ def _converted(path: Path) -> list[tuple[Vector, Vector, Vector | None]]:
     try:
         scene = trimesh.load_scene(path)
         parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    except Exception as error:  # of whichever reader it calls
+    except Exception as error:  # any reader that trimesh calls may raise any class
         raise MeshProblem(f"{path.name}: can't be converted ({type(error).__name__}: {error})"[:200]) from error
     if not parts:
         raise MeshProblem(f"{path.name}: has no faces")
@@ -122,16 +124,16 @@ def _converted(path: Path) -> list[tuple[Vector, Vector, Vector | None]]:
 
 
 def _colour(part: Any) -> Vector | None:
-    """Return the one colour (4,) of a part, or None."""
+    """Return the colour (4,) of a part, or None if it has not exactly one."""
     try:
         rgba = np.array(part.visual.to_color().main_color, dtype=float) / 255.0
-    except Exception:  # textures that are missing, and the like
+    except Exception:  # such as a missing texture
         return None
     return rgba if rgba.shape == (4,) and rgba[3] > 0.0 else None
 
 
 def write_stl(path: Path, mesh: Mesh) -> None:
-    """Write vertices and faces as a binary STL file."""
+    """Write the vertices and faces of a mesh as a binary STL file."""
     assert mesh.vertices is not None
     assert mesh.faces is not None
     corners = mesh.vertices[mesh.faces].astype("<f4")
@@ -146,12 +148,12 @@ FITS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
 }
 ROUND = 1.25
-"""A mesh is like a ball if no extent of it is larger than its smallest by this factor."""
+"""A mesh counts as round if its largest extent is at most its smallest times this factor."""
 
 
 def fitted(shape: Shape) -> Shape:
-    """Return the primitive around the mesh of a shape: of those that MuJoCo fits to its bounding box, the smallest; a ball
-    only for what is round.
+    """Return the primitive around the mesh of a shape: the smallest of those that MuJoCo fits to its bounding box; a sphere
+    only for a round mesh.
 
     Raises:
         MeshProblem: MuJoCo refuses the mesh.
@@ -167,20 +169,20 @@ def fitted(shape: Shape) -> Shape:
 
 
 def rounded(shape: Shape) -> Shape:
-    """Return a primitive that stands for a mesh as a ball or capsule, where there is one: feet of a point roll."""
+    """Return a primitive that was fitted to a mesh as a sphere or capsule, if one of them fits: point feet roll."""
     options = [kind for kind in ("capsule", "sphere") if kind in shape.fits]
     return refitted(shape, min(options, key=lambda kind: _volume(kind, shape.fits[kind][0]), default=shape.kind))
 
 
 def refitted(shape: Shape, kind: str) -> Shape:
-    """Return a primitive that stands for a mesh as one of another kind, where there is one."""
+    """Return a primitive that was fitted to a mesh as a primitive of kind `kind`, if one fits."""
     size, pos, quat = shape.fits.get(kind, (shape.size, shape.pos, shape.quat))
     kind = kind if kind in shape.fits else shape.kind
     return replace(shape, kind=kind, size=size.copy(), pos=pos.copy(), quat=quat.copy())
 
 
 def _fits(mesh: Mesh) -> dict[str, tuple[Vector, Vector, Vector]]:
-    """Return what MuJoCo fits to a mesh: size, position and orientation (3,), (3,), (4,) by the kind of shape; a flat thing
+    """Return the primitives that MuJoCo fits to a mesh: kind -> size (3,), position (3,) and orientation (4,). A flat mesh
     has no capsule.
     """
     found: dict[str, tuple[Vector, Vector, Vector]] = {}
@@ -199,7 +201,7 @@ def _fits(mesh: Mesh) -> dict[str, tuple[Vector, Vector, Vector]]:
             spec.worldbody.add_geom(name="fit", type=kind, meshname="mesh")
             try:
                 geom = spec.compile().geom("fit")
-            except Exception as error:  # its errors have no class of their own
+            except Exception as error:  # MuJoCo's errors have no class of their own
                 problem = error
                 continue
             found[name] = (geom.size.copy(), geom.pos.copy(), geom.quat.copy())
@@ -209,7 +211,7 @@ def _fits(mesh: Mesh) -> dict[str, tuple[Vector, Vector, Vector]]:
 
 
 def _volume(kind: str, size: Vector) -> float:
-    """Return the volume of a shape [m^3]."""
+    """Return the volume of a primitive [m^3]."""
     if kind == "box":
         return float(8.0 * size.prod())
     return float(np.pi * size[0] ** 2 * (4 / 3 * size[0] + (2.0 * size[1] if kind == "capsule" else 0.0)))

@@ -1,4 +1,4 @@
-"""MJCF of any kind -> Tree: scenes with floors and lights, shapes without names, any actuators, welded bodies."""
+"""Reader of any MJCF into a Tree: scenes with floors and lights, unnamed shapes, any actuators, welded bodies."""
 
 from pathlib import Path
 
@@ -36,10 +36,10 @@ PLAIN_FRICTION = (1.0, 0.005, 0.0001)
 
 
 def read_mjcf(path: Path, drawn: bool = True) -> Tree:
-    """Return the heaviest robot in an MJCF file. Without `drawn`, shapes that are only seen are left out.
+    """Return the heaviest robot in an MJCF file, with its visual shapes if `drawn`.
 
     Raises:
-        ConfigError: MuJoCo refuses it, or nothing in it moves.
+        ConfigError: MuJoCo refuses the file, or no body in it moves.
     """
     return tree_of(spec_of(path), path, drawn)
 
@@ -52,15 +52,15 @@ def spec_of(path: Path) -> mujoco.MjSpec:
     """
     try:
         return mujoco.MjSpec.from_file(str(path))
-    except Exception as error:  # its errors have no class of their own
+    except Exception as error:  # MuJoCo's errors have no class of their own
         raise ConfigError(f"{path}: MuJoCo refuses it: {' '.join(str(error).split())}") from error
 
 
 def tree_of(spec: mujoco.MjSpec, path: Path, drawn: bool = True) -> Tree:
-    """Return the heaviest robot in a spec, which is changed; `path` is where it was read from.
+    """Return the heaviest robot in a spec, which is changed in place; `path` is the file that it was read from.
 
     Raises:
-        ConfigError: MuJoCo refuses it, or nothing in it moves.
+        ConfigError: MuJoCo refuses the spec, or no body in it moves.
     """
     tree = Tree(spec.modelname or path.stem, path, [], 0.0)
     model = _compiled(spec, path, tree, drawn)
@@ -75,11 +75,13 @@ def tree_of(spec: mujoco.MjSpec, path: Path, drawn: bool = True) -> Tree:
 
 
 def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoco.MjModel:
-    """Compile what matters here. A fragment may refer to what another file brings: sensors and pairs go first."""
+    """Compile the parts of a spec that a robot consists of. Sensors and contact pairs are removed first, because in a
+    fragment they may refer to elements of another file.
+    """
     _name_joints(spec)
     paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     for geom in spec.geoms:
-        if geom.name and geom.name in paired:  # it touches whatever its types are
+        if geom.name and geom.name in paired:  # a geom of a contact pair collides whatever its contype and conaffinity
             geom.contype = geom.contype or 1
     for kind in ("sensors", "pairs", "tuples", "skins"):
         for element in list(getattr(spec, kind)):
@@ -93,7 +95,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoc
     if missing:
         tree.say(f"{len(missing)} meshes are not beside the file and left out: {', '.join(sorted(missing))[:200]}")
     if not drawn:
-        drop_what_is_drawn(spec, path)
+        drop_visual_meshes(spec, path)
     used = {geom.meshname for geom in spec.geoms if geom.meshname}
     for mesh in list(spec.meshes):
         if mesh_name(mesh) in missing or mesh_name(mesh) not in used:
@@ -101,7 +103,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoc
     try:
         return spec.compile()
     except Exception as error:
-        for key in list(spec.keys):  # of another size: they were written for a scene with more in it
+        for key in list(spec.keys):  # keyframes of another size were written for a scene with more in it
             spec.delete(key)
         try:
             return spec.compile()
@@ -110,7 +112,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoc
 
 
 def _name_joints(spec: mujoco.MjSpec) -> None:
-    """Give joints without a name one where a body has several: the first one is called as its body."""
+    """Name unnamed joints of bodies with several: the first one takes the name of its body."""
     taken = {joint.name for joint in spec.joints}
     for body in spec.bodies[1:]:
         for joint in [joint for joint in body.joints if not joint.name][1:]:
@@ -118,9 +120,9 @@ def _name_joints(spec: mujoco.MjSpec) -> None:
             taken.add(joint.name)
 
 
-def drop_what_is_drawn(spec: mujoco.MjSpec, path: Path) -> None:
-    """Take the meshes from a spec, read from `path`, that are only seen, where their files are there and no mass comes from
-    them: reading them takes most of the time.
+def drop_visual_meshes(spec: mujoco.MjSpec, path: Path) -> None:
+    """Remove the visual meshes of a spec that was read from `path`, where their files exist and no mass is computed from
+    them; reading them would take most of the time.
     """
     folder = path.parent / (spec.meshdir or "")
     there = {mesh_name(mesh) for mesh in spec.meshes if mesh.file and (folder / mesh.file).is_file()}
@@ -136,12 +138,12 @@ def drop_what_is_drawn(spec: mujoco.MjSpec, path: Path) -> None:
 
 
 def mesh_name(mesh: mujoco.MjsMesh) -> str:
-    """Return the name of a mesh; that of its file, without ending, where it has none of its own."""
+    """Return the name of a mesh, which is its file name without suffix by default."""
     return str(mesh.name or Path(mesh.file).stem)
 
 
 def _root(model: mujoco.MjModel, path: Path, tree: Tree) -> int:
-    """Return the body that carries the robot: the heaviest on the world with something below that turns."""
+    """Return the body that carries the robot: the heaviest body on the world with a hinge below it."""
     turned = [int(body) for body in model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]]
     moved = {root for body in turned if (root := int(model.body_rootid[body])) != body}
     tops = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
@@ -170,7 +172,9 @@ def _name(model: mujoco.MjModel, body: int) -> str:
 
 
 def _read_links(model: mujoco.MjModel, root: int, tree: Tree, meshes: dict[int, Mesh], drawn: bool) -> None:
-    """Append the links of `root` and all below; the frame of the base is turned upright, as the file has it in the world."""
+    """Append the links of `root` and all bodies below it. The frame of the base is turned upright, which is its orientation
+    in the file's world.
+    """
     places: dict[int, int] = {}
     for body in (b for b in range(1, model.nbody) if model.body_rootid[b] == root):
         link = Link(_name(model, body), -1, model.body_pos[body].copy(), model.body_quat[body].copy())
@@ -196,7 +200,7 @@ def _read_links(model: mujoco.MjModel, root: int, tree: Tree, meshes: dict[int, 
 
 
 def _turn_upright(base: Link) -> None:
-    """Turn the frame of the base parallel to the world's, about its origin."""
+    """Turn the frame of the base parallel to the world's, about its own origin."""
     turn = matrix(base.quat)
     base.com, base.inertia = turn @ base.com, turn @ base.inertia @ turn.T
     for shape in base.shapes:
@@ -205,7 +209,7 @@ def _turn_upright(base: Link) -> None:
 
 
 def _read_hinges(model: mujoco.MjModel, body: int, link: Link, tree: Tree) -> None:
-    """Give `link` its hinges, with angles counted from where the file draws them; other joints are held."""
+    """Add the hinges of a body to `link`, with angles counted from the pose in the file; joints of other types are held."""
     for i in (i for i in range(model.njnt) if model.jnt_bodyid[i] == body):
         name = model.joint(i).name or f"{link.name}_joint"
         kind = mujoco.mjtJoint(int(model.jnt_type[i]))
@@ -215,7 +219,7 @@ def _read_hinges(model: mujoco.MjModel, body: int, link: Link, tree: Tree) -> No
             continue
         dof, drawn_at = int(model.jnt_dofadr[i]), float(model.qpos0[model.jnt_qposadr[i]])
         hinge = Hinge(name, model.jnt_axis[i].copy(), model.jnt_pos[i].copy(), driven=False)
-        if drawn_at:  # MuJoCo draws a joint with a `ref` at that angle
+        if drawn_at:  # a joint with a `ref` is at that angle in MuJoCo's pose
             turn_link(link, hinge, -drawn_at)
         if model.jnt_limited[i]:
             hinge.range = (float(model.jnt_range[i, 0]), float(model.jnt_range[i, 1]))
@@ -236,13 +240,13 @@ def _read_hinges(model: mujoco.MjModel, body: int, link: Link, tree: Tree) -> No
 
 
 def _smaller(limits: np.ndarray) -> float | None:
-    """Return the size of a range that holds both ways, or None."""
+    """Return the end of a range that is nearer to 0, or the other one if that is 0; None if it is no finite limit."""
     size = float(min(abs(limits[0]), abs(limits[1])) or max(abs(limits[0]), abs(limits[1])))
     return size if 0.0 < size < 1e5 else None
 
 
 def _shape(model: mujoco.MjModel, geom: int, link: str, meshes: dict[int, Mesh], tree: Tree) -> Shape | None:
-    """Return a geom as a shape of `link`; None for what no body has."""
+    """Return a geom as a shape of `link`; None for a type that bodies cannot have."""
     kind = KINDS.get(mujoco.mjtGeom(int(model.geom_type[geom])))
     collides = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
     if kind is None:
@@ -254,7 +258,7 @@ def _shape(model: mujoco.MjModel, geom: int, link: str, meshes: dict[int, Mesh],
     if kind == "mesh":
         number = int(model.geom_dataid[geom])
         mesh = meshes[number]
-        back = inverse(model.mesh_quat[number])  # MuJoCo has moved its vertices to their centre and principal axes
+        back = inverse(model.mesh_quat[number])  # MuJoCo moves the vertices of a mesh to its centre and principal axes
         quat = quat_product(quat, back)
         pos = pos - rotate(quat, model.mesh_pos[number])
     material = int(model.geom_matid[geom])
@@ -275,7 +279,7 @@ def _shape(model: mujoco.MjModel, geom: int, link: str, meshes: dict[int, Mesh],
 
 
 def _texture(model: mujoco.MjModel, material: int) -> np.ndarray:
-    """Return the mean colour (4,) of a material's texture: pictures are not taken along."""
+    """Return the mean colour (4,) of a material's texture; textures are not imported."""
     texture = int(model.mat_texid[material, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)])
     if texture < 0:
         return np.ones(4)
@@ -286,7 +290,7 @@ def _texture(model: mujoco.MjModel, material: int) -> np.ndarray:
 
 
 def _meshes(spec: mujoco.MjSpec, model: mujoco.MjModel, path: Path) -> dict[int, Mesh]:
-    """Return the meshes of a model by their numbers: files, or vertices of those that the file holds itself."""
+    """Return the meshes of a model by their ids: files, or vertices for meshes that the MJCF itself holds."""
     found: dict[int, Mesh] = {}
     for mesh in spec.meshes:
         number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MESH, mesh_name(mesh))
@@ -309,7 +313,7 @@ def _meshes(spec: mujoco.MjSpec, model: mujoco.MjModel, path: Path) -> dict[int,
 
 
 def _read_loops(model: mujoco.MjModel, tree: Tree) -> None:
-    """Take over the constraints that tie links or hinges to each other; tell of the others."""
+    """Read the equality constraints between links or hinges; report the others as left out."""
     links, hinges = {link.name for link in tree.links}, {hinge.name for hinge in tree.hinges}
     for i in range(model.neq):
         if not model.eq_active0[i]:
@@ -323,7 +327,7 @@ def _read_loops(model: mujoco.MjModel, tree: Tree) -> None:
             anchors = model.site_pos[list(ids)] if sites else data[:6].reshape(2, 3)
             names = [_name(model, body) for body in bodies]
             if set(names) <= links:
-                turned = [  # the frame of the base was turned upright
+                turned = [  # in the turned frame of the base
                     rotate(model.body_quat[body], anchor) if name == tree.links[0].name else anchor
                     for body, name, anchor in zip(bodies, names, anchors, strict=True)
                 ]
@@ -343,7 +347,7 @@ def _read_loops(model: mujoco.MjModel, tree: Tree) -> None:
 
 
 def _read_apart(model: mujoco.MjModel, tree: Tree) -> None:
-    """Take over which links do not touch each other."""
+    """Read the pairs of links that do not collide."""
     links = {link.name for link in tree.links}
     for signature in model.exclude_signature:
         pair = (_name(model, int(signature) >> 16), _name(model, int(signature) & 0xFFFF))
@@ -352,15 +356,15 @@ def _read_apart(model: mujoco.MjModel, tree: Tree) -> None:
 
 
 def _coupling(factors: np.ndarray, first: float, second: float = 0.0) -> np.ndarray:
-    """Return the polynomial (5,) of the second hinge's angle that the first one has, where MuJoCo's is of angles that are
-    counted from where these two are drawn [rad].
+    """Return the polynomial (5,) of the second hinge's angle for the first hinge's angle [rad]. MuJoCo's coefficients
+    `factors` are for angles counted from the `ref` of both joints.
     """
     polynomial = first + np.polynomial.Polynomial(factors)(np.polynomial.Polynomial([-second, 1.0]))
     return np.pad(polynomial.coef, (0, 5 - len(polynomial.coef)))
 
 
 def _read_home(model: mujoco.MjModel, tree: Tree, path: Path) -> None:
-    """Take the joint angles of the first keyframe, or of the one that is called as if the robot stood in it."""
+    """Read the joint angles of a keyframe: one whose name says that the robot stands, else the first."""
     if not model.nkey:
         return
     names = [model.key(i).name for i in range(model.nkey)]

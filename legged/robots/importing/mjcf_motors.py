@@ -1,4 +1,4 @@
-"""Actuators of MuJoCo -> the torque limit and the gains of each hinge."""
+"""Torque limits and gains of hinges, read from MuJoCo actuators."""
 
 import mujoco
 import numpy as np
@@ -7,12 +7,12 @@ from legged.robots.importing.tree import Hinge, Tree
 
 ON_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 MOST = 1e5
-"""Larger torques and gains are none [N m], [N m/rad]."""
+"""Larger torques [N m] and gains [N m/rad] count as missing."""
 
 
 def read_motors(model: mujoco.MjModel, tree: Tree) -> None:
-    """Note which hinges have actuators, with which limits and gains, as seen by the joint. A file without any actuators means
-    that all hinges have one.
+    """Set the torque limits and gains of the hinges that have actuators, as seen by the joint, and mark the others as not
+    driven. In a file without actuators all hinges are driven.
     """
     hinges = {hinge.name: hinge for hinge in tree.hinges}
     for i in range(model.nu):
@@ -42,7 +42,7 @@ def _read_actuator(model: mujoco.MjModel, i: int, hinge: Hinge) -> None:
     limits = []
     if model.actuator_forcelimited[i]:
         limits.append(np.abs(model.actuator_forcerange[i] * gear))
-    if fixed and not affine and model.actuator_ctrllimited[i]:  # a motor: its control is a force
+    if fixed and not affine and model.actuator_ctrllimited[i]:  # a motor, whose control is a force
         limits.append(np.abs(model.actuator_ctrlrange[i] * gain[0] * gear))
     if affine and fixed:
         stiffness, damping = -float(bias[1]) * gear**2, -float(bias[2]) * gear**2

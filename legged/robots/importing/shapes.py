@@ -1,4 +1,4 @@
-"""Collision shapes as engines like them: primitives, each of which has a name of its own."""
+"""Collision shapes in the form that engines need: primitives with unique names."""
 
 import re
 
@@ -7,14 +7,14 @@ import numpy as np
 
 from legged.robots.importing.meshes import MeshProblem, fitted
 from legged.robots.importing.tree import Shape, Tree
-from legged.robots.robot_model import TAKEN
+from legged.robots.reserved_names import RESERVED
 
 THINNEST = 0.02
-"""Smallest half length of a trunk that was guessed, in the largest one allowed."""
+"""Smallest half length of a guessed trunk, as a share of the largest one allowed."""
 
 
 def fit_meshes(tree: Tree) -> None:
-    """Replace the collision meshes of a tree by primitives, in place. Where nothing collides, what is drawn does."""
+    """Replace the collision meshes of a tree by primitives, in place. If no shape collides, the visual shapes do."""
     if not tree.shapes:
         _let_the_drawn_collide(tree)
     kinds: list[str] = []
@@ -36,7 +36,7 @@ def fit_meshes(tree: Tree) -> None:
 
 
 def _let_the_drawn_collide(tree: Tree) -> None:
-    """Let a copy of each shape that is drawn collide."""
+    """Add a collision copy of each visual shape."""
     tree.say("no shape collides: those that are drawn do")
     for link in tree.links:
         link.shapes += [
@@ -46,11 +46,12 @@ def _let_the_drawn_collide(tree: Tree) -> None:
 
 
 def give_trunk(tree: Tree, widest: float) -> None:
-    """Let the box that has the inertia of the base stand for its shape, with half lengths of at most `widest` [m]."""
+    """Add a collision box to the base that has the base's inertia, with half lengths of at most `widest` [m]."""
     base = tree.links[0]
     moments, axes = np.linalg.eigh(base.inertia)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
-    half = np.sqrt(np.maximum(1.5 * (moments.sum() - 2.0 * moments) / base.mass, 0.0))  # of a box I_x = m (b^2 + c^2) / 3
+    # a box has I_x = m (b^2 + c^2) / 3, with half lengths b and c
+    half = np.sqrt(np.maximum(1.5 * (moments.sum() - 2.0 * moments) / base.mass, 0.0))
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, axes.ravel())
     size = np.clip(half, THINNEST * widest, widest)
@@ -59,12 +60,12 @@ def give_trunk(tree: Tree, widest: float) -> None:
 
 
 def name_shapes(tree: Tree) -> None:
-    """Give each colliding shape a name that no other one has and that the scene does not take: its own, else its link's."""
+    """Give each collision shape a unique name that the scene does not need: its own name, else its link's."""
     taken: set[str] = set()
-    shapes = sorted(tree.shapes, key=lambda shape: not shape.name)  # those with a name keep it
+    shapes = sorted(tree.shapes, key=lambda shape: not shape.name)  # shapes with a name keep it
     for shape in shapes:
         wanted = re.sub(r"[\s/]+", "_", shape.name or shape.link) or "shape"
-        if re.fullmatch(TAKEN["geom"], wanted):
+        if re.fullmatch(RESERVED["geom"], wanted):
             tree.say("shapes whose names the scene needs are called as their links", f"{wanted} -> {shape.link}")
             wanted = shape.link
         shape.name = free_name(wanted, taken)
@@ -72,9 +73,9 @@ def name_shapes(tree: Tree) -> None:
 
 
 def free_name(wanted: str, taken: set[str]) -> str:
-    """Return `wanted`, or the first of `wanted_2`, `wanted_3`, ... that is not taken."""
+    """Return `wanted`, or the first of `wanted_2`, `wanted_3`, ... that is not in use."""
     number, name = 1, wanted
-    while name in taken or re.fullmatch(TAKEN["geom"], name):
+    while name in taken or re.fullmatch(RESERVED["geom"], name):
         number += 1
         name = f"{wanted}_{number}"
     return name

@@ -1,4 +1,4 @@
-"""A robot between files: links that hang on hinges, with masses, shapes and motors, whatever it was read from."""
+"""A robot between files: links on hinges, with masses, shapes and motors, whatever format they were read from."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,44 +8,44 @@ import numpy as np
 Vector = np.ndarray
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 MOST_NAMED = 12
-"""Names in a line to the user."""
+"""Largest number of names in a line to the user."""
 
 
 @dataclass
 class Mesh:
-    """A triangle mesh: a file that MuJoCo reads, or vertices and faces from one that it does not."""
+    """A triangle mesh: a file that MuJoCo reads, or the vertices and faces of one that it does not read."""
 
     name: str
     file: Path | None = None
     scale: Vector = field(default_factory=lambda: np.ones(3))
     vertices: Vector | None = None
-    """(V, 3) [m], scaled already."""
+    """(V, 3) [m], already scaled."""
     faces: Vector | None = None
     """(T, 3) indices of vertices."""
 
 
 @dataclass
 class Shape:
-    """A shape on a link, which collides or is only drawn. Poses are in the frame of the link."""
+    """A shape on a link: a collision shape, or a visual one. Poses are in the frame of the link."""
 
     kind: str
     """sphere, capsule, cylinder, box, ellipsoid or mesh."""
     size: Vector
-    """(3,) as MuJoCo has it: radius; radius and half length; half lengths [m]."""
+    """(3,) as in MuJoCo: radius; radius and half length; half lengths [m]."""
     pos: Vector
     quat: Vector
     collides: bool
     link: str
-    """The link that it was given to in the file, which may have been merged into another one since."""
+    """Link of the shape in the file, which may have been merged into another link since."""
     name: str = ""
     mesh: Mesh | None = None
     rgba: Vector | None = None
     friction: Vector | None = None
     fits: dict[str, tuple[Vector, Vector, Vector]] = field(default_factory=dict)
-    """What else a primitive in place of a mesh could be: size, position and orientation by its kind."""
+    """Other primitives that fit the mesh: kind -> size, position and orientation."""
 
     def move(self, pos: Vector, quat: Vector) -> None:
-        """Take the shape into another frame, in which its own is at `pos` (3,) [m], turned by `quat` (4,)."""
+        """Move the shape into another frame, in which its present frame is at `pos` (3,) [m], turned by `quat` (4,)."""
         self.pos, self.quat = pos + rotate(quat, self.pos), quat_product(quat, self.quat)
         self.fits = {
             kind: (size, pos + rotate(quat, at), quat_product(quat, turned)) for kind, (size, at, turned) in self.fits.items()
@@ -60,13 +60,13 @@ class Hinge:
     axis: Vector
     anchor: Vector = field(default_factory=lambda: np.zeros(3))
     range: tuple[float, float] | None = None
-    """[rad]; None turns without end."""
+    """[rad]; None for a hinge without limits."""
     effort: float | None = None
-    """Torque limit of its motor [N m]; None if the file has none."""
+    """Torque limit of its motor [N m]; None if the file states none."""
     velocity: float | None = None
-    """[rad/s]"""
+    """Speed limit [rad/s]."""
     driven: bool = True
-    """Whether it has a motor."""
+    """True if it has a motor."""
     stiffness: float | None = None
     """P gain of a position actuator [N m/rad]."""
     damping: float | None = None
@@ -77,7 +77,7 @@ class Hinge:
 
 @dataclass
 class Link:
-    """A rigid body. Poses are in the frame of the parent, at joint angles 0; mass and inertia in its own."""
+    """A rigid body. Its pose is in the frame of the parent at joint angles 0; mass and inertia are in its own frame."""
 
     name: str
     parent: int
@@ -89,7 +89,7 @@ class Link:
     inertia: Vector = field(default_factory=lambda: np.zeros((3, 3)))
     """(3, 3) about the centre of mass [kg m^2]."""
     hinges: list[Hinge] = field(default_factory=list)
-    """None: it is fixed to its parent, or it is the base."""
+    """Hinges to the parent; empty for the base and for a link that is fixed to its parent."""
     shapes: list[Shape] = field(default_factory=list)
 
 
@@ -101,28 +101,28 @@ class Tree:
     source: Path
     links: list[Link]
     mass: float
-    """What the file says that the whole robot weighs [kg]."""
+    """Mass of the whole robot in the file [kg]."""
     home: dict[str, float] | None = None
     """Joint angles of a keyframe [rad]."""
     home_name: str = ""
-    """Its name."""
+    """Name of that keyframe."""
     loops: list[dict[str, str]] = field(default_factory=list)
-    """Equality constraints: their kind, as `tag`, and their MJCF attributes; a `connect` has `anchor2` too, which is where
-    `anchor` is tied to, in the frame of body2 [m].
+    """Equality constraints: their kind, as `tag`, and their MJCF attributes. A `connect` also has `anchor2`, the point in the
+    frame of body2 that `anchor` is tied to [m].
     """
     apart: set[tuple[str, str]] = field(default_factory=set)
-    """Pairs of links that do not touch each other, whatever their shapes do."""
+    """Pairs of links that do not collide, whatever their shapes allow."""
     _said: dict[str, list[str]] = field(default_factory=dict)
 
     def say(self, line: str, about: str = "") -> None:
-        """Note what the user has to know; what is said `about` several things becomes one line that names them all."""
+        """Record a line for the user. Lines with the same text become one that lists everything in `about`."""
         names = self._said.setdefault(line, [])
         if about and about not in names:
             names.append(about)
 
     @property
     def said(self) -> list[str]:
-        """What was changed, left out or guessed, a line each."""
+        """Lines about changes, omissions and guesses."""
         return [f"{line}: {listed(names)}" if names else line for line, names in self._said.items()]
 
     def turn(self, quat: Vector) -> None:
@@ -137,7 +137,9 @@ class Tree:
         self.move_loops(base.name, base.name, np.zeros(3), quat)
 
     def move_loops(self, old: str, new: str, pos: Vector, quat: Vector) -> None:
-        """Let constraints on the link `old` act on `new`, in whose frame it is at `pos` (3,) [m], turned by `quat` (4,)."""
+        """Move constraints from the link `old` to the link `new`, in whose frame `old` is at `pos` (3,) [m], turned by `quat`
+        (4,).
+        """
         for loop in self.loops:
             for body, anchor in (("body1", "anchor"), ("body2", "anchor2")):
                 if loop.get(body) == old:
@@ -151,17 +153,17 @@ class Tree:
 
     @property
     def shapes(self) -> list[Shape]:
-        """All shapes that collide, in the order of the links."""
+        """All collision shapes, in the order of the links."""
         return [shape for link in self.links for shape in link.shapes if shape.collides]
 
     def children(self, parent: int) -> list[int]:
-        """Return the links that hang on `parent`."""
+        """Return the indices of the children of `parent`."""
         return [i for i, link in enumerate(self.links) if link.parent == parent]
 
 
 def turn_link(link: Link, hinge: Hinge, angle: float) -> None:
-    """Let a link be drawn where `hinge` has turned it by `angle` [rad]; hinges that it has before that one, which are in the
-    frame of the link, stay where they are.
+    """Make the pose of a link at zero angles the one that `hinge` gives it at `angle` [rad]. The hinges of the link before
+    that one stay where they are, and their axes and anchors are expressed in the turned frame.
     """
     turn = quat_about(hinge.axis, angle)
     shift, back = hinge.anchor - rotate(turn, hinge.anchor), inverse(turn)
@@ -184,7 +186,7 @@ def vector_of(text: str) -> Vector:
 
 
 def listed(names: list[str]) -> str:
-    """Return names as a list that is not endless."""
+    """Return names as a list, cut after MOST_NAMED of them."""
     return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else "")
 
 

@@ -1,4 +1,6 @@
-"""URDF files -> Tree. MuJoCo's own reader welds the base to the world, whose mass is lost then, and knows no packages."""
+"""Reader of URDF files into a Tree. MuJoCo's own reader welds the base to the world, which loses its mass, and does not know
+packages.
+"""
 
 import math
 import os
@@ -16,18 +18,18 @@ from legged.robots.importing.meshes import MeshMissing, MeshProblem
 from legged.robots.importing.tree import Hinge, Link, Shape, Tree, Vector, matrix, quat_about, quat_of_rpy, quat_product
 
 MOST_TURNS = 1e3
-"""Limits of more than this both ways are none [rad]."""
+"""Limits larger than this in both directions count as no limits [rad]."""
 HINGES = ("revolute", "continuous")
 NO_HINGES = {"prismatic": "slide", "planar": "slide in a plane", "floating": "float"}
 KINDS = (*HINGES, *NO_HINGES, "fixed")
 
 
 def read_urdf(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tree:
-    """Return the robot in a URDF file; packages are also looked for in `roots`. Links on fixed joints are links without a
-    hinge. Without `drawn`, shapes that are only seen are left out.
+    """Return the robot of a URDF file, with its visual shapes if `drawn`. Packages are also searched in `roots`. A link on a
+    fixed joint is a link without hinges.
 
     Raises:
-        ConfigError: it is no URDF, or not that of one robot.
+        ConfigError: the file is not a URDF, or not that of one robot.
     """
     root = _parsed(path)
     tree = Tree(root.get("name") or path.stem, path, [], 0.0)
@@ -61,9 +63,9 @@ def read_urdf(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tre
 
 
 def _parsed(path: Path) -> ET.Element:
-    """Return the top element of the file."""
+    """Return the root element of the file."""
     try:
-        text = path.read_bytes().lstrip(b"\xef\xbb\xbf \t\r\n")  # some have blanks before the declaration
+        text = path.read_bytes().lstrip(b"\xef\xbb\xbf \t\r\n")  # some files have blanks before the declaration
         root = ET.fromstring(text)
     except ET.ParseError as error:
         raise ConfigError(f"{path}: is not well-formed XML: {error}") from error
@@ -79,8 +81,10 @@ def _parsed(path: Path) -> ET.Element:
 
 
 def _top(elements: dict[str, ET.Element], joints: list["_Joint"], path: Path) -> tuple[str, list["_Joint"]]:
-    """Return the link that is the base, and the joints above it. It is the link that is nobody's child; empty ones there that
-    carry a single link on a fixed or floating joint, such as `world` and `base_footprint`, are taken out with their joints.
+    """Return the base link, and the joints above it.
+
+    The base is the link that is no joint's child. Empty links there that carry a single link on a fixed or floating joint,
+    such as `world` and `base_footprint`, are removed with their joints.
     """
     children = [joint.child for joint in joints]
     twice = next((name for name in children if children.count(name) > 1), None)
@@ -103,7 +107,7 @@ def _top(elements: dict[str, ET.Element], joints: list["_Joint"], path: Path) ->
 
 
 def _pass_over(tree: Tree, above: Sequence["_Joint"]) -> None:
-    """Let the robot look as it does in the frame of the links above its base, and say that these are passed over."""
+    """Keep the robot's orientation in the frame of the links above its base, and report that these links are left out."""
     for joint in reversed(above):
         tree.turn(_origin(joint.element, joint.path)[1])
         if joint.kind == "fixed" and joint.parent != "world":
@@ -120,7 +124,7 @@ def _say_dont_collapse(tree: Tree, joints: list["_Joint"]) -> None:
 
 
 class _Joint:
-    """A joint element."""
+    """A joint element of a URDF."""
 
     def __init__(self, element: ET.Element, path: Path, links: dict[str, ET.Element]) -> None:
         self.element, self.path = element, path
@@ -138,7 +142,7 @@ class _Joint:
         self.parent, self.child = ends
 
     def place(self, link: Link, tree: Tree) -> None:
-        """Give `link` its place at its parent, and its hinge."""
+        """Set the pose of `link` in its parent's frame, and add its hinge."""
         link.pos, link.quat = _origin(self.element, self.path)
         if self.kind == "fixed":
             return
@@ -183,7 +187,7 @@ class _Joint:
 
 
 def _inertial(element: ET.Element, link: Link, tree: Tree) -> None:
-    """Give `link` its mass and inertia."""
+    """Set the mass and inertia of `link`."""
     inertial = element.find("inertial")
     if inertial is None:
         return
@@ -202,7 +206,7 @@ def _inertial(element: ET.Element, link: Link, tree: Tree) -> None:
 
 
 class _Shapes:
-    """Reads the shapes of links."""
+    """Reader of the shapes of links."""
 
     def __init__(self, path: Path, roots: Sequence[Path], colours: dict[str, Vector], tree: Tree, drawn: bool) -> None:
         self.path, self.roots, self.colours, self.tree, self.drawn = path, roots, colours, tree, drawn
@@ -236,7 +240,7 @@ class _Shapes:
             if kind != "sphere":
                 size[1] = _number(given, "length", self.path) / 2.0
         else:
-            self.tree.say(f"a {kind} is no shape of a URDF and left out, of link", link)
+            self.tree.say(f"a {kind} is not a shape of URDF and is left out, of link", link)
             return []
         if not (size[: 1 if kind == "sphere" else 3 if kind == "box" else 2] > 0.0).all():
             self.tree.say("shapes without a size are left out, of links", link)
@@ -266,7 +270,7 @@ class _Shapes:
         ]
 
     def _file(self, name: str) -> Path:
-        """Return the mesh that the file means by `name`, or else the only one of that name nearby."""
+        """Return the mesh file that the URDF calls `name`, else the only file of that name nearby."""
         folder = self.path.parent.resolve()
         try:
             return meshes.find(name, folder, self.roots)
@@ -310,7 +314,7 @@ def _numbers(element: ET.Element, key: str, count: int, path: Path) -> Vector:
 
 
 def _number(element: ET.Element, key: str, path: Path, default: float | None = None) -> float:
-    """Return the number of an attribute, or `default` where it is missing; it may be infinite, as limits are."""
+    """Return the number of an attribute, or `default` if it is missing; limits may be infinite."""
     text = element.get(key)
     if text is None and default is not None:
         return default

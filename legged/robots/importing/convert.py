@@ -1,4 +1,6 @@
-"""What the engines are given of a robot's file: the file, if they can rely on it as it is, else what becomes of it."""
+"""Conversion of a robot's file to the model that the engines take: the file unchanged if it meets their conditions, else an
+adapted copy.
+"""
 
 from functools import lru_cache
 from pathlib import Path
@@ -6,58 +8,60 @@ from pathlib import Path
 import mujoco
 
 from legged.errors import ConfigError
-from legged.robots.importing.guess import read_robot
-from legged.robots.importing.mend import mend
-from legged.robots.importing.mjcf import drop_what_is_drawn
+from legged.robots.importing.infer import read_robot
+from legged.robots.importing.mjcf import drop_visual_meshes
+from legged.robots.importing.mjcf_writer import mjcf_of
+from legged.robots.importing.repair import repair
 from legged.robots.importing.shapes import fit_meshes, name_shapes
-from legged.robots.importing.text import mjcf_of
 
 URDF = ".urdf"
 
 
 def robot_spec_of(path: Path, drawn: bool = False) -> mujoco.MjSpec:
-    """Return a robot's model. A URDF, and MJCF that was written for something else, are adapted: what a scene has beside the
-    robot goes, the base floats, welded links are merged, hinges that are driven have motors, in their order, and each shape
-    that collides has a name and is a primitive. Shapes that are only seen are left out of those unless `drawn`.
+    """Return a robot's model.
+
+    A URDF, and MJCF that was written for another use, are adapted: everything of a scene but the robot is removed, the base
+    floats, welded links are merged, driven hinges have motors in the order of the hinges, and each collision shape is a
+    primitive with a name. The adapted model has visual shapes only if `drawn`.
 
     Raises:
         ConfigError: there is no robot in the file.
-        Exception: MuJoCo refuses it; its errors have no class of their own.
+        Exception: MuJoCo refuses the file; its errors have no class of their own.
     """
     if path.suffix.lower() != URDF:
         spec = mujoco.MjSpec.from_file(str(path))
         if is_plain(spec):
             if not drawn:
-                drop_what_is_drawn(spec, path)
+                drop_visual_meshes(spec, path)
             return spec
     return mujoco.MjSpec.from_string(_adapted(path, _stamp(path), drawn)[0])
 
 
 def adaptations(path: Path) -> tuple[str, ...]:
-    """Return what was done to a robot's file so that engines can rely on it, a line each; none for one that is used as it is.
+    """Return one line for each change that was made to a robot's file for the engines; empty if the file is used unchanged.
     Raises as `robot_spec_of`.
     """
     return () if is_plain_file(path) else _adapted(path, _stamp(path), False)[1]
 
 
 def _stamp(path: Path) -> tuple[int, int]:
-    """Return what tells the states of a file apart."""
+    """Return the time of the last change and the size of a file, which identify one state of it."""
     found = path.stat()
     return found.st_mtime_ns, found.st_size
 
 
 @lru_cache(maxsize=16)
 def _adapted(path: Path, _stamp: tuple[int, int], drawn: bool) -> tuple[str, tuple[str, ...]]:
-    """Return the MJCF of a file that is adapted, and what was done to it, once for each state of it."""
+    """Return the MJCF of an adapted file, and one line for each change. `_stamp` renews the cache entry of a changed file."""
     tree = read_robot(path, drawn=drawn)
     bare = not tree.shapes
-    if bare and not drawn:  # what is drawn will collide
+    if bare and not drawn:  # the visual shapes will collide
         tree = read_robot(path)
     fit_meshes(tree)
     if bare and not drawn:
         for link in tree.links:
             link.shapes = [shape for shape in link.shapes if shape.collides]
-    mend(tree)
+    repair(tree)
     name_shapes(tree)
     files: dict[str, Path] = {}
     for i, shape in enumerate(shape for link in tree.links for shape in link.shapes if not shape.collides):
@@ -71,13 +75,13 @@ def _adapted(path: Path, _stamp: tuple[int, int], drawn: bool) -> tuple[str, tup
 
 
 def is_plain_file(path: Path) -> bool:
-    """Return whether a robot's file is used as it is."""
+    """Return True if a robot's file is used unchanged."""
     return path.suffix.lower() != URDF and is_plain(mujoco.MjSpec.from_file(str(path)))
 
 
 def is_plain(spec: mujoco.MjSpec) -> bool:
-    """Return whether a spec is a robot alone, as engines rely on it: one body with a free joint on the world, named joints
-    below it, motors of hinges in their order, and shapes that collide with names, none of them a mesh.
+    """Return True if a spec is a robot alone that meets the engines' conditions: one body with a free joint on the world,
+    named joints below it, motors of hinges in the order of the hinges, and named collision shapes without meshes.
     """
     world = spec.worldbody
     if len(world.bodies) != 1 or world.geoms:
@@ -98,7 +102,7 @@ def is_plain(spec: mujoco.MjSpec) -> bool:
 
 
 def _is_motor(actuator: mujoco.MjsActuator) -> bool:
-    """Return whether an actuator passes on a torque as it is."""
+    """Return True if an actuator applies its control as a torque."""
     return (
         actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT
         and actuator.gaintype == mujoco.mjtGain.mjGAIN_FIXED

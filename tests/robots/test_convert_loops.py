@@ -6,10 +6,10 @@ import pytest
 from helpers import call
 
 from legged.cli.robot import add
-from legged.robots.importing.adapted import robot_spec_of
-from legged.robots.importing.mend import mend
+from legged.robots.importing.convert import robot_spec_of
 from legged.robots.importing.mjcf import read_mjcf
-from legged.robots.importing.text import mjcf_of
+from legged.robots.importing.mjcf_writer import mjcf_of
+from legged.robots.importing.repair import repair
 from legged.robots.robot import load_robot
 
 ARMS = """
@@ -75,7 +75,7 @@ def test_a_hinge_is_held_where_another_one_of_its_body_turns(tmp_path):
     path.write_text(ARMS.format(tied=CONNECT))
     tree = read_mjcf(path)
     tree.home = {"b": 0.7}
-    mend(tree, hold=("b",))
+    repair(tree, hold=("b",))
     theirs, ours = mujoco.MjModel.from_xml_string(path.read_text()), mujoco.MjModel.from_xml_string(mjcf_of(tree))
     for angle in (0.0, 1.1):
         places = []
@@ -102,7 +102,7 @@ def test_what_ties_parts_that_are_held_is_left_out(tmp_path, tied, hold, said):
     path = tmp_path / "arms.xml"
     path.write_text(ARMS.format(tied=tied))
     tree = read_mjcf(path)
-    mend(tree, hold=hold)
+    repair(tree, hold=hold)
     model = mujoco.MjModel.from_xml_string(mjcf_of(tree))
     assert model.neq == (said is None)
     assert said is None or any(said in line for line in tree.said)

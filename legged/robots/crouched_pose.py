@@ -1,4 +1,4 @@
-"""A pose from which a robot that lies anyhow stands up: legs bent so far that its feet are below it before they carry it."""
+"""A crouched pose, in which a fallen robot pulls its feet below the base before it stands up."""
 
 import numpy as np
 
@@ -7,17 +7,19 @@ from legged.robots.robot_model import read_model
 from legged.robots.stance import standing_height
 
 CROUCH = 0.55
-"""Height of the base in that pose, as a share of its height in the default pose."""
+"""Height of the base in the crouched pose, as a share of its height in the default pose."""
 FACTORS = np.arange(1.0, 4.0, 0.05)
-"""Times the default angles, of joints that swing legs."""
+"""Factors on the default angles of the joints that swing legs, tried in this order."""
 FEWEST_FEET = 4
-"""With fewer a robot that crouches may fall."""
+"""Least number of feet; with fewer a crouching robot may fall."""
 
 
 def crouch(robot: Robot) -> np.ndarray | None:
-    """Return joint angles (D,) [rad] at which a robot stands on its feet with the base as low as `CROUCH` says: those of the
-    default pose, those that swing legs all bent by one factor, within their limits. None for a robot with fewer than four
-    feet, with passive joints, or whose legs do not bend so far.
+    """Return joint angles (D,) [rad] at which a robot stands on its feet with its base at most `CROUCH` times its default
+    height above the ground.
+
+    The angles are those of the default pose, with all joints that swing legs multiplied by one factor, within their limits.
+    Return None for a robot with fewer than four feet, with passive joints, or with legs that do not bend so far.
     """
     if robot.passive is not None or len(robot.feet_indices) < FEWEST_FEET:
         return None

@@ -1,4 +1,4 @@
-"""What is put right in a Tree before it becomes a model: welded links are merged, impossible masses and inertias mended."""
+"""Repair of a Tree before it becomes a model: welded links are merged, impossible masses and inertias are corrected."""
 
 import re
 from collections.abc import Sequence
@@ -19,22 +19,24 @@ from legged.robots.importing.tree import (
 )
 
 LEAST_SHARE = 0.01
-"""Part of a link's mass that a massless one before it is given."""
+"""Share of its heaviest child's mass that a massless link is given."""
 LEAST_MOMENT = 1e-3
-"""Smallest principal moment of inertia, in those of the largest, where a file has one that is not above 0."""
+"""Smallest principal moment of inertia, as a share of the largest, for a link with a moment that is not above 0."""
 LARGEST = 1e6
-"""Of masses [kg], inertias [kg m^2] and lengths [m]: beyond it somebody has made a mistake."""
+"""Largest mass [kg], inertia [kg m^2] and length [m]; a larger number is a mistake in the file."""
 FINGERS = re.compile(r"hand|finger|thumb|index|middle|ring|pinky|little|gripper|palm|eye|ear|jaw|antenna", re.IGNORECASE)
-"""In the names of joints and links that walking does not need."""
+"""Pattern in the names of joints and links that walking does not need."""
 ROUNDING = 1e-6
-"""How far moments are kept from the limit A + B = C, in the largest one."""
+"""Distance of the moments from the limit A + B = C, as a share of the largest moment."""
 TINY = 1e-12
-"""Principal moments [kg m^2] and masses [kg] below this are none."""
+"""Principal moments [kg m^2] and masses [kg] below this count as zero."""
 
 
-def mend(tree: Tree, hold: Sequence[str] = (), light: float = 0.0) -> None:
-    """Put a tree right in place: hold the joints whose names contain one of `hold`, and those of fingers that move at most
-    the part `light` of the mass, weld what carries no mass, merge welded links, mend inertias.
+def repair(tree: Tree, hold: Sequence[str] = (), light: float = 0.0) -> None:
+    """Repair a tree in place: hold joints, weld links without mass, merge welded links, correct inertias.
+
+    The held joints are those whose names contain a pattern of `hold`, and those of fingers that move less than the share
+    `light` of the mass.
 
     Raises:
         ConfigError: a pattern of `hold` matches no joint, or there is no mass.
@@ -44,17 +46,17 @@ def mend(tree: Tree, hold: Sequence[str] = (), light: float = 0.0) -> None:
     _hold_what_is_light(tree, light)
     merge_welded(tree)
     if len(tree.links) == 1:
-        raise ConfigError(f"{tree.source}: nothing in it turns: no joint is a hinge that moves a mass")
+        raise ConfigError(f"{tree.source}: no joint is a hinge that moves a mass")
     _give_mass(tree)
     for link in tree.links:
         _mend_inertia(link, tree)
 
 
 def _check_numbers(tree: Tree) -> None:
-    """Look whether masses and places are such that their squares are numbers too.
+    """Check that the squares of masses, inertias, lengths and positions do not overflow.
 
     Raises:
-        ConfigError: they are not.
+        ConfigError: a number is not finite or too large.
     """
     for link in tree.links:
         values = np.hstack([link.mass, link.com, link.inertia.ravel(), link.pos, link.quat])
@@ -77,13 +79,15 @@ def _hold(tree: Tree, hold: Sequence[str]) -> None:
 
 
 def fix(link: Link, hinge: Hinge, angle: float) -> None:
-    """Take a hinge from its link, turned by `angle` [rad]."""
+    """Remove a hinge from its link, which stays turned by `angle` [rad]."""
     turn_link(link, hinge, angle)
     link.hinges = [other for other in link.hinges if other is not hinge]
 
 
 def _hold_what_is_light(tree: Tree, light: float) -> None:
-    """Hold joints that move no mass, their own link's or another's, and those of fingers, by name and mass."""
+    """Hold joints that move no mass, neither their own link's nor another's, and joints of fingers, which name and mass
+    identify.
+    """
     moved = [link.mass for link in tree.links]
     for i in reversed(range(1, len(tree.links))):
         moved[tree.links[i].parent] += moved[i]
@@ -99,12 +103,14 @@ def _hold_what_is_light(tree: Tree, light: float) -> None:
 
 
 def rest_angle(tree: Tree, hinge: Hinge) -> float:
-    """Return the angle [rad] at which a joint is held: that of the keyframe, else the nearest to 0."""
+    """Return the angle [rad] at which a joint is held: the keyframe's, else the angle in its range nearest to 0."""
     return float(np.clip((tree.home or {}).get(hinge.name, 0.0), *(hinge.range or (-np.inf, np.inf))))
 
 
 def merge_welded(tree: Tree) -> None:
-    """Merge every link without a hinge into its parent: mass, centre, inertia, and shapes, which keep its name."""
+    """Merge every link without a hinge into its parent: mass, centre of mass, inertia and shapes. A shape keeps the name of
+    its first link.
+    """
     merged = 0
     for i in reversed(range(1, len(tree.links))):
         link = tree.links[i]
@@ -132,13 +138,13 @@ def merge_welded(tree: Tree) -> None:
 
 
 def _with(pair: tuple[str, str], old: str, new: str) -> tuple[str, str]:
-    """Return a pair with one name for another."""
+    """Return the pair with the name `old` replaced by `new`."""
     first, second = (new if name == old else name for name in pair)
     return first, second
 
 
 def _drop_loops(tree: Tree) -> None:
-    """Leave out constraints of hinges that are held, and between links that are one."""
+    """Remove constraints of held hinges, and constraints between two links that were merged."""
     hinges = {hinge.name for hinge in tree.hinges}
     for loop in list(tree.loops):
         ends = [loop[key] for key in ("body1", "body2", "joint1", "joint2") if key in loop]
@@ -152,7 +158,7 @@ def _drop_loops(tree: Tree) -> None:
 
 
 def _parents_first(tree: Tree) -> None:
-    """Order links depth first."""
+    """Order the links depth first, parents before children."""
     order: list[int] = []
 
     def visit(i: int) -> None:
@@ -168,7 +174,7 @@ def _parents_first(tree: Tree) -> None:
 
 
 def _give_mass(tree: Tree) -> None:
-    """Give links without mass that carry others a part of their heaviest child's; the sum stays what it is."""
+    """Give each massless link that carries others a share of its heaviest child's mass; the sum stays the same."""
     for i in reversed(range(1, len(tree.links))):
         link = tree.links[i]
         if link.mass > TINY:
@@ -185,7 +191,7 @@ def _give_mass(tree: Tree) -> None:
 
 
 def _mend_inertia(link: Link, tree: Tree) -> None:
-    """Let the principal moments of a link be positive, and none larger than the sum of the others, as of any real body."""
+    """Make the principal moments of a link positive, and none larger than the sum of the other two, as for any real body."""
     if np.abs(link.inertia).max() < TINY * max(1.0, link.mass):
         sides = _extent([shape for shape in link.shapes if shape.collides] or link.shapes)
         if sides is None:
@@ -200,7 +206,7 @@ def _mend_inertia(link: Link, tree: Tree) -> None:
     excess = max(0.0, wanted[2] - wanted[0] - wanted[1])
     if moments[0] > 0.0 and wanted[0] + wanted[1] >= wanted[2] * (1.0 + ROUNDING):
         return
-    if excess < ROUNDING * wanted[2] and moments[0] > 0.0:  # flat things: only what is written, rounded, would break it
+    if excess < ROUNDING * wanted[2] and moments[0] > 0.0:  # flat bodies: rounded numbers in the file break the limit
         link.inertia = axes @ np.diag(wanted + np.array([1.0, 1.0, 0.0]) * ROUNDING * wanted[2]) @ axes.T
         return
     said = ", ".join(f"{moment:.3g}" for moment in moments)
@@ -212,12 +218,12 @@ def _mend_inertia(link: Link, tree: Tree) -> None:
 
 
 def _radius(mass: float) -> float:
-    """Return the radius of a ball of water [m]."""
+    """Return the radius of a ball of water of this mass [m]."""
     return float((3.0 * mass / (4000.0 * np.pi)) ** (1 / 3))
 
 
 def _extent(shapes: Sequence[Shape]) -> Vector | None:
-    """Return the sides (3,) of the box around shapes [m], in the frame of their link; None if they have no size."""
+    """Return the sides (3,) of the box around shapes in the frame of their link [m]; None if they have no size."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for shape in shapes:
         half = half_lengths(shape)
@@ -228,7 +234,7 @@ def _extent(shapes: Sequence[Shape]) -> Vector | None:
 
 
 def half_lengths(shape: Shape) -> Vector | None:
-    """Return half the sides (3,) of a primitive's box, in its own frame [m]; None for a mesh."""
+    """Return half the sides (3,) of the box around a primitive, in the primitive's frame [m]; None for a mesh."""
     a, b, _ = shape.size
     boxes = {"sphere": [a, a, a], "capsule": [a, a, a + b], "cylinder": [a, a, b], "mesh": None}
     half = boxes.get(shape.kind, shape.size)
@@ -236,5 +242,5 @@ def half_lengths(shape: Shape) -> Vector | None:
 
 
 def plain(name: str) -> str:
-    """Return a name that can be a part of MJCF and YAML without quotes."""
+    """Return a name that MJCF and YAML take without quotes."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("_") or "unnamed"

@@ -1,4 +1,7 @@
-"""A Tree that was read -> one that is ready, with everything that robot.yaml says, each guess named."""
+"""Completion of a Tree that was read from a file: repairs, names, default pose, feet, gains; all that robot.yaml states.
+
+Every value that the file does not state is inferred, and reported as a guess.
+"""
 
 import re
 from collections.abc import Sequence
@@ -11,35 +14,35 @@ from legged.robots.importing.actuation import guess_efforts, speed_limits, take_
 from legged.robots.importing.folder import Guesses, called
 from legged.robots.importing.inverse_kinematics import GOOD, standing_angles
 from legged.robots.importing.legs import Leg, Poser, face_forward, find_legs
-from legged.robots.importing.mend import mend
 from legged.robots.importing.mjcf import read_mjcf
+from legged.robots.importing.mjcf_writer import model_of
+from legged.robots.importing.repair import repair
 from legged.robots.importing.shapes import fit_meshes, free_name, give_trunk, name_shapes
-from legged.robots.importing.text import model_of
 from legged.robots.importing.tree import Shape, Tree
 from legged.robots.importing.urdf import read_urdf
 from legged.robots.stance import standing_height
 
 LIGHT = 0.005
-"""Fingers that move a smaller part of the mass are held."""
+"""Fingers that move a smaller share of the robot's mass are held."""
 MIDDLE = 0.01
-"""How far from the middle plane a link may begin that belongs to the trunk [m]."""
+"""Largest distance from the middle plane at which a link of the trunk may begin [m]."""
 SOLE = re.compile(r"foot|feet|toe|sole|heel", re.IGNORECASE)
-"""In the names of what stands on the ground behind a toe."""
+"""Pattern in the names of the shapes that stand on the ground behind a toe."""
 ABOVE = 1.03
-"""Spawn height, in that of the standing base."""
+"""Spawn height as a multiple of the height of the standing base."""
 WIDEST = 0.8
-"""Largest half length of a trunk that is guessed, in the distance from the base to the farthest foot."""
+"""Largest half length of a guessed trunk, as a share of the distance from the base to the farthest foot."""
 LOST_FOOT = 0.25
-"""A foot that is so far from where it should stand, in the length of a leg, is none."""
+"""Largest distance of a foot from its place in a stance, as a share of the leg's length; beyond it the link is not a foot."""
 LOST = 1e-6
-"""Largest part of a robot's mass that rounding may lose."""
+"""Largest share of a robot's mass that rounding may lose."""
 
 
 def read_robot(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tree:
-    """Return the robot in a URDF or MJCF file as it is there.
+    """Return the robot of a URDF or MJCF file as the file has it.
 
     Raises:
-        ConfigError: it is neither, or has no robot.
+        ConfigError: the file is neither URDF nor MJCF, or holds no robot.
     """
     if path.suffix.lower() == ".urdf":
         return read_urdf(path, roots, drawn)
@@ -50,13 +53,14 @@ def read_robot(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tr
 
 
 def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] | None = None) -> Guesses:
-    """Put a tree right, in place, and guess what it does not say. `gains` [N m/rad], [N m s/rad] replace those of the file.
+    """Repair a tree in place and infer the values that its file does not state. `gains` [N m/rad], [N m s/rad] replace those
+    of the file.
 
     Raises:
-        ConfigError: there is no robot with legs in it, or mass was lost.
+        ConfigError: the tree has no robot with legs, or mass was lost.
     """
     fit_meshes(tree)
-    mend(tree, hold, LIGHT)
+    repair(tree, hold, LIGHT)
     face_forward(tree)
     legs = find_legs(tree)
     if not any(shape.collides for i in _trunk(tree, legs) for shape in tree.links[i].shapes):
@@ -94,7 +98,7 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
 
 
 def _name_feet(tree: Tree, legs: list[Leg]) -> None:
-    """Give feet names that are parts of no other shape's: patterns of robot.yaml are parts of names."""
+    """Rename the feet so that no foot's name is part of another shape's name: patterns of robot.yaml are parts of names."""
     for leg in legs:
         for shape in leg.feet:
             others = {other.name for other in tree.shapes if other is not shape}
@@ -103,7 +107,9 @@ def _name_feet(tree: Tree, legs: list[Leg]) -> None:
 
 
 def _name_passive(tree: Tree, legs: list[Leg]) -> None:
-    """Give hinges without a motor names that are parts of no other hinge's, for the same reason."""
+    """Rename the hinges without a motor so that no such name is part of another hinge's name, since patterns are parts of
+    names.
+    """
     driven = [hinge.name for hinge in tree.hinges if hinge.driven]
     for hinge in tree.hinges:
         if hinge.driven or not any(hinge.name in name for name in driven):
@@ -119,7 +125,7 @@ def _name_passive(tree: Tree, legs: list[Leg]) -> None:
 
 
 def _named_apart(tree: Tree, role: Sequence[str]) -> list[str]:
-    """Give the shapes of a role names that are parts of no other shape's, for the same reason; return the names of all."""
+    """Rename the shapes of a role so that none of their names is part of another shape's name; return the new names."""
     named = {shape.name: shape for shape in tree.shapes}
     shapes = [named[name] for name in role]
     for shape in shapes:
@@ -132,8 +138,8 @@ def _named_apart(tree: Tree, role: Sequence[str]) -> list[str]:
 
 
 def _exact(tree: Tree, names: Sequence[str]) -> list[str]:
-    """Return patterns that match these shapes and no others: a part that all have alone, else the names, which are parts of
-    no other shape's.
+    """Return patterns that match exactly these shapes: a part of the name that only they share, else their names. No name may
+    be part of another shape's name.
     """
     others = [shape.name for shape in tree.shapes if shape.name not in names]
     for word in ("foot", "FOOT", "Foot", "toe", "calf", "shank"):
@@ -147,11 +153,15 @@ def _exact(tree: Tree, names: Sequence[str]) -> list[str]:
 
 
 def _roles(tree: Tree, legs: list[Leg], feet: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the shapes whose contact ends an episode, those of the base and of what carries arms and a head, and those whose
-    contact is penalised: thighs, shanks, and what arms end in. Hips are next to the base, and hardly touch; heels stand.
+    """Return two lists of shapes: those whose contact ends an episode, and those whose contact is penalised.
+
+    The first list is the shapes of the base and of the links that carry arms and a head. The second is thighs, shanks and the
+    ends of arms. Hips are in neither, because they hardly touch the ground, and heels are in neither, because the robot
+    stands on them.
     """
     of_legs = {i for leg in legs for i in leg.links}
-    before = {i for leg in legs for i in leg.links[-2:-1]}  # of a leg that ends in a toe, it has the heel
+    # the second-last link of a leg: it has the heel if the leg ends in a toe
+    before = {i for leg in legs for i in leg.links[-2:-1]}
     soles = {shape.name for i in before for shape in tree.links[i].shapes if SOLE.search(f"{shape.link} {shape.name}")}
     in_the_middle = _trunk(tree, legs)
     ends = [i for i in range(1, len(tree.links)) if not tree.children(i) and i not in of_legs and i not in in_the_middle]
@@ -165,7 +175,7 @@ def _roles(tree: Tree, legs: list[Leg], feet: Sequence[str]) -> tuple[list[str],
 
 
 def _trunk(tree: Tree, legs: list[Leg]) -> list[int]:
-    """Return the links in the middle that are of no leg: the base, and what carries arms and a head."""
+    """Return the links of the trunk: the base, and the links in the middle that are in no leg and carry arms and a head."""
     poser = Poser(tree)
     poser.pose({})
     of_legs = {i for leg in legs for i in leg.links}
@@ -173,14 +183,14 @@ def _trunk(tree: Tree, legs: list[Leg]) -> list[int]:
 
 
 def _reach(tree: Tree, legs: list[Leg]) -> float:
-    """Return how far the farthest foot is from the base with all joints at 0 [m]."""
+    """Return the distance from the base to the farthest foot with all joints at 0 [m]."""
     poser = Poser(tree)
     poser.pose({})
     return max(float(np.linalg.norm(poser.point(leg.end, leg.tip))) for leg in legs)
 
 
 def _draw_what_is_bare(tree: Tree) -> None:
-    """Draw the colliding shapes of links without a drawn one, where others have some."""
+    """Draw the collision shapes of links that have no visual shape, if other links have one."""
     if not any(not shape.collides for link in tree.links for shape in link.shapes):
         return
     for link in tree.links:
@@ -189,10 +199,10 @@ def _draw_what_is_bare(tree: Tree) -> None:
 
 
 def _default_pose(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], str]:
-    """Return joint angles to stand in, and where they come from.
+    """Return the joint angles of the default pose, and a text that says where they come from.
 
     Raises:
-        ConfigError: it does not stand on its legs.
+        ConfigError: the robot does not stand on its legs in that pose.
     """
     if tree.home is not None:
         angles = {hinge.name: tree.home.get(hinge.name, 0.0) for hinge in tree.hinges}
@@ -219,7 +229,7 @@ def _default_pose(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], str]:
 
 
 def _check_mass(tree: Tree) -> None:
-    """Compare the mass of the model with that of the file.
+    """Compare the mass of the model with the mass in the file.
 
     Raises:
         ConfigError: they differ.

@@ -1,5 +1,5 @@
-"""Tree -> MJCF that a person can read and engines rely on: one free base, hinges with a motor each in their order, shapes
-with names, drawn shapes apart.
+"""Readable MJCF of a Tree, as the engines need it: one free base, one motor per driven hinge in the order of the hinges,
+named collision shapes, separate visual shapes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,15 +13,19 @@ from legged.errors import ConfigError
 from legged.robots.importing.tree import IDENTITY, Hinge, Link, Mesh, Shape, Tree, Vector, quat_product, rotate, vector_of
 
 DRAWN_GROUP, TOUCHED_GROUP = 2, 3
-"""Groups of geoms: pictures show the first only."""
+"""Groups of geoms: pictures show only the first."""
 GREY = "0.7 0.7 0.72 1"
 DRAWN_APART = 1e-6
-"""How far two points that are tied together may be from each other as links are drawn [m]."""
+"""Largest distance of two points of a constraint from each other at zero joint angles [m]; a constraint with a larger one
+uses sites.
+"""
 
 
 def mjcf_of(tree: Tree, files: Mapping[str, Path] | None = None, height: float = 0.0, remarks: Sequence[str] = ()) -> str:
-    """Return a tree as MJCF. `files` says where the drawn meshes lie, by their names; without it, or where a name is missing
-    in it, meshes are not drawn. The base is drawn at `height` [m]; `remarks` stand at the top.
+    """Return a tree as MJCF.
+
+    `files` maps the names of visual meshes to their files; meshes that it does not name are left out. The base is at `height`
+    [m]; `remarks` are comments at the top.
     """
     files = files or {}
     drawn = [s for link in tree.links for s in link.shapes if not s.collides and (s.mesh is None or s.mesh.name in files)]
@@ -64,7 +68,7 @@ def mjcf_of(tree: Tree, files: Mapping[str, Path] | None = None, height: float =
 
 
 def model_of(tree: Tree) -> mujoco.MjModel:
-    """Return a tree as a model, in which meshes are not drawn.
+    """Return the compiled model of a tree without visual meshes.
 
     Raises:
         ConfigError: MuJoCo refuses it.
@@ -72,11 +76,11 @@ def model_of(tree: Tree) -> mujoco.MjModel:
     try:
         return mujoco.MjModel.from_xml_string(mjcf_of(tree))
     except ValueError as error:
-        raise ConfigError(f"{tree.source}: MuJoCo refuses what becomes of it: {' '.join(str(error).split())}") from error
+        raise ConfigError(f"{tree.source}: MuJoCo refuses the converted model: {' '.join(str(error).split())}") from error
 
 
 def numbers(values: Vector) -> str:
-    """Return numbers as MJCF has them, nine digits each."""
+    """Return numbers as text of MJCF, with nine digits each."""
     return " ".join(f"{value:.9g}" for value in np.where(np.abs(values) < 1e-12, 0.0, values))
 
 
@@ -86,13 +90,13 @@ def _touched_colour(group: int) -> str:
 
 def _mesh(mesh: Mesh, file: Path) -> str:
     scale = "" if mesh.file is None or np.allclose(mesh.scale, 1.0) else f' scale="{numbers(mesh.scale)}"'
-    # Drawn meshes weigh nothing; as a shell, even one without a volume is taken.
+    # Visual meshes have no mass; inertia="shell" makes MuJoCo accept one without a volume too.
     return f'    <mesh name={quoteattr(mesh.name)} file={quoteattr(file.as_posix())}{scale} inertia="shell"/>'
 
 
 def _loop_ends(tree: Tree) -> dict[str, list[tuple[str, str]]]:
-    """Return the sites, name and place, that each link needs for what it is tied to: where MuJoCo, which ties bodies together
-    as they are drawn, would not find the place on the other link.
+    """Return the sites of constraints, name and position, by link. MuJoCo ties two bodies together at the point where they
+    are at zero joint angles; a constraint whose points are apart there needs a site on each link.
     """
     places: list[tuple[Vector, Vector]] = []
     for link in tree.links:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from legged.robots.crouch import CROUCH, crouch
+from legged.robots.crouched_pose import CROUCH, crouch
 from legged.robots.robot import load_robot
 from legged.robots.robot_model import read_model
 from legged.robots.stance import standing_height

@@ -16,10 +16,10 @@ from legged.physics.scene.robot_scene import robot_source
 from legged.registry import make_task, task_config
 from legged.rendering.framing import size_of
 from legged.rendering.scene import display_model
-from legged.robots.importing.adapted import is_plain_file, robot_spec_of
-from legged.robots.importing.guess import make_ready, read_robot
+from legged.robots.importing.convert import is_plain_file, robot_spec_of
+from legged.robots.importing.infer import make_ready, read_robot
 from legged.robots.importing.mjcf import read_mjcf
-from legged.robots.importing.text import mjcf_of
+from legged.robots.importing.mjcf_writer import mjcf_of
 from legged.robots.importing.tree import Tree, rotate
 from legged.robots.robot import Robot, load_robot
 
