@@ -13,7 +13,7 @@ from rich.table import Table
 from legged.errors import ConfigError, suggest
 from legged.evaluation.engines import engine_of
 from legged.evaluation.reports.charts import Line, draw_charts
-from legged.evaluation.result_file import changes_text, grid_text, tracking_of
+from legged.evaluation.result_file import changes_text, grid_text, has_tracking, tracking_of
 from legged.evaluation.success_report import success_chart, types_in
 from legged.evaluation.tables import screen_table
 
@@ -72,7 +72,7 @@ def tracking_table(groups: Evaluations) -> Table:
     for label, name, part, factor, form in FIGURES:
         row = [label]
         for results in groups.values():
-            found = [tracking_of(result)[name] for result in results]
+            found = [tracking_of(result)[name] for result in results if has_tracking(result)]
             every = [value if part is None else value[part] for value in found]
             values = [factor * value for value in every if value is not None]  # null if every robot fell
             row.append(_mean_text(values, len(results), form, f"{100 * spread(values):.0f} %") if values else "none")

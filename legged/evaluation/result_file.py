@@ -104,6 +104,8 @@ def check_result(result: Any, where: str) -> None:
         check_form(result, {**HEAD, "episodes": EPISODES}, damaged)
     elif "rough" in there:
         check_form(result, {**HEAD, **SUCCESS, "rough": TRACKING}, damaged)
+    elif "success" in there and not TRACKING.keys() & there.keys():  # `legged evaluate terrain` alone
+        check_form(result, {**HEAD, **SUCCESS}, damaged)
     else:
         check_form(result, {**HEAD, **SUCCESS, **TRACKING}, damaged)
 
@@ -126,6 +128,11 @@ def write_result(path: Path, result: dict[str, Any]) -> None:
 def tracking_of(result: dict[str, Any]) -> dict[str, Any]:
     """Return the part of a result with the errors on the grid of commands."""
     return result.get("rough", result)
+
+
+def has_tracking(result: dict[str, Any]) -> bool:
+    """Return whether a checked result holds errors on a grid of commands, which `legged evaluate grid` measures."""
+    return "rmse_lin" in tracking_of(result)
 
 
 def changes_text(result: dict[str, Any]) -> str:

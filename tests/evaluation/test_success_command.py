@@ -249,7 +249,7 @@ def test_terrain_and_grid_write_their_parts_into_one_file(run, tmp_path, capsys)
 
 
 def test_evaluate_measures_success_and_tracking_on_rough_ground(run, tmp_path, capsys):
-    """Each by its own command, into the same folder; `legged evaluate` does both."""
+    """Each by its own command, into the same folder."""
     here = ["anymal_c", *HERE, "--out", str(tmp_path / "o")]
     assert call(evaluate_grid.main, [*here, *CELL]) == 0
     assert call(evaluate_terrain.main, [*here, "--types", "stairs_up,slope_down", "--robots-per-point", "2"]) == 0
@@ -270,6 +270,17 @@ def test_evaluate_measures_success_and_tracking_on_rough_ground(run, tmp_path, c
     for words in ("tracking on rough ground: 1 commands", "stairs_up: 2 sizes x 2 robots", "0.2 m *", "0/2 = 0 %"):
         assert words in out
     assert "success_mujoco.png" in out
+
+
+def test_evaluate_alone_measures_both_on_the_task_s_own_grid_and_types(trained, tmp_path, monkeypatch):
+    monkeypatch.chdir(trained)
+    asked = []
+    monkeypatch.setattr(evaluate, "evaluate_following", lambda policy, *rest: asked.append((policy, *rest)) or 0)
+    assert call(evaluate.main, ["anymal_c", *HERE, "--out", str(tmp_path / "o")]) == 0
+    ((policy, grid, sizes, robots, *_),) = asked
+    assert grid.axes["vx"] == [-1.0, -0.5, 0.0, 0.5, 1.0]
+    assert {name for name, share in policy.cfg.terrain.proportions.items() if share > 0.0} == set(sizes)
+    assert robots == 32
 
 
 def test_the_other_engine_is_drawn_too_if_it_is_of_the_same_checkpoint(tmp_path):

@@ -235,7 +235,7 @@ def test_somebody_elses_repository_is_not(installed, place):
 
 def test_without_git_that_is_said(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert code_state().splitlines()[1:] == ["git is not on the PATH: the commit is not known"]
+    assert code_state().splitlines()[1:] == ["git is not on the PATH, so the commit is unknown"]
 
 
 @pytest.mark.parametrize("name", ["", " ", "long" * 100, "zero\0byte", "../..", "*"])

@@ -190,7 +190,7 @@ def test_resuming_what_is_finished_is_an_error_and_leaves_no_folder(capsys):
     tiny_run()
     before = run_folders()
     assert call(train.main, ["--task", TASK, "--sim_device", "cpu", "--resume", "--max_iterations", "2", *SIZES]) == 2
-    assert "--max_iterations" in capsys.readouterr().err
+    assert "--max-iterations" in capsys.readouterr().err
     assert run_folders() == before
 
 

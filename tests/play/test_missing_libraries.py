@@ -36,13 +36,13 @@ def test_a_film_without_an_encoder_is_one_line_after_the_table_and_a_gif_is_ther
     """Pictures are black, so that nothing needs to be drawn."""
     code = (
         "import numpy as np\n"
-        "from legged.play import schedule, video\n"
+        "from legged.play import demonstrations, video\n"
         "class Camera:\n"
         "    def __init__(self, task, count): ...\n"
         "    def picture(self, lines): return np.zeros((18, 32, 3), dtype=np.uint8)\n"
         "    def close(self): ...\n"
         "video.camera_of = Camera\n"
-        "schedule.SCHEDULE = ((0.2, (0.5, 0.0, 0.0)),)\n"
+        "demonstrations.SCHEDULE = ((0.2, (0.5, 0.0, 0.0)),)\n"
         "from legged.cli.play import main\n"
         f"sys.exit(main({['--headless', '--gif', *ARGUMENTS]!r}))"
     )

@@ -20,7 +20,7 @@ from legged.evaluation.comparison import (
     tracking_table,
     types_of,
 )
-from legged.evaluation.result_file import read_results
+from legged.evaluation.result_file import has_tracking, read_results
 from legged.process.command_parser import CommandParser
 from legged.process.paths import make_folder, ready_to_write, relative
 
@@ -59,8 +59,9 @@ def _main(argv: list[str] | None) -> int:
     for task, physics, _ in groups.keys() - episodes.keys() - following.keys():
         raise ConfigError(f"{task} in {physics}: some evaluations are of commands, others of episodes; compare them apart")
     console = Console(width=130)
-    if following:
-        console.print(tracking_table(following))
+    tracked = {key: results for key, results in following.items() if any(map(has_tracking, results))}
+    if tracked:
+        console.print(tracking_table(tracked))
     if episodes:
         console.print(episodes_comparison(episodes))
     with_success = {key: results for key, results in following.items() if any("success" in result for result in results)}

@@ -8,7 +8,7 @@ from legged.evaluation.engines import ENGINES, engine_of
 from legged.evaluation.intervals import wilson
 from legged.evaluation.reports.charts import curves, heat_map
 from legged.evaluation.reports.document import Cell, Figures, Heading, Number, Paragraph, Part, Table
-from legged.evaluation.result_file import changes_text, tracking_of
+from legged.evaluation.result_file import changes_text, has_tracking, tracking_of
 from legged.evaluation.success_report import success_charts
 from legged.evaluation.tracking_report import PANELS, grid_means
 from legged.evaluation.velocity_grid import AXES
@@ -65,7 +65,7 @@ def _following(results: Sequence[dict[str, Any]]) -> list[Part]:
     """Return tables and drawings of robots that follow commands."""
     rows: list[list[Cell]] = []
     drawings = []
-    for result in results:
+    for result in filter(has_tracking, results):
         tracking, label = tracking_of(result), engine_of(result["physics"]).label
         counted = falls_of(tracking)
         rows.append(
@@ -95,6 +95,8 @@ def _following(results: Sequence[dict[str, Any]]) -> list[Part]:
         ),
         Table(head, rows),
     ]
+    if not rows:
+        parts = []
     if drawings:
         parts.append(Figures("tracking", drawings, "velocity and yaw rate errors over commands"))
     success = [curves(chart) for chart in success_charts(results)]

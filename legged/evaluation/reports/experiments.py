@@ -12,7 +12,7 @@ from legged.evaluation.reports.document import Cell, Link, Mono, Number, Paragra
 from legged.evaluation.reports.evaluation_part import number
 from legged.evaluation.reports.record import Record, but_for_seeds, what_changed
 from legged.evaluation.reports.run_report import REPORT
-from legged.evaluation.result_file import tracking_of
+from legged.evaluation.result_file import has_tracking, tracking_of
 
 TITLE = "Experiments"
 EMPTY = ("", "-")
@@ -83,7 +83,7 @@ def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
     timing = record.timing
     steps = timing.steps if timing else None
     judged = _judged(record)
-    tracking = {} if judged is None or "episodes" in judged else tracking_of(judged)
+    tracking = tracking_of(judged) if judged is not None and has_tracking(judged) else {}
     episodes = judged["episodes"] if judged is not None and "episodes" in judged else None
     figures = {
         "RMSE [m/s]": tracking["rmse_lin"]["mean"] if tracking else None,
