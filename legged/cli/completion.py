@@ -6,14 +6,13 @@ the shell's start-up file, and write it again after an update of the package.
 
 import argparse
 import shlex
-import sys
 from collections.abc import Iterable
 from importlib import import_module
 
 import shtab
 
 from legged.cli.main import COMMANDS
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.config.reference import fields
 from legged.envs import BaseTask, LeggedRobot
 from legged.physics.fields import FIELDS
@@ -56,11 +55,6 @@ _legged_complete_keys() { compadd -S '' -- ${(f)"$(_legged_next_keys "$PREFIX")"
 """
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
-
-
 def build_parser() -> CommandParser:
     """Return the parser of the command line."""
     parser = CommandParser(
@@ -73,7 +67,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     shell = build_parser().parse_args(argv).shell
     kinds = [getattr(import_module(module), name) for name, module in CLASSES.items()]
     lists = SCRIPT.format(cfg=shlex.quote(str(data_folder("cfg"))), keys="\n".join(keys_of(kinds)))
@@ -124,7 +120,3 @@ def keys_of(kinds: Iterable[type[BaseTask]]) -> list[str]:
                 found |= {f"{text.path.replace('<name>', group)}=" for group in ("actor", "critic")}
             found |= {f"{text.path}.{name}=" for name in entries.get(text.path, ())}
     return sorted(found)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -5,13 +5,12 @@ the iteration and the seconds from the start of the training's process (`wall_s`
 them that walks. `legged play` exports the last checkpoint alone.
 """
 
-import sys
 from pathlib import Path
 
 import torch
 
 from legged.commandline.arguments import add_policy_arguments, policy_overrides, register_given, settle_on
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.learning.checkpoint import read_checkpoint
@@ -23,11 +22,6 @@ from legged.process.paths import ready_to_write, relative
 
 MEGABYTES = 5.0
 """Largest size of the files of one policy [MiB]."""
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -47,7 +41,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     register_given(args, "policy")
     if args.checkpoint is not None:
@@ -73,7 +69,3 @@ def _main(argv: list[str] | None) -> int:
         export(task, act.network, folder / f"{iterations:05d}", training, policy.cfg)
     print(f"exported {len(paths)} checkpoint{'s' if len(paths) != 1 else ''} to {relative(folder)}")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -10,14 +10,13 @@ network.npz (for control.actuator.network), fit.json and fit.png.
 """
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.config.yaml_files import dump
 from legged.errors import ConfigError
 from legged.fitting.judgement import Fit, actuator_section, draw, errors
@@ -29,11 +28,6 @@ from legged.process.paths import make_folder, ready_to_write, relative, write_te
 UPDATES = {"mlp": 2000, "lstm": 3000}
 """Default number of updates of a network."""
 HIDDEN = {"mlp": (32, 32, 32), "lstm": (8, 8)}
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -58,7 +52,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_args(argv)
     hidden = _widths(args.hidden) if args.hidden else HIDDEN[args.kind]
     updates = UPDATES[args.kind] if args.updates is None else args.updates
@@ -159,7 +155,3 @@ def _write(folder: Path, log: ActuatorLog, drive: Drive, judged: dict[str, dict[
     numbers = {name: value if np.isfinite(value) else None for name, value in vars(drive).items()}
     facts = {"joints": list(log.joint_names), "sim_dt": log.dt, "drive": numbers, "held_out": judged}
     write_text(folder / "fit.json", json.dumps(facts, indent=1))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -3,7 +3,6 @@
 The lists are read from the files' comments, which is fast.
 """
 
-import sys
 from pathlib import Path
 
 from legged.commandline.light import answer, print_rows
@@ -50,7 +49,3 @@ def _comment(path: Path) -> str:
             break
         found.append(line.lstrip("# "))
     return " ".join(found)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -133,7 +133,3 @@ def _print_help(words: list[str]) -> None:
         raise ConfigError(f"legged {asked[0]}: there is no sub-command '{asked[1]}'{near}")
     inside = {name: said for name, (_, said) in COMMANDS.items() if name.startswith(f"{asked[0]} ")}
     print_rows(f"commands of `legged {asked[0]}`, each with --help", inside)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -8,11 +8,10 @@ differ. It lists every setting without a counterpart, with file and line.
 import argparse
 import os
 import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.config.checks import PLAIN, is_plain_name, shown
 from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError
@@ -26,11 +25,6 @@ from legged.process.command_parser import CommandParser
 from legged.process.paths import data_folder, exists, make_folder, ready_to_write, relative, write_text
 from legged.registry import register_file, task_config
 from legged.robots.robot import Robot, load_robot
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -49,7 +43,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_args(argv)
     if not (exists(args.file) and args.file.is_file()):
         raise ConfigError(f"file: there is no file {shown(str(args.file))}")
@@ -156,7 +152,3 @@ def _report(args: argparse.Namespace, path: Path, result: Translation, lost: lis
         print(f"it does not load yet: {error}")
         return
     print(f"show the whole configuration: legged train {relative(path)} --show")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -5,7 +5,6 @@ On a display a window opens first, in which the robot follows the arrow keys.
 
 import argparse
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from legged.commandline.arguments import (
     settle_on,
     watch_command,
 )
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.config import LeggedConfig, override
 from legged.envs import BaseTask, LeggedRobot
 from legged.errors import ConfigError, RunError
@@ -48,11 +47,6 @@ SHOWN_ON_A_PLANE = 4
 """Default number of robots."""
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
-
-
 def build_parser() -> CommandParser:
     """Return the parser of the command line."""
     parser = CommandParser(
@@ -71,7 +65,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     if args.gif and args.no_video:
         raise ConfigError("--gif: asks for a film, and --no-video for none; leave out one of them")
@@ -167,7 +163,3 @@ def _video(task: BaseTask, count: int, folder: Path | None, gif: bool) -> tuple[
         return Video(task, count, folder, gif), None
     except RunError as error:
         return Video(task, count, None), error
-
-
-if __name__ == "__main__":
-    sys.exit(main())

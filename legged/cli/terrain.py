@@ -4,7 +4,6 @@ terrain_map.png shows the whole grid of tiles from above, terrain.png one tile o
 shows other types than the task's.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from pathlib import Path
 from PIL import Image
 
 from legged.commandline.arguments import add_task_arguments, overrides, register_given
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.process.command_parser import CommandParser
@@ -20,11 +19,6 @@ from legged.process.paths import make_folder, ready_to_write, relative, replacin
 from legged.registry import task_config
 from legged.rendering.terrain_picture import draw_map, picture_of_types, tiles
 from legged.terrain import Terrain, check_terrain, terrain_types
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -42,7 +36,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     register_given(args, "task")
     if not 0.0 <= args.difficulty <= 1.0:
@@ -74,7 +70,3 @@ def _main(argv: list[str] | None) -> int:
         Image.fromarray(picture_of_types(cfg, types, args.difficulty)).save(part, format="PNG")
     print(f"written: {relative(map_path)}, {relative(picture_path)}")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

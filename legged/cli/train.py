@@ -379,7 +379,3 @@ def _summary(runner: Runner, folder: Path, timing: Timing, play: str) -> None:
         f"checkpoint in {relative(folder)}; see it walk: {play}",
         flush=True,
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

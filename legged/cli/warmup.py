@@ -4,20 +4,14 @@ The task is built as `legged train` builds it with the same arguments. Warp's ca
 machine's GPU, or for its CPU with sim.physics=mujoco_warp, and the next training starts without compiling.
 """
 
-import sys
 import time
 
 from legged.commandline.arguments import add_task_arguments, overrides, pick_device, register_given, settle_on
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.physics import kernel_cache, resolve_physics
 from legged.process.command_parser import CommandParser
 from legged.process.startup import STARTED_S
 from legged.registry import make_task, task_config
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -32,7 +26,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     start = STARTED_S if argv is None else time.perf_counter()
     args = build_parser().parse_intermixed_args(argv)
     register_given(args, "task")
@@ -45,7 +41,3 @@ def _main(argv: list[str] | None) -> int:
     make_task(cfg, device, graph=not args.no_graph)
     print(f"{cfg.task}: ready in {time.perf_counter() - start:.1f} s, its kernels are in {kernel_cache()}")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

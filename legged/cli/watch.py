@@ -18,7 +18,7 @@ from legged.commandline.arguments import (
     register_given,
     settle_on,
 )
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.errors import ConfigError
 from legged.play.live.address import HOST, PORT, check_port, free_port, is_loopback, url
 from legged.play.live.ground import changes_for, check_ground
@@ -32,11 +32,6 @@ ROBOTS = 4
 """Default number of robots."""
 ROBOTS_A_THREAD = 4
 """Number of robots that one core simulates in real time."""
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -57,7 +52,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     override_is_no_name(args, "policy")
     register_given(args, "policy")
@@ -87,7 +84,3 @@ def _main(argv: list[str] | None) -> int:
     finally:
         page.close()
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,12 +1,14 @@
 """Execution of a command: its exit code, and its error message in one line."""
 
 import errno
+import functools
 import re
 import sys
 import sysconfig
 import traceback
 from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
 import legged.errors
 from legged.commandline.output import forgiving_output
@@ -50,6 +52,23 @@ def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = N
     if argv is None:
         leave_at_interrupts()  # until Python itself has ended
     return code
+
+
+class Command(Protocol):
+    """The main function of a command."""
+
+    def __call__(self, argv: list[str] | None = None) -> int:
+        """Run the command with these arguments, those of this process if None; return its exit code."""
+
+
+def command(main: Callable[[list[str] | None], int]) -> Command:
+    """Let the main function of a command end as `run_main` describes."""
+
+    @functools.wraps(main)
+    def run(argv: list[str] | None = None) -> int:
+        return run_main(main, argv)
+
+    return run
 
 
 def _guarded(main: Callable[[list[str] | None], int], argv: list[str] | None) -> int:

@@ -3,13 +3,12 @@
 The task is timed on a plane, on its terrain with this package's collider, and on its terrain with mujoco-warp's general one.
 """
 
-import sys
 from typing import Any
 
 from legged.benchmarks.step_times import report
 from legged.cli.benchmark.common import add_arguments, add_memory, measure, settle, write
 from legged.commandline.arguments import settle_on
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.config import LeggedConfig, override
 from legged.errors import ConfigError
 from legged.physics import resolve_physics
@@ -21,11 +20,6 @@ GROUNDS: dict[str, list[tuple[str, Any]]] = {
     # The general collider needs room for its candidate pairs and for more contacts.
     "terrain, general collider": [("sim.terrain_collider", "convex"), ("sim.nconmax", 64), ("sim.njmax", 256)],
 }
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -41,7 +35,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     cfg, device = settle(args)
     where = cfg.origins.where("sim.physics")
@@ -57,7 +53,3 @@ def _main(argv: list[str] | None) -> int:
         print(f"{name}: {report(task, results[name])}", flush=True)
     write(args, results)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,14 +7,9 @@ import sys
 
 from legged.benchmarks.scale import numbers, scale
 from legged.cli.benchmark.common import add_arguments, add_step_arguments, settle, write
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.errors import ConfigError
 from legged.process.command_parser import CommandParser
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -31,7 +26,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     sizes = numbers(args.robots)
     if args.num_envs is not None:
@@ -40,7 +37,3 @@ def _main(argv: list[str] | None) -> int:
     result = scale(sizes, args.runner or cfg.train.runner.loop, sys.argv[1:] if argv is None else argv, cfg, device)
     write(args, result.found)
     return result.code
-
-
-if __name__ == "__main__":
-    sys.exit(main())

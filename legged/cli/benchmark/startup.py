@@ -8,13 +8,8 @@ import sys
 
 from legged.benchmarks.start_times import start_report, time_start
 from legged.cli.benchmark.common import add_arguments, settle, write
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.process.command_parser import CommandParser
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -29,14 +24,12 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     settle(args)
     times = time_start(sys.argv[1:] if argv is None else argv, args.repeats)
     print(start_report(times), flush=True)
     write(args, times)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

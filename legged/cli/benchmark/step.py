@@ -5,8 +5,6 @@ where their physics is randomised or has dry friction. On a GPU the timed steps 
 which raises at any synchronisation with the host.
 """
 
-import sys
-
 from legged.benchmarks.kernel_times import kernel_times, table
 from legged.benchmarks.step_times import report
 from legged.cli.benchmark.common import (
@@ -21,17 +19,12 @@ from legged.cli.benchmark.common import (
     write,
 )
 from legged.commandline.arguments import settle_on
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.errors import ConfigError
 from legged.process.command_parser import CommandParser
 
 KERNEL_STEPS = 20
 """Number of control steps whose kernels --kernels times."""
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -48,7 +41,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     cfg, device = settle(args)
     if args.kernels is not None and device.type != "cuda":
@@ -70,7 +65,3 @@ def _main(argv: list[str] | None) -> int:
     print(report(task, result), flush=True)
     write(args, result)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,12 +7,11 @@ policy on it.
 
 import argparse
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.config import parse_override
 from legged.config.schema import SimConfig, TerrainConfig
 from legged.deploy.contract import SCANS, Contract, read_contract
@@ -37,11 +36,6 @@ BORDER = 10.0
 """Width of the level ground around the tile [m]."""
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
-
-
 def build_parser() -> CommandParser:
     """Return the parser of the command line."""
     parser = CommandParser(
@@ -63,7 +57,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     check_simulation(args)
     if not args.seconds > 0.0:
@@ -151,7 +147,3 @@ def terrain_of(args: argparse.Namespace) -> Terrain | None:
     cfg = TerrainConfig(mesh_type="height_map", border_size=BORDER, horizontal_scale=args.cell)
     size = TERRAIN_TYPES[args.terrain].sized(0.5, cfg.scale) if args.size is None else args.size
     return Terrain.of_tiles([[TileSpec(args.terrain, size)]], cfg, np.random.default_rng(args.seed))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

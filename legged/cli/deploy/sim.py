@@ -16,7 +16,7 @@ import torch
 
 from legged.cli.deploy.robot import LISTENING, REPORT, add_simulation_arguments, check_simulation, motors_of, terrain_of
 from legged.commandline.arguments import POLICY_HELP
-from legged.commandline.command import EXIT_WRONG_INPUT, run_main
+from legged.commandline.command import EXIT_WRONG_INPUT, command
 from legged.config import LeggedConfig
 from legged.deploy.__main__ import add_program_arguments, limits_of
 from legged.deploy.contract import Contract, read_contract
@@ -41,11 +41,6 @@ SIMULATED = ("terrain", "size", "cell", "sim_dt", "latency", "loss", "seed")
 PASSED_ON = ("input", "gamepad", "commands", "seconds", "stand_seconds", "max_tilt", "max_age", "max_missed")
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
-
-
 def build_parser() -> CommandParser:
     """Return the parser of the command line."""
     parser = CommandParser(
@@ -65,7 +60,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     limits_of(args)
     check_simulation(args)
@@ -219,7 +216,3 @@ def _told(report: dict[str, Any]) -> str:
         f"{'fell' if report['fell'] else 'did not fall'}, {report['time']:.1f} s, {report['distance']:.2f} m away,"
         f" {report['climbed']:+.2f} m higher, largest lean {lean:.2f} rad, {share:.1f} % of packets lost"
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

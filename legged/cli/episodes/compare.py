@@ -4,7 +4,6 @@ Each is a policy, whose episodes are run for this purpose, or a folder of record
 """
 
 import argparse
-import sys
 from pathlib import Path
 
 import torch
@@ -18,7 +17,7 @@ from legged.cli.episodes.common import (
     wish_of,
 )
 from legged.commandline.arguments import POLICY_HELP
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.episodes.joint_statistics import check_comparable, joint_statistics
 from legged.episodes.rollout import Wish, check_wish, roll_out
 from legged.episodes.stored import ABOUT, Episodes, load_episodes
@@ -28,11 +27,6 @@ from legged.process.paths import exists, ready_to_write
 from legged.registry import import_tasks
 
 SOURCE_HELP = f"{POLICY_HELP}, or a folder of recorded episodes"
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -70,7 +64,9 @@ def run_source(source: Episodes | TrainedPolicy, wish: Wish, device: torch.devic
     return roll_out(source, wish, device, not args.no_graph, engine_from(args))[0]
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     if args.module:
         import_tasks(args.module)
@@ -85,7 +81,3 @@ def _main(argv: list[str] | None) -> int:
     check_comparable(*found.values())
     print_statistics(folder, found)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

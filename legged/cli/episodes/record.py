@@ -6,7 +6,6 @@ with one cursor.
 """
 
 import argparse
-import sys
 from pathlib import Path
 
 from legged.cli.episodes.common import (
@@ -21,7 +20,7 @@ from legged.cli.episodes.common import (
     wish_of,
 )
 from legged.commandline.arguments import POLICY_HELP, add_checkpoint_argument, register_given
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.episodes.ranking import check_ended
 from legged.episodes.rollout import check_wish, roll_out
 from legged.episodes.stored import ABOUT, ARRAYS, NO_NUMBERS, TIME_UP, Episodes, save_episodes
@@ -31,11 +30,6 @@ from legged.process.paths import ready_to_write, relative
 
 STEP_BYTES = 1200
 """Largest disk space for a control step of a robot [bytes]."""
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -54,7 +48,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     check_listing(args)
     episodes, folder = _recorded(args)
@@ -81,7 +77,3 @@ def _recorded(args: argparse.Namespace) -> tuple[Episodes, Path]:
     print(f"{policy.cfg.task}: {relative(policy.checkpoint)}, {len(episodes)} episodes in {episodes.about['physics']}")
     print(f"written: {relative(folder / ARRAYS)} and {ABOUT}")
     return episodes, folder
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -3,21 +3,15 @@
 The numbers are those of episodes that are run for this purpose, or of recorded ones if a folder is named.
 """
 
-import sys
 from pathlib import Path
 
 from legged.cli.episodes.common import add_recording_arguments, device_of, label_of, print_statistics, wish_of
 from legged.cli.episodes.compare import SOURCE_HELP, run_source, source_of
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.episodes.joint_statistics import joint_statistics
 from legged.process.command_parser import CommandParser
 from legged.process.paths import ready_to_write
 from legged.registry import import_tasks
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -34,7 +28,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     if args.module:
         import_tasks(args.module)
@@ -44,7 +40,3 @@ def _main(argv: list[str] | None) -> int:
     episodes = run_source(source_of(args.policy, wish), wish, device, args)
     print_statistics(folder, {label_of(episodes): joint_statistics(episodes)})
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

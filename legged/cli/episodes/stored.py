@@ -3,20 +3,14 @@
 Nothing is simulated: the folder holds what `legged episodes record` has written.
 """
 
-import sys
 from pathlib import Path
 
 from legged.cli.episodes.common import add_listing_arguments, check_listing, show
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.episodes.stored import load_config, load_episodes, save_episodes
 from legged.process.command_parser import CommandParser, add_import_argument
 from legged.process.paths import ready_to_write
 from legged.registry import import_tasks
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -34,7 +28,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_args(argv)
     check_listing(args)
     if args.module:
@@ -45,7 +41,3 @@ def _main(argv: list[str] | None) -> int:
         save_episodes(episodes, load_config(args.folder, "FOLDER"), folder)
     show(episodes, folder, args)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

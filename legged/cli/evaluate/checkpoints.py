@@ -4,18 +4,11 @@ Every checkpoint of the run is measured over the grid of commands. time_to_walk.
 the start of the training's process, the first one walked. A small train.runner.save_interval makes the answer finer.
 """
 
-import sys
-
 from legged.cli.evaluate.common import add_grid_arguments, check_follows_commands, evaluation_parser, grid_of, ready, settle
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.errors import ConfigError
 from legged.evaluation.all_checkpoints import WALKING_FALLS, WALKING_RMSE, check_limits, evaluate_all_checkpoints
 from legged.process.command_parser import CommandParser
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -39,7 +32,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     check_limits(args.rmse, args.falls)
     if args.checkpoint is not None:
@@ -50,7 +45,3 @@ def _main(argv: list[str] | None) -> int:
     ready(setting)
     policy, device, graph, folder = setting.policy, setting.device, setting.graph, setting.folder
     return evaluate_all_checkpoints(policy, grid, setting.asked, device, graph, folder, args.rmse, args.falls)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

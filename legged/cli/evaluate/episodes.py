@@ -4,10 +4,8 @@ It measures tasks without velocity commands, in one of the engines of this packa
 evaluation_<physics>.json.
 """
 
-import sys
-
 from legged.cli.evaluate.common import evaluation_parser, ready, settle
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.evaluation.episodes import MOST_EPISODES, evaluate_episodes
@@ -15,11 +13,6 @@ from legged.process.command_parser import CommandParser
 
 ENVIRONMENTS = 256
 """Default number of episodes, each in an environment of its own."""
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -45,7 +38,9 @@ def check_episodes(count: int) -> None:
         raise ConfigError(f"--episodes: must be {limit}, got {count:,}")
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     check_episodes(args.episodes)
     setting = settle(args)
@@ -55,7 +50,3 @@ def _main(argv: list[str] | None) -> int:
     ready(setting)
     policy, device, graph, folder = setting.policy, setting.device, setting.graph, setting.folder
     return evaluate_episodes(policy, args.episodes, setting.asked, device, graph, folder, setting.where)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

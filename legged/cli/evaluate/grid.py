@@ -5,19 +5,12 @@ evaluation_<physics>.json and .png written. With `--physics all` the grid is mea
 crossing.json and .png are written.
 """
 
-import sys
-
 from legged.cli.evaluate.common import add_grid_arguments, check_follows_commands, evaluation_parser, grid_of, ready, settle
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.errors import ConfigError
 from legged.evaluation.crossing import EVERYWHERE, cross
 from legged.evaluation.following import evaluate_following
 from legged.process.command_parser import CommandParser
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -32,7 +25,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     everywhere = args.physics == EVERYWHERE
     if everywhere:
@@ -47,7 +42,3 @@ def _main(argv: list[str] | None) -> int:
     if everywhere:
         return cross(policy, grid, setting.overrides, device, graph, folder)
     return evaluate_following(policy, grid, {}, 0, setting.asked, device, graph, folder, setting.where)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

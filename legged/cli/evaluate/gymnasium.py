@@ -4,19 +4,12 @@ The exported policy acts in the environment that the task is modelled on, and Gy
 printed and written to evaluation_gymnasium.json.
 """
 
-import sys
-
 from legged.cli.evaluate.common import evaluation_parser, ready, settle
 from legged.cli.evaluate.episodes import check_episodes
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.errors import ConfigError
 from legged.evaluation.gymnasium_episodes import EPISODES, environment_of, evaluate_in_gymnasium
 from legged.process.command_parser import CommandParser
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -31,7 +24,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     check_episodes(args.episodes)
     for option in ("physics", "solver", "sim_device"):
@@ -41,7 +36,3 @@ def _main(argv: list[str] | None) -> int:
     environment_of(setting.policy.cfg.task)
     ready(setting)
     return evaluate_in_gymnasium(setting.policy, args.episodes, setting.overrides, setting.folder)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

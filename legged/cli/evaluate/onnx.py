@@ -269,7 +269,3 @@ def _table(rows: list[Played], name: str) -> Table:
         command, reached = (" ".join(f"{value:6.2f}" for value in values) for values in (row.command, row.velocity))
         table.add_row(command, reached, f"{row.height:.3f}", "-" if row.fell_after is None else f"{row.fell_after:.2f} s")
     return table
-
-
-if __name__ == "__main__":
-    sys.exit(main())

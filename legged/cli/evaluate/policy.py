@@ -8,24 +8,18 @@ The tables are printed; evaluation_<physics>.json and pictures are written besid
 """
 
 import argparse
-import sys
 
 from legged.cli.evaluate import onnx
 from legged.cli.evaluate.common import check_points, evaluation_parser, grid_of, ready, settle
 from legged.cli.evaluate.episodes import ENVIRONMENTS
 from legged.cli.main import hint_at_sub_command
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.evaluation.episodes import evaluate_episodes
 from legged.evaluation.following import evaluate_following
 from legged.evaluation.success import chosen_sizes
 from legged.process.command_parser import CommandParser
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -35,7 +29,9 @@ def build_parser() -> CommandParser:
     )
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     if onnx.exported_file(args.policy) is not None:
         _check_plain(args)
@@ -67,7 +63,3 @@ def _check_plain(args: argparse.Namespace) -> None:
         if value != plain[name] and name not in ("out", "overrides"):
             option = f"--{'import' if name == 'module' else name.replace('_', '-')}"
             raise ConfigError(f"{option}: means nothing for an ONNX file; `legged evaluate onnx` has its options")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

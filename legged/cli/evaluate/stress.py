@@ -6,7 +6,6 @@ settings, on stairs and on the flat. The share of robots that succeed is printed
 """
 
 import argparse
-import sys
 
 from legged.cli.evaluate.common import (
     add_points_arguments,
@@ -16,7 +15,7 @@ from legged.cli.evaluate.common import (
     ready,
     settle,
 )
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.errors import ConfigError, suggest
 from legged.evaluation.stress.measuring import RISER, TREAD, Wish
 from legged.evaluation.stress.report import evaluate_stress
@@ -25,11 +24,6 @@ from legged.process.command_parser import CommandParser
 
 LIMITS = {"riser": (0.0, 1.0, "m"), "tread": (0.05, 2.0, "m"), "payload": (0.0, 1000.0, "kg")}
 """Option -> smallest and largest number, and its unit."""
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -48,7 +42,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     robots = check_points(args.robots_per_point, args.full)
     wish = _wish(args)
@@ -83,7 +79,3 @@ def stress_lines(text: str | None) -> tuple[str, ...]:
         if name not in NAMES:
             raise ConfigError(f"--lines: there is no line '{name}'{suggest(name, NAMES)}")
     return names
-
-
-if __name__ == "__main__":
-    sys.exit(main())

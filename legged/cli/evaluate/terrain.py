@@ -4,8 +4,6 @@ Robots cross tiles of each terrain type in growing sizes. The share of robots th
 success_<physics>.png, and written into evaluation_<physics>.json.
 """
 
-import sys
-
 from legged.cli.evaluate.common import (
     add_points_arguments,
     add_types_argument,
@@ -15,17 +13,12 @@ from legged.cli.evaluate.common import (
     ready,
     settle,
 )
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.evaluation.following import evaluate_following
 from legged.evaluation.success import chosen_sizes
 from legged.process.command_parser import CommandParser
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -41,7 +34,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     robots = check_points(args.robots_per_point, args.full)
     setting = settle(args)
@@ -56,7 +51,3 @@ def _main(argv: list[str] | None) -> int:
     return evaluate_following(
         policy, None, sizes, robots, setting.asked, setting.device, setting.graph, setting.folder, setting.where
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -9,7 +9,7 @@ import shlex
 import sys
 from pathlib import Path
 
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.config.checks import PLAIN, is_plain_name, shown
 from legged.errors import ConfigError, suggest
 from legged.process.command_parser import CommandParser
@@ -24,11 +24,6 @@ from legged.robots.robot import load_robot
 
 ROOM_MB = 100.0
 """Disk space for the files [MiB]."""
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -51,7 +46,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_args(argv)
     gains = _gains(args)
     path, source, licence = _source(args.source)
@@ -153,7 +150,3 @@ def _report(tree: Tree, guesses: Guesses, folder: Path, task: Path, megabytes: f
     print(f"  default pose [rad]: {angles or 'all 0'}")
     meshes = f", {megabytes:.1f} MiB of meshes" if megabytes else ""
     print(f"written: {relative(folder)}/ ({tree.name}.xml, robot.yaml, PROVENANCE.md{meshes}) and {relative(task)}")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -3,21 +3,14 @@
 The numbers are those of the robot's folder, as every task with this robot begins with them.
 """
 
-import sys
-
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.process.command_parser import CommandParser
 from legged.process.paths import relative
 from legged.robots.robot import Robot, load_robot
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -27,7 +20,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     robot = load_robot(build_parser().parse_args(argv).robot, "ROBOT")
     print(f"{robot.name}: {robot.mass:.4g} kg, {robot.height:.3g} m high, {robot.num_dof} joints, {relative(robot.folder)}")
     Console(width=130).print(joints_table(robot))
@@ -59,7 +54,3 @@ def joints_table(robot: Robot) -> Table:
         values = [f"{values[i]:.4g}" if np.isfinite(values[i]) else "-" for values in numbers]
         table.add_row(name, f"{robot.default_dof_pos[i]:.4g}", f"{low:.4g} to {high:.4g}", *values)
     return table
-
-
-if __name__ == "__main__":
-    sys.exit(main())

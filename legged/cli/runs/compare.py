@@ -4,10 +4,9 @@ comparison.html and .md show which settings differ, the learning curves over eac
 intervals. The first run is the reference.
 """
 
-import sys
 from pathlib import Path
 
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.errors import ConfigError
 from legged.evaluation.reports.comparison import comparison_parts
 from legged.evaluation.reports.document import write_pages
@@ -19,11 +18,6 @@ from legged.registry import import_tasks
 
 MOST_COMPARED = 8
 """Largest number of runs, which is the number of colours."""
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -40,7 +34,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_args(argv)
     if args.module:
         import_tasks(args.module)
@@ -55,7 +51,3 @@ def _main(argv: list[str] | None) -> int:
     page = write_pages(args.out / "comparison", "Comparison", comparison_parts(records))
     print(f"written: {relative(page)}, {len(records)} runs")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

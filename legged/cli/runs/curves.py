@@ -5,10 +5,9 @@ files. An axis on top shows the time, unless the runs differ by more than 5 % in
 the picture also shows the mean level of each type, and the shares of episodes after which robots moved up and down.
 """
 
-import sys
 from pathlib import Path
 
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.errors import ConfigError
 from legged.evaluation.learning_curves import Log, common_time, labels, read_config, read_scalars
 from legged.evaluation.reports.charts import draw_charts
@@ -19,11 +18,6 @@ from legged.process.paths import make_folder, ready_to_write, relative
 from legged.registry import import_tasks
 
 PICTURE = "learning_curve.png"
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -40,7 +34,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_args(argv)
     if args.module:
         import_tasks(args.module)
@@ -55,7 +51,3 @@ def _main(argv: list[str] | None) -> int:
     draw_charts(charts, args.out / PICTURE, iteration_s=common_time([log.scalars for log in logs]))
     print(f"written: {relative(args.out / PICTURE)}")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

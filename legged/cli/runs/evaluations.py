@@ -4,12 +4,11 @@ Evaluations of one task in one engine count as its seeds: the tables give their 
 picture their mean and range. Evaluations with other fields changed, or on another grid of commands, are kept apart.
 """
 
-import sys
 from pathlib import Path
 
 from rich.console import Console
 
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.errors import ConfigError
 from legged.evaluation.comparison import (
     draw_comparison,
@@ -23,11 +22,6 @@ from legged.evaluation.comparison import (
 from legged.evaluation.result_file import has_tracking, read_results
 from legged.process.command_parser import CommandParser
 from legged.process.paths import make_folder, ready_to_write, relative
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -46,7 +40,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_args(argv)
     if args.out:
         ready_to_write(args.out)
@@ -76,7 +72,3 @@ def _main(argv: list[str] | None) -> int:
         draw_comparison(with_success, args.out / "success.png")
         print(f"written: {relative(args.out / 'success.png')}")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

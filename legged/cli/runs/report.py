@@ -6,13 +6,12 @@ evaluation or for a run that was killed. `--film` films the policy first; `--not
 """
 
 import faulthandler
-import sys
 from pathlib import Path
 
 import torch
 
 from legged.commandline.arguments import add_checkpoint_argument
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.config import LeggedConfig
 from legged.errors import ConfigError, RunError
 from legged.evaluation.reports.record import FILMS, read_record
@@ -31,11 +30,6 @@ LONGEST_FILM_S = 900.0
 LONGEST_NOTE = 1000
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
-
-
 def build_parser() -> CommandParser:
     """Return the parser of the command line."""
     parser = CommandParser(
@@ -52,7 +46,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_args(argv)
     if args.checkpoint is not None and not args.film:
         raise ConfigError(f"--checkpoint: {args.checkpoint}: says which policy is filmed; add --film")
@@ -102,7 +98,3 @@ def _film(folder: Path, checkpoint: int | str | None) -> str:
     except (ConfigError, RunError) as error:
         return " ".join(str(error).split())
     return ""
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -4,11 +4,10 @@ Every run in logs/, or in the folders given, becomes a row of experiments.html a
 click on a column sorts and a field filters. `--seeds-share` makes one row of the seeds of a training.
 """
 
-import sys
 from pathlib import Path
 
 from legged.cli.main import hint_at_sub_command
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.evaluation.reports.document import to_html, to_markdown
 from legged.evaluation.reports.experiments import TITLE, experiments_parts
 from legged.evaluation.reports.record import folders_in, read_record
@@ -16,11 +15,6 @@ from legged.learning.run_folder import LOGS
 from legged.process.command_parser import CommandParser, add_import_argument
 from legged.process.paths import exists, make_folder, ready_to_write, relative, write_text
 from legged.registry import import_tasks
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -37,7 +31,9 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_args(argv)
     if args.module:
         import_tasks(args.module)
@@ -54,7 +50,3 @@ def _main(argv: list[str] | None) -> int:
     write_text(page, to_html(TITLE, parts["html"]))
     print(f"written: {relative(page)}, {len(records)} runs")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

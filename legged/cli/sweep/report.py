@@ -4,19 +4,12 @@ table.md, best.yaml and figures of the trials that have ended are written into l
 runs.
 """
 
-import sys
-
 from legged.cli.sweep.run import add_sweep_arguments, devices_of, plan_of
-from legged.commandline.command import run_main
+from legged.commandline.command import command
 from legged.process.command_parser import CommandParser
 from legged.process.paths import ready_to_write
 from legged.sweeping.report import write_report
 from legged.sweeping.study import Trials
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -31,13 +24,11 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_args(argv)
     plan = plan_of(args, devices_of(args)[0].type == "cpu")
     ready_to_write(plan.folder)
     print(*write_report(Trials(plan, args.storage or ""), args.module), sep="\n")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -15,7 +15,7 @@ import torch
 
 from legged.cli.sweep.worker import Worker
 from legged.commandline.arguments import pick_device
-from legged.commandline.command import EXIT_FAILED, run_main
+from legged.commandline.command import EXIT_FAILED, command
 from legged.commandline.stopping import stopping_on_signals
 from legged.config.checks import shown
 from legged.errors import ConfigError
@@ -34,11 +34,6 @@ TELL_S = 1.0
 """Interval at which the trials of other processes are read [s]."""
 MOST_STARTS = 10
 """Largest number of restarts of a worker whose process ends before the sweep does."""
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
 
 
 def build_parser() -> CommandParser:
@@ -89,7 +84,9 @@ def plan_of(args: argparse.Namespace, on_cpu: bool) -> Plan:
     return plan_sweep(read_sweep(path), path, on_cpu)
 
 
-def _main(argv: list[str] | None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
+    """Run the command; return its exit code."""
     args = build_parser().parse_args(argv)
     if Ranks.now().several:
         raise ConfigError("sweep: starts its processes by itself; run it without torchrun")
@@ -186,7 +183,3 @@ def _teller(trials: Trials, start: float) -> Callable[[], None]:
                 print(f"{time.perf_counter() - start:7.1f} s  trial {trial.number:3d}  {what}  {counted}", flush=True)
 
     return tell
-
-
-if __name__ == "__main__":
-    sys.exit(main())
