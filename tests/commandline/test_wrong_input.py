@@ -258,7 +258,7 @@ def test_a_folder_that_is_no_run(fails, tmp_path, main, flag):
     if main != grid.main:
         fails(main, task(flag, "--load_run", "other"), "--load-run", "other is not a run folder")
     if main != train.main:
-        fails(main, ["other", flag], "POLICY: 'other' holds no run: it has no config.yaml")
+        fails(main, ["other", flag], "POLICY: 'other'", "no config.yaml")
 
 
 FOREIGN = {
