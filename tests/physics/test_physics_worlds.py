@@ -239,7 +239,7 @@ def test_a_named_engine_is_taken_where_it_runs():
 
 
 def test_the_c_engine_on_a_gpu_is_an_error_that_says_what_to_do():
-    with pytest.raises(ConfigError, match=r"sim\.physics: 'mujoco' .* --sim_device cpu"):
+    with pytest.raises(ConfigError, match=r"sim\.physics: 'mujoco' .* --sim-device cpu"):
         resolve_physics("mujoco", torch.device("cuda:0"))
 
 
