@@ -49,7 +49,7 @@ def test_a_file_of_which_no_model_can_be_made_is_refused_in_one_line(tmp_path, c
     (tmp_path / "toy.urdf").write_text(urdf().replace('joint name="fr_hip"', 'joint name="fl_hip"'))
     assert call(add.main, ["toy.urdf", "--out", "mine"]) == 2
     error = capsys.readouterr().err
-    assert "toy.urdf: MuJoCo refuses what becomes of it: " in error
+    assert "toy.urdf: MuJoCo refuses the converted model: " in error
     assert "repeated name 'fl_hip'" in error
     assert error.count("\n") == 1
 
@@ -140,7 +140,7 @@ def test_a_default_pose_that_leans_to_a_side_has_no_mirror_images(added):
     before = robot.read_text()
     robot.write_text(before.replace("hip: 0", "hip: 0.1"))
     assert robot.read_text() != before
-    with pytest.raises(ConfigError, match=r"symmetry: the default_joint_angles of 'leaning_toy' are no mirror image"):
+    with pytest.raises(ConfigError, match=r"symmetry: the default_joint_angles of 'leaning_toy'"):
         task_config(task, on_cpu=True)
     task_config(task, [("train.algorithm.symmetry", False)], on_cpu=True)
     robot.write_text(before.replace("hip: 0", "fl_hip: 0.1\n  hl_hip: 0.1\n  fr_hip: -0.1\n  hr_hip: -0.1"))
