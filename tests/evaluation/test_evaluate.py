@@ -15,7 +15,7 @@ from legged.cli.evaluate import grid as evaluate_grid
 from legged.cli.evaluate import terrain as evaluate_terrain
 from legged.config import override
 from legged.errors import RunError
-from legged.evaluation import crossing, following, velocity_tracking
+from legged.evaluation import crossing, following, result_file, velocity_tracking
 from legged.evaluation.tracking_report import draw_tracking, print_tracking
 from legged.evaluation.velocity_grid import Grid, axes_of, axis_values
 from legged.evaluation.velocity_tracking import measure_tracking
@@ -324,7 +324,7 @@ def test_a_disk_that_fills_up_meanwhile_costs_the_files_and_not_the_table(tmp_pa
     def full(path, _text):
         raise RunError(f"{path.name}: no space left on the disk")
 
-    monkeypatch.setattr(following, "write_text", full)
+    monkeypatch.setattr(result_file, "write_text", full)
     grid = ["--vx=0", "--vy=0", "--yaw=0", "--robots", "1", "--physics", "mujoco", "sim.threads=1"]
     arguments = [str(POLICY), "--out", str(tmp_path), *grid]
     assert call(evaluate_grid.main, arguments) == 1
