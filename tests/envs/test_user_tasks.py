@@ -223,7 +223,8 @@ def test_a_robot_on_the_command_line_is_relative_to_the_working_directory(show, 
     assert show("--task", TASK, "robot=anymal_c").robot == "anymal_c"
     message = error("--task", TASK, "robot=./other")
     assert "command line: robot: there is no robot" in message
-    assert "that folder has no robot.yaml. If the robot was moved, say where it lies now, as in robot=FOLDER" in message
+    assert "that folder has no robot.yaml" in message
+    assert "robot=FOLDER" in message
 
 
 def test_a_robot_of_a_registered_mapping_lies_beside_its_module(show, monkeypatch):
