@@ -74,8 +74,8 @@ def test_the_tasks_of_its_help_can_be_shown():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["anymal_flat", "--out", "a.gif"], "there is no task 'anymal_flat'"),
-        (["untrained", "--out", "a.gif"], "'untrained': there is neither a run nor a shipped policy of this task"),
+        (["anymal_flat", "--out", "a.gif"], "no run 'anymal_flat'; did you mean 'anymal_d_flat'"),
+        (["untrained", "--out", "a.gif"], "'untrained' has neither a run in logs/untrained nor a shipped policy"),
         (["half_cheetah", "--out", "a.gif"], "'half_cheetah' follows no commands"),
         ([TASK, "--out", "a.jpg"], "--out: must end in .gif or .png, got 'a.jpg'"),
         ([TASK, "--out", "a.gif", "--columns", "0"], "--columns: must be at least 1, got 0"),

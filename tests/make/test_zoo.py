@@ -253,7 +253,7 @@ def test_a_shipped_policy_is_not_shipped_over_itself():
         (["anymal_c", "--types", "stair_up"], "did you mean 'stairs_up'"),
         ([TASK, "--table", "logs"], f"--table: trains nothing; leave out {TASK}"),
         (["--table", "nowhere"], "nowhere: holds no run folder"),
-        ([TASK, "--sim-device", "tpu"], "--sim_device: 'tpu'"),
+        ([TASK, "--sim-device", "tpu"], "--sim-device: 'tpu'"),
     ],
 )
 def test_wrong_input_is_named_before_anything_is_trained(arguments, words, capsys):
