@@ -74,13 +74,8 @@ def check_evaluation(cls: type, cfg: TaskConfig) -> None:
     """Check the settings of evaluations during training.
 
     Raises:
-    <<<<<<< HEAD
-        ConfigError: a named figure does not exist, a stop needs evaluations that are switched off, or an evaluation is
-            shorter than a control step.
-    =======
         ConfigError: a named figure does not exist, stop_at is set without evaluations, or an evaluation is shorter
             than a control step.
-    >>>>>>> main
     """
     runner, figures = cfg.train.runner, evaluated_figures(cls, cfg)
     asked = {f"train.runner.stop_at.{name}": name for name in runner.stop_at}

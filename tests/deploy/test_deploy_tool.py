@@ -127,7 +127,9 @@ def test_a_robot_of_ones_own_is_simulated_without_naming_it(own_run, monkeypatch
     assert call(sim.main, [str(own_run / "exported")]) == 0
     assert simulated == [str(robot)] * 2
     (own_run / "exported").rename("moved")
-    assert "moved/policy.json: robot: 'toy' does not come with this package; give its folder with --robot FOLDER" in error("moved")
+    assert "moved/policy.json: robot: 'toy' does not come with this package; give its folder with --robot FOLDER" in error(
+        "moved"
+    )
     assert call(sim.main, ["moved", "--robot", "mine/toy"]) == 0
     assert simulated[-1] == str(robot)
 
