@@ -6,7 +6,7 @@ check: ## lint, format, types
 test: ## all tests, on all cores
 	pytest -n auto --dist loadfile
 
-test-fast: ## the tests that take less than two minutes together
+test-fast: ## all tests without those marked slow
 	pytest -n auto --dist loadfile -m "not slow"
 
 docs: ## the documentation as a site, in build/site

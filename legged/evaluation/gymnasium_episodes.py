@@ -74,13 +74,13 @@ def run_exported(exported: Path, name: str, episodes: int) -> dict[str, Any]:
     try:
         environment = gymnasium.make(name)
     except gymnasium.error.Error as error:
-        raise ConfigError(f"--gymnasium: Gymnasium {gymnasium.__version__} has no {name}: {error}") from error
+        raise ConfigError(f"evaluate gymnasium: Gymnasium {gymnasium.__version__} has no {name}: {error}") from error
     shapes = environment.observation_space.shape, environment.action_space.shape
     own = scale.shape, middle.shape
     if shapes != own:
-        raise ConfigError(f"--gymnasium: {name} has observations and actions of shapes {shapes}, the policy of {own}")
+        raise ConfigError(f"evaluate gymnasium: {name} has observations and actions of shapes {shapes}, the policy of {own}")
     if history != 1:
-        raise RunError(f"--gymnasium: the policy wants the last {history} observations, {name} gives one")
+        raise RunError(f"evaluate gymnasium: the policy wants the last {history} observations, {name} gives one")
     returns, lengths, failures = [], [], 0
     terms: dict[str, float] = defaultdict(float)
     low, high = environment.action_space.low, environment.action_space.high  # type: ignore[attr-defined]

@@ -102,7 +102,9 @@ def check_asked(changes: Sequence[tuple[str, Any]]) -> None:
         names = value if key == ranges and isinstance(value, dict) else (key.removeprefix(f"{ranges}.").split(".")[0],)
         for name in names if key.startswith(ranges) else ():
             if name in GIVEN:
-                raise ConfigError(f"command line: {ranges}.{name}: --stress gives each of its lines its own; leave it out")
+                raise ConfigError(
+                    f"command line: {ranges}.{name}: legged evaluate stress sets it in each of its lines; leave it out"
+                )
 
 
 class Bench:
