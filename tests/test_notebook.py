@@ -75,6 +75,6 @@ def test_the_notebook_runs(task, tmp_path, monkeypatch):
     assert rows[0][1] == ("return" if task == "half_cheetah" else "velocity RMSE [m/s]")
     assert all(abs(float(row[1])) < 1000.0 for row in rows[2:])
     assert len(pictures) >= 2  # curves, and a figure of the search
-    assert (tmp_path / "logs" / "search" / "table.md").is_file()
+    assert (tmp_path / "logs" / "sweep_search" / "table.md").is_file()
     (run,) = (tmp_path / "logs" / "calm").iterdir()
     assert "effort: -0.05" in (run / "config.yaml").read_text()

@@ -49,7 +49,7 @@ def run_module(*arguments, **environment):
     return subprocess.run(command, env={**os.environ, **environment}, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.parametrize(("words", "name"), [(("legged", "train"), "TASK"), (("legged.cli.play",), "POLICY")])
+@pytest.mark.parametrize(("words", "name"), [(("legged", "train"), "TASK"), (("legged", "play"), "POLICY")])
 def test_modules_are_commands_too(words, name):
     done = run_module(*words, "nonsense")
     assert done.returncode == 2
@@ -58,7 +58,7 @@ def test_modules_are_commands_too(words, name):
 
 
 def test_a_machine_without_git_hears_nothing_of_it(tmp_path):
-    done = run_module("legged.cli.train", "--task", "anymal_c_flat", "--sim_device", "cpu", "--show", PATH=str(tmp_path))
+    done = run_module("legged", "train", "--task", "anymal_c_flat", "--sim_device", "cpu", "--show", PATH=str(tmp_path))
     assert (done.returncode, done.stderr) == (0, "")
 
 
