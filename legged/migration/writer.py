@@ -7,7 +7,7 @@ from typing import Any
 
 from legged.config.schema import LeggedConfig
 from legged.config.yaml_files import dump
-from legged.migration.translation import DEFAULTS, Lost
+from legged.migration.translation import DEFAULTS
 
 WIDTH = 120
 FIRST = ("robot", "env", "terrain", "commands", "init_state", "control")
@@ -15,7 +15,7 @@ ORDER = [*FIRST, *(field.name for field in dataclasses.fields(LeggedConfig) if f
 """Sections of a task, in the order of the file."""
 
 
-def task_yaml(head: Sequence[str], settings: Mapping[str, Any], comments: Mapping[str, str], lost: Sequence[Lost]) -> str:
+def task_yaml(head: Sequence[str], settings: Mapping[str, Any], comments: Mapping[str, str], lost: Sequence[str]) -> str:
     """Return the file of a task: a head, its sections, and the lost settings as comments. Lines of the head are wrapped
     unless they begin with a space.
     """
@@ -34,8 +34,8 @@ def task_yaml(head: Sequence[str], settings: Mapping[str, Any], comments: Mappin
         lines += _lines(key, sections[key], key, comments, 0)
     if lost:
         lines += ["", "# Settings of the configuration that are not in this task:"]
-        for entry in lost:
-            lines += textwrap.wrap(str(entry), WIDTH, initial_indent="# - ", subsequent_indent="#   ")
+        for text in lost:
+            lines += textwrap.wrap(text, WIDTH, initial_indent="# - ", subsequent_indent="#   ")
     return "\n".join(lines) + "\n"
 
 

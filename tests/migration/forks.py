@@ -229,6 +229,8 @@ class Result:
         self.data = read_yaml(self.path)
         self.text = self.path.read_text()
         self.lost = [line.removeprefix("not mapped: ") for line in out.splitlines() if line.startswith("not mapped: ")]
+        plain = re.search(r"without counterpart \(.*\): (.*)", out)
+        self.plain = plain[1].split(", ") if plain else []
 
 
 def built(result: Result, *overrides):
