@@ -25,16 +25,8 @@ from pathlib import Path
 from typing import Any
 
 SECTIONS = {
-    "env",
-    "terrain",
-    "commands",
-    "init_state",
-    "control",
-    "asset",
-    "domain_rand",
-    "rewards",
-    "normalization",
-    "noise",
+    *("env", "terrain", "commands", "init_state", "control"),
+    *("asset", "domain_rand", "rewards", "normalization", "noise"),
 }
 LEARNER_SECTIONS = {"policy", "algorithm", "runner"}
 REPLACED = ("isaacgym", "rsl_rl")
@@ -476,7 +468,8 @@ def observations(cls: type, config: Any) -> list[Any]:
 
 def answer(request: dict[str, Any]) -> dict[str, Any]:
     """Return the answer to a request: file, task, and legged_gym's defaults."""
-    KNOWN.update(task_registry=Registry(), LEGGED_GYM_ROOT_DIR="{LEGGED_GYM_ROOT_DIR}")
+    registry = Registry()
+    KNOWN.update(task_registry=registry, register=registry.register, LEGGED_GYM_ROOT_DIR="{LEGGED_GYM_ROOT_DIR}")
     for name, (parent, data) in request["known"].items():
         KNOWN[name] = define(name, data, KNOWN.get(parent))
     module, root = load(Path(request["file"]))

@@ -37,6 +37,8 @@ from legged.terrain.terrain import check_terrain
 LONGEST_HISTORY = 20
 """Largest number of steps of an observation history that is tried."""
 SIGMA = "tracking_sigma"
+OF_HEADING = ("_post_physics_step_callback", "_resample_commands")
+"""Methods of legged_gym that use commands[:, 3], the heading."""
 
 
 def map_settings(fork: Fork) -> Translation:
@@ -205,9 +207,10 @@ def _rewards(result: Translation, fork: Fork) -> None:
         methods = fork.methods.get(f"_reward_{name}", [])
         own = next((method for method in methods if not method.original), None)
         # In legged_gym the scale feet_stumble has no method, so it has no effect.
-        ours = "stumble" if name == "feet_stumble" and own is None else name
+        ours = "stumble" if name == "feet_stumble" and not fork.methods else name
         named += 1
-        if own is not None or f"_reward_{ours}" not in DIGESTS or ours not in known:
+        missing = bool(fork.methods) and not methods
+        if own is not None or missing or f"_reward_{ours}" not in DIGESTS or ours not in known:
             where = (
                 f"{own.place}" if own else f"no method in the fork's classes; {found.place}" if fork.methods else found.place
             )
@@ -317,7 +320,10 @@ def _random_model(result: Translation) -> None:
         if len(pair) == 2:
             result.done.add(f"domain_rand.randomize_{switch}")
             for field in fields:
-                result.put(f"domain_rand.ranges.{field}", [-pair[1], -pair[0]] if field == OFFSET else pair, path)
+                ours = field if "." in field else f"domain_rand.ranges.{field}"
+                result.put(ours, [-pair[1], -pair[0]] if field == OFFSET else pair, path)
+        else:
+            result.done -= {path} - {entry.setting for entry in result.lost}
     reach = result.theirs.get("domain_rand.rand_com_vec")
     if reach is not None and result.get("domain_rand.randomize_base_com", False):
         for axis, value in zip("xyz", result.numbers("domain_rand.rand_com_vec", []), strict=False):
@@ -358,7 +364,9 @@ def _hooks(result: Translation, fork: Fork) -> None:
     ]
     if hooks:
         result.note("methods", f"the fork's own, to be moved by hand (docs/migrating.md): {', '.join(hooks)}")
-    readers = [f"{name} ({method.place})" for name, method in own.items() if "fourth" in method.reads]
+    readers = [
+        f"{name} ({method.place})" for name, method in own.items() if "fourth" in method.reads and name not in OF_HEADING
+    ]
     if readers:
         result.note("commands", f"commands[:, 3] is the heading here, and there are no others; compare {', '.join(readers)}")
 

@@ -65,10 +65,13 @@ def map_robot(result: Translation, robot: Robot | None) -> dict[str, Any]:
     if not np.allclose(list(angles.values()), robot.default_dof_pos, atol=1e-6):
         entries["default_joint_angles"] = angles
     shapes = Shapes.of(mujoco.MjModel.from_xml_path(str(robot.model_path)), robot.file.feet, "feet")
-    own = {"feet": robot.feet_indices, LISTS[1][1]: robot.penalised_indices, LISTS[2][1]: robot.termination_indices}
-    for theirs, ours in LISTS:
+    for (theirs, ours), own in zip(
+        LISTS, (robot.feet_indices, robot.penalised_indices, robot.termination_indices), strict=True
+    ):
         if theirs in result.theirs and (patterns[ours] or ours != "feet"):
-            _contacts(result, theirs, ours, patterns[ours], shapes, own[ours], entries)
+            kept, found = _contacts(result, theirs, patterns[ours], shapes, robot.name)
+            if tuple(sorted(found)) != tuple(own) and (found or not patterns[ours]):
+                entries[ours] = list(dict.fromkeys(kept))
     count, few = result.get("env.num_actions"), ", ".join(robot.joint_names[:MOST_NAMES])
     other = f"; theirs has {count} actions" if count not in (None, robot.num_dof) else ""
     order = f"in the order {few}{', ...' if robot.num_dof > MOST_NAMES else ''}"
@@ -105,34 +108,20 @@ def _gains(result: Translation, robot: Robot, name: str, table: dict[str, float]
 
 
 def _contacts(
-    result: Translation,
-    theirs: str,
-    ours: str,
-    patterns: list[str],
-    shapes: Shapes,
-    own: tuple[int, ...],
-    entries: dict[str, Any],
-) -> None:
-    """Set an entry of robot.yaml whose patterns name other contacts than the robot's own."""
+    result: Translation, theirs: str, patterns: list[str], shapes: Shapes, robot: str
+) -> tuple[list[str], set[int]]:
+    """Return the patterns of a list that name shapes or bodies of the robot, and the contacts that they name."""
     found: set[int] = set()
     kept: list[str] = []
     for pattern in patterns:
         try:
             indices = match_shapes([pattern], shapes.names, shapes.bodies, "")
         except ConfigError:
-            result.lose(
-                theirs,
-                f"'{pattern}' is part of no body or shape of {result.settings.get('robot', 'the robot')} that collides",
-            )
+            result.lose(theirs, f"'{pattern}' is part of no body or shape of {robot} that collides")
             continue
-        contacts = {shapes.contact[i] for i in indices}
-        if ours != "feet" and not any(pattern in name for name in shapes.names):
-            # The shape of a foot on a shank does not belong to the shank.
-            others = [i for i in indices if shapes.contact[i] not in shapes.feet]
-            kept += [pattern] if len(others) == len(indices) else [shapes.names[i] for i in others]
-            contacts = {shapes.contact[i] for i in others}
-        else:
-            kept.append(pattern)
-        found |= contacts
-    if tuple(sorted(found)) != tuple(own) and (found or not patterns):
-        entries[ours] = list(dict.fromkeys(kept))
+        # The shape of a foot on a shank does not belong to the shank.
+        named = theirs == LISTS[0][0] or any(pattern in name for name in shapes.names)
+        chosen = [i for i in indices if named or shapes.contact[i] not in shapes.feet]
+        kept += [pattern] if len(chosen) == len(indices) else [shapes.names[i] for i in chosen]
+        found |= {shapes.contact[i] for i in chosen}
+    return kept, found

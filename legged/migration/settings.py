@@ -46,7 +46,6 @@ SAME: dict[str, str] = {
     },
     "sim.dt": "sim.dt",
     "domain_rand.init_dof_pos_ratio_range": "init_state.dof_pos_factor",
-    "domain_rand.initial_joint_pos_range": "init_state.dof_pos_factor",
     "domain_rand.init_base_vel_range": "init_state.base_velocity",
     "commands.zero_command_prob": "commands.standing_share",
 }
@@ -106,8 +105,10 @@ RANDOM_MODEL = (
     ("motor_offset", "motor_offset_range", ("joint_offset",)),
     ("default_dof_pos", "randomize_default_dof_pos_range", ("joint_offset",)),
     ("joint_friction", "joint_friction_range", ("joint_friction",)),
+    ("initial_joint_pos", "initial_joint_pos_range", ("init_state.dof_pos_factor",)),
 )
-"""Randomised properties of forks: randomize_<first> switches on the range <second>; the third are the properties here."""
+"""Randomised properties of forks: randomize_<first> switches on the range <second>; the third are the properties or settings
+here."""
 OFFSET = "joint_offset"
 """Property here that is added to the measured angle. A fork's offset is added to the target, so its sign is the other one."""
 HISTORY = ("frame_stack", "obs_history_length", "num_observation_history", "history_len", "include_history_steps")

@@ -230,10 +230,8 @@ def test_ranges_and_switches_that_a_fork_does_not_have_are_off(fork, migrated):
 
 def test_a_fourth_command_and_methods_that_no_setting_carries_over_are_said(fork, migrated):
     out = migrated(textwrap.dedent(CONFIG), path=fork()).out
-    assert (
-        f"commands: commands[:, 3] is the heading here, and there are no others; compare _reward_prance ({place(ENV, 'def _reward_prance', 'dog')})"
-        in out
-    )
+    where = place(ENV, "def _reward_prance", "dog")
+    assert f"commands: commands[:, 3] is the heading here, and there are no others; compare _reward_prance ({where})\n" in out
     assert f"_resample_commands ({place(ENV, 'def _resample', 'dog')})" in out
     assert "commands.num_commands = 5: commands here are vx, vy, yaw rate and heading" in out
 
@@ -371,7 +369,7 @@ def test_both_commands_for_a_missing_robot_run_as_they_are_printed(migrated, cap
     """The second one failed: `stiffness: no pattern matches`, since a rule gives the gains of a new robot."""
     Path("toy.urdf").write_text(urdf())
     lines = "file = '{LEGGED_GYM_ROOT_DIR}/toy.urdf'\nname = 'pup'\nfoot_name = 'foot'"
-    control = "stiffness = {'hip': 21.}\ndamping = {'hip': 0.7}"
+    control = "stiffness = {'hip': 21., 'thigh': 22., 'calf': 23.}\ndamping = {'_': 0.7}"
     result = migrated(sections(asset=lines, control=control), "--out", "there")
     commands = [line.removeprefix("  legged ") for line in result.out.splitlines() if line.startswith("  legged ")]
     assert len(commands) == 2
@@ -379,7 +377,7 @@ def test_both_commands_for_a_missing_robot_run_as_they_are_printed(migrated, cap
         assert call(legged.main, shlex.split(line)) == 0, capsys.readouterr().err
     out = capsys.readouterr().out
     assert "does not load yet" not in out
-    assert read_yaml(Path("there/plain.yaml"))["control"]["stiffness"] == {"hip": 21.0}
+    assert read_yaml(Path("there/plain.yaml"))["control"]["stiffness"] == {"hip": 21.0, "thigh": 22.0, "calf": 23.0}
 
 
 def test_a_robot_whose_feet_have_several_shapes(migrated):
@@ -431,7 +429,8 @@ def test_values_that_cannot_be_told_are_listed(migrated):
 
 def test_values_that_are_computed_are_taken(migrated):
     text = "import numpy as np\nfrom pathlib import Path\n" + sections(
-        terrain="measure_heights = True\nmeasured_points_x = np.linspace(-0.5, 0.5, 3)\nmeasured_points_y = [i / 10 for i in range(2)]",
+        terrain="measure_heights = True\nmeasured_points_x = np.linspace(-0.5, 0.5, 3)\n"
+        "measured_points_y = [i / 10 for i in range(2)]",
         env="num_envs = int(np.float32(3)) * len(Path('a/b').parts)",
     )
     data = migrated(text).data
