@@ -159,19 +159,6 @@ class Finder:
                 setattr(module, alias, importlib.import_module(name))
 
 
-class Registry:
-    """Stand-in for legged_gym's task registry."""
-
-    def __init__(self) -> None:
-        self.task_classes: dict[str, Any] = {}
-        self.env_cfgs: dict[str, Any] = {}
-        self.train_cfgs: dict[str, Any] = {}
-
-    def register(self, name: str, task_class: Any, env_cfg: Any, train_cfg: Any) -> None:
-        """Note a task."""
-        self.task_classes[name], self.env_cfgs[name], self.train_cfgs[name] = task_class, env_cfg, train_cfg
-
-
 def _is_installed(file: str) -> bool:
     return any(part in file for part in INSTALLED)
 
@@ -468,8 +455,11 @@ def observations(cls: type, config: Any) -> list[Any]:
 
 def answer(request: dict[str, Any]) -> dict[str, Any]:
     """Return the answer to a request: file, task, and legged_gym's defaults."""
-    registry = Registry()
-    KNOWN.update(task_registry=registry, register=registry.register, LEGGED_GYM_ROOT_DIR="{LEGGED_GYM_ROOT_DIR}")
+    registry = types.SimpleNamespace(task_classes={}, env_cfgs={}, train_cfgs={})
+    tables = vars(registry).values()
+    KNOWN.update(register=lambda name, *entries: [table.update({name: e}) for table, e in zip(tables, entries, strict=False)])
+    KNOWN.update(task_registry=registry, LEGGED_GYM_ROOT_DIR="{LEGGED_GYM_ROOT_DIR}")
+    registry.register = KNOWN["register"]
     for name, (parent, data) in request["known"].items():
         KNOWN[name] = define(name, data, KNOWN.get(parent))
     module, root = load(Path(request["file"]))
@@ -514,7 +504,8 @@ def failure(error: BaseException) -> dict[str, Any]:
     file, line = (frames[-1].filename, frames[-1].lineno) if frames else ("", 0)
     if isinstance(error, SyntaxError) and error.filename:
         file, line = error.filename, error.lineno
-    return {"error": f"{type(error).__name__}: {error}"[:LONGEST], "place": [file, line]}
+    text = f"{type(error).__name__}: {error}"[:LONGEST].replace(f"{ALONE}.", "")
+    return {"error": text, "place": [file, line]}
 
 
 def main() -> None:

@@ -9,27 +9,9 @@ from legged.config.origins import Origins
 from legged.config.schema import STATE_TERMS, TerrainConfig
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
+from legged.migration import tables
 from legged.migration.legged_gym_defaults import DIGESTS
 from legged.migration.reading import Fork, Found, Method
-from legged.migration.settings import (
-    ABSENT,
-    HISTORY,
-    MINOR,
-    MOVED,
-    NEAR,
-    OF_HEIGHTS,
-    OF_LEARNING,
-    OF_RECURRENT,
-    OF_TERRAIN,
-    OF_THE_ROBOT,
-    OFFSET,
-    ONE_STEP,
-    PARTS,
-    RANDOM_MODEL,
-    SAME,
-    TERRAIN_FUNCTIONS,
-    TERRAINS,
-)
 from legged.migration.translation import DEFAULTS, Translation, is_number
 from legged.terrain import TERRAIN_TYPES
 from legged.terrain.terrain import check_terrain
@@ -44,10 +26,10 @@ OF_HEADING = ("_post_physics_step_callback", "_resample_commands")
 def map_settings(fork: Fork) -> Translation:
     """Map the settings and the methods of a fork."""
     result = Translation(_moved(fork.settings))
-    for theirs, ours in SAME.items():
-        if theirs in ABSENT and theirs not in result.theirs:
-            result.put(ours, ABSENT[theirs], "", "theirs has no such setting")
-    result.take(SAME)
+    for theirs, ours in tables.SAME.items():
+        if theirs in tables.ABSENT and theirs not in result.theirs:
+            result.put(ours, tables.ABSENT[theirs], "", "theirs has no such setting")
+    result.take(tables.SAME)
     if not result.settings.get("domain_rand.randomize_base_mass", False):
         result.settings.pop("domain_rand.added_mass_range", None)
     _terrain(result, fork)
@@ -67,24 +49,24 @@ def _moved(settings: dict[str, Found]) -> dict[str, Found]:
     """Return the settings by legged_gym's paths."""
     paths = {}
     for path in settings:
-        start = next((old for old in MOVED if path == old or (old.endswith(".") and path.startswith(old))), "")
-        paths[path] = MOVED[start] + path.removeprefix(start) if start else path
+        start = next((old for old in tables.MOVED if path == old or (old.endswith(".") and path.startswith(old))), "")
+        paths[path] = tables.MOVED[start] + path.removeprefix(start) if start else path
     return {paths[path]: found for path, found in settings.items() if paths[path] == path or paths[path] not in settings}
 
 
 def _terrain(result: Translation, fork: Fork) -> None:
     mesh = result.get("terrain.mesh_type", "plane")
     shares = result.get("terrain.terrain_proportions")
-    result.done |= set(OF_TERRAIN) | set(OF_HEIGHTS)
+    result.done |= set(tables.OF_TERRAIN) | set(tables.OF_HEIGHTS)
     if result.get("terrain.measure_heights", False):
-        result.take(OF_HEIGHTS)
+        result.take(tables.OF_HEIGHTS)
     if mesh in ("plane", "none", None):
         return
     if mesh not in ("trimesh", "heightfield"):
         result.lose("terrain.mesh_type", "terrain.mesh_type here is plane or height_map")
         return
     result.put("terrain.mesh_type", "height_map", "terrain.mesh_type")
-    result.take(OF_TERRAIN)
+    result.take(tables.OF_TERRAIN)
     rows = int(result.number("terrain.num_rows", 10))
     if result.number("terrain.max_init_terrain_level", 5) >= rows > 0:
         result.put("terrain.max_init_terrain_level", rows - 1, "terrain.max_init_terrain_level", "of the rows there are")
@@ -113,12 +95,12 @@ def _shares(proportions: list[float], functions: list[Any] | None, unknown: list
     shares: dict[str, float] = {}
     for i, share in enumerate(proportions):
         if functions is None:
-            parts = TERRAINS[i] if i < len(TERRAINS) else {f"entry {i + 1}": 1.0}
+            parts = tables.TERRAINS[i] if i < len(tables.TERRAINS) else {f"entry {i + 1}": 1.0}
         else:
             parts = {}
             for calls in functions[i]:
                 names = tuple(name for name, _ in calls or [[f"entry {i + 1}", 0]]) if calls != [] else ()
-                kinds = TERRAIN_FUNCTIONS.get(names)
+                kinds = tables.TERRAIN_FUNCTIONS.get(names)
                 kind = kinds[(calls[0][1] if calls else 0) + 1] if kinds else ""
                 parts[kind or " + ".join(names)] = parts.get(kind or " + ".join(names), 0.0) + 0.5
         for name, part in parts.items() if share > 0.0 else ():
@@ -135,7 +117,7 @@ def _fitting(result: Translation, shares: dict[str, float], unknown: list[str]) 
         except ConfigError as error:
             if name == "flat":
                 reason = str(error).partition("terrain.")[2]
-                for path in OF_TERRAIN:
+                for path in tables.OF_TERRAIN:
                     if result.settings.pop(path, None) is not None:
                         result.lose(path, f"the terrain would be refused: {reason}")
             else:
@@ -167,7 +149,8 @@ def _commands(result: Translation) -> None:
     low, high = speeds
     if limit <= max(-low, high):
         return
-    result.put("commands.ranges.lin_vel_x", [-limit if low < 0 else low, limit], "commands.max_curriculum")
+    comment = f"theirs grows from {low:g} to {high:g} up to max_curriculum"
+    result.put("commands.ranges.lin_vel_x", [-limit if low < 0 else low, limit], "commands.max_curriculum", comment)
     result.put("commands.curriculum.enabled", True, "commands.curriculum")
     start = round(max(-low, high) / limit, 4)
     comment = "of the full range, on every axis; legged_gym widens vx alone"
@@ -237,8 +220,8 @@ def _observations(result: Translation, fork: Fork) -> None:
     """Map the observations: by what compute_observations joins or, without a class, by their number."""
     where = next(iter(fork.methods.get("compute_observations", [])), None)
     numbers = [result.get(f"env.{name}") for name in ("num_observations", "num_privileged_obs")]
-    history = next((result.get(f"env.{name}") for name in HISTORY if f"env.{name}" in result.theirs), None)
-    one = next((result.get(f"env.{name}") for name in ONE_STEP if f"env.{name}" in result.theirs), None)
+    history = next((result.get(f"env.{name}") for name in tables.HISTORY if f"env.{name}" in result.theirs), None)
+    one = next((result.get(f"env.{name}") for name in tables.ONE_STEP if f"env.{name}" in result.theirs), None)
     if history is None and is_number(one) and is_number(numbers[0]) and one and numbers[0] % one == 0:
         history = numbers[0] // one
     parts = fork.observations
@@ -276,7 +259,7 @@ def _terms(parts: list[list[str]], own: list[str]) -> list[str]:
     terms = []
     for names in parts:
         used = {name for name in names if "scale" not in name}
-        term = next((term for term, its in PARTS.items() if its == used), None)
+        term = next((term for term, its in tables.PARTS.items() if its == used), None)
         if term is None:
             first = next((name for name in names if name.startswith("self.")), names[0])
             own.append(re.sub(r"^self\.|[\[(].*|\.(unsqueeze|view|float|clone)$", "", first))
@@ -298,20 +281,20 @@ def _by_number(number: Any, joints: int, points: int) -> tuple[list[str], int] |
 
 
 def _learning(result: Translation) -> None:
-    result.take(OF_LEARNING)
+    result.take(tables.OF_LEARNING)
     if result.settings.get("train.runner.experiment_name") == "test":  # legged_gym's default
         del result.settings["train.runner.experiment_name"]
     kind = result.theirs.get("runner.policy_class_name")
     if kind is not None and "Recurrent" in str(kind.value):
         result.done.add("runner.policy_class_name")
-        result.take(OF_RECURRENT)
+        result.take(tables.OF_RECURRENT)
         result.put("train.policy.rnn_type", result.get("policy.rnn_type", "lstm"), "policy.rnn_type")
-    result.done |= set(OF_RECURRENT)
+    result.done |= set(tables.OF_RECURRENT)
 
 
 def _random_model(result: Translation) -> None:
     """Map the randomised properties of forks; leave out those that are switched off."""
-    for switch, name, fields in RANDOM_MODEL:
+    for switch, name, fields in tables.RANDOM_MODEL:
         path = f"domain_rand.{name}"
         on, values = result.theirs.get(f"domain_rand.randomize_{switch}"), result.theirs.get(path)
         if on is None or values is None or on.value is not True:
@@ -321,7 +304,7 @@ def _random_model(result: Translation) -> None:
             result.done.add(f"domain_rand.randomize_{switch}")
             for field in fields:
                 ours = field if "." in field else f"domain_rand.ranges.{field}"
-                result.put(ours, [-pair[1], -pair[0]] if field == OFFSET else pair, path)
+                result.put(ours, [-pair[1], -pair[0]] if field == tables.OFFSET else pair, path)
         else:
             result.done -= {path} - {entry.setting for entry in result.lost}
     reach = result.theirs.get("domain_rand.rand_com_vec")
@@ -332,10 +315,9 @@ def _random_model(result: Translation) -> None:
     if turn is not None and result.get("env.randomize_start_yaw", False) and is_number(turn.value):
         result.put("init_state.yaw", [-turn.value, turn.value], "env.rand_yaw_range")
     for path, found in result.theirs.items():
-        switch = re.match(r"(\w+\.)(?:randomize_)?(\w+)$", path)
-        if switch and found.value is False and path.startswith(("domain_rand.", "env.randomize_")):
-            stem = re.escape(switch[2])
-            off = rf"{re.escape(switch[1])}(randomize_)?{stem}(_.*)?$"
+        section, _, name = path.partition(".")
+        if found.value is False and path.startswith(("domain_rand.", "env.randomize_")):
+            off = rf"{section}\.(randomize_)?{re.escape(name.removeprefix('randomize_'))}(_.*)?$"
             result.done |= {other for other in result.theirs if re.match(off, other)}
 
 
@@ -374,13 +356,13 @@ def _hooks(result: Translation, fork: Fork) -> None:
 def _rest(result: Translation) -> None:
     """List the settings of the file that no other function handled."""
     for path, found in result.theirs.items():
-        if path in result.done or path in OF_THE_ROBOT or not result.given(path):
+        if path in result.done or path in tables.OF_THE_ROBOT or not result.given(path):
             continue
-        reason = next((text for pattern, text in NEAR.items() if re.match(pattern, path, re.IGNORECASE)), "")
+        reason = next((text for pattern, text in tables.NEAR.items() if re.match(pattern, path, re.IGNORECASE)), "")
         if path.startswith("rewards.") and not reason and not found.why_unknown and _is_plain(found.value):
             name = path.removeprefix("rewards.").replace(".", "_")
             result.put(f"custom.{name}", found.value, path, f"self.cfg.custom['{name}']; theirs is self.cfg.{path}")
-        elif re.match(MINOR, path):
+        elif re.match(tables.MINOR, path):
             result.minor.append(path)
         else:
             result.lose(path, found.why_unknown or reason)
