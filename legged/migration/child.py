@@ -464,7 +464,8 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
         KNOWN[name] = define(name, data, KNOWN.get(parent))
     module, root = load(Path(request["file"]))
     asked, own, tasks = request["task"], configurations(module), registered()
-    result: dict[str, Any] = {"classes": list(own), "tasks": list(tasks), **USED}
+    of_file = [task for task, entry in tasks.items() if not own or type(entry[1]) in own.values()]
+    result: dict[str, Any] = {"classes": list(own), "tasks": of_file, **USED}
     task_class = None
     if asked in tasks:
         name, (task_class, environment, learner) = asked, tasks[asked]

@@ -99,7 +99,7 @@ def read_fork(path: Path, asked: str | None) -> Fork:
         for name, entries in data["methods"].items()
     }
     return Fork(
-        task=data.get("given") or (data["task"] if data["task"] in data["tasks"] else _snake(data["task"])),
+        task=data.get("given") or (_snake(data["task"]) if data["task"] in data["classes"] else data["task"]),
         described=f"{' and '.join(parts)}{built_in}",
         settings={name: _found(entry) for name, entry in data["settings"].items()} | learning,
         methods=methods,

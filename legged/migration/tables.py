@@ -153,7 +153,7 @@ NEAR = {
     r"sim\.substeps": "sim.dt is the step of the physics",
     r"runner\.(policy|algorithm)_class_name|runner_class_name": "networks and learner are those of train",
 }
-"""Pattern of a fork's setting -> the setting here that is nearest to it, or the reason why there is none."""
+"""Pattern of a fork's setting -> the nearest setting here, or why no setting here is near."""
 MINOR = (
     r"viewer\.|sim\.physx\.|sim\.(up_axis|use_gpu_pipeline|no_camera)|env\.(env_spacing|send_timeouts|num_actions|debug_viz)"
     r"|env\.record|env\.num_recording|terrain\.(vertical_scale|slope_tres?hold|dynamic_friction|simplify_grid|hf2mesh_method)"
