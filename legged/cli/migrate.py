@@ -135,7 +135,10 @@ def _report(args: argparse.Namespace, path: Path, result: Translation, robot: Ro
     for name in filter(result.settings.__contains__, result.comments):
         print(f"changed: {name} = {shown(result.settings[name])}: {result.comments[name]}")
     for entry in filter(lambda entry: entry.reason, result.lost):
-        print(f"not mapped: {entry}")
+        alike = [other for other in result.lost if other.reason == entry.reason]
+        if entry is alike[0]:
+            also = ", ".join(other.setting for other in alike[1:])
+            print(f"not mapped: {entry}{f'; also {also}' if also else ''}")
     if not all(entry.reason for entry in result.lost):
         plain = ", ".join(entry.setting for entry in result.lost if not entry.reason)
         print(f"not mapped, without counterpart (places are in {path.name}): {plain}")

@@ -194,10 +194,11 @@ def _rewards(result: Translation, fork: Fork) -> None:
         named += 1
         missing = bool(fork.methods) and not methods
         if own is not None or missing or f"_reward_{ours}" not in DIGESTS or ours not in known:
-            where = (
-                f"{own.place}" if own else f"no method in the fork's classes; {found.place}" if fork.methods else found.place
-            )
-            paste.append(f"_reward_{name} ({where}), then set rewards.scales.{name}: {scale:g}")
+            then = f"rewards.scales.{name}: {scale:g}"
+            if missing:
+                paste.append(f"nothing for {then} ({found.place}): the fork's classes have no _reward_{name}")
+            else:
+                paste.append(f"_reward_{name} ({own.place if own else found.place}), then set {then}")
             sigma += [own] if own is not None and SIGMA in own.reads else []
         else:
             mapped.add(ours)

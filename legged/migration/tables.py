@@ -131,7 +131,7 @@ NEAR = {
     r"domain_rand\..*strength|domain_rand\..*torque": "domain_rand.ranges.motor_strength",
     r"domain_rand\..*(kp|stiffness)": "domain_rand.ranges.p_gain",
     r"domain_rand\..*(kd|damping)": "domain_rand.ranges.d_gain",
-    r"domain_rand\..*(offset|dof_pos)": "domain_rand.ranges.joint_offset, init_state.dof_pos_factor",
+    r"domain_rand\..*(motor_offset|joint_offset|dof_pos)": "domain_rand.ranges.joint_offset, init_state.dof_pos_factor",
     r"commands\..*(clip|cutoff|min_norm)": "commands.small_command",
     r"commands\..*(curriculum|max_)": "commands.ranges with commands.curriculum",
     r"commands\.num_commands": "commands here are vx, vy, yaw rate and heading; others are tensors of your own class",

@@ -175,7 +175,10 @@ def test_formulas_of_the_forks_own_get_no_scale_until_their_methods_are_pasted(f
         where = place(ENV, f"def _reward_{name}", "dog")
         assert f"paste: _reward_{name} ({where}), then set rewards.scales.{name}: {scale}\n" in result.out
     # The class has no method for this one, so that the fork itself would fail.
-    assert "paste: _reward_tracking_ang_vel (no method in the fork's classes; fork/envs/dog_config.py" in result.out
+    where = place(CONFIG, "tracking_ang_vel", "dog_config")
+    assert (
+        f"paste: nothing for rewards.scales.tracking_ang_vel: 0.5 ({where}): the fork's classes have no _reward" in result.out
+    )
     assert "rewards: 1 of 5 scales are mapped, with legged_gym's formulas; 4 wait" in result.out
     built(result)
 
