@@ -35,8 +35,8 @@ from legged.learning.timing import read_timing
 from legged.process.command_parser import CommandParser, add_import_argument
 from legged.process.cores import available_cores
 from legged.process.paths import make_folder, ready_to_write, relative, write_text
+from legged.process.processes import Job, Kind, WorkerPool, why_failed
 from legged.process.ranks import Ranks
-from legged.process.worker_pool import Job, Kind, WorkerPool, why_failed
 from legged.registry import YAML_ENDINGS, import_tasks, register_file, task_config
 
 OUT = Path("logs") / "zoo"

@@ -66,14 +66,10 @@ def _why(error: OSError | ValueError) -> str:
     return f"the output can't be written: {DISK_FULL if error.errno == errno.ENOSPC else reason(error)}"
 
 
-_OUTPUTS: list[Output] = []
-"""Outputs of the commands that run in this process, the innermost last."""
-
-
 def when_output_is_lost(do: Callable[[], object]) -> None:
     """Call `do` once nothing can be written to standard output any more. Outside of a command it is never called."""
-    if _OUTPUTS:
-        _OUTPUTS[-1].when_lost(do)
+    if isinstance(sys.stdout, Output):
+        sys.stdout.when_lost(do)
 
 
 @contextmanager
@@ -82,11 +78,9 @@ def forgiving_output() -> Iterator[Output]:
     streams = sys.stdout, sys.stderr
     output = Output(sys.stdout)
     sys.stdout, sys.stderr = output, Output(sys.stderr)  # type: ignore[assignment]
-    _OUTPUTS.append(output)
     try:
         yield output
     finally:
         output.flush()
         sys.stderr.flush()
-        _OUTPUTS.remove(output)
         sys.stdout, sys.stderr = streams

@@ -4,6 +4,7 @@ import json
 import shlex
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -19,7 +20,6 @@ from legged.sweeping.study import RUNS, WHY, Trials
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from optuna.importance import PedAnovaImportanceEvaluator
     from optuna.trial import FrozenTrial
 
 FEWEST = 4
@@ -55,15 +55,10 @@ def ranking(plan: Plan, trials: Sequence["FrozenTrial"]) -> list["FrozenTrial"]:
     return sorted(there, key=lambda trial: float(trial.value or 0.0), reverse=not plan.minimize)
 
 
-def settings(plan: Plan, trial: "FrozenTrial") -> dict[str, Any]:
-    """Return dotted path -> value of the settings that a trial was trained with."""
-    return {one.path: one.value(trial.params[one.path]) for one in plan.parameters if one.path in trial.params}
-
-
 def own_trial(plan: Plan, trials: Sequence["FrozenTrial"]) -> "FrozenTrial | None":
     """Return the trial that has the task's own settings, if there is one."""
     own = plan.own
-    return next((trial for trial in trials if settings(plan, trial) == own), None)
+    return next((trial for trial in trials if plan.settings(trial.params) == own), None)
 
 
 def table(plan: Plan, trials: Sequence["FrozenTrial"], module: str | None = None) -> str:
@@ -77,7 +72,7 @@ def table(plan: Plan, trials: Sequence["FrozenTrial"], module: str | None = None
     rows = [[rank, trial.number, f"{trial.value:.4g}"] for rank, trial in enumerate(ranked, 1)]
     rows += [["", trial.number, _why_no_value(plan, trial)] for trial in others]
     for row, trial in zip(rows, [*ranked, *others], strict=True):
-        given = settings(plan, trial)
+        given = plan.settings(trial.params)
         row += [_text(given[path]) if path in given else "" for path in paths]
         row.append(", ".join(f"`{Path(run).name}`" for run in trial.user_attrs.get(RUNS, [])))
     heads = ["rank", "trial", plan.objective_text, *(f"`{path}`" for path in paths), "run"]
@@ -85,7 +80,7 @@ def table(plan: Plan, trials: Sequence["FrozenTrial"], module: str | None = None
     parts.append(markdown_table(heads, rows, left=[len(heads) - 1]))
     if ranked:
         words = ["legged", "train", *(["--import", module] if module else []), plan.task]
-        words += [_override(path, value) for path, value in settings(plan, ranked[0]).items()]
+        words += [_override(path, value) for path, value in plan.settings(ranked[0].params).items()]
         parts += ["The settings of the best, as YAML:", f"```yaml\n{best_yaml(plan, ranked[0])}```"]
         parts += ["and on the command line:", f"```\n{shlex.join(words)}\n```"]
         if plan.given.overrides:
@@ -118,60 +113,42 @@ def _override(path: str, value: Any) -> str:
 def best_yaml(plan: Plan, best: "FrozenTrial") -> str:
     """Return the settings of a trial as the lines of a task's YAML file."""
     nested: dict[str, Any] = {}
-    for path, value in settings(plan, best).items():
+    for path, value in plan.settings(best.params).items():
         merge(nested, nest(path, value), "sweep", Origins())
     heading = f"# {plan.name}, trial {best.number}; {plan.objective_text}: {best.value:.4g}\n"
     return heading + dump(nested, sort_keys=False, default_flow_style=None, width=120)
 
 
-def importances(trials: Trials) -> dict[str, float]:
-    """Return dotted path -> importance of a setting for a trial to be among the best (PED-ANOVA, Watanabe et al., arXiv
-    2304.10255), the largest first. Return nothing while there are too few trials, or while the best quarter is no better than
-    the rest: all settings would have the same importance.
-    """
-    import optuna
-
-    if len(ranking(trials.plan, trials.all)) < FEWEST or len(trials.plan.parameters) < 2:
-        return {}
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", message=".*select the same set of trials", category=UserWarning)
-        try:
-            return dict(optuna.importance.get_param_importances(trials.study, evaluator=_evaluator()))
-        except (ValueError, RuntimeError, UserWarning):
-            return {}
-
-
-def _evaluator() -> "PedAnovaImportanceEvaluator":
-    import optuna
-
-    return optuna.importance.PedAnovaImportanceEvaluator(target_quantile=0.25)
-
-
 def draw_figures(trials: Trials) -> list[Path]:
-    """Draw Optuna's figures of the trials: values over trials, values over settings and, where it is known, the importance of
-    settings. Return the paths of the files.
+    """Draw Optuna's figures of the trials: values over trials, values over settings, and the importance of settings for a
+    trial to be among the best (PED-ANOVA, Watanabe et al., arXiv 2304.10255). Importance is left out while there are too few
+    trials, and while the best quarter is no better than the rest: all settings would have the same. Return the paths of the
+    files.
 
     Raises:
         RunError: a file can't be written.
     """
     import matplotlib.pyplot as plt
+    from optuna.importance import PedAnovaImportanceEvaluator
     from optuna.visualization import matplotlib as drawing
 
     plt.switch_backend("agg")  # no window system is asked
     plan, study = trials.plan, trials.study
-    own = own_trial(plan, ranking(plan, trials.all))
+    ranked = ranking(plan, trials.all)
+    own = own_trial(plan, ranked)
+    paths = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Optuna calls these functions experimental
+        warnings.filterwarnings("error", message=".*select the same set of trials", category=UserWarning)
         history = drawing.plot_optimization_history(study, target_name=plan.objective_text)
         if own is not None and own.value is not None:
             history.axhline(own.value, color="black", lw=1.0, ls="--", label="the task's own settings")
             history.legend()
         drawn = {"history": history, "parallel": drawing.plot_parallel_coordinate(study, target_name=plan.objective_text)}
-        if importances(trials):
-            drawn["importance"] = drawing.plot_param_importances(
-                study, evaluator=_evaluator(), target_name=plan.objective_text
-            )
-        paths = []
+        if len(ranked) >= FEWEST and len(plan.parameters) > 1:
+            evaluator = PedAnovaImportanceEvaluator(target_quantile=0.25)
+            with suppress(ValueError, RuntimeError, UserWarning):
+                drawn["importance"] = drawing.plot_param_importances(study, evaluator, target_name=plan.objective_text)
         for name, axes in drawn.items():
             figure = cast("Figure", axes.figure)
             paths.append(plan.folder / f"{name}.png")

@@ -2,16 +2,16 @@
 
 import os
 import socket
+import threading
 import time
-from contextlib import AbstractContextManager, suppress
-from importlib.util import find_spec
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from legged.errors import ConfigError, RunError
 from legged.process.paths import make_folder
-from legged.process.repeating import repeating
-from legged.sweeping.plan import Parameter, Plan
+from legged.sweeping.plan import Plan
 
 if TYPE_CHECKING:
     from optuna import Study, Trial
@@ -30,20 +30,8 @@ MOST_TRIES = 5
 """Number of attempts after which a trial is given up."""
 OWNER, ALIVE, TRIES, WHY, RUNS = "owner", "alive", "tries", "why", "runs"
 """Attributes of a trial."""
-SWEEP = "sweep"
-"""Attribute of the study: the parts of the sweep that must stay the same."""
-DEVICE = "device"
-"""Attribute of the study: the kind of device of its trials, cpu or cuda."""
-
-
-def check_installed() -> None:
-    """Check that Optuna is installed.
-
-    Raises:
-        ConfigError: it is not installed.
-    """
-    if find_spec("optuna") is None:
-        raise ConfigError("sweep: needs the package optuna, which is not installed here: pip install optuna")
+SWEEP, DEVICE = "sweep", "device"
+"""Attributes of the study: the parts of the sweep that must stay the same, and the kind of device, cpu or cuda."""
 
 
 class Trials:
@@ -56,13 +44,11 @@ class Trials:
             ConfigError: it holds another sweep of the same name, or its name is invalid.
             RunError: it can't be reached.
         """
-        check_installed()
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.ERROR)
-        self.plan, self._worker = plan, worker
+        self.plan, self._worker, self._optuna = plan, worker, optuna
         self._storage = _open(asked or plan.given.storage, plan.folder)
-        self._optuna = optuna
         try:
             self.study: Study = optuna.create_study(
                 study_name=plan.name,
@@ -74,11 +60,8 @@ class Trials:
             known = self.study.user_attrs.get(SWEEP)
             if known is None:
                 self.study.set_user_attr(SWEEP, plan.identity)
-                own = plan.own_drawn
-                if None not in own.values():
-                    self.study.enqueue_trial(own, skip_if_exists=True)
-        except ConfigError:
-            raise
+                if None not in plan.own_drawn.values():
+                    self.study.enqueue_trial(plan.own_drawn, skip_if_exists=True)
         except Exception as error:  # of SQLAlchemy, drivers and file systems, each of its own kind
             raise RunError(f"sweep: the storage can't be used: {' '.join(str(error).split())[:300]}") from error
         if known not in (None, plan.identity):
@@ -127,51 +110,46 @@ class Trials:
             seed=(self.plan.given.seed + 1009 * begun + 100_003 * self._worker) % 2**32,
             constant_liar=True,
         )
-        trial = self.study.ask()
+        trial = self.study.ask({one.path: one.distribution for one in self.plan.parameters})
         trial.set_user_attr(ALIVE, time.time())
         trial.set_user_attr(OWNER, me())
         earlier = [other for other in self._running() if other.number < trial.number]
         if len(finished(self.all)) + len(earlier) >= wanted:
-            self._put_back(trial.number, trial._trial_id, "there were enough")
+            self.end(trial, "FAIL", "there were enough")
             return None
         return trial
 
-    def draw(self, trial: "Trial") -> dict[str, Any]:
-        """Draw the values of a trial; return dotted path -> value of the setting."""
-        return {parameter.path: parameter.value(_draw(trial, parameter)) for parameter in self.plan.parameters}
+    def end(self, trial: "Trial", state: str, why: str) -> None:
+        """End a trial that has no value: PRUNED if it was ended early, FAIL if it does not count."""
+        trial.set_user_attr(WHY, why)
+        self.study.tell(trial, state=self._optuna.trial.TrialState[state])
 
     def take_back(self) -> list[int]:
         """Queue the trials of dead processes again; return their numbers. Of several processes, one does so."""
         taken = []
         for trial in self._running():
-            said = trial.user_attrs.get(ALIVE)
-            if said is None and trial.datetime_start is not None:  # it has just begun
-                said = trial.datetime_start.timestamp()
+            begun = trial.datetime_start.timestamp() if trial.datetime_start is not None else None
+            said = trial.user_attrs.get(ALIVE, begun)
             if is_dead(trial.user_attrs.get(OWNER), said) and self.try_again(trial, "its process was killed"):
                 taken.append(trial.number)
         return taken
 
-    def try_again(self, trial: "FrozenTrial", why: str) -> bool:
+    def try_again(self, trial: "Trial | FrozenTrial", why: str) -> bool:
         """End a trial without a value, and queue its settings again unless it had too many attempts. Return False if another
         process ended it.
         """
-        state = self._optuna.trial.TrialState
         tries = int(trial.user_attrs.get(TRIES, 1))
         last = tries >= MOST_TRIES
+        state = self._optuna.trial.TrialState["PRUNED" if last else "FAIL"]
         self._storage.set_trial_user_attr(trial._trial_id, WHY, f"{why}; {'given up' if last else 'tried again'}")
         try:
-            if not self._storage.set_trial_state_values(trial._trial_id, state.PRUNED if last else state.FAIL):
+            if not self._storage.set_trial_state_values(trial._trial_id, state):
                 return False
         except (RuntimeError, self._optuna.exceptions.OptunaError):  # another process ended it
             return False
         if not last and trial.params:
             self.study.enqueue_trial(trial.params, user_attrs={TRIES: tries + 1})
         return True
-
-    def _put_back(self, number: int, trial_id: int, why: str) -> None:
-        """End a trial that is not needed."""
-        self._storage.set_trial_user_attr(trial_id, WHY, why)
-        self.study.tell(number, state=self._optuna.trial.TrialState.FAIL)
 
     def _running(self) -> list["FrozenTrial"]:
         return [trial for trial in self.all if trial.state.name == "RUNNING"]
@@ -191,27 +169,16 @@ def finished(trials: list["FrozenTrial"]) -> list["FrozenTrial"]:
     return [trial for trial in trials if trial.state.name in ("COMPLETE", "PRUNED")]
 
 
-def _draw(trial: "Trial", parameter: Parameter) -> Any:
-    if parameter.kind == "choice":
-        return trial.suggest_categorical(parameter.path, parameter.choices)
-    if parameter.kind == "whole":
-        return trial.suggest_int(parameter.path, int(parameter.low), int(parameter.high), log=parameter.log)
-    return trial.suggest_float(parameter.path, parameter.low, parameter.high, log=parameter.log)
-
-
 def _open(asked: str, folder: Path) -> "BaseStorage":
-    """Open a storage.
-
-    Raises:
-        ConfigError: its name is invalid.
-        RunError: it can't be reached.
-    """
+    """Open a storage. Raises the errors of `Trials`."""
     from optuna.storages import JournalStorage, RDBStorage
     from optuna.storages.journal import JournalFileBackend
 
     if not asked:
         make_folder(folder)
         asked = f"sqlite:///{(folder / 'sweep.db').absolute()}"
+    scheme, mark, rest = asked.partition("://")
+    where = f"storage: '{scheme}{mark}***@{rest.rpartition('@')[2]}'" if "@" in rest else f"storage: '{asked}'"  # no password
     try:
         if asked.startswith(JOURNAL):
             file = Path(asked.removeprefix(JOURNAL))
@@ -220,36 +187,26 @@ def _open(asked: str, folder: Path) -> "BaseStorage":
         waiting = {"connect_args": {"timeout": WAIT_S}} if asked.startswith("sqlite") else {"pool_pre_ping": True}
         return RDBStorage(asked, engine_kwargs=waiting)
     except ImportError as error:
-        raise ConfigError(f"storage: '{_without_password(asked)}' needs a driver that is not installed ({error})") from error
+        raise ConfigError(f"{where} needs a driver that is not installed ({error})") from error
     except Exception as error:
         import sqlalchemy
 
-        text = " ".join(str(error).split())[:300]
-        if isinstance(error, sqlalchemy.exc.ArgumentError) or "://" not in asked:
-            raise ConfigError(
-                f"storage: '{_without_password(asked)}' is no storage; expected sqlite:///<file>, postgresql://..., mysql://..."
-                f" or {JOURNAL}<file>"
-            ) from error
-        raise RunError(f"storage: '{_without_password(asked)}' can't be reached: {text}") from error
-
-
-def _without_password(url: str) -> str:
-    """Return a URL without its password."""
-    scheme, mark, rest = url.partition("://")
-    return f"{scheme}{mark}***@{rest.rpartition('@')[2]}" if "@" in rest else url
+        if isinstance(error, sqlalchemy.exc.ArgumentError) or not mark:
+            known = f"sqlite:///<file>, postgresql://..., mysql://... or {JOURNAL}<file>"
+            raise ConfigError(f"{where} is no storage; expected {known}") from error
+        raise RunError(f"{where} can't be reached: {' '.join(str(error).split())[:300]}") from error
 
 
 def _pruner(plan: Plan) -> Any:
     from optuna.pruners import HyperbandPruner, MedianPruner, NopPruner
 
     runner = plan.cfg.train.runner
-    if plan.given.pruner == "none":
-        return NopPruner()
+    most = runner.max_iterations * len(plan.given.seeds)
     if plan.given.pruner == "hyperband":
-        most = runner.max_iterations * len(plan.given.seeds)
         return HyperbandPruner(min_resource=runner.evaluate_interval, max_resource=most, reduction_factor=3)
     # Early figures say little, so a trial may run for a quarter of its length.
-    return MedianPruner(n_startup_trials=5, n_warmup_steps=runner.max_iterations // 4)
+    median = MedianPruner(n_startup_trials=5, n_warmup_steps=runner.max_iterations // 4)
+    return NopPruner() if plan.given.pruner == "none" else median
 
 
 def me() -> str:
@@ -278,17 +235,34 @@ def _machine() -> str:
 
 def _began(pid: int) -> str:
     """Return the start of a process of this machine, in the system's unit; 'gone' if there is no such process."""
-    try:
+    with suppress(OSError):
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
         return "gone" if fields[0] in "ZX" else fields[19]
-    except OSError:
-        pass
-    if Path("/proc/self").exists():
-        return "gone"
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return "gone"
-    except PermissionError:
-        pass
+    with suppress(PermissionError):
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return "gone"
     return "there"
+
+
+@contextmanager
+def repeating(call: Callable[[], None], every_s: float, at_end: bool = False) -> Iterator[None]:
+    """Call a function every `every_s` seconds in a thread while the block runs, and once more after it if `at_end`. The block
+    ends when the last call has returned.
+    """
+    over = threading.Event()
+
+    def repeat() -> None:
+        while not over.wait(every_s):
+            call()
+        if at_end:
+            call()
+
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()

@@ -1,19 +1,35 @@
-"""Duration of a control step, and of its physics alone."""
+"""Measurements of the benchmark command: a control step, its physics and kernels, and training iterations."""
 
+import io
+import tempfile
 import time
 from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
+from functools import partial
+from pathlib import Path
 from statistics import median
+from types import SimpleNamespace
 from typing import Any
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged.config import TaskConfig
 from legged.envs import BaseTask
 from legged.graph.step_graph import StepGraph
+from legged.learning.captured import CapturedRunner
+from legged.learning.display import Progress
+from legged.learning.runner import Runner
+from legged.learning.student_runner import StudentRunner
+from legged.learning.teacher import Teacher
 
 Turn = tuple[Callable[[], object], Callable[[], object]]
 """Untimed preparation, and the timed function."""
+
+
+LOOPS: dict[str, Callable[..., Runner]] = {"stock": Runner, "captured": CapturedRunner}
+"""Training loops by name."""
 
 
 class Driver:
@@ -70,18 +86,13 @@ def time_steps(task: BaseTask, steps: int, repeats: int, act: Callable[[TensorDi
     turns += [(driver.put_back if k else driver.keep, run) for k, run in enumerate(alone.values())]
     results = [_time_in_turns(turns, steps, device) for _ in range(repeats)]
     driver.put_back()
-    control, *others = (sorted(times) for times in zip(*results, strict=True))
-    control_ms = median(control)
-    times: dict[str, Any] = {}
-    for name, measured in zip(alone, others, strict=True):
+    times: dict[str, Any] = {"num_envs": task.num_envs}
+    for name, measured in zip(("control_step", *alone), map(sorted, zip(*results, strict=True)), strict=True):
         times |= {f"{name}_ms": median(measured), f"{name}_ms_range": [measured[0], measured[-1]]}
     return {
-        "num_envs": task.num_envs,
-        "control_step_ms": control_ms,
-        "control_step_ms_range": [control[0], control[-1]],
         **times,
-        "ratio": control_ms / times["physics_ms"],
-        "env_steps_per_s": task.num_envs / control_ms * 1e3,
+        "ratio": times["control_step_ms"] / times["physics_ms"],
+        "env_steps_per_s": task.num_envs / times["control_step_ms"] * 1e3,
         "captured": float(task.captured),
         "overflows": float(task.metrics.flush()["Metrics/contact_overflows"]),
     }
@@ -99,32 +110,37 @@ def _control_period(task: BaseTask, step: Callable[[], None]) -> Callable[[], No
 
 def _time_in_turns(turns: Sequence[Turn], steps: int, device: torch.device) -> list[float]:
     """Return mean milliseconds per call of each turn's timed function. On a GPU, waiting for the host raises an error."""
-    totals = [0.0] * len(turns)
-    if device.type != "cuda":
-        for _ in range(steps):
-            for k, (prepare, function) in enumerate(turns):
-                prepare()
-                start = time.perf_counter()
-                function()
-                totals[k] += time.perf_counter() - start
-        return [total / steps * 1e3 for total in totals]
-    marks = [[[torch.cuda.Event(enable_timing=True) for _ in range(2)] for _ in turns] for _ in range(steps)]
+    on_gpu = device.type == "cuda"
+
+    def mark() -> Any:
+        if not on_gpu:
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        return event
+
     synchronize(device)
-    torch.cuda.set_sync_debug_mode("error")
+    spans: list[list[tuple[Any, Any]]] = [[] for _ in turns]
     try:
-        for step in range(steps):
-            for (first, last), (prepare, function) in zip(marks[step], turns, strict=True):
+        if on_gpu:
+            torch.cuda.set_sync_debug_mode("error")
+        for _ in range(steps):
+            for (prepare, function), measured in zip(turns, spans, strict=True):
                 prepare()
-                first.record()
+                first = mark()
                 function()
-                last.record()
+                measured.append((first, mark()))
     finally:
-        torch.cuda.set_sync_debug_mode("default")
+        if on_gpu:
+            torch.cuda.set_sync_debug_mode("default")
     synchronize(device)
-    for of_step in marks:
-        for k, (first, last) in enumerate(of_step):
-            totals[k] += first.elapsed_time(last)
-    return [total / steps for total in totals]
+    times = [[a.elapsed_time(b) if on_gpu else 1e3 * (b - a) for a, b in measured] for measured in spans]
+    return [sum(each) / steps for each in times]
+
+
+def device_name(device: torch.device) -> str:
+    """Return the name of a device in results."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
 
 
 def synchronize(device: torch.device) -> None:
@@ -133,10 +149,68 @@ def synchronize(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
+def loops_of(cfg: TaskConfig, teacher: Teacher | None, asked: str | None) -> dict[str, Callable[..., Runner]]:
+    """Return the runners to time, by name of the loop: the loop `asked`, or else all. Students of a `teacher` and policies
+    with an estimator have only the loop of the configuration.
+    """
+    own = cfg.train.runner.loop
+    if teacher is not None:
+        return {own: partial(StudentRunner, teacher=teacher)}
+    one = own if cfg.train.policy.estimator.targets else asked
+    return {one: LOOPS[one]} if one else LOOPS
+
+
+def time_iterations(kind: Callable[..., Runner], task: BaseTask, count: int) -> dict[str, Any]:
+    """Return the medians of rollout, update and iteration times [ms] and the range of the latter, over `count` iterations of
+    a training with new networks, after a first iteration that is left out.
+    """
+    shown: list[Progress] = []
+    display = SimpleNamespace(show=shown.append)
+    with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()) as said:
+        runner = kind(task, log_dir=Path(folder), device=str(task.device), display=display)
+        runner.learn(count + 1, init_at_random_ep_len=True)
+    seen = shown[1:]
+    whole = sorted(1e3 * (progress.collect_s + progress.learn_s) for progress in seen)
+    steps = task.cfg.train.runner.num_steps_per_env
+    return {
+        "rollout_ms": 1e3 * median([progress.collect_s for progress in seen]),
+        "update_ms": 1e3 * median([progress.learn_s for progress in seen]),
+        "iteration_ms": median(whole),
+        "iteration_ms_range": [whole[0], whole[-1]],
+        "steps_per_iteration": steps,
+        "robot_steps_per_s": task.num_envs * steps / median(whole) * 1e3,
+        "note": said.getvalue().strip(),
+    }
+
+
+def kernel_times(task: BaseTask, steps: int) -> list[dict[str, Any]]:
+    """Return the kernels of a control step as the graph replays them, slowest first; means over `steps` steps with small
+    random actions. `launches` is the number of launches in a control step, which varies with the iterations of solvers, and
+    `total_us` their GPU time [us].
+    """
+    actions = 0.3 * torch.randn(task.num_envs, task.num_actions, device=torch.device(task.device))
+    task.step(actions)
+    torch.cuda.synchronize()
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+        for _ in range(steps):
+            task.step(actions)
+        torch.cuda.synchronize()
+    seen = [e for e in profile.key_averages() if e.device_type == torch.autograd.DeviceType.CUDA]
+    times = [{"name": e.key, "launches": e.count / steps, "total_us": e.device_time_total / steps} for e in seen]
+    return sorted(times, key=lambda time: -time["total_us"])
+
+
+def kernel_table(times: list[dict[str, Any]], longest: int) -> str:
+    """Return the `longest` slowest kernels and the sum of all as lines of text."""
+    launches, total = (sum(time[key] for time in times) for key in ("launches", "total_us"))
+    whole = {"name": f"all {len(times)} kernels of a control step", "launches": launches, "total_us": total}
+    rows = [f"{time['total_us']:9.1f} {time['launches']:9.1f}  {time['name'][:90]}" for time in (*times[:longest], whole)]
+    return "\n".join([f"{'us':>9} {'launches':>9}  kernel", *rows])
+
+
 def report(task: BaseTask, result: dict[str, Any]) -> str:
     """Return the results of a benchmark of a task as lines of text."""
-    device = torch.device(task.device)
-    where = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
+    where = device_name(torch.device(task.device))
     how = "one CUDA graph, no host synchronisation in the timed steps" if task.captured else "eager"
     lines = [
         f"{task.cfg.task}, {task.num_envs} robots, {where}, {how}",
