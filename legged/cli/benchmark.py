@@ -89,11 +89,7 @@ def _add_step_arguments(parser: CommandParser) -> None:
 
 
 def _settle(args: argparse.Namespace) -> tuple[TaskConfig, torch.device]:
-    """Return the configuration and the device of a command line.
-
-    Raises:
-        ConfigError: an argument is wrong.
-    """
+    """Check the arguments that commands share; return the configuration and the device."""
     register_given(args, "task")
     device = pick_device(args.sim_device)
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
@@ -230,9 +226,7 @@ def scale(args: argparse.Namespace) -> int:
 
 def _measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, Any]:
     """Return the benchmark's results for `size` robots with these arguments; `failed` has the reason if they are missing.
-
-    Raises:
-        ConfigError: the configuration does not allow so many robots.
+    ConfigError: the configuration does not allow so many robots.
     """
     with tempfile.TemporaryDirectory() as folder:
         words = [sys.executable, "-m", "legged", "benchmark", "step", *arguments]
@@ -305,9 +299,6 @@ def _time_start(given: Sequence[str], repeats: int) -> dict[str, Any]:
     """Return medians of `repeats` runs, after one run that fills caches: `torch_s`, the time of `import torch`; `stages`, the
     end of each stage of a training with the arguments `given`, since the start of its process; `capture_s`; the `ratio` of
     the end of the first iteration to `torch_s`; and `ratio_without_capture`. Times are in seconds.
-
-    Raises:
-        RunError: a process fails; the message is the last line of its error output.
     """
     training = ["-m", "legged", "train", *without(given, "--out", "--repeats"), "--max-iterations", "1"]
     runs = [(_run("-c", "import torch"), _run(*training, "train.runner.film=false")) for _ in range(repeats + 1)][1:]

@@ -124,11 +124,7 @@ def print_rows(title: str, rows: Mapping[str, str], width: int = 0) -> None:
 
 
 def _print_help(words: list[str]) -> int:
-    """Print the commands, or those of a group; return the exit code 0.
-
-    Raises:
-        ConfigError: the words name neither a command nor a group of commands.
-    """
+    """Print the commands, or those of a group; return the exit code 0. ConfigError names a word that is neither."""
     groups: dict[str, dict[str, str]] = {}
     for name, (_, summary) in COMMANDS.items():
         groups.setdefault(name.partition(" ")[0], {})[name] = summary

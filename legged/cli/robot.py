@@ -20,7 +20,7 @@ from legged.robots.importing.infer import make_ready, read_robot
 from legged.robots.importing.menagerie import PREFIX, menagerie_model
 from legged.robots.importing.repair import plain
 from legged.robots.importing.tree import Tree
-from legged.robots.robot import Robot, load_robot
+from legged.robots.robot import load_robot
 
 ROOM_MB = 100.0
 """Disk space for the files [MiB]."""
@@ -163,7 +163,24 @@ def show(args: argparse.Namespace) -> int:
     """
     robot = load_robot(args.robot, "ROBOT")
     print(f"{robot.name}: {robot.mass:.4g} kg, {robot.height:.3g} m high, {robot.num_dof} joints, {relative(robot.folder)}")
-    Console(width=130).print(joints_table(robot))
+    table = Table(
+        *(
+            "joint",
+            "default [rad]",
+            "range [rad]",
+            "velocity [rad/s]",
+            "torque [N m]",
+            "stiffness",
+            "damping",
+            "rotor [kg m^2]",
+        )
+    )
+    for i, name in enumerate(robot.joint_names):
+        low, high = robot.dof_pos_limits[i]
+        numbers = (robot.dof_vel_limits, robot.torque_limits, robot.stiffness, robot.damping, robot.armature)
+        values = [f"{values[i]:.4g}" if np.isfinite(values[i]) else "-" for values in numbers]
+        table.add_row(name, f"{robot.default_dof_pos[i]:.4g}", f"{low:.4g} to {high:.4g}", *values)
+    Console(width=130).print(table)
     for what, names in (
         ("feet", robot.feet_names),
         ("contact is penalised", [robot.contact_names[i] for i in robot.penalised_indices]),
@@ -171,24 +188,3 @@ def show(args: argparse.Namespace) -> int:
     ):
         print(f"{what}: {', '.join(names) or 'none'}")
     return 0
-
-
-def joints_table(robot: Robot) -> Table:
-    """Return a row for each joint: default angle, limits, gains and rotor inertia."""
-    heads = (
-        "joint",
-        "default [rad]",
-        "range [rad]",
-        "velocity [rad/s]",
-        "torque [N m]",
-        "stiffness",
-        "damping",
-        "rotor [kg m^2]",
-    )
-    table = Table(*heads)
-    for i, name in enumerate(robot.joint_names):
-        low, high = robot.dof_pos_limits[i]
-        numbers = (robot.dof_vel_limits, robot.torque_limits, robot.stiffness, robot.damping, robot.armature)
-        values = [f"{values[i]:.4g}" if np.isfinite(values[i]) else "-" for values in numbers]
-        table.add_row(name, f"{robot.default_dof_pos[i]:.4g}", f"{low:.4g} to {high:.4g}", *values)
-    return table

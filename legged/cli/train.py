@@ -151,7 +151,8 @@ def train(argv: list[str] | None, prepared: Callable[[Runner], None] | None = No
                 after = f"after iteration {runner.current_learning_iteration}"
                 print(f"resumed {relative(checkpoint)} {after}; {how}", flush=True)
             training = _Training(args, cfg, device, runner, None if args.transfer else checkpoint, start_s)
-            training.set_up_evaluations()
+            if cfg.train.runner.evaluate_interval:
+                runner.evaluate_with(training.evaluations() if first else None)
             if prepared is not None:
                 prepared(runner)
             runner.logger.neighbours = neighbours
@@ -221,16 +222,12 @@ class _Training:
     ready_s: float = 0.0
     """Time at which everything was built [s]."""
 
-    def set_up_evaluations(self) -> None:
-        """Set up evaluations of the policy during the training, which the first process makes."""
-        if not self.cfg.train.runner.evaluate_interval:
-            return
-        evaluations = None
-        if Ranks.now().first:
-            evaluations = Evaluations(self.runner.env.cfg, TrainingEvaluation(self.runner.env))
-            if self.resumed_from is not None:
-                evaluations.go_on_from(self.resumed_from)
-        self.runner.evaluate_with(evaluations)
+    def evaluations(self) -> Evaluations:
+        """Return evaluations of the policy during the training, continued where the earlier training ended."""
+        evaluations = Evaluations(self.runner.env.cfg, TrainingEvaluation(self.runner.env))
+        if self.resumed_from is not None:
+            evaluations.go_on_from(self.resumed_from)
+        return evaluations
 
     def learn(self, display: Display | None) -> tuple[Path | None, bool]:
         """Train into a new run folder; return the folder (None if another process has it) and True if training reached its

@@ -259,11 +259,7 @@ def plan_sweep(path: Path, on_cpu: bool, trials: int | None = None) -> Plan:
 
 
 def _parameter(key: str, one: ParameterConfig, cfg: TaskConfig, path: Path) -> Parameter:
-    """Return the swept setting; the ends of its range and all its choices must be valid values.
-
-    Raises:
-        ConfigError: they do not.
-    """
+    """Return the swept setting; the ends of its range and all its choices must be valid values."""
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
     where = f"{path}: parameters: {key}"
