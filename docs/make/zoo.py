@@ -22,8 +22,7 @@ from shipping import ship
 
 from legged.cli.evaluate.common import ROBOTS, check_points
 from legged.commandline.arguments import pick_device
-from legged.commandline.command import EXIT_FAILED, run_main
-from legged.commandline.stopping import stopping_on_signals
+from legged.commandline.command import EXIT_FAILED, run_main, stopping_on_signals
 from legged.config import LeggedConfig, override, parse_override
 from legged.errors import ConfigError, suggest
 from legged.evaluation.engines import ENGINES

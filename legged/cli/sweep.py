@@ -17,8 +17,7 @@ import torch
 
 from legged.cli.train import train
 from legged.commandline.arguments import pick_device
-from legged.commandline.command import EXIT_FAILED, sub_command
-from legged.commandline.stopping import stopping_on_signals
+from legged.commandline.command import EXIT_FAILED, stopping_on_signals, sub_command
 from legged.config.checks import shown
 from legged.errors import ConfigError
 from legged.learning.divergence import Diverged
@@ -32,8 +31,7 @@ from legged.process.processes import Job, Kind, WorkerPool, why_failed
 from legged.process.ranks import Ranks
 from legged.registry import import_tasks
 from legged.sweeping.plan import Plan, plan_sweep, sweep_file
-from legged.sweeping.report import write_report
-from legged.sweeping.study import RUNS, WHY, Trials, finished, repeating
+from legged.sweeping.trials import RUNS, WHY, Trials, finished, repeating, write_report
 
 if TYPE_CHECKING:
     from optuna import Trial

@@ -23,10 +23,8 @@ from legged.commandline.arguments import (
     settle_on,
     watch_command,
 )
-from legged.commandline.command import EXIT_FAILED, run_main
-from legged.commandline.output import when_output_is_lost
+from legged.commandline.command import EXIT_FAILED, quiet_writers, run_main, stopping_on_signals, when_output_is_lost
 from legged.commandline.show import summary
-from legged.commandline.stopping import quiet_writers, stopping_on_signals
 from legged.config import TaskConfig, to_yaml
 from legged.config.networks import learns_from_teacher
 from legged.envs import BaseTask

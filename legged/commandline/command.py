@@ -1,31 +1,44 @@
-"""Execution of a command: its exit code, and its error message in one line."""
+"""Execution of a command: exit code, error message in one line, lost output, and signals."""
 
 import argparse
 import errno
 import functools
 import inspect
+import os
 import re
+import signal
 import sys
 import sysconfig
+import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
+from types import FrameType
+from typing import Any, TextIO
 
 import legged.errors
-from legged.commandline.output import forgiving_output
 from legged.errors import ConfigError, HostReadError, RunError, TermError
 from legged.process.command_parser import CommandParser
-from legged.process.paths import full_disk_in, reason
+from legged.process.paths import DISK_FULL, full_disk_in, reason
 from legged.process.ranks import Ranks
-from legged.process.startup import INTERRUPTED, STARTED_S, is_a_command, leave_at_interrupts, raise_at_interrupts
+from legged.process.startup import (
+    INTERRUPTED,
+    STARTED_S,
+    in_main_thread,
+    is_a_command,
+    leave_at_interrupts,
+    raise_at_interrupts,
+)
 
 EXIT_FAILED = 1
 EXIT_WRONG_INPUT = 2
 NO_MEMORY = "out of memory; fewer robots (--num-envs) need less"
 LACKS_MEMORY = re.compile(r"(?i)out of memory|can't allocate memory|failed to allocate|bad_?alloc|unable to allocate")
 """Pattern in the messages of torch, Warp, NumPy and C++ about too little memory."""
+SIGNALS = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
+"""Signals from Ctrl-C, from a scheduler, and from a terminal that is closed."""
 
 
 def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = None) -> int:
@@ -186,3 +199,135 @@ def _say(text: str) -> None:
     except ConfigError:  # the number of the process is itself wrong, which is the error
         rank = ""
     print(f"{rank}error: {text}", file=sys.stderr, flush=True)
+
+
+# ---- lost output -----------------------------------------------------------------------------------------------------
+
+
+class Output:
+    """A text stream that discards text once it can't be written any more."""
+
+    def __init__(self, stream: TextIO | None) -> None:
+        """Wrap `stream`, which is None in a process that was started without one."""
+        self._stream = open(os.devnull, "w") if stream is None else stream  # noqa: SIM115  (as long as the process)
+        self.lost: str | None = None
+        """Reason why nothing more can be written; None while writing works."""
+        self._when_lost: list[Callable[[], object]] = []
+
+    def write(self, text: str) -> int:
+        """Write a text, or discard it if it can't be written; return the number of characters."""
+        if self.lost is None:
+            with self._watched():
+                self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush the stream."""
+        if self.lost is None:
+            with self._watched():
+                self._stream.flush()
+
+    def when_lost(self, do: Callable[[], object]) -> None:
+        """Call `do` as soon as nothing can be written any more; at once, if that is already so."""
+        if self.lost is not None:
+            do()
+        self._when_lost.append(do)
+
+    @contextmanager
+    def _watched(self) -> Iterator[None]:
+        try:
+            yield
+        except UnicodeError:  # the terminal's encoding lacks a character
+            raise
+        except (OSError, ValueError) as error:  # ValueError: the stream was closed
+            self.lost = _why(error)
+            if self._stream in (sys.__stdout__, sys.__stderr__):  # text in Python's buffer must not fail at exit
+                with suppress(OSError, ValueError):
+                    nowhere = os.open(os.devnull, os.O_WRONLY)
+                    os.dup2(nowhere, self._stream.fileno())
+                    os.close(nowhere)
+            for do in self._when_lost:
+                do()
+
+    def __getattr__(self, name: str) -> Any:
+        """Return any other attribute of the text stream."""
+        return getattr(self._stream, name)
+
+
+def _why(error: OSError | ValueError) -> str:
+    if isinstance(error, ValueError) or error.errno in (errno.EPIPE, errno.EBADF, errno.EIO):
+        return "the output was closed"
+    return f"the output can't be written: {DISK_FULL if error.errno == errno.ENOSPC else reason(error)}"
+
+
+def when_output_is_lost(do: Callable[[], object]) -> None:
+    """Call `do` once nothing can be written to standard output any more. Outside of a command it is never called."""
+    if isinstance(sys.stdout, Output):
+        sys.stdout.when_lost(do)
+
+
+@contextmanager
+def forgiving_output() -> Iterator[Output]:
+    """Make losses of standard output and standard error of this process silent; yield the wrapped standard output."""
+    streams = sys.stdout, sys.stderr
+    output = Output(sys.stdout)
+    sys.stdout, sys.stderr = output, Output(sys.stderr)  # type: ignore[assignment]
+    try:
+        yield output
+    finally:
+        output.flush()
+        sys.stderr.flush()
+        sys.stdout, sys.stderr = streams
+
+
+# ---- signals ---------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def stopping_on_signals(stop: Callable[[], object]) -> Iterator[list[int]]:
+    """Call `stop` at the first signal, which ends the training after the iteration; raise KeyboardInterrupt at the second.
+    Yield a list that collects the signals. The earlier handlers are restored afterwards.
+
+    With several processes, all stop as soon as one is told to. There a second signal has no effect: torchrun passes on the
+    signals that the terminal has already sent, and kills processes that take more than half a minute. Outside the main thread
+    Python can't handle signals, so none are handled.
+    """
+    received: list[int] = []
+    ranks = Ranks.now()
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        if len(received) > 1 and not ranks.several:
+            raise KeyboardInterrupt
+        if len(received) == 1 and ranks.first:
+            once_more = "" if ranks.several else "; once more to stop at once"
+            with suppress(RuntimeError):  # the signal came during another write to the same stream
+                print(f"stopping after this iteration, with a checkpoint{once_more}", file=sys.stderr, flush=True)
+        stop()
+
+    # A signal that nohup ignores stays ignored: the training is to outlive its terminal.
+    numbers = [n for n in SIGNALS if n == signal.SIGINT or signal.getsignal(n) != signal.SIG_IGN] if in_main_thread() else []
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield received
+    finally:
+        for number, old in before.items():
+            signal.signal(number, signal.SIG_DFL if old is None else old)
+
+
+@contextmanager
+def quiet_writers() -> Iterator[None]:
+    """Keep writer threads from printing a traceback when they cannot write a file; TensorBoard's writer raises the same error
+    again in the caller.
+    """
+    before = threading.excepthook
+
+    def hook(args: threading.ExceptHookArgs) -> None:
+        if not isinstance(args.exc_value, OSError):
+            before(args)
+
+    threading.excepthook = hook
+    try:
+        yield
+    finally:
+        threading.excepthook = before

@@ -9,7 +9,6 @@ from typing import Any, NoReturn
 
 from legged.errors import suggest
 
-LEAST_EXAMPLES = 2
 NEGATIVE_NUMBER = re.compile(r"-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?$", re.IGNORECASE)
 """Negative numbers, which look like options. Before Python 3.14 argparse does not know -1e-1."""
 OF_LEGGED_GYM = re.compile(r"--(num_envs|load_run|experiment_name|run_name|max_iterations|sim_device|rl_device)(?==|$)")
@@ -20,13 +19,7 @@ class CommandParser(argparse.ArgumentParser):
     """Parser of one command's arguments, whose help ends with examples."""
 
     def __init__(self, prog: str, description: str | None, *examples: str, **options: Any) -> None:
-        """Take the words that call the command, its description, and examples as complete command lines.
-
-        Raises:
-            ValueError: fewer than two examples.
-        """
-        if len(examples) < LEAST_EXAMPLES:
-            raise ValueError(f"{prog}: the help of a command shows at least {LEAST_EXAMPLES} examples, got {len(examples)}")
+        """Take the words that call the command, its description, and at least two examples as complete command lines."""
         self.examples = examples
         """Command lines that this parser can parse."""
         shown = "\n".join(["examples:", *(f"  {example}" for example in examples)])

@@ -8,8 +8,18 @@ import torch
 from helpers import POLICY, TASK, call, small_config, small_task
 
 from legged import registry
-from legged.benchmarks import Driver, loops_of, report, time_iterations, time_steps
-from legged.cli.benchmark import ground, scale, startup, step, without
+from legged.cli.benchmark import (
+    Driver,
+    ground,
+    loops_of,
+    report,
+    scale,
+    startup,
+    step,
+    time_iterations,
+    time_steps,
+    without,
+)
 from legged.learning.captured import CapturedRunner
 from legged.learning.runner import Runner
 from legged.learning.student_runner import StudentRunner

@@ -26,10 +26,9 @@ from legged.learning.timing import read_timing
 from legged.process.paths import data_folder
 from legged.registry import task_names
 from legged.sweeping import plan as planning
-from legged.sweeping import study
+from legged.sweeping import trials as study
 from legged.sweeping.plan import plan_sweep
-from legged.sweeping.report import ranking
-from legged.sweeping.study import Trials, is_dead, me
+from legged.sweeping.trials import Trials, is_dead, me, ranking
 
 optuna = pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
 pytestmark = pytest.mark.usefixtures("workplace")

@@ -8,8 +8,7 @@ from helpers import call
 
 from legged.cli.sweep import run as sweep
 from legged.sweeping.plan import plan_sweep
-from legged.sweeping.report import ranking
-from legged.sweeping.study import Trials
+from legged.sweeping.trials import Trials, ranking
 
 pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
 pytestmark = pytest.mark.usefixtures("workplace")

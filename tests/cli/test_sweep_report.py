@@ -14,8 +14,7 @@ from legged.cli.sweep import report as reporting
 from legged.cli.sweep import run as sweep
 from legged.config import parse_override
 from legged.sweeping.plan import plan_sweep
-from legged.sweeping.report import draw_figures, table
-from legged.sweeping.study import Trials
+from legged.sweeping.trials import Trials, draw_figures, table
 
 optuna = pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
 pytestmark = pytest.mark.usefixtures("workplace")

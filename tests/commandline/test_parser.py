@@ -28,11 +28,6 @@ def test_other_options_have_hyphens_alone(capsys):
     assert "did you mean '--robots-per-point'?" in capsys.readouterr().err
 
 
-def test_a_command_with_one_example_is_not_built():
-    with pytest.raises(ValueError, match="at least 2 examples, got 1"):
-        CommandParser("x", "Do.", "python x.py")
-
-
 def test_paragraphs_of_a_description_are_filled_one_by_one_and_indented_lines_kept(monkeypatch):
     monkeypatch.setenv("COLUMNS", "40")
     text = "One two three four five six seven eight nine.\n\n  as it\n  is\n\nLast."
