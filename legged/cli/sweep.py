@@ -278,7 +278,8 @@ class Worker:
             runner.evaluations.listener = listen
             kept.append(runner)
 
-        code = train([*plan.arguments(settings, trial.number, seed), *self._flags], prepare)
+        words = [*plan.arguments(settings, trial.number, seed), *self._flags]
+        code = train.run(train.parse(words), prepare)
         (runner,) = kept
         folder, evaluations = Path(runner.logger.log_dir), runner.evaluations
         assert evaluations is not None

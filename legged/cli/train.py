@@ -1,4 +1,4 @@
-"""Train a policy: `legged train anymal_c_flat`, or `python train.py --task anymal_c_flat`."""
+"""`legged train`: trainings from the command line."""
 
 import argparse
 import contextlib
@@ -23,7 +23,7 @@ from legged.commandline.arguments import (
     settle_on,
     watch_command,
 )
-from legged.commandline.command import EXIT_FAILED, quiet_writers, run_main, stopping_on_signals, when_output_is_lost
+from legged.commandline.command import EXIT_FAILED, quiet_writers, stopping_on_signals, sub_command, when_output_is_lost
 from legged.commandline.show import summary
 from legged.config import TaskConfig, to_yaml
 from legged.config.networks import learns_from_teacher
@@ -50,29 +50,14 @@ from legged.process.cores import available_cores
 from legged.process.neighbours import Neighbours
 from legged.process.paths import full_disk_in, ready_to_write, reason, relative, write_text
 from legged.process.ranks import Ranks
-from legged.process.startup import STARTED_S, program, stage_ended
+from legged.process.startup import program, stage_ended
 from legged.registry import make_task, task_config
 
 ROOM_MB = 16.0
 """Disk space that must be free before a training begins, for its first checkpoints [MiB]."""
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(train, argv)
-
-
-def build_parser() -> CommandParser:
-    """Return the parser of the command line."""
-    parser = CommandParser(
-        "legged train",
-        __doc__,
-        "legged train anymal_c_flat",
-        "legged train anymal_c --num-envs 8192 --seed 3 rewards.scales.torques=-1e-4",
-        "legged train anymal_c --resume",
-        "legged train anymal_c_step --transfer anymal_c_flat",
-        "legged train anymal_c_student --teacher anymal_c",
-    )
+def _add_arguments(parser: CommandParser) -> None:
     add_legged_gym_arguments(parser, "task")
     parser.add_argument("--resume", action="store_true", help="continue from a checkpoint, in a new run folder")
     parser.add_argument(
@@ -88,21 +73,20 @@ def build_parser() -> CommandParser:
     parser.add_argument(
         "--show", action="store_true", help="print the full configuration, terms, actions and joints, and stop"
     )
-    return parser
 
 
-def train(argv: list[str] | None, prepared: Callable[[Runner], None] | None = None) -> int:
-    """Train with the arguments `argv`, those of this process if None; return the exit code. `prepared` receives the runner
-    after it is built and before it trains.
-
-    Raises:
-        ConfigError: the command line or the configuration is wrong.
-        RunError: training could not go on.
-    """
-    start_s = STARTED_S if argv is None else time.perf_counter()  # the time of a command includes its imports
+@sub_command(
+    "legged train anymal_c_flat",
+    "legged train anymal_c --num-envs 8192 --seed 3 rewards.scales.torques=-1e-4",
+    "legged train anymal_c --resume",
+    "legged train anymal_c_step --transfer anymal_c_flat",
+    "legged train anymal_c_student --teacher anymal_c",
+    add=_add_arguments,
+)
+def train(args: argparse.Namespace, prepared: Callable[[Runner], None] | None = None) -> int:
+    """Train a policy: `legged train anymal_c_flat`, or `python train.py --task anymal_c_flat`."""
+    # `prepared` receives the runner after it is built and before it trains.
     stage_ended("imports")
-    args = build_parser().parse_intermixed_args(argv)
-
     settle_name(args, "task")
     register_given(args, "task")
     device = pick_device(args.sim_device)
@@ -148,7 +132,7 @@ def train(argv: list[str] | None, prepared: Callable[[Runner], None] | None = No
                 how = f"all robots begin anew: {why}" if why else "robots and random numbers go on where they were"
                 after = f"after iteration {runner.current_learning_iteration}"
                 print(f"resumed {relative(checkpoint)} {after}; {how}", flush=True)
-            training = _Training(args, cfg, device, runner, None if args.transfer else checkpoint, start_s)
+            training = _Training(args, cfg, device, runner, None if args.transfer else checkpoint)
             if cfg.train.runner.evaluate_interval:
                 runner.evaluate_with(training.evaluations() if first else None)
             if prepared is not None:
@@ -172,6 +156,9 @@ def train(argv: list[str] | None, prepared: Callable[[Runner], None] | None = No
         return 0
     # No signal of this process: its output was lost, or another process was told to stop.
     return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
+
+
+build_parser, main = train.build_parser, train.main
 
 
 def _runner(task: BaseTask, teacher: Teacher | None, rl_device: torch.device, display: Display | None) -> Runner:
@@ -215,10 +202,8 @@ class _Training:
     runner: Runner
     resumed_from: Path | None
     """Checkpoint of the training that is continued."""
-    start_s: float
-    """Start of the command, on the clock of `time.perf_counter` [s]."""
     ready_s: float = 0.0
-    """Time at which everything was built [s]."""
+    """Time at which everything was built, on the clock of `time.perf_counter` [s]."""
 
     def evaluations(self) -> Evaluations:
         """Return evaluations of the policy during the training, continued where the earlier training ended."""
@@ -281,9 +266,9 @@ class _Training:
             iterations=logger.tot_timesteps // logger.steps_per_iteration,
             resumed=self.resumed_from is not None,
             steps=logger.tot_timesteps,
-            start_up_s=self.ready_s - self.start_s,
+            start_up_s=self.ready_s - self.args.start_s,
             loop_s=logger.loop_s,
-            wall_s=now_s - self.start_s,
+            wall_s=now_s - self.args.start_s,
             device=torch.cuda.get_device_name(self.device) if self.device.type == "cuda" else "cpu",
             kernels_compiled=runner.env.physics.compiled,
             beside=logger.neighbours.most if logger.neighbours is not None else 0,

@@ -88,33 +88,29 @@ class SubCommand:
     of `time.perf_counter` [s]; the start of a process includes its imports.
     """
 
-    def __init__(
-        self, run: Callable[[argparse.Namespace], int], examples: Sequence[str], add: Callable[[CommandParser], object]
-    ) -> None:
-        self._run, self._examples, self._add = run, examples, add
+    def __init__(self, run: Callable[..., int], examples: Sequence[str], add: Callable[[CommandParser], object]) -> None:
+        self.run, self._examples, self._add = run, examples, add
 
     def build_parser(self) -> CommandParser:
         """Return the parser of the command line."""
-        words = dict.fromkeys((self._run.__module__.rpartition(".")[2], self._run.__name__))
-        parser = CommandParser(" ".join(["legged", *words]), inspect.getdoc(self._run), *self._examples)
+        words = dict.fromkeys((self.run.__module__.rpartition(".")[2], self.run.__name__))
+        parser = CommandParser(" ".join(["legged", *words]), inspect.getdoc(self.run), *self._examples)
         self._add(parser)
         return parser
 
+    def parse(self, argv: list[str] | None) -> argparse.Namespace:
+        """Return the arguments of a command line, of this process if None."""
+        args = self.build_parser().parse_intermixed_args(argv)
+        args.words = sys.argv[1:] if argv is None else argv
+        args.start_s = STARTED_S if argv is None else time.perf_counter()
+        return args  # type: ignore[no-any-return]
+
     def main(self, argv: list[str] | None = None) -> int:
         """Run the command with these arguments, those of this process if None; return its exit code."""
-
-        def run(words: list[str] | None) -> int:
-            args = self.build_parser().parse_intermixed_args(words)
-            args.words = sys.argv[1:] if words is None else words
-            args.start_s = STARTED_S if words is None else time.perf_counter()
-            return self._run(args)
-
-        return run_main(run, argv)
+        return run_main(lambda words: self.run(self.parse(words)), argv)
 
 
-def sub_command(
-    *examples: str, add: Callable[[CommandParser], object]
-) -> Callable[[Callable[[argparse.Namespace], int]], SubCommand]:
+def sub_command(*examples: str, add: Callable[[CommandParser], object]) -> Callable[[Callable[..., int]], SubCommand]:
     """Make a function of parsed arguments a sub-command, whose exit code it returns. Its docstring is the description of the
     help, which ends with `examples`; `add` adds its arguments to the parser.
     """
