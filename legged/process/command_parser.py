@@ -2,7 +2,6 @@
 
 import argparse
 import re
-import shlex
 import sys
 import textwrap
 from typing import Any, NoReturn
@@ -40,12 +39,6 @@ class CommandParser(argparse.ArgumentParser):
         if unknown:
             message += suggest(unknown[1], [name for name in self._option_string_actions if name.startswith("--")], "options")
         super().error(message)
-
-    def arguments_of(self, example: str) -> list[str]:
-        """Return the arguments of an example, without the command and without a redirection of its output."""
-        words = shlex.split(example)
-        end = next((i for i, word in enumerate(words) if word in (">", "|")), len(words))
-        return words[len(self.prog.split()) : end]
 
 
 class Once(argparse.Action):

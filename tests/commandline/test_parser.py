@@ -5,11 +5,6 @@ import pytest
 from legged.process.command_parser import CommandParser
 
 
-def test_arguments_of_an_example_are_what_follows_the_program():
-    parser = CommandParser("legged runs table", "Do.", "legged runs table a", "legged runs table b")
-    assert parser.arguments_of("legged runs table --out 'x y' > a.txt") == ["--out", "x y"]
-
-
 @pytest.mark.parametrize("given", ["--num_envs", "--num-envs"])
 @pytest.mark.parametrize("form", ["{}=3", "{} 3"])
 def test_options_of_legged_gym_are_read_with_underscores_too(given, form):
