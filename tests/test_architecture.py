@@ -71,7 +71,7 @@ FLOORS = [  # from the ground up; each part imports from the floors below it onl
     {"commandline"},
     {"learning", "rendering", "deploy"},
     {"policies", "gymnasium_envs"},
-    {"play", "benchmarks"},
+    {"play"},
     {"evaluation"},
     {"episodes", "fitting", "migration", "simulated_robot"},
     {"sweeping"},
