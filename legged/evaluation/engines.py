@@ -1,6 +1,6 @@
 """The physics engines in which policies are measured: settings, labels and looks of curves."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -33,3 +33,8 @@ ENGINES = {
 def engine_of(name: str) -> Engine:
     """Return the engine of that name; an unknown engine is labelled by its name."""
     return ENGINES.get(name, Engine(name, ":", "x"))
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Return names of engines in the order of ENGINES, others last."""
+    return sorted(names, key=lambda name: [*ENGINES, name].index(name))

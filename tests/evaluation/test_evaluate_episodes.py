@@ -15,7 +15,7 @@ from legged.cli.evaluate import checkpoints, episodes, grid, policy
 from legged.cli.evaluate import gymnasium as in_gymnasium
 from legged.cli.runs import curves, evaluations
 from legged.errors import ConfigError
-from legged.evaluation.gymnasium_episodes import run_exported
+from legged.evaluation.episodes import run_exported
 
 pytestmark = pytest.mark.usefixtures("workplace")
 TASK = "half_cheetah"

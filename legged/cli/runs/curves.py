@@ -9,9 +9,8 @@ from pathlib import Path
 
 from legged.commandline.command import command
 from legged.errors import ConfigError
-from legged.evaluation.learning_curves import Log, common_time, labels, read_config, read_scalars
+from legged.evaluation.learning_curves import Log, common_time, labels, levels, outcomes, read_config, read_scalars
 from legged.evaluation.reports.charts import draw_charts
-from legged.evaluation.reports.curves import levels, outcomes
 from legged.learning.run_folder import own_run
 from legged.process.command_parser import CommandParser, add_import_argument
 from legged.process.paths import make_folder, ready_to_write, relative

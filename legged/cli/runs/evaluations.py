@@ -10,7 +10,7 @@ from rich.console import Console
 
 from legged.commandline.command import command
 from legged.errors import ConfigError
-from legged.evaluation.comparison import (
+from legged.evaluation.reports.comparison import (
     draw_comparison,
     episodes_comparison,
     grouped,

@@ -1,19 +1,16 @@
 """Pages in parts: written as one HTML file that needs no other, or as Markdown with its pictures in their own files."""
 
 import base64
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
+from legged.evaluation.reports import render
 from legged.evaluation.reports.charts import sheet
 from legged.evaluation.tables import markdown_table
 from legged.process.paths import write_text
-
-if TYPE_CHECKING:
-    from jinja2 import Environment
 
 SHORT = 32
 """Letters of a cell that stay on one line."""
@@ -113,6 +110,16 @@ class Listing:
 Part = Heading | Paragraph | Table | Figures | Picture | Listing
 
 
+def number(value: float | None, form: str = ".3f") -> Number:
+    """Return a number as a cell; a dash, which is not sorted, for None and for values that are not finite."""
+    return Number("-", None) if value is None or not math.isfinite(value) else Number(f"{value:{form}}", value)
+
+
+def between(interval: tuple[float, float], factor: float = 1.0, form: str = ".1f") -> str:
+    """Return an interval as text."""
+    return f"{factor * interval[0]:{form}} to {factor * interval[1]:{form}}"
+
+
 def write_pages(stem: Path, title: str, parts: Sequence[Part]) -> Path:
     """Write a page as <stem>.html and as <stem>.md, with its drawings as <stem>_<name>.svg; return the path of the first.
 
@@ -131,25 +138,10 @@ def write_pages(stem: Path, title: str, parts: Sequence[Part]) -> Path:
 # ---- HTML ------------------------------------------------------------------------------------------------------------
 
 
-@cache
-def _templates() -> "Environment":
-    from jinja2 import Environment, PackageLoader  # takes a while
-
-    found = Environment(loader=PackageLoader(__package__), autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    found.globals |= {"kind_of": lambda one: type(one).__name__, "pieces": _pieces, "SHORT": SHORT}
-    return found
-
-
-def render(template: str, **values: Any) -> str:
-    """Return a page from a template in the folder templates/; texts are escaped. A page holds its style and its script, and
-    its content security policy lets it load nothing else.
-    """
-    return _templates().get_template(template).render(values)
-
-
 def to_html(title: str, parts: Sequence[Part]) -> str:
     """Return a whole page, which holds its pictures too."""
-    return render("document.html", title=title, parts=parts)
+    kinds = {"kind_of": lambda one: type(one).__name__, "pieces": _pieces, "SHORT": SHORT}
+    return render("document.html", title=title, parts=parts, **kinds)
 
 
 def _pieces(text: str) -> list[str]:

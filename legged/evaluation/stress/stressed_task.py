@@ -51,14 +51,14 @@ def late(rows: Sequence[Disturbance], cfg: LeggedConfig) -> list[tuple[str, Any]
 
 
 def make_stressed(
-    cfg: LeggedConfig, rows: Sequence[Disturbance], device: torch.device, graph: bool, terrain: Terrain | None
-) -> LeggedRobot:
+    rows: Sequence[Disturbance], cfg: LeggedConfig, device: torch.device, graph: bool, terrain: Terrain | None
+) -> "StressedTask":
     """Build the task of a configuration with one robot for each of N `rows`."""
     kind: Any = task_class(cfg.task)
     own = {"rows": tuple(rows), "own_delay": cfg.control.actuator.delay, "__module__": __name__}
     stressed: Any = type(f"Stressed{kind.__name__}", (StressedTask, kind), own)
     other_ground = {} if terrain is None else {"terrain": terrain}  # a user's constructor may not know the argument
-    return stressed(override(cfg, late(rows, cfg)), device, graph, **other_ground)
+    return stressed(override(cfg, late(rows, cfg)), device, graph, **other_ground)  # type: ignore[no-any-return]
 
 
 class GivenMap(HeightMapErrors):
