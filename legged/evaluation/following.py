@@ -44,7 +44,13 @@ def evaluate_following(
     """
     start = time.perf_counter()
     head = {**setting.head, **setting.changes}
-    tracking = {} if grid is None else _tracking(setting, grid)
+    tracking: dict[str, Any] = {}
+    if grid is not None:
+        task, act = ready_to_track(setting, grid)
+        tracking = measure_tracking(task, act, grid)
+        if setting.policy.cfg.terrain.mesh_type != "plane":  # type: ignore[attr-defined]
+            tracking = {"rough": {"bumps": BUMPS * task.cfg.terrain.scale, **tracking}}
+        del task, act  # a GPU may not hold two
     success = success_over_difficulty(setting, sizes, robots) if sizes else None
     # The screen comes first: a full disk cannot take it away.
     shown = {**head, **tracking_of(tracking), "ground": "on rough ground, " if "rough" in tracking else ""}
@@ -72,15 +78,6 @@ def evaluate_following(
     return 0
 
 
-def _tracking(setting: Setting, grid: Grid) -> dict[str, Any]:
-    """Return the errors over the grid, under 'rough' for a task with terrain."""
-    task, act = ready_to_track(setting, grid)
-    figures = measure_tracking(task, act, grid)
-    if setting.policy.cfg.terrain.mesh_type == "plane":  # type: ignore[attr-defined]
-        return figures
-    return {"rough": {"bumps": BUMPS * task.cfg.terrain.scale, **figures}}
-
-
 # ---- in every engine -------------------------------------------------------------------------------------------------
 
 
@@ -88,8 +85,7 @@ def cross(setting: Setting, grid: Grid) -> int:
     """Measure the grid in every engine, the C engine on the CPU; print and draw. crossing.json is written after every engine.
     Return the exit code.
     """
-    path = setting.folder / "crossing.json"
-    failure: RunError | None = None
+    path, failure = setting.folder / "crossing.json", None
     result: dict[str, Any] = {
         "task": setting.policy.cfg.task,
         "checkpoint": setting.policy.checkpoint.name,
@@ -186,7 +182,11 @@ def evaluate_all_checkpoints(setting: Setting, grid: Grid, rmse: float = WALKING
         ConfigError: a checkpoint holds no time; nothing is measured then.
         RunError: the file can't be written.
     """
-    there = {path: _written_at(path) for path in checkpoints(setting.policy.folder).values()}
+    there = {}
+    for path in checkpoints(setting.policy.folder).values():
+        there[path] = (read_checkpoint(path).get("infos") or {}).get("wall_s")
+        if not isinstance(there[path], int | float):
+            raise ConfigError(f"{relative(path)}: says nothing of the time it was written at")
     task, act = ready_to_track(setting, grid)
     rows: list[dict[str, Any]] = []
     lost = 0
@@ -197,7 +197,7 @@ def evaluate_all_checkpoints(setting: Setting, grid: Grid, rmse: float = WALKING
         figures = measure_tracking(task, act, grid)
         lost += figures["contact_overflows"]
         errors = {name: figures[name]["mean"] for name in ("rmse_lin", "rmse_ang")}
-        rows.append({"iteration": iteration, "wall_s": seconds, **errors, "falls": figures["falls"]})
+        rows.append({"iteration": iteration, "wall_s": float(seconds), **errors, "falls": figures["falls"]})
         lin, ang = (float("nan") if error is None else error for error in errors.values())
         print(f"{iteration:9} {seconds:8.1f} {lin:20.3f} {ang:22.3f} {100 * figures['falls']:10.2f}", flush=True)
     first = next((row for row in rows if walks(row, rmse, falls)), None)
@@ -220,18 +220,6 @@ def evaluate_all_checkpoints(setting: Setting, grid: Grid, rmse: float = WALKING
     write_result(path, result)
     print(f"written: {relative(path)}")
     return 0
-
-
-def _written_at(path: Path) -> float:
-    """Return the time at which a checkpoint was written, since the start of its process [s].
-
-    Raises:
-        ConfigError: the checkpoint holds no time.
-    """
-    seconds = (read_checkpoint(path).get("infos") or {}).get("wall_s")
-    if not isinstance(seconds, int | float):
-        raise ConfigError(f"{relative(path)}: says nothing of the time it was written at")
-    return float(seconds)
 
 
 def walks(row: dict[str, Any], rmse: float, falls: float) -> bool:

@@ -9,6 +9,8 @@ success. These numbers hold for a robot half a metre high: lengths scale with `t
 import gc
 import json
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from itertools import chain, product
 from math import sqrt
 from pathlib import Path
 from typing import Any
@@ -20,14 +22,15 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.config import LeggedConfig, override
+from legged.config.dotted import value_at
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
-from legged.evaluation.engines import ENGINES, engine_of
+from legged.evaluation.engines import ENGINES, engine_of, in_order
 from legged.evaluation.intervals import wilson
-from legged.evaluation.json_forms import check_form
+from legged.evaluation.json_forms import ANY, NUMBER, check_form
 from legged.evaluation.measurement import Overflows, Setting
 from legged.evaluation.reports.charts import Chart, Line, draw_charts
-from legged.evaluation.result_file import SUCCESS, file_name
+from legged.evaluation.result_file import HEAD, POINT, TYPE, file_name
 from legged.evaluation.tables import screen_table
 from legged.evaluation.tiles import cell_for, on_terrain, tiles_of_sizes
 from legged.evaluation.velocity_grid import read_range, spaced
@@ -78,6 +81,14 @@ TYPES_HELP = (
 
 OPEN, REACHED, FELL, STUCK = range(4)
 """Outcomes of a robot."""
+PANELS = {
+    "stairs": ("stairs_up", "stairs_down"),
+    "narrow stairs": ("narrow_stairs_up", "narrow_stairs_down"),
+    "obstacles": ("obstacles",),
+    "slopes": ("slope_up", "slope_down"),
+    "rough slopes": ("rough_slope_up", "rough_slope_down"),
+}
+"""Types that share a panel; every other type has its own."""
 
 
 class Scores:
@@ -283,16 +294,6 @@ def _on_type(
 
 # ---- table and curves ------------------------------------------------------------------------------------------------
 
-PANELS = {
-    "stairs": ("stairs_up", "stairs_down"),
-    "narrow stairs": ("narrow_stairs_up", "narrow_stairs_down"),
-    "obstacles": ("obstacles",),
-    "slopes": ("slope_up", "slope_down"),
-    "rough slopes": ("rough_slope_up", "rough_slope_down"),
-}
-"""Types that share a panel; every other type has its own."""
-TRAINED_LABEL = "hardest of training"
-
 
 def print_success(success: dict[str, Any]) -> None:
     """Print a table with a line a point; sizes harder than those of training are marked."""
@@ -328,68 +329,51 @@ def with_other_engines(result: dict[str, Any], path: Path) -> list[dict[str, Any
     """Return `result`, and the results of other engines next to `path` (evaluation_<physics>.json) that are of the same
     checkpoint and were measured with the same fields changed.
     """
-    found = [result]
-    for engine in ENGINES:
-        other = path.with_name(file_name(engine))
-        if engine == result["physics"] or not other.is_file():
-            continue
-        try:
-            saved = json.loads(other.read_text(encoding="utf-8"))
-            check_form(saved, SUCCESS, str(other))
-            points = [point for entry in saved["success"]["types"].values() for point in entry["points"]]
-            drawable = "robots_per_point" in saved["success"] and all({"low", "high"} <= point.keys() for point in points)
+    found = {result["physics"]: result}
+    drawn = {"types": {ANY: {**TYPE, "points": [{**POINT, "low": NUMBER, "high": NUMBER}]}}, "robots_per_point": NUMBER}
+    for engine in ENGINES.keys() - found:
+        with suppress(OSError, ValueError):  # no file of this package: nothing to show
+            saved = json.loads(path.with_name(file_name(engine)).read_text(encoding="utf-8"))
+            check_form(saved, {**HEAD, "success": drawn}, str(path))
             same = all(saved.get(key) == result.get(key) for key in ("task", "checkpoint", "changes"))
-            if drawable and saved["physics"] == engine and same:
-                found.append(saved)
-        except (OSError, ValueError, KeyError):  # not a file of ours: nothing to show
-            continue
-    return sorted(found, key=lambda one: list(ENGINES).index(one["physics"]))
+            if same and saved["physics"] == engine:
+                found[engine] = saved
+    return [found[engine] for engine in in_order(found)]
 
 
 def draw_success(results: list[dict[str, Any]], path: Path) -> None:
     """Draw success over size with its intervals into a PNG file: a panel a kind of terrain, a line a type and an engine."""
     rule, robots = results[0]["success"]["definition"], results[0]["success"]["robots_per_point"]
-    text = (
-        f"{results[0]['task']}: robots that get {rule['distance_m']:.3g} m from their start within {rule['time_s']:g} s"
-        f"\n{robots} robots a point"
-    )
-    draw_charts(success_charts(results), path, text)
+    reached = f"get {rule['distance_m']:.3g} m from their start within {rule['time_s']:g} s"
+    draw_charts(success_charts(results), path, f"{results[0]['task']}: robots that {reached}\n{robots} robots a point")
 
 
 def success_charts(results: Sequence[dict[str, Any]]) -> list[Chart]:
     """Return a chart a kind of terrain: success over size, one line a type and engine."""
     found = []
     for title, types in panels_of([name for result in results for name in types_in(result)]).items():
-        entries = {
-            _label(name, result["physics"], types, results): types_in(result)[name]
-            for name in types
-            for result in results
-            if name in types_in(result)
-        }
-        found.append(success_chart(title, [(entry, success_line(label, entry)) for label, entry in entries.items()]))
+        lines = []
+        for name, result in product(types, results):
+            if entry := types_in(result).get(name):
+                words = [name.replace("_", " ")] if len(types) > 1 else []
+                words += [engine_of(result["physics"]).label] if len(results) > 1 else []
+                lines.append((entry, success_line(", ".join(words), entry)))
+        found.append(success_chart(title, lines))
     return found
 
 
 def types_in(result: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Return terrain type -> its measurements; an empty mapping for an evaluation without success."""
-    found: dict[str, dict[str, Any]] = result.get("success", {}).get("types", {})
-    return found
-
-
-def _label(name: str, physics: str, types: Sequence[str], results: Sequence[dict[str, Any]]) -> str:
-    """Return the words that tell a line from the others of its chart."""
-    words = [name.replace("_", " ")] if len(types) > 1 else []
-    return ", ".join([*words, *([engine_of(physics).label] if len(results) > 1 else [])])
+    return value_at(result, "success.types") or {}
 
 
 def success_line(label: str, entry: dict[str, Any]) -> Line:
     """Return success over size of one terrain type, with its intervals where the file has them."""
     points = sorted(entry["points"], key=lambda point: point["size"])
-    size, share = (np.array([point[key] for point in points], dtype=float) for key in ("size", "share"))
-    band = None
-    if all(isinstance(point.get(key), int | float) for point in points for key in ("low", "high")):
-        band = (np.array([point["low"] for point in points]), np.array([point["high"] for point in points]))
-    return Line(label, size, share, band, markers=True)
+    banded = all(isinstance(point.get(key), int | float) for point in points for key in ("low", "high"))
+    keys = ("size", "share", "low", "high") if banded else ("size", "share")
+    size, share, *band = (np.array([point[key] for point in points], dtype=float) for key in keys)
+    return Line(label, size, share, (band[0], band[1]) if band else None, markers=True)
 
 
 def success_chart(title: str, lines: Sequence[tuple[dict[str, Any], Line]]) -> Chart:
@@ -400,8 +384,8 @@ def success_chart(title: str, lines: Sequence[tuple[dict[str, Any], Line]]) -> C
     for entry, line in lines:
         if entry["trained_to"] is not None:
             ends.setdefault(float(entry["trained_to"]), []).append(line.name)
-    several = len(ends) > 1
-    walls = tuple((f"{TRAINED_LABEL}: {', '.join(names)}" if several else TRAINED_LABEL, end) for end, names in ends.items())
+    label = "hardest of training"
+    walls = tuple((f"{label}: {', '.join(names)}" if len(ends) > 1 else label, end) for end, names in ends.items())
     what, unit = lines[0][0]["what"], lines[0][0]["unit"]
     drawn = [line for _, line in lines]
     return Chart(f"success: {title}", f"{what} [{unit}]", drawn, unit=what, high=1.0, percent=True, walls=walls)
@@ -411,6 +395,5 @@ def panels_of(names: list[str]) -> dict[str, tuple[str, ...]]:
     """Return title -> types of a panel, for the types in `names`."""
     there = dict.fromkeys(names)
     shared = {title: tuple(name for name in types if name in there) for title, types in PANELS.items()}
-    panels = {title: types for title, types in shared.items() if types}
-    grouped = {name for types in panels.values() for name in types}
-    return panels | {name.replace("_", " "): (name,) for name in there if name not in grouped}
+    alone = [name for name in there if name not in chain.from_iterable(PANELS.values())]
+    return {title: types for title, types in shared.items() if types} | {name.replace("_", " "): (name,) for name in alone}

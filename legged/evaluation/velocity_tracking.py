@@ -74,26 +74,45 @@ def measure_tracking(task: LeggedRobot, act: Callable[[TensorDict], Tensor], gri
     `contact_overflows` counts robots times steps that lost contacts for want of memory; `estimates` holds the errors of a
     policy with an estimator.
     """
-    device = torch.device(task.device)
-    commands = torch.tensor(grid.cells, dtype=torch.float32, device=device).repeat_interleave(grid.robots, dim=0)
+    commands = torch.tensor(grid.cells, dtype=torch.float32, device=torch.device(task.device))
+    sums = {name: torch.zeros_like(value) for name, value in _now(task).items()}
+    estimates = EstimateMeter(task, act)
+
+    def add(observations: TensorDict, alive: Tensor) -> None:
+        for name, value in _now(task).items():
+            sums[name] += torch.where(alive if value.dim() == 1 else alive.unsqueeze(1), value, 0.0)
+        estimates.add(observations, alive)
+
+    fell, lost = hold(task, act, commands.repeat_interleave(grid.robots, dim=0), grid.settle_s, grid.hold_s, add)
+    measured_s = (round(grid.hold_s / task.dt) - round(grid.settle_s / task.dt)) * task.dt
+    return {**_summary(task, grid, sums, fell, measured_s), **estimates.found(), "contact_overflows": lost}
+
+
+@torch.inference_mode()
+def hold(
+    task: LeggedRobot,
+    act: Callable[[TensorDict], Tensor],
+    commands: Tensor,
+    settle_s: float,
+    hold_s: float,
+    add: Callable[[TensorDict, Tensor], None],
+) -> tuple[Tensor, int]:
+    """Let robots follow constant commands (N, 3) for `hold_s` [s]; after each step that follows the first `settle_s`, call
+    `add` with the observations and the flags (N,) of the robots that are in their first episode still. Return the flags of
+    those that fell in it, and how often a robot lost contacts.
+    """
     task.reset()
     observations = task.hold_commands(commands)
-    sums = {name: torch.zeros_like(value) for name, value in _now(task).items()}
-    overflows, estimates = Overflows(), EstimateMeter(task, act)
-    alive = torch.ones(task.num_envs, dtype=torch.bool, device=device)
-    fell = torch.zeros_like(alive)
-    settle, steps = round(grid.settle_s / task.dt), round(grid.hold_s / task.dt)
-    for step in range(steps):
+    alive = torch.ones(task.num_envs, dtype=torch.bool, device=commands.device)
+    fell, overflows = torch.zeros_like(alive), Overflows()
+    for step in range(round(hold_s / task.dt)):
         observations, _, _, extras = task.step(act(observations))
         overflows.add(extras)
         fell |= alive & task.terminated_buf
         alive &= ~task.reset_buf
-        if step >= settle:
-            for name, value in _now(task).items():
-                sums[name] += torch.where(alive if value.dim() == 1 else alive.unsqueeze(1), value, 0.0)
-            estimates.add(observations, alive)
-    result = _summary(task, grid, sums, fell, (steps - settle) * task.dt)
-    return {**result, **estimates.found(), "contact_overflows": overflows.total(task)}
+        if step >= round(settle_s / task.dt):
+            add(observations, alive)
+    return fell, overflows.total(task)
 
 
 def _now(task: LeggedRobot) -> dict[str, Tensor]:
@@ -168,32 +187,31 @@ class EstimateMeter:
 
     def __init__(self, task: BaseTask, act: Callable[[TensorDict], Tensor]) -> None:
         """Measure the policy `act`, if it is an `Actor` with an estimator."""
-        network = getattr(act, "network", None)
-        self._network = network if isinstance(network, EstimatingModel) else None
-        if self._network is not None:
+        self._task, self._network = task, getattr(act, "network", None)
+        if isinstance(self._network, EstimatingModel):
             self._errors = EstimationErrors(task.observation_groups[ESTIMATED])
             self._squares = torch.zeros(task.num_envs, len(self._errors.names), device=torch.device(task.device))
             self._counted = torch.zeros(task.num_envs, device=self._squares.device)
-            self._units = [unit_of(getattr(type(task), f"_obs_{name}")) for name in self._errors.names]
 
     def add(self, observations: TensorDict, counted: Tensor) -> None:
         """Add the errors of the estimates from `observations` for the robots in `counted` (N,)."""
-        if self._network is None:
-            return
-        squares = self._errors.squares(self._network.estimate(observations), observations[ESTIMATED])
-        self._squares += torch.where(counted.unsqueeze(1), squares, 0.0)
-        self._counted += counted
+        if isinstance(self._network, EstimatingModel):
+            squares = self._errors.squares(self._network.estimate(observations), observations[ESTIMATED])
+            self._squares += torch.where(counted.unsqueeze(1), squares, 0.0)
+            self._counted += counted
 
     def found(self) -> dict[str, Any]:
         """Return, as `estimates`, for each term the root mean square error of its numbers over robots and steps, with its
         unit; null if no step was counted. Return nothing for a policy without an estimator.
         """
-        if self._network is None:
+        if not isinstance(self._network, EstimatingModel):
             return {}
-        count = float(self._counted.double().sum())
+        count, found = float(self._counted.double().sum()), {}
         means = (self._squares.double().sum(dim=0) / max(count, 1.0)).tolist()
-        each = zip(self._errors.names, means, self._units, strict=True)
-        return {"estimates": {name: {"rmse": math.sqrt(mean) if count else None, "unit": unit} for name, mean, unit in each}}
+        for name, mean in zip(self._errors.names, means, strict=True):
+            unit = unit_of(getattr(type(self._task), f"_obs_{name}"))
+            found[name] = {"rmse": math.sqrt(mean) if count else None, "unit": unit}
+        return {"estimates": found}
 
 
 def print_tracking(result: dict[str, Any]) -> None:

@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.table import Table
 
 from legged.cli.evaluate.common import check_number
 from legged.commandline.command import run_main
 from legged.errors import ConfigError
-from legged.evaluation.playback import SETTLING_S, Played, follow, play
+from legged.evaluation.playback import SETTLING_S, follow, play
 from legged.evaluation.tables import screen_table
 from legged.evaluation.velocity_grid import AXES, AXIS, Grid, axis_values, check_size
 from legged.learning.run_folder import CONFIG_FILE
@@ -116,8 +117,8 @@ def evaluate(argv: list[str] | None) -> int:
         said = []
         for path, policy in zip(files, policies, strict=True):
             rows = play(robot, policy, commands, seconds, args.friction)
-            _print_played(rows, path.name)
-            said.append({"file": str(path), "commands": [_row(row) for row in rows]})
+            Console(width=100).print(_table(rows, path.name))
+            said.append({"file": str(path), "commands": rows})
         result = {"robot": robot.name, "friction": args.friction, "seconds": seconds, "policies": said}
     if args.out is not None:
         make_folder(args.out)
@@ -210,17 +211,14 @@ def _marks(policy: ForeignPolicy) -> dict[str, float]:
     return found
 
 
-def _row(row: Played) -> dict[str, Any]:
-    """Return a command's figures for JSON, with null for undefined ones."""
-    velocity = None if row.fell_after is not None else list(row.velocity)
-    height = None if velocity is None else row.height
-    return {"command": list(row.command), "velocity": velocity, "lowest_base": height, "fell_after": row.fell_after}
+def _table(rows: list[dict[str, Any]], name: str) -> Table:
+    def text(values: list[float] | None) -> str:
+        return "-" if values is None else " ".join(f"{value:6.2f}" for value in values)
 
-
-def _print_played(rows: list[Played], name: str) -> None:
     lines = []
     for row in rows:
-        command, reached = (" ".join(f"{value:6.2f}" for value in values) for values in (row.command, row.velocity))
-        lines.append([command, reached, f"{row.height:.3f}", "-" if row.fell_after is None else f"{row.fell_after:.2f} s"])
+        height, fell_after = row["lowest_base"], row["fell_after"]
+        ends = ("-" if height is None else f"{height:.3f}", "-" if fell_after is None else f"{fell_after:.2f} s")
+        lines.append([text(row["command"]), text(row["velocity"]), *ends])
     title = f"{name}: velocities after {SETTLING_S:g} s, base frame [m/s, m/s, rad/s]"
-    Console(width=100).print(screen_table(title, ("command", "reached", "lowest base [m]", "fell after"), lines, left=()))
+    return screen_table(title, ("command", "reached", "lowest base [m]", "fell after"), lines, left=())

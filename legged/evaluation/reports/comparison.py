@@ -284,8 +284,8 @@ def _table(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> Ta
         row: list[Cell] = [label, *(_text(_figure(one), form, factor) for one in found)]
         for one in found[1:]:
             more = _difference(found[0], one)
-            apart = more is not None and more[1] is not None and not more[1][0] <= 0.0 <= more[1][1]
-            row.append(_text(more, f"+{form}", factor) + " *" * apart)
+            clear = more is not None and more[1] is not None and not more[1][0] <= 0.0 <= more[1][1]
+            row.append(_text(more, f"+{form}", factor) + " *" * clear)
         rows.append(row)
     return Table(["measure", *names, *(f"{name} - {names[0]}" for name in names[1:])], rows)
 

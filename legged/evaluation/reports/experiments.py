@@ -72,7 +72,7 @@ def _shared_row(group: Sequence[Record], beside: Path, ending: str) -> dict[str,
     for name, form in FORMS.items():
         known = [cell.value for row in rows if isinstance(cell := row[name], Number) and cell.value is not None]
         shared[name] = number(mean(known) if known else None, form)
-    seeds = [value for record in group if (value := _whole(record.at("env.seed"))) is not None]
+    seeds = [seed for record in group if isinstance(seed := record.at("env.seed"), int)]
     shared["seed"] = Number(", ".join(f"{seed:,d}" for seed in sorted(seeds)), min(seeds, default=None))
     shared["evaluated"] = ", ".join(dict.fromkeys(text for row in rows if (text := text_of(row["evaluated"]))))
     shared["what changed"] = what_changed(group[0], named=False)
@@ -80,9 +80,10 @@ def _shared_row(group: Sequence[Record], beside: Path, ending: str) -> dict[str,
 
 
 def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
-    """Return the row of a run, by column."""
+    """Return the row of a run, by column; figures of evaluations are those in the first engine of ENGINES that has one."""
     timing = record.timing
-    judged = _judged(record)
+    by_engine = {result["physics"]: result for result in record.results}
+    judged = by_engine[in_order(by_engine)[0]] if by_engine else {}
     tracking = tracking_of(judged)
     figures = {
         "RMSE [m/s]": value_at(tracking, "rmse_lin.mean"),
@@ -104,11 +105,11 @@ def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
         "what changed": what_changed(record),
         "status": record.status,
         "iterations": number(record.done, ",.0f"),
-        "seed": number(_whole(record.at("env.seed")), ",.0f"),
+        "seed": number(seed if isinstance(seed := record.at("env.seed"), int) else None, ",.0f"),
         "evaluated": record.another_policy(judged),
         **{name: number(value, FORMS[name]) for name, value in figures.items()},
         "robots": number(record.robots, ",.0f"),
-        "device": ("" if timing is None else "CPU" if timing.device == "cpu" else timing.device),
+        "device": "" if timing is None else "CPU" if timing.device == "cpu" else timing.device,
         "commit": Mono(record.code.commit[:10] + ("+" if record.code.files else "")),
     }
 
@@ -132,16 +133,6 @@ def _began(record: Record, beside: Path, ending: str) -> Cell:
     return text
 
 
-def _whole(value: Any) -> int | None:
-    return value if isinstance(value, int) else None
-
-
 def _last(record: Record, tag: str) -> float | None:
     """Return the last value of a curve, as a running mean."""
     return float(smooth(record.scalars[tag][1])[-1]) if tag in record.scalars else None
-
-
-def _judged(record: Record) -> dict[str, Any]:
-    """Return the evaluation of a run in the first engine of ENGINES that has one; an empty mapping without evaluations."""
-    by_engine = {result["physics"]: result for result in record.results}
-    return by_engine[in_order(by_engine)[0]] if by_engine else {}

@@ -22,7 +22,6 @@ from legged.learning.run_folder import CODE_FILE, CONFIG_FILE, NOTE_FILE, checkp
 from legged.learning.timing import Timing, read_timing
 from legged.registry import task_config
 
-STAMP = re.compile(r"(\d{4}-\d{2}-\d{2}_\d{2}-\d{2}-\d{2})(?:_(.*))?")
 FILMS = ("film.gif", "play.gif", "play.mp4")
 """Films of the policy; the first that exists is shown."""
 NAMES = ("train.runner.run_name", "train.runner.experiment_name", "train.runner.report", "train.runner.film", "task")
@@ -34,6 +33,8 @@ DEEPEST = 3
 """Levels of folders in which runs are searched: logs, tasks, runs."""
 QUIET_S = 3600.0
 """A training that has written nothing for this long has ended, even if a process has its number [s]."""
+QUIET_ELSEWHERE_S = 120.0
+"""The same for a training on another machine [s]."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +98,7 @@ class Record:
     @property
     def name(self) -> str:
         """Name of the folder, after that of its experiment."""
-        folder = self.folder.resolve()
-        return f"{folder.parent.name}/{folder.name}"
+        return "/".join(self.folder.resolve().parts[-2:])
 
     @property
     def robots(self) -> int | None:
@@ -175,11 +175,9 @@ def read_record(folder: Path) -> Record:
 
 
 def _began(folder: Path) -> datetime:
-    """Return the start of a run, from the name of its folder, else from its configuration's file."""
-    match = STAMP.match(folder.resolve().name)
+    """Return the start of a run, from the beginning of its folder's name, else from its configuration's file."""
     with suppress(ValueError):
-        if match:
-            return datetime.strptime(match[1], "%Y-%m-%d_%H-%M-%S")
+        return datetime.strptime(folder.resolve().name[:19], "%Y-%m-%d_%H-%M-%S")
     return datetime.fromtimestamp((folder / CONFIG_FILE).stat().st_mtime)
 
 
@@ -208,17 +206,14 @@ def is_running(folder: Path) -> bool:
     """
     for path in folder.glob("events.out.tfevents.*"):
         match = re.fullmatch(r"events\.out\.tfevents\.\d+\.(.*)\.(\d+)\.\d+", path.name)
-        if match is None:
-            continue
         with suppress(OSError):
-            silent_s = time.time() - path.stat().st_mtime
-            if match[1] != socket.gethostname():
-                if silent_s < 120.0:
-                    return True
-            elif silent_s < QUIET_S:
-                with suppress(PermissionError):  # the process exists and belongs to another user
+            here = match is not None and match[1] == socket.gethostname()
+            if match is None or time.time() - path.stat().st_mtime >= (QUIET_S if here else QUIET_ELSEWHERE_S):
+                continue
+            with suppress(PermissionError):  # the process exists and belongs to another user
+                if here and match is not None:
                     os.kill(int(match[2]), 0)  # signal 0 only checks that the process exists
-                return True
+            return True
     return False
 
 
@@ -229,7 +224,7 @@ def read_code(folder: Path) -> Code:
     except OSError:
         return Code()
     head, *rest = text.splitlines() or [""]
-    commit = next((line.removeprefix("commit ") for line in rest[:1] if line.startswith("commit ")), "")
+    commit = rest[0].removeprefix("commit ") if rest and rest[0].startswith("commit ") else ""
     lines = [line for line in rest if line[:1] in ("+", "-") and not line.startswith(("+++ ", "--- "))]
     files = sum(line.startswith("diff --git ") for line in rest)
     added = sum(line[0] == "+" for line in lines)

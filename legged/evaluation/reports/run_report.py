@@ -55,6 +55,13 @@ FILMING: list[subprocess.Popen] = []
 """Filming processes that this process has started."""
 LONGEST_DIFF = 200_000
 """Most letters of a difference in the page; its file holds all of it."""
+ON_GRID = (
+    "Without noise and pushes, on a grid of commands: root mean square of the error over time, mean of the cells. The"
+    " interval of falls is Wilson's. A cell of the maps is the mean over the third command."
+)
+ON_TERRAIN = (
+    "Robots that get out of a tile of each size, with Wilson's interval of 95 %; a dotted line is the hardest of training."
+)
 OVER_TRAINING = {
     "Train/mean_reward": ("return", 1.0, ".2f"),
     "Train/std_reward": ("standard deviation of the return", 1.0, ".2f"),
@@ -154,8 +161,7 @@ def _film(record: Record) -> list[Part]:
 
 def _differences(record: Record) -> list[Part]:
     """Return the settings in which a run differs from its task."""
-    heading = Heading("Settings other than the task's")
-    found = from_task_file(record)
+    heading, found = Heading("Settings other than the task's"), from_task_file(record)
     if found is None:
         told = f", and `{command_on(record, 'runs report')}` says where it is" if record.given is not None else ""
         text = f"There is no task '{record.task}' here to compare with{told}; config.yaml has all settings."
@@ -206,45 +212,21 @@ def _evaluations(record: Record) -> list[Part]:
             parts.append(Paragraph(f"In {label} it was made with {changes_text(result)}."))
     following = [(label, result) for label, result in results if "episodes" not in result]
     tracked = [(label, tracking_of(result)) for label, result in following if has_tracking(result)]
-    if tracked:
-        parts += [
-            Paragraph(
-                "Without noise and pushes, on a grid of commands: root mean square of the error over time, mean of the cells."
-                " The interval of falls is Wilson's. A cell of the maps is the mean over the third command."
-            ),
-            Table(
-                [
-                    *("engine", "velocity RMSE [m/s]", "worst cell", "yaw rate RMSE [rad/s]", "worst cell", "falls [%]"),
-                    *("95 % interval", "cost of transport"),
-                ],
-                [_tracking_row(label, tracking) for label, tracking in tracked],
-            ),
-        ]
+    rows: list[list[Cell]] = []
+    for label, tracking in tracked:
+        counted = falls_of(tracking)
+        errors = [number(tracking[name][part]) for name in ("rmse_lin", "rmse_ang") for part in ("mean", "worst")]
+        falls = [number(100.0 * tracking["falls"], ".2f"), between(wilson(*counted), 100.0, ".2f") if counted else "-"]
+        rows.append([label, *errors, *falls, number(tracking.get("cost_of_transport"), ".2f")])
+    heads = ["engine", "velocity RMSE [m/s]", "worst cell", "yaw rate RMSE [rad/s]", "worst cell", "falls [%]"]
+    parts += [Paragraph(ON_GRID), Table([*heads, "95 % interval", "cost of transport"], rows)] if rows else []
     maps = [drawing for label, tracking in tracked for drawing in _heat_maps(tracking, label)]
     parts += [Figures("tracking", maps, "velocity and yaw rate errors over commands")] if maps else []
     success = [curves(chart) for chart in success_charts([result for _, result in following])]
-    if success:
-        parts += [
-            Paragraph(
-                "Robots that get out of a tile of each size, with Wilson's interval of 95 %; a dotted line is the hardest of"
-                " training."
-            ),
-            Figures("success", success, "success over difficulty"),
-        ]
-    return parts + [
-        part for label, result in results if "episodes" in result for part in _episodes(label, result["episodes"])
-    ]
-
-
-def _tracking_row(label: str, tracking: dict[str, Any]) -> list[Cell]:
-    counted = falls_of(tracking)
-    return [
-        label,
-        *(number(tracking[name][part]) for name in ("rmse_lin", "rmse_ang") for part in ("mean", "worst")),
-        number(100.0 * tracking["falls"], ".2f"),
-        "-" if counted is None else between(wilson(*counted), 100.0, ".2f"),
-        number(tracking.get("cost_of_transport"), ".2f"),
-    ]
+    parts += [Paragraph(ON_TERRAIN), Figures("success", success, "success over difficulty")] if success else []
+    for label, result in results:
+        parts += _episodes(label, result["episodes"]) if "episodes" in result else []
+    return parts
 
 
 def _heat_maps(tracking: dict[str, Any], label: str) -> list[str]:

@@ -16,7 +16,7 @@ from torch import Tensor
 from legged.config import LeggedConfig, override
 from legged.errors import ConfigError
 from legged.evaluation.intervals import mean_of_shares
-from legged.evaluation.measurement import Overflows, Setting, warn_of_overflows
+from legged.evaluation.measurement import Setting, warn_of_overflows
 from legged.evaluation.result_file import stress_name, write_result
 from legged.evaluation.stress.stressed_task import GIVEN, StressedTask, declared, make_stressed
 from legged.evaluation.stress.table import NOMINAL, WRITTEN_FOR, Disturbance, table
@@ -24,6 +24,7 @@ from legged.evaluation.success import FORWARD, TIME_S, point, run_out, share_of,
 from legged.evaluation.tables import screen_table
 from legged.evaluation.tiles import dividing_cell, tiles_apart
 from legged.evaluation.velocity_grid import axes_of, number_or_null
+from legged.evaluation.velocity_tracking import hold
 from legged.figures import figure
 from legged.mdp.actuator_network import NetworkWeights
 from legged.mdp.tracking_error import velocity_error
@@ -62,7 +63,9 @@ SETTING_LINES = ("nominal", "together")
 def settings(cfg: LeggedConfig, engine: str) -> dict[str, list[tuple[str, Any]]]:
     """Return name -> overrides of the solver settings to try, besides the task's own, that engine and motors allow."""
     found: dict[str, list[tuple[str, Any]]] = {}
-    if can_halve_step(cfg):
+    network = cfg.control.actuator.network
+    # An LSTM of the motors advances with every step of the length that it was trained with.
+    if not network or NetworkWeights.load(network).kind != "lstm":
         found[HALF_STEP] = [("sim.dt", 0.5 * cfg.sim.dt), ("control.decimation", 2 * cfg.control.decimation)]
         if cfg.control.actuator.delay[1]:  # in physics steps
             found[HALF_STEP] += [("control.actuator.delay", [2 * steps for steps in cfg.control.actuator.delay])]
@@ -72,28 +75,15 @@ def settings(cfg: LeggedConfig, engine: str) -> dict[str, list[tuple[str, Any]]]
     return found
 
 
-def can_halve_step(cfg: LeggedConfig) -> bool:
-    """Return whether a task can be simulated with half its time step. An LSTM of the motors can't, because it advances with
-    every step of the length that it was trained with.
-    """
-    network = cfg.control.actuator.network
-    return not network or NetworkWeights.load(network).kind != "lstm"
-
-
 def check_asked(changes: Sequence[tuple[str, Any]]) -> None:
-    """Check that the command line randomises no property that the lines of the table set.
-
-    Raises:
-        ConfigError: it randomises one.
-    """
+    """Check that the command line randomises no property that the lines of the table set."""
     ranges = "domain_rand.ranges"
     for key, value in changes:
-        names = value if key == ranges and isinstance(value, dict) else (key.removeprefix(f"{ranges}.").split(".")[0],)
+        names = value if key == ranges and isinstance(value, dict) else [key.removeprefix(f"{ranges}.").split(".")[0]]
         for name in names if key.startswith(ranges) else ():
             if name in GIVEN:
-                raise ConfigError(
-                    f"command line: {ranges}.{name}: legged evaluate stress sets it in each of its lines; leave it out"
-                )
+                where = f"command line: {ranges}.{name}"
+                raise ConfigError(f"{where}: legged evaluate stress sets it in each of its lines; leave it out")
 
 
 class Bench:
@@ -160,20 +150,16 @@ class Bench:
         specs = [TileSpec(name, round(size * self.scale, 6)) for name, size in GROUND.items()]
         found = self._run_out([NOMINAL] * (len(specs) * self.robots), specs)
         outcomes, times = (values.view(len(specs), self.robots) for values in found)
-        return {
-            spec.type: {
-                "unit": TERRAIN_TYPES[spec.type].unit,
-                "what": TERRAIN_TYPES[spec.type].what,
-                **point(spec.size, *of_type),
-            }
-            for spec, *of_type in zip(specs, outcomes, times, strict=True)
-        }
+        ground = {}
+        for spec, *of_type in zip(specs, outcomes, times, strict=True):
+            kind = TERRAIN_TYPES[spec.type]
+            ground[spec.type] = {"unit": kind.unit, "what": kind.what, **point(spec.size, *of_type)}
+        return ground
 
     def on_flat(self, rows: Sequence[Disturbance], changes: Sequence[tuple[str, Any]] = ()) -> list[dict[str, Any]]:
         """Return the figures of each line's robots that follow commands on a plane."""
         per_robot = [row for row in rows for _ in range(self.robots)]
-        axes = axes_of(self.cfg)
-        ends = torch.tensor([[abs(axis[end]) for axis in axes.values()] for end in (0, -1)])
+        ends = torch.tensor([[abs(axis[end]) for axis in axes_of(self.cfg).values()] for end in (0, -1)])
         parts = torch.tensor(COMMANDS)
         commands = torch.where(parts < 0.0, parts * ends[0], parts * ends[1])
         turns = torch.arange(self.robots) % len(COMMANDS)
@@ -184,9 +170,8 @@ class Bench:
         ]
         task, act = self._build(per_robot, own, changes, None)
         error, fell = self._follow(task, act, commands[turns].repeat(len(rows), 1))
-        return [
-            followed(*of_row, self.limit) for of_row in zip(error.view(len(rows), -1), fell.view(len(rows), -1), strict=True)
-        ]
+        by_row = zip(error.view(len(rows), -1), fell.view(len(rows), -1), strict=True)
+        return [followed(*of_row, self.limit) for of_row in by_row]
 
     def _build(
         self,
@@ -204,10 +189,7 @@ class Bench:
         return restore(self.setting.policy, changes, self.setting.device, self.setting.graph, terrain, make)
 
     def _run_out(
-        self,
-        rows: Sequence[Disturbance],
-        specs: Sequence[TileSpec],
-        last: Sequence[tuple[str, Any]] = (),
+        self, rows: Sequence[Disturbance], specs: Sequence[TileSpec], last: Sequence[tuple[str, Any]] = ()
     ) -> tuple[Tensor, Tensor]:
         """Return the outcomes (N,) of robots that are shared out among tiles, and their times [s]; `last` as for `_build`."""
         own = to_run_out(self.cfg, len(rows))
@@ -217,26 +199,18 @@ class Bench:
         self.lost += lost
         return scores.outcome.cpu(), scores.time_s.cpu()
 
-    @torch.inference_mode()
     def _follow(self, task: StressedTask, act: Callable[[TensorDict], Tensor], commands: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean square error of each robot's velocity in its first episode (N,) [m^2/s^2], NaN for robots that fell
         before the measurement began, and flags of those that fell (N,).
         """
-        task.reset()
-        observations = task.hold_commands(commands.to(task.device))
-        alive = torch.ones(task.num_envs, dtype=torch.bool, device=task.device)
-        fell = torch.zeros_like(alive)
         total, steps = (torch.zeros(task.num_envs, device=task.device) for _ in range(2))
-        overflows = Overflows()
-        for step in range(round(HOLD_S / task.dt)):
-            observations, _, _, extras = task.step(act(observations))
-            overflows.add(extras)
-            fell |= alive & task.terminated_buf
-            alive &= ~task.reset_buf
-            if step >= round(SETTLE_S / task.dt):
-                total += torch.where(alive, velocity_error(task.commands, task.base_lin_vel), 0.0)
-                steps += alive
-        self.lost += overflows.total(task)
+
+        def add(_: TensorDict, alive: Tensor) -> None:
+            total.add_(torch.where(alive, velocity_error(task.commands, task.base_lin_vel), 0.0))
+            steps.add_(alive)
+
+        fell, lost = hold(task, act, commands.to(task.device), SETTLE_S, HOLD_S, add)
+        self.lost += lost
         return (total / steps).cpu(), fell.cpu()
 
 
@@ -254,11 +228,8 @@ def score(lines: Sequence[dict[str, Any]], ground: dict[str, Any]) -> dict[str, 
     stairs and on the flat, and over new ground; with its interval of 95 % and the means of the three parts.
     """
     disturbed = [line for line in lines if line["name"] != NOMINAL.name]
-    parts = {
-        "stairs": [line["stairs"] for line in disturbed if "stairs" in line],
-        "flat": [line["flat"] for line in disturbed],
-        "ground": list(ground.values()),
-    }
+    parts = {name: [line[name] for line in disturbed if name in line] for name in ("stairs", "flat")}
+    parts["ground"] = list(ground.values())
     counts = {name: [(one["successes"], one["robots"]) for one in found] for name, found in parts.items()}
     value, (low, high) = mean_of_shares([one for found in counts.values() for one in found])
     means = {name: mean_of_shares(found)[0] for name, found in counts.items() if found}
@@ -285,7 +256,7 @@ def evaluate_stress(bench: Bench, full: bool) -> int:
     few = [row for row in bench.rows if full or row.name in SETTING_LINES]
     others = {}
     tried = settings(bench.cfg, engine) if full or bench.whole else {}
-    if tried and not can_halve_step(bench.cfg):
+    if tried and HALF_STEP not in tried:
         print(f"{HALF_STEP}: left out, because the motors' LSTM (control.actuator.network) knows its own alone", flush=True)
     for name, changes in tried.items():
         print(f"{name}: {len(few)} lines", flush=True)
@@ -322,13 +293,10 @@ def evaluate_stress(bench: Bench, full: bool) -> int:
 
 def rows_of(result: dict[str, Any]) -> list[tuple[str, str, str, dict[str, Any] | None, dict[str, Any] | None]]:
     """Return the rows of the table: kind (of COLORS), name, description, and figures of success and of the flat."""
-    rows = [
-        ("combined" if line["name"] in COMBINED else "table", line["name"], line["what"], line.get("stairs"), line["flat"])
-        for line in result["lines"]
-    ]
+    named = [("combined" if line["name"] in COMBINED else "table", line["name"], line) for line in result["lines"]]
     for name, lines in result["settings"].items():
-        for line in lines:
-            rows.append(("settings", f"{name}: {line['name']}", line["what"], line.get("stairs"), line["flat"]))
+        named += [("settings", f"{name}: {line['name']}", line) for line in lines]
+    rows = [(kind, name, line["what"], line.get("stairs"), line["flat"]) for kind, name, line in named]
     for name, entry in result["ground"].items():
         what = f"{entry['what']} {entry['size']:.3g} {entry['unit']}"
         rows.append(("ground", f"{name.replace('_', ' ')}, {entry['size']:.3g} {entry['unit']}", what, entry, None))
