@@ -280,5 +280,5 @@ def levels(logs: Sequence[Log]) -> list[Chart]:
     found = [Chart("mean terrain level by type", "iteration", lines(LEVEL, 1), level=level)]
     for moved, way in (("promoted", "up"), ("demoted", "down")):
         shares = lines(f"Terrain/{moved}_", 25)
-        found.append(Chart(f"episodes after which a robot moves {way}", "iteration", shares, high=1.0, percent=True))
+        found.append(Chart(f"episodes after which a robot moves {way}", "iteration", shares, percent=True))
     return [chart for chart in found if any(len(line.x) for line in chart.lines)]

@@ -96,14 +96,9 @@ def check_result(result: Any, where: str) -> None:
         ConfigError: a field is missing or has another type.
     """
     damaged, there = f"{where}: is not the result of an evaluation", result if isinstance(result, dict) else {}
-    if "episodes" in there:
-        check_form(result, {**HEAD, "episodes": EPISODES}, damaged)
-    elif "rough" in there:
-        check_form(result, {**HEAD, **SUCCESS, "rough": TRACKING}, damaged)
-    elif "success" in there and not TRACKING.keys() & there.keys():  # `legged evaluate terrain` alone
-        check_form(result, {**HEAD, **SUCCESS}, damaged)
-    else:
-        check_form(result, {**HEAD, **SUCCESS, **TRACKING}, damaged)
+    alone = "success" in there and not TRACKING.keys() & there.keys()  # from `legged evaluate terrain`
+    tracking: dict[str, Any] = {"rough": TRACKING} if "rough" in there else {} if alone else TRACKING
+    check_form(result, {**HEAD, "episodes": EPISODES} if "episodes" in there else {**HEAD, **SUCCESS, **tracking}, damaged)
 
 
 def device_name(device: torch.device) -> str:

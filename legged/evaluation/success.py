@@ -8,7 +8,7 @@ success. These numbers hold for a robot half a metre high: lengths scale with `t
 
 import gc
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import chain, product
 from math import sqrt
@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import torch
 from rich.console import Console
-from tensordict import TensorDict
 from torch import Tensor
 
 from legged.config import LeggedConfig, override
@@ -35,6 +34,7 @@ from legged.evaluation.tables import screen_table
 from legged.evaluation.tiles import cell_for, on_terrain, tiles_of_sizes
 from legged.evaluation.velocity_grid import read_range, spaced
 from legged.math import uniform, yaw_of
+from legged.policies.episodes import Policy
 from legged.policies.restore import restore, undisturbed
 from legged.terrain import METRES, TERRAIN_TYPES, hardest_difficulty, terrain_types, tile_size
 
@@ -162,10 +162,10 @@ def chosen_sizes(cfg: LeggedConfig, asked: str | None, full: bool, scale: float)
 def _named_sizes(name: str, text: str) -> tuple[float, ...]:
     """Return the named sizes of a type, '0.25' or '0.1:0.2:0.05', in its unit."""
     flag, kind = f"--types: {name}", TERRAIN_TYPES[name]
-    low, high, step = read_range(flag, text, f"{name}=0.1:0.2:0.05")
+    given = low, high, _ = read_range(flag, text, f"{name}=0.1:0.2:0.05")
     if not SMALLEST <= low <= high <= kind.largest:
         raise ConfigError(f"{flag}: sizes are at least {SMALLEST:g} and at most {kind.largest:g} {kind.unit}, got '{text}'")
-    return tuple(spaced(flag, text, low, high, step, "sizes", MOST_SIZES))
+    return tuple(spaced(flag, text, given, "sizes", MOST_SIZES))
 
 
 def trained_to(cfg: LeggedConfig) -> dict[str, float]:
@@ -198,9 +198,7 @@ def place(task: LeggedRobot, robots: int) -> None:
     task.terrain_curriculum.place_at(2 * (index // robots), 2 * (index % robots % variants))
 
 
-def measure_success(
-    task: LeggedRobot, act: Callable[[TensorDict], Tensor], sizes: Sequence[float], robots: int
-) -> tuple[list[dict[str, Any]], int]:
+def measure_success(task: LeggedRobot, act: Policy, sizes: Sequence[float], robots: int) -> tuple[list[dict[str, Any]], int]:
     """Run one type on a task with `robots` robots for each size on `tiles_of_sizes`; return its points, and how often a robot
     lost contacts in a control step for want of memory.
     """
@@ -210,7 +208,7 @@ def measure_success(
 
 
 @torch.inference_mode()
-def run_out(task: LeggedRobot, act: Callable[[TensorDict], Tensor], robots: int) -> tuple[Scores, int]:
+def run_out(task: LeggedRobot, act: Policy, robots: int) -> tuple[Scores, int]:
     """Run all robots out of their tiles, `robots` of them on each kind of tile; return their scores, and how often a robot
     lost contacts.
     """
@@ -388,7 +386,7 @@ def success_chart(title: str, lines: Sequence[tuple[dict[str, Any], Line]]) -> C
     walls = tuple((f"{label}: {', '.join(names)}" if len(ends) > 1 else label, end) for end, names in ends.items())
     what, unit = lines[0][0]["what"], lines[0][0]["unit"]
     drawn = [line for _, line in lines]
-    return Chart(f"success: {title}", f"{what} [{unit}]", drawn, unit=what, high=1.0, percent=True, walls=walls)
+    return Chart(f"success: {title}", f"{what} [{unit}]", drawn, unit=what, percent=True, walls=walls)
 
 
 def panels_of(names: list[str]) -> dict[str, tuple[str, ...]]:

@@ -24,6 +24,7 @@ from legged.figures import figure
 from legged.learning.estimator import EstimatingModel, EstimationErrors
 from legged.mdp.tracking_error import velocity_error, yaw_rate_error
 from legged.policies.actor import Actor
+from legged.policies.episodes import Policy
 from legged.policies.restore import restore, undisturbed
 from legged.terrain import Terrain
 
@@ -66,7 +67,7 @@ def place_to_track(
 
 
 @torch.inference_mode()
-def measure_tracking(task: LeggedRobot, act: Callable[[TensorDict], Tensor], grid: Grid) -> dict[str, Any]:
+def measure_tracking(task: LeggedRobot, act: Policy, grid: Grid) -> dict[str, Any]:
     """Run the grid on a task of grid.num_envs robots; return plain numbers and lists, one entry a cell in "cells".
 
     A robot is measured until it falls or its episode ends by a time-out. Errors are those at the ends of control steps. The
@@ -91,7 +92,7 @@ def measure_tracking(task: LeggedRobot, act: Callable[[TensorDict], Tensor], gri
 @torch.inference_mode()
 def hold(
     task: LeggedRobot,
-    act: Callable[[TensorDict], Tensor],
+    act: Policy,
     commands: Tensor,
     settle_s: float,
     hold_s: float,
@@ -185,7 +186,7 @@ def _summary(task: LeggedRobot, grid: Grid, sums: dict[str, Tensor], fell: Tenso
 class EstimateMeter:
     """Sums of the squared errors of a policy's estimates; empty for a policy without an estimator."""
 
-    def __init__(self, task: BaseTask, act: Callable[[TensorDict], Tensor]) -> None:
+    def __init__(self, task: BaseTask, act: Policy) -> None:
         """Measure the policy `act`, if it is an `Actor` with an estimator."""
         self._task, self._network = task, getattr(act, "network", None)
         if isinstance(self._network, EstimatingModel):

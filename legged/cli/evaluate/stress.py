@@ -8,8 +8,8 @@ settings, on stairs and on the flat. The share of robots that succeed is printed
 from legged.cli.evaluate.common import add_points_arguments, check_points, evaluation_parser, settle
 from legged.commandline.command import command
 from legged.errors import ConfigError, suggest
+from legged.evaluation.stress.disturbances import NAMES
 from legged.evaluation.stress.measuring import RISER, TREAD, Bench, evaluate_stress
-from legged.evaluation.stress.table import NAMES
 from legged.process.command_parser import CommandParser
 
 LIMITS = {"riser": (0.0, 1.0, "m"), "tread": (0.05, 2.0, "m"), "payload": (0.0, 1000.0, "kg")}

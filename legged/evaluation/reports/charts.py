@@ -41,7 +41,7 @@ class Line:
     y: np.ndarray
     band: tuple[np.ndarray, np.ndarray] | None = None
     markers: bool = False
-    style: int | None = None
+    style: int = -1
     """Index into colours and dashes; by default the line's place in the chart."""
 
 
@@ -55,20 +55,26 @@ class Chart:
     lines: Sequence[Line] = ()
     unit: str = "iteration"
     """Name of a value of x."""
-    low: float | None = 0.0
-    """The y axis shows at least this value; None fits it to the lines."""
-    high: float | None = None
-    """Upper end of the y axis; None fits it to the lines."""
     log: bool = False
     percent: bool = False
+    """True: y is a share, and its axis ends at 100 %."""
     level: tuple[str, float] | None = None
     """Name and y of a dotted horizontal line."""
     walls: tuple[tuple[str, float], ...] = ()
     """Names and x of dotted vertical lines."""
 
     def cleaned(self) -> "Chart":
-        """Return the chart without values that can't be drawn: those that are not finite, or not positive on a log axis."""
-        return replace(self, lines=[_cleaned(line, self.log) for line in self.lines])
+        """Return the chart without values that can't be drawn: not finite, or not positive on a log axis. Lines have as many
+        points as can be seen, and their own styles.
+        """
+        lines = []
+        for i, line in enumerate(self.lines):
+            good = np.isfinite(line.x) & np.isfinite(line.y) & ((line.y > 0.0) | (not self.log))
+            parts = [line.x[good], line.y[good], *(part[good] for part in line.band or ())]
+            x, y, *band = _thinned(*parts) if not line.markers else parts
+            style, markers = i if line.style < 0 else line.style, line.markers or len(x) == 1
+            lines.append(Line(line.name, x, y, (band[0], band[1]) if band else None, markers, style % len(COLORS)))
+        return replace(self, lines=lines)
 
 
 # ---- PNG -------------------------------------------------------------------------------------------------------------
@@ -88,7 +94,7 @@ def draw_charts(charts: Sequence[Chart], path: Path, title: str = "", iteration_
             axis.set_visible(False)
         before: list[str] = []
         for axis, chart in zip(axes.flat, charts, strict=False):
-            draw_panel(axis, chart.cleaned())
+            draw_panel(axis, chart)
             names = axis.get_legend_handles_labels()[1]
             if names and names != before:  # one legend for panels with the same lines
                 axis.legend(fontsize="small", frameon=False)
@@ -104,11 +110,10 @@ def draw_panel(axis: Any, chart: Chart) -> None:
     """Draw a chart into axes of matplotlib."""
     from matplotlib.ticker import PercentFormatter
 
-    for i, line in enumerate(chart.lines):
-        style = i if line.style is None else line.style
-        look = {"color": COLORS[style % len(COLORS)], "linestyle": STYLES[style % len(STYLES)], "linewidth": 1.5}
-        if line.markers or len(line.x) == 1:
-            look |= {"marker": "o", "markersize": 3}
+    chart = chart.cleaned()
+    for line in chart.lines:
+        look = {"color": COLORS[line.style], "linestyle": STYLES[line.style % len(STYLES)], "linewidth": 1.5}
+        look |= {"marker": "o", "markersize": 3} if line.markers else {}
         axis.plot(line.x, line.y, label=line.name or None, **look)
         if line.band is not None and len(line.x) > 1:
             axis.fill_between(line.x, *line.band, color=look["color"], alpha=0.15, linewidth=0)
@@ -140,16 +145,14 @@ def curves(chart: Chart) -> str:
     xs = np.concatenate([*(line.x for line in chart.lines), [x for _, x in chart.walls]])
     ends = (float(xs.min()), float(xs.max())) if len(xs) else (0.0, 1.0)
     frame = _Frame(chart, ends, _y_range(chart), [line.name for line in chart.lines if line.name])
-    for i, line in enumerate(chart.lines):
-        if not len(line.x):
-            continue
-        style = i if line.style is None else line.style
-        color, dash = COLORS[style % len(COLORS)], DASHES[style % len(DASHES)]
-        if line.band is not None:
-            frame.area(line.x, *line.band, color, 0.18)
-        frame.line(line, color, dash)
-        if line.name:
-            frame.key(line.name, color, dash)
+    for line in chart.lines:
+        if len(line.x):
+            color, dash = COLORS[line.style], DASHES[line.style]
+            if line.band is not None:
+                frame.area(line.x, *line.band, color, 0.18)
+            frame.line(line, color, dash)
+            if line.name:
+                frame.key(line.name, color, dash)
     return frame.svg()
 
 
@@ -250,7 +253,7 @@ class _Frame:
 
     def line(self, line: Line, color: str, dash: str) -> None:
         """Draw a line through its points."""
-        dots = zip(self.px(line.x), self.py(line.y), strict=True) if line.markers or len(line.x) == 1 else ()
+        dots = zip(self.px(line.x), self.py(line.y), strict=True) if line.markers else ()
         look = {"points": self._points(line.x, line.y), "dash": dash, "dots": dots}
         self.marks.append({"kind": "line", **look, **self.data(line, color)})
 
@@ -281,14 +284,6 @@ class _Frame:
         )
 
 
-def _cleaned(line: Line, log: bool) -> Line:
-    """Return a line without values that can't be drawn, and with as many points as can be seen."""
-    good = np.isfinite(line.x) & np.isfinite(line.y) & ((line.y > 0.0) | (not log))
-    parts = [line.x[good], line.y[good], *(part[good] for part in line.band or ())]
-    x, y, *band = _thinned(*parts) if not line.markers else parts
-    return replace(line, x=x, y=y, band=(band[0], band[1]) if band else None)
-
-
 def _thinned(*columns: np.ndarray) -> list[np.ndarray]:
     """Return columns (n,) of at most MOST_POINTS values: means of neighbours; the first and the last value are kept."""
     count = len(columns[0])
@@ -306,12 +301,12 @@ def _y_range(chart: Chart) -> tuple[float, float]:
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
     if chart.log:
         return (low / 1.2, high * 1.2) if low > 0.0 else (0.1, 1.0)
-    low = low if chart.low is None else min(low, chart.low)
-    if chart.high is not None:
-        return low, chart.high
+    low = min(low, 0.0)
+    if chart.percent:
+        return low, 1.0
     if high <= low:
         return low - 0.5 * (low < 0.0), low + 1.0
-    return low - (0.04 * (high - low) if low < 0.0 or chart.low is None else 0.0), high + 0.06 * (high - low)
+    return low - 0.04 * (high - low) * (low < 0.0), high + 0.06 * (high - low)
 
 
 def ticks(low: float, high: float, count: int) -> list[float]:

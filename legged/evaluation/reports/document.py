@@ -4,8 +4,8 @@ import base64
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from legged.evaluation.reports import render
 from legged.evaluation.reports.charts import sheet
@@ -23,16 +23,14 @@ class Mono(str):
     __slots__ = ()
 
 
-@dataclass(frozen=True)
-class Link:
+class Link(NamedTuple):
     """A text that leads to another file."""
 
     text: str
     href: str
 
 
-@dataclass(frozen=True)
-class Number:
+class Number(NamedTuple):
     """A number: its text, and the value that it is sorted by."""
 
     text: str
@@ -42,23 +40,20 @@ class Number:
 Cell = str | Mono | Link | Number
 
 
-@dataclass(frozen=True)
-class Heading:
+class Heading(NamedTuple):
     """The title of the parts that follow."""
 
     text: str
 
 
-@dataclass(frozen=True)
-class Paragraph:
+class Paragraph(NamedTuple):
     """Sentences, with code between backticks; a short `badge` may stand before them."""
 
     text: str
     badge: str = ""
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """Rows under a head; a `wide` table can be sorted by its columns and filtered by words."""
 
     head: Sequence[str]
@@ -71,8 +66,7 @@ class Table:
         return [bool(self.rows) and all(isinstance(row[i], Number) for row in self.rows) for i in range(len(self.head))]
 
 
-@dataclass(frozen=True)
-class Figures:
+class Figures(NamedTuple):
     """Drawings (SVG), side by side where there is room; in Markdown one file of that `name`."""
 
     name: str
@@ -80,8 +74,7 @@ class Figures:
     alt: str
 
 
-@dataclass(frozen=True)
-class Picture:
+class Picture(NamedTuple):
     """A picture or film in a file."""
 
     path: Path
@@ -98,8 +91,7 @@ class Picture:
         return f"data:{self.mime};base64,{base64.b64encode(self.path.read_bytes()).decode('ascii')}"
 
 
-@dataclass(frozen=True)
-class Listing:
+class Listing(NamedTuple):
     """Lines of a program or a difference, folded up in a page; Markdown names their `file`."""
 
     title: str

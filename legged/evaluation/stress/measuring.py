@@ -2,7 +2,7 @@
 
 import gc
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from math import sqrt
 from pathlib import Path
@@ -18,8 +18,16 @@ from legged.errors import ConfigError
 from legged.evaluation.intervals import mean_of_shares
 from legged.evaluation.measurement import Setting, warn_of_overflows
 from legged.evaluation.result_file import stress_name, write_result
-from legged.evaluation.stress.stressed_task import GIVEN, StressedTask, declared, make_stressed
-from legged.evaluation.stress.table import NOMINAL, WRITTEN_FOR, Disturbance, table
+from legged.evaluation.stress.disturbances import (
+    GIVEN,
+    NOMINAL,
+    WRITTEN_FOR,
+    Disturbance,
+    StressedTask,
+    declared,
+    make_stressed,
+    table,
+)
 from legged.evaluation.success import FORWARD, TIME_S, point, run_out, share_of, to_run_out
 from legged.evaluation.tables import screen_table
 from legged.evaluation.tiles import dividing_cell, tiles_apart
@@ -28,6 +36,7 @@ from legged.evaluation.velocity_tracking import hold
 from legged.figures import figure
 from legged.mdp.actuator_network import NetworkWeights
 from legged.mdp.tracking_error import velocity_error
+from legged.policies.episodes import Policy
 from legged.policies.restore import restore, undisturbed
 from legged.process.paths import relative
 from legged.robots.similarity import size_of
@@ -50,6 +59,8 @@ COMMANDS = (
     *((0.5, 0.0, 0.5), (0.5, 0.0, -0.5)),
 )
 """Commands on the flat (vx, vy, yaw rate), as parts of the ends of the axes of the task's grid; robots have them in turn."""
+Changes = Sequence[tuple[str, Any]]
+"""Overrides of a configuration."""
 HALF_STEP = "half the time step"
 """Name of the setting that LSTM actuators do not allow."""
 COLORS = {"table": "#0072B2", "combined": "#D55E00", "settings": "#009E73", "ground": "#E69F00"}
@@ -75,7 +86,7 @@ def settings(cfg: LeggedConfig, engine: str) -> dict[str, list[tuple[str, Any]]]
     return found
 
 
-def check_asked(changes: Sequence[tuple[str, Any]]) -> None:
+def check_asked(changes: Changes) -> None:
     """Check that the command line randomises no property that the lines of the table set."""
     ranges = "domain_rand.ranges"
     for key, value in changes:
@@ -124,7 +135,7 @@ class Bench:
         """True if the policy was trained on a plane; it is then measured on the flat only."""
         return self.cfg.terrain.mesh_type == "plane"
 
-    def measure(self, rows: Sequence[Disturbance], changes: Sequence[tuple[str, Any]] = ()) -> list[dict[str, Any]]:
+    def measure(self, rows: Sequence[Disturbance], changes: Changes = ()) -> list[dict[str, Any]]:
         """Return the figures of some lines of the table; `changes` choose a solver."""
         found: list[dict[str, Any]] = [{"name": row.name, "what": row.text} for row in rows]
         if not self.on_plane:
@@ -134,7 +145,7 @@ class Bench:
             line["flat"] = figures
         return found
 
-    def on_stairs(self, rows: Sequence[Disturbance], changes: Sequence[tuple[str, Any]] = ()) -> list[dict[str, Any]]:
+    def on_stairs(self, rows: Sequence[Disturbance], changes: Changes = ()) -> list[dict[str, Any]]:
         """Return the success of each line; half of its robots go up, the others down."""
         half = max(1, self.robots // 2)
         per_robot = [row for _ in STAIRS for row in rows for _ in range(half)]
@@ -156,7 +167,7 @@ class Bench:
             ground[spec.type] = {"unit": kind.unit, "what": kind.what, **point(spec.size, *of_type)}
         return ground
 
-    def on_flat(self, rows: Sequence[Disturbance], changes: Sequence[tuple[str, Any]] = ()) -> list[dict[str, Any]]:
+    def on_flat(self, rows: Sequence[Disturbance], changes: Changes = ()) -> list[dict[str, Any]]:
         """Return the figures of each line's robots that follow commands on a plane."""
         per_robot = [row for row in rows for _ in range(self.robots)]
         ends = torch.tensor([[abs(axis[end]) for axis in axes_of(self.cfg).values()] for end in (0, -1)])
@@ -174,12 +185,8 @@ class Bench:
         return [followed(*of_row, self.limit) for of_row in by_row]
 
     def _build(
-        self,
-        rows: Sequence[Disturbance],
-        own: Sequence[tuple[str, Any]],
-        last: Sequence[tuple[str, Any]],
-        terrain: Terrain | None,
-    ) -> tuple[StressedTask, Callable[[TensorDict], Tensor]]:
+        self, rows: Sequence[Disturbance], own: Changes, last: Changes, terrain: Terrain | None
+    ) -> tuple[StressedTask, Policy]:
         """Build a task and its policy. Overrides apply in the order `own`, the user's, `last`: another solver replaces the
         user's.
         """
@@ -188,9 +195,7 @@ class Bench:
         make = partial(make_stressed, rows)
         return restore(self.setting.policy, changes, self.setting.device, self.setting.graph, terrain, make)
 
-    def _run_out(
-        self, rows: Sequence[Disturbance], specs: Sequence[TileSpec], last: Sequence[tuple[str, Any]] = ()
-    ) -> tuple[Tensor, Tensor]:
+    def _run_out(self, rows: Sequence[Disturbance], specs: Sequence[TileSpec], last: Changes = ()) -> tuple[Tensor, Tensor]:
         """Return the outcomes (N,) of robots that are shared out among tiles, and their times [s]; `last` as for `_build`."""
         own = to_run_out(self.cfg, len(rows))
         cfg: Any = override(self.cfg, [*own, *self.setting.asked, *last])
@@ -199,7 +204,7 @@ class Bench:
         self.lost += lost
         return scores.outcome.cpu(), scores.time_s.cpu()
 
-    def _follow(self, task: StressedTask, act: Callable[[TensorDict], Tensor], commands: Tensor) -> tuple[Tensor, Tensor]:
+    def _follow(self, task: StressedTask, act: Policy, commands: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean square error of each robot's velocity in its first episode (N,) [m^2/s^2], NaN for robots that fell
         before the measurement began, and flags of those that fell (N,).
         """

@@ -12,8 +12,8 @@ from legged.cli.evaluate import stress
 from legged.evaluation import success
 from legged.evaluation.measurement import Setting
 from legged.evaluation.stress import measuring
+from legged.evaluation.stress.disturbances import ALONE, Disturbance
 from legged.evaluation.stress.measuring import GROUND, STAIRS, Bench
-from legged.evaluation.stress.table import ALONE, Disturbance
 from legged.evaluation.success import FELL, REACHED, STUCK, Scores
 from legged.policies.restore import policy_of
 

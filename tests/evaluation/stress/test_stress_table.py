@@ -9,8 +9,8 @@ from helpers import small_config
 
 from legged.config import override
 from legged.evaluation.intervals import mean_of_shares, wilson
+from legged.evaluation.stress.disturbances import ALONE, NOMINAL, Disturbance, combined, scaled, table
 from legged.evaluation.stress.measuring import STAIRS, followed, score, settings
-from legged.evaluation.stress.table import ALONE, NOMINAL, Disturbance, combined, scaled, table
 from legged.evaluation.success import to_run_out
 from legged.evaluation.tiles import dividing_cell, tiles_apart
 from legged.mdp.actuator_network import NetworkWeights

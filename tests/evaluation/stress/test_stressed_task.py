@@ -7,8 +7,7 @@ import torch
 from helpers import CALM, ENGINE, JOINTS, TASK, small_config, small_task, zero_actions
 
 from legged.config import override
-from legged.evaluation.stress.stressed_task import declared, make_stressed
-from legged.evaluation.stress.table import NOMINAL, PUSH_INTERVAL, Disturbance
+from legged.evaluation.stress.disturbances import NOMINAL, PUSH_INTERVAL, Disturbance, declared, make_stressed
 from legged.evaluation.tiles import on_terrain
 from legged.mdp.control import control_gains
 from legged.physics import FIELDS, RobotScene
