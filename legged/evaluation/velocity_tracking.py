@@ -91,12 +91,7 @@ def measure_tracking(task: LeggedRobot, act: Policy, grid: Grid) -> dict[str, An
 
 @torch.inference_mode()
 def hold(
-    task: LeggedRobot,
-    act: Policy,
-    commands: Tensor,
-    settle_s: float,
-    hold_s: float,
-    add: Callable[[TensorDict, Tensor], None],
+    task: LeggedRobot, act: Policy, commands: Tensor, settle_s: float, hold_s: float, add: Callable[[Any, Tensor], None]
 ) -> tuple[Tensor, int]:
     """Let robots follow constant commands (N, 3) for `hold_s` [s]; after each step that follows the first `settle_s`, call
     `add` with the observations and the flags (N,) of the robots that are in their first episode still. Return the flags of

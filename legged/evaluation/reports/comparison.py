@@ -105,11 +105,12 @@ def episodes_comparison(groups: Evaluations) -> ScreenTable:
     found = [[_episode_figures(result["episodes"]) for result in results] for results in groups.values()]
     rows = []
     for label in dict.fromkeys(label for seeds in found for seed in seeds for label in seed):
-        columns = [[seed[label] for seed in seeds if label in seed] for seeds in found]
-        forms = [".1f" if values and abs(mean(values)) >= 100 else ".2f" for values in columns]
-        rows.append(
-            [label, *(_range_text(values, len(values), form, form) for values, form in zip(columns, forms, strict=True))]
-        )
+        row = [label]
+        for seeds in found:
+            values = [seed[label] for seed in seeds if label in seed]
+            form = ".1f" if values and abs(mean(values)) >= 100 else ".2f"
+            row.append(_range_text(values, len(values), form, form))
+        rows.append(row)
     return screen_table("episodes: mean of seeds (lowest to highest)", ["measure", *_heads(groups)], rows)
 
 
@@ -167,13 +168,10 @@ def success_table(groups: Evaluations) -> ScreenTable:
     """Return a table with a line a type and size: the mean success over seeds and their range."""
     rows: list[list[str] | None] = []
     for name, entry in types_of(groups).items():
-        columns = [
-            {size: [100 * value for value in found] for size, found in shares(results, name).items()}
-            for results in groups.values()
-        ]
-        for i, size in enumerate(sorted(set().union(*columns))):
-            each = zip(columns, groups.values(), strict=True)
-            cells = [_range_text(column.get(size, []), len(seeds), ".1f", ".0f") for column, seeds in each]
+        columns = [(shares(results, name), len(results)) for results in groups.values()]
+        for i, size in enumerate(sorted(set().union(*(found for found, _ in columns)))):
+            percent = [([100 * value for value in found.get(size, [])], seeds) for found, seeds in columns]
+            cells = [_range_text(values, seeds, ".1f", ".0f") for values, seeds in percent]
             rows.append([name if i == 0 else "", f"{size:g} {entry['unit']}", *cells])
         rows.append(None)
     return screen_table("success [%]: mean of seeds (lowest to highest)", ["terrain", "size", *_heads(groups)], rows)
