@@ -58,7 +58,7 @@ class Setting:
 
     @property
     def changes(self) -> dict[str, Any]:
-        """The field `changes` of a result, with the overrides that change its conditions; empty if there are none."""
+        """The field `changes` of a result, with the overrides that change its conditions; empty without such overrides."""
         changes = changes_of(self.overrides)
         return {"changes": changes} if changes else {}
 

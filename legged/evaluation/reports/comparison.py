@@ -208,7 +208,10 @@ def comparison_parts(records: Sequence[Record]) -> list[Part]:
         rows.append([*row, record.code.summary, *([record.note] if noted else [])])
     head = ["run", "folder", "status", "", "robots", "loop [s]", "steps/s", "commit", *(["note"] if noted else [])]
     parts: list[Part] = [Paragraph(f"All runs: {common}.")] if common else []
-    parts += [Table(head, rows), Heading("Settings that differ"), _settings(names, records)]
+    found = differences([record.config for record in records])
+    settings: list[list[Cell]] = [[Mono(path), *(Mono(words(value)) for value in values)] for path, values in found.items()]
+    told = Table(["setting", *names], settings) if settings else Paragraph("None.")
+    parts += [Table(head, rows), Heading("Settings that differ"), told]
     drawings = curves_of_runs([(name, record.log) for name, record in zip(names, records, strict=True)])
     if drawings:
         parts += [Heading("Curves"), Figures("curves", drawings, "learning curves of the runs")]
@@ -223,15 +226,6 @@ def apart(names: Sequence[str]) -> tuple[str, list[str]]:
     return (", ".join(common), rest) if all(rest) else ("", list(names))
 
 
-def _settings(names: Sequence[str], records: Sequence[Record]) -> Part:
-    """Return a table of the settings that are not the same in all runs."""
-    found = differences([record.config for record in records])
-    if not found:
-        return Paragraph("None.")
-    rows: list[list[Cell]] = [[Mono(path), *(Mono(words(value)) for value in values)] for path, values in found.items()]
-    return Table(["setting", *names], rows)
-
-
 def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
     """Return tables and drawings of the engines in which at least two runs were evaluated."""
     by_engine = [{result["physics"]: result for result in record.results} for record in records]
@@ -244,7 +238,12 @@ def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
         others = [(name, record.another_policy(one)) for name, record, one in zip(names, records, results, strict=True)]
         parts += [Paragraph(f"{name}: of `{file}`, which is not its last policy.") for name, file in others if file]
         parts += [Paragraph(f"{name}: {text}.") for name, text in zip(names, conditions_of(results), strict=True) if text]
-        drawings = _success(names, results)
+        drawings = []
+        entries = [(name, types_in(result or {})) for name, result in zip(names, results, strict=True)]
+        for kind in dict.fromkeys(kind for _, one in entries for kind in one):
+            there = [(one[kind], success_line(name, one[kind])) for name, one in entries if kind in one]
+            if len(there) > 1:
+                drawings.append(curves(success_chart(kind.replace("_", " "), there)))
         if drawings:
             parts.append(Figures(f"success_{engine}", drawings, f"success over difficulty in {engine_of(engine).label}"))
     if not parts:
@@ -333,7 +332,7 @@ def _errors(name: str, result: dict[str, Any]) -> Counted:
 
 
 def _failures(result: dict[str, Any]) -> Counted:
-    count = int(result["episodes"]["count"]) if "episodes" in result else 0
+    count = int(value_at(result, "episodes.count") or 0)
     return (round(result["episodes"]["failures"] * count), count) if count > 0 else None
 
 
@@ -346,14 +345,3 @@ def _returns(result: dict[str, Any]) -> Counted:
         return None
     returns = result["episodes"]["return"]
     return returns["mean"], returns["std"] * sqrt(count / max(count - 1, 1)), count
-
-
-def _success(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> list[str]:
-    """Return a drawing a terrain type that at least two of the runs have crossed."""
-    entries = [types_in(result or {}) for result in results]
-    found = []
-    for kind in dict.fromkeys(kind for one in entries for kind in one):
-        there = [(one[kind], success_line(name, one[kind])) for name, one in zip(names, entries, strict=True) if kind in one]
-        if len(there) > 1:
-            found.append(curves(success_chart(kind.replace("_", " "), there)))
-    return found
