@@ -177,7 +177,7 @@ def test_a_policy_is_named_in_all_ways(trained, monkeypatch, name, experiment):
     monkeypatch.setattr(registry, "_REGISTERED", {})
     (run,) = Path("logs", TASK).iterdir()
     found = []
-    monkeypatch.setattr(policy, "evaluate_following", lambda one, *_: found.append(one) or 0)
+    monkeypatch.setattr(policy, "evaluate_following", lambda one, *_: found.append(one.policy) or 0)
     name = name.format(run=f"{TASK}/{run.name}", here=trained)
     assert call(main, ["evaluate", name, "--physics", "mujoco", "--out", str(trained / "out")]) == 0
     (one,) = found

@@ -16,7 +16,7 @@ from legged.cli.evaluate import gymnasium as in_gymnasium
 from legged.cli.runs import curves, evaluations
 from legged.cli.terrain import terrain
 from legged.errors import ConfigError
-from legged.evaluation.gymnasium_episodes import run_exported
+from legged.evaluation.episodes import run_exported
 
 pytestmark = pytest.mark.usefixtures("workplace")
 TASK = "half_cheetah"
