@@ -12,14 +12,13 @@ network.npz (for control.actuator.network), fit.json and fit.png.
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from legged.commandline.command import command
 from legged.config.yaml_files import dump
 from legged.errors import ConfigError
-from legged.fitting.judgement import Fit, actuator_section, draw, errors
+from legged.fitting.judgement import Fit, control_section, draw, errors
 from legged.fitting.log import ActuatorLog, check_alike, read_log
 from legged.fitting.parametric import Drive, fit_drive
 from legged.process.command_parser import CommandParser
@@ -90,7 +89,13 @@ def main(argv: list[str] | None) -> int:
     print("held out:")
     for name, of in judged.items():
         print(f"  {name:10}  RMSE {of['rmse']:.3g} N m, largest {of['largest']:.3g} N m, explained {of['explained']:.2%}")
-    _write(args.out, at_steps, drive, judged)
+    make_folder(args.out)
+    told = "# Fitted by legged fit-actuator: copy it into the YAML of a task\n"
+    section = dump({"control": control_section(at_steps, drive)}, sort_keys=False, default_flow_style=None, width=120)
+    write_text(args.out / "actuator.yaml", told + section)
+    numbers = {name: value if np.isfinite(value) else None for name, value in vars(drive).items()}
+    facts = {"joints": list(log.joint_names), "sim_dt": at_steps.dt, "drive": numbers, "held_out": judged}
+    write_text(args.out / "fit.json", json.dumps(facts, indent=1))
     replace(weights, facts=judged["network"]).save(args.out / "network.npz")
     draw(args.out / "fit.png", log, fits, drive)
     print(f"written: {relative(args.out)}/ (actuator.yaml, network.npz, fit.json, fit.png)")
@@ -98,11 +103,7 @@ def main(argv: list[str] | None) -> int:
 
 
 def _widths(text: str) -> list[int]:
-    """Return the units of the layers.
-
-    Raises:
-        ConfigError: the text is not a list of numbers.
-    """
+    """Return the units of the layers."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() for part in parts):
         raise ConfigError(f"--hidden: expected numbers like 32,32,32, got '{text}'")
@@ -111,47 +112,24 @@ def _widths(text: str) -> list[int]:
 
 def _tell(log: ActuatorLog) -> None:
     """Print the contents of the log."""
-    seconds, held = len(log.run) * log.dt, float(log.held_out.mean())
-    runs = len(np.unique(log.run))
+    seconds, held, runs = len(log.run) * log.dt, float(log.held_out.mean()), len(np.unique(log.run))
     names = ", ".join(log.joint_names[:4]) + (", ..." if len(log.joint_names) > 4 else "")
-    print(
-        f"{seconds:.4g} s at {1.0 / log.dt:.4g} Hz in {runs} run{'s' if runs > 1 else ''}, {held:.0%} of it held out; {names}"
-    )
+    sampled = f"{seconds:.4g} s at {1.0 / log.dt:.4g} Hz in {runs} run{'s' if runs > 1 else ''}"
+    print(f"{sampled}, {held:.0%} of it held out; {names}")
 
 
 def _tell_drive(drive: Drive, log: ActuatorLog) -> None:
     """Print the fitted parameters, and those that the log does not determine."""
-    known = log.stiffness is not None and log.damping is not None
-    print(f"gains: {drive.stiffness:.4g} N m/rad, {drive.damping:.4g} N m s/rad ({'given' if known else 'fitted'})")
+    given = "given" if log.has_gains else "fitted"
+    print(f"gains: {drive.stiffness:.4g} N m/rad, {drive.damping:.4g} N m s/rad ({given})")
     print(f"delay: {1e3 * drive.delay:.3g} ms")
     if np.isfinite(drive.stall_torque):
         print(f"motor: {drive.stall_torque:.4g} N m at rest, none at {drive.no_load_speed:.4g} rad/s")
     else:
         print("motor: its torque-speed line is not reached in the log; the effort limit stays")
-    viscous = f"viscous {drive.viscous:.3g} N m s/rad" if known else "viscous friction is part of the damping"
+    viscous = f"viscous {drive.viscous:.3g} N m s/rad" if log.has_gains else "viscous friction is part of the damping"
     if drive.breakaway == drive.coulomb:
         dry = f"{drive.coulomb:.3g} N m (the log shows no more to break away)"
     else:
         dry = f"{drive.breakaway:.3g} N m to break away, {drive.coulomb:.3g} N m beyond {drive.stribeck_velocity:.2g} rad/s"
     print(f"friction: {dry}, {viscous}")
-
-
-def _write(folder: Path, log: ActuatorLog, drive: Drive, judged: dict[str, dict[str, float]]) -> None:
-    """Write the results.
-
-    Raises:
-        RunError: the files can't be written.
-    """
-    make_folder(folder)
-    control: dict[str, Any] = {"actuator": actuator_section(log, drive, log.dt)}
-    if log.stiffness is None or log.damping is None:  # gains that the log does not state are part of the fit
-        gains = (("stiffness", drive.stiffness), ("damping", drive.damping))
-        control |= {name: {joint: float(f"{gain:.4g}") for joint in log.joint_names} for name, gain in gains}
-    told = "# Fitted by legged fit-actuator: copy it into the YAML of a task\n"
-    write_text(
-        folder / "actuator.yaml",
-        told + dump({"control": control}, sort_keys=False, default_flow_style=None, width=120),
-    )
-    numbers = {name: value if np.isfinite(value) else None for name, value in vars(drive).items()}
-    facts = {"joints": list(log.joint_names), "sim_dt": log.dt, "drive": numbers, "held_out": judged}
-    write_text(folder / "fit.json", json.dumps(facts, indent=1))

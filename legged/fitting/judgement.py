@@ -34,31 +34,29 @@ def errors(fit: Fit) -> dict[str, float]:
     """Return the root mean squared error and the largest error on held-out samples [N m], and the explained share of their
     variance.
     """
-    held = fit.log.held_out
-    measured = fit.log.torque[held]
-    wrong = fit.torque[held] - measured
+    measured = fit.log.torque[fit.log.held_out]
+    wrong = fit.torque[fit.log.held_out] - measured
     explained = 1.0 - float(np.mean(wrong**2) / max(np.var(measured), 1e-12))
-    return {
-        "rmse": float(np.sqrt(np.mean(wrong**2))),
-        "largest": float(np.abs(wrong).max()),
-        "explained": explained,
-    }
+    return {"rmse": float(np.sqrt(np.mean(wrong**2))), "largest": float(np.abs(wrong).max()), "explained": explained}
 
 
-def actuator_section(log: ActuatorLog, drive: Drive, sim_dt: float) -> dict[str, Any]:
-    """Return the section `control.actuator` of a fitted drive for the joints of the log."""
+def control_section(log: ActuatorLog, drive: Drive) -> dict[str, Any]:
+    """Return the section `control` of a fitted drive, for the joints of a log with the time step of the physics. Gains that
+    the log does not state are part of it.
+    """
 
-    def named(value: float) -> dict[str, float]:
-        return {name: float(f"{value:.4g}") for name in log.joint_names}
+    def named(**values: float) -> dict[str, dict[str, float]]:
+        return {key: {name: float(f"{value:.4g}") for name in log.joint_names} for key, value in values.items()}
 
     section: dict[str, Any] = {}
     if np.isfinite(drive.stall_torque):
-        limits = {"stall_torque": named(drive.stall_torque), "no_load_speed": named(drive.no_load_speed)}
+        limits = named(stall_torque=drive.stall_torque, no_load_speed=drive.no_load_speed)
         section |= {"model": "dc_motor", "joints": list(log.joint_names), **limits}
-    section |= {"coulomb_friction": named(drive.coulomb), "breakaway_friction": named(drive.breakaway)}
-    section |= {"viscous_friction": named(drive.viscous), "stribeck_velocity": float(f"{drive.stribeck_velocity:.4g}")}
-    steps = drive.delay / sim_dt
-    return section | {"delay": [int(np.floor(steps + 0.05)), int(np.ceil(steps - 0.05))]}
+    friction = {"coulomb_friction": drive.coulomb, "breakaway_friction": drive.breakaway, "viscous_friction": drive.viscous}
+    section |= {**named(**friction), "stribeck_velocity": float(f"{drive.stribeck_velocity:.4g}")}
+    steps = drive.delay / log.dt
+    section["delay"] = [int(np.floor(steps + 0.05)), int(np.ceil(steps - 0.05))]
+    return {"actuator": section} | ({} if log.has_gains else named(stiffness=drive.stiffness, damping=drive.damping))
 
 
 def draw(path: Path, log: ActuatorLog, fits: list[Fit], drive: Drive) -> None:
@@ -67,18 +65,15 @@ def draw(path: Path, log: ActuatorLog, fits: list[Fit], drive: Drive) -> None:
     Raises:
         RunError: the file cannot be written.
     """
-    held = log.held_out
-    joint = int(np.argmax(log.torque[held].std(axis=0)))
+    joint = int(np.argmax(log.torque[log.held_out].std(axis=0)))
     with figure(path, (13.0, 4.6), 1, 3) as (_, axes):
         over_time, over_speed, bars = axes[0]
         rows = _shown(log)
-        over_time.plot(
-            (rows - rows[0]) * log.dt, log.torque[rows, joint], color=MEASURED, linewidth=2.2, label="measured", zorder=0
-        )
+        over_time.plot((rows - rows[0]) * log.dt, log.torque[rows, joint], color=MEASURED, lw=2.2, label="measured", zorder=0)
         for fit in fits:
             rows = _shown(fit.log)
             time = (rows - rows[0]) * fit.log.dt
-            over_time.plot(time, fit.torque[rows, joint], color=COLORS[fit.name], linewidth=1.2, label=fit.name)
+            over_time.plot(time, fit.torque[rows, joint], color=COLORS[fit.name], lw=1.2, label=fit.name)
         over_time.set(title=f"{log.joint_names[joint]}, held out", xlabel="time [s]", ylabel="torque [N m]")
         over_time.legend(fontsize=8)
         speeds, torques = log.velocity.ravel(), log.torque.ravel()

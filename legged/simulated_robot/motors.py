@@ -41,7 +41,6 @@ def motors_config(
                 f"command line: {key}: only {OURS} can be changed of a simulated robot, e.g. {OURS}.model=dc_motor"
             )
     source, own = "command line", {}
-    counted = dt if contract is None else contract.sim_dt
     if contract is not None and not ideal:
         trained_with = dict(contract.actuator)
         if network := trained_with.get("network"):
@@ -54,7 +53,7 @@ def motors_config(
     except ConfigError as error:
         raise ConfigError(str(error).replace("sim.dt", "--sim-dt")) from error
     check_motor_model(cfg.control.actuator, cfg.origins)
-    return cfg.control.actuator, counted
+    return cfg.control.actuator, dt if contract is None else contract.sim_dt
 
 
 class Motors:

@@ -7,8 +7,7 @@ import numpy as np
 
 from legged.config.schema import ActuatorConfig, SimConfig
 from legged.deploy.contract import SCANS
-from legged.deploy.interface import RobotFacts
-from legged.deploy.udp_packets import RobotState
+from legged.deploy.interface import Reading, RobotFacts
 from legged.errors import RunError
 from legged.physics import RobotScene
 from legged.robots.robot import Robot
@@ -27,12 +26,7 @@ class SimulatedRobot:
     """A robot that starts in its default pose on a plane, or in the middle of the first tile of a terrain."""
 
     def __init__(
-        self,
-        robot: Robot,
-        terrain: Terrain | None,
-        sim: SimConfig,
-        motors: Motors | None = None,
-        scan: str = SCANS[0],
+        self, robot: Robot, terrain: Terrain | None, sim: SimConfig, motors: Motors | None = None, scan: str = SCANS[0]
     ) -> None:
         """Build the world with the solver options of `sim` and motors, by default ideal ones. `scan` is the setting
         terrain.scan for the heights.
@@ -47,8 +41,7 @@ class SimulatedRobot:
         self.data.qpos[:3] = start + np.array([0.0, 0.0, robot.height])
         self._scan = None if terrain is None else terrain.height_map.scan_map(scan)
         mujoco.mj_forward(self.model, self.data)
-        count = robot.num_dof
-        self.asked = np.zeros((3, count))
+        self.asked = np.zeros((3, robot.num_dof))
         """(3, D) targets [rad], P gains [N m/rad], D gains [N m s/rad]."""
         self._start = self.data.qpos[:3].copy()
         self.lowest, self.highest, self.steepest = float(self._start[2]), float(self._start[2]), 0.0
@@ -84,11 +77,12 @@ class SimulatedRobot:
         _, x, y, _ = data.qpos[3:7]
         self.steepest = max(self.steepest, float(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0))))
 
-    def state(self, sources: Mapping[str, np.ndarray | None]) -> RobotState:
+    def state(self, sources: Mapping[str, np.ndarray | None]) -> Reading:
         """Return the present measurements and the requested sources, `heights` at its points (P, 2)."""
         data = self.data
-        return RobotState(
+        return Reading(
             time=float(data.time),
+            received=0.0,
             quaternion=data.qpos[3:7].copy(),
             gyro=data.qvel[3:6].copy(),  # MuJoCo has the angular velocity of a floating base in the base's frame
             positions=data.qpos[self._qpos],
@@ -99,22 +93,18 @@ class SimulatedRobot:
 
     def _source(self, name: str, points: np.ndarray | None) -> np.ndarray:
         """Return a source in the form of `legged.deploy.interface.Reading.sources`."""
-        position, quaternion = self.data.qpos[:3], self.data.qpos[3:7]
-        entries = np.zeros(9)
-        mujoco.mju_quat2Mat(entries, quaternion)
+        position, entries = self.data.qpos[:3], np.zeros(9)
+        mujoco.mju_quat2Mat(entries, self.data.qpos[3:7])
         rotation = entries.reshape(3, 3)
         if name == "base_lin_vel":
             return rotation.T @ self.data.qvel[:3]
         points = np.zeros((0, 2)) if points is None else points
+        if self._terrain is None or self._scan is None:
+            return np.zeros(len(points)) - position[2]
         yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
         turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-        return self._ground(position[:2] + points @ turn.T) - position[2]
-
-    def _ground(self, places: np.ndarray) -> np.ndarray:
-        """Return the heights of the ground at world points (P, 2) as in training [m]."""
-        if self._terrain is None or self._scan is None:
-            return np.zeros(len(places))
-        return self._scan[self._terrain.height_map.index(*places.T)]
+        places = position[:2] + points @ turn.T
+        return self._scan[self._terrain.height_map.index(*places.T)] - position[2]
 
     def report(self) -> dict[str, float | bool]:
         """Return the distances moved [m], the largest lean [rad], and whether the robot fell."""

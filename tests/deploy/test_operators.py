@@ -9,10 +9,7 @@ import pytest
 from helpers import call, kept_global_state
 
 from legged.deploy.__main__ import ENDING, Interruptible, main
-from legged.deploy.commands import Script
-from legged.deploy.gamepad import Gamepad
-from legged.deploy.keyboard import Keyboard
-from legged.deploy.states import Event
+from legged.deploy.operators import Event, Gamepad, Keyboard, Script
 from legged.errors import ConfigError
 
 

@@ -47,12 +47,10 @@ def build_parser() -> CommandParser:
     )
     parser.add_argument("robot", metavar="ROBOT", help="name of a robot, or its folder")
     add_simulation_arguments(parser)
-    parser.add_argument(
-        "--contract", type=Path, help="policy.json whose motors and map the robot has; ideal motors without one"
-    )
-    parser.add_argument(
-        "--out", type=Path, help=f"folder for {REPORT} and {POSES}, 25 poses a second of the first half minute"
-    )
+    trained = "policy.json whose motors and map the robot has; ideal motors without one"
+    parser.add_argument("--contract", type=Path, help=trained)
+    out = f"folder for {REPORT} and {POSES}, 25 poses a second of the first half minute"
+    parser.add_argument("--out", type=Path, help=out)
     parser.add_argument("--seconds", type=float, default=3600.0, help="end after so long; default 3600")
     return parser
 

@@ -89,15 +89,15 @@ def main(argv: list[str] | None) -> int:
 def _exported(name: str) -> Path:
     """Return the folder of the exported policy `name`. A run whose newest checkpoint was not exported is exported first, and
     so is a shipped policy.
-
-    Raises:
-        ConfigError: there is no policy of that name, or its task has no commands.
     """
     given = Path(name).parent if name.endswith(".onnx") else Path(name)
     if exists(given / "policy.onnx"):
         return given
-    if exists(given / EXPORTED / "policy.onnx") and not _outdated(given):
-        return given / EXPORTED
+    inside = given / EXPORTED / "policy.onnx"
+    if exists(inside):
+        saved = checkpoints(given)
+        if not saved or saved[max(saved)].stat().st_mtime <= inside.stat().st_mtime:
+            return given / EXPORTED
     policy = policy_of(name)
     if not isinstance(policy.cfg, LeggedConfig):
         raise ConfigError(f"POLICY: '{policy.cfg.task}' follows no commands; the program is for legged robots that do")
@@ -109,18 +109,9 @@ def _exported(name: str) -> Path:
     return folder
 
 
-def _outdated(run: Path) -> bool:
-    """Return True if the export in a run folder is older than the run's newest checkpoint."""
-    saved = checkpoints(run)
-    return bool(saved) and saved[max(saved)].stat().st_mtime > (run / EXPORTED / "policy.onnx").stat().st_mtime
-
-
 def _simulated(given: str | None, exported: Path, contract: Contract) -> Robot:
     """Return the simulated robot: the one `given`, else the policy's. A contract names a user-defined robot without its
     folder, which is in the configuration of the run that contains the export.
-
-    Raises:
-        ConfigError: the robot is not found.
     """
     if given is not None:
         return load_robot(given, "--robot")
@@ -145,12 +136,10 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
     """
     report = folder / REPORT
     report.unlink(missing_ok=True)  # the report of another run
+    simulated = [sys.executable, "-m", "legged", "deploy", "robot", robot, "--out", str(folder)]
+    simulated += [*(["--ideal-motors"] if args.ideal_motors else []), "--contract", str(exported / "policy.json")]
     simulator = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "legged", "deploy", "robot", robot, "--out", str(folder)),
-            *(["--ideal-motors"] if args.ideal_motors else []),
-            *("--contract", str(exported / "policy.json"), *_flags(args, SIMULATED), *args.overrides),
-        ],
+        [*simulated, *_flags(args, SIMULATED), *args.overrides],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         text=True,
@@ -164,13 +153,9 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         line = simulator.stdout.readline()
         if not line.startswith(LISTENING):
             raise RunError(f"the simulated robot did not start (exit code {simulator.wait(END_S)})")
-        address = line.removeprefix(LISTENING).strip()
-        program = subprocess.Popen(
-            [
-                *(sys.executable, "-m", "legged.deploy", str(exported), "--robot", f"udp:{address}"),
-                *("--log", str(folder / "log.npz"), *_flags(args, PASSED_ON)),
-            ]
-        )
+        udp = f"udp:{line.removeprefix(LISTENING).strip()}"
+        command = [sys.executable, "-m", "legged.deploy", str(exported), "--robot", udp, "--log", str(folder / "log.npz")]
+        program = subprocess.Popen([*command, *_flags(args, PASSED_ON)])
         code = _wait(program)
         if code in DID_NOT_RUN:  # the program has printed the reason
             return code, None
@@ -202,17 +187,14 @@ def _wait(program: subprocess.Popen) -> int:
 
 def _flags(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
     """Return the given and default values of the named options as flags."""
-    given = {name: getattr(args, name) for name in names}
-    return [
-        word for name, value in given.items() if value is not None for word in (f"--{name.replace('_', '-')}", str(value))
-    ]
+    given = {f"--{name.replace('_', '-')}": getattr(args, name) for name in names}
+    return [word for flag, value in given.items() if value is not None for word in (flag, str(value))]
 
 
 def _told(report: dict[str, Any]) -> str:
     """Return a summary of the robot's report in one line."""
-    lost = report["lost"] / max(1, report["sent"] + report["received"])
-    lean, share = report["largest_lean"], 100.0 * lost
+    lost = 100.0 * report["lost"] / max(1, report["sent"] + report["received"])
     return (
         f"{'fell' if report['fell'] else 'did not fall'}, {report['time']:.1f} s, {report['distance']:.2f} m away,"
-        f" {report['climbed']:+.2f} m higher, largest lean {lean:.2f} rad, {share:.1f} % of packets lost"
+        f" {report['climbed']:+.2f} m higher, largest lean {report['largest_lean']:.2f} rad, {lost:.1f} % of packets lost"
     )

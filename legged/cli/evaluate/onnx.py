@@ -22,7 +22,7 @@ from legged.errors import ConfigError
 from legged.evaluation.playback import SETTLING_S, Played, follow, play
 from legged.evaluation.velocity_grid import AXES, AXIS, Grid, axis_values, check_size
 from legged.learning.run_folder import CONFIG_FILE
-from legged.policies.foreign import ForeignPolicy, Layout, read_layout, was_trained_with_other_motors
+from legged.policies.foreign import ForeignPolicy, read_layout, was_trained_with_other_motors
 from legged.process.command_parser import CommandParser
 from legged.process.paths import exists, make_folder, ready_to_write, relative, write_text
 from legged.robots.robot import Robot, load_robot
@@ -94,17 +94,19 @@ def evaluate(argv: list[str] | None) -> int:
         raise ConfigError(f"--friction: must be from 0 to 10, got {args.friction}")
     commands = [_command(text) for text in args.command or ()] or COMMANDS
     files = [_file(name) for name in args.policy]
-    given = args.layout or str(_description(files))
     if args.out is not None:
         ready_to_write(args.out)
-    layout = read_layout(given, "--layout")
-    robot = load_robot(args.robot or _robot_in(given), "--robot")
-    policies = [ForeignPolicy(path, layout, robot) for path in files]
-    if given.endswith(".json") and was_trained_with_other_motors(Path(given)):
+    layouts = [read_layout(args.layout or str(_description(path, files[0])), "--layout") for path in files]
+    contract = layouts[0].contract
+    if args.robot is None and contract is None:
+        raise ConfigError(f"--robot: is missing; the layout '{args.layout}' names none")
+    robot = load_robot(args.robot or contract.robot, "--robot")  # type: ignore[union-attr]
+    policies = [ForeignPolicy(path, layout, robot) for path, layout in zip(files, layouts, strict=True)]
+    if contract is not None and was_trained_with_other_motors(contract):
         told = "the policy was trained with motors that are not ideal (its actuator says which); here they are"
-        print(f"warning: {given}: {told}", file=sys.stderr, flush=True)
+        print(f"warning: {contract.path}: {told}", file=sys.stderr, flush=True)
     if grid:
-        result = _follow_all(robot, layout, policies, files, args, grid)
+        result = _follow_all(robot, policies, files, args, grid)
     else:
         played = [play(robot, policy, commands, seconds, args.friction) for policy in policies]
         for path, rows in zip(files, played, strict=True):
@@ -136,27 +138,12 @@ def _file(name: str) -> Path:
     return path
 
 
-def _description(files: list[Path]) -> Path:
-    """Return the policy.json next to the first file.
-
-    Raises:
-        ConfigError: the file is missing.
-    """
-    path = files[0].with_name(EXPORTED[1])
-    if not exists(path):
-        raise ConfigError(f"{files[0]}: no {EXPORTED[1]} lies beside it; give the contents of its observation with --layout")
+def _description(file: Path, first: Path) -> Path:
+    """Return the policy.json next to a file, or else next to the first file."""
+    path = next((path for path in (file.with_name(EXPORTED[1]), first.with_name(EXPORTED[1])) if exists(path)), None)
+    if path is None:
+        raise ConfigError(f"{first}: no {EXPORTED[1]} lies beside it; give the contents of its observation with --layout")
     return path
-
-
-def _robot_in(layout: str) -> str:
-    """Return the robot that a policy.json names.
-
-    Raises:
-        ConfigError: the layout is another file.
-    """
-    if not layout.endswith(".json"):
-        raise ConfigError(f"--robot: is missing; the layout '{layout}' names none")
-    return str(json.loads(Path(layout).read_text(encoding="utf-8")).get("robot", ""))
 
 
 def _command(text: str) -> tuple[float, ...]:
@@ -198,12 +185,7 @@ def _grid(args: argparse.Namespace) -> Grid | None:
 
 
 def _follow_all(
-    robot: Robot,
-    layout: Layout,
-    policies: list[ForeignPolicy],
-    files: list[Path],
-    args: argparse.Namespace,
-    grid: Grid,
+    robot: Robot, policies: list[ForeignPolicy], files: list[Path], args: argparse.Namespace, grid: Grid
 ) -> dict[str, Any]:
     """Measure every policy on the grid, print a line about each, and return all figures. Policies that state their training
     time come in its order.
@@ -224,7 +206,7 @@ def _follow_all(
     result = {
         "robot": robot.name,
         "friction": args.friction,
-        "sim_dt": layout.sim_dt,
+        "sim_dt": policies[0].layout.sim_dt,
         "grid": grid.axes,
         "hold_s": grid.hold_s,
         "settle_s": grid.settle_s,
