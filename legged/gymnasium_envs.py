@@ -37,31 +37,36 @@ class _Driver:
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES}
-    render_mode: str | None
 
-    def _build(
+    def __init__(
         self,
         task: str,
         num_envs: int,
-        render_mode: str | None,
-        device: str,
-        physics: str,
-        config: Mapping[str, Any] | None,
-        observations: Seen,
-        size: tuple[int, int],
-    ) -> tuple[spaces.Box, spaces.Space[Any]]:
-        """Build the task; return the spaces of the actions and the observations of one environment."""
+        *,
+        render_mode: str | None = None,
+        device: str = "cpu",
+        physics: str = "auto",
+        config: Mapping[str, Any] | None = None,
+        observations: Seen = "actor",
+        width: int = 480,
+        height: int = 270,
+    ) -> None:
+        """Build the task `task`; the arguments are explained in docs/gymnasium.md.
+
+        Raises:
+            ConfigError: the task, the device or a setting does not exist, or a value is not allowed.
+        """
         for name, value, allowed in (("render_mode", render_mode, RENDER_MODES), ("observations", observations, SEEN)):
             if value not in allowed and (name, value) != ("render_mode", None):
                 raise ConfigError(f"{name}: got {shown(value)}{suggest(str(value)[:100], allowed)}")
-        for name, side in zip(("width", "height"), size, strict=True):
+        for name, side in (("width", width), ("height", height)):
             if isinstance(side, bool) or not isinstance(side, (int, np.integer)) or not 1 <= side <= LARGEST_PICTURE:
                 raise ConfigError(f"{name}: must be a whole number of pixels from 1 to {LARGEST_PICTURE}, got {shown(side)}")
         if config is not None and not (isinstance(config, Mapping) and all(isinstance(path, str) for path in config)):
             raise ConfigError(f"config: expected settings by dotted path, {{'sim.dt': 0.004}}; got {shown(config)}")
         if "env.num_envs" in (config or {}):
             raise ConfigError("config: env.num_envs: the number of environments is that of make_vec(..., num_envs=...)")
-        self.render_mode, self._size = render_mode, (int(size[0]), int(size[1]))
+        self.render_mode, self._size = render_mode, (int(width), int(height))
         self._device = pick_device(str(device), "device")
         settings = [("train.algorithm.num_mini_batches", 1), *(config or {}).items(), ("env.num_envs", num_envs)]
         if physics != "auto":
@@ -89,10 +94,10 @@ class _Driver:
 
         clip = cfg.observations.clip
         widths = {name: group.buffer.shape[1] for name, group in self.task.observation_groups.items()}
-        actions = box(cfg.control.clip_actions, self.task.num_actions)
-        if self._groups is None:
-            return actions, spaces.Dict({name: box(clip, width) for name, width in widths.items()})
-        return actions, box(clip, sum(widths[name] for name in self._groups))
+        boxes = {name: box(clip, width) for name, width in widths.items()}
+        self._actions = box(cfg.control.clip_actions, self.task.num_actions)
+        chosen = self._groups
+        self._observations = spaces.Dict(boxes) if chosen is None else box(clip, sum(widths[name] for name in chosen))
 
     @contextmanager
     def _own_random_numbers(self) -> Iterator[None]:
@@ -172,26 +177,10 @@ class _Driver:
 class TaskEnv(_Driver, gymnasium.Env):
     """One environment of a task. At the end of an episode `step` returns its last observation; `reset` starts the next."""
 
-    def __init__(
-        self,
-        task: str,
-        *,
-        render_mode: str | None = None,
-        device: str = "cpu",
-        physics: str = "auto",
-        config: Mapping[str, Any] | None = None,
-        observations: Seen = "actor",
-        width: int = 480,
-        height: int = 270,
-    ) -> None:
-        """Build the task `task`; the arguments are explained in docs/gymnasium.md.
-
-        Raises:
-            ConfigError: the task, the device or a setting does not exist, or a value is not allowed.
-        """
-        self.action_space, self.observation_space = self._build(
-            task, 1, render_mode, device, physics, config, observations, (width, height)
-        )
+    def __init__(self, task: str, **arguments: Any) -> None:
+        """Build the task `task`; the arguments are explained in docs/gymnasium.md. Raises the errors of `_Driver`."""
+        super().__init__(task, 1, **arguments)
+        self.action_space, self.observation_space = self._actions, self._observations
         self._over = True
         self._shows_the_next = False
 
@@ -249,29 +238,11 @@ class TaskVectorEnv(_Driver, VectorEnv):
 
     metadata: ClassVar[dict[str, Any]] = {**_Driver.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}  # type: ignore[misc]
 
-    def __init__(
-        self,
-        task: str,
-        num_envs: int,
-        *,
-        render_mode: str | None = None,
-        device: str = "cpu",
-        physics: str = "auto",
-        config: Mapping[str, Any] | None = None,
-        observations: Seen = "actor",
-        to_numpy: bool = True,
-        width: int = 480,
-        height: int = 270,
-    ) -> None:
-        """Build the task `task`; the arguments are explained in docs/gymnasium.md.
-
-        Raises:
-            ConfigError: the task, the device or a setting does not exist, or a value is not allowed.
-        """
+    def __init__(self, task: str, num_envs: int, *, to_numpy: bool = True, **arguments: Any) -> None:
+        """Build the task `task`; the arguments are explained in docs/gymnasium.md. Raises the errors of `_Driver`."""
+        super().__init__(task, num_envs, **arguments)
         self.num_envs, self._to_numpy = num_envs, to_numpy
-        self.single_action_space, self.single_observation_space = self._build(
-            task, num_envs, render_mode, device, physics, config, observations, (width, height)
-        )
+        self.single_action_space, self.single_observation_space = self._actions, self._observations
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 

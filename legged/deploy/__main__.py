@@ -13,7 +13,6 @@ from pathlib import Path
 from types import FrameType
 
 from legged.deploy.interface import Interface
-from legged.deploy.log import Log
 from legged.deploy.operators import DEVICE, HELP, Event, Gamepad, Keyboard, Operator, Orders, Script
 from legged.deploy.pace import StatusMessages, take_priority
 from legged.deploy.policy import Policy
@@ -23,6 +22,7 @@ from legged.deploy.udp import UdpRobot
 from legged.deploy.unitree import KINDS, SdkWire, UnitreeRobot
 from legged.errors import ConfigError, RunError, suggest
 from legged.process.command_parser import CommandParser
+from legged.process.paths import ready_to_write_file
 
 BOUNDS = {"stand_seconds": (1.0, 60.0), "max_tilt": (0.1, 1.6), "max_age": (0.005, 0.5), "max_missed": (1, 50)}
 """Flag -> its smallest and largest value, in seconds, radians and cycles; degrees or milliseconds are refused."""
@@ -71,7 +71,7 @@ def _main(argv: list[str] | None) -> int:
     limits = limits_of(args)
     if not args.robot.startswith("udp:") and args.robot not in KINDS:
         raise ConfigError(f"--robot: '{args.robot}' is unknown{suggest(args.robot, [*KINDS, 'udp:HOST:PORT'])}")
-    Log.check(args.log)
+    ready_to_write_file("--log", args.log, endings=(".npz",))
     policy = Policy(args.policy)
     if args.robot in KINDS:  # refuse a misfit before the robot leaves its own controller
         policy.contract.check_fits(KINDS[args.robot].facts)
@@ -109,16 +109,16 @@ def _main(argv: list[str] | None) -> int:
 
 def add_program_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of the program that do not depend on the robot."""
-    standard = Limits()
     parser.add_argument("--input", choices=tuple(HELP), default="keyboard", help="who commands; default keyboard")
     parser.add_argument("--gamepad", type=Path, default=DEVICE, help=f"device; default {DEVICE}")
     parser.add_argument("--commands", type=Path, help="file of commands, in place of a keyboard or gamepad")
     never = float("inf")
     parser.add_argument("--seconds", type=float, default=never, help="end after so long; at the operator's word by default")
     parser.add_argument("--stand-seconds", type=float, default=3.0, help="time for standing up [s]; default 3")
-    parser.add_argument("--max-tilt", type=float, help=f"stop beyond this [rad]; default {standard.max_tilt:g}")
-    parser.add_argument("--max-age", type=float, help=f"stop at older data [s]; default {standard.max_age_s:g}")
-    parser.add_argument("--max-missed", type=int, help=f"stop at so many missed in a row; default {standard.max_missed}")
+    tilt, age, missed = Limits.max_tilt, Limits.max_age_s, Limits.max_missed
+    parser.add_argument("--max-tilt", type=float, default=tilt, help=f"stop beyond this [rad]; default {tilt:g}")
+    parser.add_argument("--max-age", type=float, default=age, help=f"stop at older data [s]; default {age:g}")
+    parser.add_argument("--max-missed", type=int, default=missed, help=f"stop at so many missed in a row; default {missed}")
 
 
 def limits_of(args: argparse.Namespace) -> Limits:
@@ -131,10 +131,9 @@ def limits_of(args: argparse.Namespace) -> Limits:
         raise ConfigError(f"--seconds: must be above 0, got {args.seconds:g}")
     for flag, (low, high) in BOUNDS.items():
         value = getattr(args, flag)
-        if value is not None and not low <= value <= high:
+        if not low <= value <= high:
             raise ConfigError(f"--{flag.replace('_', '-')}: must be between {low:g} and {high:g}, got {value:g}")
-    given = {"max_tilt": args.max_tilt, "max_age_s": args.max_age, "max_missed": args.max_missed}
-    return Limits(**{name: value for name, value in given.items() if value is not None})
+    return Limits(max_tilt=args.max_tilt, max_age_s=args.max_age, max_missed=args.max_missed)
 
 
 def make_operator(args: argparse.Namespace) -> Operator:

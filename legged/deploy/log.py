@@ -1,7 +1,6 @@
 """Log of a run: readings with the targets at their time, cycles of the program, and samples for fitting actuators."""
 
 import json
-import tempfile
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from legged.deploy.contract import Contract
 from legged.deploy.interface import Reading
 from legged.deploy.operators import State
-from legged.errors import ConfigError, RunError
+from legged.process.paths import make_folder, replacing
 
 STATES = tuple(state.value for state in State)
 ACTUATORS = "_actuators"
@@ -72,21 +71,6 @@ class Log:
         """Return the notes so far."""
         return [text for _, text in self._notes]
 
-    @staticmethod
-    def check(path: Path) -> None:
-        """Check before a run that its log can be written to `path`.
-
-        Raises:
-            ConfigError: the path is a folder or not writable.
-        """
-        if path.suffix != ".npz" or "\0" in str(path) or path.is_dir():
-            raise ConfigError(f"--log: {path}: the name of an .npz file is wanted")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=path.parent).close()
-        except OSError as error:
-            raise ConfigError(f"--log: {path}: cannot be written ({error.strerror or error})") from error
-
     def save(self, path: Path) -> None:
         """Write the log.
 
@@ -108,23 +92,14 @@ class Log:
             "note_times": np.array([seconds for seconds, _ in self._notes]),
             "contract": np.array(json.dumps(self._contract.entries)),
         }
-        _write(path, arrays)
-        _write(path.with_stem(f"{path.stem}{ACTUATORS}"), actuator_arrays(arrays, self._contract))
-
-
-def _write(path: Path, arrays: Mapping[str, np.ndarray] | None) -> None:
-    """Write a file atomically; without arrays, remove the file that another run has left."""
-    part = path.with_name(f".{path.name}.part.npz")
-    try:
-        if arrays is None:
-            path.unlink(missing_ok=True)
-            return
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(part, allow_pickle=False, **arrays)  # type: ignore[arg-type]
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise RunError(f"{path}: {error.strerror or error}") from error
+        make_folder(path.parent)
+        beside, samples = path.with_stem(f"{path.stem}{ACTUATORS}"), actuator_arrays(arrays, self._contract)
+        with replacing(path) as part:
+            np.savez_compressed(part, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+            beside.unlink(missing_ok=True)  # left by another run
+        if samples is not None:
+            with replacing(beside) as part:
+                np.savez_compressed(part, allow_pickle=False, **samples)  # type: ignore[arg-type]
 
 
 def actuator_arrays(log: Mapping[str, np.ndarray], contract: Contract) -> dict[str, np.ndarray] | None:

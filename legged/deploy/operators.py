@@ -197,7 +197,32 @@ class Script(Operator):
         return Orders(self._velocity, tuple(events))
 
 
-class Keyboard(Operator):
+class _Device(Operator):
+    """An operator at an open device, whose command is a share of the largest one; a device that is closed counts as lost."""
+
+    def __init__(self, descriptor: int, name: str) -> None:
+        self._descriptor, self._name = descriptor, name
+        self._velocity = np.zeros(3)
+        self._lost: str | None = None
+
+    def _read(self) -> bytes:
+        """Return the bytes received since the last call."""
+        found = b""
+        while self._lost is None and select.select([self._descriptor], [], [], 0.0)[0]:
+            try:
+                more = os.read(self._descriptor, 512)
+            except OSError:
+                more = b""
+            if not more:
+                self._lost = f"{self._name} is closed"
+            found += more
+        return found
+
+    def _orders(self, events: list[Event]) -> Orders:
+        return Orders(self._velocity.copy(), tuple(events), shares=True, lost=self._lost)
+
+
+class Keyboard(_Device):
     """The terminal of the program, read key by key until `close`."""
 
     def __init__(self, descriptor: int | None = None) -> None:
@@ -206,7 +231,7 @@ class Keyboard(Operator):
         Raises:
             ConfigError: there is no terminal.
         """
-        self._descriptor = sys.stdin.fileno() if descriptor is None else descriptor
+        super().__init__(sys.stdin.fileno() if descriptor is None else descriptor, "the terminal")
         if not os.isatty(self._descriptor):
             raise ConfigError("--input: the keyboard needs a terminal; name a gamepad (gamepad) or a file (--commands)")
         import termios
@@ -214,13 +239,11 @@ class Keyboard(Operator):
 
         self._before = termios.tcgetattr(self._descriptor)
         tty.setcbreak(self._descriptor)
-        self._velocity = np.zeros(3)
         self._typed = 0.0
-        self._lost: str | None = None
 
     def poll(self, seconds: float) -> Orders:
         events = []
-        keys = self._keys()
+        keys = self._read().decode("utf-8", "ignore")
         if keys:
             self._typed = seconds
         elif seconds - self._typed > SILENCE_S:
@@ -233,20 +256,7 @@ class Keyboard(Operator):
             elif key in STEPS:
                 axis, sense = STEPS[key]
                 self._velocity[axis] = np.clip(self._velocity[axis] + sense * STEP, -1.0, 1.0)
-        return Orders(self._velocity.copy(), tuple(events), shares=True, lost=self._lost)
-
-    def _keys(self) -> str:
-        """Return the characters typed since the last call."""
-        found = b""
-        while self._lost is None and select.select([self._descriptor], [], [], 0.0)[0]:
-            try:
-                more = os.read(self._descriptor, 64)
-            except OSError:
-                more = b""
-            if not more:
-                self._lost = "the terminal is closed"
-            found += more
-        return found.decode("utf-8", "ignore")
+        return self._orders(events)
 
     def close(self) -> None:
         import termios
@@ -255,8 +265,8 @@ class Keyboard(Operator):
             termios.tcsetattr(self._descriptor, termios.TCSANOW, self._before)
 
 
-class Gamepad(Operator):
-    """A gamepad, read from Linux's joystick device; when it is unplugged the operator counts as lost."""
+class Gamepad(_Device):
+    """A gamepad, read from Linux's joystick device."""
 
     def __init__(self, device: Path = DEVICE) -> None:
         """Open the device.
@@ -265,43 +275,24 @@ class Gamepad(Operator):
             ConfigError: the device does not exist, or this user may not read it.
         """
         try:
-            self._descriptor = os.open(device, os.O_RDONLY | os.O_NONBLOCK)
+            super().__init__(os.open(device, os.O_RDONLY | os.O_NONBLOCK), str(device))
         except OSError as error:
             raise ConfigError(f"--input: there is no gamepad at {device} ({error.strerror})") from error
-        self._device = device
-        self._sticks = np.zeros(3)
-        self._lost: str | None = None
         self._rest = b""
 
     def poll(self, seconds: float) -> Orders:
         events = []
-        self._rest += self._bytes()
+        self._rest += self._read()
         whole = len(self._rest) - len(self._rest) % JOYSTICK.size
         for _, value, kind, number in JOYSTICK.iter_unpack(self._rest[:whole]):
             if kind & ~AT_START == AXIS and number in AXES:
                 axis, sense = AXES[number]
                 share = float(np.clip(value / LARGEST, -1.0, 1.0))
-                self._sticks[axis] = sense * share if abs(share) > STILL else 0.0
+                self._velocity[axis] = sense * share if abs(share) > STILL else 0.0
             elif kind == BUTTON and value and number in BUTTONS:
                 events.append(BUTTONS[number])
         self._rest = self._rest[whole:]
-        return Orders(self._sticks.copy(), tuple(events), shares=True, lost=self._lost)
-
-    def _bytes(self) -> bytes:
-        """Return the bytes received since the last call."""
-        found = b""
-        while self._lost is None:
-            try:
-                more = os.read(self._descriptor, 64 * JOYSTICK.size)
-            except BlockingIOError:
-                break
-            except OSError as error:
-                self._lost = f"{self._device} ({error.strerror})"
-                break
-            if not more:
-                self._lost = f"{self._device} is closed"
-            found += more
-        return found
+        return self._orders(events)
 
     def close(self) -> None:
         os.close(self._descriptor)

@@ -9,8 +9,8 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from onnx import numpy_helper
 from helpers import CALM, ENGINE
+from onnx import numpy_helper
 from still_robot import BLIND, PROPRIOCEPTION, SMALL, exported, facts_for
 
 from legged.deploy.contract import CONTRACT_VERSION, need_of, read_contract
@@ -272,9 +272,9 @@ def test_a_network_of_weights_that_are_not_finite_is_refused(export_of):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ('{"observation": %s1%s}' % ("[" * 500, "]" * 500), "is nested too deeply"),
-        ('{"observation": [], "sim_dt": %s}' % ("1" * 400), "has a whole number of 400 digits"),
-        ('{"observation": [], "sim_dt": %s}' % ("1" * 5000), "has a whole number of 5000 digits"),
+        ('{"observation": ' + "[" * 500 + "]" * 500 + "}", "is nested too deeply"),
+        ('{"observation": [], "sim_dt": ' + "1" * 400 + "}", "has a whole number of 400 digits"),
+        ('{"observation": [], "sim_dt": ' + "1" * 5000 + "}", "has a whole number of 5000 digits"),
     ],
     ids=["deep", "long", "longer"],
 )

@@ -22,8 +22,7 @@ from legged.process.command_parser import CommandParser
 from legged.process.paths import make_folder, ready_to_write, replacing, write_text
 from legged.robots.robot import Robot, load_robot
 from legged.simulated_robot.film import POSES
-from legged.simulated_robot.motors import Motors, motors_config
-from legged.simulated_robot.robot import SimulatedRobot
+from legged.simulated_robot.robot import Motors, SimulatedRobot, motors_config
 from legged.simulated_robot.server import Server
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, terrain_type
 
