@@ -21,14 +21,14 @@ from legged.mdp.actuator import with_rotors
 from legged.process.command_parser import CommandParser
 from legged.process.paths import make_folder, ready_to_write, replacing, write_text
 from legged.robots.robot import Robot, load_robot
-from legged.simulated_robot.film import POSES
 from legged.simulated_robot.robot import Motors, SimulatedRobot, motors_config
 from legged.simulated_robot.server import Server
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, terrain_type
 
 LISTENING = "listening at "
 """Beginning of the line with the address."""
-REPORT = "report.json"
+REPORT, POSES = "report.json", "poses.npy"
+"""Files in the folder of a run."""
 PRIORITY = 10
 """Priority below the program's."""
 BORDER = 10.0

@@ -12,9 +12,18 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
-from legged.cli.deploy.robot import LISTENING, REPORT, add_simulation_arguments, check_simulation, motors_of, terrain_of
+from legged.cli.deploy.robot import (
+    LISTENING,
+    POSES,
+    REPORT,
+    add_simulation_arguments,
+    check_simulation,
+    motors_of,
+    terrain_of,
+)
 from legged.commandline.arguments import POLICY_HELP
 from legged.commandline.command import EXIT_WRONG_INPUT, command
 from legged.config import LeggedConfig
@@ -22,14 +31,18 @@ from legged.deploy.__main__ import add_program_arguments, limits_of
 from legged.deploy.contract import Contract, read_contract
 from legged.errors import ConfigError, RunError
 from legged.learning.run_folder import CONFIG_FILE, checkpoints, run_config
+from legged.play.video import write_mp4
 from legged.policies.export import EXPORTED, export
 from legged.policies.restore import policy_of, restore, undisturbed
 from legged.process.command_parser import CommandParser, add_import_argument
 from legged.process.paths import exists, ready_to_write, relative
 from legged.process.startup import INTERRUPTED, in_main_thread
 from legged.registry import import_tasks
+from legged.rendering import Camera, display_model, size_of
+from legged.rendering.camera import caption
+from legged.rendering.framing import Follower
 from legged.robots.robot import Robot, load_robot
-from legged.simulated_robot.film import make_film
+from legged.terrain import Terrain
 
 ROOM_MB = 16.0
 """Disk space for the exported policy and the log [MiB]."""
@@ -37,6 +50,13 @@ END_S = 20.0
 """Longest time for a process to end after it was told to [s]."""
 DID_NOT_RUN = (EXIT_WRONG_INPUT, INTERRUPTED)
 """Exit codes of a program that did not move the robot."""
+FILM = "film.mp4"
+SIZE = (640, 360)
+"""Width and height [pixels]."""
+AWAY = 3.45
+"""Distance of the camera, in lengths of the robot."""
+GLIDE = 0.1
+"""Share of the distance to a robot on a plane that the camera covers per picture."""
 SIMULATED = ("terrain", "size", "cell", "sim_dt", "latency", "loss", "seed")
 PASSED_ON = ("input", "gamepad", "commands", "seconds", "stand_seconds", "max_tilt", "max_age", "max_missed")
 
@@ -198,3 +218,37 @@ def _told(report: dict[str, Any]) -> str:
         f"{'fell' if report['fell'] else 'did not fall'}, {report['time']:.1f} s, {report['distance']:.2f} m away,"
         f" {report['climbed']:+.2f} m higher, largest lean {report['largest_lean']:.2f} rad, {lost:.1f} % of packets lost"
     )
+
+
+def make_film(robot: Robot, terrain: Terrain | None, folder: Path) -> None:
+    """Write a film of the poses in `folder` with the states of its log.npz; fewer than two poses make no film.
+
+    Raises:
+        RunError: this machine cannot render, or the film cannot be written.
+    """
+    poses = np.load(folder / POSES)
+    log = np.load(folder / "log.npz")
+    if len(poses) < 2 or "times" not in log:
+        (folder / FILM).unlink(missing_ok=True)  # left by another run
+        print(f"{folder}: the run was too short for a film, so there is none")
+        return
+    camera = Camera(display_model(robot, 1, *SIZE, terrain), *SIZE)
+    away = AWAY * size_of(robot).longest
+    follower = None if terrain is None else Follower(terrain.height_map, away)
+    camera.view.distance, camera.view.azimuth, camera.view.elevation = away, 130.0, -18.0
+    camera.view.lookat[:] = poses[0, 1:4]
+    frames = []
+    for time, *qpos in poses:
+        camera.data.qpos[:] = qpos
+        base = np.array(qpos[:3])
+        if follower is None:
+            camera.view.lookat[:] += GLIDE * (base - camera.view.lookat)
+        else:
+            follower.update(base)
+            follower.aim(camera.view)
+        camera.update()
+        place = min(int(np.searchsorted(log["times"], time)), len(log["times"]) - 1)
+        state = log["states"][log["state"][place]]
+        frames.append(caption(camera.render(), [f"{robot.name}: {state}", f"{time:.1f} s, {base[0]:+.1f} m forward"]))
+    camera.close()
+    write_mp4(frames, folder / FILM, (len(poses) - 1) / max(poses[-1, 0] - poses[0, 0], 1e-3))
