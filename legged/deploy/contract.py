@@ -3,7 +3,7 @@
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -82,10 +82,9 @@ def need_of(term: str) -> str:
 
 @dataclass(frozen=True)
 class Term:
-    """A term of the observation in the columns `start` to `start + size` of one observation of its group."""
+    """A term of the observation in the columns `start` to `start + size` of the oldest observation of its group."""
 
     name: str
-    group: str
     start: int
     size: int
     scale: np.ndarray
@@ -108,10 +107,10 @@ class Term:
 class Group:
     """A group of terms: `history` observations of `size` numbers each, oldest first, from column `start` on."""
 
-    name: str
     start: int
     size: int
     history: int
+    terms: tuple[Term, ...]
 
 
 @dataclass(frozen=True)
@@ -145,7 +144,6 @@ class Contract:
     """(A,) [rad]."""
     action_clip: float
     observation_clip: float
-    terms: tuple[Term, ...]
     groups: tuple[Group, ...]
     command_ranges: np.ndarray
     """(3, 2) lowest and highest vx, vy [m/s] and yaw rate [rad/s]."""
@@ -164,6 +162,11 @@ class Contract:
     def width(self) -> int:
         """Return the width of the policy's observation."""
         return sum(group.size * group.history for group in self.groups)
+
+    @property
+    def terms(self) -> list[Term]:
+        """Return all terms of the observation in order."""
+        return [term for group in self.groups for term in group.terms]
 
     @property
     def sources(self) -> dict[str, Term]:
@@ -243,7 +246,6 @@ def read_contract(path: Path) -> Contract:
         if (control := said.get("control_type")) != "P":
             raise ConfigError(f"{path}: control_type: got {control!r}; a robot takes joint angles ('P') only")
         contract = _contract(path, said)
-        _check_observation(contract)
         for name, digest in said.get(CHECKSUMS, {}).items():
             file = path.with_name(name)
             if file.is_file() and hashlib.sha256(file.read_bytes()).hexdigest() != digest:
@@ -257,10 +259,15 @@ def read_contract(path: Path) -> Contract:
 
 
 def _contract(path: Path, said: Mapping[str, Any]) -> Contract:
+    joints, acted, memory = tuple(said["joint_names"]), said["action_joints"], said["recurrent"] or {"onnx_inputs": ()}
+    count, scale = len(joints), said["action_scale"]
+
     def check(key: str, allowed: str, right: Any, values: np.ndarray) -> None:
         wrong = ~np.ravel(right)
         if wrong.any():
-            raise ConfigError(f"{path}: {key}: must be {allowed}, got {values.ravel()[int(wrong.argmax())]:g}")
+            i = int(wrong.argmax())
+            where = f" at '{joints[i]}'" if wrong.shape == (count,) else ""
+            raise ConfigError(f"{path}: {key}: must be {allowed}, got {values.ravel()[i]:g}{where}")
 
     def numbers(key: str, *shape: int) -> np.ndarray:
         values = np.array(said[key], dtype=float)
@@ -270,28 +277,6 @@ def _contract(path: Path, said: Mapping[str, Any]) -> Contract:
         check(key, allowed, np.isfinite(values) & right(values), values)
         return values
 
-    def term(entry: Mapping[str, Any]) -> Term:
-        name, needs, points = str(entry["name"]), str(entry["needs"]), entry.get("points")
-        if not needs.startswith(SOURCE) and needs != SENSORS.get(name):
-            raise ConfigError(f"{path}: observation: '{name}' needs '{needs}', which it is not made of")
-        scale = np.array(entry["scale"], dtype=float)
-        check(f"scale of {name}", "finite", np.isfinite(scale), scale)
-        return Term(
-            name=name,
-            group=str(entry["group"]),
-            start=int(entry["start"]),
-            size=int(entry["size"]),
-            scale=scale,
-            source=needs.removeprefix(SOURCE) if needs.startswith(SOURCE) else None,
-            points=None if points is None else np.array(points, dtype=float).reshape(-1, 2),
-            offset=float(entry.get("offset", 0.0)),
-            limit=float(entry.get("limit", np.inf)),
-            deepest=float(entry.get("deepest", entry.get("limit", np.inf))),
-            scan=str(entry.get("scan", SCANS[0])),
-        )
-
-    joints, acted, memory = tuple(said["joint_names"]), said["action_joints"], said["recurrent"] or {"onnx_inputs": ()}
-    count, scale = len(joints), said["action_scale"]
     if len(set(joints)) < count:
         raise ConfigError(f"{path}: joint_names: must differ from each other")
     limits = np.array([(-np.inf, np.inf) if pair is None else pair for pair in said["position_limits"]], dtype=float)
@@ -300,9 +285,8 @@ def _contract(path: Path, said: Mapping[str, Any]) -> Contract:
     default = numbers("default_joint_angles", count)
     crouch = None if said["crouch_joint_angles"] is None else numbers("crouch_joint_angles", count)
     for key, pose in (("default_joint_angles", default), ("crouch_joint_angles", crouch)):
-        outside = np.zeros(count) if pose is None else (pose < low - TOLERANCE) | (pose > high + TOLERANCE)
-        if outside.any():
-            raise ConfigError(f"{path}: {key}: that of '{joints[int(outside.argmax())]}' lies outside its position_limits")
+        if pose is not None:
+            check(key, "within position_limits", (low - TOLERANCE <= pose) & (pose <= high + TOLERANCE), pose)
     ranges = np.array([said["command_ranges"][name] for name in ("vx", "vy", "yaw_rate")], dtype=float).reshape(3, 2)
     right = np.isfinite(ranges).all(axis=1) & (ranges[:, 0] <= ranges[:, 1])
     check("command_ranges", "finite, and not above the upper ones", right, ranges[:, 0])
@@ -326,11 +310,7 @@ def _contract(path: Path, said: Mapping[str, Any]) -> Contract:
         action_scale=np.broadcast_to(numbers("action_scale", *np.shape(scale)), (len(acted),)).copy(),
         action_clip=float(numbers("action_clip")),
         observation_clip=float(numbers("observation_clip")),
-        terms=tuple(term(entry) for entry in said["observation"]),
-        groups=tuple(
-            Group(str(group["name"]), int(group["start"]), int(group["size"]), int(group["history"]))
-            for group in said["observation_groups"]
-        ),
+        groups=tuple(_groups(f"{path}: observation", said, count)),
         command_ranges=ranges,
         dead_zone=float(numbers("command_dead_zone")),
         control_dt=float(control_dt),
@@ -340,37 +320,60 @@ def _contract(path: Path, said: Mapping[str, Any]) -> Contract:
     )
 
 
-def _check_observation(contract: Contract) -> None:
-    """Check that a robot can make every term, that terms fill their groups, and that groups fill the observation."""
-    where, joints = f"{contract.path}: observation", len(contract.joint_names)
+def _groups(where: str, said: Mapping[str, Any], joints: int) -> Iterator[Group]:
+    """Yield the groups, whose terms a robot with so many joints can make, and which lie side by side without gaps."""
     sizes = {"base_ang_vel": 3, "projected_gravity": 3, "commands": 3, "dof_pos": joints, "dof_vel": joints}
-    sizes["actions"] = len(contract.acted)
-    names = [group.name for group in contract.groups]
-    for term in contract.terms:
-        if term.group not in names:
-            raise ConfigError(f"{where}: '{term.name}' lies outside its group '{term.group}'")
-        if term.source is None and term.size != sizes[term.name]:
-            raise ConfigError(f"{where}: '{term.name}' has {term.size} numbers, a robot gives {sizes[term.name]}")
-        if term.scale.shape != (term.size,):
-            raise ConfigError(f"{where}: '{term.name}' has {term.size} numbers and {term.scale.size} scales")
-        if term.source == "heights" and (term.points is None or len(term.points) != term.size):
-            raise ConfigError(f"{where}: 'heights' has {term.size} numbers and no point for each")
-        if term.scan not in SCANS:
-            raise ConfigError(f"{where}: scan of '{term.name}': must be one of {', '.join(SCANS)}, got '{term.scan}'")
-    begin = 0
-    for group in contract.groups:
-        if group.history < 1 or group.size < 1:
+    sizes["actions"] = len(said["action_joints"])
+    names = [entry["name"] for entry in said["observation_groups"]]
+    for entry in said["observation"]:
+        if entry["group"] not in names:
+            raise ConfigError(f"{where}: '{entry['name']}' lies outside its group '{entry['group']}'")
+    start = 0
+    for entry in said["observation_groups"]:
+        size, history, column = int(entry["size"]), int(entry["history"]), start
+        if history < 1 or size < 1:
             raise ConfigError(f"{where}_groups: each must have a history and a size of at least 1")
-        if group.start != begin or names.count(group.name) > 1:
-            raise ConfigError(f"{where}_groups: '{group.name}' must be named once and start at column {begin}")
-        column = begin
-        for term in sorted((term for term in contract.terms if term.group == group.name), key=lambda term: term.start):
+        if entry["start"] != start:
+            raise ConfigError(f"{where}_groups: '{entry['name']}' must start at column {start}, got {entry['start']}")
+        own = [term for term in said["observation"] if term["group"] == entry["name"]]
+        terms = sorted((_term(where, term, sizes) for term in own), key=lambda term: term.start)
+        for term in terms:
             if term.start != column:
                 raise ConfigError(f"{where}: '{term.name}' must start at column {column}, got {term.start}")
             column += term.size
-        if column != begin + group.size:
-            raise ConfigError(f"{where}_groups: '{group.name}' has {group.size} numbers, its terms {column - begin}")
-        begin += group.size * group.history
+        if column != start + size:
+            raise ConfigError(f"{where}_groups: '{entry['name']}' has {size} numbers, its terms {column - start}")
+        yield Group(start, size, history, tuple(terms))
+        start += size * history
+
+
+def _term(where: str, entry: Mapping[str, Any], sizes: Mapping[str, int]) -> Term:
+    name, needs, size, limit = str(entry["name"]), str(entry["needs"]), int(entry["size"]), entry.get("limit", np.inf)
+    source = needs.removeprefix(SOURCE) if needs.startswith(SOURCE) else None
+    scale, points = np.array(entry["scale"], dtype=float), np.array(entry.get("points") or (), dtype=float).reshape(-1, 2)
+    scan = str(entry.get("scan", SCANS[0]))
+    if source is None and needs != SENSORS.get(name):
+        raise ConfigError(f"{where}: '{name}' needs '{needs}', which it is not made of")
+    if source is None and size != sizes[name]:
+        raise ConfigError(f"{where}: '{name}' has {size} numbers, a robot gives {sizes[name]}")
+    if scale.shape != (size,) or not np.isfinite(scale).all():
+        raise ConfigError(f"{where}: scale of '{name}': must be {size} finite numbers, got {entry['scale']}")
+    if source == "heights" and len(points) != size:
+        raise ConfigError(f"{where}: 'heights' has {size} numbers and {len(points)} points")
+    if scan not in SCANS:
+        raise ConfigError(f"{where}: scan of '{name}': must be one of {', '.join(SCANS)}, got '{scan}'")
+    return Term(
+        name=name,
+        start=int(entry["start"]),
+        size=size,
+        scale=scale,
+        source=source,
+        points=points if entry.get("points") else None,
+        offset=float(entry.get("offset", 0.0)),
+        limit=float(limit),
+        deepest=float(entry.get("deepest", limit)),
+        scan=scan,
+    )
 
 
 def _difference(wanted: Sequence[str], there: Sequence[str], robot: str) -> str:

@@ -85,7 +85,7 @@ class Policy:
                 raise ConfigError(f"POLICY: there is no {needed}: a folder with policy.onnx and policy.json is wanted")
         self.contract = contract = read_contract(path.with_name("policy.json"))
         self._network = Network(path, contract)
-        self._steps = {group.name: np.zeros((group.history, group.size)) for group in contract.groups}
+        self._steps = [np.zeros((group.history, group.size)) for group in contract.groups]
         self.observation = np.zeros(contract.width, dtype=np.float32)
         """(width,) observation of the last call."""
         self.restart()
@@ -126,19 +126,17 @@ class Policy:
             "dof_vel": reading.velocities,
             "actions": self.actions,
         }
-        for group in contract.groups:
-            steps = self._steps[group.name]
+        for group, steps in zip(contract.groups, self._steps, strict=True):
             steps[:-1] = steps[1:]
-            for term in contract.terms:
-                if term.group == group.name:
-                    value = values[term.name] if term.source is None else _from_source(term, reading.sources[term.source])
-                    start = term.start - group.start
-                    steps[-1, start : start + term.size] = term.scale * value
+            for term in group.terms:
+                value = values[term.name] if term.source is None else _from_source(term, reading.sources[term.source])
+                begin = term.start - group.start
+                steps[-1, begin : begin + term.size] = term.scale * value
             np.clip(steps[-1], -contract.observation_clip, contract.observation_clip, out=steps[-1])
             if self._begins:
                 steps[:] = steps[-1]
         self._begins = False
-        return np.concatenate([self._steps[group.name].ravel() for group in contract.groups]).astype(np.float32)
+        return np.concatenate([steps.ravel() for steps in self._steps]).astype(np.float32)
 
 
 def _from_source(term: Term, given: np.ndarray) -> np.ndarray:

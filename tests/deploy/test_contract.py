@@ -103,9 +103,9 @@ def test_a_joint_without_limits_has_none_in_the_contract_too(folder, tmp_path):
             {"observation_groups": [{"name": "actor", "start": 0, "size": 45, "history": 0}]},
             r"observation_groups: each must have a history and a size of at least 1",
         ),
-        ({"crouch_joint_angles": [50.0] * 12}, r"crouch_joint_angles: that of 'LF_HAA' lies outside its position_limits"),
+        ({"crouch_joint_angles": [50.0] * 12}, r"crouch_joint_angles: must be within position_limits, got 50 at 'LF_HAA'"),
         ({"control_dt": 5.0}, r"control_dt: must be between 0\.001 and 1, got 5"),
-        ({"default_joint_angles": [2.0] * 12}, r"default_joint_angles: that of 'LF_HAA' lies outside its position_limits"),
+        ({"default_joint_angles": [2.0] * 12}, r"default_joint_angles: must be within position_limits, got 2 at 'LF_HAA'"),
         (
             {"observation_groups": [{"name": "actor", "start": 0, "size": 46, "history": 2}]},
             r"observation_groups: 'actor' has 46 numbers, its terms 45",
