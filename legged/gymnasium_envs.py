@@ -174,7 +174,7 @@ class _Driver:
             self._camera = None
 
 
-class TaskEnv(_Driver, gymnasium.Env):
+class TaskEnv(_Driver, gymnasium.Env):  # type: ignore[misc]
     """One environment of a task. At the end of an episode `step` returns its last observation; `reset` starts the next."""
 
     def __init__(self, task: str, **arguments: Any) -> None:
@@ -231,7 +231,7 @@ class TaskEnv(_Driver, gymnasium.Env):
         self.close_extras()
 
 
-class TaskVectorEnv(_Driver, VectorEnv):
+class TaskVectorEnv(_Driver, VectorEnv):  # type: ignore[misc]
     """The N environments of a task. At the end of an episode an environment is reset within the same step: `step` returns the
     first observation of the next episode, and `infos["final_obs"]` has the last one of the old.
     """

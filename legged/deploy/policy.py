@@ -46,7 +46,8 @@ class Network:
         """
         self._session, self._states = open_onnx(path), contract.states
         contract.check_metadata(path, self._session.get_modelmeta().custom_metadata_map)
-        wanted = {"obs": (contract.width,), **{name: (shape[0], shape[2]) for name, shape in contract.states.items()}}
+        wanted: dict[str, tuple[int, ...]] = {"obs": (contract.width,)}
+        wanted |= {name: (layers, width) for name, (layers, _, width) in contract.states.items()}
         found = {each.name: tuple(n for n in each.shape if isinstance(n, int)) for each in self._session.get_inputs()}
         if list(found.items()) != list(wanted.items()):  # sizes of the batch have names in place of numbers
             raise ConfigError(f"{path}: takes {found}; policy.json says {wanted}")

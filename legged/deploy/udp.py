@@ -69,11 +69,12 @@ def unpack_sources(body: bytes) -> dict[str, np.ndarray | None]:
     Raises:
         ValueError, KeyError, TypeError, AttributeError: the body is no greeting, or has points that are not finite.
     """
-    found = {}
+    found: dict[str, np.ndarray | None] = {}
     for name, given in plain_json(body)["sources"].items():
-        found[name] = None if given is None else np.array(given, dtype=float).reshape(-1, 2)
-        if given is not None and not np.isfinite(found[name]).all():
+        points = None if given is None else np.array(given, dtype=float).reshape(-1, 2)
+        if points is not None and not np.isfinite(points).all():
             raise ValueError(f"{name}: its points are not finite")
+        found[name] = points
     return found
 
 

@@ -111,8 +111,8 @@ def _side(side: str, parts: dict[str, tuple[float, float, float, float]]) -> dic
     """Return the joints of one side; on the right, rolls of hips and shoulders have the opposite sign."""
     mirrored = ("hip_roll", "shoulder_roll") if side == "right" else ()
     return {
-        f"{side}_{part}_joint": (-high, -low, *limits) if part in mirrored else (low, high, *limits)
-        for part, (low, high, *limits) in parts.items()
+        f"{side}_{part}_joint": (-high, -low, speed, torque) if part in mirrored else (low, high, speed, torque)
+        for part, (low, high, speed, torque) in parts.items()
     }
 
 

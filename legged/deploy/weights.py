@@ -98,7 +98,8 @@ def unpack(data: bytes) -> list[Layer]:
     """
     if data[: len(MAGIC)] != MAGIC:
         raise ValueError("is no policy.weights of an export")
-    place, kept, layers = len(MAGIC) + COUNT.size, 0, list[Layer]()
+    place, kept = len(MAGIC) + COUNT.size, 0
+    layers: list[Layer] = []
     try:
         for _ in range(COUNT.unpack_from(data, len(MAGIC))[0]):
             kind, detail, inputs, outputs = HEAD.unpack_from(data, place)

@@ -166,15 +166,16 @@ def read_log(path: Path) -> ActuatorLog:
             allowed = "above 0" if name == "torque_limit" else "0 or more"
             raise ConfigError(f"{path}: {name}: must be {allowed}, got {values.min():g}")
         found[name] = np.broadcast_to(values, count).copy()
-    if "dt" not in arrays and "time" not in arrays:
+    steps = [float(numbers("dt", "a number", (), (1,)).item())] if "dt" in arrays else []
+    if "time" in arrays:
+        steps.append(_even_step(numbers("time", f"{run.shape}", run.shape), run, path))
+    if not steps:
         raise ConfigError(f"{path}: 'dt' is missing: the time between two samples [s], or 'time' of each of them")
-    step = _even_step(numbers("time", f"{run.shape}", run.shape), run, path) if "time" in arrays else None
-    dt = step if "dt" not in arrays else numbers("dt", "a number", (), (1,)).item()
-    if not dt > 0.0:
-        raise ConfigError(f"{path}: dt: must be above 0, got {dt:g}")
-    if step is not None and not np.isclose(step, dt, rtol=UNEVEN):
-        raise ConfigError(f"{path}: dt: got {dt:g} s, but 'time' says {step:g} s; leave one of them out")
-    return ActuatorLog(names, dt, run, **found)
+    if not steps[0] > 0.0:
+        raise ConfigError(f"{path}: dt: must be above 0, got {steps[0]:g}")
+    if not np.isclose(steps[-1], steps[0], rtol=UNEVEN):
+        raise ConfigError(f"{path}: dt: got {steps[0]:g} s, but 'time' says {steps[1]:g} s; leave one of them out")
+    return ActuatorLog(names, steps[0], run, **found)
 
 
 def check_alike(log: ActuatorLog, path: Path) -> None:
