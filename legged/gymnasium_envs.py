@@ -94,7 +94,7 @@ class _Driver:
 
         clip = cfg.observations.clip
         widths = {name: group.buffer.shape[1] for name, group in self.task.observation_groups.items()}
-        boxes = {name: box(clip, width) for name, width in widths.items()}
+        boxes: dict[str, spaces.Space[Any]] = {name: box(clip, width) for name, width in widths.items()}
         self._actions = box(cfg.control.clip_actions, self.task.num_actions)
         chosen = self._groups
         self._observations = spaces.Dict(boxes) if chosen is None else box(clip, sum(widths[name] for name in chosen))
