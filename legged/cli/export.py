@@ -33,11 +33,8 @@ def build_parser() -> CommandParser:
         "legged export anymal_c_flat/2026-11-22_05-38-19",
     )
     add_policy_arguments(parser)
-    parser.add_argument(
-        "--out",
-        type=Path,
-        help="folder for the folders; exported/ in the run folder by default, or logs/export/ for a shipped policy",
-    )
+    out = "folder for the folders; exported/ in the run folder by default, or logs/export/ for a shipped policy"
+    parser.add_argument("--out", type=Path, help=out)
     return parser
 
 
@@ -61,11 +58,10 @@ def main(argv: list[str] | None) -> int:
     changes = [*calm, ("sim.physics", "mujoco"), *policy_overrides(args)]
     task, act = restore(policy, changes, device, graph=False)
     for path in paths.values():
-        iterations = act.load(path)
-        training: dict[str, float] = {"iterations": iterations}
-        seconds = (read_checkpoint(path).get("infos") or {}).get("wall_s")
+        training: dict[str, float] = {"iterations": act.load(path)}
+        seconds = read_checkpoint(path)["infos"].get("wall_s")
         if isinstance(seconds, int | float):
             training["wall_s"] = seconds
-        export(task, act.network, folder / f"{iterations:05d}", training, policy.cfg)
+        export(task, act.network, folder / f"{training['iterations']:05d}", training, policy.cfg)
     print(f"exported {len(paths)} checkpoint{'s' if len(paths) != 1 else ''} to {relative(folder)}")
     return 0

@@ -10,7 +10,7 @@ network.npz (for control.actuator.network), fit.json and fit.png.
 """
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ import numpy as np
 from legged.commandline.command import command
 from legged.config.yaml_files import dump
 from legged.errors import ConfigError
-from legged.fitting.judgement import Fit, actuator_section, draw, errors
+from legged.figures import figure
 from legged.fitting.log import ActuatorLog, check_alike, read_log
 from legged.fitting.parametric import Drive, fit_drive
 from legged.process.command_parser import CommandParser
@@ -28,6 +28,24 @@ from legged.process.paths import make_folder, ready_to_write, relative, write_te
 UPDATES = {"mlp": 2000, "lstm": 3000}
 """Default number of updates of a network."""
 HIDDEN = {"mlp": (32, 32, 32), "lstm": (8, 8)}
+MEASURED = "#000000"
+COLORS = {"ideal PD": "#E69F00", "parametric": "#0072B2", "network": "#D55E00"}
+"""Colours of the fits, from the palette of Okabe and Ito."""
+SHOWN_S = 2.0
+"""Time range of the picture [s]."""
+POINTS = 4000
+"""Number of measurements in the plot of torque over speed."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Prediction of the torques of a log by one model."""
+
+    name: str
+    log: ActuatorLog
+    """Log at the time step of the model."""
+    torque: np.ndarray
+    """(T, D) [N m]."""
 
 
 def build_parser() -> CommandParser:
@@ -90,7 +108,13 @@ def main(argv: list[str] | None) -> int:
     print("held out:")
     for name, of in judged.items():
         print(f"  {name:10}  RMSE {of['rmse']:.3g} N m, largest {of['largest']:.3g} N m, explained {of['explained']:.2%}")
-    _write(args.out, at_steps, drive, judged)
+    make_folder(args.out)
+    told = "# Fitted by legged fit-actuator: copy it into the YAML of a task\n"
+    section = dump({"control": control_section(at_steps, drive)}, sort_keys=False, default_flow_style=None, width=120)
+    write_text(args.out / "actuator.yaml", told + section)
+    numbers = {name: value if np.isfinite(value) else None for name, value in vars(drive).items()}
+    facts = {"joints": list(log.joint_names), "sim_dt": at_steps.dt, "drive": numbers, "held_out": judged}
+    write_text(args.out / "fit.json", json.dumps(facts, indent=1))
     replace(weights, facts=judged["network"]).save(args.out / "network.npz")
     draw(args.out / "fit.png", log, fits, drive)
     print(f"written: {relative(args.out)}/ (actuator.yaml, network.npz, fit.json, fit.png)")
@@ -98,11 +122,7 @@ def main(argv: list[str] | None) -> int:
 
 
 def _widths(text: str) -> list[int]:
-    """Return the units of the layers.
-
-    Raises:
-        ConfigError: the text is not a list of numbers.
-    """
+    """Return the units of the layers."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() for part in parts):
         raise ConfigError(f"--hidden: expected numbers like 32,32,32, got '{text}'")
@@ -111,24 +131,22 @@ def _widths(text: str) -> list[int]:
 
 def _tell(log: ActuatorLog) -> None:
     """Print the contents of the log."""
-    seconds, held = len(log.run) * log.dt, float(log.held_out.mean())
-    runs = len(np.unique(log.run))
+    seconds, held, runs = len(log.run) * log.dt, float(log.held_out.mean()), len(np.unique(log.run))
     names = ", ".join(log.joint_names[:4]) + (", ..." if len(log.joint_names) > 4 else "")
-    print(
-        f"{seconds:.4g} s at {1.0 / log.dt:.4g} Hz in {runs} run{'s' if runs > 1 else ''}, {held:.0%} of it held out; {names}"
-    )
+    sampled = f"{seconds:.4g} s at {1.0 / log.dt:.4g} Hz in {runs} run{'s' if runs > 1 else ''}"
+    print(f"{sampled}, {held:.0%} of it held out; {names}")
 
 
 def _tell_drive(drive: Drive, log: ActuatorLog) -> None:
     """Print the fitted parameters, and those that the log does not determine."""
-    known = log.stiffness is not None and log.damping is not None
-    print(f"gains: {drive.stiffness:.4g} N m/rad, {drive.damping:.4g} N m s/rad ({'given' if known else 'fitted'})")
+    given = "given" if log.has_gains else "fitted"
+    print(f"gains: {drive.stiffness:.4g} N m/rad, {drive.damping:.4g} N m s/rad ({given})")
     print(f"delay: {1e3 * drive.delay:.3g} ms")
     if np.isfinite(drive.stall_torque):
         print(f"motor: {drive.stall_torque:.4g} N m at rest, none at {drive.no_load_speed:.4g} rad/s")
     else:
         print("motor: its torque-speed line is not reached in the log; the effort limit stays")
-    viscous = f"viscous {drive.viscous:.3g} N m s/rad" if known else "viscous friction is part of the damping"
+    viscous = f"viscous {drive.viscous:.3g} N m s/rad" if log.has_gains else "viscous friction is part of the damping"
     if drive.breakaway == drive.coulomb:
         dry = f"{drive.coulomb:.3g} N m (the log shows no more to break away)"
     else:
@@ -136,22 +154,73 @@ def _tell_drive(drive: Drive, log: ActuatorLog) -> None:
     print(f"friction: {dry}, {viscous}")
 
 
-def _write(folder: Path, log: ActuatorLog, drive: Drive, judged: dict[str, dict[str, float]]) -> None:
-    """Write the results.
+def errors(fit: Fit) -> dict[str, float]:
+    """Return the root mean squared error and the largest error on held-out samples [N m], and the explained share of their
+    variance.
+    """
+    measured = fit.log.torque[fit.log.held_out]
+    wrong = fit.torque[fit.log.held_out] - measured
+    explained = 1.0 - float(np.mean(wrong**2) / max(np.var(measured), 1e-12))
+    return {"rmse": float(np.sqrt(np.mean(wrong**2))), "largest": float(np.abs(wrong).max()), "explained": explained}
+
+
+def control_section(log: ActuatorLog, drive: Drive) -> dict[str, Any]:
+    """Return the section `control` of a fitted drive, for the joints of a log with the time step of the physics. Gains that
+    the log does not state are part of it.
+    """
+
+    def named(**values: float) -> dict[str, dict[str, float]]:
+        return {key: {name: float(f"{value:.4g}") for name in log.joint_names} for key, value in values.items()}
+
+    section: dict[str, Any] = {}
+    if np.isfinite(drive.stall_torque):
+        limits = named(stall_torque=drive.stall_torque, no_load_speed=drive.no_load_speed)
+        section |= {"model": "dc_motor", "joints": list(log.joint_names), **limits}
+    friction = {"coulomb_friction": drive.coulomb, "breakaway_friction": drive.breakaway, "viscous_friction": drive.viscous}
+    section |= {**named(**friction), "stribeck_velocity": float(f"{drive.stribeck_velocity:.4g}")}
+    steps = drive.delay / log.dt
+    section["delay"] = [int(np.floor(steps + 0.05)), int(np.ceil(steps - 0.05))]
+    return {"actuator": section} | ({} if log.has_gains else named(stiffness=drive.stiffness, damping=drive.damping))
+
+
+def draw(path: Path, log: ActuatorLog, fits: list[Fit], drive: Drive) -> None:
+    """Write a picture: torques over time and errors of each fit on held-out samples, and torque over speed.
 
     Raises:
-        RunError: the files can't be written.
+        RunError: the file cannot be written.
     """
-    make_folder(folder)
-    control: dict[str, Any] = {"actuator": actuator_section(log, drive, log.dt)}
-    if log.stiffness is None or log.damping is None:  # gains that the log does not state are part of the fit
-        gains = (("stiffness", drive.stiffness), ("damping", drive.damping))
-        control |= {name: {joint: float(f"{gain:.4g}") for joint in log.joint_names} for name, gain in gains}
-    told = "# Fitted by legged fit-actuator: copy it into the YAML of a task\n"
-    write_text(
-        folder / "actuator.yaml",
-        told + dump({"control": control}, sort_keys=False, default_flow_style=None, width=120),
-    )
-    numbers = {name: value if np.isfinite(value) else None for name, value in vars(drive).items()}
-    facts = {"joints": list(log.joint_names), "sim_dt": log.dt, "drive": numbers, "held_out": judged}
-    write_text(folder / "fit.json", json.dumps(facts, indent=1))
+    joint = int(np.argmax(log.torque[log.held_out].std(axis=0)))
+    with figure(path, (13.0, 4.6), 1, 3) as (_, axes):
+        over_time, over_speed, bars = axes[0]
+        rows = _shown(log)
+        over_time.plot((rows - rows[0]) * log.dt, log.torque[rows, joint], color=MEASURED, lw=2.2, label="measured", zorder=0)
+        for fit in fits:
+            rows = _shown(fit.log)
+            time = (rows - rows[0]) * fit.log.dt
+            over_time.plot(time, fit.torque[rows, joint], color=COLORS[fit.name], lw=1.2, label=fit.name)
+        over_time.set(title=f"{log.joint_names[joint]}, held out", xlabel="time [s]", ylabel="torque [N m]")
+        over_time.legend(fontsize=8)
+        speeds, torques = log.velocity.ravel(), log.torque.ravel()
+        picked = np.linspace(0, len(speeds) - 1, min(POINTS, len(speeds))).astype(int)
+        over_speed.scatter(speeds[picked], torques[picked], s=3, color="#999999", label="measured")
+        line = np.linspace(speeds.min(), speeds.max(), 200)
+        if np.isfinite(drive.stall_torque):
+            for sign, label in ((1.0, "limits of the fitted motor"), (-1.0, None)):
+                edge = drive.torques(np.full(200, sign * 1e6), line)
+                over_speed.plot(line, edge, color=COLORS["parametric"], label=label)
+        over_speed.plot(line, -drive.friction(line), color=COLORS["network"], linestyle="--", label="fitted friction")
+        reach = 1.15 * np.abs(torques).max()
+        over_speed.set(ylim=(-reach, reach), title="all samples", xlabel="velocity [rad/s]", ylabel="torque [N m]")
+        over_speed.legend(fontsize=8)
+        values = [errors(fit)["rmse"] for fit in fits]
+        drawn = bars.bar([fit.name for fit in fits], values, color=[COLORS[fit.name] for fit in fits])
+        bars.bar_label(drawn, [f"{value:.3g}" for value in values])
+        bars.set(title="error on held-out samples", ylabel="RMSE [N m]")
+
+
+def _shown(log: ActuatorLog) -> np.ndarray:
+    """Return the indices of the first held-out samples of a log, all of one run."""
+    held = log.held_out
+    start = int(np.flatnonzero(held)[0])
+    rows = np.arange(start, min(start + round(SHOWN_S / log.dt), len(held)))
+    return rows[held[rows] & (log.run[rows] == log.run[start])]

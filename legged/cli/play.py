@@ -22,7 +22,7 @@ from legged.commandline.arguments import (
 )
 from legged.commandline.command import command
 from legged.config import LeggedConfig, override
-from legged.envs import BaseTask, LeggedRobot
+from legged.envs import LeggedRobot
 from legged.errors import ConfigError, RunError
 from legged.learning.run_folder import find_run, run_config
 from legged.play.demonstrations import EPISODE_S, follow_schedule, roll_out, schedule_s, walk_out
@@ -78,9 +78,8 @@ def main(argv: list[str] | None) -> int:
     policy = policy_of(_named(args), args.checkpoint)
     asked = policy_overrides(args)
     folder = args.out or policy.output("play")
-    graph = not args.no_graph
     if isinstance(policy.cfg, LeggedConfig):
-        playground, task, act = _on_ground(args, policy, asked, device, graph, folder)
+        playground, task, act = _on_ground(args, policy, asked, device, folder)
     else:
         for flag in ("terrain", "difficulty"):
             if getattr(args, flag) is not None:
@@ -88,7 +87,7 @@ def main(argv: list[str] | None) -> int:
         playground = None
         policy, changes = for_episodes(policy, args.num_envs if args.num_envs is not None else SHOWN_ON_A_PLANE)
         ready_to_write(folder, ROOM_MB)
-        task, act = restore(policy, [*changes, *asked], device, graph)
+        task, act = restore(policy, [*changes, *asked], device, not args.no_graph)
     print(f"{policy.cfg.task}: {relative(policy.checkpoint)}\nwatch it: {watch_command(args, policy.folder)}")
 
     differences = export(task, act.network, folder / EXPORTED, trained=policy.cfg)
@@ -105,24 +104,24 @@ def main(argv: list[str] | None) -> int:
     elif not (args.no_video or args.headless) and "DISPLAY" in os.environ:
         print(f"the display {os.environ['DISPLAY']} (DISPLAY) does not answer: recording only")
     shown = min(task.num_envs, len(playground.order) if playground else MOST_SHOWN)
-    video, failure = _video(task, shown, None if args.no_video else folder, args.gif)
+    failure = None
+    try:
+        video = Video(task, shown, None if args.no_video else folder, args.gif)
+    except RunError as error:  # this machine cannot render, but the policy is still measured
+        video, failure = Video(task, shown, None), error
     if not isinstance(task, LeggedRobot):
         result = roll_out(task, act, video)
     else:
         result = walk_out(task, act, playground, video) if playground else follow_schedule(task, act, video)
     Console(width=90).print(result)
-    if failure is None:
-        video.write()
-        return 0
-    raise failure
+    if failure is not None:
+        raise failure
+    video.write()
+    return 0
 
 
 def _named(args: argparse.Namespace) -> str:
-    """Return the policy's name as POLICY; legged_gym's options choose a run of the task.
-
-    Raises:
-        ConfigError: there is no such run, or it is of another task.
-    """
+    """Return the policy's name as POLICY; legged_gym's options choose a run of the task."""
     if args.load_run is None and args.experiment_name is None:
         return str(args.policy)
     flags = [("train.runner.experiment_name", args.experiment_name)] if args.experiment_name else []
@@ -134,12 +133,7 @@ def _named(args: argparse.Namespace) -> str:
 
 
 def _on_ground(
-    args: argparse.Namespace,
-    policy: TrainedPolicy,
-    asked: list[tuple[str, Any]],
-    device: torch.device,
-    graph: bool,
-    folder: Path,
+    args: argparse.Namespace, policy: TrainedPolicy, asked: list[tuple[str, Any]], device: torch.device, folder: Path
 ) -> tuple[Playground | None, LeggedRobot, Actor]:
     """Build a task of legged robots, on tiles if the command line chooses terrain."""
     wanted: LeggedConfig = override(policy.cfg, asked)  # type: ignore[assignment]
@@ -152,14 +146,4 @@ def _on_ground(
         changes += playground.changes(wanted)
         terrain = playground.build(override(policy.cfg, changes))  # type: ignore[arg-type]
     ready_to_write(folder, ROOM_MB)
-    return playground, *restore(policy, changes, device, graph=graph, terrain=terrain)
-
-
-def _video(task: BaseTask, count: int, folder: Path | None, gif: bool) -> tuple[Video, RunError | None]:
-    """Return a `Video` of the robots, and None. If this machine cannot render, return a `Video` that only measures, and the
-    error.
-    """
-    try:
-        return Video(task, count, folder, gif), None
-    except RunError as error:
-        return Video(task, count, None), error
+    return playground, *restore(policy, changes, device, graph=not args.no_graph, terrain=terrain)

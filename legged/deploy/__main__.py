@@ -9,34 +9,22 @@ import gc
 import signal
 import sys
 from contextlib import suppress
-from dataclasses import fields
 from pathlib import Path
 from types import FrameType
 
-from legged.deploy import gamepad, keyboard
-from legged.deploy.commands import Operator, Orders, Script
-from legged.deploy.gamepad import Gamepad
 from legged.deploy.interface import Interface
-from legged.deploy.keyboard import Keyboard
-from legged.deploy.log import Log
-from legged.deploy.pace import take_priority
+from legged.deploy.operators import DEVICE, HELP, Event, Gamepad, Keyboard, Operator, Orders, Script
+from legged.deploy.pace import StatusMessages, take_priority
 from legged.deploy.policy import Policy
 from legged.deploy.program import Program
 from legged.deploy.safety import Limits
-from legged.deploy.states import Event
-from legged.deploy.status_messages import StatusMessages
 from legged.deploy.udp import UdpRobot
-from legged.deploy.unitree import SdkWire, UnitreeRobot
-from legged.deploy.unitree_messages import KINDS
+from legged.deploy.unitree import KINDS, SdkWire, UnitreeRobot
 from legged.errors import ConfigError, RunError, suggest
 from legged.process.command_parser import CommandParser
+from legged.process.paths import ready_to_write_file
 
-BOUNDS = {
-    "stand_seconds": (1.0, 60.0),
-    "max_tilt": (0.1, 1.6),
-    "max_age": (0.005, 0.5),
-    "max_missed": (1, 50),
-}
+BOUNDS = {"stand_seconds": (1.0, 60.0), "max_tilt": (0.1, 1.6), "max_age": (0.005, 0.5), "max_missed": (1, 50)}
 """Flag -> its smallest and largest value, in seconds, radians and cycles; degrees or milliseconds are refused."""
 ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
 """Signals that end the program after the robot was braked: Ctrl-C, kill, a closed terminal or a lost connection, Ctrl-\\ and
@@ -83,7 +71,7 @@ def _main(argv: list[str] | None) -> int:
     limits = limits_of(args)
     if not args.robot.startswith("udp:") and args.robot not in KINDS:
         raise ConfigError(f"--robot: '{args.robot}' is unknown{suggest(args.robot, [*KINDS, 'udp:HOST:PORT'])}")
-    Log.check(args.log)
+    ready_to_write_file("--log", args.log, endings=(".npz",))
     policy = Policy(args.policy)
     if args.robot in KINDS:  # refuse a misfit before the robot leaves its own controller
         policy.contract.check_fits(KINDS[args.robot].facts)
@@ -91,45 +79,46 @@ def _main(argv: list[str] | None) -> int:
     tell = StatusMessages()
     hurries = take_priority()  # before a robot's SDK starts threads, which inherit it
     try:
-        robot = _connect(args)
-        operator.take()
+        if args.robot in KINDS:
+            robot: Interface = UnitreeRobot(args.robot, SdkWire(KINDS[args.robot], args.network, args.domain))
+        else:
+            robot = UdpRobot(args.robot.removeprefix("udp:"))
+        try:
+            operator.take()
+            program = Program(policy, robot, operator, limits, args.stand_seconds, tell=tell)
+        except BaseException:
+            robot.close()
+            raise
     except BaseException:
-        operator.close()
-        raise
-    try:
-        program = Program(policy, robot, operator, limits, args.stand_seconds, tell=tell)
-    except BaseException:
-        robot.close()
         operator.close()
         raise
     sys.setswitchinterval(SWITCH_S)
     hurry = "with priority" if hurries else "without priority: cycles may begin late on a busy machine (rtprio)"
     tell(f"{policy.contract.task} on {robot.facts.name}, {1.0 / policy.contract.control_dt:g} Hz, {hurry}")
     try:
-        outcome = program.run(args.seconds)
+        program.run(args.seconds)
     finally:
         program.log.save(args.log)
         tell(f"wrote {args.log}")
         tell.close()
     with suppress(OSError):  # the terminal may be closed
-        print(outcome.cycles.line(), flush=True)
+        print(program.pace.line(), flush=True)
     gc.collect()
-    return EXIT_STOPPED if outcome.stops else 0
+    return EXIT_STOPPED if program.stops else 0
 
 
 def add_program_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of the program that do not depend on the robot."""
-    standard = {field.name: field.default for field in fields(Limits)}
-    parser.add_argument("--input", choices=("keyboard", "gamepad"), default="keyboard", help="who commands; default keyboard")
-    parser.add_argument("--gamepad", type=Path, default=gamepad.DEVICE, help=f"device; default {gamepad.DEVICE}")
+    parser.add_argument("--input", choices=tuple(HELP), default="keyboard", help="who commands; default keyboard")
+    parser.add_argument("--gamepad", type=Path, default=DEVICE, help=f"device; default {DEVICE}")
     parser.add_argument("--commands", type=Path, help="file of commands, in place of a keyboard or gamepad")
-    parser.add_argument(
-        "--seconds", type=float, default=float("inf"), help="end after so long; at the operator's word by default"
-    )
+    never = float("inf")
+    parser.add_argument("--seconds", type=float, default=never, help="end after so long; at the operator's word by default")
     parser.add_argument("--stand-seconds", type=float, default=3.0, help="time for standing up [s]; default 3")
-    parser.add_argument("--max-tilt", type=float, help=f"stop beyond this [rad]; default {standard['max_tilt']:g}")
-    parser.add_argument("--max-age", type=float, help=f"stop at older data [s]; default {standard['max_age_s']:g}")
-    parser.add_argument("--max-missed", type=int, help=f"stop at so many missed in a row; default {standard['max_missed']}")
+    tilt, age, missed = Limits.max_tilt, Limits.max_age_s, Limits.max_missed
+    parser.add_argument("--max-tilt", type=float, default=tilt, help=f"stop beyond this [rad]; default {tilt:g}")
+    parser.add_argument("--max-age", type=float, default=age, help=f"stop at older data [s]; default {age:g}")
+    parser.add_argument("--max-missed", type=int, default=missed, help=f"stop at so many missed in a row; default {missed}")
 
 
 def limits_of(args: argparse.Namespace) -> Limits:
@@ -142,10 +131,9 @@ def limits_of(args: argparse.Namespace) -> Limits:
         raise ConfigError(f"--seconds: must be above 0, got {args.seconds:g}")
     for flag, (low, high) in BOUNDS.items():
         value = getattr(args, flag)
-        if value is not None and not low <= value <= high:
+        if not low <= value <= high:
             raise ConfigError(f"--{flag.replace('_', '-')}: must be between {low:g} and {high:g}, got {value:g}")
-    given = {"max_tilt": args.max_tilt, "max_age_s": args.max_age, "max_missed": args.max_missed}
-    return Limits(**{name: value for name, value in given.items() if value is not None})
+    return Limits(max_tilt=args.max_tilt, max_age_s=args.max_age, max_missed=args.max_missed)
 
 
 def make_operator(args: argparse.Namespace) -> Operator:
@@ -157,7 +145,7 @@ def make_operator(args: argparse.Namespace) -> Operator:
     if args.commands is not None:
         return Script(args.commands)
     operator: Operator = Gamepad(args.gamepad) if args.input == "gamepad" else Keyboard()
-    print(gamepad.HELP if args.input == "gamepad" else keyboard.HELP, flush=True)
+    print(HELP[args.input], flush=True)
     return operator
 
 
@@ -167,7 +155,6 @@ class Interruptible(Operator):
     """
 
     def __init__(self, operator: Operator) -> None:
-        """Handle signals in addition to the orders of `operator`."""
         self._operator, self._ends, self._has_robot = operator, False, False
         for name in ENDING:
             if hasattr(signal, name):
@@ -190,18 +177,6 @@ class Interruptible(Operator):
 
     def close(self) -> None:
         self._operator.close()
-
-
-def _connect(args: argparse.Namespace) -> Interface:
-    """Return the interface to the robot of --robot.
-
-    Raises:
-        ConfigError: the address is invalid, or a package is not installed.
-        RunError: the robot does not answer.
-    """
-    if args.robot.startswith("udp:"):
-        return UdpRobot(args.robot.removeprefix("udp:"))
-    return UnitreeRobot(args.robot, SdkWire(KINDS[args.robot], args.network, args.domain))
 
 
 if __name__ == "__main__":

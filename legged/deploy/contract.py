@@ -1,7 +1,9 @@
-"""The contract of an exported policy: the contents of policy.json, and their comparison with a robot."""
+"""The contract of an exported policy: policy.json, and its comparison with the exported files and with a robot."""
 
+import hashlib
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,10 @@ from legged.errors import ConfigError
 
 CONTRACT_VERSION = 1
 """Version of policy.json that this package writes and reads."""
+CHECKSUMS = "sha256"
+"""Key of policy.json: file of the export -> its SHA-256 in hexadecimal digits. Older exports lack the key."""
+NOT_COMPARED = {CHECKSUMS, "iterations", "wall_s"}
+"""Keys of policy.json that may differ from the metadata of the ONNX file: its own checksum, and the marks of a training."""
 SENSORS = {
     "base_ang_vel": "gyro",
     "projected_gravity": "quaternion",
@@ -29,6 +35,44 @@ SCANS = ("lowest", "own", "highest")
 highest of the three."""
 TOLERANCE = 1e-3
 """Largest difference, absolute or relative, at which limits count as equal."""
+DEEPEST, MOST_DIGITS = 20, 18
+"""Deepest nesting and longest whole number in JSON from outside."""
+RULES: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
+    "stiffness": ("0 or more", lambda x: x >= 0.0),
+    "damping": ("above 0: it is what stops a robot", lambda x: x > 0.0),
+    "torque_limits": ("above 0", lambda x: x > 0.0),
+    "velocity_limits": ("above 0", lambda x: x > 0.0),
+    "action_clip": ("above 0 and finite", lambda x: x > 0.0),
+    "observation_clip": ("above 0 and finite", lambda x: x > 0.0),
+    "command_dead_zone": ("0 or more", lambda x: x >= 0.0),
+    "control_dt": ("between 0.001 and 1", lambda x: (x >= 1e-3) & (x <= 1.0)),
+}
+"""Key of policy.json -> allowed numbers, in words and as a function; all must also be finite."""
+
+
+def plain_json(text: str | bytes) -> Any:
+    """Return the value of JSON from outside this program, such as a file or a packet.
+
+    Raises:
+        ValueError: the text is no JSON, is nested too deeply, or has whole numbers that are too long.
+    """
+
+    def whole(digits: str) -> int:
+        if len(digits) > MOST_DIGITS:
+            raise ValueError(f"has a whole number of {len(digits)} digits")
+        return int(digits)
+
+    try:
+        value = json.loads(text, parse_int=whole)
+    except RecursionError as error:
+        raise ValueError("is nested too deeply") from error
+    level = [value]
+    for _ in range(DEEPEST):
+        parts = [part.values() if isinstance(part, dict) else part for part in level if isinstance(part, dict | list)]
+        level = [inner for part in parts for inner in part]
+    if level:
+        raise ValueError("is nested too deeply")
+    return value
 
 
 def need_of(term: str) -> str:
@@ -38,16 +82,15 @@ def need_of(term: str) -> str:
 
 @dataclass(frozen=True)
 class Term:
-    """A term of the observation in the columns `start` to `start + size` of one observation of its group."""
+    """A term of the observation in the columns `start` to `start + size` of the oldest observation of its group."""
 
     name: str
-    group: str
     start: int
     size: int
     scale: np.ndarray
     """(size,) factors."""
-    needs: str
-    """A value of `SENSORS`, or `SOURCE` and a name."""
+    source: str | None
+    """Source that the term needs; None if sensors suffice."""
     points: np.ndarray | None
     """(P, 2) points at which a height map is read, x forward and y left of the base [m]; None for other terms."""
     offset: float
@@ -59,30 +102,15 @@ class Term:
     scan: str
     """Value that a point reads of a map of cells, one of `SCANS`."""
 
-    @property
-    def source(self) -> str | None:
-        """Return the source that the term needs; None if sensors suffice."""
-        return self.needs.removeprefix(SOURCE) if self.needs.startswith(SOURCE) else None
-
 
 @dataclass(frozen=True)
 class Group:
     """A group of terms: `history` observations of `size` numbers each, oldest first, from column `start` on."""
 
-    name: str
     start: int
     size: int
     history: int
-
-
-@dataclass(frozen=True)
-class Memory:
-    """The hidden state of a recurrent policy: inputs and outputs of the ONNX file, in the same order, and their shape."""
-
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    layers: int
-    width: int
+    terms: tuple[Term, ...]
 
 
 @dataclass(frozen=True)
@@ -90,6 +118,8 @@ class Contract:
     """Requirements of a policy for a robot with D joints, A of which have an action; SI units."""
 
     path: Path
+    entries: Mapping[str, Any]
+    """Contents of the file, as plain data."""
     task: str
     robot: str
     imu_body: str
@@ -114,7 +144,6 @@ class Contract:
     """(A,) [rad]."""
     action_clip: float
     observation_clip: float
-    terms: tuple[Term, ...]
     groups: tuple[Group, ...]
     command_ranges: np.ndarray
     """(3, 2) lowest and highest vx, vy [m/s] and yaw rate [rad/s]."""
@@ -126,7 +155,8 @@ class Contract:
     """Physics step of the training; the unit of the actuator's delay [s]."""
     actuator: Mapping[str, Any]
     """Section control.actuator of the training's configuration; empty for exports without it."""
-    memory: Memory | None
+    states: Mapping[str, tuple[int, int, int]]
+    """Input of the ONNX file -> shape (layers, 1, width) of a hidden state; empty for a policy without memory."""
 
     @property
     def width(self) -> int:
@@ -134,13 +164,30 @@ class Contract:
         return sum(group.size * group.history for group in self.groups)
 
     @property
+    def terms(self) -> list[Term]:
+        """Return all terms of the observation in order."""
+        return [term for group in self.groups for term in group.terms]
+
+    @property
     def sources(self) -> dict[str, Term]:
-        """Return source -> the first term that needs it."""
-        found: dict[str, Term] = {}
-        for term in self.terms:
-            if term.source is not None:
-                found.setdefault(term.source, term)
-        return found
+        """Return source -> a term that needs it."""
+        return {term.source: term for term in self.terms if term.source is not None}
+
+    def check_metadata(self, network: Path, metadata: Mapping[str, str]) -> None:
+        """Compare all entries with the metadata of the ONNX file `network`, JSON texts by key.
+
+        Raises:
+            ConfigError: the metadata are no contract, or those of another export.
+        """
+        try:
+            inside = {key: plain_json(text) for key, text in metadata.items() if key not in NOT_COMPARED}
+        except ValueError:
+            inside = {}
+        if "contract_version" not in inside:
+            raise ConfigError(f"{network}: has no metadata of an export, which must be the entries of {self.path}")
+        for key in sorted({*inside, *self.entries} - NOT_COMPARED):
+            if key not in inside or key not in self.entries or inside[key] != self.entries[key]:
+                raise ConfigError(f"{self.path}: {key}: is not that of {network}: they are of different exports")
 
     def check_fits(self, robot: RobotFacts) -> None:
         """Compare with a robot.
@@ -156,16 +203,11 @@ class Contract:
                 f"{self.path}: imu_frame: the policy observes in the frame of '{self.imu_body}',"
                 f" the IMU of '{robot.name}' measures in that of '{robot.imu_body}'"
             )
-        for name, unit, own, there in (
-            ("torque_limits", "N m", self.torque_limits, robot.torque_limits),
-            ("velocity_limits", "rad/s", self.velocity_limits, robot.velocity_limits),
-        ):
-            for joint, mine, its in zip(self.joint_names, own, there, strict=True):
+        for name, unit in (("torque_limits", "N m"), ("velocity_limits", "rad/s")):
+            for joint, mine, its in zip(self.joint_names, getattr(self, name), getattr(robot, name), strict=True):
                 if not mine <= its * (1.0 + TOLERANCE):  # also true for a limit of NaN
-                    raise ConfigError(
-                        f"{self.path}: {name}: the policy was trained with {mine:g} {unit} at '{joint}',"
-                        f" '{robot.name}' has {its:g}"
-                    )
+                    trained = f"the policy was trained with {mine:g} {unit} at '{joint}'"
+                    raise ConfigError(f"{self.path}: {name}: {trained}, '{robot.name}' has {its:g}")
         for joint, mine, its in zip(self.joint_names, self.position_limits, robot.position_limits, strict=True):
             if mine[0] < its[0] - TOLERANCE or mine[1] > its[1] + TOLERANCE:
                 raise ConfigError(
@@ -182,192 +224,163 @@ class Contract:
 
 
 def read_contract(path: Path) -> Contract:
-    """Return the contract in a policy.json.
+    """Return the contract in a policy.json, after a comparison of the exported files next to it with its checksums.
 
     Raises:
         ConfigError: the file cannot be read, has another version, describes a policy that this program cannot run, or has
-            invalid values.
+            invalid values; or an exported file is not the one that was written with it.
     """
     try:
-        said = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: is no policy.json of an export ({' '.join(str(error).split())})") from error
-    if not isinstance(said, dict) or "observation" not in said:
-        raise ConfigError(f"{path}: is no policy.json of an export (observation is missing)")
-    if "joint_names" not in said or "command_ranges" not in said:
-        raise ConfigError(f"{path}: task: '{said.get('task')}' is no task of a legged robot that follows commands")
-    version = said.get("contract_version")
-    if version != CONTRACT_VERSION:
-        was = "none: an older version of this package wrote it" if version is None else f"{version!r}"
-        raise ConfigError(
-            f"{path}: contract_version: got {was}; this program reads {CONTRACT_VERSION}: export the policy again"
-            f" (legged play {said.get('task')} --no-video)"
-        )
-    if (control := said.get("control_type")) != "P":
-        raise ConfigError(f"{path}: control_type: got {control!r}; a robot takes joint angles ('P') only")
-    try:
+        said = plain_json(path.read_bytes())
+        if not isinstance(said, dict) or "observation" not in said:
+            raise ConfigError(f"{path}: is no policy.json of an export (observation is missing)")
+        if "joint_names" not in said or "command_ranges" not in said:
+            raise ConfigError(f"{path}: task: '{said.get('task')}' is no task of a legged robot that follows commands")
+        version = said.get("contract_version")
+        if version != CONTRACT_VERSION:
+            was = "none: an older version of this package wrote it" if version is None else f"{version!r}"
+            raise ConfigError(
+                f"{path}: contract_version: got {was}; this program reads {CONTRACT_VERSION}: export the policy again"
+                f" (legged play {said.get('task')} --no-video)"
+            )
+        if (control := said.get("control_type")) != "P":
+            raise ConfigError(f"{path}: control_type: got {control!r}; a robot takes joint angles ('P') only")
         contract = _contract(path, said)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise ConfigError(f"{path}: is no policy.json of an export ({type(error).__name__}: {error})") from error
-    _check_sizes(contract)
+        for name, digest in said.get(CHECKSUMS, {}).items():
+            file = path.with_name(name)
+            if file.is_file() and hashlib.sha256(file.read_bytes()).hexdigest() != digest:
+                raise ConfigError(f"{file}: is not the file that was exported with {path} ({CHECKSUMS}): export it again")
+    except ConfigError:
+        raise
+    except (OSError, KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ConfigError(f"{path}: is no policy.json of an export ({text})") from error
     return contract
 
 
 def _contract(path: Path, said: Mapping[str, Any]) -> Contract:
-    joints, acted = tuple(said["joint_names"]), said["action_joints"]
-    count = len(joints)
-    scale = said["action_scale"]
-    limits = [(-np.inf, np.inf) if pair is None else pair for pair in said["position_limits"]]
+    joints, acted, memory = tuple(said["joint_names"]), said["action_joints"], said["recurrent"] or {"onnx_inputs": ()}
+    count, scale = len(joints), said["action_scale"]
+
+    def check(key: str, allowed: str, right: Any, values: np.ndarray) -> None:
+        wrong = ~np.ravel(right)
+        if wrong.any():
+            i = int(wrong.argmax())
+            where = f" at '{joints[i]}'" if wrong.shape == (count,) else ""
+            raise ConfigError(f"{path}: {key}: must be {allowed}, got {values.ravel()[i]:g}{where}")
+
+    def numbers(key: str, *shape: int) -> np.ndarray:
+        values = np.array(said[key], dtype=float)
+        if values.shape != shape:
+            raise ValueError(f"{key}: {math.prod(shape)} numbers are wanted")
+        allowed, right = RULES.get(key, ("finite", np.isfinite))
+        check(key, allowed, np.isfinite(values) & right(values), values)
+        return values
+
+    if len(set(joints)) < count:
+        raise ConfigError(f"{path}: joint_names: must differ from each other")
+    limits = np.array([(-np.inf, np.inf) if pair is None else pair for pair in said["position_limits"]], dtype=float)
+    low, high = limits.reshape(count, 2).T
+    check("position_limits", "below the upper ones", low < high, low)
+    default = numbers("default_joint_angles", count)
+    crouch = None if said["crouch_joint_angles"] is None else numbers("crouch_joint_angles", count)
+    for key, pose in (("default_joint_angles", default), ("crouch_joint_angles", crouch)):
+        if pose is not None:
+            check(key, "within position_limits", (low - TOLERANCE <= pose) & (pose <= high + TOLERANCE), pose)
+    ranges = np.array([said["command_ranges"][name] for name in ("vx", "vy", "yaw_rate")], dtype=float).reshape(3, 2)
+    right = np.isfinite(ranges).all(axis=1) & (ranges[:, 0] <= ranges[:, 1])
+    check("command_ranges", "finite, and not above the upper ones", right, ranges[:, 0])
+    control_dt, sim_dt = numbers("control_dt"), np.array(said.get("sim_dt", said["control_dt"]), dtype=float)
+    check("sim_dt", "above 0, and at most control_dt", (sim_dt > 0.0) & (sim_dt <= control_dt + 1e-9), sim_dt)
     return Contract(
         path=path,
+        entries=said,
         task=str(said["task"]),
         robot=str(said["robot"]),
         imu_body=str(said["imu_frame"]["body"]),
         joint_names=joints,
         acted=np.array([joints.index(name) for name in acted]),
-        default=_numbers(said, "default_joint_angles", count),
-        crouch=None if said["crouch_joint_angles"] is None else _numbers(said, "crouch_joint_angles", count),
-        stiffness=_numbers(said, "stiffness", count),
-        damping=_numbers(said, "damping", count),
-        position_limits=np.array(limits, dtype=float).reshape(count, 2),
-        velocity_limits=_numbers(said, "velocity_limits", count),
-        torque_limits=_numbers(said, "torque_limits", count),
-        action_scale=np.broadcast_to(np.asarray(scale, dtype=float), (len(acted),)).copy(),
-        action_clip=float(said["action_clip"]),
-        observation_clip=float(said["observation_clip"]),
-        terms=tuple(_term(term) for term in said["observation"]),
-        groups=tuple(
-            Group(str(group["name"]), int(group["start"]), int(group["size"]), int(group["history"]))
-            for group in said["observation_groups"]
-        ),
-        command_ranges=np.array([said["command_ranges"][name] for name in ("vx", "vy", "yaw_rate")], dtype=float).reshape(
-            3, 2
-        ),
-        dead_zone=float(said["command_dead_zone"]),
-        control_dt=float(said["control_dt"]),
-        sim_dt=float(said.get("sim_dt", said["control_dt"])),
+        default=default,
+        crouch=crouch,
+        stiffness=numbers("stiffness", count),
+        damping=numbers("damping", count),
+        position_limits=limits.reshape(count, 2),
+        velocity_limits=numbers("velocity_limits", count),
+        torque_limits=numbers("torque_limits", count),
+        action_scale=np.broadcast_to(numbers("action_scale", *np.shape(scale)), (len(acted),)).copy(),
+        action_clip=float(numbers("action_clip")),
+        observation_clip=float(numbers("observation_clip")),
+        groups=tuple(_groups(f"{path}: observation", said, count)),
+        command_ranges=ranges,
+        dead_zone=float(numbers("command_dead_zone")),
+        control_dt=float(control_dt),
+        sim_dt=float(sim_dt),
         actuator=dict(said.get("actuator", {})),
-        memory=_memory(said["recurrent"]),
+        states={name: (int(memory["shape"][0]), 1, int(memory["shape"][2])) for name in memory["onnx_inputs"]},
     )
 
 
-def _numbers(said: Mapping[str, Any], key: str, count: int) -> np.ndarray:
-    values = np.array(said[key], dtype=float)
-    if values.shape != (count,) or not np.isfinite(values).all():
-        raise ValueError(f"{key}: {count} numbers are wanted, one for each of joint_names")
-    return values
-
-
-def _term(said: Mapping[str, Any]) -> Term:
-    points = said.get("points")
-    return Term(
-        name=str(said["name"]),
-        group=str(said["group"]),
-        start=int(said["start"]),
-        size=int(said["size"]),
-        scale=np.array(said["scale"], dtype=float),
-        needs=str(said["needs"]),
-        points=None if points is None else np.array(points, dtype=float).reshape(-1, 2),
-        offset=float(said.get("offset", 0.0)),
-        limit=float(said.get("limit", np.inf)),
-        deepest=float(said.get("deepest", said.get("limit", np.inf))),
-        scan=str(said.get("scan", SCANS[0])),
-    )
-
-
-def _memory(said: Mapping[str, Any] | None) -> Memory | None:
-    if said is None:
-        return None
-    layers, _, width = said["shape"]
-    return Memory(tuple(said["onnx_inputs"]), tuple(said["onnx_outputs"]), int(layers), int(width))
-
-
-def _check_sizes(contract: Contract) -> None:
-    """Check that the terms and groups of a contract are consistent.
-
-    Raises:
-        ConfigError: they are not.
-    """
-    path, groups = contract.path, {group.name: group for group in contract.groups}
-    joints = len(contract.joint_names)
+def _groups(where: str, said: Mapping[str, Any], joints: int) -> Iterator[Group]:
+    """Yield the groups, whose terms a robot with so many joints can make, and which lie side by side without gaps."""
     sizes = {"base_ang_vel": 3, "projected_gravity": 3, "commands": 3, "dof_pos": joints, "dof_vel": joints}
-    sizes["actions"] = len(contract.acted)
-    if not 1e-3 <= contract.control_dt <= 1.0:
-        raise ConfigError(f"{path}: control_dt: must be between 0.001 and 1, got {contract.control_dt:g}")
-    for term in contract.terms:
-        group = groups.get(term.group)
-        if group is None or not group.start <= term.start <= group.start + group.size - term.size:
-            raise ConfigError(f"{path}: observation: '{term.name}' lies outside its group '{term.group}'")
-        if term.source is None and term.needs != SENSORS.get(term.name):
-            raise ConfigError(f"{path}: observation: '{term.name}' needs '{term.needs}', which it is not made of")
-        if term.source is None and term.size != sizes[term.name]:
-            raise ConfigError(f"{path}: observation: '{term.name}' has {term.size} numbers, a robot gives {sizes[term.name]}")
-        if len(term.scale) != term.size:
-            raise ConfigError(f"{path}: observation: '{term.name}' has {term.size} numbers and {len(term.scale)} scales")
-        if term.source == "heights" and (term.points is None or len(term.points) != term.size):
-            raise ConfigError(f"{path}: observation: 'heights' has {term.size} numbers and no point for each")
-        if term.scan not in SCANS:
-            raise ConfigError(
-                f"{path}: observation: scan of '{term.name}': must be one of {', '.join(SCANS)}, got '{term.scan}'"
-            )
-    _check_numbers(contract)
-    filled = {name: sum(term.size for term in contract.terms if term.group == name) for name in groups}
-    for name, group in groups.items():
-        if filled[name] != group.size:
-            raise ConfigError(f"{path}: observation_groups: '{name}' has {group.size} numbers, its terms {filled[name]}")
-        place = group.start
-        for term in sorted((term for term in contract.terms if term.group == name), key=lambda term: term.start):
-            if term.start != place:
-                raise ConfigError(f"{path}: observation: '{term.name}' must start at column {place}, got {term.start}")
-            place += term.size
-    low, high = contract.position_limits.T
-    outside = (contract.default < low - TOLERANCE) | (contract.default > high + TOLERANCE)
-    if outside.any():
-        joint = contract.joint_names[int(outside.argmax())]
-        raise ConfigError(f"{path}: default_joint_angles: that of '{joint}' lies outside its position_limits")
+    sizes["actions"] = len(said["action_joints"])
+    names = [entry["name"] for entry in said["observation_groups"]]
+    for entry in said["observation"]:
+        if entry["group"] not in names:
+            raise ConfigError(f"{where}: '{entry['name']}' lies outside its group '{entry['group']}'")
+    start = 0
+    for entry in said["observation_groups"]:
+        size, history, column = int(entry["size"]), int(entry["history"]), start
+        if history < 1 or size < 1:
+            raise ConfigError(f"{where}_groups: each must have a history and a size of at least 1")
+        if entry["start"] != start:
+            raise ConfigError(f"{where}_groups: '{entry['name']}' must start at column {start}, got {entry['start']}")
+        own = [term for term in said["observation"] if term["group"] == entry["name"]]
+        terms = sorted((_term(where, term, sizes) for term in own), key=lambda term: term.start)
+        for term in terms:
+            if term.start != column:
+                raise ConfigError(f"{where}: '{term.name}' must start at column {column}, got {term.start}")
+            column += term.size
+        if column != start + size:
+            raise ConfigError(f"{where}_groups: '{entry['name']}' has {size} numbers, its terms {column - start}")
+        yield Group(start, size, history, tuple(terms))
+        start += size * history
 
 
-def _check_numbers(contract: Contract) -> None:
-    """Check the ranges of a contract's numbers.
-
-    Raises:
-        ConfigError: a number is outside its range.
-    """
-    low, high = contract.command_ranges.T
-    for key, values, allowed, right in (
-        ("sim_dt", contract.sim_dt, "above 0, and at most control_dt", 0.0 < contract.sim_dt <= contract.control_dt + 1e-9),
-        ("stiffness", contract.stiffness, "0 or more", contract.stiffness >= 0.0),
-        ("damping", contract.damping, "above 0: it is what stops a robot", contract.damping > 0.0),
-        ("torque_limits", contract.torque_limits, "above 0", contract.torque_limits > 0.0),
-        ("velocity_limits", contract.velocity_limits, "above 0", contract.velocity_limits > 0.0),
-        ("position_limits", contract.position_limits[:, 0], "below the upper ones", np.less(*contract.position_limits.T)),
-        ("action_scale", contract.action_scale, "finite", np.isfinite(contract.action_scale)),
-        ("action_clip", contract.action_clip, "above 0 and finite", 0.0 < contract.action_clip < np.inf),
-        ("observation_clip", contract.observation_clip, "above 0 and finite", 0.0 < contract.observation_clip < np.inf),
-        ("command_dead_zone", contract.dead_zone, "0 or more", 0.0 <= contract.dead_zone < np.inf),
-        ("command_ranges", low, "finite, and not above the upper ones", np.isfinite(low) & np.isfinite(high) & (low <= high)),
-        *((f"scale of {t.name}", t.scale, "finite", np.isfinite(t.scale)) for t in contract.terms),
-    ):
-        wrong = np.atleast_1d(~np.asarray(right))
-        if wrong.any():
-            value = np.atleast_1d(values)[int(wrong.argmax())]
-            raise ConfigError(f"{contract.path}: {key}: must be {allowed}, got {value:g}")
-    if len(set(contract.joint_names)) < len(contract.joint_names):
-        raise ConfigError(f"{contract.path}: joint_names: must differ from each other")
-    if any(group.history < 1 or group.size < 1 for group in contract.groups):
-        raise ConfigError(f"{contract.path}: observation_groups: each must have a history and a size of at least 1")
-    starts = np.cumsum([0, *(group.size * group.history for group in contract.groups)])[:-1].tolist()
-    if [group.start for group in contract.groups] != starts:
-        raise ConfigError(f"{contract.path}: observation_groups: must lie side by side, starting at {starts}")
+def _term(where: str, entry: Mapping[str, Any], sizes: Mapping[str, int]) -> Term:
+    name, needs, size, limit = str(entry["name"]), str(entry["needs"]), int(entry["size"]), entry.get("limit", np.inf)
+    source = needs.removeprefix(SOURCE) if needs.startswith(SOURCE) else None
+    scale, points = np.array(entry["scale"], dtype=float), np.array(entry.get("points") or (), dtype=float).reshape(-1, 2)
+    scan = str(entry.get("scan", SCANS[0]))
+    if source is None and needs != SENSORS.get(name):
+        raise ConfigError(f"{where}: '{name}' needs '{needs}', which it is not made of")
+    if source is None and size != sizes[name]:
+        raise ConfigError(f"{where}: '{name}' has {size} numbers, a robot gives {sizes[name]}")
+    if scale.shape != (size,) or not np.isfinite(scale).all():
+        raise ConfigError(f"{where}: scale of '{name}': must be {size} finite numbers, got {entry['scale']}")
+    if source == "heights" and len(points) != size:
+        raise ConfigError(f"{where}: 'heights' has {size} numbers and {len(points)} points")
+    if scan not in SCANS:
+        raise ConfigError(f"{where}: scan of '{name}': must be one of {', '.join(SCANS)}, got '{scan}'")
+    return Term(
+        name=name,
+        start=int(entry["start"]),
+        size=size,
+        scale=scale,
+        source=source,
+        points=points if entry.get("points") else None,
+        offset=float(entry.get("offset", 0.0)),
+        limit=float(limit),
+        deepest=float(entry.get("deepest", limit)),
+        scan=scan,
+    )
 
 
 def _difference(wanted: Sequence[str], there: Sequence[str], robot: str) -> str:
     """Return the first difference between two lists of joints, in words."""
-    missing = [name for name in wanted if name not in there]
-    if missing:
+    if missing := [name for name in wanted if name not in there]:
         return f"'{robot}' has no joint '{missing[0]}' (its joints: {', '.join(there)})"
-    more = [name for name in there if name not in wanted]
-    if more:
+    if more := [name for name in there if name not in wanted]:
         return f"the policy knows no joint '{more[0]}', which '{robot}' has"
     place = next(i for i, (a, b) in enumerate(zip(wanted, there, strict=True)) if a != b)
     return f"joint {place} is '{wanted[place]}' for the policy and '{there[place]}' for '{robot}': another order"

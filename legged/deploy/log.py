@@ -1,32 +1,36 @@
-"""Log of a run: every reading with the targets at that time, and every cycle of the program."""
+"""Log of a run: readings with the targets at their time, cycles of the program, and samples for fitting actuators."""
 
 import json
-import tempfile
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from legged.deploy.actuator_log import actuator_arrays
 from legged.deploy.contract import Contract
 from legged.deploy.interface import Reading
-from legged.deploy.states import State
-from legged.errors import ConfigError, RunError
+from legged.deploy.operators import State
+from legged.process.paths import make_folder, replacing
 
 STATES = tuple(state.value for state in State)
 ACTUATORS = "_actuators"
 MOST_READINGS, MOST_CYCLES = 300_000, 60_000
 """Rows that are kept, the newest ones: twenty minutes at 250 readings and 50 cycles per second, a few hundred megabytes."""
+SHORTEST = 20
+"""Smallest number of samples in a run of the samples for fitting."""
+UNEVEN = 0.75
+"""Largest deviation of the time between two samples, as a share of a time step. A clock with a resolution of 1 ms alternates
+between 2 and 3 ms at 400 Hz; a missing sample adds a whole step."""
+MEASURED = {"position": "positions", "velocity": "velocities", "torque": "torques"}
+"""Array of the samples for fitting -> array of the log."""
 
 
 class Log:
     """Collector of readings, cycles and notes, which are written as one .npz file."""
 
     def __init__(self, contract: Contract) -> None:
-        """Start an empty log."""
         self._contract = contract
-        self._said = json.dumps(json.loads(contract.path.read_text(encoding="utf-8")))
         self._readings: dict[str, deque[Any]] = {}
         self._cycles: dict[str, deque[Any]] = {}
         self._notes: list[tuple[float, str]] = []
@@ -67,24 +71,6 @@ class Log:
         """Return the notes so far."""
         return [text for _, text in self._notes]
 
-    @staticmethod
-    def check(path: Path) -> None:
-        """Check before a run that its log can be written to `path`.
-
-        Raises:
-            ConfigError: the path is a folder or not writable.
-        """
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if path.is_dir() or path.suffix != ".npz":
-                raise ConfigError(f"--log: {path}: the name of an .npz file is wanted")
-            with tempfile.TemporaryFile(dir=path.parent):
-                return
-        except (OSError, ValueError) as error:
-            if isinstance(error, ConfigError):
-                raise
-            raise ConfigError(f"--log: {path}: cannot be written ({getattr(error, 'strerror', None) or error})") from error
-
     def save(self, path: Path) -> None:
         """Write the log.
 
@@ -102,32 +88,52 @@ class Log:
         arrays |= {
             "joint_names": np.array(self._contract.joint_names),
             "states": np.array(STATES),
-            "notes": np.array([text for _, text in self._notes], dtype=str),
+            "notes": np.array(self.notes, dtype=str),
             "note_times": np.array([seconds for seconds, _ in self._notes]),
-            "contract": np.array(self._said),
+            "contract": np.array(json.dumps(self._contract.entries)),
         }
-        _write(path, arrays)
-        beside, of_actuators = path.with_stem(f"{path.stem}{ACTUATORS}"), actuator_arrays(arrays, self._contract)
-        if of_actuators is not None:
-            _write(beside, of_actuators)
-            return
-        try:
+        make_folder(path.parent)
+        beside, samples = path.with_stem(f"{path.stem}{ACTUATORS}"), actuator_arrays(arrays, self._contract)
+        with replacing(path) as part:
+            np.savez_compressed(part, allow_pickle=False, **arrays)  # type: ignore[arg-type]
             beside.unlink(missing_ok=True)  # left by another run
-        except OSError as error:
-            raise RunError(f"{beside}: {error.strerror or error}") from error
+        if samples is not None:
+            with replacing(beside) as part:
+                np.savez_compressed(part, allow_pickle=False, **samples)  # type: ignore[arg-type]
 
 
-def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write a file atomically.
+def actuator_arrays(log: Mapping[str, np.ndarray], contract: Contract) -> dict[str, np.ndarray] | None:
+    """Return the readings of a log (arrays of `Log.save`) that have the policy's gains and torques, evenly spaced; None
+    without such readings.
 
-    Raises:
-        RunError: the file cannot be written.
+    A missing reading ends a run; repeated readings are left out. The arrays are `joint_names` (D,), `run` (T,), `dt` [s],
+    `target`, `position` [rad], `velocity` [rad/s], `torque` [N m] (T, D), and the gains `stiffness`, `damping` (D,).
     """
-    part = path.with_name(f".{path.name}.part.npz")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(part, allow_pickle=False, **arrays)  # type: ignore[arg-type]
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise RunError(f"{path}: {error.strerror or error}") from error
+    if "times" not in log:
+        return None
+    usable = (log["stiffness"] == contract.stiffness).all(axis=1) & (log["damping"] == contract.damping).all(axis=1)
+    for name in MEASURED.values():
+        usable &= np.isfinite(log[name]).all(axis=1)
+    new = np.concatenate([[True], np.diff(log["times"]) != 0.0])
+    rows, left_out = np.flatnonzero(usable & new), np.cumsum(new & ~usable)
+    if len(rows) < SHORTEST:  # or the robot has no clock
+        return None
+    steps = np.diff(log["times"][rows])
+    usual = float(np.median(steps))
+    apart = (np.diff(left_out[rows]) > 0) | (np.abs(steps - usual) > UNEVEN * usual)
+    if not usual > 0.0 or apart.all():
+        return None
+    run = np.concatenate([[0], np.cumsum(apart)])
+    long = np.bincount(run)[run] >= SHORTEST
+    if not long.any():
+        return None
+    rows, run = rows[long], run[long]
+    return {
+        "joint_names": np.array(contract.joint_names),
+        "dt": np.array(float(np.mean(steps[~apart]))),
+        "run": np.unique(run, return_inverse=True)[1],
+        "target": log["targets"][rows],
+        **{name: log[given][rows] for name, given in MEASURED.items()},
+        "stiffness": contract.stiffness,
+        "damping": contract.damping,
+    }

@@ -1,14 +1,18 @@
-"""A fixed cycle rate, with statistics of durations, delays and missed deadlines."""
+"""Real time: priority, a fixed cycle rate with statistics, and status lines that never delay the robot."""
 
 import os
+import queue
+import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
 
 import numpy as np
 
 PRIORITY = 20
 """Real-time priority of the process under Linux's SCHED_FIFO (1 to 99)."""
+END_S = 1.0
+"""Time for the last status lines to be printed at the end [s]."""
 
 
 def take_priority(priority: int = PRIORITY) -> bool:
@@ -23,29 +27,6 @@ def take_priority(priority: int = PRIORITY) -> bool:
     return True
 
 
-@dataclass(frozen=True)
-class CycleTimes:
-    """Statistics of the cycles of a run [s]."""
-
-    count: int
-    mean: float
-    p50: float
-    p99: float
-    longest: float
-    late_p99: float
-    """99th percentile of the delay with which cycles began [s]."""
-    missed: int
-    """Missed deadlines; a cycle that takes two and a half periods misses two."""
-
-    def line(self) -> str:
-        """Return the statistics as a line of text, in milliseconds."""
-        times = ", ".join(
-            f"{name} {1e3 * value:.2f}"
-            for name, value in (("mean", self.mean), ("p50", self.p50), ("p99", self.p99), ("max", self.longest))
-        )
-        return f"{self.count} cycles: {times} ms; begun up to {1e3 * self.late_p99:.2f} ms late (p99); {self.missed} missed"
-
-
 class Pace:
     """A clock of cycles that begin every `dt` after the first one, regardless of their durations."""
 
@@ -58,10 +39,9 @@ class Pace:
         self._began = 0.0
         self.took: list[float] = []
         """Duration of each cycle [s]."""
-        self.late: list[float] = []
-        """Delay of the beginning of each cycle [s]."""
-        self.missed = 0
-        self.missed_in_a_row = 0
+        self._late: list[float] = []
+        self.missed = self.missed_in_a_row = 0
+        """Missed deadlines; a cycle that takes two and a half periods misses two."""
 
     def wait(self) -> float:
         """Wait until the next cycle is due; return the time at which it begins [s]."""
@@ -71,7 +51,7 @@ class Pace:
         if now < self._due:
             self._sleep(self._due - now)
             now = self._clock()
-        self.late.append(max(0.0, now - self._due))
+        self._late.append(max(0.0, now - self._due))
         self._began = now
         return now
 
@@ -91,15 +71,34 @@ class Pace:
         self.missed_in_a_row += 1 + overdue
         self._due += self._dt * overdue
 
-    def times(self) -> CycleTimes:
-        """Return the statistics of the cycles so far."""
-        took = np.array(self.took or [0.0])
-        return CycleTimes(
-            count=len(self.took),
-            mean=float(took.mean()),
-            p50=float(np.percentile(took, 50)),
-            p99=float(np.percentile(took, 99)),
-            longest=float(took.max()),
-            late_p99=float(np.percentile(self.late or [0.0], 99)),
-            missed=self.missed,
-        )
+    def line(self) -> str:
+        """Return durations, delays and missed deadlines of the cycles so far as a line of text, in milliseconds."""
+        took, late = np.array(self.took or [0.0]), np.percentile(self._late or [0.0], 99)
+        named = {"mean": took.mean(), "p50": np.percentile(took, 50), "p99": np.percentile(took, 99), "max": took.max()}
+        times = ", ".join(f"{name} {1e3 * value:.2f}" for name, value in named.items())
+        return f"{len(self.took)} cycles: {times} ms; begun up to {1e3 * late:.2f} ms late (p99); {self.missed} missed"
+
+
+class StatusMessages:
+    """Prints lines in its own thread, so that a held (Ctrl-S), closed or slow terminal does not delay the robot."""
+
+    def __init__(self, say: Callable[[str], object] | None = None) -> None:
+        """Start the thread; `say` prints a line, by default to standard output."""
+        self._say = say or (lambda line: print(line, flush=True))
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="status_messages", daemon=True)
+        self._thread.start()
+
+    def __call__(self, line: str) -> None:
+        """Queue a line."""
+        self._lines.put(line)
+
+    def _run(self) -> None:
+        while (line := self._lines.get()) is not None:
+            with suppress(OSError, ValueError):  # the terminal is closed
+                self._say(line)
+
+    def close(self) -> None:
+        """Wait until all lines are printed, at most `END_S`."""
+        self._lines.put(None)
+        self._thread.join(END_S)

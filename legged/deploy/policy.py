@@ -1,23 +1,37 @@
-"""An exported policy for one robot: policy.onnx and its contract."""
+"""An exported policy for one robot: readings and commands -> observations -> policy.onnx -> joint targets."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import onnxruntime
 
-from legged.deploy.contract import Contract, read_contract
+from legged.deploy.contract import Contract, Term, read_contract
 from legged.deploy.interface import Reading
-from legged.deploy.observations import Observer
 from legged.errors import ConfigError
 
 WARM_UP = 20
 """Runs of the network at the start, because the first ones take ten times as long."""
-COMPARED = (
-    *("contract_version", "joint_names", "action_joints", "imu_frame", "control_dt", "observation", "observation_groups"),
-    *("observation_clip", "default_joint_angles", "action_scale", "action_clip", "stiffness", "damping", "recurrent"),
-)
-"""Keys whose values in the ONNX file's metadata must equal those of policy.json."""
+
+
+def gravity_in(quaternion: np.ndarray) -> np.ndarray:
+    """Return the unit vector along gravity (3,) in the frame that `quaternion` (w, x, y, z) rotates to the world frame."""
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    return np.array([2.0 * (w * y - x * z), -2.0 * (y * z + w * x), 2.0 * (x * x + y * y) - 1.0])
+
+
+def open_onnx(path: Path) -> onnxruntime.InferenceSession:
+    """Return a session of an ONNX file in one thread, since a policy of one robot is too small for several.
+
+    Raises:
+        ConfigError: the file cannot be read.
+    """
+    try:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 3
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # its errors have no class in common
+        raise ConfigError(f"{path}: onnxruntime cannot read it: {' '.join(str(error).split())}") from error
 
 
 class Network:
@@ -27,49 +41,28 @@ class Network:
         """Load the file.
 
         Raises:
-            ConfigError: the file cannot be read, has other sizes than the contract, or comes from another export.
+            ConfigError: the file cannot be read, has other sizes than the contract, comes from another export, or gives
+                actions that are not finite.
         """
-        try:
-            options = onnxruntime.SessionOptions()
-            options.intra_op_num_threads = options.inter_op_num_threads = 1  # too small for several threads
-            options.log_severity_level = 3
-            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # its errors have no class in common
-            raise ConfigError(f"{path}: onnxruntime cannot read it: {' '.join(str(error).split())}") from error
-        self._path, self._memory = path, contract.memory
-        self._check(contract)
-        self._hidden: dict[str, np.ndarray] = {}
+        self._session, self._states = open_onnx(path), contract.states
+        contract.check_metadata(path, self._session.get_modelmeta().custom_metadata_map)
+        wanted: dict[str, tuple[int, ...]] = {"obs": (contract.width,)}
+        wanted |= {name: (layers, width) for name, (layers, _, width) in contract.states.items()}
+        found = {each.name: tuple(n for n in each.shape if isinstance(n, int)) for each in self._session.get_inputs()}
+        if list(found.items()) != list(wanted.items()):  # sizes of the batch have names in place of numbers
+            raise ConfigError(f"{path}: takes {found}; policy.json says {wanted}")
         self.restart()
         for _ in range(WARM_UP):
             actions = self.run(np.zeros(contract.width, dtype=np.float32))
         if actions.shape != contract.acted.shape:
             raise ConfigError(f"{path}: gives {actions.size} actions, policy.json says {len(contract.acted)}")
+        if not np.isfinite(actions).all():
+            raise ConfigError(f"{path}: gives actions that are not finite for an observation of zeros")
         self.restart()
-
-    def _check(self, contract: Contract) -> None:
-        """Compare with the contract.
-
-        Raises:
-            ConfigError: something differs.
-        """
-        memory = contract.memory
-        inputs = {given.name: given.shape for given in self._session.get_inputs()}
-        wanted = ["obs", *(memory.inputs if memory else ())]
-        if list(inputs) != wanted:
-            raise ConfigError(f"{self._path}: takes {', '.join(inputs)}; policy.json says {', '.join(wanted)}")
-        if inputs["obs"][-1] != contract.width:
-            raise ConfigError(f"{self._path}: takes {inputs['obs'][-1]} numbers, policy.json says {contract.width}")
-        inside = self._session.get_modelmeta().custom_metadata_map
-        beside = json.loads(contract.path.read_text(encoding="utf-8"))
-        for key in COMPARED:
-            if key in inside and json.loads(inside[key]) != beside[key]:
-                raise ConfigError(f"{contract.path}: {key}: is not that of {self._path}: they are of different exports")
 
     def restart(self) -> None:
         """Clear the hidden state."""
-        if self._memory is not None:
-            shape = (self._memory.layers, 1, self._memory.width)
-            self._hidden = {name: np.zeros(shape, dtype=np.float32) for name in self._memory.inputs}
+        self._hidden = {name: np.zeros(shape, dtype=np.float32) for name, shape in self._states.items()}
 
     def run(self, observation: np.ndarray) -> np.ndarray:
         """Return the actions (A,) for an observation (width,), float32 both."""
@@ -91,31 +84,61 @@ class Policy:
         for needed in (path, path.with_name("policy.json")):
             if not needed.is_file():
                 raise ConfigError(f"POLICY: there is no {needed}: a folder with policy.onnx and policy.json is wanted")
-        self.contract = read_contract(path.with_name("policy.json"))
-        self._network = Network(path, self.contract)
-        self._observer = Observer(self.contract)
-        self.actions = np.zeros(len(self.contract.acted))
-        """(A,) last output, within plus and minus action_clip."""
-        self.observation = np.zeros(self.contract.width, dtype=np.float32)
+        self.contract = contract = read_contract(path.with_name("policy.json"))
+        self._network = Network(path, contract)
+        self._steps = [np.zeros((group.history, group.size)) for group in contract.groups]
+        self.observation = np.zeros(contract.width, dtype=np.float32)
         """(width,) observation of the last call."""
+        self.restart()
 
     def restart(self) -> None:
-        """Clear the hidden state, the last action and the history."""
+        """Clear the hidden state, the last action and the histories; the next observation fills them, as the first one of an
+        episode does in training.
+        """
         self._network.restart()
-        self._observer.restart()
+        self._begins = True
         self.actions = np.zeros(len(self.contract.acted))
+        """(A,) last output, within plus and minus action_clip."""
 
     def act(self, reading: Reading, command: np.ndarray) -> np.ndarray:
-        """Return the joint targets (D,) [rad]; they are not finite where the network's output is not.
+        """Return the joint targets (D,) [rad] for `command`, vx, vy [m/s] and yaw rate [rad/s]. They are not finite where the
+        network's output is not.
 
         Raises:
             KeyError: a source that the policy needs is missing.
         """
         contract = self.contract
-        self.observation = self._observer.observe(reading, command, self.actions)
+        self.observation = self._observe(reading, command)
         given = self._network.run(self.observation).astype(float)
         actions = np.clip(given, -contract.action_clip, contract.action_clip)
         self.actions = np.where(np.isfinite(given), actions, np.nan)  # clipping would make an infinite output finite
         targets = contract.default.copy()
         targets[contract.acted] += contract.action_scale * self.actions
         return targets
+
+    def _observe(self, reading: Reading, command: np.ndarray) -> np.ndarray:
+        """Return the observation (width,) float32: scaled and clipped terms, and the histories of their groups."""
+        contract = self.contract
+        values = {
+            "base_ang_vel": reading.gyro,
+            "projected_gravity": gravity_in(reading.quaternion),
+            "commands": command,
+            "dof_pos": reading.positions - contract.default,
+            "dof_vel": reading.velocities,
+            "actions": self.actions,
+        }
+        for group, steps in zip(contract.groups, self._steps, strict=True):
+            steps[:-1] = steps[1:]
+            for term in group.terms:
+                value = values[term.name] if term.source is None else _from_source(term, reading.sources[term.source])
+                begin = term.start - group.start
+                steps[-1, begin : begin + term.size] = term.scale * value
+            np.clip(steps[-1], -contract.observation_clip, contract.observation_clip, out=steps[-1])
+            if self._begins:
+                steps[:] = steps[-1]
+        self._begins = False
+        return np.concatenate([steps.ravel() for steps in self._steps]).astype(np.float32)
+
+
+def _from_source(term: Term, given: np.ndarray) -> np.ndarray:
+    return np.clip(-given - term.offset, -term.limit, term.deepest) if term.source == "heights" else given

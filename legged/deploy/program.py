@@ -4,17 +4,16 @@ import gc
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from legged.deploy.commands import Operator, Orders, Ramp
 from legged.deploy.interface import Interface, Reading
 from legged.deploy.log import Log
-from legged.deploy.pace import CycleTimes, Pace
+from legged.deploy.operators import MOVING, TRANSITIONS, Event, Operator, Orders, Ramp, State
+from legged.deploy.pace import Pace
 from legged.deploy.policy import Policy
 from legged.deploy.safety import Limits, Watch, braking, clamp_targets
-from legged.deploy.states import MOVING, Event, State, next_state
 
 STANDS_WITHIN = 0.6
 """Largest deviation of a joint from the default pose of a standing robot, whose weight causes part of it [rad]."""
@@ -37,17 +36,6 @@ def along(path: Sequence[np.ndarray], share: float) -> np.ndarray:
     part = min(1.0, share * legs - i)
     smooth = part * part * (3.0 - 2.0 * part)
     return np.asarray((1.0 - smooth) * path[i] + smooth * path[i + 1])
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Result of a run."""
-
-    cycles: CycleTimes
-    stops: tuple[str, ...]
-    """Reasons of all stops, in order."""
-    walked_s: float
-    """Time for which the policy acted [s]."""
 
 
 class Program:
@@ -76,23 +64,24 @@ class Program:
         self._watch = Watch(contract, limits or Limits())
         self._ramp = Ramp(contract)
         self._braking = braking(contract)
-        self._pace = Pace(contract.control_dt, clock, sleep)
+        self.pace = Pace(contract.control_dt, clock, sleep)
         self.log = Log(contract)
         self.state = State.IDLE
-        self.stops: list[str] = []
+        self.stops: tuple[str, ...] = ()
+        """Reasons of all stops, in order."""
         self._reading: Reading | None = None
         self._ticks = False
         """The robot's clock has advanced between readings."""
         self._path, self._path_s = [contract.default], stand_s
         self._since = self._start = 0.0
-        self._walked_s = 0.0
+        self.walked_s = 0.0
+        """Time for which the policy acted [s]."""
         self._halting_s: float | None = None
         """Time since which a robot that is about to stand has had the command zero [s]; None if it is not about to."""
-        nothing = np.zeros(len(contract.joint_names))
-        self._asked = (nothing, nothing, nothing)
+        self._asked = (np.zeros(len(contract.joint_names)),) * 3
         """Last targets and gains that were sent to the robot."""
 
-    def run(self, seconds: float = np.inf) -> Outcome:
+    def run(self, seconds: float = np.inf) -> None:
         """Run until the operator quits or for some time [s]; then brake and release the robot."""
         collects = gc.isenabled()
         gc.freeze()
@@ -102,7 +91,7 @@ class Program:
             self._start = self._clock()
             quits = False
             while not quits:
-                now = self._pace.wait()
+                now = self.pace.wait()
                 quits = self._cycle(now) or now - self._start > seconds
             self._settle()
             self._write(self._contract.default, 0.0, self._braking)
@@ -116,13 +105,12 @@ class Program:
                 self._robot.close()
             finally:
                 self._operator.close()
-        return Outcome(self._pace.times(), tuple(self.stops), self._walked_s)
 
     def _cycle(self, now: float) -> bool:
         """Run one cycle; return whether the operator quits."""
         self._read()
         orders = self._operator.poll(now - self._start)
-        reason = self._watch.reason(self._reading, now, self._pace.missed_in_a_row)
+        reason = self._watch.reason(self._reading, now, self.pace.missed_in_a_row)
         events = list(orders.events)
         if orders.lost is not None and self.state in MOVING:
             self._stop(f"operator lost: {orders.lost}", now)
@@ -140,7 +128,7 @@ class Program:
             targets, stiffness, damping = self._decide(orders, now)
         self._write(targets, stiffness, damping)
         self._log_cycle(now)
-        self._pace.done()
+        self.pace.done()
         return Event.QUIT in events
 
     def _read(self) -> None:
@@ -170,7 +158,7 @@ class Program:
             self._halting_s = None
             self._say("walk: it walks on", now)
             return
-        following = next_state(self.state, event)
+        following = TRANSITIONS.get((self.state, event))
         if following is None:
             self._say(f"refused: '{event.value}' leads nowhere from {self.state.value}", now)
         elif following in MOVING and reason is not None:
@@ -193,13 +181,13 @@ class Program:
         away = np.abs(self._reading.positions - self._contract.default)
         if away.max() <= STANDS_WITHIN:
             return None
-        name = self._contract.joint_names[int(away.argmax())]
-        return f"it does not stand: {name} is {away.max():.2f} rad from its default angle (allowed: {STANDS_WITHIN:g})"
+        joint = self._contract.joint_names[int(away.argmax())]
+        return f"it does not stand: {joint} is {away.max():.2f} rad from its default angle (allowed: {STANDS_WITHIN:g})"
 
     def _stop(self, reason: str, now: float) -> None:
         """Enter the state `stop` and report the reason."""
         if self.state is not State.STOP:
-            self.stops.append(reason)
+            self.stops += (reason,)
             self._say(f"stop: {reason}", now)
             self._enter(State.STOP, now)
 
@@ -229,7 +217,7 @@ class Program:
                 if halts and not command.any():
                     self._halting_s = (self._halting_s or 0.0) + contract.control_dt
                 targets = self._policy.act(reading, command)
-                self._walked_s += contract.control_dt
+                self.walked_s += contract.control_dt
             else:
                 targets = along(self._path, (now - self._since) / self._path_s)
             clamped = clamp_targets(targets, reading.positions, reading.velocities, contract)
@@ -265,11 +253,11 @@ class Program:
         if self.state in MOVING:
             self._enter(State.DAMPING, self._clock())
         end = self._clock() + (SETTLE_S if self.state is not State.IDLE else 0.0)
-        while (now := self._pace.wait()) < end:
+        while (now := self.pace.wait()) < end:
             self._read()
             self._write(*self._decide(Orders(np.zeros(3)), now))
             self._log_cycle(now)
-            self._pace.done()
+            self.pace.done()
 
     def _settle_blindly(self) -> None:
         """Send braking commands after a failure and ignore further failures; several, because one may get lost."""

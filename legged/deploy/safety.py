@@ -6,7 +6,7 @@ import numpy as np
 
 from legged.deploy.contract import Contract
 from legged.deploy.interface import Reading
-from legged.deploy.observations import gravity_in
+from legged.deploy.policy import gravity_in
 
 SLOWEST_FALL = 0.5
 """Share of a joint's largest speed at which braking needs its whole torque."""
@@ -40,7 +40,6 @@ class Watch:
     """Check of readings for reasons to stop."""
 
     def __init__(self, contract: Contract, limits: Limits) -> None:
-        """Check the robot of `contract` against `limits`."""
         self._contract, self.limits = contract, limits
         self._fastest = limits.speed_share * contract.velocity_limits
         self._fast_s = np.zeros(len(self._fastest))
@@ -82,40 +81,33 @@ class Watch:
         tilt = float(np.arccos(np.clip(-gravity_in(reading.quaternion)[2], -1.0, 1.0)))
         if tilt > limits.max_tilt:
             return f"tilt: {tilt:.2f} rad (allowed: {limits.max_tilt:g})"
+        joints = self._contract.joint_names
         at_once = np.abs(reading.velocities) > AT_ONCE * self._fastest
-        too_fast = at_once | (self._fast_s >= limits.fast_s)
+        too_fast = at_once if at_once.any() else self._fast_s >= limits.fast_s
         if too_fast.any():
-            i = int((at_once if at_once.any() else too_fast).argmax())
-            name, most = self._contract.joint_names[i], f"{self._fastest[i]:.1f} rad/s for {1e3 * limits.fast_s:.0f} ms"
+            i = int(too_fast.argmax())
             how = f"turns at {reading.velocities[i]:.1f} rad/s" if at_once.any() else "has been faster than that"
-            return f"joint speed: {name} {how} (allowed: {most})"
+            return f"joint speed: {joints[i]} {how} (allowed: {self._fastest[i]:.1f} rad/s for {1e3 * limits.fast_s:.0f} ms)"
         low, high = self._contract.position_limits.T
         beyond = np.maximum(low - reading.positions, reading.positions - high)
-        if beyond.max() > limits.beyond:
-            i = int(beyond.argmax())
-            name = self._contract.joint_names[i]
-            return f"joint position: {name} is at {reading.positions[i]:.2f} rad (its limits: {low[i]:.2f} to {high[i]:.2f})"
+        i = int(beyond.argmax())
+        if beyond[i] > limits.beyond:
+            found = f"{joints[i]} is at {reading.positions[i]:.2f} rad"
+            return f"joint position: {found} (its limits: {low[i]:.2f} to {high[i]:.2f})"
         if reading.temperatures is not None and reading.temperatures.max() > limits.max_temperature:
             i = int(reading.temperatures.argmax())
-            name = self._contract.joint_names[i]
-            return f"temperature: {name} has {reading.temperatures[i]:.0f} degrees (allowed: {limits.max_temperature:g})"
+            return f"temperature: {joints[i]} has {reading.temperatures[i]:.0f} degrees (allowed: {limits.max_temperature:g})"
         if missed >= limits.max_missed:
             return f"missed deadlines: {missed} in a row (allowed: {limits.max_missed - 1})"
-        lacking = [name for name in self._contract.sources if name not in reading.sources]
-        if lacking:
-            return f"missing data: source {lacking[0]}"
         for name, term in self._contract.sources.items():
+            if name not in reading.sources:
+                return f"missing data: source {name}"
             if reading.sources[name].shape != (term.size,):
                 return f"missing data: source {name} has {reading.sources[name].size} numbers, not {term.size}"
         return None
 
 
-def clamp_targets(
-    targets: np.ndarray,
-    positions: np.ndarray,
-    velocities: np.ndarray,
-    contract: Contract,
-) -> np.ndarray:
+def clamp_targets(targets: np.ndarray, positions: np.ndarray, velocities: np.ndarray, contract: Contract) -> np.ndarray:
     """Return targets (D,) within the position limits for which |kp (target - q) - kd dq| is within the torque limits [rad].
     Where both are not possible, the torque limits take precedence.
     """

@@ -1,4 +1,9 @@
-"""A robot reached by UDP: the simulator in another process, or a bridge to a robot's computer."""
+"""A robot reached by UDP, the simulator in another process or a bridge to a robot's computer, and the packets for it.
+
+A packet is `HEADER` (magic, kind, sequence number) and a body, all little-endian. The program sends a greeting with the
+sources that it needs, and the robot answers with its facts, both as JSON. Then the robot sends states to the last sender of a
+greeting, and the program sends commands. Each side numbers its packets in increasing order.
+"""
 
 import json
 import socket
@@ -7,26 +12,25 @@ import sys
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from legged.deploy.contract import plain_json
 from legged.deploy.interface import Interface, Reading, RobotFacts
-from legged.deploy.udp_packets import (
-    BYE,
-    COMMAND,
-    FACTS,
-    HELLO,
-    LARGEST,
-    STATE,
-    facts_of_json,
-    open_packet,
-    pack_command,
-    pack_json,
-    packet,
-    unpack_state,
-)
 from legged.errors import ConfigError, RunError
 
+HEADER = struct.Struct("<4sBxxxI")
+MAGIC = b"LGD1"
+HELLO, FACTS, STATE, COMMAND, BYE = range(1, 6)
+STATE_HEAD = struct.Struct("<dHHB")
+"""Head of a state: time [s], D, flags, number of sources. Float32 w, x, y, z, gyro (3), q (D), dq (D) and torques (D) follow,
+and for each source its name (length as a byte, ASCII) and its numbers (count as uint16, float32)."""
+COMMAND_HEAD = struct.Struct("<IH")
+"""Head of a command: sequence number of the answered state, D. Float32 targets, P gains and D gains (D each) follow."""
+LARGEST = 60_000
+"""Largest size of a packet [bytes]."""
 ANSWER_S = 10.0
 """Time within which a robot must answer a greeting [s]."""
 ASK_EVERY_S = 0.1
@@ -40,8 +44,137 @@ SOURCE_AGE_S = 0.2
 """Age at which the value of a source expires, by this machine's clock, since a robot may have none [s]."""
 
 
+def packet(kind: int, sequence: int, body: bytes = b"") -> bytes:
+    """Return a packet."""
+    return HEADER.pack(MAGIC, kind, sequence & 0xFFFFFFFF) + body
+
+
+def open_packet(data: bytes) -> tuple[int, int, bytes] | None:
+    """Return kind, sequence number and body of a packet; None for other data."""
+    if len(data) < HEADER.size:
+        return None
+    magic, kind, sequence = HEADER.unpack_from(data)
+    return (kind, sequence, data[HEADER.size :]) if magic == MAGIC else None
+
+
+def pack_sources(sources: Mapping[str, np.ndarray | None]) -> bytes:
+    """Return the body of a greeting: source -> its points (P, 2), or None."""
+    wanted = {name: None if points is None else points.tolist() for name, points in sources.items()}
+    return json.dumps({"sources": wanted}).encode()
+
+
+def unpack_sources(body: bytes) -> dict[str, np.ndarray | None]:
+    """Return the sources of a greeting.
+
+    Raises:
+        ValueError, KeyError, TypeError, AttributeError: the body is no greeting, or has points that are not finite.
+    """
+    found: dict[str, np.ndarray | None] = {}
+    for name, given in plain_json(body)["sources"].items():
+        points = None if given is None else np.array(given, dtype=float).reshape(-1, 2)
+        if points is not None and not np.isfinite(points).all():
+            raise ValueError(f"{name}: its points are not finite")
+        found[name] = points
+    return found
+
+
+def pack_facts(facts: RobotFacts) -> bytes:
+    """Return the body of the answer to a greeting; null stands for no limit."""
+    return json.dumps(
+        {
+            "name": facts.name,
+            "joint_names": list(facts.joint_names),
+            "position_limits": [[x if np.isfinite(x) else None for x in pair] for pair in facts.position_limits.tolist()],
+            "velocity_limits": facts.velocity_limits.tolist(),
+            "torque_limits": facts.torque_limits.tolist(),
+            "imu_body": facts.imu_body,
+            "offers": sorted(facts.offers),
+        }
+    ).encode()
+
+
+def unpack_facts(body: bytes) -> RobotFacts:
+    """Return the facts in the answer to a greeting.
+
+    Raises:
+        ValueError, KeyError, TypeError: the body has no facts.
+    """
+    said: Mapping[str, Any] = plain_json(body)
+    count = len(said["joint_names"])
+    limits = np.array(said["position_limits"], dtype=float).reshape(count, 2)  # null becomes NaN
+    return RobotFacts(
+        name=str(said["name"]),
+        joint_names=tuple(said["joint_names"]),
+        position_limits=np.where(np.isnan(limits), [-np.inf, np.inf], limits),
+        velocity_limits=np.array(said["velocity_limits"], dtype=float).reshape(count),
+        torque_limits=np.array(said["torque_limits"], dtype=float).reshape(count),
+        imu_body=str(said["imu_body"]),
+        offers=frozenset(said["offers"]),
+    )
+
+
+def pack_state(state: Reading) -> bytes:
+    """Return the body of a state; its torques must be known."""
+    assert state.torques is not None
+    rows = (state.quaternion, state.gyro, state.positions, state.velocities, state.torques)
+    parts = [STATE_HEAD.pack(state.time, len(state.positions), 0, len(state.sources))]
+    parts.append(np.concatenate(rows, dtype="<f4").tobytes())
+    for name, values in state.sources.items():
+        encoded = name.encode("ascii")
+        parts += [struct.pack("<B", len(encoded)), encoded, struct.pack("<H", len(values))]
+        parts.append(np.asarray(values, dtype="<f4").tobytes())
+    return b"".join(parts)
+
+
+def unpack_state(body: bytes, received: float) -> Reading:
+    """Return the state in a body that arrived at the time `received` [s].
+
+    Raises:
+        ValueError: the body is too short or too long.
+    """
+    try:
+        moment, count, _, sources = STATE_HEAD.unpack_from(body)
+        place = STATE_HEAD.size
+        numbers = np.frombuffer(body, "<f4", 7 + 3 * count, place).astype(float)
+        place += 4 * len(numbers)
+        found = {}
+        for _ in range(sources):
+            (length,) = struct.unpack_from("<B", body, place)
+            name = body[place + 1 : place + 1 + length].decode("ascii")
+            (size,) = struct.unpack_from("<H", body, place + 1 + length)
+            found[name] = np.frombuffer(body, "<f4", size, place + 3 + length).astype(float)
+            place += 3 + length + 4 * size
+    except (struct.error, UnicodeDecodeError) as error:
+        raise ValueError(str(error)) from error
+    if place != len(body):
+        raise ValueError("its length is another")
+    q, dq, torques = numbers[7:].reshape(3, count)
+    return Reading(moment, received, numbers[:4], numbers[4:7], q, dq, torques, sources=found)
+
+
+def pack_command(answers: int, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> bytes:
+    """Return the body of a command."""
+    numbers = np.concatenate((positions, stiffness, damping), dtype="<f4")
+    return COMMAND_HEAD.pack(answers & 0xFFFFFFFF, len(positions)) + numbers.tobytes()
+
+
+def unpack_command(body: bytes) -> tuple[int, np.ndarray]:
+    """Return the sequence number of the state that a command answers, and its targets, P gains and D gains (3, D).
+
+    Raises:
+        ValueError: the body is too short or too long, or its numbers are not finite.
+    """
+    if len(body) < COMMAND_HEAD.size:
+        raise ValueError("it is cut short")
+    answers, count = COMMAND_HEAD.unpack_from(body)
+    numbers = np.frombuffer(body, "<f4", offset=COMMAND_HEAD.size).astype(float)
+    if len(numbers) != 3 * count or not np.isfinite(numbers).all():
+        raise ValueError("its numbers are others")
+    return answers, numbers.reshape(3, count)
+
+
 class UdpRobot(Interface):
-    """A robot that uses the packets of `udp_packets`."""
+    """A robot that answers with the packets of this module."""
 
     def __init__(self, address: str) -> None:
         """Greet the robot at `address`, "host:port".
@@ -66,7 +199,7 @@ class UdpRobot(Interface):
         self._behind = time.perf_counter() - time.time()
         self._seen: dict[str, tuple[float, np.ndarray]] = {}
         self._asked: set[str] = set()
-        self._greeting = packet(HELLO, 0, pack_json({"sources": {}}))
+        self._greeting = packet(HELLO, 0, pack_sources({}))
         self.facts = self._greet(address)
 
     def _greet(self, address: str) -> RobotFacts:
@@ -74,27 +207,22 @@ class UdpRobot(Interface):
         while time.perf_counter() < end:
             self._send(self._greeting)
             time.sleep(ASK_EVERY_S)
-            for data, _ in self._received():
-                opened = open_packet(data)
-                if opened is None or opened[0] != FACTS:
-                    continue
-                with suppress(ValueError, KeyError, TypeError, RecursionError):  # not from a robot
-                    return facts_of_json(json.loads(opened[2]))
+            for _, body, _ in self._received(FACTS):
+                with suppress(ValueError, KeyError, TypeError):  # not from a robot
+                    return unpack_facts(body)
         self._socket.close()
         raise RunError(f"--robot: no robot answers at udp:{address} within {ANSWER_S:g} s")
 
     def _send(self, data: bytes) -> None:
         """Send a packet; a failure counts as a lost packet."""
-        try:
+        with suppress(OSError):
             self._socket.send(data)
-        except OSError:
-            return
 
-    def _received(self) -> list[tuple[bytes, float]]:
-        """Return the new packets with their times of arrival, as `time.perf_counter` [s]. If the time of day was set in
-        between, the present time replaces them.
+    def _received(self, kind: int) -> list[tuple[int, bytes, float]]:
+        """Return the new packets of a kind: their numbers, bodies and times of arrival, as `time.perf_counter` [s]. If the
+        time of day was set in between, the present time replaces the times of arrival.
         """
-        found: list[tuple[bytes, float]] = []
+        found: list[tuple[int, bytes, float]] = []
         now, behind = time.perf_counter(), time.perf_counter() - time.time()
         was_set, self._behind = abs(behind - self._behind) > SET_S, behind
         while True:
@@ -103,45 +231,32 @@ class UdpRobot(Interface):
             except OSError:  # no more packets, or the last one sent had no receiver
                 return found
             came = time.time()
-            for level, kind, value in notes:
-                if (level, kind, len(value)) == (socket.SOL_SOCKET, SO_TIMESTAMP, MOMENT.size):
+            for level, name, value in notes:
+                if (level, name, len(value)) == (socket.SOL_SOCKET, SO_TIMESTAMP, MOMENT.size):
                     seconds, microseconds = MOMENT.unpack(value)
                     came = seconds + 1e-6 * microseconds
-            found.append((data, now if was_set else came + behind))
+            opened = open_packet(data)
+            if opened is not None and opened[0] == kind:
+                found.append((*opened[1:], now if was_set else came + behind))
 
     def ask(self, sources: Mapping[str, np.ndarray | None]) -> None:
-        wanted = {name: None if points is None else points.tolist() for name, points in sources.items()}
-        self._greeting = packet(HELLO, 1, pack_json({"sources": wanted}))
-        self._asked = set(wanted)
+        self._greeting = packet(HELLO, 1, pack_sources(sources))
+        self._asked = set(sources)
         self._send(self._greeting)
 
     def read(self) -> list[Reading]:
         found = []
-        for data, came in self._received():
-            opened = open_packet(data)
-            if opened is None or opened[0] != STATE or opened[1] <= self._newest:
-                continue
+        for number, body, came in self._received(STATE):
             try:
-                state = unpack_state(opened[2])
+                state = unpack_state(body, came)
             except ValueError:
                 continue
-            if len(state.positions) != len(self.facts.joint_names):
+            if number <= self._newest or len(state.positions) != len(self.facts.joint_names):
                 continue
-            self._newest = opened[1]
+            self._newest = number
             self._seen |= {name: (came, values) for name, values in state.sources.items()}
             fresh = {name: values for name, (at, values) in self._seen.items() if came - at <= SOURCE_AGE_S}
-            found.append(
-                Reading(
-                    time=state.time,
-                    received=came,
-                    quaternion=state.quaternion,
-                    gyro=state.gyro,
-                    positions=state.positions,
-                    velocities=state.velocities,
-                    torques=state.torques,
-                    sources=fresh,
-                )
-            )
+            found.append(replace(state, sources=fresh))
         if found and not self._asked <= found[-1].sources.keys():
             self._send(self._greeting)  # the first one may be lost
         return found

@@ -1,27 +1,22 @@
-"""A Go2 or a G1 controlled by Unitree's SDK 2, on the network or in Unitree's simulator."""
+"""A Go2 or a G1 controlled by Unitree's SDK 2, on the network or in Unitree's simulator.
+
+Layouts of messages are those of the definitions (IDL) that Unitree publishes with its SDK 2, "unitree_go" for Go2 and
+"unitree_hg" for G1, in C's memory layout. The checksum is CRC-32/MPEG-2 (polynomial 0x04C11DB7, start 0xFFFFFFFF, nothing
+reflected, no final exclusive or) over all but the last of the message's 32-bit words, the highest byte of each word first.
+"""
 
 import threading
 import time
+import zlib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from legged.deploy.interface import Interface, Reading
-from legged.deploy.unitree_messages import (
-    KINDS,
-    L2,
-    OTHER_G1,
-    SELECT,
-    B,
-    UnitreeKind,
-    copy_into,
-    fill_command,
-    new_command,
-    pressed,
-)
+from legged.deploy.interface import Interface, Reading, RobotFacts
 from legged.errors import ConfigError, RunError
 
 COMMAND_TOPIC, STATE_TOPIC = "rt/lowcmd", "rt/lowstate"
@@ -38,33 +33,167 @@ RELEASE_S = 10.0
 """Time within which a robot must leave its own controller [s]."""
 BRAKING = 2.0
 """D gain of joints that are braked after the program died [N m s/rad]."""
+FLOATS = [(name, "<f4") for name in ("q", "dq", "tau", "kp", "kd")]
+GO_MOTOR = np.dtype([("mode", "u1"), *FLOATS, ("reserve", "<u4", (3,))], align=True)
+GO_COMMAND = np.dtype(
+    [
+        ("head", "u1", (2,)),
+        ("level_flag", "u1"),
+        ("frame_reserve", "u1"),
+        ("sn", "<u4", (2,)),
+        ("version", "<u4", (2,)),
+        ("bandwidth", "<u2"),
+        ("motor_cmd", GO_MOTOR, (20,)),
+        ("bms_cmd", [("off", "u1"), ("reserve", "u1", (3,))]),
+        ("wireless_remote", "u1", (40,)),
+        ("led", "u1", (12,)),
+        ("fan", "u1", (2,)),
+        ("gpio", "u1"),
+        ("reserve", "<u4"),
+        ("crc", "<u4"),
+    ],
+    align=True,
+)
+"""LowCmd of unitree_go, 812 bytes."""
+HG_MOTOR = np.dtype([("mode", "u1"), *FLOATS, ("reserve", "<u4")], align=True)
+HG_COMMAND = np.dtype(
+    [
+        ("mode_pr", "u1"),
+        ("mode_machine", "u1"),
+        ("motor_cmd", HG_MOTOR, (35,)),
+        ("reserve", "<u4", (4,)),
+        ("crc", "<u4"),
+    ],
+    align=True,
+)
+"""LowCmd of unitree_hg, 1004 bytes."""
+NO_POSITION, NO_VELOCITY = 2.146e9, 16000.0
+"""Targets for motors of Go2 without position or velocity control."""
+ENABLED = 1
+"""Mode of a motor that is on."""
+SERIES = 0
+"""`mode_pr` with which the ankles and the waist of G1 take pitch and roll angles instead of those of their two motors."""
+OTHER_G1 = {1: "23 joints", 3: "a locked waist", 4: "23 joints", 6: "a locked waist", 9: "no legs"}
+"""`mode_machine` of a G1 without all 29 joints -> its joints (from the table of Unitree's description of G1)."""
+BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+"""Byte -> the byte with its bits in reverse order."""
+SELECT, L2, B = (2, 3), (2, 5), (3, 1)
+"""Keys of the remote control: byte of `wireless_remote` and bit in it."""
+# Lowest and highest angle [rad], largest velocity [rad/s] and torque [N m] by joint, as Unitree's models have them.
+_GO2_LEG = {"hip": (-1.0472, 1.0472, 30.1, 23.7), "calf": (-2.7227, -0.83776, 20.07, 35.55)}
+_GO2_THIGH = {"F": (-1.5708, 3.4907, 30.1, 23.7), "R": (-0.5236, 4.5379, 30.1, 23.7)}
+_GO2 = {
+    f"{leg}_{part}_joint": _GO2_THIGH[leg[0]] if part == "thigh" else _GO2_LEG[part]
+    for leg in ("FL", "FR", "RL", "RR")
+    for part in ("hip", "thigh", "calf")
+}
+_G1_LEG = {
+    "hip_pitch": (-2.5307, 2.8798, 32.0, 88.0),
+    "hip_roll": (-0.5236, 2.9671, 20.0, 139.0),
+    "hip_yaw": (-2.7576, 2.7576, 32.0, 88.0),
+    "knee": (-0.087267, 2.8798, 20.0, 139.0),
+    "ankle_pitch": (-0.87267, 0.5236, 37.0, 50.0),
+    "ankle_roll": (-0.2618, 0.2618, 37.0, 50.0),
+}
+_G1_WAIST = {"yaw": (-2.618, 2.618, 32.0, 88.0), "roll": (-0.52, 0.52, 37.0, 50.0), "pitch": (-0.52, 0.52, 37.0, 50.0)}
+_G1_ARM = {
+    "shoulder_pitch": (-3.0892, 2.6704, 37.0, 25.0),
+    "shoulder_roll": (-1.5882, 2.2515, 37.0, 25.0),
+    "shoulder_yaw": (-2.618, 2.618, 37.0, 25.0),
+    "elbow": (-1.0472, 2.0944, 37.0, 25.0),
+    "wrist_roll": (-1.97222, 1.97222, 37.0, 25.0),
+    "wrist_pitch": (-1.61443, 1.61443, 22.0, 5.0),
+    "wrist_yaw": (-1.61443, 1.61443, 22.0, 5.0),
+}
 
 
-class Wire(Protocol):
-    """Transport of Unitree's messages."""
+def _side(side: str, parts: dict[str, tuple[float, float, float, float]]) -> dict[str, tuple[float, float, float, float]]:
+    """Return the joints of one side; on the right, rolls of hips and shoulders have the opposite sign."""
+    mirrored = ("hip_roll", "shoulder_roll") if side == "right" else ()
+    return {
+        f"{side}_{part}_joint": (-high, -low, speed, torque) if part in mirrored else (low, high, speed, torque)
+        for part, (low, high, speed, torque) in parts.items()
+    }
 
-    def new_command(self) -> Any:
-        """Return a LowCmd_ of the robot's kind, with zeros."""
 
-    def listen(self, heard: Callable[[Any], None]) -> None:
-        """Call `heard` with every LowState_ from another thread."""
+_G1 = {
+    **_side("left", _G1_LEG),
+    **_side("right", _G1_LEG),
+    **{f"waist_{part}_joint": limits for part, limits in _G1_WAIST.items()},
+    **_side("left", _G1_ARM),
+    **_side("right", _G1_ARM),
+}
 
-    def take_over(self) -> None:
-        """Make the robot leave its own controller before the first command, since two programs must never command one robot.
 
-        Raises:
-            RunError: the robot keeps its controller or does not answer.
-        """
+@dataclass(frozen=True)
+class UnitreeKind:
+    """A Unitree robot: its messages, its joints, and the motor of each joint."""
 
-    def send(self, command: Any) -> None:
-        """Send a LowCmd_."""
+    facts: RobotFacts
+    motors: tuple[int, ...]
+    """(D,) index of each joint in `motor_cmd` and `motor_state`."""
+    command: np.dtype
+    package: str
+    """Package of the messages in Unitree's SDK."""
 
-    def close(self) -> None:
-        """Release the connection."""
+
+def _facts(name: str, imu_body: str, joints: dict[str, tuple[float, float, float, float]]) -> RobotFacts:
+    numbers = np.array(list(joints.values()))
+    return RobotFacts(name, tuple(joints), numbers[:, :2], numbers[:, 2], numbers[:, 3], imu_body)
+
+
+KINDS = {
+    # The motors of Go2 are ordered front right, front left, rear right, rear left; the joints begin with the left.
+    "go2": UnitreeKind(_facts("go2", "base", _GO2), (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8), GO_COMMAND, "unitree_go"),
+    "g1": UnitreeKind(_facts("g1", "pelvis", _G1), tuple(range(29)), HG_COMMAND, "unitree_hg"),
+}
+
+
+def crc(message: bytes) -> int:
+    """Return the checksum of a message, which belongs into its last four bytes.
+
+    zlib computes the reflected CRC of the same polynomial, so the bits of input and output are reversed.
+    """
+    words = np.frombuffer(message, "<u4")[:-1].astype(">u4").tobytes()
+    reflected = zlib.crc32(words.translate(BITS)) ^ 0xFFFFFFFF
+    return int(f"{reflected:032b}"[::-1], 2)
+
+
+def command_of(
+    kind: UnitreeKind, mode_machine: int, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray
+) -> np.ndarray:
+    """Return a command, a record (), with targets (D,) [rad] and gains (D,) [N m/rad], [N m s/rad] of the joints. Their
+    velocities and feedforward torques are zero, and all other motors are off. `mode_machine` is the value in G1's state.
+    """
+    message, places = np.zeros((), kind.command), list(kind.motors)
+    motors = message["motor_cmd"]
+    if kind.command is GO_COMMAND:
+        message["head"], message["level_flag"] = (0xFE, 0xEF), 0xFF
+        motors["mode"], motors["q"], motors["dq"] = ENABLED, NO_POSITION, NO_VELOCITY
+    else:
+        message["mode_pr"], message["mode_machine"] = SERIES, mode_machine
+        motors["mode"][places] = ENABLED
+    motors["q"][places], motors["kp"][places], motors["kd"][places] = positions, stiffness, damping
+    motors["dq"][places] = 0.0
+    message["crc"] = crc(message.tobytes())
+    return message
+
+
+def copy_into(message: np.ndarray, target: Any) -> None:
+    """Copy the numbers of a record to an object of Unitree's SDK."""
+    for name in message.dtype.names or ():
+        value = message[name]
+        if not value.dtype.names:
+            setattr(target, name, value.tolist())
+        elif value.shape:
+            for part, place in zip(value, getattr(target, name), strict=True):
+                copy_into(part, place)
+        else:
+            copy_into(value, getattr(target, name))
 
 
 class SdkWire:
-    """Transport by Unitree's SDK (the extra `unitree-sdk2`)."""
+    """Transport of messages by Unitree's SDK (the extra `unitree-sdk2`)."""
 
     def __init__(self, kind: UnitreeKind, network: str | None, domain: int) -> None:
         """Join the network by the interface `network`, such as eth0. The DDS domain 0 is a robot's, `SIMULATOR_DOMAIN` that
@@ -88,18 +217,22 @@ class SdkWire:
             channel.ChannelFactoryInitialize(domain, network)
         except Exception as error:  # the SDK raises plain exceptions
             raise ConfigError(f"--network: {network or 'none given'}: domain {domain} cannot be joined ({error})") from error
-        self._new: Callable[[], Any] = getattr(default, f"{kind.package}_msg_dds__LowCmd_")
+        self.new_command: Callable[[], Any] = getattr(default, f"{kind.package}_msg_dds__LowCmd_")
+        """Return a LowCmd_ of the robot's kind, with zeros."""
         self._publisher = channel.ChannelPublisher(COMMAND_TOPIC, messages.LowCmd_)
         self._publisher.Init()
         self._subscriber = channel.ChannelSubscriber(STATE_TOPIC, messages.LowState_)
 
-    def new_command(self) -> Any:
-        return self._new()
-
     def listen(self, heard: Callable[[Any], None]) -> None:
+        """Call `heard` with every LowState_ from another thread."""
         self._subscriber.Init(heard, 10)
 
     def take_over(self) -> None:
+        """Make the robot leave its own controller before the first command, since two programs must never command one robot.
+
+        Raises:
+            RunError: the robot keeps its controller or does not answer.
+        """
         if self._switcher is None:
             return
         client = self._switcher.MotionSwitcherClient()
@@ -118,10 +251,16 @@ class SdkWire:
         raise RunError(f"--robot: the robot's own controller is still on after {RELEASE_S:g} s; leave it by hand")
 
     def send(self, command: Any) -> None:
+        """Send a LowCmd_.
+
+        Raises:
+            RunError: it was not sent.
+        """
         if self._publisher.Write(command) is False:  # the SDK does not raise
             raise RunError("--robot: Unitree's SDK could not send a command")
 
     def close(self) -> None:
+        """Release the connection."""
         self._subscriber.Close()
         self._publisher.Close()
 
@@ -129,7 +268,7 @@ class SdkWire:
 class UnitreeRobot(Interface):
     """A Unitree robot. A thread repeats the newest command, and brakes the joints if the program dies."""
 
-    def __init__(self, name: str, wire: Wire, repeat_s: float = REPEAT_S) -> None:
+    def __init__(self, name: str, wire: SdkWire, repeat_s: float = REPEAT_S) -> None:
         """Wait for the first state of the robot `name`, a key of `KINDS`, and make it leave its own controller.
 
         Raises:
@@ -139,10 +278,9 @@ class UnitreeRobot(Interface):
         self.kind = KINDS[name]
         self.facts = self.kind.facts
         self._wire, self._repeat_s = wire, repeat_s
-        self._places = list(self.kind.motors)
         self._lock = threading.Lock()
         self._heard: list[Reading] = []
-        self._mode_machine: int | None = None
+        self._mode_machine = 0
         self._first = threading.Event()
         wire.listen(self._hear)
         try:
@@ -150,7 +288,6 @@ class UnitreeRobot(Interface):
         except BaseException:  # Ctrl-C too
             wire.close()
             raise
-        self._record = new_command(self.kind, self._mode_machine or 0)
         self._command = wire.new_command()
         self._written: float | None = None
         self._braked = False
@@ -164,8 +301,7 @@ class UnitreeRobot(Interface):
             raise RunError(
                 f"--robot: {name}: no state came within {FIRST_STATE_S:g} s; is it on, and --network the right one?"
             )
-        lacks = OTHER_G1.get(self._mode_machine or 0) if name == "g1" else None
-        if lacks is not None:
+        if name == "g1" and (lacks := OTHER_G1.get(self._mode_machine)) is not None:
             raise ConfigError(f"--robot: g1: mode_machine is {self._mode_machine}: this robot has {lacks}, not 29 joints")
         self._wire.take_over()
         with self._lock:
@@ -174,7 +310,8 @@ class UnitreeRobot(Interface):
     def _hear(self, state: Any) -> None:
         """Store the reading of a LowState_."""
         received = time.perf_counter()
-        motors = [state.motor_state[place] for place in self._places]
+        motors = [state.motor_state[place] for place in self.kind.motors]
+        select, l2, b = (bool(int(state.wireless_remote[byte]) >> bit & 1) for byte, bit in (SELECT, L2, B))
         reading = Reading(
             time=1e-3 * float(state.tick),
             received=received,
@@ -184,8 +321,7 @@ class UnitreeRobot(Interface):
             velocities=np.array([motor.dq for motor in motors], dtype=float),
             torques=np.array([motor.tau_est for motor in motors], dtype=float),
             temperatures=np.array([np.max(motor.temperature) for motor in motors], dtype=float),
-            stop=pressed(state.wireless_remote, SELECT)
-            or (pressed(state.wireless_remote, L2) and pressed(state.wireless_remote, B)),
+            stop=select or (l2 and b),
         )
         with self._lock:
             self._heard.append(reading)
@@ -202,25 +338,19 @@ class UnitreeRobot(Interface):
 
     def write(self, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:
         with self._lock:
-            self._fill(positions, stiffness, damping)
+            copy_into(command_of(self.kind, self._mode_machine, positions, stiffness, damping), self._command)
             self._written, self._braked = time.perf_counter(), False
             self._wire.send(self._command)
 
-    def _fill(self, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:
-        if "mode_machine" in (self._record.dtype.names or ()):
-            self._record["mode_machine"] = self._mode_machine or 0
-        fill_command(self._record, self.kind, positions, stiffness, damping)
-        copy_into(self._record, self._command)
-
     def _repeat(self) -> None:
         """Send the newest command until the robot is released; brake once the command is too old."""
-        nothing = np.zeros(len(self._places))
+        nothing = np.zeros(len(self.kind.motors))
         while not self._closing.wait(self._repeat_s):
             with self._lock:
                 if self._written is None:
                     continue
                 if not self._braked and time.perf_counter() - self._written > HOLD_S:
-                    self._fill(nothing, nothing, np.full(len(self._places), BRAKING))
+                    copy_into(command_of(self.kind, self._mode_machine, nothing, nothing, nothing + BRAKING), self._command)
                     self._braked = True
                 with suppress(Exception):  # a later command may succeed; `write` raises its own errors
                     self._wire.send(self._command)

@@ -13,7 +13,6 @@ and float32 numbers, matrices row by row:
   of an estimator in addition to its observations.
 """
 
-import itertools
 import math
 import struct
 from collections.abc import Callable
@@ -95,14 +94,14 @@ def unpack(data: bytes) -> list[Layer]:
     """Return the layers of a file.
 
     Raises:
-        ValueError: the data are no such file, too short, or their layers do not form a network.
+        ValueError: the data are no such file, too short, have numbers that are not finite, or do not form a network.
     """
     if data[: len(MAGIC)] != MAGIC:
         raise ValueError("is no policy.weights of an export")
+    place, kept = len(MAGIC) + COUNT.size, 0
+    layers: list[Layer] = []
     try:
-        (count,) = COUNT.unpack_from(data, len(MAGIC))
-        place, layers = len(MAGIC) + COUNT.size, []
-        for _ in range(count):
+        for _ in range(COUNT.unpack_from(data, len(MAGIC))[0]):
             kind, detail, inputs, outputs = HEAD.unpack_from(data, place)
             place += HEAD.size
             arrays = []
@@ -111,50 +110,36 @@ def unpack(data: bytes) -> list[Layer]:
                 if place + 4 * size > len(data):
                     raise ValueError("is cut short")
                 arrays.append(np.frombuffer(data, "<f4", size, place).reshape(shape))
+                if not np.isfinite(arrays[-1]).all():
+                    raise ValueError("has numbers that are not finite")
                 place += 4 * size
+            if kind == KEEP:
+                kept = inputs
+            if kind == JOIN:
+                if not kept or outputs != kept + inputs:
+                    raise ValueError("has a layer that joins what was not kept")
+                kept = 0
+            if kind in (NORMALISE, ACTIVATION, KEEP) and inputs != outputs:
+                raise ValueError("has a layer that changes a width it cannot change")
+            if kind == ACTIVATION and detail >= len(ACTIVATIONS):
+                raise ValueError("has a layer that this program does not know")
+            if layers and layers[-1].outputs != inputs:
+                raise ValueError("has layers that do not fit together")
             layers.append(Layer(kind, detail, inputs, outputs, tuple(arrays)))
     except struct.error as error:
         raise ValueError("is cut short") from error
     if place != len(data):
         raise ValueError("is longer than it says")
-    _check_chain(layers)
-    return layers
-
-
-def _check_chain(layers: list[Layer]) -> None:
-    """Check that the outputs of each layer fit the inputs of the next.
-
-    Raises:
-        ValueError: they do not, there are no layers, or a layer is unknown.
-    """
     if not layers:
         raise ValueError("has no layers")
-    kept = 0
-    for layer, following in itertools.pairwise([*layers, None]):
-        assert layer is not None
-        if layer.kind == KEEP:
-            kept = layer.inputs
-        if layer.kind == JOIN:
-            if not kept or layer.outputs != kept + layer.inputs:
-                raise ValueError("has a layer that joins what was not kept")
-            kept = 0
-        if layer.kind in (NORMALISE, ACTIVATION, KEEP) and layer.inputs != layer.outputs:
-            raise ValueError("has a layer that changes a width it cannot change")
-        if layer.kind == ACTIVATION and layer.detail >= len(ACTIVATIONS):
-            raise ValueError("has a layer that this program does not know")
-        if following is not None and layer.outputs != following.inputs:
-            raise ValueError("has layers that do not fit together")
+    return layers
 
 
 class NumpyNetwork:
     """The network of such a file in float64 for a batch of observations; it keeps the hidden state between calls."""
 
     def __init__(self, data: bytes) -> None:
-        """Load the contents of a file.
-
-        Raises:
-            ValueError: as in `unpack`.
-        """
+        """Load the contents of a file. Raises the errors of `unpack`."""
         self._layers = unpack(data)
         self._functions = list(ACTIVATIONS.values())
         self._hidden: dict[int, np.ndarray] = {}

@@ -10,8 +10,10 @@ import numpy as np
 from legged.errors import ConfigError, suggest
 from legged.robots.patterns import match_names
 
-NEEDED = ("joint_names", "target", "position", "velocity", "torque")
-OPTIONAL = ("dt", "time", "run", "stiffness", "damping", "torque_limit")
+MEASURED = ("target", "position", "velocity", "torque")
+DRIVE = ("stiffness", "damping", "torque_limit")
+NEEDED, OPTIONAL = ("joint_names", *MEASURED), ("dt", "time", "run", *DRIVE)
+"""Arrays of a file."""
 BLOCKS = 10
 """Blocks of time of a run; every `HELD_OUT`th block is held out."""
 HELD_OUT = 5
@@ -46,6 +48,11 @@ class ActuatorLog:
     """(D,) torque limits of the drives [N m], if known."""
 
     @property
+    def has_gains(self) -> bool:
+        """Return whether both gains of the drives are known."""
+        return self.stiffness is not None and self.damping is not None
+
+    @property
     def held_out(self) -> np.ndarray:
         """Return the mask (T,) of held-out samples, about a fifth: whole runs, or every fifth block of time if there are few
         runs or one run has nearly all samples.
@@ -71,9 +78,8 @@ class ActuatorLog:
         if not patterns:
             return self
         keep = list(match_names(tuple(patterns), self.joint_names, "--joints"))
-        arrays: dict[str, Any] = {name: getattr(self, name)[:, keep] for name in NEEDED[1:]}
-        of_joints: dict[str, Any] = {name: None if (a := getattr(self, name)) is None else a[keep] for name in OPTIONAL[3:]}
-        return replace(self, joint_names=tuple(self.joint_names[i] for i in keep), **arrays, **of_joints)
+        chosen = {name: getattr(self, name)[..., keep] for name in (*MEASURED, *DRIVE) if getattr(self, name) is not None}
+        return replace(self, joint_names=tuple(self.joint_names[i] for i in keep), **chosen)
 
     def resampled(self, dt: float) -> "ActuatorLog":
         """Return the log at samples `dt` [s] apart: measurements are interpolated linearly, targets are the last ones sent.
@@ -87,7 +93,7 @@ class ActuatorLog:
             raise ConfigError(
                 f"--dt: the log was sampled every {self.dt:g} s; what happens within {dt:g} s can't be learned from it"
             )
-        parts: dict[str, list[np.ndarray]] = {name: [] for name in ("run", *NEEDED[1:])}
+        parts: dict[str, list[np.ndarray]] = {name: [] for name in ("run", *MEASURED)}
         for number in np.unique(self.run):
             rows = np.flatnonzero(self.run == number)
             at = np.arange(0.0, (len(rows) - 1) * self.dt * (1.0 + 1e-9), dt) / self.dt
@@ -95,7 +101,7 @@ class ActuatorLog:
             after, share = np.minimum(before + 1, len(rows) - 1), np.clip(at - before, 0.0, 1.0)[:, None]
             parts["run"].append(np.full(len(at), number))
             parts["target"].append(self.target[rows[before]])
-            for name in NEEDED[2:]:
+            for name in MEASURED[1:]:
                 values = getattr(self, name)[rows]
                 parts[name].append((1.0 - share) * values[before] + share * values[after])
         joined: dict[str, Any] = {name: np.concatenate(values) for name, values in parts.items()}
@@ -133,36 +139,43 @@ def read_log(path: Path) -> ActuatorLog:
     for name in NEEDED:
         if name not in arrays:
             raise ConfigError(f"{path}: '{name}' is missing (keys: {', '.join(NEEDED)}, and dt or time)")
+
+    def numbers(name: str, expected: str, *shapes: tuple[int, ...]) -> np.ndarray:
+        if arrays[name].shape not in shapes:
+            raise ConfigError(f"{path}: {name}: expected {expected}, got {arrays[name].shape}")
+        if arrays[name].dtype.kind not in ("bfiu" if name == "run" else "fiu") or not np.isfinite(arrays[name]).all():
+            raise ConfigError(f"{path}: {name}: expected finite numbers")
+        return arrays[name].astype(np.float64)
+
     names = tuple(str(name) for name in np.atleast_1d(arrays["joint_names"]))
     if len(set(names)) < len(names):
         raise ConfigError(f"{path}: joint_names: must differ from each other, got {', '.join(names)}")
-    shape = arrays["target"].shape
-    if len(shape) != 2 or shape[1] != len(names):
+    count, shape = (len(names),), arrays["target"].shape
+    if len(shape) != 2 or shape[1:] != count:
         raise ConfigError(f"{path}: target: expected (samples, {len(names)} joints), got {shape}")
-    found: dict[str, np.ndarray] = {}
-    for name in NEEDED[1:]:
-        if arrays[name].shape != shape:
-            raise ConfigError(f"{path}: {name}: expected {shape} as target, got {arrays[name].shape}")
-        found[name] = _numbers(arrays[name], f"{path}: {name}")
+    found = {name: numbers(name, f"{shape} as target", shape) for name in MEASURED}
     if shape[0] < SHORTEST:
         raise ConfigError(f"{path}: target: {shape[0]} samples are too few; at least {SHORTEST} are needed")
-    run = np.atleast_1d(arrays.get("run", np.zeros(shape[0], dtype=int)))
-    if run.shape != shape[:1]:
-        raise ConfigError(f"{path}: run: expected ({shape[0]},), got {run.shape}")
-    if run.dtype.kind not in "bfiu" or not np.isfinite(run).all():
-        raise ConfigError(f"{path}: run: expected finite numbers")
+    arrays.setdefault("run", np.zeros(shape[0]))
+    run = numbers("run", f"({shape[0]},)", shape[:1])
     # A run number that occurs again, as in concatenated logs, is another run.
     run = np.concatenate([[0], np.cumsum(run[1:] != run[:-1])])
-    for name in OPTIONAL[3:]:
-        if name in arrays:
-            values = _numbers(arrays[name], f"{path}: {name}")
-            if values.shape not in ((), (1,), (len(names),)):
-                raise ConfigError(f"{path}: {name}: expected a number or ({len(names)},), got {values.shape}")
-            if values.min() < 0.0 or (name == "torque_limit" and values.min() == 0.0):
-                allowed = "above 0" if name == "torque_limit" else "0 or more"
-                raise ConfigError(f"{path}: {name}: must be {allowed}, got {values.min():g}")
-            found[name] = np.broadcast_to(values, (len(names),)).copy()
-    return ActuatorLog(names, _time_step(arrays, run, path), run, **found)
+    for name in (name for name in DRIVE if name in arrays):
+        values = numbers(name, f"a number or ({len(names)},)", (), (1,), count)
+        if values.min() < 0.0 or (name == "torque_limit" and values.min() == 0.0):
+            allowed = "above 0" if name == "torque_limit" else "0 or more"
+            raise ConfigError(f"{path}: {name}: must be {allowed}, got {values.min():g}")
+        found[name] = np.broadcast_to(values, count).copy()
+    steps = [float(numbers("dt", "a number", (), (1,)).item())] if "dt" in arrays else []
+    if "time" in arrays:
+        steps.append(_even_step(numbers("time", f"{run.shape}", run.shape), run, path))
+    if not steps:
+        raise ConfigError(f"{path}: 'dt' is missing: the time between two samples [s], or 'time' of each of them")
+    if not steps[0] > 0.0:
+        raise ConfigError(f"{path}: dt: must be above 0, got {steps[0]:g}")
+    if not np.isclose(steps[-1], steps[0], rtol=UNEVEN):
+        raise ConfigError(f"{path}: dt: got {steps[0]:g} s, but 'time' says {steps[1]:g} s; leave one of them out")
+    return ActuatorLog(names, steps[0], run, **found)
 
 
 def check_alike(log: ActuatorLog, path: Path) -> None:
@@ -174,8 +187,7 @@ def check_alike(log: ActuatorLog, path: Path) -> None:
     fitted_to = log.torque[~log.held_out]
     if fitted_to.min() == fitted_to.max():
         raise ConfigError(f"{path}: torque: is {fitted_to[0, 0]:g} N m throughout; nothing can be fitted to that")
-    known = log.stiffness is not None and log.damping is not None  # a single gain is not used
-    for name in (*(OPTIONAL[3:5] if known else ()), OPTIONAL[5]):
+    for name in DRIVE if log.has_gains else DRIVE[2:]:  # a single gain is not used
         values = getattr(log, name)
         if values is None or np.allclose(values, values[0], rtol=1e-4, atol=0.0):
             continue
@@ -186,47 +198,8 @@ def check_alike(log: ActuatorLog, path: Path) -> None:
         )
 
 
-def _numbers(values: np.ndarray, where: str) -> np.ndarray:
-    """Return an array as float64.
-
-    Raises:
-        ConfigError: the array holds other values than finite numbers.
-    """
-    if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
-        raise ConfigError(f"{where}: expected finite numbers")
-    return values.astype(np.float64)
-
-
-def _time_step(arrays: dict[str, np.ndarray], run: np.ndarray, path: Path) -> float:
-    """Return the time between two samples [s].
-
-    Raises:
-        ConfigError: the time is missing, changes within a run, or differs between `dt` and `time`.
-    """
-    if "dt" in arrays:
-        given = _numbers(arrays["dt"], f"{path}: dt")
-        if given.size != 1:
-            raise ConfigError(f"{path}: dt: expected a number, got {given.shape}")
-        dt = given.item()
-        if dt <= 0.0:
-            raise ConfigError(f"{path}: dt: must be above 0, got {dt:g}")
-        if "time" in arrays and not np.isclose(step := _even_step(arrays["time"], run, path), dt, rtol=UNEVEN):
-            raise ConfigError(f"{path}: dt: got {dt:g} s, but 'time' says {step:g} s; leave one of them out")
-        return dt
-    if "time" not in arrays:
-        raise ConfigError(f"{path}: 'dt' is missing: the time between two samples [s], or 'time' of each of them")
-    return _even_step(arrays["time"], run, path)
-
-
-def _even_step(times: np.ndarray, run: np.ndarray, path: Path) -> float:
-    """Return the time between two samples, computed from `times` [s].
-
-    Raises:
-        ConfigError: the time changes within a run.
-    """
-    time = _numbers(times, f"{path}: time")
-    if time.shape != run.shape:
-        raise ConfigError(f"{path}: time: expected {run.shape}, got {time.shape}")
+def _even_step(time: np.ndarray, run: np.ndarray, path: Path) -> float:
+    """Return the time between two samples at the times `time` (T,) [s], which must not change within a run."""
     steps = np.diff(time)[np.diff(run) == 0]
     if not len(steps):
         raise ConfigError(

@@ -113,14 +113,18 @@ def fit_drive(log: ActuatorLog, longest_delay: float = 0.05) -> Drive:
     delays = np.arange(0, int(longest_delay / log.dt + 1e-6) + 1)
     tried = [search(float(k), of, of is limits, ROUGHLY) for k in delays for of in (start, limits)]
     best = min(tried, key=lambda one: one[0])[1]
-    limited = bool(np.isfinite(best.stall_torque)) and _share_limited(best, log, every) >= SEEN
-    if not limited:
-        best = replace(best, stall_torque=np.inf, no_load_speed=np.inf)
+    free = replace(best, stall_torque=np.inf, no_load_speed=np.inf)
+    reduced = np.abs(best.predict(log)[every] - free.predict(log)[every]) > 1e-6  # by the line, not by the effort limit
+    limited = bool(np.isfinite(best.stall_torque)) and float(np.mean(reduced)) >= SEEN
+    best = best if limited else free
     found = search(best.delay / log.dt, best, limited)
     for step in (1.0, 0.5, 0.25, 0.1):
         near = found[1].delay / log.dt + step * np.array([-1.0, 1.0])
         found = min([found, *(search(float(k), found[1], limited) for k in near if k >= 0.0)], key=lambda one: one[0])
-    even = search(found[1].delay / log.dt, _without_peak(found[1]), limited, peaked=False)
+    at_low_speed = float(found[1].friction(np.array(5.0 * SMOOTHING)))
+    dry = max(found[1].coulomb, min(found[1].breakaway, at_low_speed), 1e-6)
+    flat = replace(found[1], coulomb=dry, breakaway=dry, stribeck_velocity=2.0 * SMOOTHING)  # dry friction without a peak
+    even = search(found[1].delay / log.dt, flat, limited, peaked=False)
     told = NARROWEST <= found[1].stribeck_velocity <= WIDEST * speeds.max() and found[0] <= (1.0 - WORTH) * even[0]
     return (found if told else even)[1]
 
@@ -136,16 +140,9 @@ def _start(log: ActuatorLog, effort: float) -> Drive:
     return Drive(float(stiffness), float(damping), dry, dry, 2.0 * SMOOTHING, 0.05 * damping + 1e-6, effort=effort)
 
 
-def _without_peak(drive: Drive) -> Drive:
-    """Return a drive whose dry friction is constant and about as large as that of the given one."""
-    dry = max(drive.coulomb, min(drive.breakaway, float(drive.friction(np.array(5.0 * SMOOTHING)))), 1e-6)
-    return replace(drive, coulomb=dry, breakaway=dry, stribeck_velocity=2.0 * SMOOTHING)
-
-
 def _free(log: ActuatorLog, limited: bool, peaked: bool) -> tuple[str, ...]:
     """Return the names of the free parameters; without a peak, breakaway friction equals Coulomb friction."""
-    known = log.stiffness is not None and log.damping is not None
-    gains = ("viscous",) if known else ("stiffness", "damping")
+    gains = ("viscous",) if log.has_gains else ("stiffness", "damping")
     limits = ("stall_torque", "no_load_speed") if limited else ()
     peak = ("breakaway", "stribeck_velocity") if peaked else ()
     return (*gains, "coulomb", *peak, *limits)
@@ -187,9 +184,3 @@ def _search(
         if better < FINEST:
             break
     return cost / len(torque), drive(x)
-
-
-def _share_limited(drive: Drive, log: ActuatorLog, rows: np.ndarray) -> float:
-    """Return the share of samples in which the motor's torque-speed line, not the effort limit, reduces the torque."""
-    free = replace(drive, stall_torque=np.inf, no_load_speed=np.inf)
-    return float(np.mean(np.abs(drive.predict(log)[rows] - free.predict(log)[rows]) > 1e-6))

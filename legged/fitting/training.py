@@ -26,24 +26,18 @@ def train_network(
     Raises:
         ConfigError: the runs are too short.
     """
-    error = log.target - log.position
-    used = ~log.held_out
-    scales = np.array([1.0 / _spread(error[used]), 1.0 / _spread(log.velocity[used]), _spread(log.torque[used])], np.float32)
+    error, used = log.target - log.position, ~log.held_out
+    spread = [max(float(np.std(values[used])), 1e-6) for values in (error, log.velocity, log.torque)]
+    scales = np.array([1.0 / spread[0], 1.0 / spread[1], spread[2]], np.float32)
+    inputs, torque = (error * scales[0], log.velocity * scales[1]), log.torque / scales[2]
     random = torch.Generator().manual_seed(seed)
     state = torch.get_rng_state()
     try:
         torch.manual_seed(seed)  # for the initial weights
-        train = _train_mlp if kind == "mlp" else _train_lstm
-        layers = train(
-            log,
-            error * scales[0],
-            log.velocity * scales[1],
-            log.torque / scales[2],
-            hidden,
-            (samples, spacing),
-            updates,
-            random,
-        )
+        if kind == "mlp":
+            layers = _train_mlp(log, inputs, torque, hidden, spacing * np.arange(samples), updates, random)
+        else:
+            layers = _train_lstm(log, inputs, torque, hidden, updates, random)
     finally:
         torch.set_rng_state(state)
     dt, seen = (log.dt * spacing, samples) if kind == "mlp" else (log.dt, 1)
@@ -66,16 +60,8 @@ def predict(weights: NetworkWeights, log: ActuatorLog) -> np.ndarray:
     return found.numpy().astype(np.float64)
 
 
-def _spread(values: np.ndarray) -> float:
-    return max(float(np.std(values)), 1e-6)
-
-
 def _rows(log: ActuatorLog, past: int) -> np.ndarray:
-    """Return the indices of training samples with at least `past` samples before them in the same run, none held out.
-
-    Raises:
-        ConfigError: there are no such samples.
-    """
+    """Return the indices of training samples with at least `past` samples before them in the same run, none held out."""
     usable = ~log.held_out
     starts = np.r_[True, (np.diff(log.run) != 0) | (np.diff(usable.astype(int)) != 0)]
     since = np.arange(len(usable)) - np.maximum.accumulate(np.where(starts, np.arange(len(usable)), 0))
@@ -87,23 +73,19 @@ def _rows(log: ActuatorLog, past: int) -> np.ndarray:
 
 def _train_mlp(
     log: ActuatorLog,
-    error: np.ndarray,
-    velocity: np.ndarray,
+    seen: Sequence[np.ndarray],
     torque: np.ndarray,
     hidden: Sequence[int],
-    history: tuple[int, int],
+    lags: np.ndarray,
     updates: int,
     random: torch.Generator,
 ) -> tuple[dict[str, np.ndarray], ...]:
-    """Return the layers of an MLP; arrays are (T, D), scaled."""
-    samples, spacing = history
-    rows = _rows(log, spacing * (samples - 1))
-    lags = spacing * np.arange(samples)
-    seen = [values[rows - lag].ravel() for values in (error, velocity) for lag in lags]
-    inputs = torch.tensor(np.stack(seen, axis=1), dtype=torch.float32)
+    """Return the layers of an MLP that sees errors and velocities `lags` samples ago; arrays are (T, D), scaled."""
+    rows = _rows(log, int(lags[-1]))
+    inputs = torch.tensor(np.stack([values[rows - lag].ravel() for values in seen for lag in lags], 1), dtype=torch.float32)
     outputs = torch.tensor(torque[rows].ravel(), dtype=torch.float32)
-    widths = [2 * samples, *hidden]
-    linear = [nn.Linear(a, b) for a, b in zip(widths, [*widths[1:], 1], strict=True)]
+    widths = [2 * len(lags), *hidden]
+    linear = [nn.Linear(a, b) for a, b in zip(widths, [*hidden, 1], strict=True)]
     network = nn.Sequential(*[part for layer in linear[:-1] for part in (layer, nn.Softsign())], linear[-1])
 
     def loss() -> Tensor:
@@ -116,17 +98,15 @@ def _train_mlp(
 
 def _train_lstm(
     log: ActuatorLog,
-    error: np.ndarray,
-    velocity: np.ndarray,
+    seen: Sequence[np.ndarray],
     torque: np.ndarray,
     hidden: Sequence[int],
-    _: tuple[int, int],
     updates: int,
     random: torch.Generator,
 ) -> tuple[dict[str, np.ndarray], ...]:
     """Return the layers of an LSTM, by backpropagation through sequences; arrays are (T, D), scaled."""
     ends = torch.tensor(_rows(log, CHUNK - 1))
-    inputs = torch.tensor(np.stack([error, velocity], axis=2), dtype=torch.float32)
+    inputs = torch.tensor(np.stack(seen, axis=2), dtype=torch.float32)
     outputs = torch.tensor(torque, dtype=torch.float32)
     cells = [nn.LSTM(a, b) for a, b in zip([2, *hidden], hidden, strict=False)]
     last = nn.Linear(hidden[-1], 1)

@@ -45,15 +45,20 @@ def describe(task: BaseTask, trained: TaskConfig | None = None) -> dict[str, Any
     never renamed. The noise comes from `trained`, the configuration of the training, or else from the task's.
     """
     cfg = task.cfg
-    groups = describe_groups(task)
-    noise = {group["name"]: noise_in(trained or cfg, group["name"]) for group in groups}
+    groups: list[dict[str, Any]] = []
+    terms: list[dict[str, Any]] = []
+    start, observed = 0, (trained or cfg).observations
+    for name in groups_of(cfg, "actor"):
+        group = task.observation_groups[name]
+        width = group.buffer.shape[1]
+        groups.append({"name": name, "start": start, "size": width // group.history, "history": group.history})
+        level = observed.noise_level if observed.add_noise and observed.groups[name].noise else 0.0
+        for term in group.terms:
+            terms.append(describe_term(task, term, groups[-1], observed.noise.get(term.name, 0.0) * level))
+        start += width
     return {
         "task": cfg.task,
-        "observation": [
-            describe_term(task, term, group, noise[group["name"]].get(term.name, 0.0))
-            for group in groups
-            for term in task.observation_groups[group["name"]].terms
-        ],
+        "observation": terms,
         "observation_history": groups[0]["history"],
         "observation_groups": groups,
         "observation_clip": cfg.observations.clip,
@@ -137,25 +142,6 @@ def conventions(task: LeggedRobot) -> dict[str, str]:
         "actuator": "the motors of the training: the section control.actuator of its configuration; delay in steps of sim_dt",
         "time": "every control_dt: observe, run the policy, hold its action for control_dt",
     }
-
-
-def describe_groups(task: BaseTask) -> list[dict[str, Any]]:
-    """Return the name, first column, width of one observation and history of each observation group of the policy."""
-    groups: list[dict[str, Any]] = []
-    start = 0
-    for name in groups_of(task.cfg, "actor"):
-        group = task.observation_groups[name]
-        width = group.buffer.shape[1]
-        groups.append({"name": name, "start": start, "size": width // group.history, "history": group.history})
-        start += width
-    return groups
-
-
-def noise_in(cfg: TaskConfig, group: str) -> dict[str, float]:
-    """Return the half width of the noise on each term of an observation group, in the term's unit; nothing without noise."""
-    observations = cfg.observations
-    noisy = observations.add_noise and observations.groups[group].noise
-    return {term: half * observations.noise_level for term, half in observations.noise.items()} if noisy else {}
 
 
 def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any], noise: float) -> dict[str, Any]:

@@ -1,9 +1,10 @@
 """Export of a policy as TorchScript, ONNX and plain numbers with a description, checked against torch."""
 
+import hashlib
 import io
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +13,17 @@ import onnx
 import onnxruntime
 import torch
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 
 from legged.config import TaskConfig
 from legged.config.actuator import MOTORS
-from legged.deploy.weights import NumpyNetwork
+from legged.deploy import weights as kinds
+from legged.deploy.contract import CHECKSUMS
+from legged.deploy.weights import Layer, NumpyNetwork, pack
 from legged.envs import BaseTask, LeggedRobot
 from legged.errors import RunError
+from legged.learning.estimator import EstimatingModel
 from legged.policies.description import describe
-from legged.policies.weights_file import weights_of
 from legged.process.paths import make_folder, write_bytes, write_text
 
 EXPORTED = "exported"
@@ -51,8 +54,8 @@ def export(
     All map a flat observation (batch, width) to actions (batch, joints), without noise. The observation has the policy's
     groups side by side; a group with a history of H steps has H observations, oldest first. The TorchScript of a recurrent
     policy keeps the hidden state for a batch of 1 until its reset(); the ONNX has it as inputs and outputs. The metadata,
-    with the entries of `training`, is in the ONNX file and in policy.json. `trained` is the configuration of the training if
-    it is not the task's. A network of the motors is copied to the folder.
+    with the entries of `training`, is in the ONNX file and in policy.json, which also has the files' checksums. `trained` is
+    the configuration of the training if it is not the task's. A network of the motors is copied to the folder.
 
     Raises:
         ExportError: a file computes other actions.
@@ -60,105 +63,107 @@ def export(
     """
     metadata = {**describe(task, trained), **(training or {})}
     device = next(policy.parameters()).device
-    widths = {name: task.observation_groups[name].buffer.shape[1] for name in policy.obs_groups}
     # A sequence of batches; its order matters only to recurrent policies.
     length, batch = CHECKED_SEQUENCE if policy.is_recurrent else (1, CHECKED_OBSERVATIONS)
+    widths = {name: task.observation_groups[name].buffer.shape[1] for name in policy.obs_groups}
     observations = torch.randn(length, batch, sum(widths.values()))
     begins = torch.zeros(length, batch, dtype=torch.bool)
     begins[0] = True
     if policy.is_recurrent:
         for step, robot in NEW_EPISODES:
             begins[step, robot] = True
+
+    def act(step: Tensor) -> Tensor:
+        groups = dict(zip(widths, step.split([*widths.values()], dim=1), strict=True))
+        return policy(TensorDict(groups, batch_size=[len(step)]))
+
     # Files are checked in memory before they are written; torch aborts the process when the disk is full.
     hidden = policy.get_hidden_state()
     try:
         policy.to("cpu").eval()
-        wanted = _run_policy(policy, observations, begins, widths)
-        script, network = _torchscript(policy), _onnx(policy, metadata)
-        weights = weights_of(policy, task.cfg.train.policy.activation, task.num_actions)
+        policy.reset()
+        wanted = _actions(act, policy.reset, observations, begins)
+        files = {"policy.pt": _torchscript(policy), "policy.onnx": _onnx(policy, metadata)}
+        files["policy.weights"] = weights_of(policy, task.cfg.train.policy.activation, task.num_actions)
     finally:
         policy.to(device)
         policy.reset(hidden_state=hidden)
-    if policy.is_recurrent:
-        by_script = [
-            (_run_script(script, observations[:, i : i + 1], begins[:, i]), wanted[:, i : i + 1]) for i in range(batch)
-        ]
-    else:
-        by_script = [(_run_script(script, observations, begins[:, 0]), wanted)]
-    by_onnx = [(_run_onnx(network, observations, begins, metadata["recurrent"]), wanted)]
-    by_weights = [(_run_weights(weights, observations, begins), wanted)]
+    found = {
+        "policy.pt": _by_script(files["policy.pt"], observations, begins, 1 if policy.is_recurrent else batch),
+        "policy.onnx": _by_onnx(files["policy.onnx"], observations, begins, metadata["recurrent"]),
+        "policy.weights": _by_weights(files["policy.weights"], observations, begins),
+    }
     differences = {}
-    for name, pairs in (("policy.pt", by_script), ("policy.onnx", by_onnx), ("policy.weights", by_weights)):
-        difference = float(np.max([np.abs(found - right).max() / max(1.0, np.abs(right).max()) for found, right in pairs]))
+    for name, actions in found.items():
+        difference = float(np.abs(actions - wanted).max() / max(1.0, np.abs(wanted).max()))
         if not difference <= LARGEST_DIFFERENCE:
             raise ExportError(f"{name}: differs from the policy by {difference:.1e} (allowed: {LARGEST_DIFFERENCE})")
         differences[name] = difference
-    make_folder(folder)
-    write_bytes(folder / "policy.pt", script)
-    write_bytes(folder / "policy.onnx", network)
-    write_bytes(folder / "policy.weights", weights)
     if isinstance(task, LeggedRobot) and (motors := task.cfg.control.actuator.network):
-        write_bytes(folder / MOTORS, Path(motors).read_bytes())
-    write_text(folder / "policy.json", json.dumps(metadata, indent=1))
+        files[MOTORS] = Path(motors).read_bytes()
+    make_folder(folder)
+    for name, content in files.items():
+        write_bytes(folder / name, content)
+    checksums = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    write_text(folder / "policy.json", json.dumps({**metadata, CHECKSUMS: checksums}, indent=1))
     return differences
 
 
 @torch.inference_mode()
-def _run_policy(policy: Any, observations: Tensor, begins: Tensor, widths: dict[str, int]) -> np.ndarray:
-    """Return the policy's actions (T, batch, D) for observations (T, batch, width) of groups with these `widths`; episodes
-    begin before the steps in the mask `begins` (T, batch).
+def _actions(
+    run: Callable[[Tensor], Any], restart: Callable[[Tensor], Any], observations: Tensor, begins: Tensor
+) -> np.ndarray:
+    """Return the actions (T, batch, D) for observations (T, batch, width), step by step; `restart` gets the mask (batch,) of
+    the episodes that begin before a step, a row of `begins`.
     """
-    policy.reset()
     actions = []
     for step, new in zip(observations, begins, strict=True):
-        policy.reset(new)
-        groups = dict(zip(widths, step.split([*widths.values()], dim=1), strict=True))
-        actions.append(policy(TensorDict(groups, batch_size=[len(step)])))
-    return torch.stack(actions).numpy()
+        restart(new)
+        actions.append(np.asarray(run(step)))
+    return np.stack(actions)
 
 
 @torch.inference_mode()
-def _run_script(content: bytes, observations: Tensor, begins: Tensor) -> np.ndarray:
-    """Return the actions of the TorchScript file, which is reset before the steps in the mask `begins` (T,)."""
+def _by_script(content: bytes, observations: Tensor, begins: Tensor, batch: int) -> np.ndarray:
+    """Return the actions of the TorchScript file in batches of `batch` columns, each of which begins episodes at once."""
     script = torch.jit.load(io.BytesIO(content))
-    script(observations[0])
-    actions = []
-    for step, new in zip(observations, begins, strict=True):
-        if new:
+
+    def restart(new: Tensor) -> None:
+        if new.any():
             script.reset()
-        actions.append(script(step))
-    return torch.stack(actions).numpy()
+
+    parts = []
+    for columns, own in zip(observations.split(batch, dim=1), begins.split(batch, dim=1), strict=True):
+        script(columns[0])
+        parts.append(_actions(script, restart, columns, own))
+    return np.concatenate(parts, axis=1)
 
 
-def _run_onnx(content: bytes, observations: Tensor, begins: Tensor, memory: dict[str, Any] | None) -> np.ndarray:
-    """Return the actions of the ONNX file; a hidden state, described by `memory`, is passed on and cleared before the steps
-    in the mask `begins` (T, batch).
-    """
+def _by_onnx(content: bytes, observations: Tensor, begins: Tensor, memory: dict[str, Any] | None) -> np.ndarray:
+    """Return the actions of the ONNX file, whose hidden state, described by `memory`, is passed on."""
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     hidden: dict[str, np.ndarray] = {}
     if memory is not None:
-        layers, _, width = memory["shape"]
-        size = (layers, observations.shape[1], width)
+        size = (memory["shape"][0], observations.shape[1], memory["shape"][2])
         hidden = {name: np.ones(size, dtype=np.float32) for name in memory["onnx_inputs"]}
-    actions = []
-    for step, new in zip(observations, begins.numpy(), strict=True):
+
+    def restart(new: Tensor) -> None:
         for state in hidden.values():
-            state[:, new] = 0.0
+            state[:, new.numpy()] = 0.0
+
+    def run(step: Tensor) -> Any:
         action, *states = session.run(None, {"obs": step.numpy(), **hidden})
-        hidden = {name: np.array(state) for name, state in zip(hidden, states, strict=True)}
-        actions.append(np.asarray(action))
-    return np.stack(actions)
+        hidden.update({name: np.array(state) for name, state in zip(hidden, states, strict=True)})
+        return action
+
+    return _actions(run, restart, observations, begins)
 
 
-def _run_weights(content: bytes, observations: Tensor, begins: Tensor) -> np.ndarray:
-    """Return the actions of the file of weights, whose hidden state is cleared before the steps in `begins` (T, batch)."""
+def _by_weights(content: bytes, observations: Tensor, begins: Tensor) -> np.ndarray:
+    """Return the actions of the file of weights."""
     network = NumpyNetwork(content)
     network.run(observations[0].numpy())
-    actions = []
-    for step, new in zip(observations.numpy(), begins.numpy(), strict=True):
-        network.restart(new)
-        actions.append(network.run(step))
-    return np.stack(actions)
+    return _actions(lambda step: network.run(step.numpy()), lambda new: network.restart(new.numpy()), observations, begins)
 
 
 def _torchscript(policy: Any) -> bytes:
@@ -191,3 +196,49 @@ def _onnx(policy: Any, metadata: dict[str, Any]) -> bytes:
     onnx.helper.set_model_props(model, {key: json.dumps(value) for key, value in metadata.items()})
     onnx.checker.check_model(model)
     return model.SerializeToString()
+
+
+def weights_of(policy: Any, activation: str, num_actions: int) -> bytes:
+    """Return the file of `policy`, rsl-rl's actor network on the CPU, whose hidden layers have an activation of rsl-rl's
+    name. Only the outputs for the means of actions are kept.
+    """
+    layers: list[Layer] = []
+    if policy.obs_normalization:
+        normaliser = policy.obs_normalizer
+        mean, divisor = normaliser._mean.flatten(), (normaliser._std + normaliser.eps).flatten()
+        layers.append(_layer(kinds.NORMALISE, len(mean), len(mean), mean, divisor))
+    if policy.is_recurrent:
+        layers += _recurrent(policy.rnn.rnn)
+    if isinstance(policy, EstimatingModel):
+        width = policy.obs_dim
+        found = _dense(policy.estimator, activation)
+        more = found[-1].outputs
+        layers += [Layer(kinds.KEEP, 0, width, width, ()), *found, Layer(kinds.JOIN, 0, more, width + more, ())]
+    return pack([*layers, *_dense(policy.mlp, activation, num_actions)])
+
+
+def _dense(mlp: nn.Sequential, activation: str, outputs: int | None = None) -> list[Layer]:
+    """Return the layers of an MLP; the last one is cut to its first `outputs`, which are the means."""
+    layers: list[Layer] = []
+    linear = [module for module in mlp if isinstance(module, nn.Linear)]
+    for module in linear:
+        rows = module.out_features if outputs is None or module is not linear[-1] else outputs
+        layers.append(_layer(kinds.LINEAR, module.in_features, rows, module.weight[:rows], module.bias[:rows]))
+        if module is not linear[-1]:
+            layers.append(Layer(kinds.ACTIVATION, list(kinds.ACTIVATIONS).index(activation), rows, rows, ()))
+    return layers
+
+
+def _recurrent(module: nn.LSTM | nn.GRU) -> list[Layer]:
+    """Return the layers of a recurrent module, the first one first."""
+    kind, layers = kinds.LSTM if isinstance(module, nn.LSTM) else kinds.GRU, []
+    for i in range(module.num_layers):
+        names = (f"weight_ih_l{i}", f"weight_hh_l{i}", f"bias_ih_l{i}", f"bias_hh_l{i}")
+        inputs = module.input_size if i == 0 else module.hidden_size
+        layers.append(_layer(kind, inputs, module.hidden_size, *(getattr(module, name) for name in names)))
+    return layers
+
+
+@torch.no_grad()
+def _layer(kind: int, inputs: int, outputs: int, *arrays: Tensor) -> Layer:
+    return Layer(kind, 0, inputs, outputs, tuple(array.detach().float().numpy().copy() for array in arrays))

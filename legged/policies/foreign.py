@@ -4,20 +4,20 @@ A layout is a YAML file, or the policy.json of an export.
 """
 
 import ast
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
 
 from legged.config.actuator import ActuatorConfig
 from legged.config.bounds import LARGEST, between, items, positive
 from legged.config.checks import build
 from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
+from legged.deploy.contract import Contract, read_contract
+from legged.deploy.policy import open_onnx
 from legged.errors import ConfigError, suggest
 from legged.mdp.actuator import is_ideal
 from legged.process.paths import data_folder, exists
@@ -85,6 +85,8 @@ class Layout:
     """Time for which an action is held [s]."""
     sim_dt: float = field(default=0.005, metadata=positive(0.1, low=1e-5))
     """Physics step [s]."""
+    contract: Contract | None = field(default=None, compare=False)
+    """Contract of the export that the layout describes; None for a YAML file."""
 
 
 def read_layout(name: str, where: str) -> Layout:
@@ -101,14 +103,64 @@ def read_layout(name: str, where: str) -> Layout:
     if path is None:
         known = suggest(name, [file.stem for file in folder.glob("*.yaml")])
         raise ConfigError(f"{where}: there is no layout '{name}', neither as a file nor here{known}")
-    data = read_description(path) if path.suffix == ".json" else read_yaml(path)
-    if not data.get("observation"):
-        raise ConfigError(f"{path}: observation: must name at least one term (allowed: {', '.join(TERMS)})")
-    layout = build(Layout, data, "", Origins(), str(path))
+    if path.suffix == ".json":
+        layout = _layout_of(read_contract(path))
+    else:
+        data = read_yaml(path)
+        if not data.get("observation"):
+            raise ConfigError(f"{path}: observation: must name at least one term (allowed: {', '.join(TERMS)})")
+        layout = build(Layout, data, "", Origins(), str(path))
     for term in layout.observation:
         if term not in TERMS:
             raise ConfigError(f"{path}: observation: there is no term '{term}'{suggest(term, TERMS)}")
     return layout
+
+
+def _layout_of(contract: Contract) -> Layout:
+    """Return the layout of an exported policy, which must observe a single step, with one scale for each term."""
+    path = contract.path
+    if contract.states or any(group.history != 1 for group in contract.groups):
+        raise ConfigError(f"{path}: the policy has a memory; only policies that observe a single step can be played here")
+    observation: dict[str, float] = {}
+    for term in contract.terms:
+        halves = dict(zip(COMMANDS, (term.scale[:2], term.scale[2:]), strict=True))
+        for part, scales in halves.items() if term.name == "commands" else ((term.name, term.scale),):
+            if (scales != scales[0]).any():
+                text = f"columns of '{term.name}' have scales of their own: {term.scale.tolist()}"
+                raise ConfigError(f"{path}: observation: {text}")
+            observation[part] = float(scales[0])
+    joints = contract.joint_names
+    acted = tuple(joints[i] for i in contract.acted)
+
+    def by_joint(values: np.ndarray) -> dict[str, float]:
+        return dict(zip(joints, values.tolist(), strict=True))
+
+    return Layout(
+        observation=observation,
+        observation_clip=contract.observation_clip,
+        joints=joints,
+        action_joints=acted,
+        action_scale=dict(zip(acted, contract.action_scale.tolist(), strict=True)),
+        action_clip=contract.action_clip,
+        default_joint_angles=by_joint(contract.default),
+        stiffness=by_joint(contract.stiffness),
+        damping=by_joint(contract.damping),
+        torque_limits=by_joint(contract.torque_limits),
+        control_dt=contract.control_dt,
+        sim_dt=contract.sim_dt,
+        contract=contract,
+    )
+
+
+def was_trained_with_other_motors(contract: Contract) -> bool:
+    """Return whether a policy was trained with motors that no layout describes: control.actuator with a torque-speed line,
+    friction, a delay, a learned law or rotor inertia.
+
+    Raises:
+        ConfigError: the contract's section about the actuator is invalid.
+    """
+    motors = build(ActuatorConfig, contract.actuator, "", Origins(), f"{contract.path}: actuator")
+    return not is_ideal(motors) or bool(motors.armature)
 
 
 class ForeignPolicy:
@@ -118,57 +170,64 @@ class ForeignPolicy:
         """Load the ONNX file at `path`; its metadata, texts by name, are in `metadata`.
 
         Raises:
-            ConfigError: it cannot be read, its joints are not the robot's, or its sizes are not the layout's.
+            ConfigError: it cannot be read, its joints are not the robot's, its sizes are not the layout's, its actions are
+                not finite, or the layout is the contract of another export.
         """
-        self.layout, self._path = layout, path
-        try:
-            options = onnxruntime.SessionOptions()
-            options.intra_op_num_threads = 1  # a policy of one robot is too small to be shared out
-            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # its errors have no class in common
-            raise ConfigError(f"{path}: onnxruntime cannot read it: {' '.join(str(error).split())}") from error
-        self.metadata = said = dict(self._session.get_modelmeta().custom_metadata_map)
-        joints = list(layout.joints or _listed(said, JOINTS, str(path)) or robot.joint_names)
+        self.layout, self._path, self._session = layout, path, open_onnx(path)
+        self.metadata = dict(self._session.get_modelmeta().custom_metadata_map)
+        if layout.contract is not None:
+            layout.contract.check_metadata(path, self.metadata)
+        names = robot.joint_names
+        joints = list(layout.joints or self._listed(JOINTS) or names)
         for name in (*joints, *layout.action_joints):
-            if name not in robot.joint_names:
-                raise ConfigError(f"{path}: joint '{name}' is none of '{robot.name}'{suggest(str(name), robot.joint_names)}")
+            if name not in names:
+                raise ConfigError(f"{path}: joint '{name}' is none of '{robot.name}'{suggest(str(name), names)}")
         if len(set(joints)) != len(joints) or len(joints) != robot.num_dof:
             raise ConfigError(f"{path}: it names {len(set(joints))} joints, '{robot.name}' has {robot.num_dof}")
         acted = list(layout.action_joints) or joints
         if len(set(acted)) != len(acted):
             raise ConfigError(f"{path}: action_joints: names a joint twice")
-        self._order = np.array([robot.joint_names.index(name) for name in joints])
-        self._acted = np.array([robot.joint_names.index(name) for name in acted])
-        self.default = robot.default_dof_pos
-        if layout.default_joint_angles:
-            self.default = match_values(layout.default_joint_angles, robot.joint_names, "layout: default_joint_angles")
-        self.torque_limits = robot.torque_limits
-        if layout.torque_limits:
-            self.torque_limits = match_values(layout.torque_limits, robot.joint_names, "layout: torque_limits")
-        self.stiffness = self._gains(layout.stiffness, robot.stiffness, said, STIFFNESS, robot)
-        self.damping = self._gains(layout.damping, robot.damping, said, DAMPING, robot)
+        self._order = np.array([names.index(name) for name in joints])
+        self._acted = np.array([names.index(name) for name in acted])
+
+        self.default = self._by_joint("default_joint_angles", robot.default_dof_pos, robot)
+        self.torque_limits = self._by_joint("torque_limits", robot.torque_limits, robot)
+        self.stiffness = self._by_joint("stiffness", robot.stiffness, robot, STIFFNESS)
+        self.damping = self._by_joint("damping", robot.damping, robot, DAMPING)
         scale = layout.action_scale
         every = match_values(scale, acted, "layout: action_scale") if isinstance(scale, dict) else np.array(scale)
         self._scale = np.broadcast_to(every, (len(acted),))
         self.reset()
         self._check_sizes(robot)
 
-    def _gains(
-        self, table: Mapping[str, float], of_robot: np.ndarray, said: Mapping[str, str], keys: Sequence[str], robot: Robot
-    ) -> np.ndarray:
-        """Return gains (D,) in the robot's order: from the layout's `table`, or else from the file's metadata under `keys`,
-        or else `of_robot`.
+    def _listed(self, keys: Sequence[str]) -> list[Any] | None:
+        """Return the list under the first of `keys` in the file's metadata; None without such a key."""
+        key = next((key for key in keys if key in self.metadata), None)
+        if key is None:
+            return None
+        text = self.metadata[key]
+        try:
+            value = ast.literal_eval(text)
+        except (ValueError, SyntaxError, RecursionError, MemoryError):
+            value = [part.strip() for part in text.split(",")]
+        if not isinstance(value, list | tuple) or not value:
+            raise ConfigError(f"{self._path}: metadata {key}: expected a list")
+        return list(value)
+
+    def _by_joint(self, key: str, of_robot: np.ndarray, robot: Robot, keys: Sequence[str] = ()) -> np.ndarray:
+        """Return numbers (D,) in the robot's order: those of the layout, or else of the file's metadata under `keys`, or else
+        `of_robot`.
         """
-        if table:
-            return match_values(table, robot.joint_names, f"layout: {keys[1]}")
-        listed = _listed(said, keys, str(self._path))
+        if table := getattr(self.layout, key):
+            return match_values(table, robot.joint_names, f"layout: {key}")
+        listed = self._listed(keys)
         if listed is None:
             return of_robot
         if len(listed) != robot.num_dof or not all(isinstance(value, int | float) for value in listed):
             raise ConfigError(f"{self._path}: metadata {'/'.join(keys)}: expected {robot.num_dof} numbers")
-        gains = np.zeros(robot.num_dof)
-        gains[self._order] = listed
-        return gains
+        numbers = np.zeros(robot.num_dof)
+        numbers[self._order] = listed
+        return numbers
 
     def _check_sizes(self, robot: Robot) -> None:
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
@@ -199,6 +258,9 @@ class ForeignPolicy:
     ) -> np.ndarray:
         """Return joint targets (D,) [rad] for the next `control_dt`.
 
+        Raises:
+            ConfigError: the network's output is not finite.
+
         Args:
             command: vx, vy [m/s] and yaw rate [rad/s].
             lin_vel: velocity of the base's origin, base frame [m/s].
@@ -212,6 +274,8 @@ class ForeignPolicy:
             self._phase[:] = standing
         observation = self._observe(command, lin_vel, ang_vel, gravity, dof_pos, dof_vel)
         actions = self._session.run(None, {self._input: observation[None].astype(np.float32)})[0][0]
+        if not np.isfinite(actions).all():
+            raise ConfigError(f"{self._path}: gives actions that are not finite")
         self._actions = np.clip(actions, -self.layout.action_clip, self.layout.action_clip).astype(float)
         self._phase += 2.0 * np.pi * self.layout.control_dt / self.layout.phase_period_s
         targets = self.default.copy()
@@ -234,94 +298,3 @@ class ForeignPolicy:
         }
         columns = np.concatenate([scale * terms[name] for name, scale in self.layout.observation.items()])
         return np.clip(columns, -self.layout.observation_clip, self.layout.observation_clip)
-
-
-def _listed(said: Mapping[str, str], keys: Sequence[str], where: str) -> list[Any] | None:
-    """Return the list under the first of `keys` in an ONNX file's metadata; None without such a key.
-
-    Raises:
-        ConfigError: the value is no list.
-    """
-    key = next((key for key in keys if key in said), None)
-    if key is None:
-        return None
-    try:
-        value = ast.literal_eval(said[key])
-    except (ValueError, SyntaxError):
-        value = [part.strip() for part in said[key].split(",")]
-    if not isinstance(value, list | tuple) or not value:
-        raise ConfigError(f"{where}: metadata {key}: expected a list")
-    return list(value)
-
-
-# ---- layouts of policies that this package exported ----------------------------------------------------------------------
-
-
-def read_description(path: Path) -> dict[str, Any]:
-    """Return the entries of the layout that describes the policy of the policy.json at `path`.
-
-    Raises:
-        ConfigError: the file is no policy.json, or a layout cannot describe its policy: it has a memory, another control law,
-            or different scales within one term.
-    """
-    try:
-        said = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: is no policy.json of an export ({' '.join(str(error).split())})") from error
-    try:
-        return _entries(said, path)
-    except (KeyError, TypeError, IndexError, AttributeError) as error:
-        raise ConfigError(f"{path}: is no policy.json of an export ({type(error).__name__}: {error})") from error
-
-
-def was_trained_with_other_motors(path: Path) -> bool:
-    """Return whether the policy of the policy.json at `path` was trained with motors that no layout describes:
-    control.actuator with a torque-speed line, friction, a delay, a learned law or rotor inertia. `read_description` must
-    accept the file.
-
-    Raises:
-        ConfigError: its section about the actuator is invalid.
-    """
-    said = json.loads(path.read_text(encoding="utf-8")).get("actuator", {})
-    motors = build(ActuatorConfig, said, "", Origins(), f"{path}: actuator")
-    return not is_ideal(motors) or bool(motors.armature)
-
-
-def _entries(said: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    if said["recurrent"] is not None or any(group["history"] != 1 for group in said["observation_groups"]):
-        raise ConfigError(f"{path}: the policy has a memory; only policies that observe a single step can be played here")
-    if said["control_type"] != "P":
-        raise ConfigError(f"{path}: control_type: got {said['control_type']!r}; only 'P' can be played here")
-    joints, acted, scale = said["joint_names"], said["action_joints"], said["action_scale"]
-
-    def by_joint(key: str) -> dict[str, float]:
-        return dict(zip(joints, said[key], strict=True))
-
-    return {
-        "observation": _observation(said["observation"], path),
-        "observation_clip": said["observation_clip"],
-        "joints": joints,
-        "action_joints": acted,
-        "action_scale": dict(zip(acted, scale, strict=True)) if isinstance(scale, list) else scale,
-        "action_clip": said["action_clip"],
-        "default_joint_angles": by_joint("default_joint_angles"),
-        "stiffness": by_joint("stiffness"),
-        "damping": by_joint("damping"),
-        "torque_limits": by_joint("torque_limits"),
-        "control_dt": said["control_dt"],
-        "sim_dt": said["sim_dt"],
-    }
-
-
-def _observation(terms: list[Any], path: Path) -> dict[str, float]:
-    """Return term -> scale in the order of the columns."""
-    found: dict[str, float] = {}
-    for term in terms:
-        scales = term["scale"]
-        name = term["name"]
-        parts = dict(zip(COMMANDS, (scales[:2], scales[2:]), strict=True)) if name == "commands" else {name: scales}
-        for part, values in parts.items():
-            if any(value != values[0] for value in values):
-                raise ConfigError(f"{path}: observation: columns of '{name}' have scales of their own: {scales}")
-            found[part] = values[0]
-    return found

@@ -1,18 +1,27 @@
-"""One robot in C MuJoCo, with motors that are updated at every physics step, and sensors."""
+"""One robot in C MuJoCo, with sensors, and with the motors of training, whose commands arrive at any time.
 
-from collections.abc import Mapping
+`legged.mdp.actuator` has the same formulas for thousands of robots with one command per control step. For one robot the
+operations of a physics step take 0.1 ms in torch and 0.02 ms in numpy, about as long as MuJoCo's own step.
+"""
+
+from collections import deque
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import mujoco
 import numpy as np
+import torch
 
+from legged.config import LeggedConfig, override
+from legged.config.loader import from_dict
 from legged.config.schema import ActuatorConfig, SimConfig
-from legged.deploy.contract import SCANS
-from legged.deploy.interface import RobotFacts
-from legged.deploy.udp_packets import RobotState
-from legged.errors import RunError
+from legged.deploy.contract import SCANS, Contract
+from legged.deploy.interface import Reading, RobotFacts
+from legged.errors import ConfigError, RunError
+from legged.mdp.actuator import check_actuator, check_motor_model, friction_numbers, modelled_joints, motor_numbers
+from legged.mdp.actuator_network import ActuatorNetwork, NetworkWeights
 from legged.physics import RobotScene
 from legged.robots.robot import Robot
-from legged.simulated_robot.motors import Motors
 from legged.terrain import Terrain
 
 OFFERS = frozenset({"base_lin_vel", "heights"})
@@ -21,18 +30,111 @@ UNSTABLE = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("Q
 """MuJoCo's warnings after which it has reset the state."""
 FALLEN = 1.2
 """Lean of the base above which the robot has fallen [rad]."""
+OURS = "control.actuator"
+"""Section of a configuration about the motors."""
+
+
+def motors_config(
+    robot: Robot, contract: Contract | None, ideal: bool, changes: Iterable[tuple[str, Any]], dt: float
+) -> tuple[ActuatorConfig, float]:
+    """Return the configuration of the motors and the time unit of their delay [s]. The motors are those of the training of
+    `contract`'s policy, or ideal ones, with `changes` of control.actuator. Without a contract the unit is the motors' step
+    `dt`.
+
+    Raises:
+        ConfigError: a change concerns another section, or the motors do not fit the robot or the step.
+    """
+    changes = list(changes)
+    for key, _ in changes:
+        if key != OURS and not key.startswith(f"{OURS}."):
+            raise ConfigError(
+                f"command line: {key}: only {OURS} can be changed of a simulated robot, e.g. {OURS}.model=dc_motor"
+            )
+    source, own = "command line", {}
+    if contract is not None and not ideal:
+        trained_with = dict(contract.actuator)
+        if network := trained_with.get("network"):
+            trained_with["network"] = str(contract.path.parent / str(network))
+        source, own = f"{contract.path}: actuator", {"control": {"actuator": trained_with}}
+    cfg = override(from_dict({"task": "simulated", "robot": str(robot.folder), **own}, source=source), changes)
+    assert isinstance(cfg, LeggedConfig)
+    try:
+        check_actuator(robot, cfg.control, dt, cfg.origins.where)
+    except ConfigError as error:
+        raise ConfigError(str(error).replace("sim.dt", "--sim-dt")) from error
+    check_motor_model(cfg.control.actuator, cfg.origins)
+    return cfg.control.actuator, dt if contract is None else contract.sim_dt
+
+
+class Motors:
+    """Motors of D joints: delay, control law, torque limits and friction."""
+
+    def __init__(self, robot: Robot, cfg: ActuatorConfig, dt: float, counted: float, seed: int = 1) -> None:
+        """Create motors with the step `dt` [s]; delays of `cfg` are in steps of `counted` [s] and drawn with `seed`."""
+        self._effort = robot.torque_limits
+        self._stall, self._fastest = motor_numbers(robot, cfg)
+        self._coulomb, breakaway, self._viscous = friction_numbers(robot, cfg)
+        self._extra = breakaway - self._coulomb
+        self._stribeck, self._smoothing = cfg.stribeck_velocity, cfg.friction_smoothing
+        self._has_curve = cfg.model == "dc_motor"
+        self._has_friction = bool(self._coulomb.any() or self._extra.any() or self._viscous.any())
+        self._random, self._range, self._ratio = np.random.default_rng(seed), cfg.delay, counted / dt
+        self._varies = cfg.delay_varies
+        self.delay = self._draw()
+        """Present delay of a command [steps]."""
+        self._past: deque[np.ndarray] = deque([np.zeros((3, robot.num_dof))])  # from the one that has arrived to the newest
+        self._network: ActuatorNetwork | None = None
+        if cfg.network:
+            weights = NetworkWeights.load(cfg.network)
+            self._network = ActuatorNetwork(weights, 1, robot.num_dof, dt, torch.device("cpu"))
+            self._by_network = np.isin(np.arange(robot.num_dof), modelled_joints(robot, cfg))
+
+    def _draw(self) -> int:
+        low, high = self._range
+        return round(int(self._random.integers(low, high + 1)) * self._ratio)
+
+    def torques(self, command: np.ndarray, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
+        """Return the torques (D,) [N m] of a physics step at angles q [rad] and velocities dq [rad/s], (D,) each. `command`
+        is the newest command: targets [rad], P gains [N m/rad] and D gains [N m s/rad], (3, D).
+        """
+        target, stiffness, damping = self._arrived(command)
+        torques = stiffness * (target - q) - damping * dq
+        if self._network is not None:
+            # The network was fitted with the gains of the policy, not with those of braking.
+            torques = np.where(self._by_network & (stiffness > 0.0), self._learned(target - q, dq), torques)
+        if self._has_curve:
+            share = dq / self._fastest
+            torques = np.minimum(np.maximum(torques, self._stall * (-1.0 - share)), self._stall * (1.0 - share))
+        torques = np.clip(torques, -self._effort, self._effort)
+        return np.clip(torques - self._friction(dq), -self._effort, self._effort) if self._has_friction else torques
+
+    def _arrived(self, command: np.ndarray) -> np.ndarray:
+        """Return the newest command that has arrived; commands never overtake each other."""
+        if self._varies and not np.array_equal(command, self._past[-1]):
+            self.delay = self._draw()
+        self._past.append(command.copy())
+        while len(self._past) > self.delay + 1:
+            self._past.popleft()
+        return self._past[0]
+
+    def _friction(self, dq: np.ndarray) -> np.ndarray:
+        """Return the friction torques (D,) [N m]."""
+        slow = np.exp(-np.square(dq / self._stribeck))
+        return (self._coulomb + self._extra * slow) * np.tanh(dq / self._smoothing) + self._viscous * dq
+
+    def _learned(self, error: np.ndarray, dq: np.ndarray) -> np.ndarray:
+        """Return the torques (D,) of the network [N m]."""
+        assert self._network is not None
+        with torch.inference_mode():
+            found = self._network.torques(*(torch.tensor(each, dtype=torch.float32).unsqueeze(0) for each in (error, dq)))
+        return found[0].double().numpy()
 
 
 class SimulatedRobot:
     """A robot that starts in its default pose on a plane, or in the middle of the first tile of a terrain."""
 
     def __init__(
-        self,
-        robot: Robot,
-        terrain: Terrain | None,
-        sim: SimConfig,
-        motors: Motors | None = None,
-        scan: str = SCANS[0],
+        self, robot: Robot, terrain: Terrain | None, sim: SimConfig, motors: Motors | None = None, scan: str = SCANS[0]
     ) -> None:
         """Build the world with the solver options of `sim` and motors, by default ideal ones. `scan` is the setting
         terrain.scan for the heights.
@@ -47,8 +149,7 @@ class SimulatedRobot:
         self.data.qpos[:3] = start + np.array([0.0, 0.0, robot.height])
         self._scan = None if terrain is None else terrain.height_map.scan_map(scan)
         mujoco.mj_forward(self.model, self.data)
-        count = robot.num_dof
-        self.asked = np.zeros((3, count))
+        self.asked = np.zeros((3, robot.num_dof))
         """(3, D) targets [rad], P gains [N m/rad], D gains [N m s/rad]."""
         self._start = self.data.qpos[:3].copy()
         self.lowest, self.highest, self.steepest = float(self._start[2]), float(self._start[2]), 0.0
@@ -84,11 +185,12 @@ class SimulatedRobot:
         _, x, y, _ = data.qpos[3:7]
         self.steepest = max(self.steepest, float(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0))))
 
-    def state(self, sources: Mapping[str, np.ndarray | None]) -> RobotState:
+    def state(self, sources: Mapping[str, np.ndarray | None]) -> Reading:
         """Return the present measurements and the requested sources, `heights` at its points (P, 2)."""
         data = self.data
-        return RobotState(
+        return Reading(
             time=float(data.time),
+            received=0.0,
             quaternion=data.qpos[3:7].copy(),
             gyro=data.qvel[3:6].copy(),  # MuJoCo has the angular velocity of a floating base in the base's frame
             positions=data.qpos[self._qpos],
@@ -99,22 +201,18 @@ class SimulatedRobot:
 
     def _source(self, name: str, points: np.ndarray | None) -> np.ndarray:
         """Return a source in the form of `legged.deploy.interface.Reading.sources`."""
-        position, quaternion = self.data.qpos[:3], self.data.qpos[3:7]
-        entries = np.zeros(9)
-        mujoco.mju_quat2Mat(entries, quaternion)
+        position, entries = self.data.qpos[:3], np.zeros(9)
+        mujoco.mju_quat2Mat(entries, self.data.qpos[3:7])
         rotation = entries.reshape(3, 3)
         if name == "base_lin_vel":
             return rotation.T @ self.data.qvel[:3]
         points = np.zeros((0, 2)) if points is None else points
+        if self._terrain is None or self._scan is None:
+            return np.zeros(len(points)) - position[2]
         yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
         turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-        return self._ground(position[:2] + points @ turn.T) - position[2]
-
-    def _ground(self, places: np.ndarray) -> np.ndarray:
-        """Return the heights of the ground at world points (P, 2) as in training [m]."""
-        if self._terrain is None or self._scan is None:
-            return np.zeros(len(places))
-        return self._scan[self._terrain.height_map.index(*places.T)]
+        places = position[:2] + points @ turn.T
+        return self._scan[self._terrain.height_map.index(*places.T)] - position[2]
 
     def report(self) -> dict[str, float | bool]:
         """Return the distances moved [m], the largest lean [rad], and whether the robot fell."""

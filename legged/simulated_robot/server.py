@@ -1,28 +1,15 @@
 """A simulated robot in real time, reached by UDP over a link with latency and losses."""
 
-import json
 import random
 import socket
 import time
 from collections import deque
-from dataclasses import dataclass, field
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
 
-from legged.deploy.udp_packets import (
-    BYE,
-    COMMAND,
-    FACTS,
-    HELLO,
-    LARGEST,
-    STATE,
-    facts_as_json,
-    open_packet,
-    pack_json,
-    pack_state,
-    packet,
-    unpack_command,
-)
+from legged.deploy import udp
 from legged.simulated_robot.robot import SimulatedRobot
 
 STATE_S = 0.004
@@ -39,24 +26,22 @@ BEHIND_S = 0.1
 
 
 class Link:
-    """One direction of a link, which delays packets by `latency_s` and loses some."""
+    """One direction of a link, which delays packets by `latency_s` [s] and loses a share `loss`, drawn from `seed`."""
 
     def __init__(self, latency_s: float, loss: float, seed: int) -> None:
-        """Lose a share `loss` of the packets, drawn from `seed`."""
-        self._latency_s, self._loss = latency_s, loss
-        self._random = random.Random(seed)
-        self._waiting: deque[tuple[float, bytes]] = deque()
+        self._latency_s, self._loss, self._random = latency_s, loss, random.Random(seed)
+        self._waiting: deque[tuple[float, Any]] = deque()
         self.sent = self.lost = 0
 
-    def put(self, now: float, packet: bytes) -> None:
+    def put(self, now: float, item: Any) -> None:
         """Send a packet at the time `now` [s]."""
         self.sent += 1
         if self._random.random() < self._loss:
             self.lost += 1
         else:
-            self._waiting.append((now + self._latency_s, packet))
+            self._waiting.append((now + self._latency_s, item))
 
-    def take(self, now: float) -> list[bytes]:
+    def take(self, now: float) -> list[Any]:
         """Return the packets that have arrived at the time `now` [s], in their order of sending."""
         found = []
         while self._waiting and self._waiting[0][0] <= now:
@@ -64,27 +49,19 @@ class Link:
         return found
 
 
-@dataclass
 class Server:
     """Real-time loop that steps a robot, sends its states and applies commands."""
 
-    robot: SimulatedRobot
-    latency_s: float = 0.0
-    """Latency of each direction [s]."""
-    loss: float = 0.0
-    """Share of lost packets in each direction."""
-    seed: int = 1
-    poses: list[np.ndarray] = field(default_factory=list)
-    """Time [s] and MuJoCo's generalised positions, (1 + nq,) each."""
-    _socket: socket.socket = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Take a free port of this machine."""
+    def __init__(self, robot: SimulatedRobot, latency_s: float = 0.0, loss: float = 0.0, seed: int = 1) -> None:
+        """Take a free port of this machine. Both directions of the link have a latency [s] and a share of lost packets."""
+        self.robot = robot
+        self.poses: list[np.ndarray] = []
+        """Time [s] and MuJoCo's generalised positions, (1 + nq,) each."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self._socket.setblocking(False)
         self.port: int = self._socket.getsockname()[1]
-        self._out, self._in = Link(self.latency_s, self.loss, self.seed), Link(self.latency_s, self.loss, self.seed + 1)
+        self._out, self._in = Link(latency_s, loss, seed), Link(latency_s, loss, seed + 1)
         self._client: tuple[str, int] | None = None
         self._sources: dict[str, np.ndarray | None] = {}
         self._sequence = self._newest = 0
@@ -114,7 +91,8 @@ class Server:
                 self.skipped_s += now - due
                 due = now
             while due <= now:
-                self._brake_if_alone()
+                if self.robot.data.time - self._told > HOLD_S:  # commands have stopped
+                    self.robot.asked[1] = 0.0
                 self.robot.step()
                 steps += 1
                 due += dt
@@ -132,57 +110,34 @@ class Server:
         """Process the packets that have arrived."""
         while True:
             try:
-                data, client = self._socket.recvfrom(LARGEST)
+                data, client = self._socket.recvfrom(udp.LARGEST)
             except OSError:  # no more packets, or the receiver has closed
                 break
-            opened = open_packet(data)
-            if opened is None:
-                continue
-            if opened[0] == HELLO:
-                self._greet(client, opened[2])
-            elif client == self._client and opened[0] == BYE:  # not subject to the link, so that the simulation always ends
+            kind, sequence, body = udp.open_packet(data) or (None, 0, b"")
+            if kind == udp.HELLO:
+                with suppress(ValueError, KeyError, TypeError, AttributeError):  # not from a program
+                    self._greet(client, udp.unpack_sources(body))
+            elif client == self._client and kind == udp.BYE:  # not subject to the link, so that the simulation always ends
                 self._gone = True
-            elif client == self._client:
-                self._in.put(now, data)
-        for data in self._in.take(now):
-            opened = open_packet(data)
-            assert opened is not None, "only packets of ours are put into the link"
-            self._obey(*opened)
+            elif client == self._client and kind == udp.COMMAND:
+                self._in.put(now, (sequence, body))
+        for sequence, body in self._in.take(now):
+            with suppress(ValueError):
+                _, asked = udp.unpack_command(body)
+                if sequence > self._newest and asked.shape == self.robot.asked.shape:  # no later one has arrived before
+                    self._newest, self.robot.asked, self._told = sequence, asked, self.robot.data.time
 
-    def _greet(self, client: tuple[str, int], body: bytes) -> None:
+    def _greet(self, client: tuple[str, int], sources: dict[str, np.ndarray | None]) -> None:
         """Answer a greeting; its sender receives the states from now on."""
-        try:
-            sources = json.loads(body)["sources"]
-            wanted = {name: None if p is None else np.array(p, dtype=float).reshape(-1, 2) for name, p in sources.items()}
-        except (ValueError, KeyError, TypeError, AttributeError):
-            return
         if client != self._client:
             self._newest = 0
-        self._client, self._sources = client, wanted
-        self._send(packet(FACTS, 0, pack_json(facts_as_json(self.robot.facts))))
-
-    def _obey(self, kind: int, sequence: int, body: bytes) -> None:
-        """Apply a command packet unless a later one has arrived before."""
-        if kind != COMMAND or sequence <= self._newest:
-            return
-        try:
-            _, asked = unpack_command(body)
-        except ValueError:
-            return
-        if asked.shape == self.robot.asked.shape:
-            self._newest = sequence
-            self.robot.asked = asked
-            self._told = self.robot.data.time
-
-    def _brake_if_alone(self) -> None:
-        """Set the P gains to zero if commands have stopped."""
-        if self._told is not None and self.robot.data.time - self._told > HOLD_S:
-            self.robot.asked[1] = 0.0
+        self._client, self._sources = client, sources
+        self._send(udp.packet(udp.FACTS, 0, udp.pack_facts(self.robot.facts)))
 
     def _send_state(self, now: float, sources: dict[str, np.ndarray | None]) -> None:
         """Put a state into the link."""
         self._sequence += 1
-        self._out.put(now, packet(STATE, self._sequence, pack_state(self.robot.state(sources))))
+        self._out.put(now, udp.packet(udp.STATE, self._sequence, udp.pack_state(self.robot.state(sources))))
 
     def _deliver(self, now: float) -> None:
         """Send the packets that have passed the link."""
@@ -191,7 +146,5 @@ class Server:
 
     def _send(self, data: bytes) -> None:
         if self._client is not None:
-            try:
+            with suppress(OSError):  # the receiver has closed
                 self._socket.sendto(data, self._client)
-            except OSError:  # the receiver has closed
-                return

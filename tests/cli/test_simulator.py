@@ -24,7 +24,6 @@ from legged.physics import RobotScene
 from legged.process.headless import off_screen_library
 from legged.registry import make_task, task_config
 from legged.robots.robot import load_robot
-from legged.simulated_robot.film import make_film
 from legged.simulated_robot.robot import SimulatedRobot
 from legged.simulated_robot.server import Link, Server
 from legged.terrain import Terrain, TileSpec
@@ -219,7 +218,7 @@ def test_a_film_has_a_picture_for_each_pose(tmp_path):
     np.save(tmp_path / "poses.npy", [[0.04 * i, *pose] for i in range(4)])
     rows = {"times": np.array([0.0, 0.1]), "state": np.array([1, 2]), "states": np.array(["idle", "damping", "stand"])}
     np.savez(tmp_path / "log.npz", **rows)
-    make_film(robot, None, tmp_path)
+    sim.make_film(robot, None, tmp_path)
     frames = iio.imread(tmp_path / "film.mp4")
     assert frames.shape == (4, 360, 640, 3)
     assert frames.std() > 10.0
@@ -232,7 +231,7 @@ def test_a_run_too_short_for_a_film_has_none_and_says_so(count, tmp_path, capsys
     np.save(tmp_path / "poses.npy", np.array([[0.04, *robot.default_qpos]] * count))
     np.savez(tmp_path / "log.npz", times=np.array([0.0]), state=np.array([0]), states=np.array(["idle"]))
     (tmp_path / "film.mp4").write_bytes(b"of the run before")
-    make_film(robot, None, tmp_path)
+    sim.make_film(robot, None, tmp_path)
     assert "the run was too short for a film, so there is none" in capsys.readouterr().out
     assert not (tmp_path / "film.mp4").exists()
 

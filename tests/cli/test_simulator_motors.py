@@ -19,8 +19,7 @@ from legged.mdp.actuator_network import NetworkWeights
 from legged.mdp.control import Control
 from legged.policies.export import export
 from legged.robots.robot import load_robot
-from legged.simulated_robot.motors import Motors, motors_config
-from legged.simulated_robot.robot import SimulatedRobot
+from legged.simulated_robot.robot import Motors, SimulatedRobot, motors_config
 
 ROBOT = load_robot("anymal_c")
 DT = 0.005

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 from helpers import small_config, small_task
 
-from legged.deploy.commands import Operator, Orders
 from legged.deploy.interface import Interface, Reading, RobotFacts
+from legged.deploy.operators import Event, Operator, Orders
 from legged.deploy.policy import Policy
 from legged.deploy.program import Program
-from legged.deploy.states import Event
 from legged.learning.runner import Runner
 from legged.policies.export import export
 
@@ -125,8 +124,8 @@ class Stage:
         self.operator = Says(plan, does)
         clocks = {"clock": self.time.clock, "sleep": self.time.sleep, "tell": self.told.append, "stand_s": stand_s}
         self.program = Program(self.policy, self.robot, self.operator, **clocks, **settings)
-        self.outcome = self.program.run(seconds)
-        return self.outcome
+        self.program.run(seconds)
+        return self.program
 
 
 def spoil(**changes):

@@ -6,9 +6,11 @@ import sys
 from dataclasses import replace
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from helpers import CALM, ENGINE
+from onnx import numpy_helper
 from still_robot import BLIND, PROPRIOCEPTION, SMALL, exported, facts_for
 
 from legged.deploy.contract import CONTRACT_VERSION, need_of, read_contract
@@ -101,8 +103,9 @@ def test_a_joint_without_limits_has_none_in_the_contract_too(folder, tmp_path):
             {"observation_groups": [{"name": "actor", "start": 0, "size": 45, "history": 0}]},
             r"observation_groups: each must have a history and a size of at least 1",
         ),
+        ({"crouch_joint_angles": [50.0] * 12}, r"crouch_joint_angles: must be within position_limits, got 50 at 'LF_HAA'"),
         ({"control_dt": 5.0}, r"control_dt: must be between 0\.001 and 1, got 5"),
-        ({"default_joint_angles": [2.0] * 12}, r"default_joint_angles: that of 'LF_HAA' lies outside its position_limits"),
+        ({"default_joint_angles": [2.0] * 12}, r"default_joint_angles: must be within position_limits, got 2 at 'LF_HAA'"),
         (
             {"observation_groups": [{"name": "actor", "start": 0, "size": 46, "history": 2}]},
             r"observation_groups: 'actor' has 46 numbers, its terms 45",
@@ -193,9 +196,92 @@ def test_folders_without_an_export_are_refused(folder, tmp_path):
     (tmp_path / "policy.onnx").write_bytes(b"no network")
     with pytest.raises(ConfigError, match=r"POLICY: there is no .*policy\.json"):
         Policy(tmp_path)
-    changed(folder, tmp_path)
+    changed(folder, tmp_path, sha256=None)
     with pytest.raises(ConfigError, match=r"policy\.onnx: onnxruntime cannot read it"):
         Policy(tmp_path)
+
+
+@pytest.fixture
+def export_of(folder, tmp_path):
+    """export_of(change, **changes): a copy of the export whose ONNX model was changed, and entries of its policy.json too."""
+
+    def write(change=lambda model: None, **changes):
+        for name in ("policy.onnx", "policy.weights"):
+            (tmp_path / name).write_bytes((folder / name).read_bytes())
+        changed(folder, tmp_path, **changes)
+        model = onnx.load(tmp_path / "policy.onnx")
+        change(model)
+        onnx.save(model, tmp_path / "policy.onnx")
+        return tmp_path
+
+    return write
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"command_ranges": {"vx": [-50.0, 50.0], "vy": [-0.4, 0.4], "yaw_rate": [-0.7, 0.7]}},
+        {"torque_limits": [8.0] * 12},
+        {"velocity_limits": [2.0] * 12},
+        {"crouch_joint_angles": [0.0, 0.4, -0.8] * 4},
+        {"command_dead_zone": 0.0},
+        {"sim_dt": 0.001},
+        {"robot": "go2"},
+        {"my_own": 1},
+    ],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_every_entry_is_compared_with_the_onnx_file(export_of, changes):
+    (key,) = changes
+    with pytest.raises(
+        ConfigError, match=rf"policy\.json: {key}: is not that of .*policy\.onnx: they are of different exports"
+    ):
+        Policy(export_of(sha256=None, **changes))
+
+
+def test_an_onnx_file_without_a_contract_is_refused(export_of):
+    with pytest.raises(ConfigError, match=r"policy\.onnx: has no metadata of an export"):
+        Policy(export_of(lambda model: model.ClearField("metadata_props"), sha256=None))
+
+
+def test_an_export_without_checksums_is_read_as_before(export_of):
+    assert Policy(export_of(sha256=None)).contract.width == 90
+
+
+@pytest.mark.parametrize("name", ["policy.onnx", "policy.weights"])
+def test_a_file_that_was_changed_after_the_export_is_refused(name, folder, tmp_path):
+    changed(folder, tmp_path)
+    for file in ("policy.onnx", "policy.weights"):
+        (tmp_path / file).write_bytes((folder / file).read_bytes() + (b"\0" if file == name else b""))
+    with pytest.raises(ConfigError, match=rf"{name}: is not the file that was exported with .*policy\.json \(sha256\)"):
+        read_contract(tmp_path / "policy.json")
+
+
+def spoil_weights(model):
+    for tensor in model.graph.initializer:
+        values = numpy_helper.to_array(tensor)
+        if values.dtype == np.float32:
+            tensor.CopyFrom(numpy_helper.from_array(np.full_like(values, np.nan), tensor.name))
+
+
+def test_a_network_of_weights_that_are_not_finite_is_refused(export_of):
+    with pytest.raises(ConfigError, match=r"policy\.onnx: gives actions that are not finite"):
+        Policy(export_of(spoil_weights, sha256=None))
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('{"observation": ' + "[" * 500 + "]" * 500 + "}", "is nested too deeply"),
+        ('{"observation": [], "sim_dt": ' + "1" * 400 + "}", "has a whole number of 400 digits"),
+        ('{"observation": [], "sim_dt": ' + "1" * 5000 + "}", "has a whole number of 5000 digits"),
+    ],
+    ids=["deep", "long", "longer"],
+)
+def test_depth_and_numbers_of_the_file_are_bounded(text, says, tmp_path):
+    (tmp_path / "policy.json").write_text(text)
+    with pytest.raises(ConfigError, match=rf"is no policy\.json of an export \(ValueError: {says}\)"):
+        read_contract(tmp_path / "policy.json")
 
 
 def reading_of(task, robot, sources):

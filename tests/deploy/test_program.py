@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from still_robot import WALKS, spoil, tilted, with_one
 
-from legged.deploy.actuator_log import actuator_arrays
+from legged.deploy.log import actuator_arrays
+from legged.deploy.operators import Event
 from legged.deploy.safety import Limits, braking, clamp_targets
-from legged.deploy.states import Event
 
 DAMPING, STAND, WALK, QUIT = Event.DAMPING, Event.STAND, Event.WALK, Event.QUIT
 
@@ -17,7 +17,7 @@ def test_it_stands_up_walks_and_lies_down_and_is_never_stopped(stage):
     assert outcome.stops == ()
     assert outcome.walked_s == pytest.approx(2.0, abs=0.05)
     assert stage.program.log.notes == ["idle -> damping", "damping -> stand", "stand -> walk", "walk -> damping"]
-    assert (outcome.cycles.missed, stage.robot.closed, stage.operator.closed) == (0, True, True)
+    assert (outcome.pace.missed, stage.robot.closed, stage.operator.closed) == (0, True, True)
     at = {round(moment - 100.0, 2): asked for moment, *asked in stage.robot.written}
     np.testing.assert_array_equal(at[0.2][2], braking(contract))
     assert not at[0.2][1].any()

@@ -8,10 +8,10 @@ import pytest
 from helpers import HANG_S
 from still_robot import BLIND, WALKS, Stage, exported, facts_for, spoil, tilted, with_one
 
+from legged.deploy.operators import TRANSITIONS, Event, State
+from legged.deploy.pace import StatusMessages
 from legged.deploy.policy import Policy
 from legged.deploy.safety import Limits, braking
-from legged.deploy.states import TRANSITIONS, Event, State, next_state
-from legged.deploy.status_messages import StatusMessages
 
 DAMPING, STAND, WALK, STOP, QUIT = Event.DAMPING, Event.STAND, Event.WALK, Event.STOP, Event.QUIT
 
@@ -83,13 +83,13 @@ def test_a_measurement_that_is_sent_again_and_again_is_as_old_as_the_first_time(
         stage.robot.change = lambda reading: replace(reading, time=last)
 
     stage.run({**WALKS, 5.0: QUIT}, {4.0: freeze})
-    assert stage.outcome.stops == ("stale data: the newest reading is 60 ms old (allowed: 50 ms)",)
+    assert stage.program.stops == ("stale data: the newest reading is 60 ms old (allowed: 50 ms)",)
 
 
 def test_a_robot_without_a_clock_can_walk(stage):
     stage.robot.change = lambda reading: replace(reading, time=0.0)
     assert stage.run({**WALKS, 4.0: QUIT}).stops == ()
-    assert stage.outcome.walked_s > 0.9
+    assert stage.program.walked_s > 0.9
 
 
 def test_a_stop_that_one_reading_of_a_cycle_asks_for_is_heard(stage):
@@ -110,7 +110,7 @@ def test_silence_stops_it(stage):
 
     stage.run({**WALKS, 5.0: QUIT}, {4.0: begin})
     # The last reading came at 4.00 s; at 4.06 s it is older than 50 ms.
-    assert stage.outcome.stops == ("stale data: the newest reading is 60 ms old (allowed: 50 ms)",)
+    assert stage.program.stops == ("stale data: the newest reading is 60 ms old (allowed: 50 ms)",)
 
 
 @pytest.mark.parametrize(("count", "stops"), [(5, True), (4, False)])
@@ -120,8 +120,8 @@ def test_deadlines_missed_in_a_row_stop_it(stage, count, stops):
 
     does = {4.0 + 0.021 * i: slow for i in range(count)}
     outcome = stage.run({**WALKS, 6.0: QUIT}, does)
-    assert outcome.cycles.missed == count
-    assert outcome.cycles.longest == pytest.approx(0.021)
+    assert outcome.pace.missed == count
+    assert max(outcome.pace.took) == pytest.approx(0.021)
     assert outcome.stops == (("missed deadlines: 5 in a row (allowed: 4)",) if stops else ())
 
 
@@ -133,7 +133,7 @@ def test_one_long_hang_is_as_many_deadlines_as_it_takes(stage):
 
     outcome = stage.run({**WALKS, 6.0: QUIT}, {4.0: hang})
     assert outcome.stops == ("missed deadlines: 5 in a row (allowed: 4)",)
-    assert outcome.cycles.missed == 5
+    assert outcome.pace.missed == 5
 
 
 def test_an_operator_who_is_gone_stops_it(stage):
@@ -177,7 +177,7 @@ def test_the_operator_stops_it_and_it_goes_on_only_by_damping(stage):
 
 
 def test_every_state_leads_to_stop_and_stop_only_to_damping():
-    assert all(next_state(state, STOP) is State.STOP for state in State)
+    assert all(TRANSITIONS[state, STOP] is State.STOP for state in State)
     assert {event for state, event in TRANSITIONS if state is State.STOP} == {STOP, DAMPING}
     assert {state for (state, event) in TRANSITIONS if event is WALK} == {State.STAND}
 

@@ -17,23 +17,24 @@ from still_robot import facts_for
 
 from legged.deploy import udp
 from legged.deploy.contract import read_contract
+from legged.deploy.interface import Reading
 from legged.deploy.safety import braking
-from legged.deploy.udp import UdpRobot
-from legged.deploy.udp_packets import (
+from legged.deploy.udp import (
     BYE,
     COMMAND,
     FACTS,
     HELLO,
     STATE,
-    RobotState,
-    facts_as_json,
-    facts_of_json,
+    UdpRobot,
     open_packet,
     pack_command,
-    pack_json,
+    pack_facts,
+    pack_sources,
     pack_state,
     packet,
     unpack_command,
+    unpack_facts,
+    unpack_sources,
     unpack_state,
 )
 from legged.errors import ConfigError, RunError
@@ -41,13 +42,14 @@ from legged.errors import ConfigError, RunError
 
 def state(time=1.5, **sources):
     ramp = np.arange(12.0)
-    return RobotState(time, np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.1, 0.2, 0.3]), ramp, 2.0 * ramp, 3.0 * ramp, sources)
+    upright, gyro = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.1, 0.2, 0.3])
+    return Reading(time, 0.0, upright, gyro, ramp, 2.0 * ramp, 3.0 * ramp, sources=sources)
 
 
 def test_a_state_comes_out_as_it_went_in():
     sent = state(heights=np.array([-0.5, 0.25]), base_lin_vel=np.array([1.0, 2.0, 4.0]))
-    found = unpack_state(pack_state(sent))
-    assert found.time == 1.5
+    found = unpack_state(pack_state(sent), 2.5)
+    assert (found.time, found.received) == (1.5, 2.5)
     for name in ("quaternion", "gyro", "positions", "velocities", "torques"):
         np.testing.assert_allclose(getattr(found, name), getattr(sent, name), rtol=1e-6)
     assert found.sources.keys() == {"heights", "base_lin_vel"}
@@ -58,9 +60,9 @@ def test_no_other_bytes_are_a_state_or_a_command():
     whole = pack_state(state(heights=np.array([1.0, 2.0])))
     for length in range(len(whole)):
         with pytest.raises(ValueError, match=r"."):
-            unpack_state(whole[:length])
+            unpack_state(whole[:length], 0.0)
     with pytest.raises(ValueError, match="length"):
-        unpack_state(whole + b"x")
+        unpack_state(whole + b"x", 0.0)
     command = pack_command(7, *np.ones((3, 12)))
     assert unpack_command(command)[0] == 7
     for length in range(len(command)):
@@ -76,7 +78,7 @@ def test_facts_come_out_as_they_went_in(policy_folder):
     limits = read_contract(policy_folder / "policy.json").position_limits.copy()
     limits[3] = -np.inf, np.inf
     facts = facts_for(read_contract(policy_folder / "policy.json"), position_limits=limits, offers=frozenset({"heights"}))
-    found = facts_of_json(json.loads(json.dumps(facts_as_json(facts))))
+    found = unpack_facts(pack_facts(facts))
     assert (found.name, found.joint_names, found.imu_body, found.offers) == ("still", facts.joint_names, "base", {"heights"})
     np.testing.assert_array_equal(found.position_limits, limits)
     np.testing.assert_array_equal(found.torque_limits, facts.torque_limits)
@@ -94,12 +96,35 @@ def test_facts_come_out_as_they_went_in(policy_folder):
     ids=["torques", "positions", "names", "velocities", "none"],
 )
 def test_what_are_no_facts_is_refused(policy_folder, changes):
-    said = facts_as_json(facts_for(read_contract(policy_folder / "policy.json")))
+    said = json.loads(pack_facts(facts_for(read_contract(policy_folder / "policy.json"))))
     said |= changes
     if "name" in changes:
         del said["imu_body"]
     with pytest.raises((ValueError, KeyError, TypeError)):
-        facts_of_json(said)
+        unpack_facts(json.dumps(said).encode())
+
+
+def test_a_greeting_comes_out_as_it_went_in():
+    found = unpack_sources(pack_sources({"heights": np.array([[0.5, 0.0]]), "base_lin_vel": None}))
+    assert found["base_lin_vel"] is None
+    np.testing.assert_array_equal(found["heights"], [[0.5, 0.0]])
+
+
+HUGE, DEEP = b"1" * 400, b"[" * 25_000
+
+
+@pytest.mark.parametrize("body", [DEEP, b"[]", b'{"sources": %s}' % HUGE, b'{"sources": {"x": [[%s, 1]]}}' % HUGE])
+@pytest.mark.parametrize("unpack", [unpack_sources, unpack_facts])
+def test_numbers_and_depth_of_a_packet_end_in_errors_that_are_expected(unpack, body):
+    """One packet once ended the simulated robot: nested too deeply, or with numbers beyond float64."""
+    with pytest.raises((ValueError, KeyError, TypeError, AttributeError)):
+        unpack(body)
+
+
+@pytest.mark.parametrize("point", ["NaN", "Infinity", "1e999"])
+def test_points_that_are_not_finite_are_refused(point):
+    with pytest.raises(ValueError, match="heights: its points are not finite"):
+        unpack_sources(b'{"sources": {"heights": [[0.0, %s]]}}' % point.encode())
 
 
 class Answers:
@@ -127,7 +152,7 @@ class Answers:
             opened = open_packet(data)
             self.heard.append(opened)
             if opened[0] == HELLO:
-                self.socket.sendto(packet(FACTS, 0, pack_json(facts_as_json(self.facts))), self.client)
+                self.socket.sendto(packet(FACTS, 0, pack_facts(self.facts)), self.client)
 
     def send(self, *packets):
         for data in packets:
@@ -179,7 +204,7 @@ def test_a_reading_is_as_old_as_its_arrival_not_as_its_reading(link):
 def test_a_robot_with_other_joints_gives_no_reading(link):
     robot, there = link
     four = np.zeros(4)
-    there.send(packet(STATE, 1, pack_state(RobotState(1.0, four, np.zeros(3), four, four, four, {}))))
+    there.send(packet(STATE, 1, pack_state(Reading(1.0, 0.0, four, np.zeros(3), four, four, four))))
     assert robot.read() == []
 
 
@@ -282,7 +307,7 @@ def test_what_is_no_address_is_refused(address):
 
 def test_somebody_who_answers_with_something_else_is_no_robot(monkeypatch):
     monkeypatch.setattr(udp, "ANSWER_S", 0.4)
-    monkeypatch.setattr(f"{__name__}.facts_as_json", lambda _: {"joint_names": ["one"]})
+    monkeypatch.setattr(f"{__name__}.pack_facts", lambda _: b'{"joint_names": ["one"]}')
     there = Answers(None)
     with pytest.raises(RunError, match="no robot answers"):
         UdpRobot(there.address)

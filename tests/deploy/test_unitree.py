@@ -10,8 +10,7 @@ import pytest
 from helpers import until
 
 from legged.deploy import unitree
-from legged.deploy.unitree import UnitreeRobot
-from legged.deploy.unitree_messages import GO_COMMAND, HG_COMMAND, KINDS, crc, fill_command, new_command
+from legged.deploy.unitree import GO_COMMAND, HG_COMMAND, KINDS, UnitreeRobot, crc
 from legged.errors import ConfigError, RunError
 from legged.robots.robot import load_robot
 
@@ -334,13 +333,3 @@ def test_a_robot_that_says_nothing_is_named(monkeypatch):
     with pytest.raises(RunError, match=r"--robot: g1: no state came within 0\.05 s"):
         UnitreeRobot("g1", wire)
     assert wire.closed
-
-
-def test_a_filled_command_can_be_filled_again():
-    """What was asked before leaves nothing behind."""
-    kind = KINDS["go2"]
-    twice, once = new_command(kind, 0), new_command(kind, 0)
-    fill_command(twice, kind, np.full(12, 3.0), np.full(12, 9.0), np.full(12, 2.0))
-    fill_command(twice, kind, np.zeros(12), np.ones(12), np.ones(12))
-    fill_command(once, kind, np.zeros(12), np.ones(12), np.ones(12))
-    assert twice.tobytes() == once.tobytes()

@@ -6,8 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from legged.deploy import unitree
-from legged.deploy.unitree import SdkWire
-from legged.deploy.unitree_messages import KINDS
+from legged.deploy.unitree import KINDS, SdkWire
 from legged.errors import ConfigError, RunError
 
 

@@ -155,8 +155,9 @@ JOINS = ["nothing kept", "joined to another width", "joined twice", "kept with a
         (pack([KEPT, linear(3, 2), Layer(JOIN, 0, 2, 6, ())]), "has a layer that joins what was not kept"),
         (pack([KEPT, Layer(JOIN, 0, 3, 6, ()), Layer(JOIN, 0, 6, 9, ())]), "has a layer that joins what was not kept"),
         (pack([Layer(KEEP, 0, 3, 4, ()), linear(4, 2)]), "has a layer that changes a width it cannot change"),
+        (pack([Layer(LINEAR, 0, 1, 1, (np.full((1, 1), np.nan), np.ones(1)))]), "has numbers that are not finite"),
     ],
-    ids=["no layers", "do not fit", "unknown activation", "another width", "longer", *JOINS],
+    ids=["no layers", "do not fit", "unknown activation", "another width", "longer", *JOINS, "NaN"],
 )
 def test_layers_that_make_no_network_are_refused_by_both(data, says, program, tmp_path):
     (tmp_path / "policy.weights").write_bytes(data)

@@ -163,12 +163,35 @@ def test_our_own_checkpoints_are_judged_as_the_task_sees_them(tmp_path, monkeypa
 def test_motors_that_are_not_simulated_are_told(changes, warns, tmp_path, capsys):
     """A layout knows ideal motors alone, so a policy that was trained with others is not judged as it was trained."""
     task = small_task(*changes, num_envs=1)
-    (tmp_path / "policy.json").write_text(json.dumps(describe(task)))
-    policy = write_policy(tmp_path / "policy.onnx", np.zeros((48, 12)), np.zeros(12))
+    description = describe(task)
+    (tmp_path / "policy.json").write_text(json.dumps(description))
+    metadata = {key: json.dumps(value) for key, value in description.items()}
+    policy = write_policy(tmp_path / "policy.onnx", np.zeros((48, 12)), np.zeros(12), **metadata)
     command = ["--command", "0,0,0", "--seconds", "2.1"]
     assert call(evaluate_onnx.main, [str(policy), *command]) == 0
     said = capsys.readouterr().err
     assert ("policy.json: the policy was trained with motors that are not ideal" in said) == warns
+
+
+@pytest.mark.parametrize(
+    ("changes", "bias", "says"),
+    [
+        ({"stiffness": [900.0] * 12}, 0.0, "stiffness: is not that of"),
+        ({"damping": [0.0] * 12}, 0.0, "damping: must be above 0"),
+        ({"control_dt": 0.0005}, 0.0, "control_dt: must be between 0.001 and 1, got 0.0005"),
+        ({"joint_names": list(reversed(load_robot("anymal_c").joint_names))}, 0.0, "joint_names: is not that of"),
+        ({}, math.nan, "policy.onnx: gives actions that are not finite"),
+    ],
+    ids=["gains", "damping", "control_dt", "joints", "NaN"],
+)
+def test_an_export_is_played_with_its_own_contract_alone(changes, bias, says, tmp_path, capsys):
+    """These once changed what was measured without a word; a policy of NaN lay still."""
+    description = describe(small_task(num_envs=1))
+    (tmp_path / "policy.json").write_text(json.dumps({**description, **changes}))
+    metadata = {key: json.dumps(value) for key, value in description.items()}
+    policy = write_policy(tmp_path / "policy.onnx", np.zeros((48, 12)), np.full(12, bias), **metadata)
+    assert call(evaluate_onnx.main, [str(policy), "--command", "0,0,0", "--seconds", "2.1"]) == 2
+    assert says in capsys.readouterr().err
 
 
 def test_the_first_that_follows(standing, tmp_path, capsys):
@@ -210,13 +233,16 @@ def test_wrong_grids_end_with_one_line(standing, tmp_path, capsys, arguments, me
 def test_policies_that_cannot_be_played(tmp_path):
     description = describe(small_task(num_envs=1))
     terms = description["observation"]
-    uneven = [{**terms[0], "scale": [1.0, 2.0, 1.0]}]
+    uneven = [{**terms[0], "scale": [1.0, 2.0, 1.0]}, *terms[1:]]
+    heights = {**terms[0], "name": "heights", "needs": "source heights", "points": [[0.0, 0.0]] * 3}
+    memory = {"rnn_type": "lstm", "shape": [1, "batch", 8], "onnx_inputs": ["h_in", "c_in"]}
+    (group,) = description["observation_groups"]
     for change, message in (
         ({"control_type": "V"}, "control_type: got 'V'"),
-        ({"recurrent": {"rnn_type": "lstm"}}, "has a memory"),
-        ({"observation_groups": [{"history": 3}]}, "has a memory"),
+        ({"recurrent": memory}, "has a memory"),
+        ({"observation_groups": [{**group, "history": 3}]}, "has a memory"),
         ({"observation": uneven}, "columns of 'base_lin_vel' have scales of their own"),
-        ({"observation": [{**terms[0], "name": "heights"}]}, "there is no term 'heights'"),
+        ({"observation": [heights, *terms[1:]]}, "there is no term 'heights'"),
         ({"damping": None}, "is no policy.json"),
     ):
         path = tmp_path / "policy.json"

@@ -21,15 +21,14 @@ from legged.mdp.actuator import with_rotors
 from legged.process.command_parser import CommandParser
 from legged.process.paths import make_folder, ready_to_write, replacing, write_text
 from legged.robots.robot import Robot, load_robot
-from legged.simulated_robot.film import POSES
-from legged.simulated_robot.motors import Motors, motors_config
-from legged.simulated_robot.robot import SimulatedRobot
+from legged.simulated_robot.robot import Motors, SimulatedRobot, motors_config
 from legged.simulated_robot.server import Server
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, terrain_type
 
 LISTENING = "listening at "
 """Beginning of the line with the address."""
-REPORT = "report.json"
+REPORT, POSES = "report.json", "poses.npy"
+"""Files in the folder of a run."""
 PRIORITY = 10
 """Priority below the program's."""
 BORDER = 10.0
@@ -47,12 +46,10 @@ def build_parser() -> CommandParser:
     )
     parser.add_argument("robot", metavar="ROBOT", help="name of a robot, or its folder")
     add_simulation_arguments(parser)
-    parser.add_argument(
-        "--contract", type=Path, help="policy.json whose motors and map the robot has; ideal motors without one"
-    )
-    parser.add_argument(
-        "--out", type=Path, help=f"folder for {REPORT} and {POSES}, 25 poses a second of the first half minute"
-    )
+    trained = "policy.json whose motors and map the robot has; ideal motors without one"
+    parser.add_argument("--contract", type=Path, help=trained)
+    out = f"folder for {REPORT} and {POSES}, 25 poses a second of the first half minute"
+    parser.add_argument("--out", type=Path, help=out)
     parser.add_argument("--seconds", type=float, default=3600.0, help="end after so long; default 3600")
     return parser
 

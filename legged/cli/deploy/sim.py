@@ -12,9 +12,18 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
-from legged.cli.deploy.robot import LISTENING, REPORT, add_simulation_arguments, check_simulation, motors_of, terrain_of
+from legged.cli.deploy.robot import (
+    LISTENING,
+    POSES,
+    REPORT,
+    add_simulation_arguments,
+    check_simulation,
+    motors_of,
+    terrain_of,
+)
 from legged.commandline.arguments import POLICY_HELP
 from legged.commandline.command import EXIT_WRONG_INPUT, command
 from legged.config import LeggedConfig
@@ -22,14 +31,18 @@ from legged.deploy.__main__ import add_program_arguments, limits_of
 from legged.deploy.contract import Contract, read_contract
 from legged.errors import ConfigError, RunError
 from legged.learning.run_folder import CONFIG_FILE, checkpoints, run_config
+from legged.play.video import write_mp4
 from legged.policies.export import EXPORTED, export
 from legged.policies.restore import policy_of, restore, undisturbed
 from legged.process.command_parser import CommandParser, add_import_argument
 from legged.process.paths import exists, ready_to_write, relative
 from legged.process.startup import INTERRUPTED, in_main_thread
 from legged.registry import import_tasks
+from legged.rendering import Camera, display_model, size_of
+from legged.rendering.camera import caption
+from legged.rendering.framing import Follower
 from legged.robots.robot import Robot, load_robot
-from legged.simulated_robot.film import make_film
+from legged.terrain import Terrain
 
 ROOM_MB = 16.0
 """Disk space for the exported policy and the log [MiB]."""
@@ -37,6 +50,13 @@ END_S = 20.0
 """Longest time for a process to end after it was told to [s]."""
 DID_NOT_RUN = (EXIT_WRONG_INPUT, INTERRUPTED)
 """Exit codes of a program that did not move the robot."""
+FILM = "film.mp4"
+SIZE = (640, 360)
+"""Width and height [pixels]."""
+AWAY = 3.45
+"""Distance of the camera, in lengths of the robot."""
+GLIDE = 0.1
+"""Share of the distance to a robot on a plane that the camera covers per picture."""
 SIMULATED = ("terrain", "size", "cell", "sim_dt", "latency", "loss", "seed")
 PASSED_ON = ("input", "gamepad", "commands", "seconds", "stand_seconds", "max_tilt", "max_age", "max_missed")
 
@@ -89,15 +109,15 @@ def main(argv: list[str] | None) -> int:
 def _exported(name: str) -> Path:
     """Return the folder of the exported policy `name`. A run whose newest checkpoint was not exported is exported first, and
     so is a shipped policy.
-
-    Raises:
-        ConfigError: there is no policy of that name, or its task has no commands.
     """
     given = Path(name).parent if name.endswith(".onnx") else Path(name)
     if exists(given / "policy.onnx"):
         return given
-    if exists(given / EXPORTED / "policy.onnx") and not _outdated(given):
-        return given / EXPORTED
+    inside = given / EXPORTED / "policy.onnx"
+    if exists(inside):
+        saved = checkpoints(given)
+        if not saved or saved[max(saved)].stat().st_mtime <= inside.stat().st_mtime:
+            return given / EXPORTED
     policy = policy_of(name)
     if not isinstance(policy.cfg, LeggedConfig):
         raise ConfigError(f"POLICY: '{policy.cfg.task}' follows no commands; the program is for legged robots that do")
@@ -109,18 +129,9 @@ def _exported(name: str) -> Path:
     return folder
 
 
-def _outdated(run: Path) -> bool:
-    """Return True if the export in a run folder is older than the run's newest checkpoint."""
-    saved = checkpoints(run)
-    return bool(saved) and saved[max(saved)].stat().st_mtime > (run / EXPORTED / "policy.onnx").stat().st_mtime
-
-
 def _simulated(given: str | None, exported: Path, contract: Contract) -> Robot:
     """Return the simulated robot: the one `given`, else the policy's. A contract names a user-defined robot without its
     folder, which is in the configuration of the run that contains the export.
-
-    Raises:
-        ConfigError: the robot is not found.
     """
     if given is not None:
         return load_robot(given, "--robot")
@@ -145,12 +156,10 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
     """
     report = folder / REPORT
     report.unlink(missing_ok=True)  # the report of another run
+    simulated = [sys.executable, "-m", "legged", "deploy", "robot", robot, "--out", str(folder)]
+    simulated += [*(["--ideal-motors"] if args.ideal_motors else []), "--contract", str(exported / "policy.json")]
     simulator = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "legged", "deploy", "robot", robot, "--out", str(folder)),
-            *(["--ideal-motors"] if args.ideal_motors else []),
-            *("--contract", str(exported / "policy.json"), *_flags(args, SIMULATED), *args.overrides),
-        ],
+        [*simulated, *_flags(args, SIMULATED), *args.overrides],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         text=True,
@@ -164,13 +173,9 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         line = simulator.stdout.readline()
         if not line.startswith(LISTENING):
             raise RunError(f"the simulated robot did not start (exit code {simulator.wait(END_S)})")
-        address = line.removeprefix(LISTENING).strip()
-        program = subprocess.Popen(
-            [
-                *(sys.executable, "-m", "legged.deploy", str(exported), "--robot", f"udp:{address}"),
-                *("--log", str(folder / "log.npz"), *_flags(args, PASSED_ON)),
-            ]
-        )
+        udp = f"udp:{line.removeprefix(LISTENING).strip()}"
+        command = [sys.executable, "-m", "legged.deploy", str(exported), "--robot", udp, "--log", str(folder / "log.npz")]
+        program = subprocess.Popen([*command, *_flags(args, PASSED_ON)])
         code = _wait(program)
         if code in DID_NOT_RUN:  # the program has printed the reason
             return code, None
@@ -202,17 +207,48 @@ def _wait(program: subprocess.Popen) -> int:
 
 def _flags(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
     """Return the given and default values of the named options as flags."""
-    given = {name: getattr(args, name) for name in names}
-    return [
-        word for name, value in given.items() if value is not None for word in (f"--{name.replace('_', '-')}", str(value))
-    ]
+    given = {f"--{name.replace('_', '-')}": getattr(args, name) for name in names}
+    return [word for flag, value in given.items() if value is not None for word in (flag, str(value))]
 
 
 def _told(report: dict[str, Any]) -> str:
     """Return a summary of the robot's report in one line."""
-    lost = report["lost"] / max(1, report["sent"] + report["received"])
-    lean, share = report["largest_lean"], 100.0 * lost
+    lost = 100.0 * report["lost"] / max(1, report["sent"] + report["received"])
     return (
         f"{'fell' if report['fell'] else 'did not fall'}, {report['time']:.1f} s, {report['distance']:.2f} m away,"
-        f" {report['climbed']:+.2f} m higher, largest lean {lean:.2f} rad, {share:.1f} % of packets lost"
+        f" {report['climbed']:+.2f} m higher, largest lean {report['largest_lean']:.2f} rad, {lost:.1f} % of packets lost"
     )
+
+
+def make_film(robot: Robot, terrain: Terrain | None, folder: Path) -> None:
+    """Write a film of the poses in `folder` with the states of its log.npz; fewer than two poses make no film.
+
+    Raises:
+        RunError: this machine cannot render, or the film cannot be written.
+    """
+    poses = np.load(folder / POSES)
+    log = np.load(folder / "log.npz")
+    if len(poses) < 2 or "times" not in log:
+        (folder / FILM).unlink(missing_ok=True)  # left by another run
+        print(f"{folder}: the run was too short for a film, so there is none")
+        return
+    camera = Camera(display_model(robot, 1, *SIZE, terrain), *SIZE)
+    away = AWAY * size_of(robot).longest
+    follower = None if terrain is None else Follower(terrain.height_map, away)
+    camera.view.distance, camera.view.azimuth, camera.view.elevation = away, 130.0, -18.0
+    camera.view.lookat[:] = poses[0, 1:4]
+    frames = []
+    for time, *qpos in poses:
+        camera.data.qpos[:] = qpos
+        base = np.array(qpos[:3])
+        if follower is None:
+            camera.view.lookat[:] += GLIDE * (base - camera.view.lookat)
+        else:
+            follower.update(base)
+            follower.aim(camera.view)
+        camera.update()
+        place = min(int(np.searchsorted(log["times"], time)), len(log["times"]) - 1)
+        state = log["states"][log["state"][place]]
+        frames.append(caption(camera.render(), [f"{robot.name}: {state}", f"{time:.1f} s, {base[0]:+.1f} m forward"]))
+    camera.close()
+    write_mp4(frames, folder / FILM, (len(poses) - 1) / max(poses[-1, 0] - poses[0, 0], 1e-3))

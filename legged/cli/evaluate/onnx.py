@@ -24,7 +24,7 @@ from legged.evaluation.playback import SETTLING_S, follow, play
 from legged.evaluation.tables import screen_table
 from legged.evaluation.velocity_grid import AXES, AXIS, Grid, axis_values, check_size
 from legged.learning.run_folder import CONFIG_FILE
-from legged.policies.foreign import ForeignPolicy, Layout, read_layout, was_trained_with_other_motors
+from legged.policies.foreign import ForeignPolicy, read_layout, was_trained_with_other_motors
 from legged.process.command_parser import CommandParser
 from legged.process.paths import exists, make_folder, ready_to_write, relative, write_text
 from legged.robots.robot import Robot, load_robot
@@ -96,23 +96,19 @@ def evaluate(argv: list[str] | None) -> int:
         raise ConfigError(f"--friction: must be from 0 to 10, got {args.friction}")
     commands = [_command(text) for text in args.command or ()] or COMMANDS
     files = [_file(name) for name in args.policy]
-    beside = files[0].with_name(EXPORTED[1])
-    if not args.layout and not exists(beside):
-        raise ConfigError(f"{files[0]}: no {beside.name} lies beside it; give the contents of its observation with --layout")
-    given = args.layout or str(beside)
     if args.out is not None:
         ready_to_write(args.out)
-    layout = read_layout(given, "--layout")
-    if not args.robot and not given.endswith(".json"):
-        raise ConfigError(f"--robot: is missing; the layout '{given}' names none")
-    named = args.robot or str(json.loads(Path(given).read_text(encoding="utf-8")).get("robot", ""))
-    robot = load_robot(named, "--robot")
-    policies = [ForeignPolicy(path, layout, robot) for path in files]
-    if given.endswith(".json") and was_trained_with_other_motors(Path(given)):
+    layouts = [read_layout(args.layout or str(_description(path, files[0])), "--layout") for path in files]
+    contract = layouts[0].contract
+    if args.robot is None and contract is None:
+        raise ConfigError(f"--robot: is missing; the layout '{args.layout}' names none")
+    robot = load_robot(args.robot or contract.robot, "--robot")  # type: ignore[union-attr]
+    policies = [ForeignPolicy(path, layout, robot) for path, layout in zip(files, layouts, strict=True)]
+    if contract is not None and was_trained_with_other_motors(contract):
         told = "the policy was trained with motors that are not ideal (its actuator says which); here they are"
-        print(f"warning: {given}: {told}", file=sys.stderr, flush=True)
+        print(f"warning: {contract.path}: {told}", file=sys.stderr, flush=True)
     if grid:
-        result = _follow_all(robot, layout, policies, files, args, grid)
+        result = _follow_all(robot, policies, files, args, grid)
     else:
         said = []
         for path, policy in zip(files, policies, strict=True):
@@ -132,6 +128,14 @@ def _file(name: str) -> Path:
     path = exported_file(name)
     if path is None or not exists(path) or not path.is_file():
         raise ConfigError(f"POLICY: there is no ONNX file '{name}', nor is it an exported folder (with {EXPORTED[0]})")
+    return path
+
+
+def _description(file: Path, first: Path) -> Path:
+    """Return the policy.json next to a file, or else next to the first file."""
+    path = next((path for path in (file.with_name(EXPORTED[1]), first.with_name(EXPORTED[1])) if exists(path)), None)
+    if path is None:
+        raise ConfigError(f"{first}: no {EXPORTED[1]} lies beside it; give the contents of its observation with --layout")
     return path
 
 
@@ -165,7 +169,7 @@ def _grid(args: argparse.Namespace) -> Grid | None:
 
 
 def _follow_all(
-    robot: Robot, layout: Layout, policies: list[ForeignPolicy], files: list[Path], args: argparse.Namespace, grid: Grid
+    robot: Robot, policies: list[ForeignPolicy], files: list[Path], args: argparse.Namespace, grid: Grid
 ) -> dict[str, Any]:
     """Measure every policy on the grid, print a line about each, and return all figures. Policies that state their training
     time come in its order.
@@ -185,7 +189,7 @@ def _follow_all(
     result = {
         "robot": robot.name,
         "friction": args.friction,
-        "sim_dt": layout.sim_dt,
+        "sim_dt": policies[0].layout.sim_dt,
         "grid": grid.axes,
         "hold_s": grid.hold_s,
         "settle_s": grid.settle_s,

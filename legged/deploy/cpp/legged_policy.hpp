@@ -58,6 +58,8 @@ public:
                 throw std::runtime_error(path + ": has layers that do not fit together");
             layer.numbers.resize(layer.size());
             read(file, path, layer.numbers.data(), sizeof(float) * layer.numbers.size());
+            for (const float number : layer.numbers)
+                if (!std::isfinite(number)) throw std::runtime_error(path + ": has numbers that are not finite");
             if (layer.kind == lstm || layer.kind == gru) {
                 layer.hidden.assign(layer.outputs, 0.0f);
                 layer.cell.assign(layer.outputs, 0.0f);

@@ -1,0 +1,315 @@
+"""Tasks as environments of Gymnasium: `gymnasium.make("legged/<task>")` and `gymnasium.make_vec` (docs/gymnasium.md)."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, ClassVar, Literal
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from torch import Tensor
+
+from legged.commandline.arguments import pick_device
+from legged.config.checks import shown
+from legged.config.networks import groups_of
+from legged.envs.final_observation import keep_final_step
+from legged.errors import ConfigError, suggest
+from legged.registry import make_task, task_config
+from legged.rendering import ModelCamera, RobotsCamera, camera_of
+
+Seen = Literal["actor", "dict"]
+"""Form of the observations: the policy's groups side by side, or a dictionary of all groups."""
+SEEN = ("actor", "dict")
+RENDER_MODES = ["rgb_array"]
+REWARD = "reward_"
+"""Prefix of the reward terms in infos."""
+LARGEST_SEED = 2**63
+LARGEST_PICTURE = 16384
+"""Largest side of a picture, a limit of graphics cards [pixels]."""
+
+
+class _Driver:
+    """Shared part of both kinds of environment: a task that keeps the last step of every episode, its random numbers (tasks
+    draw from torch's generators, which are global to the process), its spaces and its camera.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES}
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int,
+        *,
+        render_mode: str | None = None,
+        device: str = "cpu",
+        physics: str = "auto",
+        config: Mapping[str, Any] | None = None,
+        observations: Seen = "actor",
+        width: int = 480,
+        height: int = 270,
+    ) -> None:
+        """Build the task `task`; the arguments are explained in docs/gymnasium.md.
+
+        Raises:
+            ConfigError: the task, the device or a setting does not exist, or a value is not allowed.
+        """
+        for name, value, allowed in (("render_mode", render_mode, RENDER_MODES), ("observations", observations, SEEN)):
+            if value not in allowed and (name, value) != ("render_mode", None):
+                raise ConfigError(f"{name}: got {shown(value)}{suggest(str(value)[:100], allowed)}")
+        for name, side in (("width", width), ("height", height)):
+            if isinstance(side, bool) or not isinstance(side, (int, np.integer)) or not 1 <= side <= LARGEST_PICTURE:
+                raise ConfigError(f"{name}: must be a whole number of pixels from 1 to {LARGEST_PICTURE}, got {shown(side)}")
+        if config is not None and not (isinstance(config, Mapping) and all(isinstance(path, str) for path in config)):
+            raise ConfigError(f"config: expected settings by dotted path, {{'sim.dt': 0.004}}; got {shown(config)}")
+        if "env.num_envs" in (config or {}):
+            raise ConfigError("config: env.num_envs: the number of environments is that of make_vec(..., num_envs=...)")
+        self.render_mode, self._size = render_mode, (int(width), int(height))
+        self._device = pick_device(str(device), "device")
+        settings = [("train.algorithm.num_mini_batches", 1), *(config or {}).items(), ("env.num_envs", num_envs)]
+        if physics != "auto":
+            settings.append(("sim.physics", physics))
+        cfg = task_config(task, settings, on_cpu=self._device.type == "cpu")
+        self._random: list[Tensor] | None = None
+        with self._own_random_numbers():
+            self.task: Any = make_task(cfg, self._device, graph=False)
+            """The task, a `legged.envs.BaseTask`. After the end of an episode it is already in the next one."""
+            # On a GPU the captured step includes the copies of final states; on the CPU no graph needs a check.
+            self._final = keep_final_step(self.task, graph=self._device.type == "cuda")
+            # The initial state, with the buffers that terms create at their first call: a step is made and undone.
+            before = self.task.state_dict()
+            self.task.step(torch.zeros_like(self.task.actions))
+            self._beginning = {part: {**state, **before[part]} for part, state in self.task.state_dict().items()}
+            self.task.load_state_dict(self._beginning)
+        self._seeded = False
+        self._groups = None if observations == "dict" else groups_of(cfg, "actor")
+        self._camera: ModelCamera | RobotsCamera | None = None
+        # One picture per step shows real time.
+        self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / self.task.dt))}  # type: ignore[misc]
+
+        def box(bound: float, width: int) -> spaces.Box:
+            return spaces.Box(-bound, bound, (width,), np.float32)
+
+        clip = cfg.observations.clip
+        widths = {name: group.buffer.shape[1] for name, group in self.task.observation_groups.items()}
+        boxes: dict[str, spaces.Space[Any]] = {name: box(clip, width) for name, width in widths.items()}
+        self._actions = box(cfg.control.clip_actions, self.task.num_actions)
+        chosen = self._groups
+        self._observations = spaces.Dict(boxes) if chosen is None else box(clip, sum(widths[name] for name in chosen))
+
+    @contextmanager
+    def _own_random_numbers(self) -> Iterator[None]:
+        """Let torch draw from this environment's random numbers in the block; restore the global state afterwards."""
+        on_gpu = [self._device] if self._device.type == "cuda" else []
+        with torch.random.fork_rng(on_gpu):
+            if self._random is not None:
+                torch.set_rng_state(self._random[0])
+                for device, state in zip(on_gpu, self._random[1:], strict=True):
+                    torch.cuda.set_rng_state(state, device)
+            try:
+                yield
+            finally:
+                self._random = [torch.get_rng_state(), *(torch.cuda.get_rng_state(device) for device in on_gpu)]
+
+    def _reset(self, seed: int | None, options: dict[str, Any] | None, chosen: np.random.Generator) -> Any:
+        """Start an episode in every environment and return the observations. A seed restores the initial state, curricula
+        included, and seeds the random numbers. Without one they continue; `chosen` draws the first seed.
+        """
+        if options:
+            raise ConfigError(f"reset: options: there are none; got {shown(options)}")
+        with self._own_random_numbers():
+            if seed is not None or not self._seeded:
+                drawn = int(chosen.integers(LARGEST_SEED)) if seed is None else seed % LARGEST_SEED
+                torch.random.default_generator.manual_seed(drawn)
+                if self._device.type == "cuda":
+                    with torch.cuda.device(self._device):
+                        torch.cuda.manual_seed(drawn)
+            if seed is not None:
+                self.task.load_state_dict(self._beginning)
+            self._seeded = True
+            return self._seen(dict(self.task.reset().items()))
+
+    def _step(self, actions: Any) -> tuple[Any, Tensor]:
+        """Make a step with `actions` (N, D); return the observations and the rewards (N,) in new tensors."""
+        with self._own_random_numbers():
+            observations, rewards, _, _ = self.task.step(actions)
+        return self._seen(dict(observations.items())), rewards
+
+    def _final_observations(self) -> Any:
+        """Return the observations of the last step before environments were reset, in new tensors."""
+        return self._seen({name: seen.clone() for name, seen in self._final.observations.items()})
+
+    def _reward_parts(self, to_numpy: bool) -> dict[str, Any]:
+        """Return the terms of the last rewards, (N,) each, in new tensors or arrays."""
+        parts = self.task.rewards.last.clone()
+        rows = parts.cpu().numpy() if to_numpy else parts  # all in one copy
+        return {f"{REWARD}{name}": part for name, part in zip(self.task.rewards.names, rows, strict=True)}
+
+    def _seen(self, groups: dict[str, Tensor]) -> Any:
+        """Return the observations in the requested form."""
+        if self._groups is None:
+            return groups
+        chosen = [groups[name] for name in self._groups]
+        return chosen[0] if len(chosen) == 1 else torch.cat(chosen, dim=1)
+
+    def _pictures(self) -> list[np.ndarray] | None:
+        """Return a picture (height, width, 3) uint8 of the present state of every environment; None without a render mode."""
+        if self.render_mode is None:
+            gymnasium.logger.warn('render() shows nothing without a render mode: make(..., render_mode="rgb_array")')
+            return None
+        if self._camera is None:
+            self._camera = camera_of(self.task, 1, *self._size)
+        found = []
+        for env in range(self.task.num_envs):
+            self._camera.turn_to(env)
+            found.append(self._camera.picture())
+        return found
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free the camera."""
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
+
+
+class TaskEnv(_Driver, gymnasium.Env):  # type: ignore[misc]
+    """One environment of a task. At the end of an episode `step` returns its last observation; `reset` starts the next."""
+
+    def __init__(self, task: str, **arguments: Any) -> None:
+        """Build the task `task`; the arguments are explained in docs/gymnasium.md. Raises the errors of `_Driver`."""
+        super().__init__(task, 1, **arguments)
+        self.action_space, self.observation_space = self._actions, self._observations
+        self._over = True
+        self._shows_the_next = False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; return the observation and empty infos.
+
+        Raises:
+            ConfigError: `options` are given.
+        """
+        super().reset(seed=seed)
+        seen = self._reset(seed, options, self.np_random)
+        self._over = self._shows_the_next = False
+        return row(as_numpy(seen), 0), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Make a step with `action` (D,). Return the observation, the reward, whether the episode ended in a failure, whether
+        its time ran out, and infos with the reward terms, `reward_<name>`.
+
+        Raises:
+            ResetNeeded: no episode is running.
+            ValueError: the action has another shape, or is not of real numbers.
+        """
+        if self._over:
+            raise gymnasium.error.ResetNeeded("the episode is over, or none has begun: call reset() before step()")
+        seen, rewards = self._step(action[None] if isinstance(action, Tensor) else np.asarray(action)[None])
+        terminated, truncated = bool(self.task.terminated_buf[0]), bool(self.task.time_out_buf[0])
+        self._over = self._shows_the_next = terminated or truncated
+        if self._over:
+            seen = self._final_observations()
+        infos = {name: float(part[0]) for name, part in self._reward_parts(to_numpy=True).items()}
+        return row(as_numpy(seen), 0), float(rewards[0]), terminated, truncated, infos
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """Return a picture (height, width, 3) uint8, or None without a `render_mode`.
+
+        Raises:
+            RunError: this machine cannot render.
+        """
+        if self._shows_the_next and self.render_mode is not None:  # restore the end of the episode: only a reset can follow
+            self.task.physics.write(torch.ones_like(self.task.reset_buf), self._final.qpos, self._final.qvel)
+            self.task.sense()
+            self._shows_the_next = False
+        pictures = self._pictures()
+        return None if pictures is None else pictures[0]
+
+    def close(self) -> None:
+        """Free the camera."""
+        self.close_extras()
+
+
+class TaskVectorEnv(_Driver, VectorEnv):  # type: ignore[misc]
+    """The N environments of a task. At the end of an episode an environment is reset within the same step: `step` returns the
+    first observation of the next episode, and `infos["final_obs"]` has the last one of the old.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {**_Driver.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}  # type: ignore[misc]
+
+    def __init__(self, task: str, num_envs: int, *, to_numpy: bool = True, **arguments: Any) -> None:
+        """Build the task `task`; the arguments are explained in docs/gymnasium.md. Raises the errors of `_Driver`."""
+        super().__init__(task, num_envs, **arguments)
+        self.num_envs, self._to_numpy = num_envs, to_numpy
+        self.single_action_space, self.single_observation_space = self._actions, self._observations
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode in every environment; return the observations (N, width) and empty infos.
+
+        Raises:
+            ConfigError: `options` are given.
+        """
+        super().reset(seed=seed)
+        seen = self._reset(seed, options, self.np_random)  # type: ignore[arg-type]
+        return (as_numpy(seen) if self._to_numpy else seen), {}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Make a step with `actions` (N, D). Return the observations (N, width), the rewards (N,), masks (N,) of the episodes
+        that ended in a failure and of those whose time ran out, and infos.
+
+        Infos have the reward terms, `reward_<name>` (N,). For environments whose episode ended, these are in `final_info` and
+        the last observations in `final_obs`. With NumPy `final_obs` is an array of N objects, None where no episode ended,
+        and is absent if none ended; with tensors it is (N, width), valid where the mask `_final_obs` is true.
+
+        Raises:
+            ValueError: the actions have another shape, or are not real numbers.
+        """
+        found: tuple[Any, ...] = *self._step(actions), self.task.terminated_buf.clone(), self.task.time_out_buf.clone()
+        if self._to_numpy:
+            found = tuple(as_numpy(value) for value in found)
+        seen, rewards, terminated, truncated = found
+        ended, parts = terminated | truncated, self._reward_parts(self._to_numpy)
+        infos = masked(parts, ~ended)
+        if not self._to_numpy or ended.any():
+            last = self._final_observations()
+            final_obs = rows_of(as_numpy(last), ended) if self._to_numpy else last
+            infos |= masked({"final_obs": final_obs, "final_info": masked(parts, ended)}, ended)
+        return seen, rewards, terminated, truncated, infos
+
+    def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
+        """Return a picture (height, width, 3) uint8 of each environment, or None without a `render_mode`.
+
+        Raises:
+            RunError: this machine cannot render.
+        """
+        pictures = self._pictures()
+        return None if pictures is None else tuple(pictures)
+
+
+def as_numpy(value: Any) -> Any:
+    """Return a tensor, or the tensors of a dictionary, as arrays; those of tensors on the CPU share their memory."""
+    if isinstance(value, dict):
+        return {name: as_numpy(part) for name, part in value.items()}
+    return value.cpu().numpy() if isinstance(value, Tensor) else value
+
+
+def row(value: Any, index: int) -> Any:
+    """Return one row of an array, or of the arrays of a dictionary."""
+    return {name: part[index] for name, part in value.items()} if isinstance(value, dict) else value[index]
+
+
+def rows_of(value: Any, mask: np.ndarray) -> np.ndarray:
+    """Return an array (N,) of objects, as Gymnasium stores final observations: copies of the rows in `mask` (N,) or None."""
+    found = np.full(len(mask), None, dtype=object)
+    for index in mask.nonzero()[0].tolist():
+        one = row(value, index)
+        found[index] = {name: part.copy() for name, part in one.items()} if isinstance(one, dict) else one.copy()
+    return found
+
+
+def masked(values: Mapping[str, Any], mask: Any) -> dict[str, Any]:
+    """Return infos in Gymnasium's form: each value (N, ...) with a mask (N,) of the environments for which it is valid."""
+    return {key: value for name, part in values.items() for key, value in ((name, part), (f"_{name}", mask))}
