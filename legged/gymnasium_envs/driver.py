@@ -15,7 +15,7 @@ from legged.envs.final_observation import keep_final_step
 from legged.errors import ConfigError, suggest
 from legged.gymnasium_envs.random_stream import RandomStream
 from legged.registry import make_task, task_config
-from legged.rendering import ModelCamera, RobotsCamera, camera_of
+from legged.rendering.camera import ModelCamera, RobotsCamera, camera_of
 
 Seen = Literal["actor", "dict"]
 """Form of the observations: the policy's groups side by side, or a dictionary of all groups."""
